@@ -1,0 +1,39 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What can go wrong, by kind.
+
+Every message is one sentence for the person at the other end: what is wrong, where, and what to do.
+The commands and the add-on show it as it stands; anything else that escapes is a defect of ours.
+"""
+from __future__ import annotations
+
+
+class FitFlareError(Exception):
+    """Base of all errors whose message is meant to be read by the user."""
+
+
+class SettingsError(FitFlareError):
+    """A setting or argument that makes no sense."""
+
+
+class CaptureError(FitFlareError):
+    """A capture folder, camera model, lights or split file that cannot be used."""
+
+
+class FrameError(FitFlareError):
+    """A picture that cannot be read or written."""
+
+
+class FlareFileError(FitFlareError):
+    """A .flare or PLY file that cannot be read."""
+
+
+class RunError(FitFlareError):
+    """A run folder that is missing, damaged, or made with other settings."""
+
+
+class EngineError(FitFlareError):
+    """The part of the engine that was asked for is not installed here."""
+
+
+class Cancelled(FitFlareError):
+    """The user, or the system, asked a long job to stop; what is on disk is whole."""

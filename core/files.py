@@ -1,0 +1,77 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Files that are whole or absent, and names that stay inside their folder."""
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from .errors import FitFlareError
+
+
+@contextlib.contextmanager
+def atomic_path(target: Path | str) -> Iterator[Path]:
+    """A temporary path beside `target`, renamed on to it when the block ends well and removed when not.
+
+    The temporary name keeps the suffix, since writers choose their format by it.
+    """
+    target = Path(target)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    handle, name = tempfile.mkstemp(prefix=f".{target.stem}.", suffix=target.suffix, dir=target.parent)
+    os.close(handle)
+    temporary = Path(name)
+    try:
+        yield temporary
+        # mkstemp makes private files; the result gets the permissions that any new file here would have.
+        temporary.chmod(0o666 & ~_umask())
+        temporary.replace(target)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
+
+
+def write_text(path: Path | str, text: str) -> None:
+    """Write UTF-8 text atomically, with Unix line ends on every system."""
+    with atomic_path(path) as temporary:
+        temporary.write_text(text, encoding="utf-8", newline="\n")
+
+
+def write_json(path: Path | str, data: Any) -> None:
+    """Write JSON atomically. NaN and infinity are refused: other readers would choke on them."""
+    write_text(path, json.dumps(data, indent=2, allow_nan=False) + "\n")
+
+
+def read_json(path: Path | str, error: type[FitFlareError]) -> Any:
+    """The content of a JSON file; `error` with one sentence where it cannot be had."""
+    path = Path(path)
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except OSError as problem:
+        raise error(f"{path} cannot be read: {problem.strerror or problem}.") from problem
+    except (ValueError, RecursionError) as problem:
+        raise error(f"{path} is not valid JSON ({problem}); mend it or make it again.") from problem
+
+
+def inside(folder: Path | str, name: str, error: type[FitFlareError]) -> Path:
+    """`folder / name`, refused with `error` where the name would lead out of the folder.
+
+    Absolute names, drive letters, `..` and symbolic links that point outside are refused; what a file
+    from elsewhere names must not reach the rest of the disk.
+    """
+    folder = Path(folder)
+    parts = Path(name.replace("\\", "/"))
+    if not name or "\0" in name or parts.is_absolute() or ":" in parts.parts[0] or ".." in parts.parts:
+        raise error(f"{folder} names the file {name!r}, which is not inside the folder; remove that entry.")
+    path = folder / parts
+    if not path.resolve().is_relative_to(folder.resolve()):
+        raise error(f"{path} is a link that leads out of {folder}; put the file itself there.")
+    return path

@@ -1,0 +1,249 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Pictures: read, written, and moved between display and scene-linear light.
+
+Core works on float32, height x width x 3, row 0 on top. A picture carries its encoding: "srgb" for 8
+and 16 bit files (display values 0..1, IEC 61966-2-1) and "linear" for EXR (scene-linear Rec. 709, any
+value). OpenCV and OpenEXR are imported where they are used, so that Blender's own Python, which has
+neither, can import this module.
+"""
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .errors import FrameError
+from .files import atomic_path
+
+Encoding = Literal["srgb", "linear"]
+Pixels = NDArray[np.float32]
+
+SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".tif", ".tiff", ".exr"})
+LARGEST = 500_000_000  # pixels; a header that claims more is damaged or hostile
+
+
+@dataclass(frozen=True)
+class Picture:
+    """Pixels (height, width, 3) float32 and how they are encoded."""
+
+    pixels: Pixels
+    encoding: Encoding
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(width, height) in pixels."""
+        return self.pixels.shape[1], self.pixels.shape[0]
+
+    def display(self) -> Pixels:
+        """sRGB display values, clipped to 0..1 as a screen clips."""
+        pixels = srgb_from_linear(self.pixels) if self.encoding == "linear" else self.pixels
+        return np.clip(pixels, 0.0, 1.0)
+
+    def linear(self) -> Pixels:
+        """Scene-linear Rec. 709 values."""
+        return linear_from_srgb(self.pixels) if self.encoding == "srgb" else self.pixels
+
+    def resized(self, width: int, height: int) -> Picture:
+        """This picture at another size: area average when it shrinks, bicubic when it grows."""
+        if (width, height) == self.size:
+            return self
+        import cv2
+
+        shrinks = width <= self.size[0] and height <= self.size[1]
+        how = cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC
+        pixels = cv2.resize(self.pixels, (width, height), interpolation=how)
+        return Picture(np.asarray(pixels, np.float32), self.encoding)
+
+
+def srgb_from_linear(linear: NDArray[Any]) -> Pixels:
+    """IEC 61966-2-1 encoding, continued unclipped above 1 and mirrored below 0."""
+    size = np.abs(np.asarray(linear, np.float32))
+    curve = 1.055 * np.power(np.maximum(size, 0.0031308), np.float32(1 / 2.4)) - 0.055
+    return np.copysign(np.where(size <= 0.0031308, 12.92 * size, curve), linear).astype(np.float32)
+
+
+def linear_from_srgb(display: NDArray[Any]) -> Pixels:
+    """The inverse of `srgb_from_linear`."""
+    size = np.abs(np.asarray(display, np.float32))
+    curve = np.power((np.maximum(size, 0.04045) + 0.055) / 1.055, np.float32(2.4))
+    return np.copysign(np.where(size <= 0.04045, size / 12.92, curve), display).astype(np.float32)
+
+
+def read_picture(path: Path | str) -> Picture:
+    """Decode PNG, JPEG, TIFF (8 or 16 bit, grey or colour, alpha dropped) or EXR.
+
+    Raises FrameError where the file is missing, damaged or of another kind, or holds NaN or infinity.
+    """
+    path = Path(path)
+    if path.suffix.lower() not in SUFFIXES:
+        raise FrameError(f"{path} is not a picture this program reads; use PNG, JPEG, TIFF or EXR.")
+    if not path.is_file():
+        raise FrameError(f"{path} is missing.")
+    if path.suffix.lower() == ".exr":
+        return Picture(_rgb_from_channels(path, read_exr(path)), "linear")
+    import cv2
+
+    width, height = picture_size(path)
+    data = np.fromfile(path, np.uint8)  # imread cannot open every path that Windows allows
+    try:
+        stored = cv2.imdecode(data, cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
+    except cv2.error:
+        stored = None
+    if stored is None or stored.shape[:2] != (height, width):
+        raise FrameError(f"{path} is damaged or truncated; export it again.")
+    if stored.ndim == 2:
+        stored = np.repeat(stored[..., None], 3, axis=2)
+    colour = stored[..., 2::-1]  # OpenCV keeps B G R (A)
+    if stored.dtype == np.uint8:
+        return Picture(colour.astype(np.float32) / np.float32(255), "srgb")
+    if stored.dtype == np.uint16:
+        return Picture(colour.astype(np.float32) / np.float32(65535), "srgb")
+    pixels = np.ascontiguousarray(colour, np.float32)
+    if not np.isfinite(pixels).all():
+        raise FrameError(f"{path} holds pixels that are not finite numbers; clean it before it is used.")
+    return Picture(pixels, "linear")  # a float TIFF
+
+
+def picture_size(path: Path | str) -> tuple[int, int]:
+    """(width, height) from the header alone. Raises FrameError where the header is no picture's."""
+    path = Path(path)
+    if not path.is_file():
+        raise FrameError(f"{path} is missing.")
+    try:
+        with open(path, "rb") as stream:
+            size = _size_from_header(stream.read(1 << 16), path)
+    except OSError as problem:
+        raise FrameError(f"{path} cannot be read: {problem.strerror or problem}.") from problem
+    if size is None or min(size) <= 0:
+        raise FrameError(f"{path} is not a picture, or its header is damaged; export it again.")
+    if size[0] * size[1] > LARGEST:
+        raise FrameError(f"{path} claims {size[0]} x {size[1]} pixels, more than this program opens.")
+    return size
+
+
+def _size_from_header(head: bytes, path: Path) -> tuple[int, int] | None:
+    if head[:8] == b"\x89PNG\r\n\x1a\n" and len(head) >= 24:
+        return int.from_bytes(head[16:20], "big"), int.from_bytes(head[20:24], "big")
+    if head[:2] == b"\xff\xd8":
+        return _jpeg_size(path)
+    if head[:4] in (b"II*\0", b"MM\0*"):
+        return _tiff_size(path, "little" if head[:2] == b"II" else "big")
+    if head[:4] == b"\x76\x2f\x31\x01":
+        return _exr_size(head)
+    return None
+
+
+def _jpeg_size(path: Path) -> tuple[int, int] | None:
+    """Walk the segments to the frame header (SOF)."""
+    with open(path, "rb") as stream:
+        stream.seek(2)
+        while marker := stream.read(2):
+            while len(marker) == 2 and marker[1] == 0xFF:  # fill bytes may stand before a marker
+                marker = marker[1:] + stream.read(1)
+            if len(marker) < 2 or marker[0] != 0xFF:
+                return None
+            segment = stream.read(2)
+            length = int.from_bytes(segment, "big")
+            if len(segment) < 2 or length < 2:
+                return None
+            if 0xC0 <= marker[1] <= 0xCF and marker[1] not in (0xC4, 0xC8, 0xCC):
+                frame = stream.read(5)
+                if len(frame) < 5:
+                    return None
+                return int.from_bytes(frame[3:5], "big"), int.from_bytes(frame[1:3], "big")
+            stream.seek(length - 2, os.SEEK_CUR)
+    return None
+
+
+def _tiff_size(path: Path, order: Literal["little", "big"]) -> tuple[int, int] | None:
+    """Tags 256 and 257 of the first directory."""
+    with open(path, "rb") as stream:
+        stream.seek(4)
+        stream.seek(int.from_bytes(stream.read(4), order))
+        size: dict[int, int] = {}
+        for _ in range(int.from_bytes(stream.read(2), order)):
+            entry = stream.read(12)
+            if len(entry) < 12:
+                return None
+            tag, kind = (int.from_bytes(entry[at:at + 2], order) for at in (0, 2))
+            if tag in (256, 257):
+                size[tag] = int.from_bytes(entry[8:10] if kind == 3 else entry[8:12], order)
+    return (size[256], size[257]) if len(size) == 2 else None
+
+
+def _exr_size(head: bytes) -> tuple[int, int] | None:
+    """The dataWindow attribute of the first header."""
+    at = head.find(b"dataWindow\0box2i\0")
+    if at < 0 or len(head) < at + 17 + 4 + 16:
+        return None
+    x0, y0, x1, y1 = np.frombuffer(head, "<i4", 4, at + 17 + 4).tolist()
+    return x1 - x0 + 1, y1 - y0 + 1
+
+
+def read_exr(path: Path | str) -> dict[str, Pixels]:
+    """Every channel of every part of an EXR, by name, as (height, width) float32.
+
+    Raises FrameError where the file is damaged or holds NaN or infinity.
+    """
+    import OpenEXR
+
+    path = Path(path)
+    picture_size(path)
+    channels: dict[str, Pixels] = {}
+    try:
+        with OpenEXR.File(str(path), separate_channels=True) as file:
+            for part in file.parts:
+                for name, channel in part.channels.items():
+                    channels[name] = np.asarray(channel.pixels, np.float32)
+    except Exception as problem:  # the library raises bare RuntimeError and worse for damaged files
+        raise FrameError(f"{path} is damaged or truncated ({problem}); export it again.") from problem
+    for name, pixels in channels.items():
+        if not np.isfinite(pixels).all():
+            raise FrameError(f"{path} holds values in channel {name} that are not finite; clean it first.")
+    return channels
+
+
+def _rgb_from_channels(path: Path, channels: Mapping[str, Pixels]) -> Pixels:
+    if all(name in channels for name in "RGB"):
+        return np.stack([channels[name] for name in "RGB"], axis=-1)
+    if "Y" in channels:
+        return np.repeat(channels["Y"][..., None], 3, axis=2)
+    raise FrameError(f"{path} has no R, G, B channels at its root (it has {', '.join(sorted(channels))}).")
+
+
+def write_exr(path: Path | str, channels: Mapping[str, NDArray[Any]], *, half: bool = True,
+              header: Mapping[str, Any] | None = None) -> None:
+    """Write one part, scanlines, ZIP; each channel (height, width). Full names as given ("scene.R").
+
+    `half` stores 16 bit floats; channels that end in ".Z" stay 32 bit, since depth needs the range.
+    """
+    import OpenEXR
+
+    def stored(name: str, pixels: NDArray[Any]) -> NDArray[Any]:
+        if half and not name.endswith(".Z") and name != "Z":
+            return np.ascontiguousarray(np.clip(pixels, -65504, 65504), np.float16)
+        return np.ascontiguousarray(pixels, np.float32)
+
+    attributes = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **(header or {})}
+    packed = {name: stored(name, pixels) for name, pixels in channels.items()}
+    with atomic_path(path) as temporary, OpenEXR.File(attributes, packed) as file:
+        file.write(str(temporary))
+
+
+def write_png(path: Path | str, display: NDArray[Any], bits: Literal[8, 16] = 8) -> None:
+    """Write display values 0..1, (height, width, 3) or (height, width), as PNG."""
+    import cv2
+
+    top = (1 << bits) - 1
+    pixels = np.clip(np.nan_to_num(display), 0.0, 1.0) * top + 0.5
+    stored: NDArray[Any] = pixels.astype(np.uint8 if bits == 8 else np.uint16)
+    done, data = cv2.imencode(".png", stored[..., ::-1] if stored.ndim == 3 else stored)
+    if not done:
+        raise FrameError(f"{path} could not be encoded as PNG.")
+    with atomic_path(path) as temporary:
+        data.tofile(temporary)

@@ -1,0 +1,188 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""How long work tells where it stands, and how it is asked to stop.
+
+Core code takes a `Progress` and calls `stage`, `advance`, `say`, `result`. The base class is silent;
+`TerminalProgress` draws a bar; `JsonProgress` writes one JSON object a line for the add-on and farms:
+
+    {"type": "stage", "name": "fit", "total": 3000}
+    {"type": "progress", "stage": "fit", "done": 120, "total": 3000, "left_s": 61.2, "figures": {…}}
+    {"type": "say", "text": "…"}
+    {"type": "result", "data": {…}}
+    {"type": "error", "text": "…"}
+"""
+from __future__ import annotations
+
+import contextlib
+import json
+import signal
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from typing import Any, TextIO
+
+from .errors import Cancelled
+
+
+class Progress:
+    """Silent progress, and the interface of the others; `advance` raises Cancelled after `request_stop`."""
+
+    def __init__(self) -> None:
+        self._stop = threading.Event()
+        self._stage = ""
+        self._total = 0
+        self._done = 0
+        self._began = 0.0
+        self._first = 0
+
+    def stage(self, name: str, total: int, done: int = 0) -> None:
+        """Begin a stage of `total` steps, of which `done` were made by an earlier run."""
+        self._stage, self._total, self._done = name, total, done
+        self._began, self._first = time.monotonic(), done
+        self._show_stage()
+        self.check()
+
+    def advance(self, steps: int = 1, **figures: float) -> None:
+        """Count steps; `figures` are shown beside them (loss, Gaussians, …)."""
+        self._done += steps
+        self._show_progress(figures)
+        self.check()
+
+    def say(self, text: str) -> None:
+        """One sentence for the person who watches."""
+
+    def result(self, **data: Any) -> None:
+        """What the command made: paths and figures, JSON-able."""
+
+    def error(self, text: str) -> None:
+        """The one sentence a failed command ends with."""
+
+    def close(self) -> None:
+        """Leave the terminal tidy."""
+
+    def request_stop(self) -> None:
+        """Ask the work to end at its next step; safe from signal handlers and other threads."""
+        self._stop.set()
+
+    def check(self) -> None:
+        """Raise Cancelled if a stop was asked for."""
+        if self._stop.is_set():
+            raise Cancelled(f"Stopped during {self._stage or 'start-up'} as asked; run it again to go on.")
+
+    @property
+    def left_s(self) -> float | None:
+        """Seconds left in this stage at the pace so far; None before the first step."""
+        made = self._done - self._first
+        if made <= 0:
+            return None
+        return (time.monotonic() - self._began) / made * max(self._total - self._done, 0)
+
+    def _show_stage(self) -> None:
+        pass
+
+    def _show_progress(self, figures: dict[str, float]) -> None:
+        pass
+
+
+class TerminalProgress(Progress):
+    """A bar on a terminal (tqdm); plain lines where the output is a file."""
+
+    def __init__(self, stream: TextIO | None = None) -> None:
+        super().__init__()
+        self._stream = stream or sys.stderr
+        self._bar: Any = None
+        self._shown = 0
+
+    def _show_stage(self) -> None:
+        from tqdm import tqdm
+
+        self.close()
+        # A log file gets a line now and then, a terminal a smooth bar.
+        interval = 0.1 if self._stream.isatty() else 10.0
+        self._bar = tqdm(total=self._total, initial=self._done, desc=self._stage, file=self._stream,
+                         mininterval=interval, dynamic_ncols=self._stream.isatty())
+        self._shown = self._done
+
+    def _show_progress(self, figures: dict[str, float]) -> None:
+        if self._bar is None:
+            return
+        if figures:
+            self._bar.set_postfix({key: f"{value:.4g}" for key, value in figures.items()}, refresh=False)
+        self._bar.update(self._done - self._shown)
+        self._shown = self._done
+
+    def say(self, text: str) -> None:
+        if self._bar is not None:
+            self._bar.clear()
+        print(text, file=self._stream, flush=True)
+
+    def error(self, text: str) -> None:
+        self.close()
+        print(f"error: {text}", file=self._stream, flush=True)
+
+    def close(self) -> None:
+        if self._bar is not None:
+            self._bar.close()
+            self._bar = None
+
+
+class JsonProgress(Progress):
+    """One JSON object a line on stdout, at most ten progress lines a second."""
+
+    def __init__(self, stream: TextIO | None = None) -> None:
+        super().__init__()
+        self._stream = stream or sys.stdout
+        self._last = 0.0
+
+    def _send(self, **event: Any) -> None:
+        self._stream.write(json.dumps(event) + "\n")
+        self._stream.flush()
+
+    def _show_stage(self) -> None:
+        self._last = 0.0
+        self._send(type="stage", name=self._stage, total=self._total)
+
+    def _show_progress(self, figures: dict[str, float]) -> None:
+        now = time.monotonic()
+        if self._done < self._total and now - self._last < 0.1:
+            return
+        self._last = now
+        left = self.left_s
+        self._send(type="progress", stage=self._stage, done=self._done, total=self._total,
+                   left_s=None if left is None else round(left, 1), figures=figures)
+
+    def say(self, text: str) -> None:
+        self._send(type="say", text=text)
+
+    def result(self, **data: Any) -> None:
+        self._send(type="result", data=data)
+
+    def error(self, text: str) -> None:
+        self._send(type="error", text=text)
+
+
+@contextlib.contextmanager
+def stoppable(progress: Progress) -> Iterator[Progress]:
+    """Let SIGINT, SIGTERM and (Windows) CTRL_BREAK ask the work to stop at its next step.
+
+    Only the main thread may set signal handlers; elsewhere this changes nothing.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield progress
+        return
+    names = ("SIGINT", "SIGTERM", "SIGBREAK")
+    signals = [getattr(signal, name) for name in names if hasattr(signal, name)]
+    before = {number: signal.getsignal(number) for number in signals}
+
+    def ask(number: int, _frame: Any) -> None:
+        progress.request_stop()
+        # A second signal gets the system's own, immediate, answer.
+        signal.signal(number, signal.SIG_DFL)
+
+    for number in signals:
+        signal.signal(number, ask)
+    try:
+        yield progress
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

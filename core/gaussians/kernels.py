@@ -1,0 +1,88 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Kernel sets, and which one to use.
+
+A kernel set is a module with the functions of `KernelSet`. All of them compute the picture that
+`reference.py` defines; they differ in speed and in where they run:
+
+    torch   reference.py   the definition; any device, any precision
+    tiles   tiles.py       torch, tile by tile, analytic gradients; where there is nothing faster
+    cpu     cpu/           numba with explicit SIMD; float32
+    cuda    cuda.py        NVIDIA; float32
+"""
+from __future__ import annotations
+
+import importlib
+import logging
+from functools import cache
+from typing import Protocol, cast
+
+import torch
+from torch import Tensor
+
+from ..errors import EngineError, SettingsError
+from .rendering import Rendering, Splats
+
+MODULES = {"torch": ".reference", "tiles": ".tiles", "cpu": ".cpu", "cuda": ".cuda"}
+
+log = logging.getLogger(__name__)
+
+
+class KernelSet(Protocol):
+    """Arguments as the functions of the same purpose in `rasterizer.py` take them, checked there."""
+
+    def rasterize_scene(
+        self, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, sh: Tensor,
+        world_to_camera: Tensor, intrinsics: Tensor, width: int, height: int,
+        *, background: Tensor | None, sh_degree: int, near: float, dilation: float,
+    ) -> Rendering: ...  # fmt: skip
+
+    def splat(
+        self, centres: Tensor, covariances: Tensor, opacities: Tensor, colours: Tensor,
+        width: int, height: int, *, rings: Tensor | None, arcs: Tensor | None, blend: str,
+    ) -> Splats: ...  # fmt: skip
+
+
+@cache
+def _load(name: str) -> KernelSet | ImportError:
+    try:
+        return cast(KernelSet, importlib.import_module(MODULES[name], __package__))
+    except ImportError as error:
+        return error
+
+
+def available(name: str) -> bool:
+    """Whether this kernel set can be imported here."""
+    return not isinstance(_load(name), ImportError)
+
+
+@cache
+def _say_once(sentence: str) -> None:
+    log.warning(sentence)
+
+
+def choose(name: str, like: Tensor) -> KernelSet:
+    """The kernel set of this name, or the fastest for tensors such as `like` if the name is "auto".
+
+    Raises SettingsError for an unknown name, EngineError for one that is not installed here.
+    """
+    if name == "auto":
+        name = _fastest(like)
+    if name not in MODULES:
+        raise SettingsError(f"kernels are {', '.join(MODULES)} or auto, not {name!r}.")
+    kernels = _load(name)
+    if isinstance(kernels, ImportError):
+        raise EngineError(
+            f"The {name} kernels cannot be used here ({kernels}); choose auto to do without them."
+        )
+    return kernels
+
+
+def _fastest(like: Tensor) -> str:
+    wanted = {"cuda": "cuda", "cpu": "cpu"}.get(like.device.type, "tiles")
+    if like.dtype != torch.float32:
+        return "tiles"
+    reason = _load(wanted)
+    if isinstance(reason, ImportError):
+        _say_once(f"The {wanted} kernels cannot be used here ({reason}); slower torch ones take their place.")
+        return "tiles"
+    return wanted

@@ -1,0 +1,110 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""From 3D Gaussians to 2D: elliptical weighted averaging (Zwicker et al. 2001; Kerbl et al. 2023, eq. 5, 6).
+
+A Gaussian of rotation R and scales S has the covariance R S S^T R^T. Seen by a camera with rotation W, and
+with the perspective map linearised at the mean (J), its picture has the covariance T T^T with T = J W R S,
+a 2 x 3 matrix. `dilation` on the diagonal stands for the pixel's own width.
+"""
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+QUATERNION_MIN = 1e-8
+"""Norms below this count as this: a zero quaternion becomes no rotation, not NaN."""
+FRUSTUM_MARGIN = 0.3
+"""J is taken at most this share of tan(half field of view) outside of the frame: further out the linear
+map bears no likeness to the perspective one."""
+
+
+class Projected(NamedTuple):
+    """The m Gaussians beyond the near plane. indices (m,) into the n given; centres (m, 2) px; covariances
+    (m, 3) xx, xy, yy in px², dilation included; depths (m,) camera z."""
+
+    indices: Tensor
+    centres: Tensor
+    covariances: Tensor
+    depths: Tensor
+
+
+def rotation_matrices(quaternions: Tensor) -> Tensor:
+    """(n, 3, 3) rotations of (n, 4) quaternions w, x, y, z of any length."""
+    w, x, y, z = (
+        quaternions / torch.linalg.vector_norm(quaternions, dim=-1, keepdim=True).clamp(min=QUATERNION_MIN)
+    ).unbind(-1)
+    return torch.stack(
+        [
+            1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+            2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+            2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+        ],
+        -1,
+    ).reshape(-1, 3, 3)  # fmt: skip
+
+
+def camera_position(world_to_camera: Tensor) -> Tensor:
+    """(3,) world coordinates of the camera: -R^T t."""
+    return -world_to_camera[:3, :3].T @ world_to_camera[:3, 3]
+
+
+def frustum_limits(intrinsics: Tensor, width: int, height: int) -> tuple[Tensor, Tensor]:
+    """Lower and upper bounds (2,) of (x/z, y/z) inside which J is taken; constants, not differentiated."""
+    focal, principal = intrinsics.detach().diagonal()[:2], intrinsics.detach()[:2, 2]
+    size = torch.tensor([width, height], dtype=focal.dtype, device=focal.device)
+    margin = FRUSTUM_MARGIN * size / (2 * focal)
+    return -principal / focal - margin, (size - principal) / focal + margin
+
+
+def project(
+    means: Tensor, quats: Tensor, scales: Tensor, world_to_camera: Tensor, intrinsics: Tensor,
+    width: int, height: int, near: float, dilation: float,
+) -> Projected:  # fmt: skip
+    """Projects (n, 3) means, (n, 4) quaternions, (n, 3) scales; differentiable by all of them and by the
+    camera's (4, 4) world_to_camera and (3, 3) intrinsics (no skew)."""
+    rotation, translation = world_to_camera[:3, :3], world_to_camera[:3, 3]
+    positions = means @ rotation.T + translation
+    index = torch.nonzero(positions[:, 2] > near)[:, 0]
+    x, y, z = positions[index].unbind(-1)
+    focal, principal = intrinsics.diagonal()[:2], intrinsics[:2, 2]
+
+    slopes = torch.stack([x / z, y / z], -1)
+    centres = slopes * focal + principal
+
+    u = slopes.clamp(*frustum_limits(intrinsics, width, height))
+    zero = torch.zeros_like(z)
+    jacobian = torch.stack(
+        [
+            torch.stack([focal[0] / z, zero, -focal[0] * u[:, 0] / z], -1),
+            torch.stack([zero, focal[1] / z, -focal[1] * u[:, 1] / z], -1),
+        ],
+        -2,
+    )
+    t = jacobian @ rotation @ (rotation_matrices(quats[index]) * scales[index, None, :])
+    a, b = t.unbind(-2)
+    covariances = torch.stack([(a * a).sum(-1) + dilation, (a * b).sum(-1), (b * b).sum(-1) + dilation], -1)
+    return Projected(index, centres, covariances, z)
+
+
+def determinants(covariances: Tensor) -> Tensor:
+    """(n,) determinants of (n, 3) covariances xx, xy, yy."""
+    xx, xy, yy = covariances.unbind(-1)
+    return xx * yy - xy * xy
+
+
+def half_sizes(covariances: Tensor, radii: Tensor) -> Tensor:
+    """Half width and height (n, 2) px of the box around the ellipse at these Mahalanobis radii (n,)."""
+    return radii[:, None] * covariances[:, ::2].clamp(min=0).sqrt()
+
+
+def visible_radii(
+    centres: Tensor, covariances: Tensor, radii: Tensor, width: int, height: int
+) -> Tensor:
+    """(n,) 3 sigma of the longer axis, px; 0 where the box at Mahalanobis radius `radii` misses the frame."""
+    half = half_sizes(covariances, radii)
+    frame = torch.tensor([width, height], dtype=centres.dtype, device=centres.device)
+    inside = ((centres + half > 0) & (centres - half < frame)).all(-1) & (radii > 0)
+    xx, xy, yy = covariances.unbind(-1)
+    largest = (xx + yy) / 2 + (((xx - yy) / 2) ** 2 + xy * xy).sqrt()
+    return 3 * largest.sqrt() * inside

@@ -1,0 +1,124 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The door: 3D Gaussians seen by a camera, and 2D Gaussians laid on a picture."""
+from __future__ import annotations
+
+from typing import Literal
+
+from torch import Tensor
+
+from ..errors import SettingsError
+from .kernels import choose
+from .mixed import splat_mixed
+from .rendering import DILATION, NEAR, Rendering, Splats
+from .spherical_harmonics import degree_of
+
+Kernels = Literal["auto", "torch", "tiles", "cpu", "cuda"]
+Blend = Literal["over", "add"]
+Resolution = Literal["full", "mixed"]
+
+
+def rasterization(
+    means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, sh: Tensor,
+    world_to_camera: Tensor, intrinsics: Tensor, width: int, height: int,
+    *, background: Tensor | None = None, sh_degree: int | None = None,
+    kernels: Kernels = "auto", near: float = NEAR, dilation: float = DILATION,
+) -> Rendering:  # fmt: skip
+    """Renders n 3D Gaussians (Kerbl et al. 2023), nearest first; `reference.py` has the definition.
+
+    means            (n, 3) world coordinates
+    quats            (n, 4) rotations w, x, y, z of any length
+    scales           (n, 3) standard deviations along the axes, world units, > 0
+    opacities        (n,)   0..1
+    sh               (n, k, 3) spherical harmonics, k = 1, 4, 9 or 16
+    world_to_camera  (4, 4) x right, y down, z forward
+    intrinsics       (3, 3) focal lengths and principal point, px; no skew
+    background       (3,)   shows where the Gaussians leave transmittance; black by default
+    sh_degree        how much of sh is used: 0 to 3, all of it by default
+    kernels          see `kernels.py`
+    near             camera depth at which Gaussians are culled, world units
+    dilation         px², added to both diagonal elements of the projected covariances
+
+    Differentiable by every tensor. Raises SettingsError for shapes and values that do not fit,
+    EngineError for kernels that are not installed.
+    """
+    n = _count(means, 3, "means")
+    _expect(quats, (n, 4), "quats")
+    _expect(scales, (n, 3), "scales")
+    _expect(opacities, (n,), "opacities")
+    _expect(sh, (n, sh.shape[1] if sh.ndim == 3 else 1, 3), "sh")
+    _expect(world_to_camera, (4, 4), "world_to_camera")
+    _expect(intrinsics, (3, 3), "intrinsics")
+    if background is not None:
+        _expect(background, (3,), "background")
+    _check_size(width, height)
+    degree = degree_of(sh.shape[1])
+    if sh_degree is not None:
+        if not 0 <= sh_degree <= degree:
+            raise SettingsError(f"sh_degree is {sh_degree}, but sh holds degrees 0 to {degree}.")
+        degree = sh_degree
+    return choose(kernels, means).rasterize_scene(
+        means, quats, scales, opacities, sh, world_to_camera, intrinsics, width, height,
+        background=background, sh_degree=degree, near=near, dilation=dilation,
+    )  # fmt: skip
+
+
+def splat(
+    centres: Tensor, covariances: Tensor, opacities: Tensor, colours: Tensor, width: int, height: int,
+    *, rings: Tensor | None = None, arcs: Tensor | None = None,
+    blend: Blend = "over", resolution: Resolution = "full", kernels: Kernels = "auto",
+) -> Splats:  # fmt: skip
+    """Lays n 2D Gaussians on a picture: the flare's way in; `reference.py` has the definition.
+
+    centres      (n, 2) px, pixel centres at + 1/2
+    covariances  (n, 3) xx, xy, yy, px²; taken as they are, without dilation; those that are not positive
+                 definite cover nothing
+    opacities    (n,)   0..1 ("add": any gain >= 0)
+    colours      (n, 3)
+    rings        (n, 2) r0 and w > 0, Mahalanobis distance: the profile is a ring, not a disc
+    arcs         (n, 3) theta0 (radians, from x to y), cos delta, k: the profile is cut to an arc
+    blend        "over": front to back in the order given; "add": a sum, for scene-linear light
+    resolution   "mixed": those large against the pixel are drawn at 1/4 or 1/2 size and enlarged
+                 (behind the small ones, if "over"); see `mixed.py` for the error
+    kernels      see `kernels.py`
+
+    Differentiable by every tensor. Raises SettingsError for shapes and values that do not fit,
+    EngineError for kernels that are not installed.
+    """
+    n = _count(centres, 2, "centres")
+    _expect(covariances, (n, 3), "covariances")
+    _expect(opacities, (n,), "opacities")
+    _expect(colours, (n, 3), "colours")
+    if rings is not None:
+        _expect(rings, (n, 2), "rings")
+    if arcs is not None:
+        _expect(arcs, (n, 3), "arcs")
+    _check_size(width, height)
+    if blend not in ("over", "add"):
+        raise SettingsError(f"blend is over or add, not {blend!r}.")
+    if resolution not in ("full", "mixed"):
+        raise SettingsError(f"resolution is full or mixed, not {resolution!r}.")
+    chosen = choose(kernels, centres)
+    if resolution == "mixed":
+        return splat_mixed(
+            chosen, centres, covariances, opacities, colours, width, height,
+            rings=rings, arcs=arcs, blend=blend,
+        )  # fmt: skip
+    return chosen.splat(
+        centres, covariances, opacities, colours, width, height, rings=rings, arcs=arcs, blend=blend
+    )
+
+
+def _count(tensor: Tensor, width: int, name: str) -> int:
+    if tensor.ndim != 2 or tensor.shape[1] != width:
+        raise SettingsError(f"{name} has the shape {tuple(tensor.shape)}, but must be (n, {width}).")
+    return tensor.shape[0]
+
+
+def _expect(tensor: Tensor, shape: tuple[int, ...], name: str) -> None:
+    if tuple(tensor.shape) != shape:
+        raise SettingsError(f"{name} has the shape {tuple(tensor.shape)}, but must be {shape}.")
+
+
+def _check_size(width: int, height: int) -> None:
+    if width < 1 or height < 1:
+        raise SettingsError(f"A picture of {width} x {height} pixels cannot be rendered.")

@@ -1,0 +1,149 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The definition of the picture, in plain torch: every Gaussian at every pixel, differentiated by autograd.
+
+Any device, float32 or float64; slow. All other kernel sets are measured against this one.
+
+At a pixel centre (x + 1/2, y + 1/2), with d its offset from a Gaussian's centre:
+
+    q = d^T covariance^-1 d                                       squared Mahalanobis distance
+    G = exp(-q / 2)                                               the plain profile, or
+    G = exp(-(sqrt(q) - r0)² / (2 w²))                            a ring (METHOD: r0 = 0, w = 1 is plain)
+    G = G * sigmoid(k (cos(theta - theta0) - cos delta))          an arc of either; theta = atan2(d_y, d_x)
+
+    over:  alpha_i = min(opacity_i, 0.99) G_i, or 0 if that is below 1/255
+           T_i = prod_{j before i} (1 - alpha_j)
+           picture = sum_i colour_i alpha_i T_i  over all i with T_i >= 1e-4, front to back
+    add:   picture = sum_i colour_i opacity_i G_i  over all i with G_i >= 1/4096
+"""
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+from torch.utils.checkpoint import checkpoint
+
+from .projection import camera_position, determinants, project, visible_radii
+from .rendering import ALPHA_MIN, OPACITY_MAX, PROFILE_MIN, TRANSMITTANCE_MIN, Rendering, Splats, extent
+from .spherical_harmonics import colours as colours_of
+
+RADIUS_MIN = 1e-6
+"""Distances are not told apart below this, where the direction of their gradient has no meaning."""
+CHUNK = 1 << 18
+"""Pairs of Gaussian and pixel at a time; what bounds the memory, and small enough for the cache."""
+
+
+def pixel_centres(width: int, height: int, like: Tensor) -> Tensor:
+    """(height * width, 2) coordinates x, y of the pixel centres, row by row."""
+    x, y = (torch.arange(size, dtype=like.dtype, device=like.device) + 0.5 for size in (width, height))
+    return torch.cartesian_prod(y, x).flip(-1)
+
+
+def profiles(
+    pixels: Tensor, centres: Tensor, covariances: Tensor, rings: Tensor | None, arcs: Tensor | None
+) -> Tensor:
+    """G of n Gaussians at p pixels: (n, p), 0..1."""
+    dx, dy = (pixels[None] - centres[:, None]).unbind(-1)
+    xx, xy, yy = covariances[:, :, None].unbind(1)
+    q = (yy * dx * dx - 2 * xy * dx * dy + xx * dy * dy) / determinants(covariances)[:, None]
+    if rings is None:
+        g = torch.exp(-q / 2)
+    else:
+        r0, w = rings[:, :, None].unbind(1)
+        g = torch.exp(-((q.clamp(min=RADIUS_MIN**2).sqrt() - r0) ** 2) / (2 * w * w))
+    if arcs is not None:
+        theta0, cos_delta, k = arcs[:, :, None].unbind(1)
+        distance = (dx * dx + dy * dy).clamp(min=RADIUS_MIN**2).sqrt()
+        cosine = (dx * theta0.cos() + dy * theta0.sin()) / distance
+        g = g * torch.sigmoid(k * (cosine - cos_delta))
+    return g
+
+
+def over(g: Tensor, opacities: Tensor) -> tuple[Tensor, Tensor]:
+    """Alphas and the transmittances before them, both (n, p), from profiles (n, p), front to back."""
+    alpha = opacities.clamp(max=OPACITY_MAX)[:, None] * g
+    alpha = torch.where(alpha >= ALPHA_MIN, alpha, 0)
+    return alpha, torch.cat([torch.ones_like(alpha[:1]), torch.cumprod(1 - alpha, 0)[:-1]])
+
+
+def weights_over(g: Tensor, opacities: Tensor) -> Tensor:
+    """Shares (n, p) of the Gaussians in the colour of the pixels."""
+    alpha, transmittance = over(g, opacities)
+    return torch.where(transmittance >= TRANSMITTANCE_MIN, alpha * transmittance, 0)
+
+
+def weights_add(g: Tensor, opacities: Tensor) -> Tensor:
+    """The same where light adds."""
+    return opacities[:, None] * torch.where(g >= PROFILE_MIN, g, 0)
+
+
+def _in_chunks(pixels: Tensor, count: int, shade: Callable[[Tensor], Tensor]) -> Tensor:
+    """shade(pixels) in parts of bounded size, whose intermediates are computed anew in backward."""
+    parts = pixels.split(max(1, CHUNK // max(count, 1)))
+    if len(parts) == 1 or not torch.is_grad_enabled():
+        return torch.cat([shade(part) for part in parts])
+    return torch.cat([checkpoint(shade, part, use_reentrant=False) for part in parts])
+
+
+def rasterize_scene(
+    means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, sh: Tensor,
+    world_to_camera: Tensor, intrinsics: Tensor, width: int, height: int,
+    *, background: Tensor | None, sh_degree: int, near: float, dilation: float,
+) -> Rendering:  # fmt: skip
+    """See `rasterization`."""
+    seen = project(means, quats, scales, world_to_camera, intrinsics, width, height, near, dilation)
+    order = torch.argsort(seen.depths, stable=True)
+    index, centres, covariances, depths = (part[order] for part in seen)
+    colours = colours_of((means - camera_position(world_to_camera))[index], sh[index], sh_degree)
+    values = torch.cat([colours, depths[:, None]], -1)
+    opacities = opacities[index]
+
+    gradients = torch.zeros_like(means[:, :2]).detach()
+    if centres.requires_grad:
+        centres.register_hook(lambda gradient: gradients.index_add_(0, index, gradient))
+
+    def shade(pixels: Tensor) -> Tensor:
+        weights = weights_over(profiles(pixels, centres, covariances, None, None), opacities)
+        return torch.cat([weights.T @ values, weights.sum(0)[:, None]], -1)
+
+    def median(pixels: Tensor) -> Tensor:
+        alpha, before = over(profiles(pixels, centres, covariances, None, None), opacities)
+        passed = (before * (1 - alpha) >= 0.5).sum(0)
+        return torch.cat([depths, depths.new_zeros(1)])[passed]
+
+    pixels = pixel_centres(width, height, means)
+    with torch.no_grad():
+        median_depth = _in_chunks(pixels, len(index), median).reshape(height, width)
+        all_centres = torch.zeros_like(means[:, :2]).index_copy_(0, index, centres)
+        reach = extent(opacities.clamp(max=OPACITY_MAX))
+        radii = torch.zeros_like(means[:, 0]).index_copy_(
+            0, index, visible_radii(centres, covariances, reach, width, height)
+        )
+    picture = _in_chunks(pixels, len(index), shade).reshape(height, width, 5)
+    alpha = picture[..., 4]
+    colour = picture[..., :3]
+    if background is not None:
+        colour = colour + (1 - alpha)[..., None] * background
+    depth = picture[..., 3] / alpha.clamp(min=ALPHA_MIN / 2)
+    return Rendering(colour, alpha, depth, median_depth, all_centres, radii, gradients)
+
+
+def splat(
+    centres: Tensor, covariances: Tensor, opacities: Tensor, colours: Tensor, width: int, height: int,
+    *, rings: Tensor | None, arcs: Tensor | None, blend: str,
+) -> Splats:  # fmt: skip
+    """See `splat` of the package; full resolution."""
+    index = torch.nonzero(determinants(covariances) > 0)[:, 0]  # a degenerate ellipse covers nothing
+    centres, covariances, opacities, colours = (
+        part[index] for part in (centres, covariances, opacities, colours)
+    )
+    rings, arcs = (None if part is None else part[index] for part in (rings, arcs))
+    weigh = weights_over if blend == "over" else weights_add
+
+    def shade(pixels: Tensor) -> Tensor:
+        weights = weigh(profiles(pixels, centres, covariances, rings, arcs), opacities)
+        return torch.cat([weights.T @ colours, weights.sum(0)[:, None]], -1)
+
+    picture = _in_chunks(pixel_centres(width, height, centres), len(index), shade).reshape(height, width, 4)
+    colour, alpha = picture[..., :3], picture[..., 3]
+    return Splats(colour, 1 - alpha if blend == "over" else torch.ones_like(alpha))

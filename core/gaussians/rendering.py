@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What a rasterizer returns, and the numbers that every kernel set agrees on."""
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+ALPHA_MIN = 1 / 255
+"""Blended contributions fainter than this are skipped, as in 3DGS."""
+OPACITY_MAX = 0.99
+"""Opacity is clamped here before blending, so that no Gaussian hides all behind it (and 1 - alpha > 0)."""
+TRANSMITTANCE_MIN = 1e-4
+"""A pixel is finished once its transmittance has fallen below this: later Gaussians do not count."""
+PROFILE_MIN = 1 / 4096
+"""Added contributions are skipped where the profile is below this share of its own peak. Relative to
+the peak, so that the extent of a Gaussian (4.08 sigma) depends on neither its opacity nor its colour."""
+NEAR = 0.2
+"""Gaussians at this camera depth or nearer are culled."""
+DILATION = 0.3
+"""Added to the diagonal of projected covariances, px²: nothing is thinner than about half a pixel."""
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """A scene seen by one camera. h, w: the picture; n: the Gaussians, in the caller's order.
+
+    colour            (h, w, 3)  background included; in the units of the colours
+    alpha             (h, w)     0..1, one minus the transmittance left behind all Gaussians
+    depth             (h, w)     mean camera depth, weighted by contribution; 0 where alpha is 0
+    median_depth      (h, w)     depth of the Gaussian at which transmittance falls below 1/2, 0 where
+                                 none does; not differentiable
+    centres           (n, 2)     projected centres, px; 0 for those culled; detached
+    radii             (n,)       3 sigma of the longer axis, px; 0 for those that touch no pixel; detached
+    centre_gradients  (n, 2)     zero until backward, which adds the gradient of the loss by the centres,
+                                 px^-1 (the statistic that densification goes by)
+    """
+
+    colour: Tensor
+    alpha: Tensor
+    depth: Tensor
+    median_depth: Tensor
+    centres: Tensor
+    radii: Tensor
+    centre_gradients: Tensor
+
+
+@dataclass(frozen=True)
+class Splats:
+    """2D Gaussians on a picture: colour (h, w, 3) and the transmittance (h, w) they leave to what lies
+    behind (ones where light is added), so that the whole picture is colour + transmittance * behind."""
+
+    colour: Tensor
+    transmittance: Tensor
+
+
+def extent(peaks: Tensor, blend: str = "over") -> Tensor:
+    """Mahalanobis radius beyond which a plain Gaussian of this peak is skipped; 0 if all of it is.
+
+    peaks: (n,) opacities, already clamped. Solves peak * exp(-r²/2) = threshold for r.
+    """
+    if blend == "add":
+        return torch.full_like(peaks, (-2 * torch.log(torch.tensor(PROFILE_MIN))).sqrt().item())
+    return (2 * (peaks / ALPHA_MIN).clamp(min=1.0).log()).sqrt()

@@ -1,0 +1,38 @@
+# make demo   sets everything up and runs the whole chain on the sample scene
+# make test   sets everything up and runs the checks and tests
+PYTHON ?= python3.11
+PIP = -m pip --disable-pip-version-check --quiet
+
+.PHONY: demo test check setup package clean
+
+demo: .venv/.ready
+	.venv/bin/python headless/run.py demo
+
+test: setup check
+	.venv/bin/python -m pytest
+
+check: .venv/.ready
+	.venv/bin/ruff check .
+	.venv/bin/mypy
+
+setup: .venv/.ready .venv-bpy45/.ready
+
+# The engine, with Blender as a module beside it.
+.venv/.ready: constraints.txt pyproject.toml
+	$(PYTHON) -m venv .venv
+	.venv/bin/python $(PIP) install --upgrade pip
+	.venv/bin/python $(PIP) install --group engine --group blender --group test -c constraints.txt
+	touch $@
+
+# An older Blender without an engine, for the tests of Blender's side.
+.venv-bpy45/.ready: constraints.txt pyproject.toml
+	$(PYTHON) -m venv .venv-bpy45
+	.venv-bpy45/bin/python $(PIP) install bpy==4.5.15 numpy==1.26.4 OpenEXR==3.5.3
+	touch $@
+
+# The extension as Blender installs it.
+package: .venv/.ready
+	.venv/bin/python headless/package.py
+
+clean:
+	rm -rf build .venv .venv-bpy45

@@ -1,0 +1,252 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Every setting of a fit, its presets, and the config.toml that a run keeps.
+
+Defaults are the paper's (appendix "Flare representation"); the presets change length and rates so that a
+fit ends in minutes on two CPU cores.
+"""
+from __future__ import annotations
+
+import dataclasses
+import math
+import tomllib
+import types
+import typing
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, is_dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+from ..errors import RunError, SettingsError
+from ..files import write_text
+from ..flare.density import DensitySettings
+from ..flare.model import OURS, PAPER, FlareForm
+
+Mode = Literal["default", "unsup", "in-flare", "2d", "3dgs"]
+Preset = Literal["draft", "standard", "high", "paper"]
+
+
+@dataclass(frozen=True)
+class FlareRates:
+    """Adam's learning rates for the flare; `position` decays exponentially to `position_final`."""
+
+    network: float = 1e-4
+    grids: float = 1e-4
+    position: float = 1.6e-4
+    position_final: float = 1.6e-6
+    features: float = 2.5e-3
+    opacity: float = 0.05
+    scale: float = 0.1
+    rotation: float = 1e-3
+    offset: float = 1e-3
+    ring: float = 5e-3
+    latent: float = 5e-3
+
+
+@dataclass(frozen=True)
+class SceneRates:
+    """Adam's learning rates for the scene, as in 3DGS (Kerbl et al. 2023); positions in units of the extent."""
+
+    position: float = 1.6e-4
+    position_final: float = 1.6e-6
+    features: float = 2.5e-3
+    features_rest: float = 2.5e-3 / 20
+    opacity: float = 0.05
+    scale: float = 5e-3
+    rotation: float = 1e-3
+
+
+@dataclass(frozen=True)
+class FlareSettings:
+    """The flare: its form, how many Gaussians a light starts with, density control, rates, warm start.
+
+    `detection` False puts every light at the centroid of the points plus uniform noise (ablation).
+    """
+
+    form: FlareForm = PAPER
+    count: int = 200
+    density: DensitySettings = field(default_factory=DensitySettings)
+    rates: FlareRates = field(default_factory=FlareRates)
+    detection: bool = True
+
+
+@dataclass(frozen=True)
+class SceneSettings:
+    """The scene: 3DGS from the capture's points; densified until `densify_until` up to `most` Gaussians."""
+
+    rates: SceneRates = field(default_factory=SceneRates)
+    densify_from: int = 500
+    densify_until: int = 15000
+    densify_every: int = 100
+    opacity_reset_every: int = 3000
+    sh_every: int = 1000
+    gradient: float = 2e-4
+    most: int = 1_000_000
+
+
+@dataclass(frozen=True)
+class FitSettings:
+    """A whole fit. `width`: the working width in pixels at most; 0 keeps the frames' own size.
+
+    ssim_share is 1 - lambda of the paper's loss. `holdout`: None (every view is fitted), a number N (every
+    N-th view is held out) or a split file's name.
+    """
+
+    mode: Mode = "default"
+    blend: Literal["over", "add"] = "over"
+    iterations: int = 30000
+    width: int = 0
+    seed: int = 0
+    ssim_share: float = 0.1
+    holdout: str | int | None = None
+    kernels: Literal["auto", "torch", "tiles", "cpu", "cuda"] = "auto"
+    checkpoint_every_s: float = 60.0
+    preview_every: int = 1000
+    flare: FlareSettings = field(default_factory=FlareSettings)
+    scene: SceneSettings = field(default_factory=SceneSettings)
+
+    def checked(self) -> FitSettings:
+        """Itself; raises SettingsError where a value makes no sense."""
+        checks = (
+            (self.iterations >= 1, "iterations must be at least 1"),
+            (self.width >= 0, "size must not be negative"),
+            (0 <= self.ssim_share <= 1, "ssim_share must lie between 0 and 1"),
+            (self.flare.count >= 1, "a flare starts with at least one Gaussian"),
+            (self.seed >= 0, "seed must not be negative"),
+            (self.mode != "2d" or not self.flare.form.line, "mode 2d needs a form without the line"),
+        )
+        for good, sentence in checks:
+            if not good:
+                raise SettingsError(f"The settings cannot be used: {sentence}.")
+        return self
+
+
+def preset(name: Preset, *, model: Literal["paper", "ours"] = "paper", mode: Mode = "default",
+           blend: Literal["over", "add"] | None = None, iterations: int | None = None) -> FitSettings:
+    """Settings by name, with every schedule stretched to the number of iterations.
+
+    paper     the paper's figures, 30,000 iterations
+    draft, standard, high: shorter schedules with higher rates (README has times and figures)
+    """
+    lengths = {"draft": 1000, "standard": 3000, "high": 10000, "paper": 30000}
+    if name not in lengths:
+        raise SettingsError(f"There is no preset {name!r}; choose {', '.join(lengths)}.")
+    length = iterations or lengths[name]
+    form = replace(PAPER if model == "paper" else OURS, line=mode != "2d")
+    if blend is None:
+        blend = "over" if model == "paper" else "add"
+    settings = FitSettings(mode=mode, blend=blend, iterations=length, flare=FlareSettings(form=form))
+    if name != "paper":
+        settings = _shortened(settings, {"draft": 300, "standard": 500, "high": 700}[name])
+    return settings.checked()
+
+
+def _shortened(settings: FitSettings, count: int) -> FitSettings:
+    """A schedule for a short fit: the same events at the same shares of the whole, and higher rates."""
+    length = settings.iterations
+    every = max(round(length / 40), 20)
+    density = replace(settings.flare.density, start=max(round(length * 0.1), every), stop=round(length * 0.6),
+                      every=every, clone_ratio=0.1)
+    rates = replace(settings.flare.rates, network=1e-3, grids=5e-3, position=1.6e-3, position_final=1.6e-5,
+                    features=1e-2, scale=0.02, rotation=5e-3)
+    scene = replace(settings.scene, densify_from=max(round(length * 0.05), 100),
+                    densify_until=round(length * 0.6), densify_every=max(round(length / 40), 50),
+                    opacity_reset_every=10 * length, sh_every=max(round(length / 6), 1), most=60_000,
+                    rates=replace(settings.scene.rates, position=3.2e-4))
+    return replace(settings, scene=scene, flare=replace(settings.flare, count=count, density=density, rates=rates))
+
+
+# ---- config.toml ----------------------------------------------------------------------------------
+
+
+def write_config(path: Path, settings: FitSettings) -> None:
+    """Every setting, resolved, as TOML."""
+    lines: list[str] = []
+    _write_table(lines, [], settings)
+    write_text(path, "\n".join(lines).lstrip("\n") + "\n")
+
+
+def _write_table(lines: list[str], keys: list[str], table: Any) -> None:
+    plain = [entry for entry in fields(table) if not is_dataclass(getattr(table, entry.name))]
+    if keys:
+        lines += ["", f"[{'.'.join(keys)}]"]
+    for entry in plain:
+        value = getattr(table, entry.name)
+        if value is not None:  # TOML has no null; what is absent has its default, None
+            lines.append(f"{entry.name} = {_toml(value)}")
+    for entry in fields(table):
+        if entry not in plain:
+            _write_table(lines, [*keys, entry.name], getattr(table, entry.name))
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, str):
+        escaped = value.replace("\\", "\\\\").replace('"', '\\"')
+        return f'"{escaped}"'
+    return repr(value)
+
+
+def read_config(path: Path) -> FitSettings:
+    """The settings of a run. Raises RunError where the file is missing, damaged, or holds unknown names."""
+    try:
+        data = tomllib.loads(path.read_text(encoding="utf-8"))
+        return _read_table(FitSettings, data).checked()
+    except OSError as problem:
+        raise RunError(f"{path} cannot be read ({problem.strerror}); is this the folder of a run?") from problem
+    except (ValueError, TypeError, SettingsError) as problem:
+        raise RunError(f"{path} is not a fit's configuration ({problem}); start the fit anew.") from problem
+
+
+def changed(settings: FitSettings, values: Mapping[str, Any]) -> FitSettings:
+    """Settings with some replaced by dotted name, e.g. {"flare.rates.network": 1e-3}.
+
+    Raises SettingsError for a name or a kind of value that does not exist.
+    """
+    for name, value in values.items():
+        settings = _changed(settings, name.split("."), value, name)
+    return settings.checked()
+
+
+def _changed(table: Any, keys: list[str], value: Any, name: str) -> Any:
+    known = {entry.name for entry in fields(table)}
+    if keys[0] not in known:
+        raise SettingsError(f"There is no setting {name!r}; here there are {', '.join(sorted(known))}.")
+    now = getattr(table, keys[0])
+    if len(keys) > 1:
+        if not is_dataclass(now):
+            raise SettingsError(f"There is no setting {name!r}; {keys[0]} has no parts.")
+        return replace(table, **{keys[0]: _changed(now, keys[1:], value, name)})
+    try:
+        return replace(table, **{keys[0]: _read_value(typing.get_type_hints(type(table))[keys[0]], value)})
+    except (ValueError, TypeError) as problem:
+        raise SettingsError(f"The setting {name!r} cannot be {value!r} ({problem}).") from problem
+
+
+def _read_table(kind: Any, data: Any) -> Any:
+    if not isinstance(data, dict):
+        raise ValueError(f"{kind.__name__} must be a table")
+    hints = typing.get_type_hints(kind)
+    unknown = set(data) - set(hints)
+    if unknown:
+        raise ValueError(f"unknown settings {', '.join(sorted(unknown))}")
+    values = {key: _read_value(hints[key], value) for key, value in data.items()}
+    return kind(**values)
+
+
+def _read_value(kind: Any, value: Any) -> Any:
+    if dataclasses.is_dataclass(kind):
+        return _read_table(kind, value)
+    if typing.get_origin(kind) is Literal:
+        if value not in typing.get_args(kind):
+            raise ValueError(f"{value!r} is not one of {', '.join(typing.get_args(kind))}")
+        return value
+    options = typing.get_args(kind) if isinstance(kind, types.UnionType) else (kind,)
+    for option in options:
+        if option is float and isinstance(value, int | float) and not isinstance(value, bool):
+            if not math.isfinite(value):
+                raise ValueError("it must be a finite number")
+            return float(value)
+        if type(value) is option or (option is type(None) and value is None):
+            return value
+    raise ValueError(f"{value!r} is not {kind}")

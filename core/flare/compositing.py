@@ -1,0 +1,129 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Scene and flare put together, as a picture for the loss and as layers for the compositor.
+
+Two ways, a setting of the fit:
+
+over  the paper's: flare Gaussians hide what lies behind, in display space. All of them lie in front of
+      every scene Gaussian, so the joint picture is C_flare + T_flare * C_scene.
+add   light adds: I = encode(scene_linear + flare_linear), clipped as a camera clips.
+
+Layers are scene-linear whichever way was fitted, and scene + flare = composite in every pixel.
+"""
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Literal, NamedTuple
+
+import torch
+from torch import Tensor
+
+from ..gaussians import Splats, splat
+from . import placement
+from .placement import PlaneGaussians
+
+Blend = Literal["over", "add"]
+
+
+def splat_flare(gaussians: PlaneGaussians, intrinsics: Tensor, width: int, height: int, blend: Blend, *,
+                kernels: str = "auto", resolution: str = "full") -> Splats:
+    """The flare's colour (height, width, 3) and transmittance (height, width) under these intrinsics.
+
+    The colour is in display space for `over` and scene-linear for `add`.
+    """
+    centres, covariances = placement.pixels(gaussians, intrinsics)
+    return splat(centres, covariances, gaussians.opacities, gaussians.colours, width, height,
+                 rings=gaussians.rings, blend=blend, kernels=kernels, resolution=resolution)
+
+
+def joined(flares: Mapping[str, PlaneGaussians]) -> PlaneGaussians | None:
+    """All lights' Gaussians as one set, in the lights' order; None where no light is in front of the camera."""
+    sets = list(flares.values())
+    if not sets:
+        return None
+    rings = None
+    if any(gaussians.rings is not None for gaussians in sets):
+        rings = torch.cat([_rings_of(gaussians) for gaussians in sets])
+    means, covariances, opacities, colours = (torch.cat(parts) for parts in zip(*(s[:4] for s in sets), strict=True))
+    return PlaneGaussians(means, covariances, opacities, colours, rings)
+
+
+def _rings_of(gaussians: PlaneGaussians) -> Tensor:
+    if gaussians.rings is not None:
+        return gaussians.rings
+    return gaussians.means.new_tensor([0.0, 1.0]).repeat(len(gaussians.means), 1)  # a plain Gaussian
+
+
+def composite(scene: Tensor, flare: Splats | None, blend: Blend) -> Tensor:
+    """The picture in display space: scene (height, width, 3) in display space, with the flare before it."""
+    if flare is None:
+        return scene
+    if blend == "over":
+        return flare.colour + flare.transmittance[..., None] * scene
+    return clip_through(encode(decode(clip_through(scene)) + flare.colour))
+
+
+def decode(display: Tensor) -> Tensor:
+    """sRGB display values, not negative, to linear light (IEC 61966-2-1)."""
+    return torch.where(display <= 0.04045, display / 12.92, ((display.clamp_min(0.04045) + 0.055) / 1.055) ** 2.4)
+
+
+def encode(linear: Tensor) -> Tensor:
+    """Linear light, not negative, to sRGB display values; above 1 the curve goes on."""
+    return torch.where(linear <= 0.0031308, linear * 12.92,
+                       1.055 * linear.clamp_min(0.0031308) ** (1 / 2.4) - 0.055)
+
+
+class _ClipThrough(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: object, values: Tensor) -> Tensor:
+        return values.clamp(0, 1)
+
+    @staticmethod
+    def backward(ctx: object, gradient: Tensor) -> Tensor:
+        return gradient
+
+
+def clip_through(values: Tensor) -> Tensor:
+    """Clip to 0..1, with the gradient passed on as it is.
+
+    A pixel that is too bright must be able to come down again; the true gradient of a clip is zero there.
+    """
+    return _ClipThrough.apply(values)
+
+
+class Layers(NamedTuple):
+    """Scene-linear layers of a view, (height, width, 3) each; scene + flare = composite.
+
+    flares: by light, they sum to `flare`. alpha (height, width): what the flare hides, 0 for `add`.
+    """
+
+    composite: Tensor
+    scene: Tensor
+    flare: Tensor
+    flares: dict[str, Tensor]
+    alpha: Tensor
+
+
+def layers(scene: Tensor, flares: Mapping[str, Splats], blend: Blend) -> Layers:
+    """Layers from the scene's picture in display space and each light's splats, in the lights' order.
+
+    `over` is not a sum: a light's layer is what the picture gains in linear light when that light is put
+    before those that follow it, so the layers add up to the whole exactly.
+    """
+    display = scene.clamp(0, 1)
+    scene_linear = decode(display)
+    alpha = torch.zeros_like(scene[..., 0])
+    parts: dict[str, Tensor] = {}
+    if blend == "add":
+        parts = {name: splats.colour for name, splats in flares.items()}
+        total = sum(parts.values(), torch.zeros_like(scene_linear))
+        return Layers(scene_linear + total, scene_linear, total, parts, alpha)
+    below, picture = scene_linear, display
+    transmittance = torch.ones_like(alpha)
+    for name, splats in reversed(flares.items()):  # the first light lies in front
+        picture = splats.colour + splats.transmittance[..., None] * picture
+        above = decode(picture.clamp_min(0))
+        parts[name] = above - below
+        below, transmittance = above, transmittance * splats.transmittance
+    ordered = {name: parts[name] for name in flares}
+    return Layers(below, scene_linear, below - scene_linear, ordered, 1 - transmittance)

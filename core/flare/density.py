@@ -1,0 +1,57 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Cloning and pruning of flare Gaussians (paper, appendix "Flare representation")."""
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from .model import LightFlare
+
+
+class RowOptimiser(Protocol):
+    """What an optimiser must offer so that Gaussians can come and go."""
+
+    def reindex(self, parameter: Tensor, index: Tensor, fresh: Tensor) -> Tensor: ...
+
+
+@dataclass(frozen=True)
+class DensitySettings:
+    """When and how flare Gaussians are cloned and pruned; the defaults are the paper's.
+
+    Iterations `start` to `stop`, every `every`; those with opacity above `clone_above` are cloned with
+    probability `clone_ratio` and moved by Gaussian noise of `noise` in mu; those below `prune_below` go.
+    `most` bounds the Gaussians of one light.
+    """
+
+    start: int = 1000
+    stop: int = 12000
+    every: int = 500
+    clone_above: float = 0.005
+    clone_ratio: float = 0.2
+    noise: float = 0.02
+    prune_below: float = 0.002
+    most: int = 20000
+
+    def due(self, iteration: int) -> bool:
+        return self.start <= iteration <= self.stop and iteration % self.every == 0
+
+
+def clone_and_prune(flare: LightFlare, optimiser: RowOptimiser, settings: DensitySettings,
+                    generator: torch.Generator) -> None:
+    """Clone and prune one light's canonical Gaussians in place, with their optimiser state."""
+    opacity = flare.gaussians["opacity_logits"].detach().sigmoid()[:, 0]
+    kept = (opacity >= settings.prune_below).nonzero()[:, 0]
+    drawn = torch.rand(len(opacity), generator=generator) < settings.clone_ratio
+    cloned = (drawn & (opacity > settings.clone_above)).nonzero()[:, 0]
+    cloned = cloned[: max(settings.most - len(kept), 0)]
+    index = torch.cat([kept, cloned])
+    fresh = torch.arange(len(index)) >= len(kept)
+    noise = settings.noise * torch.randn((len(cloned), flare.gaussians["positions"].shape[1]), generator=generator)
+    for name, parameter in flare.gaussians.items():
+        rows = optimiser.reindex(parameter, index, fresh)
+        if name == "positions":
+            rows.data[fresh] += noise
+        flare.gaussians[name] = rows

@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Input encodings of the deformation network (paper, appendix "Flare representation").
+
+The light and the camera are the same for all Gaussians of a view, so each hash grid is asked for one
+point a view: 8 corners on each of 16 levels. Gradients therefore touch 128 rows of millions; the tables
+give sparse gradients and are meant for an optimiser that updates those rows alone.
+"""
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+# Instant-NGP's spatial hash (Müller et al. 2022, eq. 4).
+_PRIMES = (1, 2654435761, 805459861)
+
+
+class HashGrid(nn.Module):
+    """Multiresolution hash grid over the unit cube (Müller et al. 2022, section 3).
+
+    levels x features table entries, level k at resolution `base * growth**k`; levels that fit in the
+    table are stored densely, the others hashed. Input (3,) in 0..1 (clamped), output (levels * features,).
+    """
+
+    def __init__(self, table_bits: int, growth: float, levels: int = 16, features: int = 2, base: int = 16) -> None:
+        super().__init__()
+        self.levels, self.features = levels, features
+        size = 1 << table_bits
+        resolutions = [math.floor(base * growth**level) for level in range(levels)]
+        rows = [min((resolution + 1) ** 3, size) for resolution in resolutions]
+        starts = [sum(rows[:level]) for level in range(levels)]
+        self.table = nn.Embedding(sum(rows), features, sparse=True)
+        # Zero, not noise: gradients reach the table through the network, and a file need hold touched rows only.
+        nn.init.zeros_(self.table.weight)
+
+        def constant(name: str, values: list[int]) -> None:
+            self.register_buffer(name, torch.tensor(values, dtype=torch.int64), persistent=False)
+
+        constant("_resolutions", resolutions)
+        constant("_starts", starts)
+        constant("_rows", rows)
+        constant("_primes", list(_PRIMES))
+        corners = [[(corner >> axis) & 1 for axis in range(3)] for corner in range(8)]
+        self.register_buffer("_corners", torch.tensor(corners, dtype=torch.int64), persistent=False)
+
+    def forward(self, point: Tensor) -> Tensor:
+        indices, weights = self._cell(point.detach())
+        rows = self.table(indices)  # (levels, 8, features)
+        return (rows * weights[..., None]).sum(1).reshape(-1)
+
+    def _cell(self, point: Tensor) -> tuple[Tensor, Tensor]:
+        """Rows (levels, 8) of the corners around the point and their trilinear weights."""
+        resolutions, rows, primes, corners = self._resolutions, self._rows, self._primes, self._corners
+        scaled = point.clamp(0, 1)[None] * resolutions[:, None]
+        low = torch.minimum(scaled.floor(), resolutions[:, None] - 1.0)
+        fraction = (scaled - low)[:, None]  # (levels, 1, 3)
+        corner = low.long()[:, None] + corners  # (levels, 8, 3)
+        weights = torch.where(corners.bool(), fraction, 1 - fraction).prod(-1)
+        side = resolutions[:, None] + 1
+        dense = corner[..., 0] + side * (corner[..., 1] + side * corner[..., 2])
+        mixed = corner * primes
+        hashed = (mixed[..., 0] ^ mixed[..., 1] ^ mixed[..., 2]) % rows[:, None]
+        fits = (side**3 <= rows[:, None])
+        return torch.where(fits, dense, hashed) + self._starts[:, None], weights.to(point.dtype)
+
+
+def frequency_encoding(values: Tensor, bands: int) -> Tensor:
+    """sin and cos of 2^k pi x for k < bands (Mildenhall et al. 2020, eq. 4): (n, d) to (n, 2 * bands * d)."""
+    octaves = math.pi * 2.0 ** torch.arange(bands, dtype=values.dtype, device=values.device)
+    angles = (values[..., None] * octaves).flatten(-2)
+    return torch.cat([angles.sin(), angles.cos()], -1)

@@ -1,0 +1,138 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The .flare file: one captured flare look, as safetensors with a JSON description.
+
+The description (metadata key "fit_flare") is readable without the tensors: format version, blend, form,
+lights with positions and the ranges they were trained on, training camera, elements, licence, notes.
+Hash tables are stored as the rows that training touched; the others are zero. Nothing is unpickled.
+"""
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ..errors import FlareFileError
+from ..files import atomic_path
+from .compositing import Blend
+from .deformation import QueryRange
+from .model import FlareForm, FlareModel, LightFlare
+
+VERSION = 1
+_KEY = "fit_flare"
+_MOST_GAUSSIANS = 1_000_000  # a file that claims more is damaged or hostile
+
+
+@dataclass(frozen=True)
+class TrainingCamera:
+    """Intrinsics of the footage, pixels; the plane's coordinates are (pixel - centre) / focal length."""
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+
+@dataclass
+class FlareFile:
+    """A flare model and what an artist needs to know of it."""
+
+    model: FlareModel
+    blend: Blend
+    camera: TrainingCamera
+    licence: str = ""
+    notes: str = ""
+    elements: list[dict[str, Any]] = field(default_factory=list)
+
+
+def save(path: Path | str, flare: FlareFile) -> None:
+    """Write a .flare atomically."""
+    from safetensors.torch import save_file
+
+    forms = [asdict(light.form) for light in flare.model.flares]
+    lights = [
+        {"name": name, "xyz": xyz, "form": form, "range": asdict(light.query_range), "count": light.count}
+        for name, xyz, form, light in zip(flare.model.names, flare.model.positions.tolist(), forms,
+                                          flare.model.flares, strict=True)
+    ]
+    description = {"version": VERSION, "blend": flare.blend, "lights": lights, "camera": asdict(flare.camera),
+                   "elements": flare.elements, "licence": flare.licence, "notes": flare.notes}
+    with atomic_path(path) as temporary:
+        save_file(_packed(flare.model), str(temporary), {_KEY: json.dumps(description)})
+
+
+def load(path: Path | str) -> FlareFile:
+    """Read a .flare. Raises FlareFileError where it is missing, damaged, newer, or not a flare."""
+    from safetensors import SafetensorError, safe_open
+
+    path = Path(path)
+    if not path.is_file():
+        raise FlareFileError(f"{path} is missing; choose a .flare file that a fit has written.")
+    try:
+        with safe_open(str(path), "pt") as file:
+            description = json.loads((file.metadata() or {})[_KEY])
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
+    except KeyError as problem:
+        raise FlareFileError(f"{path} is a safetensors file, but not a flare; choose another.") from problem
+    except (SafetensorError, ValueError, OSError, RecursionError) as problem:
+        raise FlareFileError(f"{path} is damaged or not a flare ({problem}); save it again.") from problem
+    version = description.get("version") if isinstance(description, dict) else None
+    if not isinstance(version, int) or version > VERSION:
+        raise FlareFileError(f"{path} was written by a newer Fit Flare (format {version}); update to open it.")
+    try:
+        return _unpacked(description, tensors)
+    except (KeyError, TypeError, ValueError, RuntimeError) as problem:
+        raise FlareFileError(f"{path} is damaged: its tensors do not fit its description ({problem}).") from problem
+
+
+def _packed(model: FlareModel) -> dict[str, Tensor]:
+    """State with every hash table as its rows that are not zero."""
+    packed: dict[str, Tensor] = {}
+    for name, tensor in model.flares.state_dict().items():
+        tensor = tensor.detach().contiguous().cpu()
+        if name.endswith("table.weight"):
+            rows = tensor.abs().amax(1).nonzero()[:, 0]
+            packed[f"{name}.rows"], packed[f"{name}.values"] = rows.to(torch.int32), tensor[rows]
+        else:
+            packed[name] = tensor.clone()
+    return packed
+
+
+def _unpacked(description: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> FlareFile:
+    for name, tensor in tensors.items():
+        if tensor.is_floating_point() and not tensor.isfinite().all():
+            raise ValueError(f"{name} holds values that are not finite")
+    flares, names, positions = [], [], []
+    for light in description["lights"]:
+        count = int(light["count"])
+        xyz = [float(value) for value in light["xyz"]]
+        if not 0 <= count <= _MOST_GAUSSIANS or len(xyz) != 3 or not all(map(math.isfinite, xyz)):
+            raise ValueError("a light's description makes no sense")
+        ranges = {key: tuple(map(float, values)) for key, values in light["range"].items()}
+        form = FlareForm(**light["form"])
+        if form.sh_degree not in range(4) or not 1 <= form.levels <= 16 or not 0 <= form.latent <= 64:
+            raise ValueError("a light's form makes no sense")
+        flares.append(LightFlare(form, QueryRange(**ranges), count, torch.Generator()))
+        names.append(str(light["name"]))
+        positions.append(xyz)
+    model = FlareModel(names, torch.tensor(positions, dtype=torch.float64).reshape(-1, 3), flares)
+    state = model.flares.state_dict()
+    for name in state:
+        if name.endswith("table.weight"):
+            rows = tensors[f"{name}.rows"].long()
+            state[name] = torch.zeros_like(state[name]).index_copy(0, rows, tensors[f"{name}.values"])
+        else:
+            state[name] = tensors[name]
+    model.flares.load_state_dict(state)
+    blend = description["blend"]
+    if blend not in ("over", "add"):
+        raise ValueError(f"blend {blend!r}")
+    return FlareFile(model, blend, TrainingCamera(**description["camera"]), str(description.get("licence", "")),
+                     str(description.get("notes", "")), list(description.get("elements", [])))

@@ -1,0 +1,191 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The flare of one light: canonical Gaussians and the network that deforms them.
+
+The paper's form and ours are one model with switches (`FlareForm`), so that every design choice can be
+taken away and measured. A `FlareModel` holds one such flare for each light of a capture.
+"""
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from ..gaussians.spherical_harmonics import colours
+from . import placement
+from .deformation import DeformationNetwork, QueryRange
+from .placement import PlaneGaussians
+
+
+@dataclass(frozen=True)
+class FlareForm:
+    """What the model is made of; each field a choice that can be measured alone.
+
+    line              Gaussians live on the line through principal point and light; else free (mode `2d`)
+    light_correction  delta_l, a 2D correction of the light's position for each view (paper, eq. 4)
+    plane_offset      delta_f, a deformed 2D offset of each Gaussian (paper, eq. 3)
+    solid             3D Gaussians with SH colour at depth 0.21 (paper); else ellipses on the plane
+    sh_degree         of the colour's view dependence, 0 to 3 (solid only)
+    static_offset     a learned 2D offset of each Gaussian, the same in all views
+    rings             the radial profile exp(-(r - r0)^2 / (2 w^2)) (METHOD, section 5)
+    latent            width of a per-Gaussian code that the network sees
+    levels            of the hash grids
+    """
+
+    line: bool = True
+    light_correction: bool = True
+    plane_offset: bool = True
+    solid: bool = True
+    sh_degree: int = 3
+    static_offset: bool = False
+    rings: bool = False
+    latent: int = 0
+    levels: int = 16
+
+
+PAPER = FlareForm()
+OURS = replace(PAPER, solid=False, sh_degree=0, static_offset=True, rings=True, latent=4)
+
+
+class ViewOfLight(NamedTuple):
+    """One light seen from one camera: what a flare is a function of.
+
+    camera (3,) position in the world, rotation (3, 3) world to camera, light (2,) normalised coordinates,
+    depth of the light along the axis, world units; not positive means behind the camera.
+    """
+
+    camera: Tensor
+    rotation: Tensor
+    light: Tensor
+    depth: float
+
+    @classmethod
+    def of(cls, world_to_camera: Tensor, xyz: Tensor) -> ViewOfLight:
+        """From a pose (4, 4) and the light's position (3,) in the world; float32 comes out."""
+        pose = world_to_camera.double()
+        x, y, z = (pose[:3, :3] @ xyz.double() + pose[:3, 3]).tolist()
+        camera = -pose[:3, :3].T @ pose[:3, 3]
+        light = torch.tensor([x / z, y / z] if z > 0 else [math.inf, math.inf])
+        return cls(camera.float(), pose[:3, :3].float(), light.float(), z)
+
+
+class LightFlare(nn.Module):
+    """Canonical Gaussians of one light and their deformation.
+
+    `gaussians` holds one row for each Gaussian: positions (n, 1) along the line or (n, 2) on the plane,
+    log_scales (n, 3 | 2), rotations (n, 4) quaternions or (n, 2) directions, opacity_logits (n, 1),
+    sh (n, k * 3), and where the form has them offsets (n, 2), rings (n, 2) as r0 and log w, latent (n, d).
+    """
+
+    def __init__(self, form: FlareForm, query_range: QueryRange, count: int, generator: torch.Generator) -> None:
+        super().__init__()
+        self.form, self.query_range = form, query_range
+        self.gaussians = nn.ParameterDict(
+            {name: nn.Parameter(rows) for name, rows in _canonical(form, count, generator).items()})
+        deformed = [name for name in self.gaussians if name not in ("offsets", "latent")]
+        heads = {name: self.gaussians[name].shape[1] for name in deformed}
+        if form.line and form.plane_offset:
+            heads["plane_offset"] = 2
+        self.network = DeformationNetwork(heads, query_range, positions=1 if form.line else 2,
+                                          latent=form.latent, levels=form.levels)
+
+    @property
+    def count(self) -> int:
+        return len(self.gaussians["positions"])
+
+    def forward(self, view: ViewOfLight) -> PlaneGaussians:
+        """The flare's Gaussians in this view (paper, eq. 1 to 3), on the normalised plane.
+
+        Raises ValueError for a light behind the camera: it has no flare (paper, "Flare Representation").
+        """
+        if view.depth <= 0:
+            raise ValueError("a light behind the camera has no flare")
+        form, rows = self.form, self.gaussians
+        features = self.network.view_features(view.camera, view.light)
+        latent = rows["latent"] if form.latent else None
+        change = self.network(rows["positions"], latent, features)
+
+        def deformed(name: str) -> Tensor:
+            return rows[name] + change[name]
+
+        light = view.light
+        if form.light_correction:
+            light = light + self.network.light_correction(features)
+        means = placement.on_line(deformed("positions"), light) if form.line else deformed("positions")
+        if "plane_offset" in change:
+            means = means + change["plane_offset"]
+        if form.static_offset:
+            means = means + rows["offsets"]
+        shape = placement.covariance_of_solid if form.solid else placement.covariance_of_ellipse
+        covariances = shape(means, deformed("log_scales"), deformed("rotations"))
+        return PlaneGaussians(means, covariances, deformed("opacity_logits").sigmoid()[:, 0],
+                              self._colours(deformed("sh"), means, view.rotation),
+                              _rings(deformed("rings")) if form.rings else None)
+
+    def _colours(self, sh: Tensor, means: Tensor, rotation: Tensor) -> Tensor:
+        rays = torch.cat([means, torch.ones_like(means[:, :1])], -1)
+        return colours(rays @ rotation, sh.reshape(len(sh), -1, 3), self.form.sh_degree)
+
+
+def _rings(raw: Tensor) -> Tensor:
+    """r0 as learned and w = exp(log w), kept wide enough for the sampling of a picture."""
+    return torch.stack([raw[:, 0], raw[:, 1].clamp(-3, 3).exp()], -1)
+
+
+def _canonical(form: FlareForm, count: int, generator: torch.Generator) -> dict[str, Tensor]:
+    """`count` Gaussians spread along the line, small enough to leave most of the frame free.
+
+    Sizes are log-uniform from 0.01 to 0.06 of the normalised plane (a 50 mm frame is about 0.7 wide).
+    """
+
+    def uniform(low: float, high: float, *shape: int) -> Tensor:
+        return low + (high - low) * torch.rand(shape, generator=generator)
+
+    positions = torch.linspace(-1.2, 1.4, count)[:, None] if form.line else uniform(-0.5, 0.5, count, 2)
+    size = uniform(math.log(0.01), math.log(0.06), count, 1)
+    if form.solid:
+        log_scales = (size + math.log(placement.PLANE_DEPTH)).repeat(1, 3)
+        rotations = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1)
+    else:
+        log_scales, rotations = size.repeat(1, 2), torch.tensor([1.0, 0.0]).repeat(count, 1)
+    rows = {
+        "positions": positions,
+        "log_scales": log_scales,
+        "rotations": rotations,
+        "opacity_logits": torch.full((count, 1), math.log(0.05 / 0.95)),
+        "sh": torch.zeros(count, 3 * (form.sh_degree + 1) ** 2),
+    }
+    if form.static_offset:
+        rows["offsets"] = torch.zeros(count, 2)
+    if form.rings:
+        rows["rings"] = torch.zeros(count, 2)
+    if form.latent:
+        rows["latent"] = 0.1 * torch.randn(count, form.latent, generator=generator)
+    return rows
+
+
+class FlareModel(nn.Module):
+    """The flares of a capture: one `LightFlare` for each light, by name, in the capture's order."""
+
+    def __init__(self, names: Sequence[str], positions: Tensor, flares: Sequence[LightFlare]) -> None:
+        super().__init__()
+        self.names = tuple(names)
+        self.register_buffer("positions", positions.double())  # (lights, 3), world units
+        self.flares = nn.ModuleList(flares)
+
+    @property
+    def count(self) -> int:
+        """Gaussians in all flares together."""
+        return sum(flare.count for flare in self.flares)
+
+    def views(self, world_to_camera: Tensor) -> list[ViewOfLight]:
+        """Every light seen from one pose (4, 4)."""
+        return [ViewOfLight.of(world_to_camera, xyz) for xyz in self.positions]
+
+    def forward(self, world_to_camera: Tensor) -> dict[str, PlaneGaussians]:
+        """The Gaussians of every light in front of the camera, by the light's name."""
+        seen = zip(self.names, self.flares, self.views(world_to_camera), strict=True)
+        return {name: flare(view) for name, flare, view in seen if view.depth > 0}

@@ -1,0 +1,78 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Where flare Gaussians lie in the picture (paper, section "Flare Representation").
+
+Everything is in normalised image coordinates (x/z, y/z, origin at the principal point p, y down), so a
+flare does not depend on resolution and a change of focal length moves it as a lens would. `pixels` is
+the only place where a camera's intrinsics enter.
+"""
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+PLANE_DEPTH = 0.21  # just past 3DGS's near plane of 0.2 (paper, appendix)
+
+
+class PlaneGaussians(NamedTuple):
+    """Gaussians on the normalised plane, ready to be splatted.
+
+    means (n, 2), covariances (n, 3) as xx, xy, yy, opacities (n,) in 0..1, colours (n, 3), and rings
+    (n, 2) as r0 and w in Mahalanobis radii (METHOD section 5) or None.
+    """
+
+    means: Tensor
+    covariances: Tensor
+    opacities: Tensor
+    colours: Tensor
+    rings: Tensor | None = None
+
+
+def on_line(mu: Tensor, light: Tensor) -> Tensor:
+    """mu (n, 1) to the plane (n, 2): 0 at the principal point, 1 at the light (2,), its delta_l included."""
+    return mu * light
+
+
+def covariance_of_solid(means: Tensor, log_scales: Tensor, quaternions: Tensor) -> Tensor:
+    """Covariances (n, 3) on the plane of 3D Gaussians in the camera frame at depth `PLANE_DEPTH`.
+
+    means (n, 2) on the plane, log_scales (n, 3) in world units, quaternions (n, 4) wxyz. The local affine
+    approximation of the projection (Zwicker et al. 2002): J = [1 0 -x; 0 1 -y] / depth.
+    """
+    rotation = rotation_matrices(quaternions)
+    x, y = means[:, :1], means[:, 1:]
+    # Rows of J R, scaled by the axes: (J R S)(J R S)^T is the projected covariance.
+    first = (rotation[:, 0] - x * rotation[:, 2]) * log_scales.exp() / PLANE_DEPTH
+    second = (rotation[:, 1] - y * rotation[:, 2]) * log_scales.exp() / PLANE_DEPTH
+    return torch.stack([(first * first).sum(-1), (first * second).sum(-1), (second * second).sum(-1)], -1)
+
+
+def covariance_of_ellipse(log_scales: Tensor, directions: Tensor) -> Tensor:
+    """Covariances (n, 3) of ellipses: log_scales (n, 2), directions (n, 2) of the first axis, any length."""
+    axis = functional.normalize(directions, dim=-1, eps=1e-12)
+    variances = (2 * log_scales).exp()
+    c, s = axis[:, 0], axis[:, 1]
+    a, b = variances[:, 0], variances[:, 1]
+    return torch.stack([a * c * c + b * s * s, (a - b) * c * s, a * s * s + b * c * c], -1)
+
+
+def rotation_matrices(quaternions: Tensor) -> Tensor:
+    """(n, 4) wxyz, any length but zero, to (n, 3, 3)."""
+    w, x, y, z = functional.normalize(quaternions, dim=-1, eps=1e-12).unbind(-1)
+    rows = [
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    ]
+    return torch.stack(rows, -1).reshape(-1, 3, 3)
+
+
+def pixels(gaussians: PlaneGaussians, intrinsics: Tensor, dilation: float = 0.3) -> tuple[Tensor, Tensor]:
+    """Centres (n, 2) px and covariances (n, 3) px^2 under intrinsics (3, 3), with 3DGS's low-pass added."""
+    focal, centre = intrinsics.diagonal()[:2], intrinsics[:2, 2]
+    fx, fy = focal
+    stretch = torch.stack([fx * fx, fx * fy, fy * fy])
+    low_pass = torch.tensor([dilation, 0.0, dilation], dtype=stretch.dtype, device=stretch.device)
+    return gaussians.means * focal + centre, gaussians.covariances * stretch + low_pass

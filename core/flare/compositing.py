@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from ..gaussians import Splats, splat
+from ..gaussians.rasterizer import Kernels, Resolution
 from . import placement
 from .placement import PlaneGaussians
 
@@ -25,7 +26,7 @@ Blend = Literal["over", "add"]
 
 
 def splat_flare(gaussians: PlaneGaussians, intrinsics: Tensor, width: int, height: int, blend: Blend, *,
-                kernels: str = "auto", resolution: str = "full") -> Splats:
+                kernels: Kernels = "auto", resolution: Resolution = "full") -> Splats:
     """The flare's colour (height, width, 3) and transmittance (height, width) under these intrinsics.
 
     The colour is in display space for `over` and scene-linear for `add`.
@@ -75,11 +76,11 @@ def encode(linear: Tensor) -> Tensor:
 
 class _ClipThrough(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: object, values: Tensor) -> Tensor:
+    def forward(_ctx: object, values: Tensor) -> Tensor:
         return values.clamp(0, 1)
 
     @staticmethod
-    def backward(ctx: object, gradient: Tensor) -> Tensor:
+    def backward(_ctx: object, gradient: Tensor) -> Tensor:
         return gradient
 
 
@@ -120,7 +121,7 @@ def layers(scene: Tensor, flares: Mapping[str, Splats], blend: Blend) -> Layers:
         return Layers(scene_linear + total, scene_linear, total, parts, alpha)
     below, picture = scene_linear, display
     transmittance = torch.ones_like(alpha)
-    for name, splats in reversed(flares.items()):  # the first light lies in front
+    for name, splats in reversed(list(flares.items())):  # the first light lies in front
         picture = splats.colour + splats.transmittance[..., None] * picture
         above = decode(picture.clamp_min(0))
         parts[name] = above - below

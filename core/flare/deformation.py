@@ -56,6 +56,10 @@ class DeformationNetwork(nn.Module):
     `latent` the width of a per-Gaussian code, 0 in the paper's form.
     """
 
+    camera_low: Tensor
+    camera_extent: Tensor
+    light_high: Tensor
+
     def __init__(self, heads: Mapping[str, int], query_range: QueryRange, *, positions: int = 1, latent: int = 0,
                  width: int = 128, hidden: int = 3, levels: int = 16) -> None:
         super().__init__()
@@ -68,10 +72,10 @@ class DeformationNetwork(nn.Module):
         self.names, self.widths = list(heads), list(heads.values())
         # One matrix holds every head: the same function, one product instead of many.
         self.head = nn.Linear(width, sum(self.widths))
-        self.correction = nn.Sequential(nn.Linear(view, width), nn.ReLU(), nn.Linear(width, 2))
+        shift = nn.Linear(width, 2)
+        self.correction = nn.Sequential(nn.Linear(view, width), nn.ReLU(), shift)
         # All offsets start at nothing: the first picture is the canonical flare.
-        last = self.correction[2]
-        for layer in (self.head, last):
+        for layer in (self.head, shift):
             nn.init.zeros_(layer.weight)
             nn.init.zeros_(layer.bias)
         self.register_buffer("camera_low", torch.tensor(query_range.camera_low), persistent=False)

@@ -23,6 +23,12 @@ class HashGrid(nn.Module):
     table are stored densely, the others hashed. Input (3,) in 0..1 (clamped), output (levels * features,).
     """
 
+    _resolutions: Tensor
+    _starts: Tensor
+    _rows: Tensor
+    _primes: Tensor
+    _corners: Tensor
+
     def __init__(self, table_bits: int, growth: float, levels: int = 16, features: int = 2, base: int = 16) -> None:
         super().__init__()
         self.levels, self.features = levels, features

@@ -56,11 +56,11 @@ def save(path: Path | str, flare: FlareFile) -> None:
     """Write a .flare atomically."""
     from safetensors.torch import save_file
 
-    forms = [asdict(light.form) for light in flare.model.flares]
+    forms = [asdict(light.form) for light in flare.model.lights]
     lights = [
         {"name": name, "xyz": xyz, "form": form, "range": asdict(light.query_range), "count": light.count}
         for name, xyz, form, light in zip(flare.model.names, flare.model.positions.tolist(), forms,
-                                          flare.model.flares, strict=True)
+                                          flare.model.lights, strict=True)
     ]
     description = {"version": VERSION, "blend": flare.blend, "lights": lights, "camera": asdict(flare.camera),
                    "elements": flare.elements, "licence": flare.licence, "notes": flare.notes}
@@ -92,6 +92,13 @@ def load(path: Path | str) -> FlareFile:
         raise FlareFileError(f"{path} is damaged: its tensors do not fit its description ({problem}).") from problem
 
 
+def _triple(values: Any) -> tuple[float, float, float]:
+    x, y, z = (float(value) for value in values)
+    if not all(map(math.isfinite, (x, y, z))):
+        raise ValueError("a range is not finite")
+    return x, y, z
+
+
 def _packed(model: FlareModel) -> dict[str, Tensor]:
     """State with every hash table as its rows that are not zero."""
     packed: dict[str, Tensor] = {}
@@ -115,11 +122,11 @@ def _unpacked(description: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> 
         xyz = [float(value) for value in light["xyz"]]
         if not 0 <= count <= _MOST_GAUSSIANS or len(xyz) != 3 or not all(map(math.isfinite, xyz)):
             raise ValueError("a light's description makes no sense")
-        ranges = {key: tuple(map(float, values)) for key, values in light["range"].items()}
+        low, high, reach = (_triple(light["range"][key]) for key in ("camera_low", "camera_high", "light_high"))
         form = FlareForm(**light["form"])
         if form.sh_degree not in range(4) or not 1 <= form.levels <= 16 or not 0 <= form.latent <= 64:
             raise ValueError("a light's form makes no sense")
-        flares.append(LightFlare(form, QueryRange(**ranges), count, torch.Generator()))
+        flares.append(LightFlare(form, QueryRange(low, high, reach), count, torch.Generator()))
         names.append(str(light["name"]))
         positions.append(xyz)
     model = FlareModel(names, torch.tensor(positions, dtype=torch.float64).reshape(-1, 3), flares)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import torch
 from torch import Tensor, nn
@@ -119,8 +119,11 @@ class LightFlare(nn.Module):
             means = means + change["plane_offset"]
         if form.static_offset:
             means = means + rows["offsets"]
-        shape = placement.covariance_of_solid if form.solid else placement.covariance_of_ellipse
-        covariances = shape(means, deformed("log_scales"), deformed("rotations"))
+        scales, rotations = deformed("log_scales"), deformed("rotations")
+        if form.solid:
+            covariances = placement.covariance_of_solid(means, scales, rotations)
+        else:
+            covariances = placement.covariance_of_ellipse(scales, rotations)
         return PlaneGaussians(means, covariances, deformed("opacity_logits").sigmoid()[:, 0],
                               self._colours(deformed("sh"), means, view.rotation),
                               _rings(deformed("rings")) if form.rings else None)
@@ -170,6 +173,8 @@ def _canonical(form: FlareForm, count: int, generator: torch.Generator) -> dict[
 class FlareModel(nn.Module):
     """The flares of a capture: one `LightFlare` for each light, by name, in the capture's order."""
 
+    positions: Tensor
+
     def __init__(self, names: Sequence[str], positions: Tensor, flares: Sequence[LightFlare]) -> None:
         super().__init__()
         self.names = tuple(names)
@@ -177,9 +182,14 @@ class FlareModel(nn.Module):
         self.flares = nn.ModuleList(flares)
 
     @property
+    def lights(self) -> list[LightFlare]:
+        """The flares, in the lights' order."""
+        return [cast(LightFlare, flare) for flare in self.flares]
+
+    @property
     def count(self) -> int:
         """Gaussians in all flares together."""
-        return sum(flare.count for flare in self.flares)
+        return sum(flare.count for flare in self.lights)
 
     def views(self, world_to_camera: Tensor) -> list[ViewOfLight]:
         """Every light seen from one pose (4, 4)."""
@@ -187,5 +197,5 @@ class FlareModel(nn.Module):
 
     def forward(self, world_to_camera: Tensor) -> dict[str, PlaneGaussians]:
         """The Gaussians of every light in front of the camera, by the light's name."""
-        seen = zip(self.names, self.flares, self.views(world_to_camera), strict=True)
+        seen = zip(self.names, self.lights, self.views(world_to_camera), strict=True)
         return {name: flare(view) for name, flare, view in seen if view.depth > 0}

@@ -14,7 +14,7 @@ from __future__ import annotations
 import importlib
 import logging
 from functools import cache
-from typing import Protocol, cast
+from typing import Any, Protocol, cast
 
 import torch
 from torch import Tensor
@@ -58,6 +58,15 @@ def available(name: str) -> bool:
 @cache
 def _say_once(sentence: str) -> None:
     log.warning(sentence)
+
+
+def fused(like: Tensor) -> Any:
+    """The CPU kernels if they can take tensors such as `like`, else None: for the loss and the optimiser,
+    which have a plain torch form of their own."""
+    if like.device.type != "cpu" or like.dtype != torch.float32:
+        return None
+    kernels = _load("cpu")
+    return None if isinstance(kernels, ImportError) else kernels
 
 
 def choose(name: str, like: Tensor) -> KernelSet:

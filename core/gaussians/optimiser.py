@@ -1,0 +1,142 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Adam (Kingma & Ba 2015) for parameters whose rows come and go.
+
+The same steps as torch.optim.Adam, with three additions: a rate of its own for each parameter, or for each
+column of one (the degrees of spherical harmonics); rows that are kept, re-ordered or appended together
+with their moments, as densification asks; and the fused CPU kernel where there is one.
+
+    m = b1 m + (1 - b1) g        v = b2 v + (1 - b2) g²
+    p = p - rate / (1 - b1^t) * m / (sqrt(v) / sqrt(1 - b2^t) + epsilon)
+"""
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn import Parameter
+
+from ..errors import RunError, SettingsError
+from .kernels import fused
+
+Rate = float | Tensor
+
+
+class Moments(NamedTuple):
+    """Running means of the gradient and of its square, shaped as the parameter."""
+
+    first: Tensor
+    second: Tensor
+
+
+class Adam:
+    """Optimises named parameters.
+
+    parameters  by name; the objects stay the same, whatever happens to their rows
+    rates       one for all, or by name; a float, or a tensor of the shape of one row. `self.rates` may be
+                changed between steps; a name that is missing there does not move
+    """
+
+    def __init__(
+        self, parameters: Mapping[str, Parameter], rates: Rate | Mapping[str, Rate],
+        *, betas: tuple[float, float] = (0.9, 0.999), epsilon: float = 1e-15,
+    ) -> None:  # fmt: skip
+        self.parameters = dict(parameters)
+        self.rates: dict[str, Rate] = (
+            dict(rates) if isinstance(rates, Mapping) else dict.fromkeys(self.parameters, rates)
+        )
+        if unknown := self.rates.keys() - self.parameters.keys():
+            raise SettingsError(f"There is no parameter {min(unknown)!r} to give a learning rate to.")
+        self.betas = betas
+        self.epsilon = epsilon
+        self.moments = {name: _zeros(p) for name, p in self.parameters.items()}
+        self.steps = dict.fromkeys(self.parameters, 0)
+
+    @torch.no_grad()
+    def step(self) -> None:
+        """Moves every parameter that has a gradient and a rate."""
+        for name, rate in self.rates.items():
+            parameter = self.parameters[name]
+            if parameter.grad is None or parameter.numel() == 0:
+                continue
+            self.steps[name] += 1
+            moments = self.moments[name]
+            data = parameter.data
+            cpu = fused(data) if data.is_contiguous() else None
+            advance = adam_step if cpu is None else cpu.adam_step
+            advance(
+                data, parameter.grad.contiguous(), moments.first, moments.second, step=self.steps[name],
+                rate=rate, beta1=self.betas[0], beta2=self.betas[1], epsilon=self.epsilon,
+            )  # fmt: skip
+
+    def zero_grad(self) -> None:
+        """Forgets the gradients."""
+        for parameter in self.parameters.values():
+            parameter.grad = None
+
+    @torch.no_grad()
+    def keep(self, index: Tensor, names: Iterable[str] | None = None) -> None:
+        """Keeps the rows of this index (a boolean mask, or row numbers: also a new order), moments included.
+
+        names: which parameters; all by default. Their gradients are forgotten.
+        """
+        for name in self.parameters if names is None else names:
+            parameter, moments = self.parameters[name], self.moments[name]
+            parameter.data = parameter.data[index]
+            parameter.grad = None
+            self.moments[name] = Moments(moments.first[index], moments.second[index])
+
+    @torch.no_grad()
+    def append(self, rows: Mapping[str, Tensor]) -> None:
+        """Appends rows, by name of the parameter, with moments of zero; gradients are forgotten."""
+        for name, new in rows.items():
+            parameter, moments = self.parameters[name], self.moments[name]
+            new = new.to(parameter)
+            parameter.data = torch.cat([parameter.data, new])
+            parameter.grad = None
+            self.moments[name] = Moments(*(torch.cat([m, torch.zeros_like(new)]) for m in moments))
+
+    @torch.no_grad()
+    def forget(self, name: str, index: Tensor | None = None) -> None:
+        """Sets the moments of a parameter to zero, of all rows or of those of the index."""
+        for moment in self.moments[name]:
+            moment[slice(None) if index is None else index] = 0
+
+    def state_dict(self) -> dict[str, Any]:
+        """Tensors by "name.first" and "name.second", and the step counts under "steps"."""
+        state: dict[str, Any] = {"steps": dict(self.steps)}
+        for name, moments in self.moments.items():
+            state[f"{name}.first"], state[f"{name}.second"] = moments
+        return state
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Takes up what state_dict gave; the parameters themselves are restored by their owner first.
+
+        Raises RunError if it does not fit the parameters.
+        """
+        for name, parameter in self.parameters.items():
+            loaded = [state[key] for key in (f"{name}.first", f"{name}.second") if key in state]
+            if len(loaded) < 2 or any(moment.shape != parameter.shape for moment in loaded):
+                raise RunError(f"The saved optimiser does not fit {name}; start the fit anew, without resuming.")
+            self.moments[name] = Moments(*(moment.to(parameter, copy=True).contiguous() for moment in loaded))
+            self.steps[name] = int(state["steps"][name])
+
+
+def adam_step(
+    parameter: Tensor, gradient: Tensor, first: Tensor, second: Tensor,
+    *, step: int, rate: Rate, beta1: float, beta2: float, epsilon: float,
+) -> None:  # fmt: skip
+    """One step in place, in torch; `step` counts from 1, `rate` is a float or has the shape of a row."""
+    first.lerp_(gradient, 1 - beta1)
+    second.mul_(beta2).addcmul_(gradient, gradient, value=1 - beta2)
+    root = (second.sqrt() / math.sqrt(1 - beta2**step)).add_(epsilon)
+    if isinstance(rate, Tensor):
+        parameter.sub_(first / root * (rate / (1 - beta1**step)))
+    else:
+        parameter.addcdiv_(first, root, value=-rate / (1 - beta1**step))
+
+
+def _zeros(parameter: Tensor) -> Moments:
+    return Moments(*(torch.zeros_like(parameter, memory_format=torch.contiguous_format) for _ in range(2)))

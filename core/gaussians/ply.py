@@ -1,0 +1,128 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Scenes as PLY files, in the layout of the 3DGS authors, which viewers and editors read.
+
+One binary element `vertex` of float32: x y z, nx ny nz (unused), f_dc_0..2 (degree 0, by channel),
+f_rest_0..44 (the 15 others, all of one channel before the next), opacity (logit), scale_0..2 (log),
+rot_0..3 (w x y z). Fewer f_rest (0, 9, 24) mean a lower degree.
+"""
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ..errors import FlareFileError
+from ..files import atomic_path
+from .scene import COEFFICIENTS, SceneGaussians
+
+HEADER_MAX = 1 << 16
+ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
+TYPES = {
+    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2",
+    "ushort": "u2", "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4",
+    "float": "f4", "float32": "f4", "double": "f8", "float64": "f8",
+}  # fmt: skip
+POSITION = ("x", "y", "z")
+NORMAL = ("nx", "ny", "nz")
+DC = tuple(f"f_dc_{i}" for i in range(3))
+SCALE = tuple(f"scale_{i}" for i in range(3))
+ROTATION = tuple(f"rot_{i}" for i in range(4))
+
+
+def _rest(number: int) -> tuple[str, ...]:
+    return tuple(f"f_rest_{i}" for i in range(number))
+
+
+def write_ply(path: Path | str, scene: SceneGaussians) -> None:
+    """Writes a scene; every parameter comes back bit by bit."""
+    names = POSITION + NORMAL + DC + _rest(3 * (COEFFICIENTS - 1)) + ("opacity",) + SCALE + ROTATION
+    n = len(scene)
+    means, log_scales, quaternions, opacities, sh = (
+        parameter.detach().cpu().numpy().astype("<f4")
+        for parameter in (
+            scene.means, scene.log_scales, scene.quaternions, scene.opacity_logits, scene.sh
+        )
+    )  # fmt: skip
+    rest = sh[:, 1:].transpose(0, 2, 1).reshape(n, -1)
+    table = np.concatenate(
+        [means, np.zeros((n, 3), "<f4"), sh[:, 0], rest, opacities[:, None], log_scales, quaternions], 1
+    )
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {n}"]
+    lines += [f"property float {name}" for name in names] + ["end_header"]
+    with atomic_path(path) as temporary, open(temporary, "wb") as file:
+        file.write(("\n".join(lines) + "\n").encode("ascii"))
+        file.write(np.ascontiguousarray(table, "<f4").tobytes())
+
+
+def read_ply(path: Path | str) -> SceneGaussians:
+    """Reads a scene; any order of properties, and others besides, are taken in.
+
+    Raises FlareFileError for a file that is no PLY of Gaussians, is cut short, or holds NaN or infinity.
+    """
+    path = Path(path)
+    try:
+        with open(path, "rb") as file:
+            order, n, layout, start = _header(path, file.read(HEADER_MAX))
+            kind = np.dtype([(name, order + code) for name, code in layout])
+            if path.stat().st_size - start < n * kind.itemsize:
+                raise FlareFileError(f"{path} is cut short: it announces {n} Gaussians; copy it again.")
+            file.seek(start)
+            table = np.frombuffer(file.read(n * kind.itemsize), kind)
+    except OSError as problem:
+        raise FlareFileError(f"{path} cannot be read: {problem.strerror or problem}.") from problem
+
+    present = {name for name, _ in layout}
+    rest_names = _rest(sum(name.startswith("f_rest_") for name in present))
+    if len(rest_names) not in (0, 9, 24, 45):
+        raise FlareFileError(
+            f"{path} has {len(rest_names)} f_rest properties, where Gaussians have 0, 9, 24 or 45; export it again."
+        )
+    for name in (*POSITION, *DC, *rest_names, "opacity", *SCALE, *ROTATION):
+        if name not in present:
+            raise FlareFileError(f"{path} is not a PLY file of Gaussians: the property {name} is missing.")
+
+    def columns(names: tuple[str, ...]) -> torch.Tensor:
+        values: NDArray[np.float32] = np.empty((n, len(names)), np.float32)
+        for column, name in enumerate(names):
+            values[:, column] = table[name]
+        if not np.isfinite(values).all():
+            raise FlareFileError(f"{path} holds numbers that are not finite; export it again.")
+        return torch.from_numpy(values)
+
+    sh = torch.zeros(n, COEFFICIENTS, 3)
+    sh[:, 0] = columns(DC)
+    if rest_names:
+        sh[:, 1 : 1 + len(rest_names) // 3] = columns(rest_names).reshape(n, 3, -1).transpose(1, 2)
+    return SceneGaussians(
+        columns(POSITION), columns(SCALE), columns(ROTATION), columns(("opacity",))[:, 0].clone(), sh
+    )
+
+
+def _header(path: Path, head: bytes) -> tuple[str, int, list[tuple[str, str]], int]:
+    """Byte order, number of vertices, their properties with types, and where the data starts."""
+    end = head.find(b"\nend_header")
+    start = head.find(b"\n", end + 1) + 1
+    if not head.startswith(b"ply") or end < 0 or not start:
+        raise FlareFileError(f"{path} is not a PLY file.")
+    order, count, element = "", -1, ""
+    layout: list[tuple[str, str]] = []
+    for line in head[:end].decode("ascii", "replace").splitlines()[1:]:
+        match line.split():
+            case ["format", form, _]:
+                if form not in ORDERS:
+                    raise FlareFileError(f"{path} is a PLY file in the format {form}; export it as binary.")
+                order = ORDERS[form]
+            case ["element", name, number]:
+                if count < 0 and (name != "vertex" or not (number.isascii() and number.isdigit())):
+                    raise FlareFileError(f"{path} does not begin with its vertices; export it again.")
+                element = name
+                count = int(number) if name == "vertex" else count
+            case ["property", *words] if element == "vertex":
+                if len(words) != 2 or words[0] not in TYPES:
+                    raise FlareFileError(f"{path} has the property {' '.join(words)!r}, not a plain number.")
+                layout.append((words[1], TYPES[words[0]]))
+    if not order or not layout or len({name for name, _ in layout}) < len(layout):
+        raise FlareFileError(f"{path} is not a PLY file of Gaussians.")
+    return order, count, layout, start

@@ -1,0 +1,140 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The scene as 3D Gaussians: what is optimised, in the form in which nothing needs to be constrained."""
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from ..capture import Camera, PointCloud
+from ..errors import SettingsError
+from . import spherical_harmonics
+from .optimiser import Rate
+from .ordering import nearest_distances
+from .rasterizer import Kernels, rasterization
+from .rendering import Rendering
+
+COEFFICIENTS = (spherical_harmonics.MAX_DEGREE + 1) ** 2
+INITIAL_OPACITY = 0.1
+DISTANCE_MIN = 1e-7 ** 0.5
+"""Points nearer to each other than this make Gaussians of this size."""
+
+
+class SceneGaussians(nn.Module):
+    """n Gaussians. Parameters, in 3DGS's own form:
+
+    means           (n, 3) world coordinates
+    log_scales      (n, 3) log of the standard deviations
+    quaternions     (n, 4) w, x, y, z, not normalised
+    opacity_logits  (n,)
+    sh              (n, 16, 3) spherical harmonics, degree 0 first
+    """
+
+    def __init__(
+        self, means: Tensor, log_scales: Tensor, quaternions: Tensor, opacity_logits: Tensor, sh: Tensor
+    ) -> None:
+        super().__init__()
+        self.means = nn.Parameter(means)
+        self.log_scales = nn.Parameter(log_scales)
+        self.quaternions = nn.Parameter(quaternions)
+        self.opacity_logits = nn.Parameter(opacity_logits)
+        self.sh = nn.Parameter(sh)
+
+    @classmethod
+    def from_points(cls, points: PointCloud) -> SceneGaussians:
+        """A Gaussian at each point, as 3DGS starts: round, as large as the root mean square distance to the
+        three nearest neighbours, opacity 0.1, of the point's colour from everywhere.
+
+        Raises SettingsError where there are no points.
+        """
+        if len(points.xyz) == 0:
+            raise SettingsError("The capture has no points to start the scene from; solve it again.")
+        means = torch.tensor(np.asarray(points.xyz), dtype=torch.float32)
+        colours = torch.tensor(np.asarray(points.rgb), dtype=torch.float32) / 255
+        n = len(means)
+        distances = nearest_distances(means)
+        size = distances.square().mean(-1).sqrt() if distances.shape[1] else torch.ones(n)
+        sh = torch.zeros(n, COEFFICIENTS, 3)
+        sh[:, 0] = spherical_harmonics.dc_from_colour(colours)
+        quaternions = torch.zeros(n, 4)
+        quaternions[:, 0] = 1
+        return cls(
+            means,
+            size.clamp(min=DISTANCE_MIN).log()[:, None].repeat(1, 3),
+            quaternions,
+            torch.logit(torch.full((n,), INITIAL_OPACITY)),
+            sh,
+        )
+
+    @classmethod
+    def empty(cls, n: int = 0) -> SceneGaussians:
+        """n Gaussians of zeros: something to load a state into."""
+        return cls(*(torch.zeros(n, *shape) for shape in ((3,), (3,), (4,), (), (COEFFICIENTS, 3))))
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    def load_state_dict(self, state_dict: Any, *arguments: Any, **options: Any) -> Any:
+        """As nn.Module's, for any number of Gaussians."""
+        for name, parameter in self.named_parameters():
+            if name in state_dict:
+                parameter.data = torch.empty_like(state_dict[name], device=parameter.device)
+        return super().load_state_dict(state_dict, *arguments, **options)
+
+    @property
+    def scales(self) -> Tensor:
+        """(n, 3) standard deviations, world units."""
+        return self.log_scales.exp()
+
+    @property
+    def opacities(self) -> Tensor:
+        """(n,) 0..1."""
+        return self.opacity_logits.sigmoid()
+
+    def render(
+        self, camera: Camera, sh_degree: int | None = None, background: Tensor | None = None,
+        *, kernels: Kernels = "auto",
+    ) -> Rendering:  # fmt: skip
+        """The scene as the camera sees it; see `rasterization`. Differentiable by the Gaussians."""
+        return rasterization(
+            self.means, self.quaternions, self.scales, self.opacities, self.sh,
+            torch.as_tensor(camera.world_to_camera).to(self.means),
+            torch.as_tensor(camera.intrinsics).to(self.means),
+            camera.width, camera.height, background=background, sh_degree=sh_degree, kernels=kernels,
+        )  # fmt: skip
+
+
+def sh_degree_at(iteration: int, interval: int = 1000) -> int:
+    """The degree in use at an iteration: one more every `interval`, so that the colour seen from everywhere
+    settles first (Kerbl et al. 2023, section 7.1)."""
+    return min(iteration // interval, spherical_harmonics.MAX_DEGREE)
+
+
+def learning_rates(extent: float) -> dict[str, Rate]:
+    """Rates of 3DGS by parameter, for `Adam`; extent: of the scene, world units (see `scene_extent`)."""
+    sh = torch.full((COEFFICIENTS, 3), 2.5e-3 / 20)
+    sh[0] = 2.5e-3
+    return {
+        "means": 1.6e-4 * extent,
+        "log_scales": 5e-3,
+        "quaternions": 1e-3,
+        "opacity_logits": 5e-2,
+        "sh": sh,
+    }
+
+
+def means_rate(extent: float, iteration: int, iterations: int) -> float:
+    """Rate of the means at an iteration: falls exponentially from 1.6e-4 to 1.6e-6 of the extent."""
+    share = min(max(iteration / max(iterations, 1), 0.0), 1.0)
+    return float(1.6e-4 * extent * 0.01**share)
+
+
+def scene_extent(cameras: Iterable[Camera]) -> float:
+    """1.1 times the largest distance of a camera from the middle of them all (3DGS), world units; 1 where
+    they stand in one place."""
+    positions = np.stack([camera.position for camera in cameras])
+    radius = float(np.linalg.norm(positions - positions.mean(0), axis=1).max())
+    return 1.1 * radius or 1.0

@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""One frame as one multilayer EXR file, and back.
+
+One part; root R G B A = composite, then scene.*, flare.*, flare_<light>.*, depth.Z (see `layers`).
+The header says what the file is: `software`, the Rec. 709 `chromaticities`, and `fitFlare`, a JSON text
+with the version, the view, the frame number, and the light that each flare layer belongs to.
+"""
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from ..errors import FrameError
+from ..pictures import read_exr, write_exr
+from .layers import FrameLayers, Pixels, layer_names
+
+ATTRIBUTE = "fitFlare"
+VERSION = 1
+_REC_709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
+
+
+def write_layers(path: Path | str, layers: FrameLayers, *, half: bool = True,
+                 notes: Mapping[str, Any] | None = None) -> None:
+    """Write a frame's layers atomically, ZIP compressed; depth stays 32 bit when the rest is `half`.
+
+    notes: JSON-able entries for the header (view, frame, …).
+    """
+    lights = {layer: light for light, layer in layer_names(layers.flares).items()}
+    description = json.dumps({"version": VERSION, "lights": lights, **(notes or {})})
+    header = {"software": "Fit Flare", "chromaticities": _REC_709, ATTRIBUTE: description}
+    write_exr(path, layers.channels(), half=half, header=header)
+
+
+def read_description(path: Path | str) -> dict[str, Any]:
+    """What `write_layers` noted in the header. Raises FrameError where the file is not one of ours."""
+    import OpenEXR
+
+    try:
+        with OpenEXR.File(str(path), header_only=True) as file:
+            text = file.parts[0].header.get(ATTRIBUTE)
+        description = json.loads(text) if text else None
+    except Exception as problem:  # the library raises bare RuntimeError and worse for damaged files
+        raise FrameError(f"{path} is damaged or no EXR file ({problem}); bake it again.") from problem
+    if not isinstance(description, dict) or not isinstance(description.get("lights"), dict):
+        raise FrameError(f"{path} holds no layers of Fit Flare; choose a file that `bake` has written.")
+    return description
+
+
+def read_layers(path: Path | str) -> FrameLayers:
+    """The layers of a file that `write_layers` made. Raises FrameError where it is damaged or not one."""
+    import numpy as np
+
+    lights = read_description(path)["lights"]
+    channels = read_exr(path)
+
+    def colour(layer: str) -> Pixels:
+        return np.stack([channels[f"{layer}.{name}"] for name in "RGB"], axis=-1)
+
+    try:
+        return FrameLayers(colour("scene"), {light: colour(layer) for layer, light in lights.items()},
+                           channels["depth.Z"])
+    except KeyError as problem:
+        raise FrameError(f"{path} lacks the channel {problem}; bake it again.") from problem

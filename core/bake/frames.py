@@ -1,0 +1,62 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Which views are which frames: numbers for a sequence, from the names of the views.
+
+A view's frame number is the number its name ends with ("DSC_0123.JPG" is frame 123), so that layers line
+up with the footage. Where names have none, or two views of a folder would share one, the views of that
+folder are counted from 1 in their order.
+"""
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import PurePosixPath
+
+from ..errors import SettingsError
+
+_LAST_NUMBER = re.compile(r"(\d{1,6})$")
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A view's name, its number, and the file (relative, with forward slashes) its layers go to."""
+
+    view: str
+    number: int
+    file: str
+
+
+def numbered(views: Iterable[str]) -> list[Frame]:
+    """Frames for views, by folder and number. A view in a folder keeps the folder: `left/layers.0001.exr`."""
+    folders: dict[PurePosixPath, list[str]] = {}
+    for view in views:
+        folders.setdefault(PurePosixPath(view).parent, []).append(view)
+    frames: list[Frame] = []
+    for folder, names in sorted(folders.items()):
+        found = [_LAST_NUMBER.search(PurePosixPath(name).stem) for name in names]
+        numbers = [int(match[1]) for match in found if match]
+        if len(set(numbers)) < len(names):
+            names, numbers = sorted(names), list(range(1, len(names) + 1))
+        pairs = sorted(zip(numbers, names, strict=True))
+        frames += [Frame(name, number, str(folder / f"layers.{number:04d}.exr")) for number, name in pairs]
+    return frames
+
+
+def chosen(frames: Sequence[Frame], text: str | None) -> list[Frame]:
+    """The frames that `text` asks for: numbers and ranges, "3", "1-20", "1-20,31,40-44"; None asks for all.
+
+    Raises SettingsError where the text is no such list or asks for no frame that there is.
+    """
+    if text is None:
+        return list(frames)
+    ranges: list[tuple[int, int]] = []
+    for part in text.split(","):
+        match = re.fullmatch(r"\s*(\d+)\s*(?:-\s*(\d+)\s*)?", part)
+        if not match or int(match[2] or match[1]) < int(match[1]):
+            raise SettingsError(f"The frames {text!r} are not a list of numbers and ranges such as 1-20,31.")
+        ranges.append((int(match[1]), int(match[2] or match[1])))
+    result = [frame for frame in frames if any(low <= frame.number <= high for low, high in ranges)]
+    if not result:
+        there = f"{frames[0].number} to {frames[-1].number}" if frames else "none"
+        raise SettingsError(f"None of the frames {text!r} is in the capture, whose frames are {there}.")
+    return result

@@ -1,0 +1,116 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""A run against its references: scores of composite, scene and flare, by view and on average.
+
+The flare of a view is |composite - scene| in display space, against |frame - reference scene|, as the
+paper measures it. Where the exact flare is known, `flare_linear` compares the linear layer itself, with
+the pixels that the frame clipped left out, since nothing can be learned from those. PSNR flatters faint
+flares, so each flare score stands beside that of an empty flare.
+"""
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..pictures import Picture, srgb_from_linear
+from .pictures import flip, psnr, relative_l2, ssim
+
+Array = NDArray[np.float32]
+Scores = dict[str, float | None]
+Reference = Literal["truth", "removed"]
+
+LAYERS = ("composite", "scene", "flare", "flare_linear")
+_CLIPPED = 254.5 / 255
+
+
+def score_view(composite: Array, scene: Array, frame: Picture, scene_reference: Picture,
+               flare_truth: Picture | None = None) -> dict[str, Scores]:
+    """Scores of one view by layer: psnr, ssim, lpips (null without weights), flip.
+
+    composite, scene: scene-linear layers (height, width, 3); the rest are pictures of the same size.
+    A flare also has `empty_psnr`, what no flare at all would score.
+    """
+    shown, clean = _display(composite), _display(scene)
+    filmed, reference = frame.display(), scene_reference.display()
+    flare, flare_reference = np.abs(shown - clean), np.abs(filmed - reference)
+    scores = {
+        "composite": _picture_scores(shown, filmed),
+        "scene": _picture_scores(clean, reference),
+        "flare": {**_picture_scores(flare, flare_reference),
+                  "empty_psnr": psnr(np.zeros_like(flare), flare_reference)},
+    }
+    if flare_truth is not None:
+        truth, layer, keep = flare_truth.linear(), composite - scene, ~clipped(frame)
+        scores["flare_linear"] = {
+            "psnr": psnr(layer, truth, keep), "relative_l2": relative_l2(layer, truth, keep),
+            "empty_psnr": psnr(np.zeros_like(layer), truth, keep)}
+    return scores
+
+
+def clipped(frame: Picture) -> NDArray[np.bool_]:
+    """(height, width): where a frame's brightest code hides how bright it was. A linear frame hides nothing."""
+    if frame.encoding == "linear":
+        return np.zeros(frame.pixels.shape[:2], bool)
+    return (frame.pixels >= _CLIPPED).any(-1)
+
+
+def _display(linear: Array) -> Array:
+    return np.clip(srgb_from_linear(linear), 0, 1)
+
+
+def _picture_scores(image: Array, target: Array) -> Scores:
+    return {"psnr": psnr(image, target), "ssim": ssim(image, target), "lpips": None, "flip": flip(image, target)}
+
+
+def summary(reference: Reference, views: Sequence[tuple[str, dict[str, Scores]]],
+            size: tuple[int, int]) -> dict[str, Any]:
+    """The content of eval.json: means over views, then each view. Not-finite numbers become null."""
+    mean = {layer: _mean([scores[layer] for _, scores in views if layer in scores]) for layer in LAYERS}
+    return {
+        "reference": reference,
+        "size": list(size),
+        "ssim_borders": "valid",
+        **{layer: _finite(scores) for layer, scores in mean.items() if scores},
+        "views": [{"name": name, **{layer: _finite(part) for layer, part in scores.items()}}
+                  for name, scores in views],
+    }
+
+
+def _mean(parts: list[Scores]) -> Scores:
+    means: Scores = {}
+    for key in parts[0] if parts else ():
+        values = [value for part in parts if (value := part[key]) is not None and math.isfinite(value)]
+        means[key] = sum(values) / len(values) if values else None
+    return means
+
+
+def _finite(scores: Scores) -> Scores:
+    return {key: value if value is not None and math.isfinite(value) else None for key, value in scores.items()}
+
+
+def table(scores: dict[str, Any]) -> str:
+    """The means of eval.json as text, with the view that scored lowest in each layer."""
+    count = len(scores["views"])
+    against = {"truth": "the exact layers", "removed": "the frames of removed/"}[scores["reference"]]
+    width, height = scores["size"]
+    lines = [f"{count} views at {width} x {height}, scene and flare against {against}",
+             f"{'':13}{'PSNR':>8}{'empty':>8}{'SSIM':>8}{'LPIPS':>8}{'FLIP':>8}{'rel. L2':>9}  lowest PSNR"]
+    for layer in LAYERS:
+        if layer not in scores:
+            continue
+        part = scores[layer]
+        cells = [_cell(part.get(key), decimals) for key, decimals in
+                 (("psnr", 2), ("empty_psnr", 2), ("ssim", 4), ("lpips", 4), ("flip", 4))]
+        scored = [view for view in scores["views"] if view.get(layer, {}).get("psnr") is not None]
+        worst = min(scored, key=lambda view: view[layer]["psnr"], default=None)
+        where = f"{worst[layer]['psnr']:.2f} in {worst['name']}" if worst else "-"
+        lines.append(f"{layer:13}{''.join(f'{cell:>8}' for cell in cells)}"
+                     f"{_cell(part.get('relative_l2'), 3):>9}  {where}")
+    return "\n".join(lines)
+
+
+def _cell(value: float | None, decimals: int) -> str:
+    return "-" if value is None else f"{value:.{decimals}f}"

@@ -1,0 +1,252 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Layers, their files, edits, frame numbers, and a bake that can be gone on with."""
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from core.bake.bake import RECORD, BakeSettings, bake, read_record
+from core.bake.edits import gains
+from core.bake.exr import read_description, read_layers, write_layers
+from core.bake.frames import chosen, numbered
+from core.bake.layers import FARTHEST, FrameLayers, layer_names, layers_of
+from core.capture.camera import Camera
+from core.errors import Cancelled, FrameError, RunError, SettingsError
+from core.files import write_json
+from core.pictures import read_exr, write_exr
+from core.progress import Progress
+
+HALF = 2.0 ** -11  # the relative rounding error of 16 bit floats
+
+
+@dataclass
+class FakeRendering:
+    scene: np.ndarray
+    flare_by_light: dict[str, np.ndarray]
+    depth: np.ndarray
+
+
+class FakeRenderer:
+    """Two lights over noise; remembers what it was asked for."""
+
+    fingerprint = "fake"
+    lights = ("lamp", "key light")
+
+    def __init__(self) -> None:
+        self.rendered: list[int] = []
+
+    def render(self, camera: Camera) -> FakeRendering:
+        self.rendered.append(round(camera.fx))
+        random = np.random.default_rng(round(camera.fx))
+        size = camera.height, camera.width
+        flares = {light: random.random((*size, 3), np.float32) ** 4 * 3 for light in self.lights}
+        depth = random.random(size, np.float32)
+        depth[0, 0] = 0
+        return FakeRendering(random.random((*size, 3), np.float32), flares, depth)
+
+
+def camera(mark: int) -> Camera:
+    return Camera(12, 8, float(mark), float(mark), 6.0, 4.0, np.eye(4))
+
+
+VIEWS = ("0003.png", "0004.png", "0010.png")
+CAMERAS = {name: camera(index + 1) for index, name in enumerate(VIEWS)}
+FRAMES = numbered(VIEWS)
+
+
+def layers(mark: int = 1) -> FrameLayers:
+    return layers_of(FakeRenderer().render(camera(mark)))
+
+
+# ---- layers and files -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("half", [True, False])
+def test_scene_and_flares_sum_to_the_composite_in_the_file(tmp_path: Path, half: bool) -> None:
+    write_layers(tmp_path / "a.exr", layers(), half=half)
+    channels = read_exr(tmp_path / "a.exr")
+    tolerance = 2 * HALF if half else 1e-6
+    for name in "RGB":
+        scene, flare = channels[f"scene.{name}"], channels[f"flare.{name}"]
+        lights = channels[f"flare_lamp.{name}"] + channels[f"flare_key_light.{name}"]
+        np.testing.assert_allclose(scene + flare, channels[name], rtol=tolerance)
+        np.testing.assert_allclose(lights, flare, rtol=tolerance, atol=tolerance)
+
+
+def test_channels_are_those_of_the_format(tmp_path: Path) -> None:
+    write_layers(tmp_path / "a.exr", layers())
+    channels = read_exr(tmp_path / "a.exr")
+    rgba = ["R", "G", "B", "A"]
+    expected = {*rgba, "scene.R", "scene.G", "scene.B", "depth.Z"} | {
+        f"{layer}.{name}" for layer in ("flare", "flare_lamp", "flare_key_light") for name in rgba}
+    assert set(channels) == expected
+    assert channels["depth.Z"][0, 0] == np.float32(FARTHEST)
+    assert (channels["A"] == 1).all()
+    brightest = np.max([channels[f"flare.{name}"] for name in "RGB"], axis=0)
+    np.testing.assert_allclose(channels["flare.A"], np.clip(brightest, 0, 1), rtol=HALF)
+
+
+def test_depth_stays_32_bit_beside_half_colour(tmp_path: Path) -> None:
+    frame = layers()
+    write_layers(tmp_path / "a.exr", frame)
+    channels = read_exr(tmp_path / "a.exr")
+    np.testing.assert_array_equal(channels["depth.Z"][1:], frame.depth[1:])
+    assert not np.array_equal(channels["scene.R"], frame.scene[..., 0])
+
+
+def test_layers_come_back_with_their_lights_and_notes(tmp_path: Path) -> None:
+    frame = layers()
+    write_layers(tmp_path / "a.exr", frame, half=False, notes={"view": "0003.png"})
+    again = read_layers(tmp_path / "a.exr")
+    assert list(again.flares) == ["lamp", "key light"]
+    np.testing.assert_array_equal(again.flares["key light"], frame.flares["key light"])
+    np.testing.assert_array_equal(again.scene, frame.scene)
+    assert read_description(tmp_path / "a.exr")["view"] == "0003.png"
+
+
+def test_a_strange_exr_is_refused_by_name(tmp_path: Path) -> None:
+    write_exr(tmp_path / "other.exr", {"R": np.zeros((4, 4))})
+    (tmp_path / "broken.exr").write_bytes(b"\x76\x2f\x31\x01 and then nothing")
+    for name in ("other.exr", "broken.exr", "absent.exr"):
+        with pytest.raises(FrameError, match=name):
+            read_layers(tmp_path / name)
+
+
+def test_light_names_become_safe_and_stay_apart() -> None:
+    names = layer_names(["lamp", "Lamp", "desk.lamp/2", "Lampe é", "灯", "", "x" * 90])
+    assert list(names.values())[:6] == [
+        "flare_lamp", "flare_Lamp_2", "flare_desk_lamp_2", "flare_Lampe_e", "flare_light", "flare_light_2"]
+    assert all("." not in name and len(name) <= 48 for name in names.values())
+    taken = layer_names(["a", "a!", "a_2", "a?"])
+    assert len({name.casefold() for name in taken.values()}) == 4
+
+
+def test_a_flare_without_lights_is_black() -> None:
+    frame = FrameLayers(np.ones((2, 3, 3), np.float32), {}, np.ones((2, 3), np.float32))
+    assert not frame.flare.any()
+    np.testing.assert_array_equal(frame.composite, frame.scene)
+
+
+# ---- edits and frames -----------------------------------------------------------------------------
+
+
+def test_edits_multiply() -> None:
+    assert gains(["lamp.intensity=2", "lamp.tint=1,0.5,0"], ["lamp", "key"]) == {"lamp": (2, 1, 0)}
+    assert gains(["*.intensity=0.5"], ["lamp", "key"]) == {"lamp": (0.5,) * 3, "key": (0.5,) * 3}
+    assert gains(["a.b.intensity=3"], ["a.b"]) == {"a.b": (3, 3, 3)}
+    red = gains(["lamp.tint=#ff8000"], ["lamp"])["lamp"]
+    np.testing.assert_allclose(red, (1, 0.21586, 0), atol=1e-5)
+
+
+@pytest.mark.parametrize("edit", ["lamp", "lamp.intensity", "lamp.intensity=", "lamp.intensity=much", "sun.intensity=1",
+                                  "lamp.intensity=-1", "lamp.intensity=nan", "lamp.tint=1,2", "lamp.size=2",
+                                  "lamp.tint=#12345", "=2", ".intensity=2"])
+def test_an_edit_that_makes_no_sense_is_refused(edit: str) -> None:
+    with pytest.raises(SettingsError, match="edit"):
+        gains([edit], ["lamp"])
+
+
+def test_frame_numbers_come_from_names_or_else_from_the_order() -> None:
+    def of(*views: str) -> list[tuple[str, int, str]]:
+        return [(frame.view, frame.number, frame.file) for frame in numbered(views)]
+
+    assert of("0003.png", "DSC_0000.JPG") == [
+        ("DSC_0000.JPG", 0, "layers.0000.exr"), ("0003.png", 3, "layers.0003.exr")]
+    assert of("b.png", "a.png") == [("a.png", 1, "layers.0001.exr"), ("b.png", 2, "layers.0002.exr")]
+    assert [entry[1] for entry in of("a1.png", "b1.png")] == [1, 2]
+    assert of("left/7.png", "right/7.png") == [
+        ("left/7.png", 7, "left/layers.0007.exr"), ("right/7.png", 7, "right/layers.0007.exr")]
+
+
+def test_frames_are_chosen_by_ranges() -> None:
+    assert [frame.number for frame in chosen(FRAMES, None)] == [3, 4, 10]
+    assert [frame.number for frame in chosen(FRAMES, "1-3, 10")] == [3, 10]
+    for text in ("", "a", "3-", "5-4", "20-30", "-3"):
+        with pytest.raises(SettingsError):
+            chosen(FRAMES, text)
+
+
+# ---- bake -----------------------------------------------------------------------------------------
+
+
+def test_bake_writes_every_frame_at_the_size_asked_for(tmp_path: Path) -> None:
+    record = bake(FakeRenderer(), FRAMES, CAMERAS, tmp_path, BakeSettings(size=(24, 16), edits=("lamp.intensity=2",)))
+    assert [entry["file"] for entry in record["frames"]] == [frame.file for frame in FRAMES]
+    assert record == read_record(tmp_path)
+    again = read_layers(tmp_path / FRAMES[0].file)
+    assert again.scene.shape == (16, 24, 3)
+    rendering = FakeRenderer().render(camera(1).scaled(24, 16))
+    np.testing.assert_allclose(again.flares["lamp"], 2 * rendering.flare_by_light["lamp"], rtol=HALF, atol=1e-6)
+    np.testing.assert_allclose(again.flares["key light"], rendering.flare_by_light["key light"], rtol=HALF, atol=1e-6)
+
+
+class StopAfter(Progress):
+    def __init__(self, steps: int) -> None:
+        super().__init__()
+        self.steps = steps
+
+    def advance(self, steps: int = 1, **figures: float) -> None:
+        self.steps -= steps
+        if self.steps <= 0:
+            self.request_stop()
+        super().advance(steps, **figures)
+
+
+def test_a_stopped_bake_goes_on_where_it_was(tmp_path: Path) -> None:
+    first, second = FakeRenderer(), FakeRenderer()
+    with pytest.raises(Cancelled):
+        bake(first, FRAMES, CAMERAS, tmp_path, progress=StopAfter(1))
+    assert first.rendered == [1]
+    assert len(read_record(tmp_path)["frames"]) == 1
+    bake(second, FRAMES, CAMERAS, tmp_path)
+    assert second.rendered == [2, 3]
+    assert len(read_record(tmp_path)["frames"]) == 3
+    assert not list(tmp_path.glob(".*"))
+
+
+def test_a_lost_file_is_made_again_and_others_stay_listed(tmp_path: Path) -> None:
+    bake(FakeRenderer(), FRAMES, CAMERAS, tmp_path)
+    (tmp_path / FRAMES[1].file).unlink()
+    again = FakeRenderer()
+    bake(again, FRAMES[1:2], CAMERAS, tmp_path)
+    assert again.rendered == [2]
+    assert [entry["frame"] for entry in read_record(tmp_path)["frames"]] == [3, 4, 10]
+
+
+def test_other_settings_do_not_mix_with_what_is_there(tmp_path: Path) -> None:
+    bake(FakeRenderer(), FRAMES, CAMERAS, tmp_path)
+    changed = BakeSettings(edits=("lamp.intensity=2",))
+    with pytest.raises(RunError, match="other settings"):
+        bake(FakeRenderer(), FRAMES[:1], CAMERAS, tmp_path, changed)
+    bake(FakeRenderer(), FRAMES[:1], CAMERAS, tmp_path, changed, overwrite=True)
+    assert [path.name for path in sorted(tmp_path.iterdir())] == [RECORD, FRAMES[0].file]
+
+
+def test_a_damaged_record_is_one_sentence(tmp_path: Path) -> None:
+    good = bake(FakeRenderer(), FRAMES[:1], CAMERAS, tmp_path)
+    for text in ("", "[]", "{}", '{"version": 99}'):
+        (tmp_path / RECORD).write_text(text)
+        with pytest.raises(RunError, match=r"bake\.json"):
+            bake(FakeRenderer(), FRAMES[:1], CAMERAS, tmp_path)
+    assert good["frames"][0]["file"] == FRAMES[0].file
+
+
+def test_a_record_cannot_reach_outside_its_folder(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    record = bake(FakeRenderer(), FRAMES[:1], CAMERAS, out)
+    treasure = tmp_path / "treasure.exr"
+    treasure.write_text("mine")
+    record["frames"][0]["file"] = "../treasure.exr"
+    write_json(out / RECORD, record)
+    with pytest.raises(RunError):
+        bake(another_fit(), FRAMES[:1], CAMERAS, out, overwrite=True)
+    assert treasure.read_text() == "mine"
+
+
+def another_fit() -> FakeRenderer:
+    renderer = FakeRenderer()
+    renderer.fingerprint = "another"
+    return renderer

@@ -1,0 +1,178 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Scores against their definitions, and eval.json."""
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+from core.errors import SettingsError
+from core.metrics.evaluation import clipped, score_view, summary, table
+from core.metrics.pictures import flip, has_flip, psnr, relative_l2, ssim
+from core.pictures import Picture, srgb_from_linear
+
+
+@pytest.fixture
+def pair() -> tuple[np.ndarray, np.ndarray]:
+    random = np.random.default_rng(0)
+    image = random.random((40, 50, 3))
+    return image, np.clip(image + 0.1 * random.standard_normal(image.shape), 0, 1)
+
+
+# ---- PSNR and the relative error ------------------------------------------------------------------
+
+
+def test_psnr_of_a_constant_error() -> None:
+    assert psnr(np.full((4, 4, 3), 0.6), np.full((4, 4, 3), 0.5)) == pytest.approx(20)
+    assert psnr(np.ones((4, 4)), np.ones((4, 4))) == math.inf
+
+
+def test_psnr_looks_only_where_it_should() -> None:
+    image, target, keep = np.zeros((4, 4, 3)), np.zeros((4, 4, 3)), np.ones((4, 4), bool)
+    image[0, 0], keep[0, 0] = 1, False
+    assert psnr(image, target) < 20
+    assert psnr(image, target, keep) == math.inf
+    assert math.isnan(psnr(image, target, np.zeros((4, 4), bool)))
+
+
+def test_relative_error_of_nothing_is_one() -> None:
+    target = np.random.default_rng(0).random((4, 4, 3))
+    assert relative_l2(np.zeros_like(target), target) == pytest.approx(1)
+    assert relative_l2(target * 1.1, target) == pytest.approx(0.1)
+    assert math.isnan(relative_l2(target, np.zeros_like(target)))
+
+
+def test_pictures_of_different_sizes_are_not_compared() -> None:
+    for score in (psnr, ssim, relative_l2, flip):
+        with pytest.raises(SettingsError):
+            score(np.zeros((20, 20, 3)), np.zeros((20, 21, 3)))
+
+
+# ---- SSIM -----------------------------------------------------------------------------------------
+
+
+def by_definition(x: np.ndarray, y: np.ndarray) -> float:
+    """Wang et al. 2004, eq. 13 to 16, window by window over one channel."""
+    at = np.arange(11) - 5
+    window = np.exp(-(at[:, None] ** 2 + at[None] ** 2) / (2 * 1.5 ** 2))
+    window /= window.sum()
+    values = []
+    for i in range(x.shape[0] - 10):
+        for j in range(x.shape[1] - 10):
+            a, b = x[i:i + 11, j:j + 11], y[i:i + 11, j:j + 11]
+            ma, mb = (window * a).sum(), (window * b).sum()
+            va, vb = (window * (a - ma) ** 2).sum(), (window * (b - mb) ** 2).sum()
+            cov = (window * (a - ma) * (b - mb)).sum()
+            values.append((2 * ma * mb + 1e-4) * (2 * cov + 9e-4) / ((ma * ma + mb * mb + 1e-4) * (va + vb + 9e-4)))
+    return float(np.mean(values))
+
+
+def test_ssim_is_the_definition(pair: tuple[np.ndarray, np.ndarray]) -> None:
+    image, target = pair
+    channels = [by_definition(image[..., index], target[..., index]) for index in range(3)]
+    assert ssim(image, target) == pytest.approx(np.mean(channels), abs=1e-9)
+    assert ssim(image, image) == pytest.approx(1)
+
+
+def test_ssim_with_padding_is_the_definition_on_the_padded_picture(pair: tuple[np.ndarray, np.ndarray]) -> None:
+    image, target = (np.pad(picture, ((5, 5), (5, 5), (0, 0))) for picture in pair)
+    assert ssim(*pair, borders="same") == pytest.approx(ssim(image, target), abs=1e-12)
+    assert ssim(*pair, borders="same") != pytest.approx(ssim(*pair), abs=1e-6)
+
+
+def test_ssim_with_padding_is_that_of_scipy(pair: tuple[np.ndarray, np.ndarray]) -> None:
+    ndimage = pytest.importorskip("scipy.ndimage")
+    x, y = (picture[..., 0] for picture in pair)
+
+    def blurred(picture: np.ndarray) -> np.ndarray:
+        return ndimage.gaussian_filter(picture, 1.5, mode="constant", radius=5)
+
+    mx, my = blurred(x), blurred(y)
+    vx, vy, cov = blurred(x * x) - mx ** 2, blurred(y * y) - my ** 2, blurred(x * y) - mx * my
+    expected = (2 * mx * my + 1e-4) * (2 * cov + 9e-4) / ((mx ** 2 + my ** 2 + 1e-4) * (vx + vy + 9e-4))
+    assert ssim(x, y, "same") == pytest.approx(expected.mean(), abs=1e-9)
+
+
+def test_ssim_needs_a_window() -> None:
+    with pytest.raises(SettingsError, match="11"):
+        ssim(np.zeros((10, 30)), np.zeros((10, 30)))
+
+
+def test_flip_is_a_number_or_honestly_absent(pair: tuple[np.ndarray, np.ndarray]) -> None:
+    if not has_flip():
+        assert flip(*pair) is None
+        return
+    assert flip(pair[0], pair[0]) == pytest.approx(0, abs=1e-6)
+    score = flip(*pair)
+    assert score is not None
+    assert 0.02 < score < 1
+
+
+# ---- evaluation -----------------------------------------------------------------------------------
+
+
+def layers() -> tuple[np.ndarray, np.ndarray]:
+    """A linear scene and a linear flare."""
+    random = np.random.default_rng(1)
+    return (0.3 * random.random((16, 20, 3))).astype(np.float32), (0.2 * random.random((16, 20, 3))).astype(np.float32)
+
+
+def test_an_exact_fit_scores_as_exact() -> None:
+    scene, flare = layers()
+    frame = Picture(srgb_from_linear(scene + flare), "srgb")
+    scores = score_view(scene + flare, scene, frame, Picture(srgb_from_linear(scene), "srgb"), Picture(flare, "linear"))
+    for layer in ("composite", "scene", "flare"):
+        assert scores[layer]["ssim"] == pytest.approx(1)
+        assert scores[layer]["psnr"] > 100
+        assert scores[layer]["lpips"] is None
+    assert scores["flare_linear"]["relative_l2"] == pytest.approx(0, abs=1e-6)
+    assert 5 < scores["flare_linear"]["empty_psnr"] < 25
+
+
+def test_the_flare_is_scored_in_display_space() -> None:
+    scene, flare = layers()
+    frame = Picture(srgb_from_linear(scene + flare), "srgb")
+    reference = Picture(srgb_from_linear(scene), "srgb")
+    scores = score_view(scene + 0.5 * flare, scene, frame, reference)
+    shown = srgb_from_linear(scene + 0.5 * flare) - srgb_from_linear(scene)
+    assert scores["flare"]["psnr"] == pytest.approx(psnr(shown, frame.pixels - reference.pixels), abs=1e-3)
+    assert scores["flare"]["empty_psnr"] == pytest.approx(psnr(0 * shown, frame.pixels - reference.pixels), abs=1e-3)
+    assert "flare_linear" not in scores
+
+
+def test_clipped_pixels_do_not_count_against_the_linear_flare() -> None:
+    scene, flare = layers()
+    truth = flare.copy()
+    truth[3, 4] = 50
+    frame = Picture(np.clip(srgb_from_linear(scene + truth), 0, 1), "srgb")
+    assert clipped(frame).sum() == 1
+    assert not clipped(Picture(scene + truth, "linear")).any()
+    scores = score_view(scene + flare, scene, frame, Picture(srgb_from_linear(scene), "srgb"), Picture(truth, "linear"))
+    assert scores["flare_linear"]["relative_l2"] == pytest.approx(0, abs=1e-6)
+
+
+def test_the_summary_is_the_mean_and_json() -> None:
+    scene, flare = layers()
+    frame = Picture(srgb_from_linear(scene + flare), "srgb")
+    reference = Picture(srgb_from_linear(scene), "srgb")
+    views = [(f"{gain}.png", score_view(scene + np.float32(gain) * flare, scene, frame, reference, Picture(flare, "linear")))
+             for gain in (0.5, 0.75, 1.0)]
+    scores = summary("truth", views, (20, 16))
+    text = json.dumps(scores, allow_nan=False)
+    again = json.loads(text)
+    assert again["reference"] == "truth"
+    assert again["flare_linear"]["relative_l2"] == pytest.approx((0.5 + 0.25 + 0) / 3, abs=1e-5)
+    assert [view["name"] for view in again["views"]] == ["0.5.png", "0.75.png", "1.0.png"]
+    assert set(again["composite"]) == {"psnr", "ssim", "lpips", "flip"}
+    shown = table(again)
+    assert "against the exact layers" in shown
+    assert "in 0.5.png" in shown
+
+
+def test_infinite_scores_become_null() -> None:
+    scores = {"composite": {"psnr": math.inf, "ssim": 1.0}, "scene": {"psnr": 20.0, "ssim": 0.5}}
+    made = summary("removed", [("a", {**scores, "flare": scores["scene"]})], (4, 4))
+    assert made["composite"] == {"psnr": None, "ssim": 1.0}
+    assert "removed/" in table(made)

@@ -1,0 +1,14 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What was filmed: frames, cameras, points and lights, from COLMAP models and transforms.json.
+
+Reading needs numpy alone, so that Blender's own Python can do it; pictures are decoded by OpenCV and
+OpenEXR, imported when the first one is asked for.
+"""
+from __future__ import annotations
+
+from .camera import Camera
+from .capture import Capture, Light, View, read_lights
+from .colmap import PointCloud
+from .lens import Lens
+
+__all__ = ["Camera", "Capture", "Lens", "Light", "PointCloud", "View", "read_lights"]

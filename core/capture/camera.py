@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""A pinhole camera with its pose: OpenCV axes (x right, y down, z forward), pixel centres at +0.5.
+
+    u = fx x/z + cx,  v = fy y/z + cy,  (x, y, z, 1) = world_to_camera (X, Y, Z, 1)
+"""
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """Size in pixels, intrinsics in pixels, and `world_to_camera` (4, 4), a rigid motion."""
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    world_to_camera: Floats
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(width, height) in pixels."""
+        return self.width, self.height
+
+    @property
+    def intrinsics(self) -> Floats:
+        """(3, 3) matrix from (x/z, y/z, 1) to pixels."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    @property
+    def camera_to_world(self) -> Floats:
+        """(4, 4), the inverse of the pose."""
+        inverse = np.eye(4)
+        inverse[:3, :3] = self.world_to_camera[:3, :3].T
+        inverse[:3, 3] = self.position
+        return inverse
+
+    @property
+    def position(self) -> Floats:
+        """(3,) centre of projection in world coordinates."""
+        return -self.world_to_camera[:3, :3].T @ self.world_to_camera[:3, 3]
+
+    @property
+    def forward(self) -> Floats:
+        """(3,) unit viewing direction in world coordinates."""
+        return self.world_to_camera[2, :3].copy()
+
+    def scaled(self, width: int, height: int) -> Camera:
+        """The same view at another size in pixels."""
+        x, y = width / self.width, height / self.height
+        return replace(self, width=width, height=height,
+                       fx=self.fx * x, cx=self.cx * x, fy=self.fy * y, cy=self.cy * y)
+
+    def normalised(self, xyz: ArrayLike) -> tuple[Floats, Floats]:
+        """World points (n, 3) to ((n, 2) of x/z and y/z, (n,) depth z).
+
+        A point in the camera's plane (z = 0) has no image: its coordinates are not finite. A point behind
+        (z < 0) has its mirrored ones, as the formula gives them; look at the depth.
+        """
+        points = np.asarray(xyz, np.float64).reshape(-1, 3)
+        local = points @ self.world_to_camera[:3, :3].T + self.world_to_camera[:3, 3]
+        depth = local[:, 2]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return local[:, :2] / depth[:, None], depth
+
+    def project(self, xyz: ArrayLike) -> tuple[Floats, Floats]:
+        """World points (n, 3) to (pixels (n, 2), depth (n,)); see `normalised` for points not in front."""
+        plane, depth = self.normalised(xyz)
+        return plane * (self.fx, self.fy) + (self.cx, self.cy), depth
+
+    def rays(self, pixels: ArrayLike) -> Floats:
+        """Pixels (n, 2) to unit directions (n, 3) in world coordinates, from `position`."""
+        plane = (np.asarray(pixels, np.float64).reshape(-1, 2) - (self.cx, self.cy)) / (self.fx, self.fy)
+        local = np.concatenate([plane, np.ones((len(plane), 1))], axis=1)
+        rays = local @ self.world_to_camera[:3, :3]
+        return rays / np.linalg.norm(rays, axis=1, keepdims=True)
+
+    def contains(self, pixels: ArrayLike, depth: Any = 1.0) -> NDArray[np.bool_]:
+        """Which pixels (n, 2), with their depths (n,), lie in front of the camera and inside the frame."""
+        at = np.asarray(pixels, np.float64).reshape(-1, 2)
+        with np.errstate(invalid="ignore"):
+            return np.asarray((np.asarray(depth) > 0) & (at >= 0).all(axis=1) & (at <= self.size).all(axis=1))
+
+    @property
+    def field_of_view(self) -> tuple[float, float]:
+        """Horizontal and vertical angle, in radians."""
+        x = math.atan(self.cx / self.fx) + math.atan((self.width - self.cx) / self.fx)
+        y = math.atan(self.cy / self.fy) + math.atan((self.height - self.cy) / self.fy)
+        return x, y
+
+
+def rotation_from_quaternion(wxyz: ArrayLike) -> Floats:
+    """(3, 3) rotation of a quaternion (w, x, y, z), normalised first (Hamilton's convention, as COLMAP)."""
+    w, x, y, z = np.asarray(wxyz, np.float64) / np.linalg.norm(wxyz)
+    return np.array([
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ])

@@ -1,0 +1,377 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""A capture: frames, cameras, points and lights of one shoot, in one folder.
+
+    images/           frames as filmed
+    sparse/0/         COLMAP model, binary or text (or transforms.json)
+    lights.json       {"lights": [{"name": "lamp", "xyz": [x, y, z]}]}; optional
+    removed/          the frames without flare, same names; optional
+    split.json        {"test": ["0003.png", ...]}; optional
+    truth/scene/, truth/flare/    exact layers where they are known; optional
+
+Opening checks names, sizes and numbers by headers alone; pixels are decoded when they are asked for.
+Distorted frames, and the pictures that belong to them, come out as the pinhole camera of their view
+sees them.
+"""
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import CaptureError, FrameError
+from ..files import inside, read_json
+from ..pictures import SUFFIXES, Picture, picture_size, read_picture
+from .camera import Camera, Floats
+from .colmap import PointCloud, Posed, find_model, read_model
+from .lens import PINHOLES, Lens
+from .transforms import FILE as TRANSFORMS
+from .transforms import read_transforms
+
+HOLDOUT = 8  # every 8th view is held out where nothing else is said, as 3DGS and mip-NeRF 360 do
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """One frame: its name, the pinhole camera of the undistorted picture, and the file's lens (None: none)."""
+
+    name: str
+    camera: Camera
+    lens: Lens | None
+
+
+@dataclass(frozen=True, eq=False)
+class Light:
+    """A light source at `xyz` (3,) in world coordinates."""
+
+    name: str
+    xyz: Floats
+
+
+class Capture:
+    """See the module's head; made by `Capture.open`."""
+
+    def __init__(self, folder: Path, views: Sequence[View], points: PointCloud, lights: Sequence[Light] = (),
+                 *, frames: dict[str, Path] | None = None, cache_bytes: int = 1 << 30) -> None:
+        """`frames` gives the file of each view by name; without it no picture can be had."""
+        self.folder = folder
+        self.views = tuple(views)
+        self.points = points
+        self.lights = tuple(lights)
+        self._frames = frames or {}
+        self._pictures = _Pictures(cache_bytes)
+        self._removed = _siblings(folder / "removed", self.views)
+        self._truth_scene = _siblings(folder / "truth" / "scene", self.views)
+        self._truth_flare = _siblings(folder / "truth" / "flare", self.views)
+
+    @classmethod
+    def open(cls, folder: Path | str, *, need_frames: bool = True, cache_bytes: int = 1 << 30) -> Capture:
+        """Read a capture and check all of it that can be checked without decoding a picture.
+
+        With `need_frames` every frame must be there, at the model's size or a uniform scale of it; without,
+        cameras, points and lights are enough. At most `cache_bytes` of decoded pictures are kept.
+
+        Raises CaptureError (model, lights, split) or FrameError (pictures), naming the file.
+        """
+        folder = Path(folder)
+        if not folder.is_dir():
+            raise CaptureError(f"{folder} is not a folder; give the capture's folder.")
+        posed, points, root = _read_poses(folder)
+        names = [frame.name for frame in posed]
+        if len(set(names)) < len(names):
+            twice = next(name for name in names if names.count(name) > 1)
+            raise CaptureError(f"{folder}: the frame {twice} has two poses; remove one of them.")
+        views, frames = [], {}
+        for frame in sorted(posed, key=lambda frame: frame.name):
+            path = inside(root, frame.name, CaptureError)
+            size = _checked_size(path, frame.lens) if need_frames else (frame.lens.width, frame.lens.height)
+            name = frame.name.removeprefix("images/") if root == folder else frame.name
+            if name in frames:
+                raise CaptureError(f"{folder}: the frame {name} has two poses; remove one of them.")
+            views.append(_view(name, frame, size))
+            frames[name] = path
+        capture = cls(folder, views, points, read_lights(folder / "lights.json"), frames=frames,
+                      cache_bytes=cache_bytes)
+        if need_frames:
+            capture._check_layers()
+        if (folder / "split.json").exists():
+            capture.split(None)
+        return capture
+
+    # What was filmed.
+
+    def frame(self, view: View, size: tuple[int, int] | None = None) -> Picture:
+        """The view's frame, undistorted, at its camera's size or at `size` (width, height).
+
+        Treat the pixels as read-only: they may be shared. Raises FrameError.
+        """
+        if view.name not in self._frames:
+            raise FrameError(f"{self.folder} has no frame for {view.name}.")
+        return self._picture(self._frames[view.name], view, size)
+
+    def frame_path(self, view: View) -> Path:
+        """The file of the view's frame."""
+        return self._frames[view.name]
+
+    def removed(self, view: View, size: tuple[int, int] | None = None) -> Picture | None:
+        """The frame without its flare, from removed/; None where there is none."""
+        return self._sibling(self._removed, view, size)
+
+    def truth_scene(self, view: View, size: tuple[int, int] | None = None) -> Picture | None:
+        """The exact scene layer, where it is known."""
+        return self._sibling(self._truth_scene, view, size)
+
+    def truth_flare(self, view: View, size: tuple[int, int] | None = None) -> Picture | None:
+        """The exact flare layer, where it is known."""
+        return self._sibling(self._truth_flare, view, size)
+
+    @property
+    def has_removed(self) -> bool:
+        """Whether every view has its frame without flare."""
+        return bool(self._removed)
+
+    @property
+    def has_truth(self) -> bool:
+        """Whether every view has its exact scene layer."""
+        return len(self._truth_scene) == len(self.views)
+
+    @property
+    def centre(self) -> Floats:
+        """(3,) mean of the camera positions."""
+        return np.mean([view.camera.position for view in self.views], axis=0)
+
+    @property
+    def extent(self) -> float:
+        """The scene's extent as in 3DGS: 1.1 x the largest distance of a camera from the mean of all.
+
+        Where the cameras share one place: the median distance of the points from it, or 1.
+        """
+        centre = self.centre
+        reach = max(float(np.linalg.norm(view.camera.position - centre)) for view in self.views)
+        if reach > 0:
+            return 1.1 * reach
+        if len(self.points):
+            return float(np.median(np.linalg.norm(self.points.xyz - centre, axis=1))) or 1.0
+        return 1.0
+
+    def view(self, name: str) -> View:
+        """The view of that name; CaptureError where there is none."""
+        for view in self.views:
+            if view.name == name:
+                return view
+        raise CaptureError(f"{self.folder} has no view {name!r}; its first is {self.views[0].name!r}.")
+
+    def split(self, holdout: str | int | Path | None = None) -> tuple[tuple[View, ...], tuple[View, ...]]:
+        """(training views, test views).
+
+        `holdout`: a JSON file like split.json; a number N (every Nth view, from the first; 0: none); None:
+        the capture's split.json, else every 8th. Raises CaptureError.
+        """
+        if isinstance(holdout, str) and holdout.strip().lstrip("+-").isdigit():
+            holdout = int(holdout)
+        if holdout is None:
+            default = self.folder / "split.json"
+            holdout = default if default.exists() else HOLDOUT
+        if isinstance(holdout, int):
+            if holdout < 0:
+                raise CaptureError(f"Every {holdout}th view cannot be held out; give a number from 0.")
+            train = tuple(view for i, view in enumerate(self.views) if not holdout or i % holdout)
+            test = tuple(view for i, view in enumerate(self.views) if holdout and not i % holdout)
+            if not train:
+                raise CaptureError(f"{self.folder}: with every {holdout}th of {len(self.views)} views held out, "
+                                   "none is left to train on.")
+            return train, test
+        names = self._test_names(Path(holdout))
+        train = tuple(view for view in self.views if view.name not in names)
+        if not train:
+            raise CaptureError(f"{holdout} holds out every view, so that none is left to train on.")
+        return train, tuple(view for view in self.views if view.name in names)
+
+    def summary(self) -> dict[str, Any]:
+        """What the capture holds, JSON-able."""
+        sizes = sorted({view.camera.size for view in self.views})
+        return {"folder": str(self.folder), "views": len(self.views), "sizes": [list(size) for size in sizes],
+                "points": len(self.points), "lights": [light.name for light in self.lights],
+                "distorted": any(view.lens for view in self.views), "removed": self.has_removed,
+                "truth": self.has_truth, "extent": self.extent}
+
+    # How the pictures are had.
+
+    def _picture(self, path: Path, view: View, size: tuple[int, int] | None) -> Picture:
+        return self._pictures.get(path, view, size or view.camera.size)
+
+    def _sibling(self, paths: dict[str, Path], view: View, size: tuple[int, int] | None) -> Picture | None:
+        return self._picture(paths[view.name], view, size) if view.name in paths else None
+
+    def _test_names(self, path: Path) -> set[str]:
+        data = read_json(path, CaptureError)
+        names = data.get("test") if isinstance(data, dict) else None
+        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+            raise CaptureError(f'{path} should read {{"test": ["name of a frame", …]}}.')
+        unknown = set(names) - {view.name for view in self.views}
+        if unknown:
+            raise CaptureError(f"{path} names {min(unknown)!r}, which is not a frame of the capture.")
+        if len(set(names)) < len(names):
+            raise CaptureError(f"{path} names a frame twice.")
+        return set(names)
+
+    def _check_layers(self) -> None:
+        """Sizes of removed/ and truth/, and that removed/ is whole: half of it is a run that broke off."""
+        if self._removed and len(self._removed) < len(self.views):
+            lacking = [view.name for view in self.views if view.name not in self._removed]
+            raise CaptureError(f"{self.folder / 'removed'} lacks {len(lacking)} of {len(self.views)} frames, "
+                               f"first {lacking[0]}; finish or remove it.")
+        for paths in (self._removed, self._truth_scene, self._truth_flare):
+            for view in self.views:
+                if view.name in paths:
+                    size = picture_size(paths[view.name])
+                    if not _uniform(size, view.camera.size):
+                        raise FrameError(f"{paths[view.name]} is {size[0]} x {size[1]} pixels and the frame "
+                                         f"{view.camera.width} x {view.camera.height}; make them one shape.")
+
+
+class _Pictures:
+    """Decoded, undistorted, resized pictures; the least recently used go when the room is used up."""
+
+    def __init__(self, room: int) -> None:
+        self._room = room
+        self._used = 0
+        self._kept: OrderedDict[tuple[Path, tuple[int, int]], Picture] = OrderedDict()
+        self._maps: OrderedDict[tuple[int, tuple[int, int], float], Any] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def get(self, path: Path, view: View, size: tuple[int, int]) -> Picture:
+        key = (path, size)
+        with self._lock:
+            if key in self._kept:
+                self._kept.move_to_end(key)
+                return self._kept[key]
+        picture = read_picture(path)
+        if view.lens is not None:
+            picture = self._undistorted(picture, view, path)
+        elif not _uniform(picture.size, view.camera.size):
+            raise FrameError(f"{path} is {picture.size[0]} x {picture.size[1]} pixels, not "
+                             f"{view.camera.width} x {view.camera.height}.")
+        picture = picture.resized(*size)
+        picture.pixels.flags.writeable = False
+        self._keep(key, picture)
+        return picture
+
+    def _keep(self, key: tuple[Path, tuple[int, int]], picture: Picture) -> None:
+        with self._lock:
+            if key in self._kept or picture.pixels.nbytes > self._room:
+                return
+            self._kept[key] = picture
+            self._used += picture.pixels.nbytes
+            while self._used > self._room:
+                _, old = self._kept.popitem(last=False)
+                self._used -= old.pixels.nbytes
+
+    def _undistorted(self, picture: Picture, view: View, path: Path) -> Picture:
+        import cv2
+
+        assert view.lens is not None
+        if not _uniform(picture.size, view.camera.size):
+            raise FrameError(f"{path} is {picture.size[0]} x {picture.size[1]} pixels, not "
+                             f"{view.camera.width} x {view.camera.height}.")
+        camera = view.camera.scaled(*picture.size)
+        key = (id(view.lens), picture.size, camera.fx)
+        with self._lock:
+            maps = self._maps.get(key)
+        if maps is None:
+            maps = view.lens.maps(camera)
+            with self._lock:
+                self._maps[key] = maps
+                while len(self._maps) > 4:
+                    self._maps.popitem(last=False)
+        # Cubic is sharper, but rings where linear light steps from 1 to 100.
+        how = cv2.INTER_CUBIC if picture.encoding == "srgb" else cv2.INTER_LINEAR
+        pixels = cv2.remap(picture.pixels, maps[0], maps[1], how, borderMode=cv2.BORDER_REPLICATE)
+        if picture.encoding == "srgb":
+            pixels = np.clip(pixels, 0.0, 1.0)
+        return Picture(np.asarray(pixels, np.float32), picture.encoding)
+
+
+def read_lights(path: Path) -> tuple[Light, ...]:
+    """The lights of a lights.json, none where the file is absent. CaptureError where it makes no sense."""
+    if not path.exists():
+        return ()
+    data = read_json(path, CaptureError)
+    entries = data.get("lights") if isinstance(data, dict) else None
+    if not isinstance(entries, list):
+        raise CaptureError(f'{path} should read {{"lights": [{{"name": "lamp", "xyz": [x, y, z]}}, …]}}.')
+    lights: dict[str, Light] = {}
+    for number, entry in enumerate(entries):
+        name = entry.get("name") if isinstance(entry, dict) else None
+        if not isinstance(name, str) or not name.strip():
+            raise CaptureError(f"{path}, light {number}: the name is missing.")
+        if name in lights:
+            raise CaptureError(f"{path} has two lights with the name {name!r}; rename one.")
+        xyz = entry.get("xyz")
+        if not isinstance(xyz, list) or len(xyz) != 3 or not all(_is_finite(x) for x in xyz):
+            raise CaptureError(f"{path}, {name!r}: xyz should be three finite numbers.")
+        lights[name] = Light(name, np.array(xyz, np.float64))
+    return tuple(lights.values())
+
+
+def _is_finite(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e30
+
+
+def _read_poses(folder: Path) -> tuple[list[Posed], PointCloud, Path]:
+    """Frames with their poses, points, and the folder that the frames' names start from."""
+    model = find_model(folder)
+    if model is None and (folder / TRANSFORMS).exists():
+        return *read_transforms(folder), folder
+    model = model or find_model(folder, ("colmap/sparse/0",))
+    if model is None:
+        raise CaptureError(f"{folder} has no camera solve: neither sparse/0/cameras.bin (or .txt) nor "
+                           f"{TRANSFORMS}; run solve first.")
+    return *read_model(model), folder / "images"
+
+
+def _uniform(size: tuple[int, int], other: tuple[int, int]) -> bool:
+    """Whether one size is the other, scaled and rounded to whole pixels."""
+    small, large = sorted((size, other))
+    scale = max(large[0] / small[0], large[1] / small[1])
+    return (abs(large[0] - small[0] * scale) <= max(scale, 1.0) + 1e-9
+            and abs(large[1] - small[1] * scale) <= max(scale, 1.0) + 1e-9)
+
+
+def _checked_size(path: Path, lens: Lens) -> tuple[int, int]:
+    size = picture_size(path)
+    if not _uniform(size, (lens.width, lens.height)):
+        raise FrameError(f"{path} is {size[0]} x {size[1]} pixels and its camera {lens.width} x {lens.height}, "
+                         "which is another shape; use the frames that were solved.")
+    if path.suffix.lower() not in SUFFIXES:
+        raise FrameError(f"{path} is not a picture this program reads; use PNG, JPEG, TIFF or EXR.")
+    return size
+
+
+def _view(name: str, frame: Posed, size: tuple[int, int]) -> View:
+    lens = frame.lens
+    fx, fy, cx, cy = lens.pinhole
+    camera = Camera(lens.width, lens.height, fx, fy, cx, cy, frame.world_to_camera)
+    straight = lens.model in PINHOLES
+    return View(name, camera if size == camera.size else camera.scaled(*size), None if straight else lens)
+
+
+def _siblings(folder: Path, views: Sequence[View]) -> dict[str, Path]:
+    """For each view the file of its name in `folder`, or of its name with another picture suffix."""
+    found: dict[str, Path] = {}
+    if not folder.is_dir():
+        return found
+    for view in views:
+        path = inside(folder, view.name, CaptureError)
+        choices = [path, *(path.with_suffix(suffix) for suffix in (".exr", ".png", ".tif", ".tiff", ".jpg", ".jpeg"))]
+        for choice in choices:
+            if choice.is_file():
+                found[view.name] = inside(folder, choice.relative_to(folder).as_posix(), CaptureError)
+                break
+    return found
+
+

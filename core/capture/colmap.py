@@ -1,0 +1,275 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""COLMAP sparse models, binary and text, read with numpy alone (Blender's own Python has no pycolmap).
+
+The format is COLMAP's documented one: cameras, images (pose as quaternion and translation, world to
+camera) and points3D. Counts in a file are checked against its length before anything is allocated.
+"""
+from __future__ import annotations
+
+import math
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import CaptureError
+from ..pictures import LARGEST
+from .camera import Floats, rotation_from_quaternion
+from .lens import MODELS, NAMES, Lens
+
+
+@dataclass(frozen=True, eq=False)
+class PointCloud:
+    """Points (n, 3) float32 in world coordinates, colours (n, 3) uint8 sRGB, and the mean reprojection
+    error (n,) float32 in pixels (0 where unknown)."""
+
+    xyz: NDArray[np.float32]
+    rgb: NDArray[np.uint8]
+    error: NDArray[np.float32]
+
+    def __len__(self) -> int:
+        return len(self.xyz)
+
+    @classmethod
+    def empty(cls) -> PointCloud:
+        """No points at all."""
+        return cls(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), np.zeros(0, np.float32))
+
+
+@dataclass(frozen=True, eq=False)
+class Posed:
+    """A frame as a model names it: its name, the lens it was seen through, and its pose (4, 4)."""
+
+    name: str
+    lens: Lens
+    world_to_camera: Floats
+
+
+def find_model(folder: Path, places: tuple[str, ...] = ("sparse/0", "sparse")) -> Path | None:
+    """The folder of the COLMAP model in a capture, the first of `places` that has one."""
+    for name in places:
+        if any((folder / name / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt")):
+            return folder / name
+    return None
+
+
+def read_model(folder: Path) -> tuple[list[Posed], PointCloud]:
+    """Read cameras, images and points3D (.bin where there is one, else .txt; points3D may be absent).
+
+    Raises CaptureError, naming the file, where one is missing, damaged, empty or makes no sense.
+    """
+    lenses = _read(folder, "cameras", _cameras_bin, _cameras_txt)
+    images = _read(folder, "images", _images_bin, _images_txt)
+    points = _read(folder, "points3D", _points_bin, _points_txt)
+    if not images:
+        raise CaptureError(f"{_path(folder, 'images')} holds no images; the solve registered no frame.")
+    posed = []
+    for name, camera, quaternion, translation in images:
+        if camera not in lenses:
+            raise CaptureError(f"{_path(folder, 'images')} gives {name} the camera {camera}, which "
+                               f"{_path(folder, 'cameras')} does not have.")
+        where = f"{_path(folder, 'images')}, {name}:"
+        pose = np.eye(4)
+        length = math.sqrt(sum(q * q for q in quaternion))
+        if not all(map(math.isfinite, (*quaternion, *translation))):
+            raise CaptureError(f"{where} the pose is not finite numbers; solve the cameras again.")
+        if abs(length - 1.0) > 0.01:
+            raise CaptureError(f"{where} the quaternion's length is {length:.4g}, so it is no rotation; "
+                               "solve the cameras again.")
+        pose[:3, :3], pose[:3, 3] = rotation_from_quaternion(quaternion), translation
+        posed.append(Posed(name, lenses[camera], pose))
+    return posed, points if points is not None else PointCloud.empty()
+
+
+def check_lens(lens: Lens, where: str) -> Lens:
+    """`lens`, or CaptureError where its numbers cannot be a camera's."""
+    if lens.width <= 0 or lens.height <= 0 or lens.width * lens.height > LARGEST:
+        raise CaptureError(f"{where} a size of {lens.width} x {lens.height} pixels makes no sense.")
+    if not all(map(math.isfinite, lens.params)):
+        raise CaptureError(f"{where} the camera parameters are not finite numbers.")
+    if min(lens.focal) <= 0:
+        raise CaptureError(f"{where} the focal length {min(lens.focal):g} is not positive.")
+    return lens
+
+
+def _path(folder: Path, name: str) -> Path:
+    binary = folder / f"{name}.bin"
+    return binary if binary.is_file() else folder / f"{name}.txt"
+
+
+def _read(folder: Path, name: str, binary: Any, text: Any) -> Any:
+    path = _path(folder, name)
+    if not path.is_file():
+        if name == "points3D":
+            return None
+        raise CaptureError(f"{folder} has no {name}.bin or {name}.txt; export the whole COLMAP model.")
+    try:
+        if path.suffix == ".bin":
+            return binary(_Bytes(path))
+        return text(path, path.read_text(encoding="utf-8").splitlines())
+    except OSError as problem:
+        raise CaptureError(f"{path} cannot be read: {problem.strerror or problem}.") from problem
+    except UnicodeDecodeError as problem:
+        raise CaptureError(f"{path} is not UTF-8 text; export the model again.") from problem
+
+
+class _Bytes:
+    """A binary file, read from front to back, that knows when it ends too early."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.data = path.read_bytes()
+        self.at = 0
+
+    def take(self, layout: str) -> tuple[Any, ...]:
+        """Little-endian values by `struct` layout."""
+        size = struct.calcsize("<" + layout)
+        self.need(size)
+        values = struct.unpack_from("<" + layout, self.data, self.at)
+        self.at += size
+        return values
+
+    def count(self, smallest: int) -> int:
+        """A 64 bit count of records that take at least `smallest` bytes each."""
+        number: int = self.take("Q")[0]
+        self.need(number * smallest)
+        return number
+
+    def skip(self, size: int) -> None:
+        self.need(size)
+        self.at += size
+
+    def name(self) -> str:
+        """A name that a zero byte ends."""
+        end = self.data.find(b"\0", self.at)
+        if end < 0:
+            self.need(len(self.data) + 1)
+        text = self.data[self.at:end].decode("utf-8")
+        self.at = end + 1
+        return text
+
+    def need(self, size: int) -> None:
+        if self.at + size > len(self.data):
+            raise CaptureError(f"{self.path} is truncated or damaged (it ends after {len(self.data)} bytes); "
+                               "copy or export it again.")
+
+
+def _cameras_bin(file: _Bytes) -> dict[int, Lens]:
+    lenses: dict[int, Lens] = {}
+    for _ in range(file.count(24)):
+        camera, number, width, height = file.take("iiQQ")
+        if number not in NAMES:
+            raise CaptureError(f"{file.path} has a camera of model {number}, which this program does not know.")
+        model = NAMES[number]
+        params = file.take("d" * len(MODELS[model][1]))
+        _add_lens(lenses, file.path, camera, Lens(model, params, width, height))
+    return lenses
+
+
+def _cameras_txt(path: Path, lines: list[str]) -> dict[int, Lens]:
+    lenses: dict[int, Lens] = {}
+    for number, line in _rows(lines):
+        words = line.split()
+        model = words[1] if len(words) > 1 else ""
+        if model not in MODELS:
+            raise CaptureError(f"{path}, line {number}: {model!r} is no camera model this program knows.")
+        camera, width, height, *params = _numbers(path, number, [words[0], *words[2:]], "iii")
+        if len(params) != len(MODELS[model][1]):
+            raise CaptureError(f"{path}, line {number}: {model} takes {len(MODELS[model][1])} parameters "
+                               f"({' '.join(MODELS[model][1])}), not {len(params)}.")
+        _add_lens(lenses, path, camera, Lens(model, tuple(params), width, height))
+    return lenses
+
+
+def _add_lens(lenses: dict[int, Lens], path: Path, camera: int, lens: Lens) -> None:
+    if camera in lenses:
+        raise CaptureError(f"{path} has two cameras with the number {camera}.")
+    lenses[camera] = check_lens(lens, f"{path}, camera {camera}:")
+
+
+Image = tuple[str, int, tuple[float, ...], tuple[float, ...]]  # name, camera, quaternion, translation
+
+
+def _images_bin(file: _Bytes) -> list[Image]:
+    images: list[Image] = []
+    for _ in range(file.count(73)):
+        values = file.take("idddddddi")
+        name = file.name()
+        file.skip(24 * file.count(24))  # the 2D points
+        images.append((name, values[8], values[1:5], values[5:8]))
+    return images
+
+
+def _images_txt(path: Path, lines: list[str]) -> list[Image]:
+    """Two lines an image; the second, of 2D points, may be empty and is not needed."""
+    images: list[Image] = []
+    rest = iter(enumerate(lines, 1))
+    for number, line in rest:
+        if not line.strip() or line.lstrip().startswith("#"):
+            continue
+        words = line.split(maxsplit=9)
+        if len(words) < 10:
+            raise CaptureError(f"{path}, line {number}: an image takes ten values (number, quaternion, "
+                               f"translation, camera, name), not {len(words)}.")
+        _, *pose, camera = _numbers(path, number, words[:9], "iqqqqtttc")
+        images.append((words[9].strip(), camera, tuple(pose[:4]), tuple(pose[4:])))
+        if next(rest, None) is None:
+            raise CaptureError(f"{path} is truncated: the line of 2D points after {words[9].strip()} is missing.")
+    return images
+
+
+def _points_bin(file: _Bytes) -> PointCloud:
+    number = file.count(51)
+    record = struct.Struct("<Q3d3BdQ")
+    values = np.empty((number, 4), np.float64)
+    rgb = np.empty((number, 3), np.uint8)
+    data, at = file.data, file.at
+    for i in range(number):
+        if at + record.size > len(data):
+            break
+        _, x, y, z, r, g, b, error, track = record.unpack_from(data, at)
+        values[i] = x, y, z, error
+        rgb[i] = r, g, b
+        at += record.size + 8 * track
+    else:
+        if at <= len(data):
+            return _cloud(file.path, values, rgb)
+    file.need(len(data) + 1)
+    raise AssertionError  # need() has raised
+
+
+def _points_txt(path: Path, lines: list[str]) -> PointCloud:
+    values, rgb = [], []
+    for number, line in _rows(lines):
+        words = line.split(maxsplit=8)
+        if len(words) < 8:
+            raise CaptureError(f"{path}, line {number}: a point takes at least eight values, not {len(words)}.")
+        _, x, y, z, *colour, error = _numbers(path, number, words[:8], "ixyziiie")
+        if not all(0 <= c <= 255 for c in colour):
+            raise CaptureError(f"{path}, line {number}: the colour {colour} is not within 0 to 255.")
+        values.append((x, y, z, error))
+        rgb.append(colour)
+    return _cloud(path, np.array(values, np.float64).reshape(-1, 4), np.array(rgb, np.uint8).reshape(-1, 3))
+
+
+def _cloud(path: Path, values: Floats, rgb: NDArray[np.uint8]) -> PointCloud:
+    if not np.isfinite(values[:, :3]).all() or (np.abs(values[:, :3]) > 1e30).any():
+        raise CaptureError(f"{path} has points that are not finite numbers; solve the cameras again.")
+    error = np.where(np.isfinite(values[:, 3]), np.maximum(values[:, 3], 0.0), 0.0)
+    return PointCloud(values[:, :3].astype(np.float32), rgb, error.astype(np.float32))
+
+
+def _rows(lines: list[str]) -> list[tuple[int, str]]:
+    return [(number, line) for number, line in enumerate(lines, 1)
+            if line.strip() and not line.lstrip().startswith("#")]
+
+
+def _numbers(path: Path, line: int, words: list[str], kinds: str) -> list[Any]:
+    """Words to numbers: integers where `kinds` says i or c, floats elsewhere and past its end."""
+    try:
+        return [int(word) if kinds[i:i + 1] in ("i", "c") else float(word) for i, word in enumerate(words)]
+    except ValueError as problem:
+        raise CaptureError(f"{path}, line {line}: {problem}; export the model again.") from problem

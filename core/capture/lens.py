@@ -1,0 +1,271 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Lens distortion, in every camera model of COLMAP, and the pinhole view that remains without it.
+
+A lens maps a direction, given as the pinhole coordinates (x, y) = (X/Z, Y/Z), to a pixel. Four families:
+
+    perspective   D(x, y)                             Brown-Conrady polynomials, FOV
+    fisheye       D(theta x/r, theta y/r)             r = |(x, y)|, theta = atan r; the same polynomials
+    one-parameter (x, y) 2 / (1 + sqrt(1 - 4 k r^2))  division model (Fitzgibbon 2001)
+    unified       (x, y) / (a sqrt(b r^2 + 1) + 1 - a)  EUCM (Khomutenko et al. 2016)
+
+followed by focal length and principal point. An equirectangular panorama has no principal point; the
+pinhole view taken from it looks straight ahead.
+"""
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..errors import CaptureError
+from .camera import Camera, Floats
+
+# COLMAP's number for each model, and its parameters in COLMAP's order.
+MODELS: dict[str, tuple[int, tuple[str, ...]]] = {
+    name: (number, tuple(parameters.split()))
+    for number, name, parameters in (
+        (0, "SIMPLE_PINHOLE", "f cx cy"),
+        (1, "PINHOLE", "fx fy cx cy"),
+        (2, "SIMPLE_RADIAL", "f cx cy k1"),
+        (3, "RADIAL", "f cx cy k1 k2"),
+        (4, "OPENCV", "fx fy cx cy k1 k2 p1 p2"),
+        (5, "OPENCV_FISHEYE", "fx fy cx cy k1 k2 k3 k4"),
+        (6, "FULL_OPENCV", "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6"),
+        (7, "FOV", "fx fy cx cy omega"),
+        (8, "SIMPLE_RADIAL_FISHEYE", "f cx cy k1"),
+        (9, "RADIAL_FISHEYE", "f cx cy k1 k2"),
+        (10, "THIN_PRISM_FISHEYE", "fx fy cx cy k1 k2 p1 p2 k3 k4 sx sy"),
+        (11, "RAD_TAN_THIN_PRISM_FISHEYE", "fx fy cx cy k1 k2 k3 k4 k5 k6 p1 p2 s1 s2 s3 s4"),
+        (12, "SIMPLE_DIVISION", "f cx cy k"),
+        (13, "DIVISION", "fx fy cx cy k"),
+        (14, "SIMPLE_FISHEYE", "f cx cy"),
+        (15, "FISHEYE", "fx fy cx cy"),
+        (16, "EUCM", "fx fy cx cy alpha beta"),
+        (17, "EQUIRECTANGULAR", "w h"),
+    )
+}
+NAMES = {number: name for name, (number, _) in MODELS.items()}
+PINHOLES = frozenset({"SIMPLE_PINHOLE", "PINHOLE"})
+
+WIDEST = math.tan(math.radians(60.0))  # half diagonal kept of a fisheye; past it a plane stretches too far
+
+Parameters = dict[str, float]
+
+
+@dataclass(frozen=True, eq=False)
+class Lens:
+    """A COLMAP camera model, its parameters in COLMAP's order, and the size in pixels they are for."""
+
+    model: str
+    params: tuple[float, ...]
+    width: int
+    height: int
+
+    @property
+    def named(self) -> Parameters:
+        """The parameters by name."""
+        return dict(zip(MODELS[self.model][1], self.params, strict=True))
+
+    @property
+    def focal(self) -> tuple[float, float]:
+        """(fx, fy) in pixels."""
+        named = self.named
+        if self.model == "EQUIRECTANGULAR":
+            return self.width / (2 * math.pi), self.height / math.pi
+        return named.get("fx", named.get("f", 0.0)), named.get("fy", named.get("f", 0.0))
+
+    @property
+    def centre(self) -> tuple[float, float]:
+        """(cx, cy), the principal point in pixels."""
+        named = self.named
+        return named.get("cx", self.width / 2), named.get("cy", self.height / 2)
+
+    def distort(self, plane: ArrayLike) -> Floats:
+        """Directions (n, 2) as X/Z and Y/Z to pixels (n, 2); NaN where the model has no image."""
+        x, y = np.asarray(plane, np.float64).reshape(-1, 2).T
+        with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+            bent = _EQUATIONS[self.model](x, y, self.named)
+        return np.stack(bent, axis=1) * self.focal + self.centre
+
+    def undistort(self, pixels: ArrayLike) -> Floats:
+        """Pixels (n, 2) to directions (n, 2) as X/Z and Y/Z: `distort` inverted by Newton's method.
+
+        NaN where no direction within 89 degrees of the axis leads to the pixel.
+        """
+        goal = np.asarray(pixels, np.float64).reshape(-1, 2)
+        plane = (goal - self.centre) / self.focal
+        if self.model in _FISHEYES or self.model == "EQUIRECTANGULAR":  # the radius is an angle here
+            angle = np.minimum(np.linalg.norm(plane, axis=1, keepdims=True), 1.5)
+            plane = plane * np.tan(angle) / np.maximum(angle, 1e-12)
+        for _ in range(40):
+            miss = self.distort(plane) - goal
+            reach = 1e-6 * np.maximum(np.linalg.norm(plane, axis=1, keepdims=True), 1.0)
+            slope_x = (self.distort(plane + reach * (1, 0)) - self.distort(plane - reach * (1, 0))) / (2 * reach)
+            slope_y = (self.distort(plane + reach * (0, 1)) - self.distort(plane - reach * (0, 1))) / (2 * reach)
+            area = slope_x[:, 0] * slope_y[:, 1] - slope_x[:, 1] * slope_y[:, 0]
+            with np.errstate(invalid="ignore", divide="ignore"):
+                step = np.stack([slope_y[:, 1] * miss[:, 0] - slope_y[:, 0] * miss[:, 1],
+                                 slope_x[:, 0] * miss[:, 1] - slope_x[:, 1] * miss[:, 0]], axis=1) / area[:, None]
+            # A step longer than the place itself would throw the search over a fold of the polynomial.
+            longest = 0.5 * (1.0 + np.linalg.norm(plane, axis=1, keepdims=True))
+            length = np.linalg.norm(step, axis=1, keepdims=True)
+            step *= np.minimum(1.0, longest / np.maximum(length, 1e-30))
+            plane = plane - step
+            if not (np.abs(miss) > 1e-9).any():
+                break
+        bad = ~(np.linalg.norm(self.distort(plane) - goal, axis=1) < 1e-4) | (np.linalg.norm(plane, axis=1) > 57)
+        plane[bad] = np.nan
+        return plane
+
+    @cached_property
+    def pinhole(self) -> tuple[float, float, float, float]:
+        """(fx, fy, cx, cy) of the undistorted view: same size and principal point, and the widest view in
+        which every pixel comes from inside the frame, up to 60 degrees off the axis in the corners.
+
+        Raises CaptureError where the parameters bend the picture so that no such view exists.
+        """
+        (fx, fy), (cx, cy) = self.focal, self.centre
+        if self.model in PINHOLES:
+            return fx, fy, cx, cy
+        border = self._border() - (cx, cy)
+        zoom_cap = float(np.linalg.norm(border / (fx, fy), axis=1).max()) / WIDEST
+        widest, narrowest = max(zoom_cap, 0.05), 20.0
+        if not (fx > 0 and fy > 0) or not self._filled(border / (fx, fy) / narrowest):
+            raise CaptureError(f"The lens parameters {self.params} ({self.model}) bend the picture until "
+                               "nothing is left of it; solve the cameras again with a simpler model.")
+        if self._filled(border / (fx, fy) / widest):
+            zoom = widest
+        elif self._filled(border / (fx, fy)) and not self._filled(border / (fx, fy) / 0.9999):
+            zoom = 1.0
+        else:
+            low, high = widest, narrowest
+            while high / low > 1 + 1e-7:
+                middle = math.sqrt(low * high)
+                low, high = (low, middle) if self._filled(border / (fx, fy) / middle) else (middle, high)
+            zoom = high
+        return fx * zoom, fy * zoom, cx, cy
+
+    def maps(self, camera: Camera) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """For `cv2.remap`: where in the distorted frame each pixel of `camera`'s view comes from.
+
+        `camera` may be of another size than the lens; the distorted frame is then of that size too.
+        """
+        u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+        plane = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy], axis=-1)
+        source = self.distort(plane) * (camera.width / self.width, camera.height / self.height) - 0.5
+        source = source.reshape(camera.height, camera.width, 2).astype(np.float32)
+        return np.ascontiguousarray(source[..., 0]), np.ascontiguousarray(source[..., 1])
+
+    def _border(self) -> Floats:
+        """Points (n, 2) along the edge of the frame."""
+        t = np.linspace(0.0, 1.0, 33)
+        x, y, zero, one = t * self.width, t * self.height, np.zeros(33), np.ones(33)
+        return np.concatenate([np.stack(side, axis=1) for side in (
+            (x, zero), (x, one * self.height), (zero, y), (one * self.width, y))])
+
+    def _filled(self, border: Floats) -> bool:
+        """Whether a view with this border (n, 2), as X/Z and Y/Z, comes from inside the frame everywhere.
+
+        The distance from the centre must grow along the way to the border: a polynomial that folds back
+        shows the frame a second time, mirrored.
+        """
+        steps = np.linspace(0.0, 1.0, 17)[1:, None, None]
+        pixels = self.distort((steps * border).reshape(-1, 2)).reshape(16, -1, 2)
+        reach = np.linalg.norm(pixels - self.distort(np.zeros((1, 2))), axis=2)
+        inside = (pixels[-1] >= -1e-6) & (pixels[-1] <= np.array([self.width, self.height]) + 1e-6)
+        away = reach[-1] > 1e-9  # a border point on the principal point itself is not further out
+        return bool(inside.all() and (np.diff(reach, axis=0) > 0)[:, away].all())
+
+
+def _brown(x: Floats, y: Floats, p: Parameters, above: str, below: str = "") -> tuple[Floats, Floats]:
+    """Radial polynomial (k's of `above` over those of `below`), tangential p1 p2, thin prism sx sy."""
+    r2 = x * x + y * y
+    radial = _series(r2, [p.get(name, 0.0) for name in above.split()])
+    if below:
+        radial = radial / _series(r2, [p.get(name, 0.0) for name in below.split()])
+    p1, p2, sx, sy = (p.get(name, 0.0) for name in ("p1", "p2", "sx", "sy"))
+    return (x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x) + sx * r2,
+            y * radial + 2 * p2 * x * y + p1 * (r2 + 2 * y * y) + sy * r2)
+
+
+def _series(r2: Floats, coefficients: list[float]) -> Floats:
+    """1 + c1 r^2 + c2 r^4 + ..."""
+    total = np.zeros_like(r2)
+    for coefficient in reversed(coefficients):
+        total = (total + coefficient) * r2
+    return 1.0 + total
+
+
+def _pinhole(x: Floats, y: Floats, _p: Parameters) -> tuple[Floats, Floats]:
+    return x, y
+
+
+def _perspective(x: Floats, y: Floats, p: Parameters) -> tuple[Floats, Floats]:
+    return _brown(x, y, p, "k1 k2 k3", "k4 k5 k6")
+
+
+def _equidistant(x: Floats, y: Floats) -> tuple[Floats, Floats]:
+    """Directions to the plane on which the distance from the centre is the angle."""
+    r = np.sqrt(x * x + y * y)
+    ratio = np.where(r > 1e-8, np.arctan(r) / np.maximum(r, 1e-8), 1.0)
+    return x * ratio, y * ratio
+
+
+def _fisheye(x: Floats, y: Floats, p: Parameters) -> tuple[Floats, Floats]:
+    return _brown(*_equidistant(x, y), p, "k1 k2 k3 k4")
+
+
+def _project_aria(x: Floats, y: Floats, p: Parameters) -> tuple[Floats, Floats]:
+    """Radial terms first, then tangential and prism terms of the result ("FISHEYE624" of Project Aria)."""
+    x, y = _equidistant(x, y)
+    radial = _series(x * x + y * y, [p[f"k{i}"] for i in range(1, 7)])
+    x, y = x * radial, y * radial
+    r2 = x * x + y * y
+    return (x + 2 * p["p2"] * x * y + p["p1"] * (r2 + 2 * x * x) + p["s1"] * r2 + p["s2"] * r2 * r2,
+            y + 2 * p["p1"] * x * y + p["p2"] * (r2 + 2 * y * y) + p["s3"] * r2 + p["s4"] * r2 * r2)
+
+
+def _fov(x: Floats, y: Floats, p: Parameters) -> tuple[Floats, Floats]:
+    """Devernay and Faugeras 2001: r_d = atan(2 r tan(omega / 2)) / omega."""
+    omega, r = p["omega"], np.sqrt(x * x + y * y)
+    if abs(omega) < 1e-6:
+        return x, y
+    spread = 2 * math.tan(omega / 2)
+    ratio = np.where(r > 1e-8, np.arctan(r * spread) / (np.maximum(r, 1e-8) * omega), spread / omega)
+    return x * ratio, y * ratio
+
+
+def _division(x: Floats, y: Floats, p: Parameters) -> tuple[Floats, Floats]:
+    """Fitzgibbon 2001: r = r_d / (1 + k r_d^2), solved for r_d."""
+    ratio = 2.0 / (1.0 + np.sqrt(1.0 - 4.0 * p["k"] * (x * x + y * y)))
+    return x * ratio, y * ratio
+
+
+def _eucm(x: Floats, y: Floats, p: Parameters) -> tuple[Floats, Floats]:
+    rho = np.sqrt(p["beta"] * (x * x + y * y) + 1.0)
+    below = p["alpha"] * rho + 1.0 - p["alpha"]
+    below = np.where(below > 0, below, np.nan)
+    return x / below, y / below
+
+
+def _equirectangular(x: Floats, y: Floats, _p: Parameters) -> tuple[Floats, Floats]:
+    return np.arctan(x), np.arctan(y / np.sqrt(1.0 + x * x))
+
+
+_FISHEYES = frozenset({"OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE",
+                       "RAD_TAN_THIN_PRISM_FISHEYE", "SIMPLE_FISHEYE", "FISHEYE"})
+_EQUATIONS: dict[str, Callable[[Floats, Floats, Parameters], tuple[Floats, Floats]]] = {
+    **dict.fromkeys(MODELS, _perspective),
+    **dict.fromkeys(_FISHEYES, _fisheye),
+    **dict.fromkeys(PINHOLES, _pinhole),
+    "RAD_TAN_THIN_PRISM_FISHEYE": _project_aria,
+    "FOV": _fov,
+    "SIMPLE_DIVISION": _division,
+    "DIVISION": _division,
+    "EUCM": _eucm,
+    "EQUIRECTANGULAR": _equirectangular,
+}

@@ -1,0 +1,147 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""nerfstudio's and instant-ngp's `transforms.json`.
+
+Poses are camera to world with OpenGL axes (x right, y up, z backward). The file's `applied_transform`
+says what was done to poses and to the point cloud of `ply_file_path` when they were written, so the world
+of the file is the world of the capture; points from a COLMAP model beside it still need it.
+"""
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import CaptureError
+from ..files import inside, read_json
+from ..pictures import SUFFIXES, picture_size
+from .camera import Floats
+from .colmap import PointCloud, Posed, check_lens, find_model, read_model
+from .lens import Lens
+from .ply import read_points
+
+FILE = "transforms.json"
+
+
+def read_transforms(folder: Path) -> tuple[list[Posed], PointCloud]:
+    """Poses and points of a capture; the names are paths below `folder`.
+
+    Raises CaptureError, naming the file and the frame, where something is missing or makes no sense.
+    """
+    path = folder / FILE
+    meta = read_json(path, CaptureError)
+    frames = meta.get("frames") if isinstance(meta, dict) else None
+    if not isinstance(frames, list) or not frames:
+        raise CaptureError(f"{path} holds no frames.")
+    posed: list[Posed] = []
+    lenses: dict[tuple[object, ...], Lens] = {}  # one object for frames of one lens: its maps are shared
+    for number, frame in enumerate(frames):
+        name = frame.get("file_path") if isinstance(frame, dict) else None
+        if not isinstance(name, str):
+            raise CaptureError(f"{path}, frame {number}: file_path is missing.")
+        where = f"{path}, {name}:"
+        name = _with_suffix(folder, name)
+        lens = _lens({**meta, **frame}, folder, name, where)
+        lens = lenses.setdefault((lens.model, lens.params, lens.width, lens.height), lens)
+        posed.append(Posed(name, lens, _pose(frame, where)))
+    return posed, _points(folder, meta)
+
+
+def _with_suffix(folder: Path, name: str) -> str:
+    """The path of a frame below the folder; NeRF's synthetic scenes leave its suffix out."""
+    name = Path(name.replace("\\", "/")).as_posix()  # drops a leading "./"
+    path = inside(folder, name, CaptureError)
+    if path.suffix.lower() not in SUFFIXES:
+        for suffix in sorted(SUFFIXES):
+            if path.with_name(path.name + suffix).is_file():
+                return name + suffix
+    return name
+
+
+def _number(meta: dict[str, Any], key: str, where: str, default: float | None = None) -> float:
+    value = meta.get(key, default)
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e12:
+        raise CaptureError(f"{where} {key} should be a finite number, not {value!r}.")
+    return float(value)
+
+
+def _lens(meta: dict[str, Any], folder: Path, name: str, where: str) -> Lens:
+    if "w" in meta or "h" in meta:
+        width, height = int(_number(meta, "w", where)), int(_number(meta, "h", where))
+    else:
+        width, height = picture_size(inside(folder, name, CaptureError))
+    if "fl_x" in meta:
+        fx = _number(meta, "fl_x", where)
+    else:
+        fx = _focal(_number(meta, "camera_angle_x", where), width, where)
+    if "fl_y" in meta:
+        fy = _number(meta, "fl_y", where)
+    else:
+        fy = _focal(_number(meta, "camera_angle_y", where), height, where) if "camera_angle_y" in meta else fx
+    cx, cy = _number(meta, "cx", where, width / 2), _number(meta, "cy", where, height / 2)
+    k1, k2, k3, k4, p1, p2 = (_number(meta, key, where, 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
+    kind = meta.get("camera_model", "OPENCV")
+    if kind in ("OPENCV_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE") or meta.get("is_fisheye"):
+        # The fisheye polynomial with every coefficient.
+        lens = Lens("THIN_PRISM_FISHEYE", (fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, 0.0, 0.0), width, height)
+    elif kind in ("OPENCV", "FULL_OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE"):
+        if k4:
+            raise CaptureError(f"{where} k4 of a {kind} camera has no agreed meaning; undistort the frames.")
+        if any((k1, k2, k3, p1, p2)):
+            lens = Lens("FULL_OPENCV", (fx, fy, cx, cy, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0), width, height)
+        else:
+            lens = Lens("PINHOLE", (fx, fy, cx, cy), width, height)
+    else:
+        raise CaptureError(f"{where} the camera model {kind!r} is not one this program reads; use OPENCV, "
+                           "OPENCV_FISHEYE or PINHOLE, or a COLMAP model.")
+    return check_lens(lens, where)
+
+
+def _focal(angle: float, size: int, where: str) -> float:
+    if not 0 < angle < math.pi:
+        raise CaptureError(f"{where} a field of view of {angle:g} radians makes no sense.")
+    return 0.5 * size / math.tan(0.5 * angle)
+
+
+def _matrix(value: Any, where: str, what: str) -> Floats:
+    """(4, 4) from nested lists of 3 or 4 rows of 4 finite numbers."""
+    try:
+        matrix = np.asarray(value, np.float64)
+    except (TypeError, ValueError):
+        matrix = np.zeros(0)
+    if matrix.shape not in ((3, 4), (4, 4)) or not np.isfinite(matrix).all():
+        raise CaptureError(f"{where} {what} should be 4 rows of 4 finite numbers.")
+    full = np.eye(4)
+    full[:len(matrix)] = matrix
+    return full
+
+
+def _pose(frame: dict[str, Any], where: str) -> Floats:
+    """world_to_camera with OpenCV axes, of camera_to_world with OpenGL axes."""
+    pose = _matrix(frame.get("transform_matrix"), where, "transform_matrix")
+    rotation = pose[:3, :3]
+    if not np.allclose(rotation.T @ rotation, np.eye(3), atol=2e-3) or np.linalg.det(rotation) < 0:
+        raise CaptureError(f"{where} transform_matrix is not a rotation and a translation.")
+    left, _, right = np.linalg.svd(rotation)  # the nearest rotation: files round their numbers
+    rotation = left @ right @ np.diag([1.0, -1.0, -1.0])
+    inverse = np.eye(4)
+    inverse[:3, :3] = rotation.T
+    inverse[:3, 3] = -rotation.T @ pose[:3, 3]
+    return inverse
+
+
+def _points(folder: Path, meta: dict[str, Any]) -> PointCloud:
+    name = meta.get("ply_file_path")
+    if isinstance(name, str):
+        path = inside(folder, Path(name).as_posix(), CaptureError)
+        if not path.is_file():
+            raise CaptureError(f"{path} is missing, which {folder / FILE} names as its points.")
+        return read_points(path)
+    model = find_model(folder, ("colmap/sparse/0",))
+    if model is None:
+        return PointCloud.empty()
+    _, points = read_model(model)
+    applied = _matrix(meta.get("applied_transform", np.eye(4).tolist()), f"{folder / FILE}:", "applied_transform")
+    moved = points.xyz.astype(np.float64) @ applied[:3, :3].T + applied[:3, 3]
+    return PointCloud(moved.astype(np.float32), points.rgb, points.error)

@@ -95,14 +95,13 @@ def clip_through(values: Tensor) -> Tensor:
 class Layers(NamedTuple):
     """Scene-linear layers of a view, (height, width, 3) each; scene + flare = composite.
 
-    flares: by light, they sum to `flare`. alpha (height, width): what the flare hides, 0 for `add`.
+    flares: by light; they sum to `flare`.
     """
 
     composite: Tensor
     scene: Tensor
     flare: Tensor
     flares: dict[str, Tensor]
-    alpha: Tensor
 
 
 def layers(scene: Tensor, flares: Mapping[str, Splats], blend: Blend) -> Layers:
@@ -113,18 +112,15 @@ def layers(scene: Tensor, flares: Mapping[str, Splats], blend: Blend) -> Layers:
     """
     display = scene.clamp(0, 1)
     scene_linear = decode(display)
-    alpha = torch.zeros_like(scene[..., 0])
     parts: dict[str, Tensor] = {}
     if blend == "add":
         parts = {name: splats.colour for name, splats in flares.items()}
         total = sum(parts.values(), torch.zeros_like(scene_linear))
-        return Layers(scene_linear + total, scene_linear, total, parts, alpha)
+        return Layers(scene_linear + total, scene_linear, total, parts)
     below, picture = scene_linear, display
-    transmittance = torch.ones_like(alpha)
     for name, splats in reversed(list(flares.items())):  # the first light lies in front
         picture = splats.colour + splats.transmittance[..., None] * picture
         above = decode(picture.clamp_min(0))
         parts[name] = above - below
-        below, transmittance = above, transmittance * splats.transmittance
-    ordered = {name: parts[name] for name in flares}
-    return Layers(below, scene_linear, below - scene_linear, ordered, 1 - transmittance)
+        below = above
+    return Layers(below, scene_linear, below - scene_linear, {name: parts[name] for name in flares})

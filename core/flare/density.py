@@ -2,19 +2,13 @@
 """Cloning and pruning of flare Gaussians (paper, appendix "Flare representation")."""
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol
 
 import torch
-from torch import Tensor
 
+from ..gaussians.optimiser import Adam
 from .model import LightFlare
-
-
-class RowOptimiser(Protocol):
-    """What an optimiser must offer so that Gaussians can come and go."""
-
-    def reindex(self, parameter: Tensor, index: Tensor, fresh: Tensor) -> Tensor: ...
 
 
 @dataclass(frozen=True)
@@ -39,19 +33,19 @@ class DensitySettings:
         return self.start <= iteration <= self.stop and iteration % self.every == 0
 
 
-def clone_and_prune(flare: LightFlare, optimiser: RowOptimiser, settings: DensitySettings,
+def clone_and_prune(flare: LightFlare, optimiser: Adam, names: Mapping[str, str], settings: DensitySettings,
                     generator: torch.Generator) -> None:
-    """Clone and prune one light's canonical Gaussians in place, with their optimiser state."""
+    """Clone and prune one light's canonical Gaussians in place, with their moments.
+
+    `names`: what the optimiser calls each of `flare.gaussians`.
+    """
     opacity = flare.gaussians["opacity_logits"].detach().sigmoid()[:, 0]
     kept = (opacity >= settings.prune_below).nonzero()[:, 0]
     drawn = torch.rand(len(opacity), generator=generator) < settings.clone_ratio
     cloned = (drawn & (opacity > settings.clone_above)).nonzero()[:, 0]
     cloned = cloned[: max(settings.most - len(kept), 0)]
-    index = torch.cat([kept, cloned])
-    fresh = torch.arange(len(index)) >= len(kept)
-    noise = settings.noise * torch.randn((len(cloned), flare.gaussians["positions"].shape[1]), generator=generator)
-    for name, parameter in flare.gaussians.items():
-        rows = optimiser.reindex(parameter, index, fresh)
-        if name == "positions":
-            rows.data[fresh] += noise
-        flare.gaussians[name] = rows
+    clones = {names[name]: rows.detach()[cloned] for name, rows in flare.gaussians.items()}
+    place = clones[names["positions"]]
+    place += settings.noise * torch.randn(place.shape, generator=generator)
+    optimiser.keep(kept, names.values())
+    optimiser.append(clones)

@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""A fit from beginning to end, in a run folder that any stop leaves whole."""
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+
+import torch
+
+from ..capture import Capture
+from ..errors import Cancelled, RunError
+from ..files import atomic_path
+from ..flare import file as flare_file
+from ..flare.file import FlareFile, TrainingCamera
+from ..gaussians.ply import write_ply
+from ..progress import Progress
+from . import checkpoint
+from .preview import row, spread, write_preview
+from .rendering import render
+from .run import CHECKPOINT, FLARE, LOG, METRICS, PREVIEW, SCENE, Run
+from .settings import FitSettings
+from .trainer import Trainer
+
+FIGURES_EVERY = 50
+PREVIEW_ROWS = 4
+
+
+def fit(capture: Capture, settings: FitSettings, folder: Path | str, progress: Progress | None = None, *,
+        resume: bool = False) -> Run:
+    """Fit scene and flare of a capture; the run's folder holds everything that comes of it.
+
+    With `resume` an unfinished run in `folder` goes on from its checkpoint, with the settings it was begun
+    with, and gives the fit that an unbroken one gives; without a run there, one is begun.
+
+    Raises CaptureError, RunError, SettingsError, and Cancelled when asked to stop (after a checkpoint).
+    """
+    progress, folder = progress or Progress(), Path(folder)
+    continued = resume and (folder / "config.toml").exists()
+    if continued:
+        run = Run.open(folder)
+        if run.finished:
+            progress.say(f"The fit in {folder} is finished already.")
+            return run
+        trainer = Trainer(capture, run.settings)
+    else:
+        trainer = Trainer(capture, settings)  # before anything is written: it may refuse the capture
+        run = Run.create(folder, settings, capture.folder)
+    path = folder / CHECKPOINT
+    if continued and path.exists():
+        trainer.load_state(checkpoint.load(path))
+    _forget_after(folder / METRICS, trainer.iteration)
+    _log(run, f"begun at iteration {trainer.iteration} of {run.settings.iterations}")
+    progress.stage("fit", run.settings.iterations, trainer.iteration)
+    try:
+        _train(trainer, run, progress)
+    except Cancelled:
+        checkpoint.save(path, trainer.state())
+        _log(run, f"stopped at iteration {trainer.iteration}")
+        raise
+    _finish(trainer, run)
+    _log(run, f"finished at iteration {trainer.iteration}")
+    return run
+
+
+def _train(trainer: Trainer, run: Run, progress: Progress) -> None:
+    settings, path = run.settings, run.folder / CHECKPOINT
+    saved, began, first = time.monotonic(), time.monotonic(), trainer.iteration
+    while trainer.iteration < settings.iterations:
+        figures = trainer.step()
+        here = trainer.iteration
+        if here % FIGURES_EVERY == 0 or here == settings.iterations:
+            counts = {"scene_gaussians": len(trainer.scene.means),
+                      "flare_gaussians": trainer.flare.count if trainer.flare else 0}
+            pace = (time.monotonic() - began) / (here - first)
+            line = {"iteration": here, **figures, **counts, "seconds_per_iteration": round(pace, 5)}
+            with open(run.folder / METRICS, "a", encoding="utf-8") as stream:
+                stream.write(json.dumps(line) + "\n")
+            figures = {**figures, **counts}
+        if here % settings.preview_every == 0:
+            _preview(trainer, run)
+        # Saved before the progress speaks, since that is where a stop is noticed.
+        if time.monotonic() - saved > settings.checkpoint_every_s:
+            checkpoint.save(path, trainer.state())
+            saved = time.monotonic()
+        progress.advance(1, **figures)
+
+
+def _finish(trainer: Trainer, run: Run) -> None:
+    """Results first, then the checkpoint goes: a kill in between repeats the last steps, and loses nothing."""
+    _preview(trainer, run)
+    write_ply(run.folder / SCENE, trainer.scene)
+    if trainer.flare is not None:
+        camera = trainer.views[0].camera
+        lens = TrainingCamera(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
+        flare_file.save(run.folder / FLARE, FlareFile(trainer.flare, run.settings.blend, lens))
+    (run.folder / CHECKPOINT).unlink(missing_ok=True)
+
+
+@torch.no_grad()
+def _preview(trainer: Trainer, run: Run) -> None:
+    """Some of the held-out views, or of all where none is held out."""
+    _, held_out = trainer.capture.split(run.settings.holdout)
+    views = held_out or trainer.views
+    rows = []
+    for index in spread(len(views), PREVIEW_ROWS):
+        camera = trainer.frames.camera(views[index])
+        view = render(trainer.scene, trainer.flare, run.settings.blend, camera, run.settings.kernels)
+        rows.append(row(trainer.frames.frame(views[index]), view))
+    write_preview(run.folder / PREVIEW, rows)
+
+
+def _forget_after(path: Path, iteration: int) -> None:
+    """Drop the lines of figures that a resumed fit will make again."""
+    if not path.exists():
+        return
+    kept = []
+    for line in path.read_text(encoding="utf-8").splitlines():
+        try:
+            if json.loads(line)["iteration"] <= iteration:
+                kept.append(line + "\n")
+        except (ValueError, KeyError, TypeError):
+            continue  # the line that a kill cut short
+    with atomic_path(path) as temporary:
+        temporary.write_text("".join(kept), encoding="utf-8", newline="\n")
+
+
+def _log(run: Run, text: str) -> None:
+    stamp = time.strftime("%Y-%m-%d %H:%M:%S")
+    try:
+        with open(run.folder / LOG, "a", encoding="utf-8") as stream:
+            stream.write(f"{stamp}  {text}\n")
+    except OSError as problem:
+        raise RunError(f"{run.folder / LOG} cannot be written ({problem.strerror}); make room or choose another "
+                       "folder.") from problem

@@ -1,0 +1,59 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""One view of a fitted model: the scene, each light's flare, and both together."""
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ..capture import Camera
+from ..flare.compositing import Blend, Layers, encode, joined, layers, splat_flare
+from ..flare.model import FlareModel
+from ..gaussians import Rendering, Splats
+from ..gaussians.rasterizer import Kernels, Resolution
+from ..gaussians.scene import SceneGaussians
+
+
+class RenderedView(NamedTuple):
+    """scene: its rendering in display space; flares: each light's splats, in the lights' order.
+
+    composite: (height, width, 3) display values in 0..1; layers: the same in linear light, taken apart.
+    """
+
+    scene: Rendering
+    flares: dict[str, Splats]
+    composite: Tensor
+    layers: Layers
+
+
+def pose_and_intrinsics(camera: Camera) -> tuple[Tensor, Tensor]:
+    """world_to_camera (4, 4) float64 and intrinsics (3, 3) float32 of a camera."""
+    return torch.from_numpy(camera.world_to_camera).double(), torch.from_numpy(camera.intrinsics).float()
+
+
+def render_flare(flare: FlareModel | None, blend: Blend, camera: Camera, kernels: Kernels = "auto",
+                 resolution: Resolution = "full") -> Splats | None:
+    """All lights' flares as one set of splats; None where there is no light in front of the camera."""
+    if flare is None:
+        return None
+    pose, intrinsics = pose_and_intrinsics(camera)
+    gaussians = joined(flare(pose))
+    if gaussians is None:
+        return None
+    return splat_flare(gaussians, intrinsics, camera.width, camera.height, blend,
+                       kernels=kernels, resolution=resolution)
+
+
+@torch.no_grad()
+def render(scene: SceneGaussians, flare: FlareModel | None, blend: Blend, camera: Camera,
+           kernels: Kernels = "auto") -> RenderedView:
+    """Everything a view has to give, without gradients."""
+    rendering = scene.render(camera, kernels=kernels)
+    flares: dict[str, Splats] = {}
+    if flare is not None:
+        pose, intrinsics = pose_and_intrinsics(camera)
+        flares = {name: splat_flare(gaussians, intrinsics, camera.width, camera.height, blend, kernels=kernels)
+                  for name, gaussians in flare(pose).items()}
+    parts = layers(rendering.colour.clamp(0, 1), flares, blend)
+    return RenderedView(rendering, flares, encode(parts.composite.clamp_min(0)).clamp(0, 1), parts)

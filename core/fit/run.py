@@ -1,0 +1,133 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The folder of a run: where a fit keeps its settings, state and results.
+
+    config.toml   every setting, resolved
+    capture.txt   the capture's folder
+    flare.flare   the flare            scene.ply   the scene, standard 3DGS
+    checkpoint/   state.safetensors    what a resumed fit needs
+    metrics.jsonl one line of figures now and then; preview.png; eval.json; log.txt
+"""
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..capture import Camera
+from ..errors import RunError
+from ..files import write_text
+from ..flare import file as flare_file
+from ..flare.file import FlareFile
+from ..gaussians.ply import read_ply
+from ..gaussians.scene import SceneGaussians
+from .rendering import RenderedView, render
+from .settings import FitSettings, read_config, write_config
+
+CONFIG = "config.toml"
+CAPTURE = "capture.txt"
+FLARE = "flare.flare"
+SCENE = "scene.ply"
+CHECKPOINT = "checkpoint/state.safetensors"
+METRICS = "metrics.jsonl"
+PREVIEW = "preview.png"
+EVALUATION = "eval.json"
+LOG = "log.txt"
+
+Pixels = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class ViewLayers:
+    """Scene-linear layers of a view, numpy: scene (h, w, 3), each light's flare (h, w, 3), depth (h, w).
+
+    The flares sum to composite - scene. Depth is along the camera's axis, world units, 0 where nothing is.
+    """
+
+    scene: Pixels
+    flare_by_light: Mapping[str, Pixels]
+    depth: Pixels
+
+
+class Run:
+    """A run folder that a fit has made or is making; made by `Run.create` or `Run.open`."""
+
+    def __init__(self, folder: Path, settings: FitSettings, capture_folder: Path) -> None:
+        self.folder = folder
+        self.settings = settings
+        self.capture_folder = capture_folder
+
+    @classmethod
+    def create(cls, folder: Path | str, settings: FitSettings, capture_folder: Path) -> Run:
+        """A new run folder, with its settings written. RunError where the folder holds a run already."""
+        folder = Path(folder)
+        if (folder / CONFIG).exists():
+            raise RunError(f"{folder} holds a run already; go on with it by --resume, or choose another folder.")
+        run = cls(folder, settings, capture_folder.resolve())
+        write_text(folder / CAPTURE, f"{run.capture_folder}\n")
+        write_config(folder / CONFIG, settings)
+        return run
+
+    @classmethod
+    def open(cls, folder: Path | str) -> Run:
+        """A run folder as it is. RunError where it is none."""
+        folder = Path(folder)
+        if not (folder / CONFIG).is_file():
+            raise RunError(f"{folder} is not the folder of a run (it has no {CONFIG}).")
+        settings = read_config(folder / CONFIG)
+        try:
+            capture = Path((folder / CAPTURE).read_text(encoding="utf-8").strip())
+        except OSError as problem:
+            raise RunError(f"{folder / CAPTURE} cannot be read ({problem.strerror}); start the fit anew.") from problem
+        return cls(folder, settings, capture)
+
+    @property
+    def finished(self) -> bool:
+        """Whether the fit ran to its end: the flare is written last."""
+        return (self.folder / FLARE).is_file() or (self.settings.mode == "3dgs" and (self.folder / SCENE).is_file())
+
+    @cached_property
+    def flare(self) -> FlareFile | None:
+        """The fitted flare; None for plain 3DGS."""
+        return None if self.settings.mode == "3dgs" else flare_file.load(self._needed(FLARE))
+
+    @cached_property
+    def scene(self) -> SceneGaussians:
+        """The fitted scene."""
+        return read_ply(self._needed(SCENE))
+
+    @property
+    def lights(self) -> tuple[str, ...]:
+        """Names of the lights, in their order."""
+        return self.flare.model.names if self.flare else ()
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """Changes whenever a picture of this run would."""
+        digest = hashlib.sha256()
+        for name in (SCENE, FLARE):
+            if (self.folder / name).is_file():
+                digest.update((self.folder / name).read_bytes())
+        return digest.hexdigest()[:16]
+
+    def view(self, camera: Camera) -> RenderedView:
+        """Scene, flares and composite as tensors."""
+        model = self.flare.model if self.flare else None
+        return render(self.scene, model, self.settings.blend, camera, self.settings.kernels)
+
+    def render(self, camera: Camera) -> ViewLayers:
+        """The layers of a view at the camera's size."""
+        view = self.view(camera)
+        flares = {name: layer.numpy() for name, layer in view.layers.flares.items()}
+        dark = np.zeros_like(view.layers.scene.numpy())
+        return ViewLayers(view.layers.scene.numpy(), {name: flares.get(name, dark) for name in self.lights},
+                          view.scene.depth.numpy())
+
+    def _needed(self, name: str) -> Path:
+        if not (self.folder / name).is_file():
+            raise RunError(f"{self.folder} has no {name} yet; finish the fit with --resume first.")
+        return self.folder / name

@@ -1,0 +1,233 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The joint optimisation of scene and flare (paper, section "Reconstruction", eq. 5).
+
+    L = lambda |I_s - I_o| + (1 - lambda)(1 - SSIM(I_s, I_o))          the scene against the flare-free frame
+      + lambda |I - I_input| + (1 - lambda)(1 - SSIM(I, I_input))      both together against the frame
+
+Every flare Gaussian lies in front of every scene Gaussian, so the scene is rasterised once for both.
+All randomness is a function of (seed, iteration): a resumed fit goes on as if it had never stopped.
+"""
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.nn import Parameter
+
+from ..capture import Capture, View
+from ..errors import CaptureError, RunError
+from ..flare.compositing import composite
+from ..flare.deformation import QueryRange
+from ..flare.density import clone_and_prune
+from ..flare.model import FlareModel, LightFlare, ViewOfLight
+from ..gaussians.loss import l1_ssim
+from ..gaussians.optimiser import Adam
+from ..gaussians.scene import SceneGaussians
+from .checkpoint import State
+from .frames import Frames, Targets
+from .rendering import render_flare
+from .settings import FitSettings
+
+TABLE = "table.weight"
+
+
+class Trainer:
+    """Scene and flare of a capture under optimisation: `step` by `step`, with `state` and `load_state`.
+
+    Raises CaptureError where the capture lacks what the mode needs.
+    """
+
+    def __init__(self, capture: Capture, settings: FitSettings) -> None:
+        torch.manual_seed(settings.seed)
+        self.settings = settings
+        self.capture = capture
+        self.frames = Frames(capture, settings.width)
+        self.views, _ = capture.split(settings.holdout)
+        self.iteration = 0
+        if settings.mode in ("default", "2d") and not self.frames.reference:
+            raise CaptureError(f"{capture.folder} has no flare-free frames (removed/); run remove on it first, "
+                               "or fit with --mode unsup.")
+        if not len(capture.points):
+            raise CaptureError(f"{capture.folder} has no 3D points to start from; solve it again.")
+        self.scene = SceneGaussians.from_points(capture.points)
+        self.flare = None if settings.mode == "3dgs" else _new_flare(capture, self.views, settings)
+        self.extent = capture.extent
+        self.scene_adam = Adam(dict(self.scene.named_parameters()), self._scene_rates())
+        self.density = scene_density(self.scene, self.scene_adam, settings, self.extent)
+        self.flare_adam, self.grid_adam = _flare_optimisers(self.flare, settings)
+
+    # ---- one iteration ----------------------------------------------------------------------------
+
+    def step(self) -> dict[str, float]:
+        """One iteration on the next view; the loss and its parts."""
+        self.iteration += 1
+        settings = self.settings
+        targets = self.frames.targets(self._view())
+        self._set_rates()
+        scene = self.scene.render(targets.camera, sh_degree=self._sh_degree(), kernels=settings.kernels)
+        flare = render_flare(self.flare, settings.blend, targets.camera, settings.kernels)
+        picture = composite(scene.colour, flare, settings.blend)
+        weight = 1 - settings.ssim_share
+        loss = l1_ssim(picture, targets.frame, weight)
+        figures = {"loss": float(loss)}
+        clean = self._scene_target(targets, picture, scene.colour)
+        if clean is not None:
+            scene_loss = l1_ssim(scene.colour, clean, weight)
+            figures["scene_loss"] = float(scene_loss)
+            loss = loss + scene_loss
+        if not math.isfinite(float(loss)):
+            raise RunError(f"The fit diverged at iteration {self.iteration} (the loss is {float(loss)}); "
+                           "resume it with lower learning rates.")
+        loss.backward()
+        with torch.no_grad():
+            self.density.after_backward(self.iteration, scene)
+            for optimiser in (self.scene_adam, self.flare_adam, self.grid_adam):
+                if optimiser is not None:
+                    optimiser.step()
+                    optimiser.zero_grad()
+            self.density.after_step(self.iteration)
+            self._change_flare_density()
+        return figures
+
+    def _view(self) -> View:
+        """Every view once in an order of its own for each round, a function of seed and iteration."""
+        done = self.iteration - 1
+        order = torch.randperm(len(self.views), generator=self._generator(done // len(self.views), 1))
+        return self.views[int(order[done % len(self.views)])]
+
+    def _scene_target(self, targets: Targets, picture: Tensor, scene: Tensor) -> Tensor | None:
+        if self.settings.mode in ("default", "2d"):
+            return targets.removed
+        if self.settings.mode == "in-flare":
+            # Input minus the flare as reconstructed so far: the composite's gain over the scene.
+            return (targets.frame - (picture - scene).detach()).clamp(0, 1)
+        return None
+
+    def _sh_degree(self) -> int:
+        return min(3, self.iteration // self.settings.scene.sh_every)
+
+    def _generator(self, number: int, purpose: int) -> torch.Generator:
+        """A random stream of its own for each purpose and moment."""
+        mixed = (self.settings.seed * 1_000_003 + purpose) * 1_000_003 + number
+        return torch.Generator().manual_seed(mixed % (1 << 62))
+
+    # ---- rates and density ------------------------------------------------------------------------
+
+    def _scene_rates(self) -> dict[str, float | Tensor]:
+        rates = self.settings.scene.rates
+        features = torch.full((16, 1), rates.features_rest)
+        features[0] = rates.features
+        progress = self.iteration / self.settings.iterations
+        return {
+            "means": _decayed(rates.position, rates.position_final, progress) * self.extent,
+            "log_scales": rates.scale,
+            "quaternions": rates.rotation,
+            "opacity_logits": rates.opacity,
+            "sh": features.expand(16, 3).contiguous(),
+        }
+
+    def _set_rates(self) -> None:
+        self.scene_adam.rates["means"] = self._scene_rates()["means"]
+        if self.flare_adam is None:
+            return
+        rates = self.settings.flare.rates
+        now = _decayed(rates.position, rates.position_final, self.iteration / self.settings.iterations)
+        for name in self.flare_adam.rates:
+            if name.endswith("gaussians.positions"):
+                self.flare_adam.rates[name] = now
+
+    def _change_flare_density(self) -> None:
+        settings = self.settings.flare.density
+        if self.flare is None or self.flare_adam is None or not settings.due(self.iteration):
+            return
+        for number, light in enumerate(self.flare.lights):
+            names = {name: f"{number}.gaussians.{name}" for name in light.gaussians}
+            clone_and_prune(light, self.flare_adam, names, settings, self._generator(self.iteration, 2 + number))
+
+    # ---- state ------------------------------------------------------------------------------------
+
+    def state(self) -> State:
+        """All that a resumed fit needs, as `checkpoint.save` takes it."""
+        state: State = {"iteration": self.iteration, "scene": dict(self.scene.state_dict()),
+                        "scene_adam": self.scene_adam.state_dict(), "density": self.density.state_dict()}
+        if self.flare is not None and self.flare_adam is not None and self.grid_adam is not None:
+            state["flare"] = dict(self.flare.state_dict())
+            state["flare_adam"] = self.flare_adam.state_dict()
+            state["grid_adam"] = {str(key): dict(value) for key, value in self.grid_adam.state_dict()["state"].items()}
+        return state
+
+    def load_state(self, state: State) -> None:
+        """Go on from a state. Raises RunError where it does not fit the capture and settings."""
+        try:
+            self.iteration = int(state["iteration"])
+            _load_parameters(dict(self.scene.named_parameters()), state["scene"])
+            self.scene_adam.load_state_dict(state["scene_adam"])
+            self.density.load_state_dict(state["density"])
+            if self.flare is not None and self.flare_adam is not None and self.grid_adam is not None:
+                _load_parameters(dict(self.flare.named_parameters()), state["flare"])
+                self.flare.positions.copy_(state["flare"]["positions"])
+                self.flare_adam.load_state_dict(state["flare_adam"])
+                groups = self.grid_adam.state_dict()["param_groups"]
+                moments = {int(key): value for key, value in state.get("grid_adam", {}).items()}
+                self.grid_adam.load_state_dict({"state": moments, "param_groups": groups})
+        except (KeyError, RuntimeError, TypeError) as problem:
+            raise RunError(f"The checkpoint does not fit this fit ({problem}); start it anew.") from problem
+
+
+def _load_parameters(parameters: dict[str, Parameter], state: State) -> None:
+    """Values of any number of rows: Gaussians come and go during a fit."""
+    for name, parameter in parameters.items():
+        parameter.data = state[name].clone().to(parameter.dtype)
+
+
+def _decayed(first: float, last: float, progress: float) -> float:
+    """Exponential decay from `first` to `last` as progress goes from 0 to 1."""
+    return first * (last / first) ** min(max(progress, 0.0), 1.0)
+
+
+def _new_flare(capture: Capture, views: tuple[View, ...], settings: FitSettings) -> FlareModel:
+    if not capture.lights:
+        raise CaptureError(f"{capture.folder} has no lights.json; run lights on it first, or fit with --mode 3dgs.")
+    generator = torch.Generator().manual_seed(settings.seed)
+    positions = torch.tensor([list(map(float, light.xyz)) for light in capture.lights], dtype=torch.float64)
+    if not settings.flare.detection:
+        # Paper, appendix: the centroid of the points, offset by uniform noise in [0, 1) along each axis.
+        centroid = torch.from_numpy(capture.points.xyz).double().mean(0)
+        positions = centroid + torch.rand(positions.shape, generator=generator, dtype=torch.float64)
+    poses = [torch.from_numpy(view.camera.world_to_camera) for view in views]
+    flares = []
+    for name, xyz in zip((light.name for light in capture.lights), positions, strict=True):
+        seen = [one for one in (ViewOfLight.of(pose, xyz) for pose in poses) if one.depth > 0]
+        if not seen:
+            raise CaptureError(f"The light {name!r} is behind the camera in every view of {capture.folder}; "
+                               "correct or remove it in lights.json.")
+        query = QueryRange.of(torch.stack([one.camera for one in seen]), torch.stack([one.light for one in seen]))
+        flares.append(LightFlare(settings.flare.form, query, settings.flare.count, generator))
+    return FlareModel([light.name for light in capture.lights], positions, flares)
+
+
+def _flare_optimisers(flare: FlareModel | None, settings: FitSettings) -> tuple[Adam | None, Any]:
+    """Adam for networks and Gaussians; for the grids one that updates only the rows that a view touched."""
+    if flare is None:
+        return None, None
+    rates = settings.flare.rates
+    of_gaussians = {
+        "positions": rates.position, "log_scales": rates.scale, "rotations": rates.rotation,
+        "opacity_logits": rates.opacity, "sh": rates.features, "offsets": rates.offset, "rings": rates.ring,
+        "latent": rates.latent,
+    }
+    dense: dict[str, Parameter] = {}
+    tables: list[Parameter] = []
+    chosen: dict[str, float | Tensor] = {}
+    for name, parameter in flare.flares.named_parameters():
+        if name.endswith(TABLE):
+            tables.append(parameter)
+            continue
+        dense[name] = parameter
+        last = name.rsplit(".", 1)[1]
+        chosen[name] = of_gaussians[last] if ".gaussians." in name else rates.network
+    return Adam(dense, chosen), torch.optim.SparseAdam(tables, lr=rates.grids)
+
+

@@ -1,0 +1,60 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Files are whole or absent, and names stay inside their folder."""
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from core.errors import CaptureError
+from core.files import atomic_path, inside, read_json, write_json, write_text
+
+
+def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
+    target = tmp_path / "a.txt"
+    write_text(target, "old")
+    with pytest.raises(ZeroDivisionError), atomic_path(target) as temporary:
+        temporary.write_text("half")
+        raise ZeroDivisionError
+    assert target.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [target]
+
+
+def test_a_write_replaces_the_file_and_makes_its_folder(tmp_path: Path) -> None:
+    target = tmp_path / "new" / "a.json"
+    write_json(target, {"a": 1})
+    write_json(target, {"a": 2})
+    assert read_json(target, CaptureError) == {"a": 2}
+    assert [path.name for path in target.parent.iterdir()] == ["a.json"]
+
+
+def test_json_refuses_nan(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="JSON"):
+        write_json(tmp_path / "a.json", {"a": float("nan")})
+    assert not (tmp_path / "a.json").exists()
+
+
+@pytest.mark.parametrize("content", [b"", b"{", b"\xff\xfe\x00", b"[" * 100_000])
+def test_bad_json_is_one_sentence_with_the_name(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "split.json"
+    path.write_bytes(content)
+    with pytest.raises(CaptureError, match=r"split\.json"):
+        read_json(path, CaptureError)
+
+
+@pytest.mark.parametrize("name", ["", "/etc/passwd", "../a", "a/../../b", "C:/a", "c:\\a", "..\\a", "a\0b"])
+def test_names_that_lead_out_are_refused(tmp_path: Path, name: str) -> None:
+    with pytest.raises(CaptureError):
+        inside(tmp_path, name, CaptureError)
+
+
+def test_links_that_lead_out_are_refused(tmp_path: Path) -> None:
+    folder = tmp_path / "images"
+    folder.mkdir()
+    (tmp_path / "secret.png").touch()
+    (folder / "a.png").symlink_to(tmp_path / "secret.png")
+    (folder / "b.png").symlink_to(folder / "c.png")
+    with pytest.raises(CaptureError, match="leads out"):
+        inside(folder, "a.png", CaptureError)
+    assert inside(folder, "b.png", CaptureError) == folder / "b.png"
+    assert inside(folder, "sub/c.png", CaptureError) == folder / "sub/c.png"

@@ -1,0 +1,110 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Pictures read back as they were written, and broken ones are refused by name."""
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from core.errors import FrameError
+from core.pictures import (
+    Picture,
+    linear_from_srgb,
+    picture_size,
+    read_exr,
+    read_picture,
+    srgb_from_linear,
+    write_exr,
+    write_png,
+)
+
+RAMP = np.random.default_rng(0).uniform(0, 1, (7, 9, 3)).astype(np.float32)
+
+
+def test_srgb_matches_the_standard_and_inverts() -> None:
+    # IEC 61966-2-1: 18 % grey is 0.4614, and 0.0031308 the end of the linear part.
+    assert srgb_from_linear(np.float32([0.18]))[0] == pytest.approx(0.46136, abs=1e-5)
+    assert srgb_from_linear(np.float32([0.0031308]))[0] == pytest.approx(0.04045, abs=1e-5)
+    values = np.linspace(-2, 50, 1001, dtype=np.float32)
+    assert np.allclose(linear_from_srgb(srgb_from_linear(values)), values, rtol=2e-6, atol=1e-7)
+
+
+@pytest.mark.parametrize(("bits", "step"), [(8, 1 / 255), (16, 1 / 65535)])
+def test_png_round_trip(tmp_path: Path, bits: int, step: float) -> None:
+    write_png(tmp_path / "a.png", RAMP, bits)  # type: ignore[arg-type]
+    picture = read_picture(tmp_path / "a.png")
+    assert picture.encoding == "srgb"
+    assert picture_size(tmp_path / "a.png") == picture.size == (9, 7)
+    assert np.abs(picture.pixels - RAMP).max() <= step / 2 + 1e-6
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".tif", ".png"])
+def test_sizes_come_from_the_header(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"a{suffix}"
+    cv2.imwrite(str(path), np.zeros((30, 50, 3), np.uint8))
+    assert picture_size(path) == (50, 30) == read_picture(path).size
+
+
+def test_grey_and_alpha_become_three_channels(tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "grey.png"), np.full((4, 5), 51, np.uint8))
+    cv2.imwrite(str(tmp_path / "alpha.png"), np.full((4, 5, 4), 51, np.uint8))
+    for name in ("grey.png", "alpha.png"):
+        assert np.allclose(read_picture(tmp_path / name).pixels, 0.2)
+        assert read_picture(tmp_path / name).pixels.shape == (4, 5, 3)
+
+
+def test_exr_keeps_values_above_one_and_names(tmp_path: Path) -> None:
+    channels = {"R": RAMP[..., 0] * 40, "G": RAMP[..., 1], "B": RAMP[..., 2], "flare_lamp.R": RAMP[..., 0],
+                "depth.Z": RAMP[..., 1] * 1e7}
+    write_exr(tmp_path / "a.exr", channels, half=True)
+    back = read_exr(tmp_path / "a.exr")
+    assert back.keys() == channels.keys()
+    assert np.allclose(back["R"], channels["R"], rtol=1e-3)
+    assert np.array_equal(back["depth.Z"], channels["depth.Z"])  # depth is never halved
+    picture = read_picture(tmp_path / "a.exr")
+    assert picture.encoding == "linear"
+    assert picture_size(tmp_path / "a.exr") == picture.size == (9, 7)
+
+
+def test_area_average_keeps_the_mean() -> None:
+    picture = Picture(np.tile(RAMP[:6, :8], (2, 2, 1)), "linear").resized(4, 3)
+    assert picture.pixels.shape == (3, 4, 3)
+    assert picture.pixels.mean() == pytest.approx(RAMP[:6, :8].mean(), rel=1e-5)
+
+
+def _truncated(path: Path) -> None:
+    data = path.read_bytes()
+    path.write_bytes(data[: len(data) // 2])
+
+
+def test_broken_files_are_refused_by_name(tmp_path: Path) -> None:
+    for name in ("a.png", "a.jpg", "a.tif"):
+        cv2.imwrite(str(tmp_path / name), np.random.default_rng(0).integers(0, 255, (64, 64, 3), np.uint8))
+    write_exr(tmp_path / "a.exr", {name: np.random.rand(64, 64) for name in "RGB"})
+    for name in ("a.png", "a.tif", "a.exr"):
+        _truncated(tmp_path / name)
+        with pytest.raises(FrameError, match=name):
+            read_picture(tmp_path / name)
+    (tmp_path / "empty.png").touch()
+    (tmp_path / "text.jpg").write_text("no picture")
+    (tmp_path / "folder.png").mkdir()
+    for name in ("empty.png", "text.jpg", "folder.png", "missing.png", "clip.mov"):
+        with pytest.raises(FrameError, match=name):
+            read_picture(tmp_path / name)
+
+
+def test_a_header_that_claims_too_much_is_refused_before_memory_is_taken(tmp_path: Path) -> None:
+    huge = (2**31 - 1).to_bytes(4, "big")
+    (tmp_path / "bomb.png").write_bytes(b"\x89PNG\r\n\x1a\n" + b"\0\0\0\rIHDR" + huge + huge + b"\x08\x02\0\0\0")
+    with pytest.raises(FrameError, match="claims"):
+        read_picture(tmp_path / "bomb.png")
+
+
+def test_nan_in_an_exr_is_refused(tmp_path: Path) -> None:
+    pixels = np.zeros((4, 4), np.float32)
+    pixels[1, 2] = np.nan
+    write_exr(tmp_path / "nan.exr", {"R": pixels, "G": pixels, "B": pixels})
+    with pytest.raises(FrameError, match=r"nan\.exr"):
+        read_picture(tmp_path / "nan.exr")

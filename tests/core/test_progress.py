@@ -1,0 +1,60 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Progress speaks JSON by the line, and a stop is heard at the next step."""
+from __future__ import annotations
+
+import io
+import json
+import os
+import signal
+
+import pytest
+
+from core.errors import Cancelled
+from core.progress import JsonProgress, Progress, TerminalProgress, stoppable
+
+
+def test_json_lines_are_whole_and_in_order() -> None:
+    stream = io.StringIO()
+    progress = JsonProgress(stream)
+    progress.stage("fit", 3)
+    for _ in range(3):
+        progress.advance(loss=0.5)
+    progress.say("done")
+    progress.result(run="a")
+    events = [json.loads(line) for line in stream.getvalue().splitlines()]
+    assert [event["type"] for event in events][0] == "stage"
+    assert events[-1] == {"type": "result", "data": {"run": "a"}}
+    last = [event for event in events if event["type"] == "progress"][-1]
+    assert (last["done"], last["total"], last["left_s"]) == (3, 3, 0.0)
+
+
+def test_terminal_progress_writes_to_a_plain_stream() -> None:
+    stream = io.StringIO()
+    progress = TerminalProgress(stream)
+    progress.stage("bake", 2)
+    progress.advance(2, loss=1.0)
+    progress.say("a sentence")
+    progress.error("wrong")
+    assert "bake" in stream.getvalue()
+    assert "a sentence" in stream.getvalue()
+    assert "error: wrong" in stream.getvalue()
+
+
+def test_a_stop_is_heard_at_the_next_step() -> None:
+    progress = Progress()
+    progress.stage("fit", 5)
+    progress.advance()
+    progress.request_stop()
+    with pytest.raises(Cancelled, match="fit"):
+        progress.advance()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_signals_ask_for_a_stop_and_handlers_come_back(number: int) -> None:
+    before = signal.getsignal(number)
+    progress = Progress()
+    with stoppable(progress):
+        os.kill(os.getpid(), number)
+        with pytest.raises(Cancelled):
+            progress.advance()
+    assert signal.getsignal(number) is before

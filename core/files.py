@@ -61,6 +61,14 @@ def read_json(path: Path | str, error: type[FitFlareError]) -> Any:
         raise error(f"{path} is not valid JSON ({problem}); mend it or make it again.") from problem
 
 
+def _is_file_name(part: str) -> bool:
+    """Whether any file system would take it: 255 bytes of UTF-8 at most, no lone surrogates."""
+    try:
+        return len(part.encode()) <= 255
+    except UnicodeEncodeError:
+        return False
+
+
 def inside(folder: Path | str, name: str, error: type[FitFlareError]) -> Path:
     """`folder / name`, refused with `error` where the name would lead out of the folder.
 
@@ -69,8 +77,9 @@ def inside(folder: Path | str, name: str, error: type[FitFlareError]) -> Path:
     """
     folder = Path(folder)
     parts = Path(name.replace("\\", "/"))
-    if not name or "\0" in name or parts.is_absolute() or ":" in parts.parts[0] or ".." in parts.parts:
-        raise error(f"{folder} names the file {name!r}, which is not inside the folder; remove that entry.")
+    if (not parts.parts or "\0" in name or parts.is_absolute() or ":" in parts.parts[0]
+            or ".." in parts.parts or not all(map(_is_file_name, parts.parts))):
+        raise error(f"{folder} names the file {name!r:.300}, which is not inside the folder; remove that entry.")
     path = folder / parts
     if not path.resolve().is_relative_to(folder.resolve()):
         raise error(f"{path} is a link that leads out of {folder}; put the file itself there.")

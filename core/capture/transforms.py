@@ -62,7 +62,7 @@ def _with_suffix(folder: Path, name: str) -> str:
 def _number(meta: dict[str, Any], key: str, where: str, default: float | None = None) -> float:
     value = meta.get(key, default)
     if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e12:
-        raise CaptureError(f"{where} {key} should be a finite number, not {value!r}.")
+        raise CaptureError(f"{where} {key} should be a finite number, not {value!r:.40}.")
     return float(value)
 
 

@@ -79,7 +79,7 @@ def inside(folder: Path | str, name: str, error: type[FitFlareError]) -> Path:
     parts = Path(name.replace("\\", "/"))
     if (not parts.parts or "\0" in name or parts.is_absolute() or ":" in parts.parts[0]
             or ".." in parts.parts or not all(map(_is_file_name, parts.parts))):
-        raise error(f"{folder} names the file {name!r:.300}, which is not inside the folder; remove that entry.")
+        raise error(f"{folder} names the file {name!r:.150}, which is not inside the folder; remove that entry.")
     path = folder / parts
     if not path.resolve().is_relative_to(folder.resolve()):
         raise error(f"{path} is a link that leads out of {folder}; put the file itself there.")

@@ -4,7 +4,7 @@
 Core code takes a `Progress` and calls `stage`, `advance`, `say`, `result`. The base class is silent;
 `TerminalProgress` draws a bar; `JsonProgress` writes one JSON object a line for the add-on and farms:
 
-    {"type": "stage", "name": "fit", "total": 3000}
+    {"type": "stage", "name": "fit", "total": 3000, "done": 0}
     {"type": "progress", "stage": "fit", "done": 120, "total": 3000, "left_s": 61.2, "figures": {…}}
     {"type": "say", "text": "…"}
     {"type": "result", "data": {…}}
@@ -84,8 +84,31 @@ class Progress:
         pass
 
 
+class _Lines:
+    """A line every ten seconds and at the end, in place of tqdm's bar."""
+
+    def __init__(self, name: str, total: int, done: int, stream: TextIO) -> None:
+        self._name, self._total, self._done, self._stream = name, total, done, stream
+        self._shown = time.monotonic()
+
+    def set_postfix(self, figures: dict[str, str], refresh: bool) -> None:
+        """Figures are left to the bar."""
+
+    def update(self, steps: int) -> None:
+        self._done += steps
+        if self._done >= self._total or time.monotonic() - self._shown > 10:
+            self._shown = time.monotonic()
+            print(f"{self._name}: {self._done}/{self._total}", file=self._stream, flush=True)
+
+    def clear(self) -> None:
+        """Lines leave nothing to clear."""
+
+    def close(self) -> None:
+        """Nor to close."""
+
+
 class TerminalProgress(Progress):
-    """A bar on a terminal (tqdm); plain lines where the output is a file."""
+    """A bar on a terminal (tqdm); plain lines where the output is a file, or tqdm is not installed."""
 
     def __init__(self, stream: TextIO | None = None) -> None:
         super().__init__()
@@ -94,9 +117,13 @@ class TerminalProgress(Progress):
         self._shown = 0
 
     def _show_stage(self) -> None:
-        from tqdm import tqdm
-
         self.close()
+        try:
+            from tqdm import tqdm
+        except ModuleNotFoundError:  # Blender's own Python
+            self._bar = _Lines(self._stage, self._total, self._done, self._stream)
+            self._shown = self._done
+            return
         # A log file gets a line now and then, a terminal a smooth bar.
         interval = 0.1 if self._stream.isatty() else 10.0
         self._bar = tqdm(total=self._total, initial=self._done, desc=self._stage, file=self._stream,
@@ -140,7 +167,7 @@ class JsonProgress(Progress):
 
     def _show_stage(self) -> None:
         self._last = 0.0
-        self._send(type="stage", name=self._stage, total=self._total)
+        self._send(type="stage", name=self._stage, total=self._total, done=self._done)
 
     def _show_progress(self, figures: dict[str, float]) -> None:
         now = time.monotonic()
@@ -185,4 +212,5 @@ def stoppable(progress: Progress) -> Iterator[Progress]:
         yield progress
     finally:
         for number, handler in before.items():
-            signal.signal(number, handler)
+            # None is a handler that Python did not set (Blender's own) and cannot set again.
+            signal.signal(number, signal.SIG_DFL if handler is None else handler)

@@ -20,6 +20,7 @@ from ..errors import RunError, SettingsError
 from ..files import write_text
 from ..flare.density import DensitySettings
 from ..flare.model import OURS, PAPER, FlareForm
+from ..gaussians.densification import ClassicSettings, McmcSettings
 
 Mode = Literal["default", "unsup", "in-flare", "2d", "3dgs"]
 Preset = Literal["draft", "standard", "high", "paper"]
@@ -71,16 +72,18 @@ class FlareSettings:
 
 @dataclass(frozen=True)
 class SceneSettings:
-    """The scene: 3DGS from the capture's points; densified until `densify_until` up to `most` Gaussians."""
+    """The scene: 3DGS from the capture's points, with one of two strategies of densification.
 
+    `sh_every`: iterations between degrees of spherical harmonics. `reorder_every`: iterations between sorts
+    along the Morton curve, which keeps neighbours together in memory.
+    """
+
+    strategy: Literal["classic", "mcmc"] = "classic"
+    classic: ClassicSettings = field(default_factory=ClassicSettings)
+    mcmc: McmcSettings = field(default_factory=McmcSettings)
     rates: SceneRates = field(default_factory=SceneRates)
-    densify_from: int = 500
-    densify_until: int = 15000
-    densify_every: int = 100
-    opacity_reset_every: int = 3000
     sh_every: int = 1000
-    gradient: float = 2e-4
-    most: int = 1_000_000
+    reorder_every: int = 500
 
 
 @dataclass(frozen=True)
@@ -148,10 +151,10 @@ def _shortened(settings: FitSettings, count: int) -> FitSettings:
                       every=every, clone_ratio=0.1)
     rates = replace(settings.flare.rates, network=1e-3, grids=5e-3, position=1.6e-3, position_final=1.6e-5,
                     features=1e-2, scale=0.02, rotation=5e-3)
-    scene = replace(settings.scene, densify_from=max(round(length * 0.05), 100),
-                    densify_until=round(length * 0.6), densify_every=max(round(length / 40), 50),
-                    opacity_reset_every=10 * length, sh_every=max(round(length / 6), 1), most=60_000,
-                    rates=replace(settings.scene.rates, position=3.2e-4))
+    classic = replace(settings.scene.classic, start=round(length * 0.05), stop=round(length * 0.6),
+                      every=max(round(length / 50), 20), reset_every=10 * length, cap=60_000)
+    scene = replace(settings.scene, classic=classic, sh_every=max(round(length / 6), 1),
+                    rates=replace(settings.scene.rates, position=3.2e-4, position_final=3.2e-6))
     return replace(settings, scene=scene, flare=replace(settings.flare, count=count, density=density, rates=rates))
 
 

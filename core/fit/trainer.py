@@ -22,8 +22,10 @@ from ..flare.compositing import composite
 from ..flare.deformation import QueryRange
 from ..flare.density import clone_and_prune
 from ..flare.model import FlareModel, LightFlare, ViewOfLight
+from ..gaussians.densification import Classic, Mcmc, Strategy
 from ..gaussians.loss import l1_ssim
 from ..gaussians.optimiser import Adam
+from ..gaussians.ordering import morton_order
 from ..gaussians.scene import SceneGaussians
 from .checkpoint import State
 from .frames import Frames, Targets
@@ -55,7 +57,7 @@ class Trainer:
         self.flare = None if settings.mode == "3dgs" else _new_flare(capture, self.views, settings)
         self.extent = capture.extent
         self.scene_adam = Adam(dict(self.scene.named_parameters()), self._scene_rates())
-        self.density = scene_density(self.scene, self.scene_adam, settings, self.extent)
+        self.strategy = self._strategy()
         self.flare_adam, self.grid_adam = _flare_optimisers(self.flare, settings)
 
     # ---- one iteration ----------------------------------------------------------------------------
@@ -71,24 +73,23 @@ class Trainer:
         picture = composite(scene.colour, flare, settings.blend)
         weight = 1 - settings.ssim_share
         loss = l1_ssim(picture, targets.frame, weight)
-        figures = {"loss": float(loss)}
+        figures = {"loss": float(loss.detach())}
         clean = self._scene_target(targets, picture, scene.colour)
         if clean is not None:
             scene_loss = l1_ssim(scene.colour, clean, weight)
-            figures["scene_loss"] = float(scene_loss)
+            figures["scene_loss"] = float(scene_loss.detach())
             loss = loss + scene_loss
-        if not math.isfinite(float(loss)):
-            raise RunError(f"The fit diverged at iteration {self.iteration} (the loss is {float(loss)}); "
-                           "resume it with lower learning rates.")
-        loss.backward()
-        with torch.no_grad():
-            self.density.after_backward(self.iteration, scene)
-            for optimiser in (self.scene_adam, self.flare_adam, self.grid_adam):
-                if optimiser is not None:
-                    optimiser.step()
-                    optimiser.zero_grad()
-            self.density.after_step(self.iteration)
-            self._change_flare_density()
+        if not all(map(math.isfinite, figures.values())):
+            raise RunError(f"The fit diverged at iteration {self.iteration}; start it anew with lower learning rates.")
+        (loss + self.strategy.regulariser()).backward()
+        self.strategy.observe(scene)
+        for optimiser in (self.scene_adam, self.flare_adam, self.grid_adam):
+            if optimiser is not None:
+                optimiser.step()
+                optimiser.zero_grad()
+        self.strategy.update(self.iteration)
+        self._keep_neighbours_together()
+        self._change_flare_density()
         return figures
 
     def _view(self) -> View:
@@ -114,6 +115,18 @@ class Trainer:
         return torch.Generator().manual_seed(mixed % (1 << 62))
 
     # ---- rates and density ------------------------------------------------------------------------
+
+    def _strategy(self) -> Strategy:
+        settings, generator = self.settings.scene, self._generator(0, 0)
+        if settings.strategy == "mcmc":
+            return Mcmc(self.scene, self.scene_adam, generator, settings.mcmc)
+        return Classic(self.scene, self.scene_adam, self.extent, generator, settings.classic)
+
+    def _keep_neighbours_together(self) -> None:
+        if self.iteration % self.settings.scene.reorder_every == 0:
+            order = morton_order(self.scene.means.detach())
+            self.scene_adam.keep(order)
+            self.strategy.reorder(order)
 
     def _scene_rates(self) -> dict[str, float | Tensor]:
         rates = self.settings.scene.rates
@@ -151,7 +164,7 @@ class Trainer:
     def state(self) -> State:
         """All that a resumed fit needs, as `checkpoint.save` takes it."""
         state: State = {"iteration": self.iteration, "scene": dict(self.scene.state_dict()),
-                        "scene_adam": self.scene_adam.state_dict(), "density": self.density.state_dict()}
+                        "scene_adam": self.scene_adam.state_dict(), "strategy": self.strategy.state_dict()}
         if self.flare is not None and self.flare_adam is not None and self.grid_adam is not None:
             state["flare"] = dict(self.flare.state_dict())
             state["flare_adam"] = self.flare_adam.state_dict()
@@ -164,7 +177,7 @@ class Trainer:
             self.iteration = int(state["iteration"])
             _load_parameters(dict(self.scene.named_parameters()), state["scene"])
             self.scene_adam.load_state_dict(state["scene_adam"])
-            self.density.load_state_dict(state["density"])
+            self.strategy.load_state_dict(state["strategy"])
             if self.flare is not None and self.flare_adam is not None and self.grid_adam is not None:
                 _load_parameters(dict(self.flare.named_parameters()), state["flare"])
                 self.flare.positions.copy_(state["flare"]["positions"])

@@ -1,0 +1,350 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The flare model: placement, encodings, compositing, density, and the .flare file."""
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+
+from core.capture import Camera
+from core.errors import FlareFileError
+from core.flare import file as flare_file
+from core.flare import placement
+from core.flare.compositing import composite, decode, encode, joined, layers, splat_flare
+from core.flare.deformation import QueryRange
+from core.flare.density import DensitySettings, clone_and_prune
+from core.flare.encoding import HashGrid, frequency_encoding
+from core.flare.file import FlareFile, TrainingCamera
+from core.flare.model import OURS, PAPER, FlareForm, FlareModel, LightFlare, ViewOfLight
+from core.gaussians import Splats, rasterization
+from core.gaussians.optimiser import Adam
+from tests.core.flared import cameras
+
+RANGE = QueryRange((-1.0, -1.0, -5.0), (1.0, 1.0, -3.0), (0.5, 0.5, 0.7))
+
+
+def random_(seed: int) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def some_flare(form: FlareForm = PAPER, count: int = 40, lights: int = 1, seed: int = 0) -> FlareModel:
+    """A flare whose network has been shaken, so that every deformation does something."""
+    generator = random_(seed)
+    flares = [LightFlare(form, RANGE, count, generator) for _ in range(lights)]
+    model = FlareModel([f"lamp {i}" for i in range(lights)],
+                       torch.tensor([[0.3 * i - 0.2, -0.4, 1.0] for i in range(lights)]), flares)
+    with torch.no_grad():
+        for name, parameter in model.named_parameters():
+            strength = 0.01 if "table" in name else 0.05
+            parameter += strength * torch.randn(parameter.shape, generator=generator)
+    return model
+
+
+def pose(number: int = 0) -> Tensor:
+    return torch.from_numpy(cameras(3)[number].world_to_camera)
+
+
+# ---- placement ------------------------------------------------------------------------------------
+
+
+def test_the_line_runs_from_principal_point_to_light() -> None:
+    light = torch.tensor([0.3, -0.2])
+    assert torch.equal(placement.on_line(torch.tensor([[0.0], [1.0], [-2.0]]), light),
+                       torch.tensor([[0.0, 0.0], [0.3, -0.2], [-0.6, 0.4]]))
+
+
+def test_solid_gaussians_project_as_the_rasterizer_projects_them() -> None:
+    """The flare emitted as 3D Gaussians at depth 0.21 gives the picture that splatting on the plane gives."""
+    generator, n = random_(1), 6
+    intrinsics = torch.tensor([[60.0, 0, 20.5], [0, 66.0, 17.5], [0, 0, 1]])
+    means = 0.15 * torch.randn(n, 2, generator=generator)
+    log_scales = math.log(0.01) + 0.4 * torch.randn(n, 3, generator=generator)
+    quaternions = torch.randn(n, 4, generator=generator)
+    opacities = torch.rand(n, generator=generator) * 0.5 + 0.2
+    colours = torch.rand(n, 3, generator=generator)
+    flat = placement.PlaneGaussians(means, placement.covariance_of_solid(means, log_scales, quaternions),
+                                    opacities, colours)
+    splats = splat_flare(flat, intrinsics, 40, 36, "over", kernels="torch")
+    solid = torch.cat([means, torch.ones(n, 1)], 1) * placement.PLANE_DEPTH
+    sh = ((colours - 0.5) / 0.28209479177387814)[:, None]
+    # All lie at one depth: nudged apart so that the order of the list is the order of depth.
+    solid[:, 2] += torch.arange(n) * 1e-6
+    picture = rasterization(solid, quaternions, log_scales.exp(), opacities, sh, torch.eye(4), intrinsics, 40, 36,
+                            kernels="torch")
+    assert torch.allclose(splats.colour, picture.colour, atol=2e-4)
+    assert torch.allclose(1 - splats.transmittance, picture.alpha, atol=2e-4)
+
+
+def test_an_ellipse_has_its_axes() -> None:
+    scales = torch.tensor([[0.2, 0.1]]).log()
+    for angle in (0.0, 0.7, 2.0):
+        axis = torch.tensor([[3 * math.cos(angle), 3 * math.sin(angle)]])
+        xx, xy, yy = placement.covariance_of_ellipse(scales, axis)[0]
+        values, vectors = torch.linalg.eigh(torch.tensor([[xx, xy], [xy, yy]]))
+        assert torch.allclose(values.sqrt(), torch.tensor([0.1, 0.2]), atol=1e-6)
+        assert abs(float(vectors[:, 1] @ axis[0])) == pytest.approx(3.0, abs=1e-4)
+
+
+def test_resolution_and_focal_length_move_the_flare_as_a_lens_would() -> None:
+    gaussians = next(iter(some_flare()(pose()).values()))
+    small, large = (torch.tensor([[f, 0, f / 3], [0, f, f / 4], [0, 0, 1.0]]) for f in (100.0, 200.0))
+    centres, covariances = placement.pixels(gaussians, small, dilation=0)
+    twice, wide = placement.pixels(gaussians, large, dilation=0)
+    assert torch.allclose(twice, 2 * centres, atol=1e-4)
+    assert torch.allclose(wide, 4 * covariances, rtol=1e-5)
+
+
+# ---- lights ---------------------------------------------------------------------------------------
+
+
+def test_a_light_behind_the_camera_has_no_flare() -> None:
+    model = some_flare(lights=2)
+    model.positions[1] = torch.tensor([0.0, 0.0, -9.0])
+    assert list(model(pose())) == ["lamp 0"]
+    with pytest.raises(ValueError, match="behind"):
+        model.lights[1](ViewOfLight.of(pose(), model.positions[1]))
+
+
+@pytest.mark.parametrize("form", [PAPER, OURS, replace(PAPER, line=False), replace(PAPER, light_correction=False),
+                                  replace(PAPER, plane_offset=False), replace(OURS, latent=0, rings=False)])
+def test_every_form_gives_finite_gaussians_and_gradients(form: FlareForm) -> None:
+    model = some_flare(form)
+    gaussians = model(pose())["lamp 0"]
+    assert gaussians.means.shape == (40, 2)
+    assert gaussians.covariances.shape == (40, 3)
+    assert gaussians.colours.shape == (40, 3) and (gaussians.colours >= 0).all()
+    assert ((gaussians.opacities > 0) & (gaussians.opacities < 1)).all()
+    assert (gaussians.rings is not None) == form.rings
+    sum((part**2).sum() for part in gaussians if part is not None).backward()
+    for name, parameter in model.named_parameters():
+        unused = "correction" in name and not form.light_correction or "correction" in name and not form.line
+        gradient = parameter.grad
+        assert (gradient is None) == unused, name
+        if gradient is not None:
+            assert gradient.coalesce().values().isfinite().all() if gradient.is_sparse else gradient.isfinite().all()
+
+
+def test_off_screen_lights_are_handled_like_others() -> None:
+    view = ViewOfLight.of(pose(), torch.tensor([30.0, 0.0, 0.0]))
+    assert view.depth > 0 and view.light[0] > 2  # 63 degrees off the axis
+    gaussians = some_flare().lights[0](view)
+    assert all(part.isfinite().all() for part in gaussians if part is not None)
+
+
+# ---- encodings ------------------------------------------------------------------------------------
+
+
+def test_a_lookup_touches_eight_rows_a_level() -> None:
+    grid = HashGrid(17, 1.8)
+    with torch.no_grad():
+        grid.table.weight.uniform_(-1, 1, generator=random_(0))
+    grid(torch.tensor([0.3, 0.6, 0.9])).sum().backward()
+    gradient = grid.table.weight.grad
+    assert gradient is not None and gradient.is_sparse
+    rows = gradient.coalesce().indices()[0]
+    assert len(rows) <= 16 * 8
+    assert len(gradient.coalesce().values()) == len(rows) >= 16 * 7
+
+
+def test_the_grid_is_continuous_across_cells_and_clamped() -> None:
+    grid = HashGrid(8, 1.6, levels=6)
+    with torch.no_grad():
+        grid.table.weight.uniform_(-1, 1, generator=random_(0))
+    border = 5 / 16
+    left, right = (grid(torch.tensor([border + step, 0.21, 0.4])) for step in (-1e-6, 1e-6))
+    assert torch.allclose(left, right, atol=1e-3)
+    assert torch.equal(grid(torch.tensor([1.5, -2.0, 0.5])), grid(torch.tensor([1.0, 0.0, 0.5])))
+
+
+def test_the_coarsest_level_interpolates_its_corners() -> None:
+    grid = HashGrid(17, 1.8, levels=1)
+    with torch.no_grad():  # a table that holds x itself must give x back
+        side = torch.arange(17, dtype=torch.float32) / 16
+        grid.table.weight[:, 0] = side.repeat(17 * 17)
+        grid.table.weight[:, 1] = side.repeat_interleave(17 * 17)
+    out = grid(torch.tensor([0.337, 0.5, 0.912]))
+    assert torch.allclose(out, torch.tensor([0.337, 0.912]), atol=1e-6)
+
+
+def test_frequency_encoding_has_three_bands() -> None:
+    out = frequency_encoding(torch.tensor([[0.25]]), 3)[0]
+    angles = torch.tensor([0.25, 0.5, 1.0]) * math.pi
+    assert torch.allclose(out, torch.cat([angles.sin(), angles.cos()]), atol=1e-6)
+
+
+# ---- compositing ----------------------------------------------------------------------------------
+
+
+def test_flare_over_scene_equals_one_joint_rasterisation() -> None:
+    """C_flare + T_flare C_scene is what 3DGS gives for both sets together (METHOD, section 1)."""
+    generator, n = random_(3), 5
+    intrinsics = torch.tensor([[50.0, 0, 16], [0, 50.0, 12], [0, 0, 1]])
+
+    def gaussians(depth: float, scale: float) -> tuple[Tensor, ...]:
+        z = depth + 0.001 * torch.arange(n)
+        xy = 0.2 * torch.randn(n, 2, generator=generator) * z[:, None]
+        return (torch.cat([xy, z[:, None]], 1), torch.randn(n, 4, generator=generator), torch.full((n, 3), scale),
+                0.2 + 0.3 * torch.rand(n, generator=generator), torch.randn(n, 1, 3, generator=generator))
+
+    scene, flare = gaussians(3.0, 0.4), gaussians(0.21, 0.02)
+
+    def picture(*parts: Tensor) -> Any:
+        return rasterization(*parts, torch.eye(4), intrinsics, 32, 24, kernels="torch")
+
+    together = picture(*(torch.cat(pair) for pair in zip(scene, flare, strict=True)))
+    before = picture(*flare)
+    apart = composite(picture(*scene).colour, Splats(before.colour, 1 - before.alpha), "over")
+    assert torch.allclose(apart, together.colour, atol=1e-6)
+
+
+def test_encode_and_decode_are_inverse() -> None:
+    values = torch.linspace(0, 4, 500)
+    assert torch.allclose(encode(decode(values)), values, atol=1e-5)
+
+
+def test_added_light_clips_but_can_come_down_again() -> None:
+    scene = torch.full((2, 2, 3), 0.9)
+    light = torch.full((2, 2, 3), 0.6, requires_grad=True)
+    picture = composite(scene, Splats(light, torch.ones(2, 2)), "add")
+    assert (picture == 1).all()
+    picture.sum().backward()
+    assert light.grad is not None and (light.grad > 0).all()
+
+
+@pytest.mark.parametrize("blend", ["over", "add"])
+def test_layers_add_up_in_linear_light(blend: Any) -> None:
+    model = some_flare(OURS if blend == "add" else PAPER, lights=3)
+    camera = cameras(3)[1]
+    intrinsics = torch.from_numpy(camera.intrinsics).float()
+    with torch.no_grad():
+        parts = model(torch.from_numpy(camera.world_to_camera))
+        splats = {name: splat_flare(one, intrinsics, camera.width, camera.height, blend, kernels="torch")
+                  for name, one in parts.items()}
+        scene = torch.rand(camera.height, camera.width, 3, generator=random_(0))
+        out = layers(scene, splats, blend)
+        whole = joined(parts)
+        assert whole is not None
+        direct = composite(scene, splat_flare(whole, intrinsics, camera.width, camera.height, blend, kernels="torch"),
+                           blend)
+    assert list(out.flares) == ["lamp 0", "lamp 1", "lamp 2"]
+    assert torch.allclose(sum(out.flares.values()), out.flare, atol=1e-5)  # type: ignore[arg-type]
+    assert torch.allclose(out.scene + out.flare, out.composite, atol=1e-6)
+    assert torch.allclose(encode(out.composite.clamp_min(0)).clamp(0, 1), direct.clamp(0, 1), atol=1e-3)
+
+
+# ---- density --------------------------------------------------------------------------------------
+
+
+def test_cloning_and_pruning_follow_opacity() -> None:
+    light = some_flare(count=1000).lights[0]
+    with torch.no_grad():
+        light.gaussians["opacity_logits"][:] = torch.logit(torch.tensor(0.3))
+        light.gaussians["opacity_logits"][:100] = torch.logit(torch.tensor(0.001))  # to be pruned
+        light.gaussians["opacity_logits"][100:200] = torch.logit(torch.tensor(0.004))  # kept, never cloned
+    optimiser = Adam(dict(light.gaussians.items()), 1e-3)
+    for parameter in light.gaussians.values():
+        parameter.grad = torch.ones_like(parameter)
+    optimiser.step()
+    before = light.gaussians["positions"].detach().clone()
+    names = {name: name for name in light.gaussians}
+    clone_and_prune(light, optimiser, names, DensitySettings(), random_(0))
+    clones = light.count - 900
+    assert 120 < clones < 200  # a fifth of 800, drawn
+    assert torch.equal(light.gaussians["positions"][:900], before[100:])
+    moved = light.gaussians["positions"][900:].detach()
+    nearest = (moved - before[200:].T).abs().amin(1)
+    assert 0 < float(nearest.max()) < 0.1
+    assert (optimiser.moments["positions"].first[900:] == 0).all()
+    assert (optimiser.moments["positions"].first[:900] != 0).all()
+    clone_and_prune(light, optimiser, names, DensitySettings(most=light.count + 3), random_(0))
+    assert light.count == 900 + clones + 3
+
+
+# ---- the file -------------------------------------------------------------------------------------
+
+CAMERA = TrainingCamera(64, 40, 70.0, 70.0, 33.0, 19.5)
+
+
+@pytest.mark.parametrize("form", [PAPER, OURS, replace(PAPER, line=False)])
+def test_a_flare_comes_back_bit_by_bit(tmp_path: Path, form: FlareForm) -> None:
+    model = some_flare(replace(form, levels=5), lights=2)
+    path = tmp_path / "look.flare"
+    flare_file.save(path, FlareFile(model, "add", CAMERA, "CC0", "warm evening", [{"name": "ghost 1"}]))
+    back = flare_file.load(path)
+    assert (back.blend, back.camera, back.licence, back.notes) == ("add", CAMERA, "CC0", "warm evening")
+    assert back.elements == [{"name": "ghost 1"}]
+    assert back.model.names == model.names
+    for (name, a), (other, b) in zip(model.state_dict().items(), back.model.state_dict().items(), strict=True):
+        assert name == other and torch.equal(a, b), name
+    for a, b in zip(model(pose())["lamp 1"], back.model(pose())["lamp 1"], strict=True):
+        assert a is b is None or torch.equal(a, b)
+
+
+def _described(path: Path, **changes: Any) -> None:
+    """Write the file again with its description changed."""
+    from safetensors import safe_open
+
+    with safe_open(str(path), "pt") as file:
+        description = json.loads(file.metadata()["fit_flare"])
+    description.update(changes)
+    save_file(load_file(str(path)), str(path), {"fit_flare": json.dumps(description)})
+
+
+@pytest.fixture
+def saved(tmp_path: Path) -> Path:
+    path = tmp_path / "look.flare"
+    flare_file.save(path, FlareFile(some_flare(replace(PAPER, levels=2)), "over", CAMERA))
+    return path
+
+
+def test_damaged_flares_are_refused_by_name(saved: Path) -> None:
+    whole = saved.read_bytes()
+    contents = {"empty": b"", "half": whole[: len(whole) // 2], "pickle": b"\x80\x04\x95" + bytes(50),
+                "header": (2**62).to_bytes(8, "little") + whole[8:]}
+    for what, data in contents.items():
+        saved.write_bytes(data)
+        with pytest.raises(FlareFileError, match=r"look\.flare"):
+            flare_file.load(saved)
+        assert what
+    saved.unlink()
+    with pytest.raises(FlareFileError, match="missing"):
+        flare_file.load(saved)
+
+
+@pytest.mark.parametrize("changes", [
+    {"version": 99}, {"version": "1"}, {"blend": "multiply"}, {"lights": [{}]}, {"lights": 3}, {"camera": {}},
+    {"lights": [{"name": "a", "xyz": [0, 0, float("inf")], "form": {}, "range": {}, "count": 1}]},
+    {"lights": [{"name": "a", "xyz": [0, 0, 1], "form": {}, "range": {}, "count": 10**12}]},
+])
+def test_a_description_that_does_not_fit_is_refused(saved: Path, changes: dict[str, Any]) -> None:
+    _described(saved, **changes)
+    with pytest.raises(FlareFileError, match=r"look\.flare"):
+        flare_file.load(saved)
+
+
+def test_other_safetensors_and_nan_are_refused(saved: Path) -> None:
+    tensors = load_file(str(saved))
+    name = next(key for key in tensors if key.endswith("opacity_logits"))
+    from safetensors import safe_open
+
+    with safe_open(str(saved), "pt") as file:
+        metadata = dict(file.metadata())
+    save_file(tensors, str(saved))
+    with pytest.raises(FlareFileError, match="not a flare"):
+        flare_file.load(saved)
+    tensors[name][0] = float("nan")
+    save_file(tensors, str(saved), metadata)
+    with pytest.raises(FlareFileError, match="finite"):
+        flare_file.load(saved)
+
+
+def test_cameras_of_the_tests_look_at_the_light() -> None:
+    assert all(isinstance(camera, Camera) for camera in cameras(2))
+    assert all(ViewOfLight.of(pose(i), torch.tensor([0.3, -0.6, 1.5])).depth > 0 for i in range(3))

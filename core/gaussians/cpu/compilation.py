@@ -1,0 +1,75 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Compiles kernels on their first call and keeps the machine code on disk for the next start.
+
+The folder is one of the user's own, so that the package itself may be read-only; the environment variable
+FIT_FLARE_CACHE names another. Its last part is a fingerprint of all sources of this package: numba looks
+for changes only in the file that a kernel stands in, not in those that it calls.
+"""
+from __future__ import annotations
+
+import hashlib
+import os
+import sys
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numba
+
+FLAGS = {"contract", "nsz"}
+"""Of fast-math, what changes no result by more than a rounding; no reordering, no assumptions on NaN."""
+
+
+def _user_folder() -> Path:
+    """Where this platform keeps what can be computed again."""
+    if sys.platform == "win32":
+        base = os.environ.get("LOCALAPPDATA") or str(Path.home() / "AppData" / "Local")
+    elif sys.platform == "darwin":
+        base = str(Path.home() / "Library" / "Caches")
+    else:
+        base = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
+    return Path(base) / "fit_flare"
+
+
+def _fingerprint() -> str:
+    digest = hashlib.sha256(numba.__version__.encode())
+    for source in sorted(Path(__file__).parent.glob("*.py")):
+        digest.update(source.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def _cache_folder() -> Path:
+    """A folder that can be written to; the last resort lasts until the system clears its temporary files."""
+    named = os.environ.get("FIT_FLARE_CACHE")
+    user = [] if named else [_user_folder()]
+    temporary = Path(tempfile.gettempdir()) / "fit_flare"
+    for base in [Path(named)] if named else [*user, temporary]:
+        folder = base / "kernels" / _fingerprint()
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError:
+            continue
+        if os.access(folder, os.W_OK):
+            return folder
+    return temporary
+
+
+CACHE_FOLDER = _cache_folder()
+
+
+def kernel(function: Callable[..., Any]) -> Any:
+    """A function called from Python; runs without the interpreter's lock."""
+    before = numba.config.CACHE_DIR
+    numba.config.CACHE_DIR = str(CACHE_FOLDER)
+    try:
+        return numba.njit(nogil=True, cache=True, error_model="numpy", fastmath=FLAGS)(function)
+    finally:
+        numba.config.CACHE_DIR = before
+
+
+def inlined(function: Callable[..., Any]) -> Any:
+    """A part of a kernel, with a name of its own and no cost."""
+    return numba.njit(
+        forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy", fastmath=FLAGS
+    )(function)

@@ -1,0 +1,486 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""From 3D Gaussians to records of 64 bytes, and back again with gradients; 16 Gaussians at a time.
+
+Forward (the definition is `..projection`): p = R m + t; with s = (p_x, p_y) / p_z, u = s held within the
+frustum's margin, and V = R Q the Gaussian's axes seen by the camera, the rows of T = J R Q S are
+
+    a = f_x / p_z (V_0 - u_x V_2) S,    b = f_y / p_z (V_1 - u_y V_2) S        covariance = T T^T + dilation I
+
+Its determinant is |a x b|² + dilation (a² + b²) + dilation²: a sum of squares, without the cancellation that
+xx yy - xy² suffers for needles. For the same reason a record does not hold the conic but its square completed:
+
+    q / (2 ln 2) = A (d_x + k d_y)² + D d_y²,   k = -xy / yy,  A = h yy / det,  D = h / yy,  h = 1 / (2 ln 2)
+
+so alpha = opacity 2^-(A u² + D d_y²), u = d_x + k d_y. From one pixel row to the next the exponent's second
+difference is -2 C with C = A k² + D; `step` = 2^(-2 C) serves the recurrence of the rasterizer.
+
+Backward: the rasterizer sends moments of g = dL / d ln alpha over the pixels: sums of g, g u, g d_y, g u²,
+g u d_y, g d_y², which give the gradients of centre, covariance and opacity (`_from_moments`), and those of the
+colour and depth as they are.
+"""
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from . import spherical_harmonics as harmonics
+from .compilation import inlined, kernel
+from .vector import (
+    LANES,
+    any_of,
+    deinterleave,
+    exp2,
+    fma,
+    interleave,
+    lanes,
+    load,
+    load_rows,
+    log2,
+    maximum,
+    minimum,
+    splat,
+    sqrt,
+    store,
+    store_rows,
+    take_number,
+    to_ints,
+    transpose,
+    where,
+)
+
+# Places in a record.
+X, Y, A, K, D, OPACITY, STEP, BEND, RED, GREEN, BLUE, DEPTH, REACH, HALF_X, HALF_Y, VISIBLE = range(16)
+RECORD = 16
+# Places in a row of gradients from the rasterizer.
+G_U, G_Y, G_UU, G_UY, G_YY, G, G_RED, G_GREEN, G_BLUE, G_DEPTH = range(10)
+# Places in the camera's numbers: rotation 0..8, translation 9..11, then
+FX, FY, CX, CY, LOW_X, HIGH_X, LOW_Y, HIGH_Y, POSITION, NEAR, DILATION = 12, 13, 14, 15, 16, 17, 18, 19, 20, 23, 24
+CAMERA = 25
+# Sums over Gaussians for the camera's gradient: rotation 0..8, translation 9..11, fx fy cx cy, then
+POSITION_SUM, CAMERA_SUMS = 16, 32
+
+CHUNK = 1024
+"""Gaussians to a piece of work."""
+TILE_WIDTH, TILE_HEIGHT = LANES, 32
+
+H = np.float32(0.5 / math.log(2))
+TWO_LN2 = np.float32(2 * math.log(2))
+LN2 = np.float32(math.log(2))
+OPACITY_MAX = np.float32(0.99)
+ALPHA_MIN = np.float32(1 / 255)
+ALPHA_MIN_INVERSE = np.float32(255)
+MARGIN = np.float32(1e-4)
+"""Added to the reach, a power of two: rounding must not lose a pixel at the rim, where alpha is tested anyway."""
+NORM2_MIN = np.float32(1e-16)
+TINY = np.float32(1e-24)
+ZERO, HALF, ONE, TWO = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
+LARGEST = np.float32(1e30)
+
+
+@inlined
+def _dot(a, b):  # type: ignore[no-untyped-def]
+    return fma(a[0], b[0], fma(a[1], b[1], a[2] * b[2]))
+
+
+@inlined
+def _scaled(s, a):  # type: ignore[no-untyped-def]
+    return a[0] * s, a[1] * s, a[2] * s
+
+
+@inlined
+def _sum(a, s, b):  # type: ignore[no-untyped-def]
+    """a + s b."""
+    return fma(s, b[0], a[0]), fma(s, b[1], a[1]), fma(s, b[2], a[2])
+
+
+@inlined
+def _rotation(w, x, y, z):  # type: ignore[no-untyped-def]
+    """Rows of the rotation of a unit quaternion."""
+    x2, y2, z2 = x * TWO, y * TWO, z * TWO
+    xx, yy, zz = x * x2, y * y2, z * z2
+    xy, xz, yz = x * y2, x * z2, y * z2
+    wx, wy, wz = w * x2, w * y2, w * z2
+    return (
+        (ONE - (yy + zz), xy - wz, xz + wy),
+        (xy + wz, ONE - (xx + zz), yz - wx),
+        (xz - wy, yz + wx, ONE - (xx + yy)),
+    )
+
+
+@inlined
+def _rotation_backward(w, x, y, z, g):  # type: ignore[no-untyped-def]
+    """Gradient of the unit quaternion from that of the rotation's rows."""
+    s01, s02, s12 = g[0][1] + g[1][0], g[0][2] + g[2][0], g[1][2] + g[2][1]
+    d10, d02, d21 = g[1][0] - g[0][1], g[0][2] - g[2][0], g[2][1] - g[1][2]
+    return (
+        (x * d21 + y * d02 + z * d10) * TWO,
+        (y * s01 + z * s02 + w * d21 - x * TWO * (g[1][1] + g[2][2])) * TWO,
+        (x * s01 + z * s12 + w * d02 - y * TWO * (g[0][0] + g[2][2])) * TWO,
+        (x * s02 + y * s12 + w * d10 - z * TWO * (g[0][0] + g[1][1])) * TWO,
+    )
+
+
+@inlined
+def _unit(q):  # type: ignore[no-untyped-def]
+    """A quaternion at length 1, and the inverse of its length; zero stays zero."""
+    inverse = ONE / sqrt(maximum(fma(q[0], q[0], _dot((q[1], q[2], q[3]), (q[1], q[2], q[3]))), NORM2_MIN))
+    return (q[0] * inverse, q[1] * inverse, q[2] * inverse, q[3] * inverse), inverse
+
+
+@inlined
+def _seen(camera, mean):  # type: ignore[no-untyped-def]
+    """Camera coordinates of points (x, y, z)."""
+    x, y, z = mean
+    return (
+        fma(x, camera[0], fma(y, camera[1], fma(z, camera[2], splat(camera[9])))),
+        fma(x, camera[3], fma(y, camera[4], fma(z, camera[5], splat(camera[10])))),
+        fma(x, camera[6], fma(y, camera[7], fma(z, camera[8], splat(camera[11])))),
+    )
+
+
+@inlined
+def _turned(camera, rows):  # type: ignore[no-untyped-def]
+    """R Q, by rows."""
+    q0, q1, q2 = rows
+    return (
+        _sum(_sum(_scaled(camera[0], q0), camera[1], q1), camera[2], q2),
+        _sum(_sum(_scaled(camera[3], q0), camera[4], q1), camera[5], q2),
+        _sum(_sum(_scaled(camera[6], q0), camera[7], q1), camera[8], q2),
+    )
+
+
+@inlined
+def _turned_back(camera, rows):  # type: ignore[no-untyped-def]
+    """R^T G, by rows."""
+    g0, g1, g2 = rows
+    return (
+        _sum(_sum(_scaled(camera[0], g0), camera[3], g1), camera[6], g2),
+        _sum(_sum(_scaled(camera[1], g0), camera[4], g1), camera[7], g2),
+        _sum(_sum(_scaled(camera[2], g0), camera[5], g1), camera[8], g2),
+    )
+
+
+@inlined
+def _times(a, s):  # type: ignore[no-untyped-def]
+    return a[0] * s[0], a[1] * s[1], a[2] * s[2]
+
+
+@inlined
+def _picture_axes(camera, v, scales, slopes, inverse_z):  # type: ignore[no-untyped-def]
+    """The rows a and b of T, and the slopes u at which J is taken."""
+    ux = minimum(maximum(slopes[0], camera[LOW_X]), camera[HIGH_X])
+    uy = minimum(maximum(slopes[1], camera[LOW_Y]), camera[HIGH_Y])
+    a = _scaled(inverse_z * camera[FX], _times(_sum(v[0], -ux, v[2]), scales))
+    b = _scaled(inverse_z * camera[FY], _times(_sum(v[1], -uy, v[2]), scales))
+    return a, b, ux, uy
+
+
+@inlined
+def _covariance(a, b, dilation):  # type: ignore[no-untyped-def]
+    """xx, xy, yy and the determinant."""
+    aa, bb, ab = _dot(a, a), _dot(b, b), _dot(a, b)
+    n = (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
+    determinant = _dot(n, n) + (aa + bb + dilation) * dilation
+    return aa + dilation, ab, bb + dilation, determinant
+
+
+@inlined
+def _direction(mean, camera):  # type: ignore[no-untyped-def]
+    """Unit vectors from the camera to the means, and the inverse distances."""
+    x, y, z = mean[0] - camera[POSITION], mean[1] - camera[POSITION + 1], mean[2] - camera[POSITION + 2]
+    inverse = ONE / sqrt(maximum(_dot((x, y, z), (x, y, z)), TINY))
+    return _scaled(inverse, (x, y, z)), inverse
+
+
+@inlined
+def _load3(array, first):  # type: ignore[no-untyped-def]
+    return deinterleave((load(array, 3 * first), load(array, 3 * first + 16), load(array, 3 * first + 32)))
+
+
+@inlined
+def _load4(array, first):  # type: ignore[no-untyped-def]
+    at = 4 * first
+    return deinterleave((load(array, at), load(array, at + 16), load(array, at + 32), load(array, at + 48)))
+
+
+@inlined
+def _store3(array, first, values):  # type: ignore[no-untyped-def]
+    store_rows(array, 3 * first, LANES, interleave(values))
+
+
+@inlined
+def _store4(array, first, values):  # type: ignore[no-untyped-def]
+    store_rows(array, 4 * first, LANES, interleave(values))
+
+
+@inlined
+def _tiles_bound(x, y, half_x, half_y, visible, width, height):  # type: ignore[no-untyped-def]
+    """How many tiles the box around each Gaussian meets."""
+    right, bottom = np.float32(width - 1), np.float32(height - 1)
+    x0 = to_ints(minimum(maximum(x - half_x, ZERO), right)) >> 4
+    x1 = to_ints(minimum(maximum(x + half_x, ZERO), right)) >> 4
+    y0 = to_ints(minimum(maximum(y - half_y, ZERO), bottom)) >> 5
+    y1 = to_ints(minimum(maximum(y + half_y, ZERO), bottom)) >> 5
+    return where(visible, (x1 - x0 + 1) * (y1 - y0 + 1), 0)
+
+
+@inlined
+def _project_block(
+    means, quats, scales, opacities, sh, sh_width, degree, camera, width, height, first, turned,
+    records, centres, radii, bounds,
+):  # type: ignore[no-untyped-def]  # fmt: skip
+    """Projects the 16 Gaussians from `first` on."""
+    mean = _load3(means, first)
+    px, py, pz = _seen(camera, mean)
+    before = pz > camera[NEAR]
+    zero = splat(ZERO)
+    inverse_z = ONE / where(before, pz, ONE)
+    slopes = (px * inverse_z, py * inverse_z)
+    x = where(before, fma(slopes[0], camera[FX], splat(camera[CX])), ZERO)
+    y = where(before, fma(slopes[1], camera[FY], splat(camera[CY])), ZERO)
+    _store2(centres, first, x, y)
+
+    (qw, qx, qy, qz), _ = _unit(_load4(quats, first))
+    v = _turned(camera, _rotation(qw, qx, qy, qz))
+    a, b, _, _ = _picture_axes(camera, v, _load3(scales, first), slopes, inverse_z)
+    xx, xy, yy, determinant = _covariance(a, b, camera[DILATION])
+
+    opacity = minimum(load(opacities, first), OPACITY_MAX)
+    reach = log2(maximum(opacity, ALPHA_MIN) * ALPHA_MIN_INVERSE)  # half the squared radius, over ln 2
+    radius2 = reach * TWO_LN2
+    half_x, half_y = sqrt(radius2 * xx), sqrt(radius2 * yy)
+    solid = before & (determinant > ZERO) & (determinant < LARGEST) & (opacity >= ALPHA_MIN)
+    inside = (x + half_x > ZERO) & (x - half_x < np.float32(width))
+    inside = inside & (y + half_y > ZERO) & (y - half_y < np.float32(height))
+    visible = solid & inside & (yy > ZERO)
+    half_difference = (xx - yy) * HALF
+    largest = (xx + yy) * HALF + sqrt(fma(half_difference, half_difference, xy * xy))
+    store(radii, first, where(visible & (radius2 > ZERO), sqrt(largest) * np.float32(3), ZERO))
+
+    inverse_y = ONE / where(visible, yy, ONE)
+    k = -xy * inverse_y
+    major = yy * H / where(visible, determinant, ONE)
+    minor = inverse_y * H
+    bend = fma(major * k, k, minor)
+    margin = splat(HALF)
+    half_x, half_y = half_x + margin, half_y + margin
+    store(bounds, first, _tiles_bound(x, y, half_x, half_y, visible, width, height))
+
+    red, green, blue = zero, zero, zero
+    if any_of(visible):
+        harmonics.gather(sh, first, sh_width, 3 * (degree + 1) * (degree + 1), turned)
+        direction, _ = _direction(mean, camera)
+        red, green, blue = harmonics.colours(turned, degree, direction[0], direction[1], direction[2])
+    rows = transpose((
+        x, y, major, k, minor, opacity, exp2(bend * -TWO), bend,
+        maximum(red, ZERO), maximum(green, ZERO), maximum(blue, ZERO), pz,
+        reach + MARGIN, half_x, half_y, where(visible, splat(ONE), ZERO),
+    ))  # fmt: skip
+    store_rows(records, first * RECORD, RECORD, rows)
+
+
+@inlined
+def _store2(array, first, x, y):  # type: ignore[no-untyped-def]
+    """Writes 16 rows of an (n, 2) array."""
+    store_rows(array, 2 * first, LANES, interleave((x, y)))
+
+
+@kernel
+def project(
+    counter, means, quats, scales, opacities, sh, sh_width, degree, camera, width, height,
+    records, centres, radii, bounds, chunk_bounds,
+):  # type: ignore[no-untyped-def]  # fmt: skip
+    """Writes a record, the centre, the radius and a bound on the number of tiles for each of n >= 16 Gaussians;
+    chunk_bounds: the sums of the bounds over chunks."""
+    n = opacities.size
+    turned = np.empty(harmonics.ROWS * LANES, np.float32)
+    while True:
+        chunk = take_number(counter)
+        start, end = chunk * CHUNK, min(chunk * CHUNK + CHUNK, n)
+        if start >= n:
+            break
+        for block in range(start, end, LANES):
+            first = min(block, n - LANES)  # the last block overlaps the one before and writes the same again
+            _project_block(
+                means, quats, scales, opacities, sh, sh_width, degree, camera, width, height, first, turned,
+                records, centres, radii, bounds,
+            )  # fmt: skip
+        total = 0
+        for i in range(start, end):
+            total += bounds[i]
+        chunk_bounds[chunk] = total
+
+
+@inlined
+def _from_moments(fields, xx, xy, yy, determinant):  # type: ignore[no-untyped-def]
+    """Gradients of the centre and of the covariance (xx, xy counted once for both places, yy).
+
+    With e = covariance^-1 d: dL/dcentre = sum g e, dL/dcovariance = sum g e e^T / 2. In terms of u and d_y,
+    e = (alpha u, alpha k u + d_y / yy) where alpha = yy / det.
+    """
+    inverse_y = ONE / yy
+    k = -xy * inverse_y
+    alpha = yy / determinant
+    ak = alpha * k
+    x = alpha * fields[G_U]
+    y = fma(ak, fields[G_U], inverse_y * fields[G_Y])
+    uu, uy, dd = alpha * fields[G_UU], inverse_y * fields[G_UY], inverse_y * inverse_y * fields[G_YY]
+    d_xx = alpha * uu * HALF
+    d_xy = fma(ak, uu, alpha * uy)
+    d_yy = fma(ak * k, uu, fma(ak * TWO, uy, dd)) * HALF
+    return x, y, d_xx, d_xy, d_yy
+
+
+@inlined
+def _sum_rows(gradients, first_slot, count):  # type: ignore[no-untyped-def]
+    """The sum of the gradient rows of one Gaussian."""
+    row = splat(ZERO)
+    for slot in range(first_slot, first_slot + count):
+        row = row + load(gradients, slot * RECORD)
+    return row
+
+
+@inlined
+def _gathered(gradients, slots, counts, first, rows):  # type: ignore[no-untyped-def]
+    """The fields of the gradient rows of 16 Gaussians, one vector a field."""
+    for i in range(LANES):
+        store(rows, i * LANES, _sum_rows(gradients, slots[first + i], counts[first + i]))
+    return transpose(load_rows(rows, 0, LANES))
+
+
+@inlined
+def _add_to(sums, place, value, mask):  # type: ignore[no-untyped-def]
+    store(sums, place * LANES, load(sums, place * LANES) + where(mask, value, ZERO))
+
+
+@inlined
+def _camera_sums(sums, fresh, mean, q, dv, dp, d_direction, intrinsics):  # type: ignore[no-untyped-def]
+    """Adds what 16 Gaussians say about the camera; fresh: lanes that have not been counted yet.
+
+    V = R Q gives dV Q^T, p = R m + t gives dp m^T, and the position of the camera minus the directions'.
+    """
+    for i in range(3):
+        _add_to(sums, 3 * i, _dot(dv[i], q[0]) + dp[i] * mean[0], fresh)
+        _add_to(sums, 3 * i + 1, _dot(dv[i], q[1]) + dp[i] * mean[1], fresh)
+        _add_to(sums, 3 * i + 2, _dot(dv[i], q[2]) + dp[i] * mean[2], fresh)
+        _add_to(sums, 9 + i, dp[i], fresh)
+        _add_to(sums, POSITION_SUM + i, -d_direction[i], fresh)
+    for i in range(4):
+        _add_to(sums, 12 + i, intrinsics[i], fresh)
+
+
+@inlined
+def _project_block_backward(
+    means, quats, scales, opacities, sh, sh_width, degree, camera, records, first, fresh, fields, turned, turned_out,
+    d_means, d_quats, d_scales, d_opacities, d_sh, d_centres, sums, with_camera,
+):  # type: ignore[no-untyped-def]  # fmt: skip
+    mean, scale = _load3(means, first), _load3(scales, first)
+    px, py, pz = _seen(camera, mean)
+    before = pz > camera[NEAR]
+    inverse_z = ONE / where(before, pz, ONE)
+    slopes = (px * inverse_z, py * inverse_z)
+    (qw, qx, qy, qz), inverse_norm = _unit(_load4(quats, first))
+    q = _rotation(qw, qx, qy, qz)
+    v = _turned(camera, q)
+    a, b, ux, uy = _picture_axes(camera, v, scale, slopes, inverse_z)
+    xx, xy, yy, determinant = _covariance(a, b, camera[DILATION])
+    usable = before & (determinant > ZERO) & (determinant < LARGEST) & (yy > ZERO)
+    yy, determinant = where(usable, yy, ONE), where(usable, determinant, ONE)
+    dx, dy, d_xx, d_xy, d_yy = _from_moments(fields, xx, xy, yy, determinant)
+    _store2(d_centres, first, dx, dy)
+
+    opacity = load(opacities, first)
+    free = (opacity <= OPACITY_MAX) & (opacity >= ALPHA_MIN)
+    store(d_opacities, first, where(free, fields[G] / where(free, opacity, ONE), ZERO))
+
+    # covariance -> a, b -> V, scales, slopes, depth
+    da = _sum(_scaled(d_xx * TWO, a), d_xy, b)
+    db = _sum(_scaled(d_yy * TWO, b), d_xy, a)
+    a_da, b_db = _dot(a, da), _dot(b, db)
+    na, nb = _scaled(inverse_z * camera[FX], da), _scaled(inverse_z * camera[FY], db)
+    n2 = _sum(_scaled(-ux, na), -uy, nb)
+    v2s = _times(v[2], scale)
+    d_ux, d_uy = -_dot(na, v2s), -_dot(nb, v2s)
+    d_scale = (
+        fma(na[0], v[0][0], fma(nb[0], v[1][0], n2[0] * v[2][0])),
+        fma(na[1], v[0][1], fma(nb[1], v[1][1], n2[1] * v[2][1])),
+        fma(na[2], v[0][2], fma(nb[2], v[1][2], n2[2] * v[2][2])),
+    )
+    _store3(d_scales, first, d_scale)
+    dv = (_times(na, scale), _times(nb, scale), _times(n2, scale))
+    gw, gx, gy, gz = _rotation_backward(qw, qx, qy, qz, _turned_back(camera, dv))
+    along = fma(gw, qw, _dot((gx, gy, gz), (qx, qy, qz)))
+    along = where(inverse_norm < np.float32(1e8), along, ZERO)  # shorter quaternions were scaled by a constant
+    _store4(d_quats, first, (
+        (gw - qw * along) * inverse_norm, (gx - qx * along) * inverse_norm,
+        (gy - qy * along) * inverse_norm, (gz - qz * along) * inverse_norm,
+    ))  # fmt: skip
+
+    inside_x = (slopes[0] >= camera[LOW_X]) & (slopes[0] <= camera[HIGH_X])
+    inside_y = (slopes[1] >= camera[LOW_Y]) & (slopes[1] <= camera[HIGH_Y])
+    d_sx = fma(dx, camera[FX], where(inside_x, d_ux, ZERO))
+    d_sy = fma(dy, camera[FY], where(inside_y, d_uy, ZERO))
+    d_pz = fields[G_DEPTH] - inverse_z * (fma(d_sx, slopes[0], d_sy * slopes[1]) + a_da + b_db)
+    dp = (d_sx * inverse_z, d_sy * inverse_z, d_pz)
+
+    # colour -> coefficients, direction; rows that are 0 in the record were cut off
+    shown = transpose(load_rows(records, first * RECORD, RECORD))
+    d_colour = (
+        where(shown[RED] > ZERO, fields[G_RED], ZERO),
+        where(shown[GREEN] > ZERO, fields[G_GREEN], ZERO),
+        where(shown[BLUE] > ZERO, fields[G_BLUE], ZERO),
+    )
+    direction, inverse_distance = _direction(mean, camera)
+    harmonics.gather(sh, first, sh_width, 3 * (degree + 1) * (degree + 1), turned)
+    g = harmonics.colours_backward(turned, degree, direction[0], direction[1], direction[2], d_colour, turned_out)
+    harmonics.scatter(turned_out, first, sh_width, d_sh)
+    d_direction = _scaled(inverse_distance, _sum(g, -_dot(g, direction), direction))
+
+    d_mean = (
+        fma(dp[0], camera[0], fma(dp[1], camera[3], fma(dp[2], camera[6], d_direction[0]))),
+        fma(dp[0], camera[1], fma(dp[1], camera[4], fma(dp[2], camera[7], d_direction[1]))),
+        fma(dp[0], camera[2], fma(dp[1], camera[5], fma(dp[2], camera[8], d_direction[2]))),
+    )
+    _store3(d_means, first, d_mean)
+    if with_camera:
+        intrinsics = (fma(dx, slopes[0], a_da / camera[FX]), fma(dy, slopes[1], b_db / camera[FY]), dx, dy)
+        _camera_sums(sums, fresh, mean, q, dv, dp, d_direction, intrinsics)
+
+
+@kernel
+def project_backward(
+    counter, means, quats, scales, opacities, sh, sh_width, degree, camera, records, gradients, slots, counts,
+    d_means, d_quats, d_scales, d_opacities, d_sh, d_centres, d_camera, with_camera,
+):  # type: ignore[no-untyped-def]  # fmt: skip
+    """Gradients of all inputs from the rasterizer's rows.
+
+    gradients: one row for each pair of Gaussian and tile; those of Gaussian i are counts[i] rows from
+    slots[i] on. d_camera: sums of each chunk, (chunks, CAMERA_SUMS), if with_camera.
+    """
+    n = opacities.size
+    turned = np.empty(harmonics.ROWS * LANES, np.float32)
+    turned_out = np.empty(harmonics.ROWS * LANES, np.float32)
+    rows = np.empty(LANES * LANES, np.float32)
+    sums = np.empty(CAMERA_SUMS * LANES, np.float32)
+    while True:
+        chunk = take_number(counter)
+        start, end = chunk * CHUNK, min(chunk * CHUNK + CHUNK, n)
+        if start >= n:
+            break
+        if with_camera:
+            sums[:] = ZERO
+        for block in range(start, end, LANES):
+            first = min(block, n - LANES)
+            fields = _gathered(gradients, slots, counts, first, rows)
+            fresh = lanes() >= np.float32(block - first)
+            _project_block_backward(
+                means, quats, scales, opacities, sh, sh_width, degree, camera, records, first, fresh, fields,
+                turned, turned_out, d_means, d_quats, d_scales, d_opacities, d_sh, d_centres, sums, with_camera,
+            )  # fmt: skip
+        if with_camera:
+            for i in range(CAMERA_SUMS):
+                total = ZERO
+                for lane in range(LANES):
+                    total += sums[i * LANES + lane]
+                d_camera[chunk, i] = total

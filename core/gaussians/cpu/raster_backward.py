@@ -1,0 +1,245 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The gradients of `raster_forward`, in the same order, front to back.
+
+With v the gradient of a pixel's colour, one number per pixel and Gaussian matters: vc = v . colour, plus the
+gradients of alpha and depth. What lies behind a Gaussian contributes S' = sum of w vc over all later ones, which is
+what is left of the sum over all (known from the final picture) as the walk goes on:
+
+    w = T alpha,   S' = S - w vc,   T' = T - w,   dL/dalpha = T vc - S' / (1 - alpha)
+    g = dL / d ln alpha = w vc - S' alpha / (1 - alpha)
+
+Sums of g times 1, u, d_y and their products over the pixels are all that the projection needs; rows of one
+lane share u up to k d_y, so that three sums a lane do (`_Moments` below), combined after the last row. Needles
+(see `raster_forward`) sum the products themselves, which would cancel otherwise.
+
+Every pair of Gaussian and tile writes a row of its own: no two threads meet, and the sums do not depend on
+the number of threads.
+"""
+from __future__ import annotations
+
+import numpy as np
+
+from .binning import END_ROW, FIRST_ROW, GAUSSIAN, SLOT, TILE_HEIGHT, TILE_WIDTH
+from .compilation import inlined, kernel
+from .projection import ALPHA_MIN, BEND, BLUE, DEPTH, GREEN, OPACITY, RECORD, RED, STEP, A, D, K, X, Y
+from .raster_forward import (
+    AHEAD,
+    DEPTH_ALPHA_MIN,
+    HALF,
+    ONE,
+    PLANE,
+    RUN,
+    STEEP,
+    T_MIN,
+    T_PLANE,
+    ZERO,
+    falloff,
+    ratio,
+    start_tile,
+)
+from .vector import (
+    LANES,
+    deinterleave,
+    fma,
+    lanes,
+    load,
+    prefetch,
+    splat,
+    store,
+    take_number,
+    totals,
+    where,
+)
+
+# The state of a tile after T: what is left behind, and the gradients of the pixels.
+S_PLANE, V_RED, V_GREEN, V_BLUE, V_ALPHA, V_DEPTH = (i * PLANE for i in range(1, 7))
+STATE = 7 * PLANE
+TWO = np.float32(2)
+
+
+@inlined
+def _load_gradients(
+    state, row, y, left, width, background, image, alphas, depths, d_image, d_alphas, d_depths, with_depth
+):  # type: ignore[no-untyped-def]  # fmt: skip
+    """One row of pixel gradients, and S before the first Gaussian, for pixels left .. left + 15."""
+    at, pixel = row * LANES, y * width + left
+    colour = deinterleave((load(image, 3 * pixel), load(image, 3 * pixel + 16), load(image, 3 * pixel + 32)))
+    v = deinterleave((load(d_image, 3 * pixel), load(d_image, 3 * pixel + 16), load(d_image, 3 * pixel + 32)))
+    alpha = load(alphas, pixel)
+    t = ONE - alpha
+    behind = fma(v[0], background[0], fma(v[1], background[1], v[2] * background[2]))
+    v_alpha = load(d_alphas, pixel) - behind
+    s = fma(v[0], colour[0], fma(v[1], colour[1], v[2] * colour[2])) - t * behind
+    if with_depth:
+        share = ONE / where(alpha > DEPTH_ALPHA_MIN, alpha, DEPTH_ALPHA_MIN)
+        v_depth = load(d_depths, pixel) * share
+        depth = load(depths, pixel)
+        v_alpha = v_alpha - where(alpha > DEPTH_ALPHA_MIN, v_depth * depth, ZERO)
+        s = fma(v_depth, depth / share, s)
+        store(state, at + V_DEPTH, v_depth)
+    store(state, at + S_PLANE, fma(v_alpha, alpha, s))
+    store(state, at + V_RED, v[0])
+    store(state, at + V_GREEN, v[1])
+    store(state, at + V_BLUE, v[2])
+    store(state, at + V_ALPHA, v_alpha)
+
+
+@inlined
+def _row_gradient(state, at, e, red, green, blue, depth, with_depth):  # type: ignore[no-untyped-def]
+    """g and w of one row, and the state after it."""
+    t, s = load(state, at + T_PLANE), load(state, at + S_PLANE)
+    alpha = where((e >= ALPHA_MIN) & (t >= T_MIN), e, ZERO)
+    w = t * alpha
+    vc = fma(load(state, at + V_RED), red, load(state, at + V_ALPHA))
+    vc = fma(load(state, at + V_GREEN), green, vc)
+    vc = fma(load(state, at + V_BLUE), blue, vc)
+    if with_depth:
+        vc = fma(load(state, at + V_DEPTH), depth, vc)
+    wvc = w * vc
+    s = s - wvc
+    store(state, at + S_PLANE, s)
+    store(state, at + T_PLANE, t - w)
+    return wvc - s * (alpha / (ONE - alpha)), w
+
+
+@inlined
+def _add_colours(state, at, w, sums, with_depth):  # type: ignore[no-untyped-def]
+    """Adds w v to the sums for red, green, blue and depth."""
+    d_red = fma(w, load(state, at + V_RED), sums[0])
+    d_green = fma(w, load(state, at + V_GREEN), sums[1])
+    d_blue = fma(w, load(state, at + V_BLUE), sums[2])
+    d_depth = fma(w, load(state, at + V_DEPTH), sums[3]) if with_depth else sums[3]
+    return d_red, d_green, d_blue, d_depth
+
+
+@inlined
+def _needle(state, records, at, dx, dy, first, end, with_depth):  # type: ignore[no-untyped-def]
+    """Sums of g u, g d_y, g u², g u d_y, g d_y², g and colours, each row by its own exponential."""
+    major, k, minor, opacity = records[at + A], records[at + K], records[at + D], records[at + OPACITY]
+    red, green, blue, depth = records[at + RED], records[at + GREEN], records[at + BLUE], records[at + DEPTH]
+    zero = splat(ZERO)
+    m, mu, my, muu, muy, myy = zero, zero, zero, zero, zero, zero
+    colours = (zero, zero, zero, zero)
+    for row in range(first, end):
+        u = dx + k * dy
+        e = falloff(major, minor, u, dy) * opacity
+        g, w = _row_gradient(state, row * LANES, e, red, green, blue, depth, with_depth)
+        colours = _add_colours(state, row * LANES, w, colours, with_depth)
+        gu, gy = g * u, g * dy
+        m, mu, my = m + g, mu + gu, my + gy
+        muu, muy, myy = fma(gu, u, muu), fma(gu, dy, muy), fma(gy, dy, myy)
+        dy += ONE
+    return mu, my, muu, muy, myy, m, colours
+
+
+@inlined
+def _ordinary(state, records, at, dx, dy, first, end, with_depth):  # type: ignore[no-untyped-def]
+    """The same by the recurrence and by sums over the rows of each lane: with u = d_x + k d_y,
+
+    sum g u = d_x m0 + k m1,   sum g u d_y = d_x m1 + k m2,   sum g u² = d_x (d_x m0 + 2 k m1) + k² m2
+    where m_i = sum g d_y^i.
+    """
+    major, k, minor, opacity = records[at + A], records[at + K], records[at + D], records[at + OPACITY]
+    red, green, blue, depth = records[at + RED], records[at + GREEN], records[at + BLUE], records[at + DEPTH]
+    step = records[at + STEP]
+    zero = splat(ZERO)
+    m0, m1, m2 = zero, zero, zero
+    colours = (zero, zero, zero, zero)
+    for run in range(first, end, RUN):
+        u = dx + k * dy
+        e = falloff(major, minor, u, dy) * opacity
+        r = ratio(major, k, minor, u, dy)
+        for row in range(run, min(run + RUN, end)):
+            g, w = _row_gradient(state, row * LANES, e, red, green, blue, depth, with_depth)
+            colours = _add_colours(state, row * LANES, w, colours, with_depth)
+            gy = g * dy
+            m0, m1, m2 = m0 + g, m1 + gy, fma(gy, dy, m2)
+            dy += ONE
+            e = e * r
+            r = r * step
+    mu = fma(dx, m0, m1 * k)
+    muy = fma(dx, m1, m2 * k)
+    muu = fma(dx, fma(m1, k, mu), m2 * (k * k))
+    return mu, m1, muu, muy, m2, m0, colours
+
+
+@inlined
+def _gradient_row(state, records, at, left, top, first, end, with_depth):  # type: ignore[no-untyped-def]
+    """The row of gradients (see `projection`) of one Gaussian in one tile."""
+    dx = lanes() + (np.float32(left) + HALF - records[at + X])
+    dy = np.float32(top + first) + HALF - records[at + Y]
+    rows = np.float32(min(end - first, RUN))
+    if records[at + BEND] * rows * rows > STEEP:
+        mu, my, muu, muy, myy, m, colours = _needle(state, records, at, dx, dy, first, end, with_depth)
+    else:
+        mu, my, muu, muy, myy, m, colours = _ordinary(state, records, at, dx, dy, first, end, with_depth)
+    return totals((mu, my, muu, muy, myy, m, colours[0], colours[1], colours[2], colours[3]))
+
+
+@inlined
+def _load_tile(
+    state, left, top, width, height, background, image, alphas, depths, d_image, d_alphas, d_depths, with_depth, edge
+):  # type: ignore[no-untyped-def]  # fmt: skip
+    """The state of a tile before its first Gaussian; edge: workspace for tiles that the picture's edge cuts."""
+    start_tile(state, left, top, width, height)
+    for row in range(min(TILE_HEIGHT, height - top)):
+        y = top + row
+        if left + LANES <= width:
+            _load_gradients(
+                state, row, y, left, width, background, image, alphas, depths, d_image, d_alphas, d_depths, with_depth
+            )
+            continue
+        edge[:, :] = ZERO
+        for lane in range(width - left):
+            pixel = y * width + left + lane
+            for c in range(3):
+                edge[0, 3 * lane + c], edge[1, 3 * lane + c] = image[3 * pixel + c], d_image[3 * pixel + c]
+            edge[2, lane], edge[3, lane] = alphas[pixel], d_alphas[pixel]
+            if with_depth:
+                edge[4, lane], edge[5, lane] = depths[pixel], d_depths[pixel]
+        _load_gradients(
+            state, row, 0, 0, width, background, edge[0], edge[2], edge[4], edge[1], edge[3], edge[5], with_depth
+        )
+
+
+@inlined
+def _tile_backward(entries, begin, used, end, records, left, top, state, gradients, with_depth):  # type: ignore[no-untyped-def]
+    for e in range(begin, used):
+        ahead = min(e + AHEAD, end - 1)
+        prefetch(records, entries[ahead, GAUSSIAN] * RECORD)
+        prefetch(gradients, entries[ahead, SLOT] * RECORD)
+        at = entries[e, GAUSSIAN] * RECORD
+        first, last = entries[e, FIRST_ROW], entries[e, END_ROW]
+        row = _gradient_row(state, records, at, left, top, first, last, with_depth)
+        store(gradients, entries[e, SLOT] * RECORD, row)
+    for e in range(used, end):
+        store(gradients, entries[e, SLOT] * RECORD, splat(ZERO))
+
+
+@kernel
+def raster_backward(
+    counter, entries, starts, ends, records, background, width, height, tiles_x, image, alphas, depths,
+    d_image, d_alphas, d_depths, gradients,
+):  # type: ignore[no-untyped-def]  # fmt: skip
+    """gradients: the row of each slot. d_depths may be empty."""
+    state = np.empty(STATE, np.float32)
+    edge = np.zeros((6, 3 * LANES), np.float32)
+    with_depth = d_depths.size > 0
+    while True:
+        tile = take_number(counter)
+        if tile >= ends.size:
+            break
+        left, top = (tile % tiles_x) * TILE_WIDTH, (tile // tiles_x) * TILE_HEIGHT
+        begin, used, end = starts[tile], ends[tile], starts[tile + 1]
+        if with_depth:
+            _load_tile(
+                state, left, top, width, height, background, image, alphas, depths, d_image, d_alphas, d_depths,
+                True, edge,
+            )  # fmt: skip
+            _tile_backward(entries, begin, used, end, records, left, top, state, gradients, True)
+        else:
+            _load_tile(
+                state, left, top, width, height, background, image, alphas, depths, d_image, d_alphas, d_depths,
+                False, edge,
+            )  # fmt: skip
+            _tile_backward(entries, begin, used, end, records, left, top, state, gradients, False)

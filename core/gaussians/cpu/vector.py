@@ -1,0 +1,544 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Sixteen lanes at once: an LLVM vector as a type of numba.
+
+numba has no vectors of its own, and LLVM does not vectorise loops such as ours by itself. So this module gives
+numba three types (16 float32, 16 int32, 16 truth values), Python's operators on them, and the functions below.
+LLVM makes one zmm register of a vector, two ymm, four xmm or four NEON ones: one source for every machine.
+
+Written in kernels as arithmetic is: `alpha = where(e >= 0.5, e * t, 0.0)`. Scalars are spread to all lanes.
+Products and sums may fuse (one rounding instead of two) where the machine can; nothing else is reordered.
+"""
+from __future__ import annotations
+
+import operator
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from llvmlite import ir
+from numba.core import cgutils, types
+from numba.core.typing.templates import AbstractTemplate, infer_global, signature
+from numba.extending import intrinsic, lower_builtin, models, register_model
+
+from .compilation import inlined
+
+LANES = 16
+
+
+class Vector(types.Type):
+    """The type of 16 values of one kind: "float32", "int32" or "bool"."""
+
+    def __init__(self, kind: str) -> None:
+        self.kind = kind
+        super().__init__(name=f"{kind}x{LANES}")
+
+
+FLOATS, INTS, MASKS = Vector("float32"), Vector("int32"), Vector("bool")
+_FLOAT, _INT = ir.FloatType(), ir.IntType(32)
+_LLVM = {
+    "float32": ir.VectorType(_FLOAT, LANES),
+    "int32": ir.VectorType(_INT, LANES),
+    "bool": ir.VectorType(ir.IntType(1), LANES),
+}
+_FUSE = ("contract",)
+
+
+@register_model(Vector)
+class _VectorModel(models.PrimitiveModel):
+    def __init__(self, manager: Any, of: Vector) -> None:
+        super().__init__(manager, of, _LLVM[of.kind])
+
+
+# --- operators -------------------------------------------------------------------------------------------
+
+
+def _spread(builder: ir.IRBuilder, scalar: ir.Value) -> ir.Value:
+    """The same value in all lanes."""
+    kind = ir.VectorType(scalar.type, LANES)
+    first = builder.insert_element(ir.Constant(kind, ir.Undefined), scalar, ir.Constant(_INT, 0))
+    zeros = ir.Constant(ir.VectorType(_INT, LANES), [0] * LANES)
+    return builder.shuffle_vector(first, ir.Constant(kind, ir.Undefined), zeros)
+
+
+def _as_vector(context: Any, builder: ir.IRBuilder, value: ir.Value, of: types.Type, kind: str) -> ir.Value:
+    if isinstance(of, Vector):
+        return value
+    scalar = {"float32": types.float32, "int32": types.int32, "bool": types.boolean}[kind]
+    value = context.cast(builder, value, of, scalar)
+    if kind == "bool":
+        value = builder.trunc(value, ir.IntType(1)) if value.type.width > 1 else value
+    return _spread(builder, value)
+
+
+def _kind_of(args: Sequence[types.Type]) -> str | None:
+    """The common kind of the vectors among two arguments, if the rest are numbers."""
+    kinds = {a.kind for a in args if isinstance(a, Vector)}
+    others = [a for a in args if not isinstance(a, Vector)]
+    if len(kinds) != 1 or not all(isinstance(a, (types.Number, types.Boolean)) for a in others):
+        return None
+    return kinds.pop()
+
+
+def _define_operator(symbol: Callable[..., Any], kinds: dict[str, Callable[..., ir.Value]], result: str) -> None:
+    """Gives numba `symbol` for two vectors, or a vector and a number. kinds: how each is emitted."""
+
+    class Typing(AbstractTemplate):
+        def generic(self, args: Any, kws: Any) -> Any:  # noqa: ARG002
+            kind = _kind_of(args) if len(args) == 2 else None
+            if kind not in kinds:
+                return None
+            return signature(Vector(result or kind), *args)
+
+    infer_global(symbol)(Typing)
+
+    def lower(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
+        kind = _kind_of(sig.args)
+        assert kind is not None
+        a, b = (_as_vector(context, builder, v, t, kind) for v, t in zip(args, sig.args, strict=True))
+        return kinds[kind](builder, a, b)
+
+    for left, right in ((Vector, Vector), (Vector, types.Number), (types.Number, Vector)):
+        lower_builtin(symbol, left, right)(lower)
+
+
+def _plain(name: str) -> Callable[..., ir.Value]:
+    return lambda builder, a, b: getattr(builder, name)(a, b)
+
+
+def _fused(name: str) -> Callable[..., ir.Value]:
+    return lambda builder, a, b: getattr(builder, name)(a, b, flags=_FUSE)
+
+
+def _compare(sign: str) -> dict[str, Callable[..., ir.Value]]:
+    return {
+        "float32": lambda builder, a, b: builder.fcmp_ordered(sign, a, b),
+        "int32": lambda builder, a, b: builder.icmp_signed(sign, a, b),
+    }
+
+
+for _symbol, _name in ((operator.add, "add"), (operator.sub, "sub"), (operator.mul, "mul")):
+    _define_operator(_symbol, {"float32": _fused("f" + _name), "int32": _plain(_name)}, "")
+    _define_operator(getattr(operator, "i" + _name), {"float32": _fused("f" + _name), "int32": _plain(_name)}, "")
+_define_operator(operator.truediv, {"float32": _fused("fdiv")}, "")
+_define_operator(operator.lshift, {"int32": _plain("shl")}, "")
+_define_operator(operator.rshift, {"int32": _plain("ashr")}, "")
+_define_operator(operator.and_, {"int32": _plain("and_"), "bool": _plain("and_")}, "")
+_define_operator(operator.or_, {"int32": _plain("or_"), "bool": _plain("or_")}, "")
+for _symbol, _sign in ((operator.lt, "<"), (operator.le, "<="), (operator.gt, ">"), (operator.ge, ">=")):
+    _define_operator(_symbol, _compare(_sign), "bool")
+
+
+@infer_global(operator.neg)
+class _Negation(AbstractTemplate):
+    def generic(self, args: Any, kws: Any) -> Any:  # noqa: ARG002
+        return signature(FLOATS, FLOATS) if tuple(args) == (FLOATS,) else None
+
+
+@lower_builtin(operator.neg, Vector)
+def _negate(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:  # noqa: ARG001
+    return builder.fneg(args[0])
+
+
+# --- functions -------------------------------------------------------------------------------------------
+
+
+def _call(builder: ir.IRBuilder, name: str, result: ir.Type, args: Sequence[ir.Value], **options: Any) -> ir.Value:
+    """Calls an LLVM intrinsic by its full name."""
+    of = ir.FunctionType(result, [a.type for a in args])
+    return builder.call(cgutils.get_or_insert_function(builder.module, of, name), args, **options)
+
+
+def _address(context: Any, builder: ir.IRBuilder, of: types.Array, array: ir.Value, index: ir.Value) -> ir.Value:
+    """Where element `index` of a C-contiguous array lies, counted flat over all dimensions."""
+    data = context.make_array(of)(context, builder, array).data
+    return builder.gep(data, [index])
+
+
+@intrinsic
+def load(typing_context, array, index):  # type: ignore[no-untyped-def]  # noqa: ARG001
+    """16 values from the flat index of a contiguous float32 or int32 array on."""
+    kind = FLOATS if array.dtype == types.float32 else INTS
+
+    def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
+        address = _address(context, builder, sig.args[0], *args)
+        return builder.load(builder.bitcast(address, _LLVM[kind.kind].as_pointer()), align=4)
+
+    return kind(array, types.int64), emit
+
+
+@intrinsic
+def store(typing_context, array, index, value):  # type: ignore[no-untyped-def]  # noqa: ARG001
+    """Writes 16 values from the flat index of a contiguous array on."""
+
+    def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
+        address = _address(context, builder, sig.args[0], *args[:2])
+        builder.store(args[2], builder.bitcast(address, args[2].type.as_pointer()), align=4)
+        return context.get_dummy_value()
+
+    return types.none(array, types.int64, value), emit
+
+
+@intrinsic
+def load_rows(typing_context, array, index, stride):  # type: ignore[no-untyped-def]  # noqa: ARG001
+    """16 vectors, from the flat index on and each `stride` elements further."""
+
+    def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
+        rows = []
+        for i in range(LANES):
+            at = builder.add(args[1], builder.mul(args[2], ir.Constant(ir.IntType(64), i)))
+            address = _address(context, builder, sig.args[0], args[0], at)
+            rows.append(builder.load(builder.bitcast(address, _LLVM["float32"].as_pointer()), align=4))
+        return _pack(context, builder, rows)
+
+    return types.UniTuple(FLOATS, LANES)(array, types.int64, types.int64), emit
+
+
+@intrinsic
+def store_rows(typing_context, array, index, stride, rows):  # type: ignore[no-untyped-def]  # noqa: ARG001
+    """Writes a tuple of vectors, from the flat index on and each `stride` elements further."""
+    count = len(rows)
+
+    def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
+        for i in range(count):
+            at = builder.add(args[1], builder.mul(args[2], ir.Constant(ir.IntType(64), i)))
+            address = _address(context, builder, sig.args[0], args[0], at)
+            row = builder.extract_value(args[3], i)
+            builder.store(row, builder.bitcast(address, row.type.as_pointer()), align=4)
+        return context.get_dummy_value()
+
+    return types.none(array, types.int64, types.int64, rows), emit
+
+
+@intrinsic
+def prefetch(typing_context, array, index):  # type: ignore[no-untyped-def]  # noqa: ARG001
+    """Asks for the cache line of a flat index, to be read or written soon; any index is safe."""
+
+    def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
+        address = _address(context, builder, sig.args[0], *args)
+        address = builder.bitcast(address, ir.IntType(8).as_pointer())
+        flags = [ir.Constant(_INT, flag) for flag in (0, 3, 1)]  # to read, keep in all caches, data
+        _call(builder, "llvm.prefetch.p0", ir.VoidType(), [address, *flags])
+        return context.get_dummy_value()
+
+    return types.none(array, types.int64), emit
+
+
+@intrinsic
+def take_number(typing_context, counter):  # type: ignore[no-untyped-def]  # noqa: ARG001
+    """Adds one to an int64 array's first element and returns what it was, without two threads getting the same."""
+
+    def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
+        address = _address(context, builder, sig.args[0], args[0], ir.Constant(ir.IntType(64), 0))
+        return builder.atomic_rmw("add", address, ir.Constant(ir.IntType(64), 1), "monotonic")
+
+    return types.int64(counter), emit
+
+
+@intrinsic
+def splat(typing_context, value):  # type: ignore[no-untyped-def]  # noqa: ARG001
+    """A number in all 16 lanes, as float32."""
+
+    def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
+        return _as_vector(context, builder, args[0], sig.args[0], "float32")
+
+    return FLOATS(value), emit
+
+
+@intrinsic
+def lanes(typing_context):  # type: ignore[no-untyped-def]  # noqa: ARG001
+    """0, 1, ... 15 as float32."""
+
+    def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:  # noqa: ARG001
+        return ir.Constant(_LLVM["float32"], [float(i) for i in range(LANES)])
+
+    return FLOATS(), emit
+
+
+@intrinsic
+def where(typing_context, mask, a, b):  # type: ignore[no-untyped-def]  # noqa: ARG001
+    """a where the mask is true, else b; one of them may be a number."""
+    kind = _kind_of((a, b))
+    if mask != MASKS or kind is None:
+        return None
+
+    def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
+        a, b = (_as_vector(context, builder, v, t, kind) for v, t in zip(args[1:], sig.args[1:], strict=True))
+        return builder.select(args[0], a, b)
+
+    return Vector(kind)(mask, a, b), emit
+
+
+def _smaller_or_larger(sign: str) -> Callable[..., Any]:
+    # A comparison and a choice: one instruction everywhere, where llvm.minnum adds a test for NaN.
+    def define(typing_context, a, b):  # type: ignore[no-untyped-def]  # noqa: ARG001
+        if _kind_of((a, b)) != "float32":
+            return None
+
+        def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
+            a, b = (_as_vector(context, builder, v, t, "float32") for v, t in zip(args, sig.args, strict=True))
+            return builder.select(builder.fcmp_ordered(sign, a, b), a, b)
+
+        return FLOATS(a, b), emit
+
+    return define
+
+
+minimum = intrinsic(_smaller_or_larger("<"))
+maximum = intrinsic(_smaller_or_larger(">"))
+
+
+@intrinsic
+def fma(typing_context, a, b, c):  # type: ignore[no-untyped-def]  # noqa: ARG001
+    """a * b + c, rounded once where the machine can (llvm.fma would call a library where it cannot)."""
+
+    def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
+        values = [_as_vector(context, builder, v, t, "float32") for v, t in zip(args, sig.args, strict=True)]
+        return _call(builder, "llvm.fmuladd.v16f32", _LLVM["float32"], values)
+
+    return FLOATS(a, b, c), emit
+
+
+@intrinsic
+def sqrt(typing_context, a):  # type: ignore[no-untyped-def]  # noqa: ARG001
+    """Square roots."""
+
+    def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:  # noqa: ARG001
+        return _call(builder, "llvm.sqrt.v16f32", _LLVM["float32"], args)
+
+    return FLOATS(FLOATS), emit
+
+
+@intrinsic
+def absolute(typing_context, a):  # type: ignore[no-untyped-def]  # noqa: ARG001
+    """Absolute values."""
+
+    def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:  # noqa: ARG001
+        return _call(builder, "llvm.fabs.v16f32", _LLVM["float32"], args)
+
+    return FLOATS(FLOATS), emit
+
+
+@intrinsic
+def any_of(typing_context, mask):  # type: ignore[no-untyped-def]  # noqa: ARG001
+    """Whether any lane is true."""
+
+    def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:  # noqa: ARG001
+        bits = builder.bitcast(args[0], ir.IntType(LANES))
+        return builder.icmp_unsigned("!=", bits, ir.Constant(bits.type, 0))
+
+    return types.boolean(MASKS), emit
+
+
+@intrinsic
+def bits_of(typing_context, mask):  # type: ignore[no-untyped-def]  # noqa: ARG001
+    """The mask as a number, lane 0 its lowest bit."""
+
+    def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:  # noqa: ARG001
+        return builder.zext(builder.bitcast(args[0], ir.IntType(LANES)), ir.IntType(64))
+
+    return types.int64(MASKS), emit
+
+
+@intrinsic
+def as_ints(typing_context, a):  # type: ignore[no-untyped-def]  # noqa: ARG001
+    """The same 32 bits a lane, read as integers."""
+
+    def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:  # noqa: ARG001
+        return builder.bitcast(args[0], _LLVM["int32"])
+
+    return INTS(FLOATS), emit
+
+
+@intrinsic
+def as_floats(typing_context, a):  # type: ignore[no-untyped-def]  # noqa: ARG001
+    """The same 32 bits a lane, read as floating point."""
+
+    def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:  # noqa: ARG001
+        return builder.bitcast(args[0], _LLVM["float32"])
+
+    return FLOATS(INTS), emit
+
+
+@intrinsic
+def to_floats(typing_context, a):  # type: ignore[no-untyped-def]  # noqa: ARG001
+    """Integers as the floating-point numbers of the same value."""
+
+    def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:  # noqa: ARG001
+        return builder.sitofp(args[0], _LLVM["float32"])
+
+    return FLOATS(INTS), emit
+
+
+@intrinsic
+def to_ints(typing_context, a):  # type: ignore[no-untyped-def]  # noqa: ARG001
+    """Rounded towards zero; must lie within int32."""
+
+    def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:  # noqa: ARG001
+        return builder.fptosi(args[0], _LLVM["int32"])
+
+    return INTS(FLOATS), emit
+
+
+# --- across lanes ----------------------------------------------------------------------------------------
+
+
+def _shuffle(builder: ir.IRBuilder, a: ir.Value, b: ir.Value | None, source: Sequence[int]) -> ir.Value:
+    """Lane i of the result is lane source[i] of a, or of b counted from 16 on."""
+    if b is None:
+        b = ir.Constant(a.type, ir.Undefined)
+    return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(_INT, len(source)), list(source)))
+
+
+def _pack(context: Any, builder: ir.IRBuilder, values: Sequence[ir.Value]) -> ir.Value:
+    return context.make_tuple(builder, types.UniTuple(FLOATS, len(values)), values)
+
+
+def _halves(builder: ir.IRBuilder, a: ir.Value, b: ir.Value, step: int) -> tuple[ir.Value, ir.Value]:
+    """Of each group of 2 * step lanes, the lower halves of a and b side by side, and the upper ones."""
+    low = [(i & ~(2 * step - 1)) + (i & (step - 1)) + (LANES if i & step else 0) for i in range(LANES)]
+    return _shuffle(builder, a, b, low), _shuffle(builder, a, b, [i + step for i in low])
+
+
+@intrinsic
+def total(typing_context, a):  # type: ignore[no-untyped-def]  # noqa: ARG001
+    """The sum of all lanes, float32; the same order on every machine."""
+
+    def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:  # noqa: ARG001
+        value = args[0]
+        for step in (8, 4, 2, 1):
+            value = builder.fadd(value, _shuffle(builder, value, None, [(i + step) % LANES for i in range(LANES)]))
+        return builder.extract_element(value, ir.Constant(_INT, 0))
+
+    return types.float32(FLOATS), emit
+
+
+@intrinsic
+def totals(typing_context, vectors):  # type: ignore[no-untyped-def]  # noqa: ARG001
+    """A vector of the sums of up to 16 vectors, in their order (further lanes: undefined).
+
+    All at once, as a transposition that adds at each of its four steps.
+    """
+    count = len(vectors)
+
+    def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:  # noqa: ARG001
+        level: list[ir.Value | None] = [builder.extract_value(args[0], i) for i in range(count)]
+        level += [None] * (LANES - count)
+        # After the step of 8, lane 8 j + i sums vector j (of a pair); after 4, quads of lanes belong to four.
+        for step in (8, 4, 2, 1):
+            half = len(level) // 2
+            following: list[ir.Value | None] = []
+            for a, b in zip(level[:half], level[half:], strict=True):
+                if a is None:
+                    following.append(None)
+                    continue
+                low, high = _halves(builder, a, ir.Constant(a.type, ir.Undefined) if b is None else b, step)
+                following.append(builder.fadd(low, high))
+            level = following
+        return level[0]
+
+    return FLOATS(vectors), emit
+
+
+@intrinsic
+def transpose(typing_context, vectors):  # type: ignore[no-untyped-def]  # noqa: ARG001
+    """16 vectors with rows and columns exchanged: lane j of result i is lane i of argument j."""
+
+    def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:  # noqa: ARG001
+        rows = [builder.extract_value(args[0], i) for i in range(LANES)]
+        for step in (1, 2, 4, 8):
+            for i in range(LANES):
+                if not i & step:
+                    rows[i], rows[i + step] = _halves(builder, rows[i], rows[i + step], step)
+        return _pack(context, builder, rows)
+
+    return types.UniTuple(FLOATS, LANES)(vectors), emit
+
+
+@intrinsic
+def interleave(typing_context, vectors):  # type: ignore[no-untyped-def]  # noqa: ARG001
+    """k vectors a, b, c ... to k vectors that read a0 b0 c0 a1 b1 c1 ... one after the other."""
+    count = len(vectors)
+
+    def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:  # noqa: ARG001
+        parts = [builder.extract_value(args[0], i) for i in range(count)]
+        results = []
+        for k in range(count):
+            positions = [divmod(k * LANES + i, count) for i in range(LANES)]  # (lane, vector) of each
+            value = parts[0]
+            for v in range(1, count):
+                source = [LANES + lane if vector == v else (lane if v == 1 else i)
+                          for i, (lane, vector) in enumerate(positions)]  # fmt: skip
+                value = _shuffle(builder, value, parts[v], source)
+            results.append(value)
+        return _pack(context, builder, results)
+
+    return types.UniTuple(FLOATS, count)(vectors), emit
+
+
+@intrinsic
+def deinterleave(typing_context, vectors):  # type: ignore[no-untyped-def]  # noqa: ARG001
+    """The inverse of `interleave`."""
+    count = len(vectors)
+
+    def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:  # noqa: ARG001
+        parts = [builder.extract_value(args[0], i) for i in range(count)]
+        results = []
+        for k in range(count):
+            positions = [divmod(lane * count + k, LANES) for lane in range(LANES)]  # (vector, lane) of each
+            value = parts[0]
+            for v in range(1, count):
+                source = [LANES + lane if vector == v else (lane if v == 1 else i)
+                          for i, (vector, lane) in enumerate(positions)]  # fmt: skip
+                value = _shuffle(builder, value, parts[v], source)
+            results.append(value)
+        return _pack(context, builder, results)
+
+    return types.UniTuple(FLOATS, count)(vectors), emit
+
+
+# --- elementary functions --------------------------------------------------------------------------------
+
+# 2^f on [-1/2, 1/2]: the polynomial of least relative error that is exact at 0 (8e-8).
+_EXP2 = tuple(
+    np.float32(c) for c in (1.0, 0.6931470616, 0.2402223532, 0.05550678369, 0.00967196168, 0.001327463337)
+)
+_ROUND = np.float32(1.5 * 2**23)  # added, it leaves the nearest integer in the lowest bits
+_EXP2_MIN = np.float32(-126.0)
+_EXP2_MAX = np.float32(126.5)
+
+
+@inlined
+def exp2(x):  # type: ignore[no-untyped-def]
+    """2^x; below -126 as at -126 (1e-38, not zero), from 126.5 on as there."""
+    x = minimum(maximum(x, _EXP2_MIN), _EXP2_MAX)
+    rounded = x + _ROUND
+    f = x - (rounded - _ROUND)
+    p = fma(f, _EXP2[5], _EXP2[4])
+    p = fma(f, p, _EXP2[3])
+    p = fma(f, p, _EXP2[2])
+    p = fma(f, p, _EXP2[1])
+    p = fma(f, p, _EXP2[0])
+    return as_floats(as_ints(p) + (as_ints(rounded) << 23))
+
+
+_SQRT2 = np.float32(1.4142135)
+# 2 / ln 2 times the series of the inverse hyperbolic tangent
+_LOG2 = tuple(np.float32(2.8853900817779268 / k) for k in (1, 3, 5, 7, 9))
+
+
+@inlined
+def log2(x):  # type: ignore[no-untyped-def]
+    """log2 x for normal x > 0 (2e-7 absolute near 1)."""
+    bits = as_ints(x)
+    exponent = to_floats(((bits >> 23) & 255) - 127)
+    m = as_floats((bits & 0x007FFFFF) | 0x3F800000)
+    large = m > _SQRT2
+    m = where(large, m * np.float32(0.5), m)
+    exponent = where(large, exponent + np.float32(1), exponent)
+    s = (m - np.float32(1)) / (m + np.float32(1))
+    s2 = s * s
+    p = fma(s2, _LOG2[4], _LOG2[3])
+    p = fma(s2, p, _LOG2[2])
+    p = fma(s2, p, _LOG2[1])
+    p = fma(s2, p, _LOG2[0])
+    return fma(s, p, exponent)

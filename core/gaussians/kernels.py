@@ -14,7 +14,7 @@ from __future__ import annotations
 import importlib
 import logging
 from functools import cache
-from typing import Any, Protocol, cast
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -27,6 +27,7 @@ MODULES = {"torch": ".reference", "tiles": ".tiles", "cpu": ".cpu", "cuda": ".cu
 log = logging.getLogger(__name__)
 
 
+@runtime_checkable
 class KernelSet(Protocol):
     """Arguments as the functions of the same purpose in `rasterizer.py` take them, checked there."""
 
@@ -45,9 +46,10 @@ class KernelSet(Protocol):
 @cache
 def _load(name: str) -> KernelSet | ImportError:
     try:
-        return cast(KernelSet, importlib.import_module(MODULES[name], __package__))
+        module = importlib.import_module(MODULES[name], __package__)
     except ImportError as error:
         return error
+    return module if isinstance(module, KernelSet) else ImportError(f"{module.__name__} is incomplete")
 
 
 def available(name: str) -> bool:

@@ -24,7 +24,16 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from .projection import camera_position, determinants, project, visible_radii
-from .rendering import ALPHA_MIN, OPACITY_MAX, PROFILE_MIN, TRANSMITTANCE_MIN, Rendering, Splats, extent
+from .rendering import (
+    ALPHA_MIN,
+    OPACITY_MAX,
+    PROFILE_MIN,
+    TRANSMITTANCE_MIN,
+    Rendering,
+    Splats,
+    extent,
+    record_gradient,
+)
 from .spherical_harmonics import colours as colours_of
 
 RADIUS_MIN = 1e-6
@@ -98,9 +107,7 @@ def rasterize_scene(
     values = torch.cat([colours, depths[:, None]], -1)
     opacities = opacities[index]
 
-    gradients = torch.zeros_like(means[:, :2]).detach()
-    if centres.requires_grad:
-        centres.register_hook(lambda gradient: gradients.index_add_(0, index, gradient))
+    gradients = record_gradient(centres, index, len(means))
 
     def shade(pixels: Tensor) -> Tensor:
         weights = weights_over(profiles(pixels, centres, covariances, None, None), opacities)

@@ -2,6 +2,7 @@
 """What a rasterizer returns, and the numbers that every kernel set agrees on."""
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -55,11 +56,27 @@ class Splats:
     transmittance: Tensor
 
 
-def extent(peaks: Tensor, blend: str = "over") -> Tensor:
-    """Mahalanobis radius beyond which a plain Gaussian of this peak is skipped; 0 if all of it is.
+def extent(peaks: Tensor, blend: str = "over", rings: Tensor | None = None) -> Tensor:
+    """(n,) Mahalanobis radius beyond which a Gaussian, or a ring (n, 2), is skipped; 0 if all of it is.
 
     peaks: (n,) opacities, already clamped. Solves peak * exp(-r²/2) = threshold for r.
     """
     if blend == "add":
-        return torch.full_like(peaks, (-2 * torch.log(torch.tensor(PROFILE_MIN))).sqrt().item())
-    return (2 * (peaks / ALPHA_MIN).clamp(min=1.0).log()).sqrt()
+        reach = torch.full_like(peaks, math.sqrt(-2 * math.log(PROFILE_MIN)))
+    else:
+        reach = (2 * (peaks / ALPHA_MIN).clamp(min=1.0).log()).sqrt()
+    if rings is not None:
+        reach = (rings[:, 0] + rings[:, 1] * reach).clamp(min=0)
+    return reach if blend == "add" else reach.masked_fill(peaks < ALPHA_MIN, 0)
+
+
+def record_gradient(centres: Tensor, index: Tensor, n: int) -> Tensor:
+    """(n, 2) zeros, to which backward will add the gradient by the centres (m, 2) of the Gaussians `index`."""
+    gradients = torch.zeros(n, 2, dtype=torch.float32, device=centres.device)
+
+    def record(gradient: Tensor) -> None:
+        gradients.index_add_(0, index, gradient.to(gradients.dtype))
+
+    if centres.requires_grad:
+        centres.register_hook(record)
+    return gradients

@@ -1,0 +1,263 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Random Gaussians for comparing kernel sets with the definition, and the comparison.
+
+The definition has steps: a contribution counts from alpha = 1/255 on, a pixel is finished at a transmittance
+of 1e-4, nearer Gaussians hide farther ones. Two correct implementations may come down on different sides of
+a step where a value lies within rounding of it. Cases are therefore drawn so that in float64 nothing lies
+within HAIR (relative) of a step: what does is moved by changing its opacity, or its place.
+"""
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from core.gaussians import rasterization, splat
+from core.gaussians import reference as r
+from core.gaussians.projection import camera_position, frustum_limits, project
+from core.gaussians.rendering import ALPHA_MIN, DILATION, NEAR, PROFILE_MIN, TRANSMITTANCE_MIN
+from core.gaussians.spherical_harmonics import basis
+
+HAIR = 1e-4
+FORWARD = 1e-5
+GRADIENT = 1e-3
+
+
+@dataclass
+class Case:
+    """Inputs by name (float32), further arguments, and what it is."""
+
+    what: str
+    inputs: dict[str, Tensor]
+    options: dict[str, object] = field(default_factory=dict)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        return self.options["width"], self.options["height"]  # type: ignore[return-value]
+
+
+SCENES = (
+    "plain", "needles", "huge", "tiny", "behind", "off-frame", "transparent", "opaque", "degenerate",
+    "one pixel", "odd", "layers", "turned",
+)  # fmt: skip
+
+
+def scene_case(seed: int) -> Case:
+    """A random scene, of a kind that goes round with the seed."""
+    rng = np.random.default_rng(seed)
+    what = SCENES[seed % len(SCENES)]
+    n = int(rng.integers(1, 40))
+    width, height = (int(v) for v in rng.integers(8, 34, 2))
+    if what == "one pixel":
+        width = height = 1
+    if what == "odd":
+        width, height = (int(v) for v in rng.choice([1, 3, 7, 15, 17, 31, 33], 2))
+    focal = width * rng.uniform(0.6, 1.6, 2)
+    principal = np.array([width, height]) * rng.uniform(0.3, 0.7, 2)
+
+    z = rng.uniform(0.5, 6, n)
+    spread = {"off-frame": 3.0, "one pixel": 0.3}.get(what, 1.1)
+    xy = rng.uniform(-spread, spread, (n, 2)) * z[:, None] * [width, height] / (2 * focal)
+    if what == "behind":
+        z = rng.uniform(-3, 3, n)
+    pixel = np.abs(z) / focal[0]  # world units of a pixel there
+    log_scales = np.log(pixel * 3)[:, None] + rng.normal(0, 0.6, (n, 1)) + rng.normal(0, 0.5, (n, 3))
+    opacities = rng.uniform(0.02, 0.98, n)
+    quats = rng.normal(size=(n, 4))
+    if what == "needles":
+        log_scales = np.log(pixel)[:, None] + rng.permuted(np.tile([-3.0, -2.0, 2.5], (n, 1)), axis=1)
+    elif what == "huge":
+        log_scales += 3.0
+    elif what == "tiny":
+        log_scales -= 5.0
+    elif what == "transparent":
+        opacities = rng.choice([0.0, 1e-6, 0.003, 0.005, 0.01], n)
+    elif what == "opaque":
+        opacities = rng.choice([0.985, 0.995, 1.0], n)
+        log_scales += 1.0
+    elif what == "degenerate":
+        quats *= rng.choice([0.0, 1e-20, 1e-6, 1.0, 1e6], (n, 1))
+        quats[0] = 0
+        log_scales[rng.random((n, 3)) < 0.3] = -30.0
+    elif what == "layers":
+        xy, z = xy * 0.2, np.sort(z)[::-1]
+        log_scales += 0.7
+    means = np.concatenate([xy, z[:, None]], 1)
+
+    world_to_camera = np.eye(4)
+    if what in ("turned", "behind"):
+        axis = rng.normal(size=3)
+        world_to_camera[:3, :3] = _rotation(axis / np.linalg.norm(axis), rng.uniform(0, 3))
+        world_to_camera[:3, 3] = rng.normal(size=3)
+        means = (means - world_to_camera[:3, 3]) @ world_to_camera[:3, :3]
+    degree = int(rng.integers(0, 4))
+    sh = rng.normal(0, 0.25, (n, 16, 3))
+    intrinsics = np.array([[focal[0], 0, principal[0]], [0, focal[1], principal[1]], [0, 0, 1]])
+    inputs = {
+        "means": means, "quats": quats, "scales": np.exp(log_scales), "opacities": opacities, "sh": sh,
+        "world_to_camera": world_to_camera, "intrinsics": intrinsics, "background": rng.uniform(0, 1, 3),
+    }  # fmt: skip
+    case = Case(f"{what}, seed {seed}", _float32(inputs), {"width": width, "height": height, "sh_degree": degree})
+    return _off_the_steps(case, scene_steps, rng)
+
+
+def splat_case(seed: int) -> Case:
+    """Random 2D Gaussians: plain, rings, arcs of both, blended or added."""
+    rng = np.random.default_rng(10_000 + seed)
+    what = ("plain", "rings", "arcs", "rings and arcs", "faint and large")[seed % 5]
+    blend = ("over", "add")[seed // 5 % 2]
+    n = int(rng.integers(1, 40))
+    width, height = (int(v) for v in rng.integers(1, 40, 2))
+    sigma = np.exp(rng.normal(1.2, 0.7, (n, 2)).clip(-0.5, 3.5)) * (8 if what == "faint and large" else 1)
+    theta = rng.uniform(0, math.pi, n)
+    c, s = np.cos(theta), np.sin(theta)
+    xx, yy = c * c * sigma[:, 0] ** 2 + s * s * sigma[:, 1] ** 2, s * s * sigma[:, 0] ** 2 + c * c * sigma[:, 1] ** 2
+    xy = c * s * (sigma[:, 0] ** 2 - sigma[:, 1] ** 2)
+    inputs = {
+        "centres": rng.uniform(-0.3, 1.3, (n, 2)) * [width, height],
+        "covariances": np.stack([xx, xy, yy], 1),
+        "opacities": rng.uniform(0.006, 0.05, n) if what == "faint and large" else rng.uniform(0, 1, n),
+        "colours": rng.uniform(0, 1, (n, 3)),
+    }
+    if "rings" in what:
+        inputs["rings"] = np.stack([rng.uniform(0, 2, n), rng.uniform(0.15, 1, n)], 1)
+    if "arcs" in what:
+        inputs["arcs"] = np.stack([rng.uniform(-4, 4, n), rng.uniform(-1, 1, n), rng.uniform(0.5, 8, n)], 1)
+    case = Case(
+        f"{what}, {blend}, seed {seed}", _float32(inputs), {"width": width, "height": height, "blend": blend}
+    )
+    return _off_the_steps(case, splat_steps, rng)
+
+
+def _float32(inputs: dict[str, np.ndarray]) -> dict[str, Tensor]:
+    return {name: torch.tensor(value, dtype=torch.float32) for name, value in inputs.items()}
+
+
+def _rotation(axis: np.ndarray, angle: float) -> np.ndarray:
+    x, y, z = axis
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
+
+
+def _near(value: Tensor, step: float) -> Tensor:
+    return (value / step - 1).abs() < HAIR
+
+
+def _in_front(close: Tensor, alpha: Tensor) -> Tensor:
+    """Pairs (n, p) that contribute to a transmittance, at them or behind, that is close to a step."""
+    return (close.flip(0).cumsum(0).flip(0) > 0) & (alpha > 0)
+
+
+def scene_steps(case: Case) -> tuple[Tensor, Tensor]:
+    """Which Gaussians (n,) have a contribution close to a step of blending, and which stand close to one of
+    projection or colour."""
+    width, height = case.size
+    i = {name: value.double() for name, value in case.inputs.items()}
+    n = len(i["means"])
+    by_opacity, by_place = torch.zeros(n, dtype=torch.bool), torch.zeros(n, dtype=torch.bool)
+    seen = project(
+        i["means"], i["quats"], i["scales"], i["world_to_camera"], i["intrinsics"], width, height, NEAR, DILATION
+    )
+    order = torch.argsort(seen.depths, stable=True)
+    index, centres, covariances, depths = (part[order] for part in seen)
+    if len(index) == 0:
+        return by_opacity, by_place
+    g = r.profiles(r.pixel_centres(width, height, i["means"]), centres, covariances, None, None)
+    alpha, before = r.over(g, i["opacities"][index])
+    after = before * (1 - alpha)
+    close = _near(i["opacities"][index].clamp(max=0.99)[:, None] * g, ALPHA_MIN)
+    by_opacity[index] = (close | _in_front(_near(before, TRANSMITTANCE_MIN) | _near(after, 0.5), alpha)).any(1)
+
+    z = (i["means"] @ i["world_to_camera"][:3, :3].T + i["world_to_camera"][:3, 3])[:, 2]
+    by_place |= _near(z, NEAR)
+    slopes = (centres - i["intrinsics"][:2, 2]) / i["intrinsics"].diagonal()[:2]
+    limits = torch.stack(frustum_limits(i["intrinsics"], width, height))
+    tied = torch.zeros_like(index, dtype=torch.bool)
+    tied[1:] = depths.diff() < HAIR * depths[1:] * 0.1
+    directions = torch.nn.functional.normalize(i["means"] - camera_position(i["world_to_camera"]), dim=-1)
+    shown = (basis(directions, 3)[:, :, None] * i["sh"])[:, : (int(case.options["sh_degree"]) + 1) ** 2].sum(1)
+    by_place |= ((shown + 0.5).abs() < HAIR).any(1)
+    by_place[index] |= tied | ((slopes - limits[:, None]).abs() < HAIR).any(-1).any(0)
+    return by_opacity, by_place
+
+
+def splat_steps(case: Case) -> tuple[Tensor, Tensor]:
+    """The same for 2D Gaussians."""
+    width, height = case.size
+    i = {name: value.double() for name, value in case.inputs.items()}
+    pixels = r.pixel_centres(width, height, i["centres"])
+    g = r.profiles(pixels, i["centres"], i["covariances"], i.get("rings"), i.get("arcs"))
+    if case.options["blend"] == "add":
+        return torch.zeros(len(g), dtype=torch.bool), _near(g, PROFILE_MIN).any(1)
+    alpha, before = r.over(g, i["opacities"])
+    close = _near(i["opacities"].clamp(max=0.99)[:, None] * g, ALPHA_MIN)
+    close |= _in_front(_near(before, TRANSMITTANCE_MIN), alpha)
+    return close.any(1), torch.zeros(len(g), dtype=torch.bool)
+
+
+def _off_the_steps(
+    case: Case, steps: Callable[[Case], tuple[Tensor, Tensor]], rng: np.random.Generator
+) -> Case:
+    place = "means" if "means" in case.inputs else "centres"
+    for _ in range(100):
+        by_opacity, by_place = steps(case)
+        if not (by_opacity.any() or by_place.any()):
+            return case
+        inputs = dict(case.inputs)
+        moved = by_opacity & torch.tensor(rng.random(len(by_opacity)) < 0.5)
+        factor = torch.tensor(rng.uniform(0.97, 1, len(by_opacity)), dtype=torch.float32)
+        inputs["opacities"] = torch.where(moved, inputs["opacities"].clamp(max=0.99) * factor, inputs["opacities"])
+        shift = torch.tensor(rng.normal(0, 0.01, inputs[place].shape), dtype=torch.float32)
+        inputs[place] = torch.where(by_place[:, None], inputs[place] + shift, inputs[place])
+        case = replace(case, inputs=inputs)
+    raise AssertionError(f"{case.what}: no place off the steps was found")
+
+
+def render(case: Case, kernels: str, dtype: torch.dtype) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    """Pictures and, by a loss that weighs every pixel of them at random, gradients of every input."""
+    inputs = {name: value.to(dtype).requires_grad_() for name, value in case.inputs.items()}
+    arguments = {**inputs, **case.options, "kernels": kernels}
+    if "means" in inputs:
+        full = rasterization(**arguments)  # type: ignore[arg-type]
+        pictures = {name: getattr(full, name) for name in ("colour", "alpha", "depth")}
+        more = {name: getattr(full, name) for name in ("median_depth", "centres", "radii")}
+    else:
+        laid = splat(**arguments)  # type: ignore[arg-type]
+        pictures = {"colour": laid.colour, "transmittance": laid.transmittance}
+        more = {}
+    generator = torch.Generator().manual_seed(0)
+    loss = sum(
+        (picture * torch.randn(picture.shape, generator=generator, dtype=torch.float64)).sum()
+        for picture in pictures.values()
+    )
+    gradients = {}
+    if isinstance(loss, Tensor) and loss.requires_grad:
+        loss.backward()
+        gradients = {
+            name: torch.zeros_like(value) if value.grad is None else value.grad for name, value in inputs.items()
+        }
+        if more:
+            gradients["centre_gradients"] = full.centre_gradients
+    return {name: p.detach() for name, p in {**pictures, **more}.items()}, gradients
+
+
+def differences(case: Case, kernels: str) -> list[str]:
+    """What a kernel set in float32 gets wrong, one sentence each, against the definition in float64."""
+    pictures, gradients = render(case, "torch", torch.float64)
+    tried, tried_gradients = render(case, kernels, torch.float32)
+    wrong = []
+    for name, picture in pictures.items():
+        error = (tried[name] - picture).abs().max().item() if picture.numel() else 0.0
+        scale = max(1.0, picture.abs().max().item() if picture.numel() else 0.0)
+        if not error <= FORWARD * scale:
+            wrong.append(f"{case.what}: {name} is off by {error:.2e} of {scale:.3g}")
+    for name, gradient in gradients.items():
+        error = torch.linalg.vector_norm(tried_gradients[name] - gradient).item()
+        norm = torch.linalg.vector_norm(gradient).item()
+        if not error <= GRADIENT * norm + FORWARD:
+            wrong.append(f"{case.what}: the gradient of {name} is off by {error / (norm + 1e-30):.2e} of {norm:.3g}")
+    return wrong

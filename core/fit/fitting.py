@@ -10,7 +10,7 @@ import torch
 
 from ..capture import Capture
 from ..errors import Cancelled, RunError
-from ..files import atomic_path
+from ..files import atomic_path, remove_partial
 from ..flare import file as flare_file
 from ..flare.file import FlareFile, TrainingCamera
 from ..gaussians.ply import write_ply
@@ -43,6 +43,7 @@ def fit(capture: Capture, settings: FitSettings, folder: Path | str, progress: P
             progress.say(f"The fit in {folder} is finished already.")
             return run
         trainer = Trainer(capture, run.settings)
+        remove_partial(folder)
     else:
         trainer = Trainer(capture, settings)  # before anything is written: it may refuse the capture
         run = Run.create(folder, settings, capture.folder)

@@ -124,7 +124,7 @@ def test_every_form_gives_finite_gaussians_and_gradients(form: FlareForm) -> Non
     assert (gaussians.rings is not None) == form.rings
     sum((part**2).sum() for part in gaussians if part is not None).backward()
     for name, parameter in model.named_parameters():
-        unused = "correction" in name and not form.light_correction or "correction" in name and not form.line
+        unused = "correction" in name and not (form.light_correction and form.line)
         gradient = parameter.grad
         assert (gradient is None) == unused, name
         if gradient is not None:

@@ -1,0 +1,71 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""How much of a light the camera sees past the scene (METHOD, section 5: explicit occlusion).
+
+A small camera at the view's position looks straight at the light, in the frame or not, and rasterises the
+scene Gaussians that lie before it; what transmittance is left over a soft disk is the visible share. It is
+differentiable by the scene's Gaussians, and fades as a light with a size fades.
+"""
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ..gaussians import rasterization
+from ..gaussians.rasterizer import Kernels
+from ..gaussians.scene import SceneGaussians
+
+
+@dataclass(frozen=True)
+class VisibilitySettings:
+    """radius: of the light's disk, as a share of its distance. margin: Gaussians nearer to the light than this
+    share of its distance do not hide it, since they show the lamp itself. pixels: the small picture's side."""
+
+    radius: float = 0.01
+    margin: float = 0.06
+    pixels: int = 9
+
+
+def visible_share(scene: SceneGaussians, camera: Tensor, light: Tensor, settings: VisibilitySettings | None = None,
+                  kernels: Kernels = "auto") -> Tensor:
+    """The share (scalar, 0..1) of a light at `light` (3,) that a camera at `camera` (3,) sees; world units."""
+    settings = settings or VisibilitySettings()
+    away = (light - camera).float()
+    distance = float(away.norm())
+    if distance <= 0:
+        return torch.ones(())
+    pose = _looking_along(camera.float(), away / distance)
+    chosen = _before(scene, pose, distance, settings)
+    size, half = settings.pixels, settings.pixels / 2
+    # The disk's edge, two deviations of the window, is the picture's edge.
+    focal = half / (2 * settings.radius)
+    intrinsics = torch.tensor([[focal, 0, half], [0, focal, half], [0, 0, 1]])
+    alpha = rasterization(scene.means[chosen], scene.quaternions[chosen], scene.log_scales[chosen].exp(),
+                          scene.opacity_logits[chosen].sigmoid(), scene.sh[chosen, :1], pose, intrinsics, size, size,
+                          near=1e-3 * distance, kernels=kernels).alpha
+    offset = torch.arange(size) + 0.5 - half
+    window = torch.exp(-0.5 * (offset / (half / 2)) ** 2)
+    weights = window[:, None] * window
+    return ((1 - alpha) * weights).sum() / weights.sum()
+
+
+@torch.no_grad()
+def _before(scene: SceneGaussians, pose: Tensor, distance: float, settings: VisibilitySettings) -> Tensor:
+    """Rows of the Gaussians between camera and light that may touch the small picture."""
+    local = scene.means @ pose[:3, :3].T + pose[:3, 3]
+    depth, aside = local[:, 2], local[:, :2].norm(dim=-1)
+    reach = 3 * scene.log_scales.amax(-1).exp()
+    between = (depth > 1e-3 * distance) & (depth < (1 - settings.margin) * distance)
+    return (between & (aside < depth * settings.radius * 4 + reach)).nonzero()[:, 0]
+
+
+def _looking_along(position: Tensor, forward: Tensor) -> Tensor:
+    """world_to_camera (4, 4) of a camera that looks along the unit vector `forward`."""
+    helper = torch.eye(3)[int(forward.abs().argmin())]
+    right = torch.linalg.cross(helper, forward)
+    right = right / right.norm()
+    rotation = torch.stack([right, torch.linalg.cross(forward, right), forward])
+    pose = torch.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation, -rotation @ position
+    return pose

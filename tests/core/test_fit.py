@@ -1,0 +1,204 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""A fit separates a known flare, goes on after any stop as if there had been none, and refuses bad captures."""
+from __future__ import annotations
+
+import json
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from core.capture import Capture
+from core.errors import Cancelled, CaptureError, FlareFileError, RunError
+from core.fit import FitSettings, Run, fit, preset
+from core.fit.settings import changed
+from core.progress import Progress
+from tests.core.flared import flared_capture
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
+    return Capture.open(flared_capture(tmp_path_factory.mktemp("capture")))
+
+
+@pytest.fixture(autouse=True)
+def _same_threads() -> Iterator[None]:
+    """One thread: the sums of a fit are then the same in every process, whatever else the machine does."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+def quick(iterations: int = 40, **changes: Any) -> FitSettings:
+    """A short fit with every event of a long one: cloning, densification, re-ordering, previews."""
+    settings = preset("draft", iterations=iterations)
+    return changed(settings, {"flare.count": 60, "holdout": 4, "preview_every": 15, "flare.density.start": 10,
+                              "flare.density.every": 10, "flare.density.stop": 30, "scene.classic.start": 5,
+                              "scene.classic.every": 10, "scene.reorder_every": 12, "scene.sh_every": 8, **changes})
+
+
+class StopAt(Progress):
+    """Asks for a stop once the given number of steps were made."""
+
+    def __init__(self, steps: int) -> None:
+        super().__init__()
+        self.steps = steps
+
+    def advance(self, steps: int = 1, **figures: float) -> None:
+        self.steps -= steps
+        if self.steps <= 0:
+            self.request_stop()
+        super().advance(steps, **figures)
+
+
+def tensors_of(run: Run) -> dict[str, torch.Tensor]:
+    assert run.flare is not None
+    return {**{f"scene.{k}": v for k, v in run.scene.state_dict().items()},
+            **{f"flare.{k}": v for k, v in run.flare.model.state_dict().items()}}
+
+
+def flare_psnr(run: Run, capture: Capture) -> tuple[float, float]:
+    """Of the linear flare on held-out views, and of an empty one."""
+    _, views = capture.split(run.settings.holdout)
+    errors, empty = [], []
+    for view in views:
+        truth = capture.truth_flare(view)
+        assert truth is not None
+        layer = sum(run.render(view.camera).flare_by_light.values())
+        errors.append(np.square(layer - truth.pixels).mean())
+        empty.append(np.square(truth.pixels).mean())
+    return -10 * float(np.log10(np.mean(errors))), -10 * float(np.log10(np.mean(empty)))
+
+
+def test_a_fit_finds_the_flare(tmp_path: Path, capture: Capture) -> None:
+    run = fit(capture, quick(400, **{"flare.density.stop": 200, "flare.density.every": 50}), tmp_path / "run")
+    fitted, empty = flare_psnr(run, capture)
+    assert fitted > empty + 6
+    names = {path.name for path in (tmp_path / "run").iterdir()}
+    assert names >= {"config.toml", "flare.flare", "scene.ply", "metrics.jsonl", "preview.png", "log.txt"}
+    lines = [json.loads(line) for line in (tmp_path / "run" / "metrics.jsonl").read_text().splitlines()]
+    assert lines[-1]["iteration"] == 400
+    assert lines[-1]["loss"] < lines[0]["loss"]
+    assert lines[-1]["flare_gaussians"] > 60
+
+
+def test_stopped_and_resumed_is_bit_for_bit_the_unbroken_fit(tmp_path: Path, capture: Capture) -> None:
+    whole = fit(capture, quick(), tmp_path / "whole")
+    for steps in (7, 11, 13):
+        with pytest.raises(Cancelled):
+            fit(capture, quick(), tmp_path / "broken", StopAt(steps), resume=True)
+    broken = fit(capture, quick(), tmp_path / "broken", resume=True)
+    assert json.loads((tmp_path / "broken/metrics.jsonl").read_text().splitlines()[-1])["iteration"] == 40
+    expected, got = tensors_of(whole), tensors_of(broken)
+    assert expected.keys() == got.keys()
+    for name, tensor in expected.items():
+        assert torch.equal(tensor, got[name]), name
+
+
+def test_killed_and_resumed_leaves_nothing_half_written(tmp_path: Path, capture: Capture) -> None:
+    folder = tmp_path / "run"
+    script = (f"import torch; torch.set_num_threads(1)\n"
+              f"from core.capture import Capture; from core.fit import fit\n"
+              f"from tests.core.test_fit import quick\n"
+              f"fit(Capture.open({str(capture.folder)!r}), quick(80, checkpoint_every_s=0.0), {str(folder)!r}, "
+              f"resume=True)\n")
+    order = random.Random(5)
+    kills = 0
+    for _ in range(3):
+        process = subprocess.Popen([sys.executable, "-c", script], cwd=ROOT)
+        begun = time.monotonic()
+        before = (folder / "checkpoint/state.safetensors").stat().st_mtime_ns if kills else 0
+        state = folder / "checkpoint/state.safetensors"
+        while process.poll() is None and time.monotonic() - begun < 60:
+            if state.exists() and state.stat().st_mtime_ns != before:
+                time.sleep(order.uniform(0.0, 0.3))
+                break
+            time.sleep(0.005)
+        if process.poll() is None:
+            os.kill(process.pid, signal.SIGKILL)
+            kills += 1
+        process.wait()
+    assert kills >= 1
+    run = fit(capture, quick(80), folder, resume=True)
+    assert run.finished
+    assert not [path for path in folder.rglob("*") if path.name.startswith(".")]
+    whole = fit(capture, quick(80), tmp_path / "whole")
+    for name, tensor in tensors_of(whole).items():
+        assert torch.equal(tensor, tensors_of(run)[name]), name
+
+
+@pytest.mark.parametrize(("mode", "changes"), [
+    ("unsup", {}), ("in-flare", {}), ("2d", {}), ("3dgs", {}), ("default", {"flare.detection": False}),
+    ("default", {"flare.form.light_correction": False}), ("default", {"flare.form.plane_offset": False}),
+    ("default", {"scene.strategy": "mcmc", "scene.mcmc.start": 5, "scene.mcmc.every": 5}),
+])
+def test_every_mode_runs_and_renders(tmp_path: Path, capture: Capture, mode: Any, changes: dict[str, Any]) -> None:
+    settings = changed(preset("draft", mode=mode, iterations=12), {"flare.count": 40, "holdout": 4, **changes})
+    run = fit(capture, settings, tmp_path / "run")
+    reopened = Run.open(tmp_path / "run")
+    assert reopened.settings == run.settings == settings
+    assert reopened.finished
+    layers = reopened.render(capture.views[0].camera)
+    assert layers.scene.shape == (40, 64, 3)
+    assert list(layers.flare_by_light) == ([] if mode == "3dgs" else ["lamp"])
+
+
+def test_ours_runs_in_linear_light(tmp_path: Path, capture: Capture) -> None:
+    settings = changed(preset("draft", model="ours", iterations=12), {"flare.count": 40, "holdout": 4})
+    assert settings.blend == "add"
+    run = fit(capture, settings, tmp_path / "run")
+    assert run.flare is not None and run.flare.blend == "add"
+    assert all((layer >= 0).all() for layer in run.render(capture.views[0].camera).flare_by_light.values())
+
+
+def test_a_capture_without_what_the_mode_needs_is_refused_and_nothing_written(tmp_path: Path, capture: Capture) -> None:
+    for missing, word, modes in (("removed", "removed", ["default"]), ("lights.json", "lights", ["default", "unsup"])):
+        folder = tmp_path / f"without {missing}"
+        shutil.copytree(capture.folder, folder)
+        shutil.rmtree(folder / "truth")
+        (shutil.rmtree if (folder / missing).is_dir() else os.unlink)(folder / missing)
+        for mode in modes:
+            with pytest.raises(CaptureError, match=word):
+                fit(Capture.open(folder), preset("draft", mode=mode, iterations=2), tmp_path / "run")  # type: ignore[arg-type]
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_run_folder_is_not_overwritten(tmp_path: Path, capture: Capture) -> None:
+    with pytest.raises(Cancelled):
+        fit(capture, quick(), tmp_path / "run", StopAt(2))
+    with pytest.raises(RunError, match="resume"):
+        fit(capture, quick(), tmp_path / "run")
+    with pytest.raises(RunError, match="scene"):
+        _ = Run.open(tmp_path / "run").scene
+
+
+def test_a_damaged_checkpoint_or_result_is_one_sentence(tmp_path: Path, capture: Capture) -> None:
+    folder = tmp_path / "run"
+    with pytest.raises(Cancelled):
+        fit(capture, quick(), folder, StopAt(2))
+    state = folder / "checkpoint/state.safetensors"
+    whole = state.read_bytes()
+    for data in (b"", whole[: len(whole) // 2], b"\x80\x04pickle"):
+        state.write_bytes(data)
+        with pytest.raises(RunError, match=r"state\.safetensors"):
+            fit(capture, quick(), folder, resume=True)
+    state.write_bytes(whole)
+    fit(capture, quick(), folder, resume=True)
+    (folder / "flare.flare").write_bytes(b"nonsense")
+    with pytest.raises(FlareFileError, match=r"flare\.flare"):
+        _ = Run.open(folder).flare
+    with pytest.raises(RunError, match="not the folder"):
+        Run.open(tmp_path)

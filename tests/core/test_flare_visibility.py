@@ -1,0 +1,66 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The visible share of a light: hidden, free, half hidden, and differentiable."""
+from __future__ import annotations
+
+import pytest
+import torch
+
+from core.flare.visibility import VisibilitySettings, visible_share
+from core.gaussians.scene import SceneGaussians
+
+LIGHT = torch.tensor([0.0, 0.0, 4.0])
+CAMERA = torch.zeros(3)
+
+
+def wall(x: float = 0.0, z: float = 2.0, half_width: float = 0.5, opacity: float = 0.98) -> SceneGaussians:
+    """A thin wall of overlapping Gaussians: x from `x - half_width` to `x + half_width`, all y."""
+    xs = torch.arange(x - half_width, x + half_width + 1e-6, 0.01)
+    ys = torch.arange(-0.3, 0.3, 0.01)
+    means = torch.cartesian_prod(xs, ys, torch.tensor([z]))
+    n = len(means)
+    return SceneGaussians(means, torch.full((n, 3), 0.008).log(), torch.tensor([1.0, 0, 0, 0]).repeat(n, 1),
+                          torch.full((n,), opacity).logit(), torch.zeros(n, 16, 3))
+
+
+def share(scene: SceneGaussians, light: torch.Tensor = LIGHT) -> float:
+    with torch.no_grad():
+        return float(visible_share(scene, CAMERA, light, VisibilitySettings(radius=0.02), kernels="torch"))
+
+
+def test_a_free_light_is_whole_and_a_hidden_one_gone() -> None:
+    assert share(SceneGaussians.empty()) == 1
+    assert share(wall()) < 0.01
+    assert share(wall(x=1.5)) > 0.99
+
+
+def test_what_lies_behind_or_at_the_light_does_not_hide_it() -> None:
+    assert share(wall(z=5.0)) == 1
+    assert share(wall(z=3.9)) == 1  # the lamp itself, within the margin
+    assert share(wall(z=-2.0)) == 1
+
+
+def test_an_edge_through_the_light_hides_half_and_fades_smoothly() -> None:
+    reach = 0.022  # Gaussians of 0.008 and the rasterizer's low-pass go on so far past the last centre
+    assert share(wall(x=0.5 + reach)) == pytest.approx(0.5, abs=0.08)
+    shares = [share(wall(x=0.5 + reach + shift)) for shift in (-0.06, -0.03, 0.0, 0.03, 0.06)]
+    assert shares == sorted(shares)
+    assert shares[0] < 0.1 and shares[-1] > 0.9
+
+
+def test_the_light_need_not_be_in_any_frame() -> None:
+    """The small camera turns to the light: all directions are alike."""
+    for axis in torch.eye(3):
+        assert share(SceneGaussians.empty(), 4 * axis) == 1
+        hidden = wall()
+        turn = torch.linalg.qr(torch.stack([axis, *torch.randn(2, 3, generator=torch.Generator().manual_seed(0))]).T)[0]
+        forward = turn[:, 0] * torch.sign(turn[:, 0] @ axis)
+        rotation = torch.stack([turn[:, 1], torch.linalg.cross(forward, turn[:, 1]), forward])
+        hidden.means.data = hidden.means.data @ rotation
+        assert share(hidden, 4 * forward) < 0.01
+
+
+def test_it_is_differentiable_by_what_hides_the_light() -> None:
+    scene = wall(opacity=0.3)
+    visible_share(scene, CAMERA, LIGHT, kernels="torch").backward()
+    gradient = scene.opacity_logits.grad
+    assert gradient is not None and float(gradient.min()) < 0 and float(gradient.max()) <= 1e-7

@@ -9,39 +9,82 @@ flares, so each flare score stands beside that of an empty flare.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import Any, Literal
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..capture import Camera, Capture, View
 from ..pictures import Picture, srgb_from_linear
+from ..progress import Progress
 from .pictures import flip, psnr, relative_l2, ssim
 
 Array = NDArray[np.float32]
 Scores = dict[str, float | None]
-Reference = Literal["truth", "removed"]
+Reference = Literal["truth", "removed", "none"]
 
 LAYERS = ("composite", "scene", "flare", "flare_linear")
 _CLIPPED = 254.5 / 255
 
 
-def score_view(composite: Array, scene: Array, frame: Picture, scene_reference: Picture,
+class Rendering(Protocol):
+    """Scene-linear layers of a view: scene (h, w, 3) and each light's flare (h, w, 3)."""
+
+    @property
+    def scene(self) -> Array: ...
+    @property
+    def flare_by_light(self) -> Mapping[str, Array]: ...
+
+
+class Renderer(Protocol):
+    """A fitted run, as `evaluate` uses it."""
+
+    def render(self, camera: Camera) -> Rendering: ...
+
+
+def evaluate(renderer: Renderer, capture: Capture, cameras: Mapping[View, Camera],
+             progress: Progress | None = None) -> dict[str, Any]:
+    """Scores of the given views, each rendered from its camera: the content of eval.json.
+
+    Scene and flare are scored against truth/ where the capture has it, else against removed/, else not.
+    Raises FrameError for pictures that cannot be read, and Cancelled when asked to stop.
+    """
+    progress = progress or Progress()
+    reference: Reference = "truth" if capture.has_truth else "removed" if capture.has_removed else "none"
+    progress.stage("eval", len(cameras))
+    scored = []
+    for view, camera in cameras.items():
+        rendering = renderer.render(camera)
+        composite = sum(rendering.flare_by_light.values(), rendering.scene)
+        clean = {"truth": capture.truth_scene, "removed": capture.removed}.get(reference, _nothing)
+        scored.append((view.name, score_view(
+            composite, rendering.scene, capture.frame(view, camera.size), clean(view, camera.size),
+            capture.truth_flare(view, camera.size) if reference == "truth" else None)))
+        progress.advance()
+    size = next(iter(cameras.values())).size if cameras else (0, 0)
+    return summary(reference, scored, size)
+
+
+def _nothing(_view: View, _size: tuple[int, int]) -> None:
+    return None
+
+
+def score_view(composite: Array, scene: Array, frame: Picture, scene_reference: Picture | None,
                flare_truth: Picture | None = None) -> dict[str, Scores]:
     """Scores of one view by layer: psnr, ssim, lpips (null without weights), flip.
 
     composite, scene: scene-linear layers (height, width, 3); the rest are pictures of the same size.
     A flare also has `empty_psnr`, what no flare at all would score.
     """
-    shown, clean = _display(composite), _display(scene)
-    filmed, reference = frame.display(), scene_reference.display()
-    flare, flare_reference = np.abs(shown - clean), np.abs(filmed - reference)
-    scores = {
-        "composite": _picture_scores(shown, filmed),
-        "scene": _picture_scores(clean, reference),
-        "flare": {**_picture_scores(flare, flare_reference),
-                  "empty_psnr": psnr(np.zeros_like(flare), flare_reference)},
-    }
+    shown, clean, filmed = _display(composite), _display(scene), frame.display()
+    scores = {"composite": _picture_scores(shown, filmed)}
+    if scene_reference is not None:
+        reference = scene_reference.display()
+        flare, flare_reference = np.abs(shown - clean), np.abs(filmed - reference)
+        scores["scene"] = _picture_scores(clean, reference)
+        scores["flare"] = {**_picture_scores(flare, flare_reference),
+                           "empty_psnr": psnr(np.zeros_like(flare), flare_reference)}
     if flare_truth is not None:
         truth, layer, keep = flare_truth.linear(), composite - scene, ~clipped(frame)
         scores["flare_linear"] = {
@@ -94,9 +137,11 @@ def _finite(scores: Scores) -> Scores:
 def table(scores: dict[str, Any]) -> str:
     """The means of eval.json as text, with the view that scored lowest in each layer."""
     count = len(scores["views"])
-    against = {"truth": "the exact layers", "removed": "the frames of removed/"}[scores["reference"]]
+    against = {"truth": "scene and flare against the exact layers",
+               "removed": "scene and flare against the frames of removed/",
+               "none": "without anything to score scene and flare against"}[scores["reference"]]
     width, height = scores["size"]
-    lines = [f"{count} views at {width} x {height}, scene and flare against {against}",
+    lines = [f"{count} views at {width} x {height}, {against}",
              f"{'':13}{'PSNR':>8}{'empty':>8}{'SSIM':>8}{'LPIPS':>8}{'FLIP':>8}{'rel. L2':>9}  lowest PSNR"]
     for layer in LAYERS:
         if layer not in scores:

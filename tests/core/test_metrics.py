@@ -157,7 +157,8 @@ def test_the_summary_is_the_mean_and_json() -> None:
     scene, flare = layers()
     frame = Picture(srgb_from_linear(scene + flare), "srgb")
     reference = Picture(srgb_from_linear(scene), "srgb")
-    views = [(f"{gain}.png", score_view(scene + np.float32(gain) * flare, scene, frame, reference, Picture(flare, "linear")))
+    truth = Picture(flare, "linear")
+    views = [(f"{gain}.png", score_view(scene + np.float32(gain) * flare, scene, frame, reference, truth))
              for gain in (0.5, 0.75, 1.0)]
     scores = summary("truth", views, (20, 16))
     text = json.dumps(scores, allow_nan=False)

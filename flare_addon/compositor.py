@@ -1,0 +1,304 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Baked layers put together in Blender's compositor, by the reusable node group "Fit Flare".
+
+    Flare = Intensity * Tint * (sum of the flare layers),   Image = Scene + Flare
+
+in scene-linear light, so that the picture is the bake's composite at Intensity 1 and white Tint.
+Written for the compositors of 4.2 to 5.2: up to 4.5 a scene owns a node tree that ends in a Composite
+node, from 5.0 it points at a node group that ends in a Group Output; the mix and math nodes changed
+family with it.
+"""
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import bpy
+
+from ..core.errors import FrameError
+from ..core.files import atomic_path
+from .layer_folder import LayerFolder
+
+GROUP = "Fit Flare"
+LAYERS = "Fit Flare Layers"
+
+_GROUPS_ARE_TREES = bpy.app.version >= (5, 0, 0)
+_MIX, _MATH = (("ShaderNodeMix", "ShaderNodeMath") if _GROUPS_ARE_TREES
+               else ("CompositorNodeMixRGB", "CompositorNodeMath"))
+
+
+# ---- the group ------------------------------------------------------------------------------------
+
+
+def node_group(layers: Sequence[str]) -> Any:
+    """The node group with one colour input for each flare layer; the one in the file where it fits.
+
+    layers: names of the inputs, such as "flare_lamp".
+    """
+    wanted = ["Scene", *layers, "Intensity", "Tint"]
+    for group in bpy.data.node_groups:
+        if group.bl_idname == "CompositorNodeTree" and group.name.split(".")[0] == GROUP:
+            inputs = [item.name for item in group.interface.items_tree if getattr(item, "in_out", "") == "INPUT"]
+            if inputs == wanted:
+                return group
+    group = bpy.data.node_groups.new(GROUP, "CompositorNodeTree")
+    _declare(group, wanted)
+    _fill(group, layers)
+    return group
+
+
+def _declare(group: Any, inputs: Iterable[str]) -> None:
+    for name in ("Image", "Flare"):
+        group.interface.new_socket(name, in_out="OUTPUT", socket_type="NodeSocketColor")
+    for name in inputs:
+        kind = "NodeSocketFloat" if name == "Intensity" else "NodeSocketColor"
+        socket = group.interface.new_socket(name, in_out="INPUT", socket_type=kind)
+        if name == "Intensity":
+            socket.default_value, socket.min_value, socket.max_value = 1.0, 0.0, 1000.0
+        else:
+            grey = 1.0 if name == "Tint" else 0.0
+            socket.default_value = (grey, grey, grey, 1.0)
+
+
+def _fill(group: Any, layers: Sequence[str]) -> None:
+    entry = _node(group, "NodeGroupInput", 0, 0)
+    total = entry.outputs[layers[0]]
+    for column, name in enumerate(layers[1:], 1):
+        total = _mix(group, "ADD", total, entry.outputs[name], column, -1)
+    column = len(layers)
+    tinted = _mix(group, "MULTIPLY", total, entry.outputs["Tint"], column, -1)
+    scaled = _mix(group, "MULTIPLY", tinted, entry.outputs["Intensity"], column + 1, -1)
+    image = _mix(group, "ADD", entry.outputs["Scene"], scaled, column + 2, 0)
+    leave = _node(group, "NodeGroupOutput", column + 6, 0)
+    group.links.new(image, leave.inputs["Image"])
+    group.links.new(_with_matte(group, scaled, column + 2), leave.inputs["Flare"])
+
+
+def _with_matte(group: Any, colour: Any, column: int) -> Any:
+    """Colour with alpha = max(R, G, B) in 0..1, the rule of the baked layers (core/bake/layers.py)."""
+    split = _node(group, "CompositorNodeSeparateColor", column, -2)
+    group.links.new(colour, split.inputs[0])
+    red, green, blue = split.outputs[:3]
+    alpha = _math(group, "MAXIMUM", _math(group, "MAXIMUM", red, green, column + 1), blue, column + 2, clamp=True)
+    join = _node(group, "CompositorNodeCombineColor", column + 3, -2)
+    for source, target in zip((red, green, blue, alpha), join.inputs, strict=True):
+        group.links.new(source, target)
+    return join.outputs[0]
+
+
+def _node(tree: Any, kind: str, column: float, row: float) -> Any:
+    node = tree.nodes.new(kind)
+    node.location = (220 * column, 220 * row)
+    return node
+
+
+def _mix(tree: Any, blend: str, a: Any, b: Any, column: float, row: float) -> Any:
+    """The output socket of a (blend) b, at full factor and unclamped."""
+    node = _node(tree, _MIX, column, row)
+    if _MIX == "ShaderNodeMix":
+        node.data_type, node.clamp_factor = "RGBA", False
+        sockets = {socket.identifier: socket for socket in node.inputs}
+        factor, first, second = (sockets[name] for name in ("Factor_Float", "A_Color", "B_Color"))
+        result = next(socket for socket in node.outputs if socket.identifier == "Result_Color")
+    else:
+        factor, first, second = node.inputs
+        result = node.outputs[0]
+    node.blend_type = blend
+    factor.default_value = 1.0
+    tree.links.new(a, first)
+    tree.links.new(b, second)
+    return result
+
+
+def _math(tree: Any, operation: str, a: Any, b: Any, column: float, *, clamp: bool = False) -> Any:
+    node = _node(tree, _MATH, column, -3)
+    node.operation, node.use_clamp = operation, clamp
+    tree.links.new(a, node.inputs[0])
+    tree.links.new(b, node.inputs[1])
+    return node.outputs[0]
+
+
+# ---- the graph ------------------------------------------------------------------------------------
+
+
+def tree_of(scene: Any) -> Any:
+    """The scene's compositor tree, None where it has none."""
+    if _GROUPS_ARE_TREES:
+        return scene.compositing_node_group
+    return scene.node_tree if scene.use_nodes else None
+
+
+def find_node(scene: Any) -> Any:
+    """The scene's "Fit Flare" node, whose inputs are the sliders; None where it is not set up."""
+    tree = tree_of(scene)
+    return tree.nodes.get(GROUP) if tree else None
+
+
+def set_up(scene: Any, layers: LayerFolder, *, keep_image: bool = False) -> Any:
+    """Build the graph that puts `layers` together, or point the one that is there at them.
+
+    keep_image: the scene is what fed the output until now (a render, a plate), and the flare goes over
+    it; otherwise it is the baked scene. Other nodes stay as they are. Returns the "Fit Flare" node.
+    Raises FrameError where the files hold no flare layers.
+    """
+    tree = tree_of(scene) or _new_tree(scene, keep_image)
+    source = tree.nodes.get(LAYERS)
+    if source is None:
+        source = _named(_node(tree, "CompositorNodeImage", -4, 0), LAYERS)
+    _point_at(source, layers)
+    sockets = {socket.name: socket for socket in source.outputs}
+    names = [name for name in sockets if name.startswith("flare_")] or [name for name in sockets if name == "flare"]
+    if not names or "scene" not in sockets:
+        raise FrameError(f"{layers.files[layers.first]} holds no scene and flare layers; choose a folder of a bake.")
+    node = tree.nodes.get(GROUP)
+    if node is None:
+        node = _named(_node(tree, "CompositorNodeGroup", -2, 0), GROUP)
+    sliders = {name: _value(node, name) for name in ("Intensity", "Tint") if name in node.inputs}
+    node.node_tree = node_group(names)
+    for name, value in sliders.items():
+        node.inputs[name].default_value = value
+    for name in names:
+        tree.links.new(sockets[name], node.inputs[name])
+    end = _output(tree)
+    before = end.links[0].from_socket if end.is_linked else None
+    if before is not None and before.node == node:  # set up earlier: what the scene is was chosen then
+        before = node.inputs["Scene"].links[0].from_socket if node.inputs["Scene"].is_linked else None
+    keep = keep_image and before is not None and before.node != source
+    tree.links.new(before if keep else sockets["scene"], node.inputs["Scene"])
+    tree.links.new(node.outputs["Image"], end)
+    return node
+
+
+def _value(node: Any, name: str) -> Any:
+    value = node.inputs[name].default_value
+    return value if isinstance(value, float) else tuple(value)
+
+
+def _named(node: Any, name: str) -> Any:
+    node.name = node.label = name
+    return node
+
+
+def _new_tree(scene: Any, keep_image: bool) -> Any:
+    """A compositor for a scene without one: with the render feeding the output, or empty.
+
+    A Render Layers node makes Blender render the 3D scene, used or not, so there is none without need.
+    """
+    fresh = _GROUPS_ARE_TREES or scene.node_tree is None
+    if _GROUPS_ARE_TREES:
+        tree = scene.compositing_node_group = bpy.data.node_groups.new("Compositor", "CompositorNodeTree")
+    else:
+        scene.use_nodes = True
+        tree = scene.node_tree
+    if fresh:
+        tree.nodes.clear()
+        if keep_image:
+            render = _node(tree, "CompositorNodeRLayers", -4, 1)
+            tree.links.new(render.outputs["Image"], _output(tree))
+    return tree
+
+
+def _output(tree: Any) -> Any:
+    """The input socket that the final picture goes into."""
+    kind = "NodeGroupOutput" if _GROUPS_ARE_TREES else "CompositorNodeComposite"
+    found = [node for node in tree.nodes if node.bl_idname == kind]
+    if _GROUPS_ARE_TREES and not any(getattr(item, "in_out", "") == "OUTPUT" for item in tree.interface.items_tree):
+        tree.interface.new_socket("Image", in_out="OUTPUT", socket_type="NodeSocketColor")
+    node = found[0] if found else _node(tree, kind, 1, 0)
+    return node.inputs[0]
+
+
+def _point_at(node: Any, layers: LayerFolder) -> None:
+    """Make an Image node show the file of each frame's number, gaps and a frame 0 included."""
+    image = bpy.data.images.load(str(layers.files[layers.first]), check_existing=True)
+    image.source = "SEQUENCE"
+    if bpy.data.filepath:
+        with contextlib.suppress(ValueError):  # another drive than the .blend's: the path stays absolute
+            image.filepath = bpy.path.relpath(image.filepath)
+    node.image = image
+    node.frame_start, node.frame_offset = layers.first, layers.first - 1
+    node.frame_duration = layers.last - layers.first + 1
+    node.use_auto_refresh = True
+
+
+# ---- frames ---------------------------------------------------------------------------------------
+
+
+def match_scene(scene: Any, layers: LayerFolder, size: tuple[int, int]) -> None:
+    """Give the scene the layers' frames and size (width, height)."""
+    scene.frame_start, scene.frame_end = layers.first, layers.last
+    render = scene.render
+    render.resolution_x, render.resolution_y = size
+    render.resolution_percentage = 100
+    render.pixel_aspect_x = render.pixel_aspect_y = 1.0
+
+
+def render_frames(scene: Any, frames: Iterable[int], path_of: Callable[[int, str], Path],
+                  done: Callable[[int], None] = lambda _frame: None) -> None:
+    """Render frames through the compositor: a half-float EXR and an 8 bit PNG each, written atomically.
+
+    path_of: from a frame's number and a suffix (".exr", ".png") to the file. The PNG shows the picture in
+    sRGB with no look ("Standard"), as the footage was. done: called after each frame.
+    """
+    if hasattr(scene.render, "compositor_device"):
+        scene.render.compositor_device = "CPU"
+    scene.render.dither_intensity = 0.0
+    with _standard_view(scene):
+        for frame in frames:
+            scene.frame_set(frame)
+            bpy.ops.render.render(scene=scene.name)
+            for suffix in (".exr", ".png"):
+                _set_format(scene.render.image_settings, suffix)
+                with atomic_path(path_of(frame, suffix)) as temporary:
+                    _render_result().save_render(str(temporary), scene=scene)
+                    if not temporary.stat().st_size:
+                        raise FrameError(f"Blender could not write frame {frame} to {temporary.parent}.")
+            done(frame)
+
+
+def _render_result() -> Any:
+    return next(image for image in bpy.data.images if image.type == "RENDER_RESULT")
+
+
+def _set_format(settings: Any, suffix: str) -> None:
+    if hasattr(settings, "media_type"):
+        settings.media_type = "IMAGE"
+    settings.file_format = "OPEN_EXR" if suffix == ".exr" else "PNG"
+    settings.color_mode = "RGBA" if suffix == ".exr" else "RGB"
+    settings.color_depth = "16" if suffix == ".exr" else "8"
+    if suffix == ".exr":
+        settings.exr_codec = "ZIP"
+
+
+@contextlib.contextmanager
+def _standard_view(scene: Any) -> Iterator[None]:
+    """The plain sRGB view while frames are saved."""
+    view = scene.view_settings
+    names = ("view_transform", "look", "exposure", "gamma")
+    before = {name: getattr(view, name) for name in names}
+    view.view_transform, view.look, view.exposure, view.gamma = "Standard", "None", 0.0, 1.0
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            setattr(view, name, value)
+
+
+def save_beside(path: Path) -> None:
+    """Save the file, with paths relative to it wherever they can be."""
+    preferences = bpy.context.preferences.filepaths
+    versions = preferences.save_version
+    preferences.save_version = 0  # no .blend1 of a file that is made anew
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        bpy.ops.wm.save_as_mainfile(filepath=os.fspath(path))
+        for image in bpy.data.images:
+            if image.source == "SEQUENCE":
+                with contextlib.suppress(ValueError):
+                    image.filepath = bpy.path.relpath(bpy.path.abspath(image.filepath))
+        bpy.ops.wm.save_as_mainfile(filepath=os.fspath(path))
+    finally:
+        preferences.save_version = versions

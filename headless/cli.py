@@ -1,0 +1,141 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The command line: reads the words, runs the command's steps where they belong, ends with one sentence.
+
+Status: 0 done; 1 it could not be done, and one sentence says why; 2 the words made no sense; 130 stopped.
+"""
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import traceback
+from collections.abc import Sequence
+from typing import Any, NoReturn
+
+from ..core.errors import Cancelled, EngineError, FitFlareError
+from ..core.progress import JsonProgress, Progress, TerminalProgress, stoppable
+from . import hand_off
+from .command import Command, Step
+from .commands import COMMANDS
+
+DONE, FAILED, MISUSED, STOPPED = 0, 1, 2, 130
+
+_DESCRIPTION = """\
+Takes lens flares out of footage, learns them, and gives them back as layers.
+
+  python headless/run.py COMMAND …
+  blender -b -P headless/run.py -- COMMAND …"""
+
+_EPILOGUE = """\
+A command that is stopped (Ctrl-C) can be given again and goes on. `COMMAND --help` tells more."""
+
+
+class Misuse(FitFlareError):
+    """Words on the command line that make no sense."""
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        raise Misuse(f"{message[0].upper()}{message[1:]} (see {self.prog} --help).")
+
+
+def parser() -> argparse.ArgumentParser:
+    """The parser of all commands, their options and the options that all share."""
+    shared = _Parser(add_help=False)
+    options = shared.add_argument_group("how it runs")
+    options.add_argument("--progress", choices=("terminal", "json"), default="terminal",
+                         help="json: one JSON object a line on standard output, for programs that watch")
+    options.add_argument("--engine", metavar="PYTHON",
+                         help="the Python with torch, or the folder of its virtual environment, for a Blender that "
+                              "has none (else FIT_FLARE_ENGINE, the add-on's preferences, .venv in the repository)")
+    options.add_argument("--blender", metavar="PROGRAM",
+                         help="the Blender for the steps that need one (else FIT_FLARE_BLENDER, the bpy package of "
+                              "this Python, `blender` on the PATH)")
+    options.add_argument("--step", help=argparse.SUPPRESS)
+    whole = _Parser(prog="run.py", description=_DESCRIPTION, epilog=_EPILOGUE,
+                    formatter_class=argparse.RawDescriptionHelpFormatter)
+    commands = whole.add_subparsers(dest="command", metavar="COMMAND", required=True)
+    for command in COMMANDS.values():
+        one = commands.add_parser(command.name, parents=[shared], help=command.summary,
+                                  description=f"{command.summary}\n\n{command.description}",
+                                  formatter_class=argparse.RawDescriptionHelpFormatter)
+        command.arguments(one)
+    return whole
+
+
+def main(words: Sequence[str]) -> int:
+    """Run the command that `words` ask for; returns the status the process should end with."""
+    if not words:
+        parser().print_help(sys.stderr)
+        return MISUSED
+    progress = _progress(words)
+    try:
+        arguments = parser().parse_args(words)
+        with stoppable(progress):
+            result = _run(COMMANDS[arguments.command], arguments, words, progress)
+        progress.close()
+        progress.result(**result)
+        return DONE
+    except SystemExit as end:  # --help
+        return int(end.code or 0)
+    except Misuse as problem:
+        progress.error(str(problem))
+        return MISUSED
+    except (Cancelled, KeyboardInterrupt) as stop:
+        progress.error(str(stop) or "Stopped.")
+        return STOPPED
+    except FitFlareError as problem:
+        progress.error(str(problem))
+        return FAILED
+    except BrokenPipeError:  # whoever listened has gone
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return FAILED
+    except OSError as problem:
+        where = f" ({problem.filename})" if problem.filename else ""
+        progress.error(f"The system refused: {problem.strerror or problem}{where}.")
+        return FAILED
+    except Exception as problem:
+        traceback.print_exc()
+        progress.error(f"A defect of Fit Flare, please report it: {type(problem).__name__}: {problem}.")
+        return FAILED
+    finally:
+        progress.close()
+
+
+def _progress(words: Sequence[str]) -> Progress:
+    """By --progress alone, read before the rest so that misuse is told in the same manner."""
+    told = " ".join(words).replace("--progress=", "--progress ").split("--progress ")[1:]
+    if not told or told[-1].split(" ")[0] != "json":
+        return TerminalProgress()
+    if "bpy" not in sys.modules:
+        return JsonProgress()
+    # Blender prints to standard output as it likes: events keep that for themselves, the rest goes to errors.
+    events = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    os.dup2(2, 1)
+    return JsonProgress(events)
+
+
+def _run(command: Command, arguments: argparse.Namespace, words: Sequence[str], progress: Progress) -> dict[str, Any]:
+    result: dict[str, Any] = {}
+    for step in command.steps:
+        if arguments.step in (None, step.name):
+            result.update(_run_step(step, arguments, words, progress))
+    return result
+
+
+def _run_step(step: Step, arguments: argparse.Namespace, words: Sequence[str], progress: Progress) -> dict[str, Any]:
+    if arguments.step and step.side == "blender" and "bpy" not in sys.modules:
+        __import__("bpy")  # this process was started for it, in a Python that has Blender as a module
+    if hand_off.here() == step.side:
+        return step.run(arguments, progress)
+    if arguments.step:
+        raise EngineError(f"The step {step.name} was handed to {sys.executable}, which has no {step.side} either.")
+    try:
+        there = (hand_off.engine_command(arguments.engine) if step.side == "engine"
+                 else hand_off.blender_command(arguments.blender))
+    except EngineError as problem:
+        if not step.optional:
+            raise
+        progress.say(f"Left out: {step.name}. {problem}")
+        return {}
+    return hand_off.run_there(there, words, step.name, progress)

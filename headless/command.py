@@ -1,0 +1,39 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What a command is: its words on the command line, and its steps with the side each one runs on.
+
+A step of the "engine" side needs torch, one of the "blender" side needs bpy, and no process ever has
+both: see `hand_off`. Steps hand results on through files; what a step returns (paths and figures,
+JSON-able) becomes part of the command's result.
+"""
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from ..core.progress import Progress
+
+Side = Literal["engine", "blender"]
+Run = Callable[[argparse.Namespace, Progress], dict[str, Any]]
+
+
+@dataclass(frozen=True)
+class Step:
+    """optional: left out, with a sentence, on a machine that lacks its side."""
+
+    name: str
+    side: Side
+    run: Run
+    optional: bool = False
+
+
+@dataclass(frozen=True)
+class Command:
+    """summary: one line of the list of commands. description: the head of its own help."""
+
+    name: str
+    summary: str
+    description: str
+    arguments: Callable[[argparse.ArgumentParser], None]
+    steps: tuple[Step, ...]

@@ -1,0 +1,10 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The commands, in the order in which the help lists them. A new one is a module here and a line below."""
+from __future__ import annotations
+
+from ..command import Command
+from . import bake, compose, demo, evaluate, fit
+
+_MODULES = (demo, fit, evaluate, bake, compose)
+
+COMMANDS: dict[str, Command] = {module.COMMAND.name: module.COMMAND for module in _MODULES}

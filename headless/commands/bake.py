@@ -1,0 +1,63 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""bake: a run's views as multilayer EXR files."""
+from __future__ import annotations
+
+import argparse
+import re
+from pathlib import Path
+from typing import Any
+
+from ...core.errors import RunError, SettingsError
+from ...core.progress import Progress
+from ..command import Command, Step
+
+
+def arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("run", type=Path, metavar="RUN", help="folder that `fit` has written")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for layers.####.exr")
+    parser.add_argument("--frames", metavar="A-B", help="frame numbers, such as 1-20,31; all where not given")
+    parser.add_argument("--size", metavar="WIDTH[xHEIGHT]", help="pixels (default: the frames')")
+    parser.add_argument("--set", action="append", default=[], metavar="LIGHT.WHAT=VALUE", dest="edits",
+                        help="lamp.intensity=2, lamp.tint=1,0.8,0.6, lamp.tint=#ffcc88; * for all lights; repeatable")
+    parser.add_argument("--float", action="store_true", help="32 bit floats (default: 16 bit, depth always 32)")
+    parser.add_argument("--overwrite", action="store_true", help="replace layers of another bake in DIR")
+    parser.add_argument("--capture", type=Path, metavar="CAPTURE", help="where the capture is, if it was moved")
+
+
+def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
+    from ...core.bake.bake import BakeSettings, bake
+    from ...core.bake.frames import chosen, numbered
+    from ...core.capture import Capture
+    from ...core.fit.run import Run
+
+    made = Run.open(words.run)
+    if not made.finished:
+        raise RunError(f"{words.run} is not finished; go on with it by `fit --resume` first.")
+    capture = Capture.open(words.capture or made.capture_folder, need_frames=False)
+    cameras = {view.name: view.camera for view in capture.views}
+    frames = chosen(numbered(cameras), words.frames)
+    settings = BakeSettings(size(words.size, cameras[frames[0].view].size), not words.float, tuple(words.edits))
+    record = bake(made, frames, cameras, words.out, settings, progress, overwrite=words.overwrite)
+    progress.say(f"{len(record['frames'])} frames of layers are in {words.out}.")
+    return {"layers": str(words.out), "frames": len(record["frames"])}
+
+
+def size(text: str | None, frame: tuple[int, int]) -> tuple[int, int] | None:
+    """"960x540", or "960" with the height that keeps the frame's (width, height) in proportion."""
+    if text is None:
+        return None
+    match = re.fullmatch(r"([1-9]\d{0,4})(?:x([1-9]\d{0,4}))?", text)
+    if not match:
+        raise SettingsError(f"--size {text} is not a width such as 960, or a size such as 960x540.")
+    width = int(match[1])
+    return width, int(match[2]) if match[2] else max(round(width * frame[1] / frame[0]), 1)
+
+
+COMMAND = Command(
+    "bake", "Renders a run's views to EXR layers.",
+    """Writes one multilayer EXR a frame, scene-linear Rec. 709: composite at the root, scene, flare,
+flare_<light>, depth. scene + flare = composite, and the lights sum to the flare, so add them up in any
+compositor. Frames already made with the same settings are kept.
+
+  run.py bake build/desk --out build/layers --frames 1-20 --set lamp.intensity=2""",
+    arguments, (Step("bake", "engine", run),))

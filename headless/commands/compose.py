@@ -1,0 +1,68 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""compose: baked layers, put together in Blender's compositor and rendered to frames."""
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from ...core.bake.edits import gains
+from ...core.errors import SettingsError
+from ...core.progress import Progress
+from ..command import Command, Step
+
+BLEND = "compositor.blend"
+
+
+def arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("layers", type=Path, metavar="LAYERS", help="folder that `bake` has written")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help=f"folder for the frames and {BLEND}")
+    parser.add_argument("--frames", metavar="A-B", help="frame numbers, such as 1-20,31; all where not given")
+    parser.add_argument("--intensity", type=float, default=1.0, metavar="X", help="factor on the flare (default 1)")
+    parser.add_argument("--tint", default="1,1,1", metavar="R,G,B",
+                        help="colour on the flare, linear factors or #rrggbb (default 1,1,1)")
+
+
+def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
+    done = frames_of(words.layers, words.out, progress, wanted=words.frames, intensity=words.intensity,
+                     tint=words.tint)
+    progress.say(f"The frames are in {done['frames']}; {done['blend']} opens in Blender.")
+    return done
+
+
+def frames_of(folder: Path, out: Path, progress: Progress, *, wanted: str | None = None, intensity: float = 1.0,
+              tint: str = "1,1,1") -> dict[str, Any]:
+    """Build the compositor over the layers in `folder`, save it as a .blend in `out`, render its frames there."""
+    import bpy
+
+    from ...core.bake.frames import Frame, chosen
+    from ...flare_addon import compositor
+    from ...flare_addon.layer_folder import LayerFolder
+
+    layers = LayerFolder.open(folder)
+    if not 0 <= intensity < float("inf"):
+        raise SettingsError(f"The intensity {intensity} is not a number of 0 or more.")
+    colour = gains([f"flare.tint={tint}"], ["flare"])["flare"]
+    known = [Frame("", number, str(path)) for number, path in layers.files.items()]
+    frames = [frame.number for frame in chosen(known, wanted)]
+
+    bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+    scene = bpy.context.scene
+    node = compositor.set_up(scene, layers)
+    compositor.match_scene(scene, layers, layers.size())
+    node.inputs["Intensity"].default_value = intensity
+    node.inputs["Tint"].default_value = (*colour, 1.0)
+    compositor.save_beside(out.resolve() / BLEND)
+    progress.stage("compose", len(frames))
+    compositor.render_frames(scene, frames, lambda number, suffix: out.resolve() / f"frame.{number:04d}{suffix}",
+                             lambda _number: progress.advance())
+    return {"frames": str(out), "blend": str(out / BLEND), "blender": bpy.app.version_string}
+
+
+COMMAND = Command(
+    "compose", "Puts baked layers together in Blender's compositor and renders the frames.",
+    f"""Builds the node group "Fit Flare" over LAYERS and writes frame.####.exr (half float, scene-linear),
+frame.####.png (sRGB) and {BLEND}, which opens in Blender and shows the same.
+
+  run.py compose build/demo/layers --out build/frames --intensity 1.5 --tint 1,0.8,0.6""",
+    arguments, (Step("compose", "blender", run),))

@@ -1,0 +1,90 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""demo: the whole chain on the sample capture, from frames to composited frames."""
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+from typing import Any
+
+from ...core.errors import CaptureError
+from ...core.progress import Progress
+from ..command import Command, Step
+from . import compose, evaluate
+
+ROOT = Path(__file__).resolve().parents[2]
+SAMPLE = ROOT / "sample_scenes" / "desk"
+SHEET = "contact_sheet.png"
+ROWS = 6
+
+
+def arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--out", type=Path, default=ROOT / "build" / "demo", metavar="DIR",
+                        help="folder for everything (default build/demo in the repository)")
+    parser.add_argument("--capture", type=Path, default=SAMPLE, metavar="CAPTURE",
+                        help="another capture than the sample")
+    parser.add_argument("--preset", choices=("draft", "standard", "high"), default="draft",
+                        help="how long and how fine (default draft)")
+
+
+def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
+    """Fit, score, bake, and the contact sheet."""
+    from ...core.bake.bake import bake
+    from ...core.bake.frames import numbered
+    from ...core.capture import Capture
+    from ...core.fit import fit, preset
+
+    if not words.capture.is_dir():
+        raise CaptureError(f"There is no capture in {words.capture}; the sample comes with the repository, "
+                           "or name another with --capture.")
+    began = time.monotonic()
+    capture, out = Capture.open(words.capture), words.out
+    progress.say(f"{words.capture.name}: {len(capture.views)} frames, {len(capture.lights)} lights. "
+                 f"{_supervision(capture)}")
+    made = fit(capture, preset(words.preset), out / "run", progress, resume=True)
+    result = evaluate.scores_of(made.folder, progress)
+    cameras = {view.name: view.camera for view in capture.views}
+    bake(made, numbered(cameras), cameras, out / "layers", progress=progress, overwrite=True)
+    _write_sheet(capture, made.settings.holdout, out)
+    progress.say(f"In {out} there are now the run, the layers of {len(cameras)} frames (EXR), and {SHEET}; "
+                 f"{time.monotonic() - began:.0f} s.")
+    return {**result, "run": str(made.folder), "layers": str(out / "layers"), "sheet": str(out / SHEET)}
+
+
+def _supervision(capture: Any) -> str:
+    """Where the flare-free frames come from, which the scene is learned from."""
+    if capture.has_removed:
+        return f"The flare-free frames are those in {capture.folder / 'removed'}; no flare is removed here."
+    if capture.has_truth:
+        return f"The flare-free frames are the exact ones in {capture.folder / 'truth' / 'scene'}."
+    return "There are no flare-free frames."
+
+
+def _write_sheet(capture: Any, holdout: Any, out: Path) -> None:
+    """Some held-out views (or some of all), from the files that were baked."""
+    from ...core.bake.bake import read_record
+    from ...core.bake.exr import read_layers
+    from ...core.bake.sheet import contact_sheet
+
+    views = capture.split(holdout)[1] or capture.views
+    step = max(len(views) // ROWS, 1)
+    files = {entry["view"]: out / "layers" / entry["file"] for entry in read_record(out / "layers")["frames"]}
+    contact_sheet(out / SHEET, ((view.name, capture.frame(view), read_layers(files[view.name]))
+                                for view in views[::step][:ROWS]))
+
+
+def frames(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
+    """The compositor's frames."""
+    done = compose.frames_of(words.out / "layers", words.out / "frames", progress)
+    progress.say(f"Blender {done['blender']} composited the frames in {done['frames']}; {done['blend']} opens there.")
+    return done
+
+
+COMMAND = Command(
+    "demo", "Runs the whole chain on the sample capture: fit, eval, bake, composited frames.",
+    f"""Writes DIR/run, DIR/layers (EXR), DIR/frames (through Blender's compositor), DIR/{SHEET}
+(frame | composite | scene | flare), and shows the table of scores. Given again, it goes on where it was.
+
+  run.py demo
+  blender -b -P headless/run.py -- demo""",
+    arguments, (Step("chain", "engine", run), Step("frames", "blender", frames, optional=True)))

@@ -1,0 +1,56 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""eval: how well a run separates, in figures."""
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from ...core.errors import RunError
+from ...core.progress import Progress
+from ..command import Command, Step
+
+VIEWS = ("held-out", "train", "all")
+
+
+def arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("run", type=Path, metavar="RUN", help="folder that `fit` has written")
+    parser.add_argument("--views", choices=VIEWS, default="held-out", help="which views to score (default held-out)")
+    parser.add_argument("--capture", type=Path, metavar="CAPTURE", help="where the capture is, if it was moved")
+
+
+def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
+    return scores_of(words.run, progress, which=words.views, capture_folder=words.capture)
+
+
+def scores_of(folder: Path, progress: Progress, *, which: str = "held-out",
+              capture_folder: Path | None = None) -> dict[str, Any]:
+    """Score a run's views, write its eval.json, show the table."""
+    from ...core.capture import Capture
+    from ...core.files import write_json
+    from ...core.fit.frames import Frames
+    from ...core.fit.run import EVALUATION, Run
+    from ...core.metrics.evaluation import evaluate, table
+
+    made = Run.open(folder)
+    capture = Capture.open(capture_folder or made.capture_folder)
+    train, held_out = capture.split(made.settings.holdout)
+    views = {"held-out": held_out, "train": train, "all": capture.views}[which]
+    if not views:
+        raise RunError(f"{folder} held no view out; score others with --views train or all.")
+    frames = Frames(capture, made.settings.width)
+    scores = evaluate(made, capture, {view: frames.camera(view) for view in views}, progress)
+    write_json(made.folder / EVALUATION, scores)
+    progress.say(table(scores))
+    return {"eval": str(made.folder / EVALUATION),
+            "scores": {layer: part for layer, part in scores.items() if isinstance(part, dict)}}
+
+
+COMMAND = Command(
+    "eval", "Scores a run: composite, scene and flare, against what is known.",
+    """Writes RUN/eval.json and shows its means: PSNR, SSIM (11x11 window, sigma 1.5, inside the picture), FLIP
+where the flip-evaluator package is installed. Scene and flare are scored against truth/ where the capture
+has it, else against removed/; "empty" is what no flare at all would score.
+
+  run.py eval build/desk""",
+    arguments, (Step("eval", "engine", run),))

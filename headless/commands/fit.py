@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""fit: a capture, separated into scene and flare."""
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from ...core.errors import SettingsError
+from ...core.progress import Progress
+from ..command import Command, Step
+
+# Spelled out here, since the settings themselves can only be imported where torch is.
+PRESETS = ("draft", "standard", "high", "paper")
+MODES = ("default", "unsup", "in-flare", "2d", "3dgs")
+MODELS = ("paper", "ours")
+BLENDS = ("over", "add")
+
+
+def arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("capture", type=Path, metavar="CAPTURE",
+                        help="folder with images/, sparse/0/ (or transforms.json), lights.json, and removed/ or "
+                             "truth/scene/")
+    parser.add_argument("--out", type=Path, required=True, metavar="RUN", help="folder for the run")
+    parser.add_argument("--resume", action="store_true",
+                        help="go on with the run in --out, with the settings it was begun with; begin it if there is "
+                             "none")
+    parser.add_argument("--preset", choices=PRESETS, default="standard",
+                        help="how long and how fine (default standard)")
+    parser.add_argument("--model", choices=MODELS, help="the flare's form: the paper's, or ours with rings and offsets")
+    parser.add_argument("--mode", choices=MODES, default="default",
+                        help="default; unsup: no flare-free frames; in-flare: scene supervised by frame less flare; "
+                             "2d: flare free on the plane; 3dgs: scene alone")
+    parser.add_argument("--blend", choices=BLENDS,
+                        help="over: the flare covers, in display space; add: it adds, in linear light")
+    parser.add_argument("--holdout", metavar="FILE|N",
+                        help="views kept for eval: a split.json, or every Nth, 0 for none (default: the capture's "
+                             "split.json, else every 8th)")
+    parser.add_argument("--size", type=int, metavar="WIDTH", help="work at this width in pixels (default: the frames')")
+    parser.add_argument("--iterations", type=int, metavar="N", help="length, with every schedule stretched to it")
+    parser.add_argument("--seed", type=int, metavar="N", help="of all randomness (default 0)")
+    parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", dest="changes",
+                        help="any other setting by its name in config.toml, e.g. flare.count=400; repeatable")
+
+
+def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
+    from ...core.capture import Capture
+    from ...core.fit import fit
+    from ...core.fit.settings import changed, preset
+
+    given = {"model": words.model} if words.model else {}
+    settings = preset(words.preset, mode=words.mode, blend=words.blend, iterations=words.iterations, **given)
+    changes = {"width": words.size, "seed": words.seed, "holdout": holdout(words.holdout)}
+    changes = {name: value for name, value in changes.items() if value is not None}
+    settings = changed(settings, {**changes, **dict(map(change, words.changes))})
+    done = fit(Capture.open(words.capture), settings, words.out, progress, resume=words.resume)
+    progress.say(f"The run is in {done.folder}: see preview.png there, then `eval` and `bake` it.")
+    return {"run": str(done.folder)}
+
+
+def holdout(text: str | None) -> str | int | None:
+    """A number, or a file's absolute path, since a run is opened again from anywhere."""
+    if text is None or text.isdigit():
+        return text if text is None else int(text)
+    path = Path(text)
+    if not path.is_file():
+        raise SettingsError(f"--holdout {text} is neither a number nor a file such as split.json.")
+    return str(path.resolve())
+
+
+def change(text: str) -> tuple[str, Any]:
+    """"name=value" as a pair, the value read as TOML reads it, bare words as text."""
+    import tomllib
+
+    name, equals, value = text.partition("=")
+    if not equals or not name.strip():
+        raise SettingsError(f"--set {text} is not of the form name=value.")
+    try:
+        return name.strip(), tomllib.loads(f"value = {value}")["value"]
+    except tomllib.TOMLDecodeError:
+        return name.strip(), value.strip()
+
+
+COMMAND = Command(
+    "fit", "Separates a capture into scene and flare.",
+    """Fits 3D Gaussians to the scene and a flare model to each light, and writes the folder RUN: config.toml,
+flare.flare, scene.ply, preview.png, metrics.jsonl. A fit that was stopped goes on with --resume.
+
+  run.py fit sample_scenes/desk --out build/desk --preset draft
+  run.py fit my_capture --out my_run --size 960 --holdout 0 --resume""",
+    arguments, (Step("fit", "engine", run),))

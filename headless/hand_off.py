@@ -1,0 +1,236 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""One process hands a step to another: the engine's to a Python with torch, Blender's to a Blender.
+
+torch never enters a process that has bpy. The other process is this same program with `--step NAME
+--progress json`; its events become this process's own, a stop is passed on, and it is never left behind.
+"""
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import json
+import os
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+from ..core.errors import Cancelled, EngineError, FitFlareError
+from ..core.progress import Progress
+from .command import Side
+
+ROOT = Path(__file__).resolve().parents[1]
+RUN = ROOT / "headless" / "run.py"
+WINDOWS = os.name == "nt"
+PATIENCE_S = 60.0  # for a stopped process to write what it must
+
+
+def here() -> Side | None:
+    """The side this process can be; None where it has neither bpy loaded nor torch installed."""
+    if "bpy" in sys.modules:
+        return "blender"
+    return "engine" if importlib.util.find_spec("torch") else None
+
+
+# ---- who ------------------------------------------------------------------------------------------
+
+
+def engine_command(named: str | None) -> list[str]:
+    """How to start run.py in a Python with torch.
+
+    Looked for in this order: `named` (--engine), FIT_FLARE_ENGINE, the add-on's preferences, `.venv` in
+    the repository or beside it. One that is named has to work; EngineError where none does.
+    """
+    for where, place in (("--engine", named), ("FIT_FLARE_ENGINE", os.environ.get("FIT_FLARE_ENGINE")),
+                         ("the add-on's preferences", _engine_in_preferences())):
+        if place:
+            python = _python_at(Path(place).expanduser())
+            if python is None or not _has_torch(python):
+                raise EngineError(f"The engine that {where} names, {place}, is not a Python with torch; "
+                                  "install the engine there or name another.")
+            return [str(python), str(RUN)]
+    for folder in (ROOT / ".venv", ROOT.parent / ".venv"):
+        python = _python_at(folder)
+        if python is not None and _has_torch(python):
+            return [str(python), str(RUN)]
+    raise EngineError(f"This step needs a Python with torch, and none was found: run `make setup` in {ROOT}, or "
+                      "name one with --engine or FIT_FLARE_ENGINE.")
+
+
+def _engine_in_preferences() -> str:
+    if "bpy" not in sys.modules:
+        return ""
+    from ..flare_addon.preferences import engine_path
+
+    return engine_path()
+
+
+def _python_at(place: Path) -> Path | None:
+    """The interpreter that `place` is, or that the virtual environment in it has."""
+    for path in (place, place / "Scripts" / "python.exe", place / "bin" / "python"):
+        if path.is_file():
+            return path.absolute()  # not resolved: a virtual environment's python is a link
+    return None
+
+
+def _has_torch(python: Path) -> bool:
+    code = "import importlib.util, sys; sys.exit(importlib.util.find_spec('torch') is None)"
+    try:
+        return subprocess.run([str(python), "-c", code], env=_environment(), capture_output=True,
+                              timeout=60, check=False).returncode == 0
+    except (OSError, subprocess.TimeoutExpired):
+        return False
+
+
+def blender_command(named: str | None) -> list[str]:
+    """How to start run.py in a Blender.
+
+    Looked for in this order: `named` (--blender) and FIT_FLARE_BLENDER, each a program or a whole command
+    line; Blender as a module of this Python; `blender` on the PATH; the system's usual places.
+    EngineError where there is none.
+    """
+    script = ["-b", "--factory-startup", "-P", str(RUN), "--"]
+    for where, text in (("--blender", named), ("FIT_FLARE_BLENDER", os.environ.get("FIT_FLARE_BLENDER"))):
+        if text:
+            words = [text] if Path(text).is_file() else shlex.split(text, posix=not WINDOWS)
+            if not words or not shutil.which(words[0]):
+                raise EngineError(f"The Blender that {where} names, {text}, is not a program; name another.")
+            return [*words, *script]
+    if importlib.util.find_spec("bpy"):
+        return [sys.executable, str(RUN)]
+    for program in (shutil.which("blender"), *_usual_places()):
+        if program and Path(program).is_file():
+            return [program, *script]
+    raise EngineError("This step needs Blender, and none was found: name one with --blender or FIT_FLARE_BLENDER, "
+                      "or install the bpy package beside the engine.")
+
+
+def _usual_places() -> Iterator[str]:
+    if sys.platform == "darwin":
+        yield "/Applications/Blender.app/Contents/MacOS/Blender"
+    elif WINDOWS:
+        folder = Path(os.environ.get("PROGRAMFILES", r"C:\Program Files"), "Blender Foundation")
+        yield from (str(path) for path in sorted(folder.glob("Blender */blender.exe"), reverse=True))
+
+
+def _environment() -> dict[str, str]:
+    """This environment, less what would lead another Python to the wrong modules."""
+    return {name: value for name, value in os.environ.items() if name not in ("PYTHONHOME", "PYTHONPATH")}
+
+
+# ---- how ------------------------------------------------------------------------------------------
+
+
+def run_there(command: Sequence[str], words: Sequence[str], step: str, progress: Progress) -> dict[str, Any]:
+    """Run one step of the command `words` in another process and return its result.
+
+    Raises Cancelled when that process was stopped, and FitFlareError with its own sentence when it failed.
+    """
+    whole = [*command, *words, "--step", step, "--progress", "json"]
+    groups: dict[str, Any] = {"start_new_session": True}
+    if WINDOWS:
+        groups = {"creationflags": getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0)}
+    with tempfile.TemporaryFile() as noise:
+        try:
+            child = subprocess.Popen(whole, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=noise,
+                                     env=_environment(), encoding="utf-8", errors="replace", **groups)
+        except OSError as problem:
+            raise EngineError(f"{whole[0]} cannot be started ({problem.strerror or problem}).") from problem
+        try:
+            with _stops_passed_on(child):
+                result, error = _relayed(child, progress)
+        finally:
+            _end(child)
+        progress.check()
+        if child.returncode == 0:
+            return result
+        if error is None:
+            noise.seek(0)
+            sys.stderr.write("".join(noise.read().decode("utf-8", "replace").splitlines(keepends=True)[-40:]))
+            raise EngineError(f"{Path(whole[0]).name} ended with status {child.returncode} during {step}; "
+                              "its last words stand above.")
+        raise FitFlareError(error)
+
+
+def _relayed(child: subprocess.Popen[str], progress: Progress) -> tuple[dict[str, Any], str | None]:
+    """The child's result and error, with its other events made this process's own."""
+    result: dict[str, Any] = {}
+    error = None
+    done = 0
+    assert child.stdout is not None
+    for line in child.stdout:
+        event = _event(line)
+        kind = event.get("type")
+        with contextlib.suppress(Cancelled):  # the child has been told too, and is heard to its end
+            if kind == "stage":
+                done = event["done"]
+                progress.stage(event["name"], event["total"], done)
+            elif kind == "progress":
+                done, before = event["done"], done
+                progress.advance(done - before, **event["figures"])
+            elif kind == "say":
+                progress.say(event["text"])
+            elif kind == "result":
+                result.update(event["data"])
+            elif kind == "error":
+                error = event["text"]
+    return result, error
+
+
+def _event(line: str) -> dict[str, Any]:
+    """The event that a line holds; {} for the other things that programs print."""
+    if not line.startswith("{"):
+        return {}
+    try:
+        event = json.loads(line)
+    except ValueError:
+        return {}
+    return event if isinstance(event, dict) else {}
+
+
+@contextlib.contextmanager
+def _stops_passed_on(child: subprocess.Popen[str]) -> Iterator[None]:
+    """Signals that ask this process to stop reach the child too; it has a process group of its own."""
+    names = ("SIGINT", "SIGTERM", "SIGBREAK")
+    numbers = [getattr(signal, name) for name in names if hasattr(signal, name)]
+    before = {number: signal.getsignal(number) for number in numbers}
+
+    def pass_on(number: int, frame: FrameType | None) -> None:
+        _interrupt(child)
+        handler = before[number]
+        if callable(handler):
+            handler(number, frame)
+
+    try:
+        for number in numbers:
+            signal.signal(number, pass_on)
+    except ValueError:  # not the main thread, which alone may do this
+        yield
+        return
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, signal.SIG_DFL if handler is None else handler)
+
+
+def _interrupt(child: subprocess.Popen[str]) -> None:
+    with contextlib.suppress(OSError):
+        child.send_signal(getattr(signal, "CTRL_BREAK_EVENT", signal.SIGINT))
+
+
+def _end(child: subprocess.Popen[str]) -> None:
+    """Wait for the child; where this process is leaving early, stop it first."""
+    if sys.exc_info()[0] is not None and child.poll() is None:
+        _interrupt(child)
+    try:
+        child.communicate(timeout=PATIENCE_S)
+    except subprocess.TimeoutExpired:
+        child.kill()
+        child.communicate()

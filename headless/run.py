@@ -1,0 +1,56 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The door for scripts and farms.
+
+    python headless/run.py COMMAND …
+    blender -b -P headless/run.py -- COMMAND …
+
+Both do the same; `COMMAND --help` says what. The file finds its own tree, whatever the working folder,
+and puts nothing on sys.path.
+"""
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import os
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGE = "fit_flare"
+
+
+def load() -> str:
+    """Make this tree importable as a package and return its name: an enabled extension's own, or PACKAGE."""
+    for name, module in list(sys.modules.items()):
+        file = getattr(module, "__file__", None)
+        if name.rpartition(".")[2] == PACKAGE and file and Path(file).resolve() == ROOT / "__init__.py":
+            return name
+    spec = importlib.util.spec_from_file_location(PACKAGE, ROOT / "__init__.py",
+                                                  submodule_search_locations=[str(ROOT)])
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[PACKAGE] = module
+    spec.loader.exec_module(module)
+    return PACKAGE
+
+
+def words() -> list[str]:
+    """The command's own words; Blender passes on what stands after the first --."""
+    if "bpy" in sys.modules:
+        return sys.argv[sys.argv.index("--") + 1:] if "--" in sys.argv else []
+    return sys.argv[1:]
+
+
+def leave(status: int) -> None:
+    """End the process. Blender as a Python module may hang at interpreter exit (seen with 4.5)."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    bpy = sys.modules.get("bpy")
+    if bpy is not None and not bpy.app.binary_path:
+        os._exit(status)
+    sys.exit(status)
+
+
+if __name__ == "__main__":
+    leave(importlib.import_module(f"{load()}.headless.cli").main(words()))

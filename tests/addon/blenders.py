@@ -1,0 +1,41 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Blenders to run scripts in, always as processes of their own, so that the tests' process never has bpy."""
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[2]
+OLDER = ROOT / ".venv-bpy45" / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
+
+
+@dataclass(frozen=True)
+class Blender:
+    """A Python that has Blender as a module; `run` gives back what a script printed last, read as JSON."""
+
+    python: Path
+
+    def run(self, script: Path, *words: object, user: Path) -> Any:
+        command: Sequence[str] = [str(self.python), str(script), *map(str, words)]
+        environment = {**os.environ, "BLENDER_USER_RESOURCES": str(user)}
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120, check=False)
+        assert done.returncode == 0, f"{done.stdout[-2000:]}\n{done.stderr[-4000:]}"
+        lines = [line for line in done.stdout.splitlines() if line.startswith(("{", "["))]
+        return json.loads(lines[-1])
+
+
+def newer() -> Blender | None:
+    """Blender 5 beside the engine."""
+    return Blender(Path(sys.executable)) if importlib.util.find_spec("bpy") else None
+
+
+def older() -> Blender | None:
+    """Blender 4.5 in a Python without an engine."""
+    return Blender(OLDER) if OLDER.is_file() else None

@@ -1,0 +1,77 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Inside Blender: build, rebuild, render. Words: the layers' folder, the folder to write."""
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import sys
+from pathlib import Path
+
+import bpy
+
+ROOT = Path(__file__).resolve().parents[3]
+spec = importlib.util.spec_from_file_location("run", ROOT / "headless" / "run.py")
+run = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(run)
+run.load()
+
+from fit_flare.flare_addon import compositor  # noqa: E402
+from fit_flare.flare_addon.layer_folder import LayerFolder  # noqa: E402
+
+INTENSITY, TINT = 1.7, (1.0, 0.5, 0.25, 1.0)
+
+folder, out = map(Path, sys.argv[1:3])
+layers = LayerFolder.open(folder)
+
+
+def empty() -> bpy.types.Scene:
+    bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+    scene = bpy.context.scene
+    compositor.match_scene(scene, layers, layers.size())
+    return scene
+
+
+def render(scene: bpy.types.Scene, name: str, frames: list[int]) -> None:
+    compositor.render_frames(scene, frames, lambda number, suffix: out / name / f"{number}{suffix}")
+
+
+facts: dict[str, object] = {"version": bpy.app.version_string}
+
+# The graph as it comes, rendered and saved.
+scene = empty()
+node = compositor.set_up(scene, layers)
+facts["inputs"] = [socket.name for socket in node.inputs]
+facts["outputs"] = [socket.name for socket in node.outputs]
+render(scene, "plain", sorted(layers.files))
+
+# With the sliders moved.
+node.inputs["Intensity"].default_value = INTENSITY
+node.inputs["Tint"].default_value = TINT
+render(scene, "changed", sorted(layers.files))
+compositor.save_beside(out / "scene" / "compositor.blend")
+
+# Set up again: nothing doubles, the sliders stay.
+count = len(compositor.tree_of(scene).nodes), len(bpy.data.node_groups)
+again = compositor.set_up(scene, layers)
+facts["doubled"] = [count, (len(compositor.tree_of(scene).nodes), len(bpy.data.node_groups))]
+facts["sliders"] = [again.inputs["Intensity"].default_value, list(again.inputs["Tint"].default_value)]
+
+# The flare alone.
+compositor.tree_of(scene).links.new(again.outputs["Flare"], compositor._output(compositor.tree_of(scene)))
+render(scene, "flare", sorted(layers.files)[:1])
+
+# Over what is there: a plain colour in place of the baked scene, twice.
+scene = empty()
+tree = compositor._new_tree(scene, keep_image=False)
+plate = tree.nodes.new("CompositorNodeRGB")
+plate.outputs[0].default_value = (0.25, 0.5, 0.75, 1.0)
+tree.links.new(plate.outputs[0], compositor._output(tree))
+for _ in range(2):
+    compositor.set_up(scene, layers, keep_image=True)
+facts["plate stays"] = plate.name in tree.nodes
+render(scene, "over", sorted(layers.files)[:1])
+
+print(json.dumps(facts))
+sys.stdout.flush()
+os._exit(0)

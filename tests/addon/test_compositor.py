@@ -1,0 +1,115 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The compositor's pixels against the layers they come from, on every Blender that is set up here."""
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+from blenders import Blender
+
+from core.bake.exr import read_layers, write_layers
+from core.bake.layers import FrameLayers, matte
+from core.pictures import read_exr, read_picture, srgb_from_linear
+
+SCRIPTS = Path(__file__).parent / "scripts"
+NUMBERS = (0, 3, 4, 1000)  # a sequence may begin at 0 and have gaps
+SIZE = 20, 32
+INTENSITY, TINT = 1.7, np.array([1.0, 0.5, 0.25], np.float32)
+HALF = 2.0 ** -11
+
+
+class Made(NamedTuple):
+    facts: dict[str, Any]
+    layers: Path
+    out: Path
+    user: Path
+
+
+def random_layers(seed: int, lights: tuple[str, ...] = ("lamp", "key light")) -> FrameLayers:
+    random = np.random.default_rng(seed)
+
+    def light(reach: float) -> np.ndarray:
+        return (random.random((*SIZE, 3), np.float32) ** 3 * reach).astype(np.float32)
+
+    return FrameLayers(light(1), {name: light(4) for name in lights}, np.ones(SIZE, np.float32))
+
+
+@pytest.fixture(scope="session")
+def made(blender: Blender, tmp_path_factory: pytest.TempPathFactory) -> Made:
+    base = tmp_path_factory.mktemp("composite")
+    layers, out, user = base / "layers", base / "out", base / "user"
+    for number in NUMBERS:
+        write_layers(layers / f"layers.{number:04d}.exr", random_layers(number))
+    return Made(blender.run(SCRIPTS / "composite.py", layers, out, user=user), layers, out, user)
+
+
+def baked(made: Made, number: int) -> FrameLayers:
+    return read_layers(made.layers / f"layers.{number:04d}.exr")
+
+
+def rgb(path: Path) -> np.ndarray:
+    return read_picture(path).pixels
+
+
+def assert_half_equal(image: np.ndarray, expected: np.ndarray) -> None:
+    """Equal within the rounding of the 16 bit file that was written, and of a sum in 32 bit before it."""
+    np.testing.assert_allclose(image, expected, rtol=1.01 * HALF, atol=1e-6)
+
+
+@pytest.mark.parametrize("number", NUMBERS)
+def test_frames_are_scene_plus_flare(made: Made, number: int) -> None:
+    layers = baked(made, number)
+    assert_half_equal(rgb(made.out / "plain" / f"{number}.exr"), layers.scene + layers.flare)
+
+
+@pytest.mark.parametrize("number", NUMBERS)
+def test_intensity_and_tint_are_factors_on_the_flare(made: Made, number: int) -> None:
+    layers = baked(made, number)
+    assert_half_equal(rgb(made.out / "changed" / f"{number}.exr"), layers.scene + INTENSITY * TINT * layers.flare)
+
+
+def test_the_png_is_what_a_screen_shows(made: Made) -> None:
+    layers = baked(made, 3)
+    shown = np.clip(srgb_from_linear(layers.composite), 0, 1)
+    np.testing.assert_allclose(rgb(made.out / "plain" / "3.png"), shown, atol=0.51 / 255)
+
+
+def test_the_flare_output_is_premultiplied_with_its_matte(made: Made) -> None:
+    channels = read_exr(made.out / "flare" / "0.exr")
+    flare = INTENSITY * TINT * baked(made, 0).flare
+    assert_half_equal(np.stack([channels[name] for name in "RGB"], -1), flare)
+    assert_half_equal(channels["A"], matte(flare))
+
+
+def test_the_group_has_its_sockets(made: Made) -> None:
+    assert made.facts["inputs"] == ["Scene", "flare_key_light", "flare_lamp", "Intensity", "Tint"]
+    assert made.facts["outputs"] == ["Image", "Flare"]
+
+
+def test_setting_up_again_changes_nothing(made: Made) -> None:
+    before, after = made.facts["doubled"]
+    assert before == after
+    np.testing.assert_allclose([made.facts["sliders"][0], *made.facts["sliders"][1]], [INTENSITY, *TINT, 1])
+
+
+def test_the_flare_can_go_over_the_present_image(made: Made) -> None:
+    assert made.facts["plate stays"]
+    plate = np.array([0.25, 0.5, 0.75], np.float32)
+    assert_half_equal(rgb(made.out / "over" / "0.exr"), plate + baked(made, 0).flare)
+
+
+def test_the_saved_file_shows_the_same_elsewhere_and_without_us(made: Made, blender: Blender, tmp_path: Path) -> None:
+    shutil.copytree(made.layers, tmp_path / "layers")
+    shutil.copytree(made.out / "scene", tmp_path / "out" / "scene")
+    made.layers.rename(made.layers.with_name("away"))  # so that a path into the first place finds nothing
+    try:
+        facts = blender.run(SCRIPTS / "reopen.py", tmp_path / "out" / "scene" / "compositor.blend", tmp_path / "again",
+                            *NUMBERS, user=tmp_path / "user")
+    finally:
+        made.layers.with_name("away").rename(made.layers)
+    assert facts == {"frames": [0, 1000], "size": [SIZE[1], SIZE[0]]}
+    for number in NUMBERS:
+        assert_half_equal(rgb(tmp_path / "again" / f"{number}.exr"), rgb(made.out / "changed" / f"{number}.exr"))

@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The extension as a user gets it: packed by Blender's own packer, installed, used, disabled."""
+from __future__ import annotations
+
+import subprocess
+import sys
+import tomllib
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from blenders import ROOT, Blender, newer
+
+from core.bake.exr import write_layers
+from core.bake.layers import FrameLayers
+
+SCRIPTS = Path(__file__).parent / "scripts"
+
+
+@pytest.fixture(scope="session")
+def package(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    if newer() is None:
+        pytest.skip("Blender's packer comes with the bpy package (`make setup`)")
+    out = tmp_path_factory.mktemp("package")
+    done = subprocess.run([sys.executable, str(ROOT / "headless" / "package.py"), str(out)], capture_output=True,
+                          text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return next(out.glob("*.zip"))
+
+
+@pytest.fixture(scope="session")
+def facts(blender: Blender, package: Path, tmp_path_factory: pytest.TempPathFactory) -> Any:
+    base = tmp_path_factory.mktemp("installed")
+    layer = np.ones((8, 16, 3), np.float32)
+    write_layers(base / "layers" / "layers.0007.exr", FrameLayers(layer, {"lamp": layer}, layer[..., 0]))
+    return blender.run(SCRIPTS / "install.py", package, base / "layers", user=base / "user")
+
+
+def test_the_versions_agree() -> None:
+    manifest = tomllib.loads((ROOT / "blender_manifest.toml").read_text(encoding="utf-8"))
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    assert manifest["version"] == project["version"]
+
+
+def test_the_package_holds_the_program_and_nothing_else(package: Path) -> None:
+    names = zipfile.ZipFile(package).namelist()
+    assert {"__init__.py", "blender_manifest.toml", "LICENSE", "core/errors.py", "headless/run.py"} <= set(names)
+    strangers = [name for name in names if name.split("/")[0].startswith(".") or "__pycache__" in name
+                 or name.split("/")[0] in ("tests", "benchmarks", "sample_scenes", "build", "tmp")]
+    assert strangers == []
+
+
+def test_it_installs_and_registers(facts: Any) -> None:
+    assert facts["enabled"]
+    assert facts["preferences"] == ""
+    classes = {"FITFLARE_OT_set_up_compositor", "FITFLARE_PT_compositor", "FITFLARE_AP_preferences"}
+    assert classes <= set(facts["classes"])
+
+
+def test_its_button_works_and_refuses_in_words(facts: Any) -> None:
+    assert facts["set up"] == ["FINISHED"]
+    assert facts["size"] == [16, 8, 7, 7]
+    assert "holds no baked layers" in facts["refusal"]
+
+
+def test_it_leaves_blender_as_it_was(facts: Any) -> None:
+    assert facts["sys.path"] == []
+    assert facts["strays"] == []
+    assert facts["left"] == []
+    assert not facts["operator left"]

@@ -219,7 +219,7 @@ def _off_the_steps(
 
 def render(case: Case, kernels: str, dtype: torch.dtype) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
     """Pictures and, by a loss that weighs every pixel of them at random, gradients of every input."""
-    inputs = {name: value.to(dtype).requires_grad_() for name, value in case.inputs.items()}
+    inputs = {name: value.to(dtype, copy=True).requires_grad_() for name, value in case.inputs.items()}
     arguments = {**inputs, **case.options, "kernels": kernels}
     if "means" in inputs:
         full = rasterization(**arguments)  # type: ignore[arg-type]

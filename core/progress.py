@@ -13,6 +13,7 @@ Core code takes a `Progress` and calls `stage`, `advance`, `say`, `result`. The 
 from __future__ import annotations
 
 import contextlib
+import importlib.util
 import json
 import signal
 import sys
@@ -90,15 +91,16 @@ class _Lines:
     def __init__(self, name: str, total: int, done: int, stream: TextIO) -> None:
         self._name, self._total, self._done, self._stream = name, total, done, stream
         self._shown = time.monotonic()
+        self._figures = ""
 
-    def set_postfix(self, figures: dict[str, str], refresh: bool) -> None:
-        """Figures are left to the bar."""
+    def set_postfix(self, figures: dict[str, str], refresh: bool) -> None:  # noqa: ARG002 - tqdm's own signature
+        self._figures = "".join(f"  {name} {value}" for name, value in figures.items())
 
     def update(self, steps: int) -> None:
         self._done += steps
         if self._done >= self._total or time.monotonic() - self._shown > 10:
             self._shown = time.monotonic()
-            print(f"{self._name}: {self._done}/{self._total}", file=self._stream, flush=True)
+            print(f"{self._name}: {self._done}/{self._total}{self._figures}", file=self._stream, flush=True)
 
     def clear(self) -> None:
         """Lines leave nothing to clear."""
@@ -118,17 +120,15 @@ class TerminalProgress(Progress):
 
     def _show_stage(self) -> None:
         self.close()
-        try:
-            from tqdm import tqdm
-        except ModuleNotFoundError:  # Blender's own Python
-            self._bar = _Lines(self._stage, self._total, self._done, self._stream)
-            self._shown = self._done
-            return
-        # A log file gets a line now and then, a terminal a smooth bar.
-        interval = 0.1 if self._stream.isatty() else 10.0
-        self._bar = tqdm(total=self._total, initial=self._done, desc=self._stage, file=self._stream,
-                         mininterval=interval, dynamic_ncols=self._stream.isatty())
         self._shown = self._done
+        # Blender's own Python has no tqdm.
+        if self._stream.isatty() and importlib.util.find_spec("tqdm"):
+            from tqdm import tqdm
+
+            self._bar = tqdm(total=self._total, initial=self._done, desc=self._stage, file=self._stream,
+                             dynamic_ncols=True)
+        else:
+            self._bar = _Lines(self._stage, self._total, self._done, self._stream)
 
     def _show_progress(self, figures: dict[str, float]) -> None:
         if self._bar is None:
@@ -139,7 +139,9 @@ class TerminalProgress(Progress):
         self._shown = self._done
 
     def say(self, text: str) -> None:
-        if self._bar is not None:
+        if self._bar is not None and self._done >= self._total:
+            self.close()
+        elif self._bar is not None:
             self._bar.clear()
         print(text, file=self._stream, flush=True)
 

@@ -33,7 +33,8 @@ def _user_folder() -> Path:
 
 
 def _fingerprint() -> str:
-    digest = hashlib.sha256(numba.__version__.encode())
+    # The machine code names the modules it came from, and the tree may be imported under several names.
+    digest = hashlib.sha256(f"{numba.__version__} {__package__}".encode())
     for source in sorted(Path(__file__).parent.glob("*.py")):
         digest.update(source.read_bytes())
     return digest.hexdigest()[:16]

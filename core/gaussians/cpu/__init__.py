@@ -8,10 +8,9 @@ lanes as a type), then each kernel with its mathematics in its head: `spherical_
 from __future__ import annotations
 
 from .scene import rasterize_scene
+from .splats import splat
 
-__all__ = ["rasterize_scene"]
-
-from ..reference import splat  # noqa
+__all__ = ["rasterize_scene", "splat"]
 
 
 def l1_ssim(image, target, lam):  # noqa

@@ -69,8 +69,8 @@ def _list_gaussian(records, i, slot, width, height, tiles_x, slots):  # type: ig
     """Writes the tiles of Gaussian i from this slot on; returns the slot after the last."""
     at = i * RECORD
     x, half_x = records[at + X], records[at + HALF_X]
-    first_column = int(min(max(x - half_x, ZERO), np.float32(width - 1))) >> TILE_SHIFT_X
-    last_column = int(min(max(x + half_x, ZERO), np.float32(width - 1))) >> TILE_SHIFT_X
+    first_column = int(min(max(x - half_x - SLACK, ZERO), np.float32(width - 1))) >> TILE_SHIFT_X
+    last_column = int(min(max(x + half_x + SLACK, ZERO), np.float32(width - 1))) >> TILE_SHIFT_X
     for column in range(first_column, last_column + 1):
         top, bottom = _column_rows(records, at, column << TILE_SHIFT_X, height)
         if top > bottom:

@@ -2,8 +2,9 @@
 """Compiles kernels on their first call and keeps the machine code on disk for the next start.
 
 The folder is one of the user's own, so that the package itself may be read-only; the environment variable
-FIT_FLARE_CACHE names another. Its last part is a fingerprint of all sources of this package: numba looks
-for changes only in the file that a kernel stands in, not in those that it calls.
+FIT_FLARE_CACHE names another. Its last part is a fingerprint of all sources of this package, since numba looks
+for changes only in the file that a kernel stands in, not in those that it calls; and of the package's full name,
+which is another inside Blender, and which numba stores.
 """
 from __future__ import annotations
 

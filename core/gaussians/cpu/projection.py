@@ -50,7 +50,7 @@ from .vector import (
 )
 
 # Places in a record.
-X, Y, A, K, D, OPACITY, STEP, BEND, RED, GREEN, BLUE, DEPTH, REACH, HALF_X, HALF_Y, VISIBLE = range(16)
+X, Y, A, K, D, OPACITY, STEP, BEND, RED, GREEN, BLUE, DEPTH, REACH, HALF_X, HALF_Y, K_REST = range(16)
 RECORD = 16
 # Places in a row of gradients from the rasterizer.
 G_U, G_Y, G_UU, G_UY, G_YY, G, G_RED, G_GREEN, G_BLUE, G_DEPTH = range(10)
@@ -263,9 +263,7 @@ def _project_block(
     major = yy * H / where(visible, determinant, ONE)
     minor = inverse_y * H
     bend = fma(major * k, k, minor)
-    margin = splat(HALF)
-    half_x, half_y = half_x + margin, half_y + margin
-    store(bounds, first, _tiles_bound(x, y, half_x, half_y, visible, width, height))
+    store(bounds, first, _tiles_bound(x, y, half_x + HALF, half_y + HALF, visible, width, height))
 
     red, green, blue = zero, zero, zero
     if any_of(visible):
@@ -275,7 +273,7 @@ def _project_block(
     rows = transpose((
         x, y, major, k, minor, opacity, exp2(bend * -TWO), bend,
         maximum(red, ZERO), maximum(green, ZERO), maximum(blue, ZERO), pz,
-        reach + MARGIN, half_x, half_y, where(visible, splat(ONE), ZERO),
+        reach + MARGIN, half_x, half_y, zero,
     ))  # fmt: skip
     store_rows(records, first * RECORD, RECORD, rows)
 

@@ -21,7 +21,7 @@ import numpy as np
 
 from .binning import END_ROW, FIRST_ROW, GAUSSIAN, SLOT, TILE_HEIGHT, TILE_WIDTH
 from .compilation import inlined, kernel
-from .projection import ALPHA_MIN, BEND, BLUE, DEPTH, GREEN, OPACITY, RECORD, RED, STEP, A, D, K, X, Y
+from .projection import ALPHA_MIN, BEND, BLUE, DEPTH, GREEN, OPACITY, RECORD, RED, STEP, A, D, K, X
 from .raster_forward import (
     AHEAD,
     DEPTH_ALPHA_MIN,
@@ -34,6 +34,7 @@ from .raster_forward import (
     T_PLANE,
     ZERO,
     falloff,
+    offsets,
     ratio,
     start_tile,
 )
@@ -85,7 +86,7 @@ def _load_gradients(
 
 
 @inlined
-def _row_gradient(state, at, e, red, green, blue, depth, with_depth):  # type: ignore[no-untyped-def]
+def row_gradient(state, at, e, red, green, blue, depth, with_depth):  # type: ignore[no-untyped-def]
     """g and w of one row, and the state after it."""
     t, s = load(state, at + T_PLANE), load(state, at + S_PLANE)
     alpha = where((e >= ALPHA_MIN) & (t >= T_MIN), e, ZERO)
@@ -113,27 +114,26 @@ def _add_colours(state, at, w, sums, with_depth):  # type: ignore[no-untyped-def
 
 
 @inlined
-def _needle(state, records, at, dx, dy, first, end, with_depth):  # type: ignore[no-untyped-def]
+def _needle(state, records, at, left, top, first, end, with_depth):  # type: ignore[no-untyped-def]
     """Sums of g u, g d_y, g u², g u d_y, g d_y², g and colours, each row by its own exponential."""
-    major, k, minor, opacity = records[at + A], records[at + K], records[at + D], records[at + OPACITY]
+    major, minor, opacity = records[at + A], records[at + D], records[at + OPACITY]
     red, green, blue, depth = records[at + RED], records[at + GREEN], records[at + BLUE], records[at + DEPTH]
     zero = splat(ZERO)
     m, mu, my, muu, muy, myy = zero, zero, zero, zero, zero, zero
     colours = (zero, zero, zero, zero)
     for row in range(first, end):
-        u = dx + k * dy
+        u, dy = offsets(records, at, left, top + row)
         e = falloff(major, minor, u, dy) * opacity
-        g, w = _row_gradient(state, row * LANES, e, red, green, blue, depth, with_depth)
+        g, w = row_gradient(state, row * LANES, e, red, green, blue, depth, with_depth)
         colours = _add_colours(state, row * LANES, w, colours, with_depth)
         gu, gy = g * u, g * dy
         m, mu, my = m + g, mu + gu, my + gy
         muu, muy, myy = fma(gu, u, muu), fma(gu, dy, muy), fma(gy, dy, myy)
-        dy += ONE
     return mu, my, muu, muy, myy, m, colours
 
 
 @inlined
-def _ordinary(state, records, at, dx, dy, first, end, with_depth):  # type: ignore[no-untyped-def]
+def _ordinary(state, records, at, left, top, first, end, with_depth):  # type: ignore[no-untyped-def]
     """The same by the recurrence and by sums over the rows of each lane: with u = d_x + k d_y,
 
     sum g u = d_x m0 + k m1,   sum g u d_y = d_x m1 + k m2,   sum g u² = d_x (d_x m0 + 2 k m1) + k² m2
@@ -146,17 +146,18 @@ def _ordinary(state, records, at, dx, dy, first, end, with_depth):  # type: igno
     m0, m1, m2 = zero, zero, zero
     colours = (zero, zero, zero, zero)
     for run in range(first, end, RUN):
-        u = dx + k * dy
+        u, dy = offsets(records, at, left, top + run)
         e = falloff(major, minor, u, dy) * opacity
         r = ratio(major, k, minor, u, dy)
         for row in range(run, min(run + RUN, end)):
-            g, w = _row_gradient(state, row * LANES, e, red, green, blue, depth, with_depth)
+            g, w = row_gradient(state, row * LANES, e, red, green, blue, depth, with_depth)
             colours = _add_colours(state, row * LANES, w, colours, with_depth)
             gy = g * dy
             m0, m1, m2 = m0 + g, m1 + gy, fma(gy, dy, m2)
             dy += ONE
             e = e * r
             r = r * step
+    dx = lanes() + (np.float32(left) + HALF - records[at + X])
     mu = fma(dx, m0, m1 * k)
     muy = fma(dx, m1, m2 * k)
     muu = fma(dx, fma(m1, k, mu), m2 * (k * k))
@@ -166,18 +167,16 @@ def _ordinary(state, records, at, dx, dy, first, end, with_depth):  # type: igno
 @inlined
 def _gradient_row(state, records, at, left, top, first, end, with_depth):  # type: ignore[no-untyped-def]
     """The row of gradients (see `projection`) of one Gaussian in one tile."""
-    dx = lanes() + (np.float32(left) + HALF - records[at + X])
-    dy = np.float32(top + first) + HALF - records[at + Y]
     rows = np.float32(min(end - first, RUN))
     if records[at + BEND] * rows * rows > STEEP:
-        mu, my, muu, muy, myy, m, colours = _needle(state, records, at, dx, dy, first, end, with_depth)
+        mu, my, muu, muy, myy, m, colours = _needle(state, records, at, left, top, first, end, with_depth)
     else:
-        mu, my, muu, muy, myy, m, colours = _ordinary(state, records, at, dx, dy, first, end, with_depth)
+        mu, my, muu, muy, myy, m, colours = _ordinary(state, records, at, left, top, first, end, with_depth)
     return totals((mu, my, muu, muy, myy, m, colours[0], colours[1], colours[2], colours[3]))
 
 
 @inlined
-def _load_tile(
+def load_tile(
     state, left, top, width, height, background, image, alphas, depths, d_image, d_alphas, d_depths, with_depth, edge
 ):  # type: ignore[no-untyped-def]  # fmt: skip
     """The state of a tile before its first Gaussian; edge: workspace for tiles that the picture's edge cuts."""
@@ -232,13 +231,13 @@ def raster_backward(
         left, top = (tile % tiles_x) * TILE_WIDTH, (tile // tiles_x) * TILE_HEIGHT
         begin, used, end = starts[tile], ends[tile], starts[tile + 1]
         if with_depth:
-            _load_tile(
+            load_tile(
                 state, left, top, width, height, background, image, alphas, depths, d_image, d_alphas, d_depths,
                 True, edge,
             )  # fmt: skip
             _tile_backward(entries, begin, used, end, records, left, top, state, gradients, True)
         else:
-            _load_tile(
+            load_tile(
                 state, left, top, width, height, background, image, alphas, depths, d_image, d_alphas, d_depths,
                 False, edge,
             )  # fmt: skip

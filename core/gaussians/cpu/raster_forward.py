@@ -17,7 +17,7 @@ import numpy as np
 
 from .binning import END_ROW, FIRST_ROW, GAUSSIAN, TILE_HEIGHT, TILE_WIDTH
 from .compilation import inlined, kernel
-from .projection import ALPHA_MIN, BEND, BLUE, DEPTH, GREEN, OPACITY, RECORD, RED, STEP, A, D, K, X, Y
+from .projection import ALPHA_MIN, BEND, BLUE, DEPTH, GREEN, OPACITY, RECORD, RED, STEP, A, D, K, K_REST, X, Y
 from .vector import LANES, any_of, exp2, fma, interleave, lanes, load, minimum, prefetch, splat, store, store_rows, take_number, where
 
 T_MIN = np.float32(1e-4)
@@ -36,6 +36,15 @@ DEPTH_ALPHA_MIN = np.float32(0.5 / 255)
 PLANE = TILE_WIDTH * TILE_HEIGHT
 T_PLANE, RED_PLANE, GREEN_PLANE, BLUE_PLANE, DEPTH_PLANE, MEDIAN_PLANE = (i * PLANE for i in range(6))
 STATE = 6 * PLANE
+
+
+@inlined
+def offsets(records, at, left, y):  # type: ignore[no-untyped-def]
+    """u along the pixel row y of the tile, and d_y. The sum of large numbers that is small near a needle is
+    taken in float64."""
+    dy = y + 0.5 - float(records[at + Y])
+    u = left + 0.5 - float(records[at + X]) + (float(records[at + K]) + float(records[at + K_REST])) * dy
+    return lanes() + np.float32(u), np.float32(dy)
 
 
 @inlined
@@ -74,7 +83,7 @@ def finished(state):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _blend_row(state, at, e, red, green, blue, depth, with_depth):  # type: ignore[no-untyped-def]
+def blend_row(state, at, e, red, green, blue, depth, with_depth):  # type: ignore[no-untyped-def]
     t = load(state, at + T_PLANE)
     alpha = where((e >= ALPHA_MIN) & (t >= T_MIN), e, ZERO)
     w = t * alpha
@@ -92,27 +101,24 @@ def _blend_row(state, at, e, red, green, blue, depth, with_depth):  # type: igno
 @inlined
 def _blend(state, records, at, left, top, first, end, with_depth):  # type: ignore[no-untyped-def]
     """One Gaussian over rows first .. end of the tile."""
-    dx = lanes() + (np.float32(left) + HALF - records[at + X])
-    dy = np.float32(top + first) + HALF - records[at + Y]
     major, k, minor = records[at + A], records[at + K], records[at + D]
     opacity, step = records[at + OPACITY], records[at + STEP]
     red, green, blue, depth = records[at + RED], records[at + GREEN], records[at + BLUE], records[at + DEPTH]
     rows = np.float32(min(end - first, RUN))
     if records[at + BEND] * rows * rows > STEEP:
         for row in range(first, end):
-            e = falloff(major, minor, dx + k * dy, dy) * opacity
-            _blend_row(state, row * LANES, e, red, green, blue, depth, with_depth)
-            dy += ONE
+            u, dy = offsets(records, at, left, top + row)
+            e = falloff(major, minor, u, dy) * opacity
+            blend_row(state, row * LANES, e, red, green, blue, depth, with_depth)
         return
     for run in range(first, end, RUN):
-        u = dx + k * dy
+        u, dy = offsets(records, at, left, top + run)
         e = falloff(major, minor, u, dy) * opacity
         r = ratio(major, k, minor, u, dy)
         for row in range(run, min(run + RUN, end)):
-            _blend_row(state, row * LANES, e, red, green, blue, depth, with_depth)
+            blend_row(state, row * LANES, e, red, green, blue, depth, with_depth)
             e = e * r
             r = r * step
-        dy += np.float32(RUN)
 
 
 @inlined
@@ -148,6 +154,13 @@ def _write_row(image, alphas, depths, medians, state, row, left, y, width, backg
 
 
 @inlined
+def write_tile(image, alphas, depths, medians, state, left, top, width, height, background, with_depth):  # type: ignore[no-untyped-def]
+    """The finished tile into the picture."""
+    for row in range(min(TILE_HEIGHT, height - top)):
+        _write_row(image, alphas, depths, medians, state, row, left, top + row, width, background, with_depth)
+
+
+@inlined
 def _raster_tile(
     entries, begin, end, records, background, left, top, width, height, state, image, alphas, depths, medians, with_depth
 ):  # type: ignore[no-untyped-def]  # fmt: skip
@@ -161,8 +174,7 @@ def _raster_tile(
         prefetch(records, entries[min(e + AHEAD, end - 1), GAUSSIAN] * RECORD)
         at = entries[e, GAUSSIAN] * RECORD
         _blend(state, records, at, left, top, entries[e, FIRST_ROW], entries[e, END_ROW], with_depth)
-    for row in range(min(TILE_HEIGHT, height - top)):
-        _write_row(image, alphas, depths, medians, state, row, left, top + row, width, background, with_depth)
+    write_tile(image, alphas, depths, medians, state, left, top, width, height, background, with_depth)
     return used
 
 

@@ -11,47 +11,19 @@ from torch import Tensor
 
 from ..projection import FRUSTUM_MARGIN
 from ..rendering import Rendering
-from . import binning, buffers, projection, raster_backward, raster_forward
+from . import buffers, projection, raster_backward, raster_forward
 from .threads import parallel
+from .tiles import EMPTY, Grid, bin_gaussians, flat
 from .vector import LANES
 
-EMPTY = np.empty(0, np.float32)
-
-
 @dataclass(frozen=True)
-class _Frame:
+class _Frame(Grid):
     """What is not differentiated."""
 
-    width: int
-    height: int
     sh_degree: int
     near: float
     dilation: float
     depth: bool
-
-    @property
-    def tiles_x(self) -> int:
-        return -(-self.width // binning.TILE_WIDTH)
-
-    @property
-    def tiles(self) -> int:
-        return self.tiles_x * -(-self.height // binning.TILE_HEIGHT)
-
-
-@dataclass(frozen=True)
-class _Bins:
-    """Entries by tile, and the slots of each Gaussian; see `binning`."""
-
-    entries: np.ndarray
-    starts: np.ndarray
-    firsts: np.ndarray
-    counts: np.ndarray
-    slots: int
-
-
-def flat(tensor: Tensor) -> np.ndarray:
-    """The numbers of a tensor, as one contiguous row of float32."""
-    return tensor.detach().to(torch.float32).contiguous().reshape(-1).numpy()
 
 
 def camera_numbers(world_to_camera: Tensor, intrinsics: Tensor, frame: _Frame) -> np.ndarray:
@@ -67,30 +39,6 @@ def camera_numbers(world_to_camera: Tensor, intrinsics: Tensor, frame: _Frame) -
             -rotation.T @ translation, [frame.near, frame.dilation],
         ]
     ).astype(np.float32)  # fmt: skip
-
-
-def bin_gaussians(records: np.ndarray, bounds: np.ndarray, chunk_bounds: np.ndarray, frame: _Frame) -> _Bins:
-    """Sorts the records (n, 16) into tiles."""
-    n = len(bounds)
-    starts_of_chunks = np.cumsum(chunk_bounds) - chunk_bounds
-    room = int(chunk_bounds.sum())
-    slots = buffers.empty(room, np.int32)
-    firsts, counts = buffers.empty(n, np.int32), buffers.empty(n, np.int32)
-    flat_records = records.reshape(-1)
-    parallel(
-        binning.list_tiles, flat_records, bounds, starts_of_chunks, frame.width, frame.height, frame.tiles_x,
-        slots, firsts, counts,
-    )  # fmt: skip
-    keys, spare_keys = buffers.empty(n, np.uint32), buffers.empty(n, np.uint32)
-    order, spare_order = buffers.empty(n, np.int32), buffers.empty(n, np.int32)
-    m = binning.sort_by_depth(flat_records.view(np.uint32), counts, keys, spare_keys, order, spare_order)
-    numbers = buffers.empty((torch.get_num_threads(), frame.tiles), np.int32)
-    starts = np.empty(frame.tiles + 1, np.int64)
-    parallel(binning.count, order, m, slots, firsts, counts, numbers)
-    binning.deal(numbers, starts)
-    entries = buffers.empty((int(starts[-1]), binning.ENTRY), np.int32)
-    parallel(binning.scatter, order, m, slots, firsts, counts, numbers, entries)
-    return _Bins(entries, starts, firsts, counts, room)
 
 
 class _Rasterize(torch.autograd.Function):

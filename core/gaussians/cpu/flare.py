@@ -1,0 +1,482 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""2D Gaussians laid on a picture: the flare's rasterizer.
+
+The definition is `..reference`: plain Gaussians, rings and arcs; "over" in the order given, or "add". Records,
+tiles and moments are those of the scene (`projection`, `binning`), so that plain Gaussians "over" need no
+kernel of their own: they are a scene that is already projected. What else there is, a row at a time:
+
+    r = sqrt(2 ln 2 (A u² + D d_y²))       Mahalanobis distance
+    ring      G = 2^-(s (r - r0)²),         s = 1 / (2 ln 2 w²)
+    arc       G = G sigmoid(k (c - cos delta)),   c = (d_x cos theta0 + d_y sin theta0) / |d|
+    add       picture = sum opacity colour G:   no order, no transmittance; its tiles are sums
+
+Backward, g = dL / d ln alpha as in the scene. A profile acts on centre and covariance through q alone, as the plain
+one does with g replaced by
+
+    h = -2 g d ln G / dq = g (r - r0) / (w² r)
+
+and an arc through the angle, too: d ln sigmoid = k (1 - sigmoid) dc, where with sin the sine of theta - theta0
+dc = sin dtheta0 and, by the centre, (-sin d_y, sin d_x) / |d|².
+"""
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from .binning import END_ROW, FIRST_ROW, GAUSSIAN, SLOT, TILE_HEIGHT, TILE_WIDTH
+from .compilation import inlined, kernel
+from .projection import (
+    ALPHA_MIN,
+    BEND,
+    BLUE,
+    DEPTH,
+    G_BLUE,
+    G_GREEN,
+    G_RED,
+    G_U,
+    G_UU,
+    G_UY,
+    G_Y,
+    G_YY,
+    GREEN,
+    HALF_X,
+    HALF_Y,
+    MARGIN,
+    OPACITY,
+    REACH,
+    RECORD,
+    RED,
+    STEP,
+    K_REST,
+    A,
+    D,
+    G,
+    K,
+    X,
+    Y,
+)
+from .raster_backward import V_BLUE, V_GREEN, V_RED, load_tile, row_gradient
+from .raster_backward import STATE as STATE_BACKWARD
+from .raster_forward import (
+    AHEAD,
+    BLUE_PLANE,
+    GREEN_PLANE,
+    HALF,
+    ONE,
+    PAUSE,
+    RED_PLANE,
+    RUN,
+    STATE,
+    STEEP,
+    ZERO,
+    blend_row,
+    falloff,
+    finished,
+    offsets,
+    ratio,
+    start_tile,
+    write_tile,
+)
+from .vector import (
+    LANES,
+    exp2,
+    fma,
+    lanes,
+    load,
+    maximum,
+    minimum,
+    prefetch,
+    splat,
+    sqrt,
+    store,
+    take_number,
+    totals,
+    where,
+)
+
+# Places in a shape: ring and arc of a Gaussian. SHARP: s above; ARC: k.
+R0, SHARP, WIDTH, COS0, SIN0, COS_DELTA, ARC = range(7)
+SHAPE = 8
+# Places in a row of gradients after those of the scene.
+G_R0, G_WIDTH, G_ARC_X, G_ARC_Y, G_THETA0, G_COS_DELTA, G_ARC = range(9, 16)
+
+PROFILE_MIN = np.float32(1 / 4096)
+OPACITY_MAX = 0.99
+TWO_LN2 = np.float32(2 * math.log(2))
+LOG2_E = np.float32(1 / math.log(2))
+RADIUS_MIN = np.float32(1e-6)
+RADIUS2_MIN = np.float32(1e-12)
+TWO = np.float32(2)
+
+
+# --- records ---------------------------------------------------------------------------------------------
+
+
+@inlined
+def _reach(opacity, ring, r0, w, add):  # type: ignore[no-untyped-def]
+    """Mahalanobis radius beyond which nothing is drawn; negative if nothing is at all."""
+    share = 4096.0 if add else opacity * 255.0
+    if share < 1.0:
+        return -1.0
+    radius = math.sqrt(2.0 * math.log(share))
+    return r0 + abs(w) * radius if ring else radius
+
+
+@kernel
+def prepare(centres, covariances, opacities, colours, rings, arcs, width, height, add, records, shapes, bounds):  # type: ignore[no-untyped-def]
+    """Writes record, shape and bound on the number of tiles of each Gaussian; in float64, for needles.
+
+    rings, arcs: empty where there are none. Where light adds, the opacity goes into the colour.
+    """
+    tiles_x, tiles_y = -(-width // TILE_WIDTH), -(-height // TILE_HEIGHT)
+    half = 0.5 / math.log(2.0)
+    for i in range(opacities.size):
+        at = i * RECORD
+        xx, xy, yy = float(covariances[3 * i]), float(covariances[3 * i + 1]), float(covariances[3 * i + 2])
+        determinant = xx * yy - xy * xy
+        opacity = float(opacities[i]) if add else min(float(opacities[i]), OPACITY_MAX)
+        r0, w = (float(rings[2 * i]), float(rings[2 * i + 1])) if rings.size > 0 else (0.0, 1.0)
+        reach = _reach(opacity, rings.size > 0, r0, w, add)
+        bounds[i] = 0
+        if not (determinant > 0 and xx > 0 and reach >= 0):
+            continue
+        x, y, k = float(centres[2 * i]), float(centres[2 * i + 1]), -xy / yy
+        major, minor = half * yy / determinant, half / yy
+        half_x, half_y = reach * math.sqrt(xx), reach * math.sqrt(yy)
+        if x + half_x <= 0 or y + half_y <= 0 or x - half_x >= width or y - half_y >= height:
+            continue
+        gain = opacity if add else 1.0
+        bend = major * k * k + minor
+        records[at + X], records[at + Y] = x, y
+        records[at + A], records[at + K], records[at + D] = major, k, minor
+        records[at + K_REST] = k - float(records[at + K])
+        records[at + OPACITY] = 1.0 if add else opacity
+        records[at + STEP], records[at + BEND] = 2.0 ** max(-2.0 * bend, -126.0), bend
+        records[at + RED], records[at + GREEN] = gain * colours[3 * i], gain * colours[3 * i + 1]
+        records[at + BLUE], records[at + DEPTH] = gain * colours[3 * i + 2], 0.0
+        records[at + REACH] = half * reach * reach + MARGIN
+        records[at + HALF_X], records[at + HALF_Y] = half_x, half_y
+        _write_shape(shapes, i, r0, w, arcs)
+        columns = (int(min(x + half_x + 0.5, width - 1)) >> 4) - (int(max(x - half_x - 0.5, 0.0)) >> 4) + 1
+        rows = (int(min(y + half_y + 0.5, height - 1)) >> 5) - (int(max(y - half_y - 0.5, 0.0)) >> 5) + 1
+        bounds[i] = min(columns, tiles_x) * min(rows, tiles_y)
+
+
+@inlined
+def _write_shape(shapes, i, r0, w, arcs):  # type: ignore[no-untyped-def]
+    at = i * SHAPE
+    shapes[at + R0], shapes[at + WIDTH] = r0, w
+    shapes[at + SHARP] = 0.5 / (math.log(2.0) * w * w)
+    if arcs.size > 0:
+        shapes[at + COS0], shapes[at + SIN0] = math.cos(float(arcs[3 * i])), math.sin(float(arcs[3 * i]))
+        shapes[at + COS_DELTA], shapes[at + ARC] = arcs[3 * i + 1], arcs[3 * i + 2]
+
+
+# --- profiles --------------------------------------------------------------------------------------------
+
+
+@inlined
+def _distance(records, at, u, dy):  # type: ignore[no-untyped-def]
+    """r, Mahalanobis."""
+    power = fma(u * records[at + A], u, splat(records[at + D] * dy * dy))
+    return sqrt(maximum(power * TWO_LN2, RADIUS2_MIN))
+
+
+@inlined
+def _ring(shapes, shape, r):  # type: ignore[no-untyped-def]
+    z = r - shapes[shape + R0]
+    return exp2(z * z * -shapes[shape + SHARP])
+
+
+@inlined
+def _angle(shapes, shape, dx, dy):  # type: ignore[no-untyped-def]
+    """Cosine and sine of the angle from theta0, and the inverse of the distance, px."""
+    inverse = ONE / sqrt(maximum(fma(dx, dx, splat(dy * dy)), RADIUS2_MIN))
+    cosine = fma(dx, shapes[shape + COS0], splat(dy * shapes[shape + SIN0])) * inverse
+    sine = fma(dx, -shapes[shape + SIN0], splat(dy * shapes[shape + COS0])) * inverse
+    return cosine, sine, inverse
+
+
+@inlined
+def _window(shapes, shape, cosine):  # type: ignore[no-untyped-def]
+    """The sigmoid of an arc."""
+    x = (cosine - shapes[shape + COS_DELTA]) * shapes[shape + ARC]
+    return ONE / (exp2(minimum(x * -LOG2_E, np.float32(120))) + ONE)
+
+
+# --- forward ---------------------------------------------------------------------------------------------
+
+
+@inlined
+def _add_row(state, at, e, red, green, blue):  # type: ignore[no-untyped-def]
+    e = where(e >= PROFILE_MIN, e, ZERO)
+    store(state, at + RED_PLANE, fma(e, red, load(state, at + RED_PLANE)))
+    store(state, at + GREEN_PLANE, fma(e, green, load(state, at + GREEN_PLANE)))
+    store(state, at + BLUE_PLANE, fma(e, blue, load(state, at + BLUE_PLANE)))
+
+
+@inlined
+def _add_plain(state, records, at, left, top, first, end):  # type: ignore[no-untyped-def]
+    """A plain Gaussian, rows first .. end; by the recurrence unless it is a needle (see `raster_forward`)."""
+    major, k, minor, step = records[at + A], records[at + K], records[at + D], records[at + STEP]
+    red, green, blue = records[at + RED], records[at + GREEN], records[at + BLUE]
+    rows = np.float32(min(end - first, RUN))
+    if records[at + BEND] * rows * rows > STEEP:
+        for row in range(first, end):
+            u, dy = offsets(records, at, left, top + row)
+            _add_row(state, row * LANES, falloff(major, minor, u, dy), red, green, blue)
+        return
+    for run in range(first, end, RUN):
+        u, dy = offsets(records, at, left, top + run)
+        e, r = falloff(major, minor, u, dy), ratio(major, k, minor, u, dy)
+        for row in range(run, min(run + RUN, end)):
+            _add_row(state, row * LANES, e, red, green, blue)
+            e = e * r
+            r = r * step
+
+
+@inlined
+def _draw_shaped(state, records, at, shapes, shape, left, top, first, end, arcs, add):  # type: ignore[no-untyped-def]
+    """A ring or arc, rows first .. end."""
+    opacity = records[at + OPACITY]
+    red, green, blue = records[at + RED], records[at + GREEN], records[at + BLUE]
+    dx = lanes() + (np.float32(left) + HALF - records[at + X])
+    for row in range(first, end):
+        u, dy = offsets(records, at, left, top + row)
+        e = _ring(shapes, shape, _distance(records, at, u, dy)) * opacity
+        if arcs:
+            e = e * _window(shapes, shape, _angle(shapes, shape, dx, dy)[0])
+        if add:
+            _add_row(state, row * LANES, e, red, green, blue)
+        else:
+            blend_row(state, row * LANES, e, red, green, blue, ZERO, False)
+
+
+@inlined
+def _draw_tile(entries, begin, end, records, shapes, left, top, state, shaped, arcs, add):  # type: ignore[no-untyped-def]
+    """All entries of a tile, or those up to where all pixels are done; returns the end of them."""
+    for e in range(begin, end):
+        if not add and (e - begin) & (PAUSE - 1) == PAUSE - 1 and finished(state):
+            return e
+        i = entries[e, GAUSSIAN]
+        at, first, last = i * RECORD, entries[e, FIRST_ROW], entries[e, END_ROW]
+        if shaped:
+            _draw_shaped(state, records, at, shapes, i * SHAPE, left, top, first, last, arcs, add)
+        else:
+            _add_plain(state, records, at, left, top, first, last)
+    return end
+
+
+@kernel
+def raster(
+    counter, entries, starts, records, shapes, background, width, height, tiles_x, shaped, arcs, add, image, alphas, ends
+):  # type: ignore[no-untyped-def]  # fmt: skip
+    """Colour (h w 3) and alpha (h w), flat; ends (tiles,): where each tile stopped. shaped, arcs: whether
+    rings (or arcs) are drawn, or plain Gaussians; these only where light adds."""
+    state = np.empty(STATE, np.float32)
+    while True:
+        tile = take_number(counter)
+        if tile >= ends.size:
+            break
+        left, top = (tile % tiles_x) * TILE_WIDTH, (tile // tiles_x) * TILE_HEIGHT
+        begin, end = starts[tile], starts[tile + 1]
+        start_tile(state, left, top, width, height)
+        if not shaped:
+            end = _draw_tile(entries, begin, end, records, shapes, left, top, state, False, False, True)
+        elif add:
+            end = _draw_tile(entries, begin, end, records, shapes, left, top, state, True, arcs, True)
+        else:
+            end = _draw_tile(entries, begin, end, records, shapes, left, top, state, True, arcs, False)
+        ends[tile] = end
+        write_tile(image, alphas, alphas, alphas, state, left, top, width, height, background, False)
+
+
+# --- backward --------------------------------------------------------------------------------------------
+
+
+@inlined
+def _add_gradient(state, at, e, red, green, blue):  # type: ignore[no-untyped-def]
+    """g and w where light adds: each Gaussian by itself."""
+    w = where(e >= PROFILE_MIN, e, ZERO)
+    vc = fma(load(state, at + V_GREEN), green, load(state, at + V_RED) * red)
+    return w * fma(load(state, at + V_BLUE), blue, vc), w
+
+
+@inlined
+def _add_colours(state, at, w, colours):  # type: ignore[no-untyped-def]
+    return (
+        fma(w, load(state, at + V_RED), colours[0]),
+        fma(w, load(state, at + V_GREEN), colours[1]),
+        fma(w, load(state, at + V_BLUE), colours[2]),
+    )
+
+
+@inlined
+def _add_moments(moments, h, u, dy):  # type: ignore[no-untyped-def]
+    """Adds h times u, d_y, u², u d_y, d_y²."""
+    hu, hy = h * u, h * dy
+    return (
+        moments[0] + hu, moments[1] + hy, fma(hu, u, moments[2]), fma(hu, dy, moments[3]), fma(hy, dy, moments[4])
+    )  # fmt: skip
+
+
+@inlined
+def _plain_backward(state, records, at, left, top, first, end):  # type: ignore[no-untyped-def]
+    """The row of gradients of a plain Gaussian whose light adds."""
+    major, k, minor, step = records[at + A], records[at + K], records[at + D], records[at + STEP]
+    red, green, blue = records[at + RED], records[at + GREEN], records[at + BLUE]
+    zero = splat(ZERO)
+    moments, colours = (zero, zero, zero, zero, zero), (zero, zero, zero)
+    rows = np.float32(min(end - first, RUN))
+    steep = records[at + BEND] * rows * rows > STEEP
+    for run in range(first, end, RUN):
+        u, dy = offsets(records, at, left, top + run)
+        e, r = falloff(major, minor, u, dy), ratio(major, k, minor, u, dy)
+        for row in range(run, min(run + RUN, end)):
+            if steep:
+                u, dy = offsets(records, at, left, top + row)
+                e = falloff(major, minor, u, dy)
+            g, w = _add_gradient(state, row * LANES, e, red, green, blue)
+            colours = _add_colours(state, row * LANES, w, colours)
+            moments = _add_moments(moments, g, u, dy)
+            dy += ONE
+            u = u + k
+            e = e * r
+            r = r * step
+    return totals((
+        moments[0], moments[1], moments[2], moments[3], moments[4], zero, colours[0], colours[1], colours[2]
+    ))  # fmt: skip
+
+
+@inlined
+def _shaped_backward(state, records, at, shapes, shape, left, top, first, end, arcs, add):  # type: ignore[no-untyped-def]
+    """The row of gradients of a ring or arc."""
+    opacity = records[at + OPACITY]
+    red, green, blue = records[at + RED], records[at + GREEN], records[at + BLUE]
+    dx = lanes() + (np.float32(left) + HALF - records[at + X])
+    r0, sharpness = shapes[shape + R0], shapes[shape + SHARP] * TWO_LN2  # 1 / w²
+    zero = splat(ZERO)
+    moments, colours, mass = (zero, zero, zero, zero, zero), (zero, zero, zero), zero
+    d_r0, d_w, arc_x, arc_y, d_theta, d_cos, d_k = zero, zero, zero, zero, zero, zero, zero
+    for row in range(first, end):
+        u, dy = offsets(records, at, left, top + row)
+        r = _distance(records, at, u, dy)
+        e = _ring(shapes, shape, r) * opacity
+        cosine, sine, inverse, window = zero, zero, zero, zero
+        if arcs:
+            cosine, sine, inverse = _angle(shapes, shape, dx, dy)
+            window = _window(shapes, shape, cosine)
+            e = e * window
+        if add:
+            g, w = _add_gradient(state, row * LANES, e, red, green, blue)
+        else:
+            g, w = row_gradient(state, row * LANES, e, red, green, blue, ZERO, False)
+        colours = _add_colours(state, row * LANES, w, colours)
+        mass = mass + g
+        z = r - r0
+        gz = g * z
+        d_r0, d_w = d_r0 + gz, fma(gz, z, d_w)
+        moments = _add_moments(moments, where(r > RADIUS_MIN, gz * sharpness / r, ZERO), u, dy)
+        if arcs:
+            off = g * (ONE - window)
+            d_k = fma(off, cosine - shapes[shape + COS_DELTA], d_k)
+            off = off * shapes[shape + ARC]
+            d_cos = d_cos - off
+            d_theta = fma(off, sine, d_theta)
+            turn = off * sine * inverse * inverse
+            arc_x, arc_y = arc_x - turn * dy, fma(turn, dx, arc_y)
+    return totals((
+        moments[0], moments[1], moments[2], moments[3], moments[4], mass, colours[0], colours[1], colours[2],
+        d_r0 * sharpness, d_w * (sharpness / shapes[shape + WIDTH]), arc_x, arc_y, d_theta, d_cos, d_k,
+    ))  # fmt: skip
+
+
+@inlined
+def _tile_backward(entries, begin, used, end, records, shapes, left, top, state, shaped, arcs, add, gradients):  # type: ignore[no-untyped-def]
+    for e in range(begin, used):
+        prefetch(gradients, entries[min(e + AHEAD, end - 1), SLOT] * RECORD)
+        i = entries[e, GAUSSIAN]
+        at, first, last = i * RECORD, entries[e, FIRST_ROW], entries[e, END_ROW]
+        if shaped:
+            row = _shaped_backward(state, records, at, shapes, i * SHAPE, left, top, first, last, arcs, add)
+        else:
+            row = _plain_backward(state, records, at, left, top, first, last)
+        store(gradients, entries[e, SLOT] * RECORD, row)
+    for e in range(used, end):
+        store(gradients, entries[e, SLOT] * RECORD, splat(ZERO))
+
+
+@kernel
+def raster_backward(
+    counter, entries, starts, ends, records, shapes, background, width, height, tiles_x, shaped, arcs, add,
+    image, alphas, d_image, d_alphas, gradients,
+):  # type: ignore[no-untyped-def]  # fmt: skip
+    """gradients: the row of each slot."""
+    state = np.empty(STATE_BACKWARD, np.float32)
+    edge = np.zeros((6, 3 * LANES), np.float32)
+    while True:
+        tile = take_number(counter)
+        if tile >= ends.size:
+            break
+        left, top = (tile % tiles_x) * TILE_WIDTH, (tile // tiles_x) * TILE_HEIGHT
+        begin, used, end = starts[tile], ends[tile], starts[tile + 1]
+        load_tile(
+            state, left, top, width, height, background, image, alphas, alphas, d_image, d_alphas, d_alphas, False, edge
+        )
+        if not shaped:
+            _tile_backward(
+                entries, begin, used, end, records, shapes, left, top, state, False, False, True, gradients
+            )
+        elif add:
+            _tile_backward(entries, begin, used, end, records, shapes, left, top, state, True, arcs, True, gradients)
+        else:
+            _tile_backward(entries, begin, used, end, records, shapes, left, top, state, True, arcs, False, gradients)
+
+
+@inlined
+def _add_rows(gradients, first, count, row):  # type: ignore[no-untyped-def]
+    total = splat(ZERO)
+    for slot in range(first, first + count):
+        total = total + load(gradients, slot * RECORD)
+    store(row, 0, total)
+
+
+@kernel
+def finish(
+    covariances, opacities, colours, records, gradients, firsts, counts, add,
+    d_centres, d_covariances, d_opacities, d_colours, d_rings, d_arcs,
+):  # type: ignore[no-untyped-def]  # fmt: skip
+    """Gradients of the inputs from the rows; see `projection` for the moments. d_rings, d_arcs may be empty."""
+    row = np.empty(RECORD, np.float32)
+    for i in range(opacities.size):
+        _add_rows(gradients, firsts[i], counts[i], row)
+        xx, xy, yy = float(covariances[3 * i]), float(covariances[3 * i + 1]), float(covariances[3 * i + 2])
+        determinant = xx * yy - xy * xy
+        if not (determinant > 0 and yy > 0):
+            determinant, yy = 1.0, 1.0
+        k, alpha, inverse = -xy / yy, yy / determinant, 1.0 / yy
+        uu, uy, dd = alpha * row[G_UU], inverse * row[G_UY], inverse * inverse * row[G_YY]
+        d_centres[2 * i] = alpha * row[G_U]
+        d_centres[2 * i + 1] = alpha * k * row[G_U] + inverse * row[G_Y]
+        d_covariances[3 * i] = 0.5 * alpha * uu
+        d_covariances[3 * i + 1] = alpha * (k * uu + uy)
+        d_covariances[3 * i + 2] = 0.5 * (alpha * k * k * uu + 2.0 * alpha * k * uy + dd)
+        light = (row[G_RED], row[G_GREEN], row[G_BLUE])
+        if add:
+            d_opacities[i] = ZERO
+            for c in range(3):
+                d_opacities[i] += light[c] * colours[3 * i + c]
+                d_colours[3 * i + c] = light[c] * opacities[i]
+        else:
+            free = ALPHA_MIN <= opacities[i] <= OPACITY_MAX
+            d_opacities[i] = row[G] / opacities[i] if free else ZERO
+            for c in range(3):
+                d_colours[3 * i + c] = light[c]
+        if d_rings.size > 0:
+            d_rings[2 * i], d_rings[2 * i + 1] = row[G_R0], row[G_WIDTH]
+        if d_arcs.size > 0:
+            d_centres[2 * i] += row[G_ARC_X]
+            d_centres[2 * i + 1] += row[G_ARC_Y]
+            for c in range(3):
+                d_arcs[3 * i + c] = row[G_THETA0 + c]

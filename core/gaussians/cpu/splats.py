@@ -1,0 +1,94 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""`splat` on the CPU: the flare's kernels as one function of autograd."""
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..rendering import Splats
+from . import buffers, flare, projection, raster_backward, raster_forward
+from .threads import parallel
+from .tiles import EMPTY, Bins, Grid, bin_gaussians, flat
+
+BLACK = np.zeros(3, np.float32)
+
+
+def _bin(records: np.ndarray, bounds: np.ndarray, grid: Grid) -> Bins:
+    chunks = np.arange(0, len(bounds), projection.CHUNK)
+    sums = np.add.reduceat(bounds, chunks, dtype=np.int64) if len(bounds) else np.zeros(0, np.int64)
+    return bin_gaussians(records, bounds, sums, grid, by_depth=False)
+
+
+class _Splat(torch.autograd.Function):
+    @staticmethod
+    def forward(  # type: ignore[override]
+        ctx: Any, centres: Tensor, covariances: Tensor, opacities: Tensor, colours: Tensor,
+        rings: Tensor | None, arcs: Tensor | None, add: bool, grid: Grid,
+    ) -> tuple[Tensor, Tensor]:  # fmt: skip
+        n, h, w = len(centres), grid.height, grid.width
+        shaped = rings is not None or arcs is not None
+        inputs = [flat(t) for t in (centres, covariances, opacities, colours)]
+        shape_inputs = [EMPTY if t is None else flat(t) for t in (rings, arcs)]
+        records, shapes = buffers.empty((n, projection.RECORD)), buffers.empty(n * flare.SHAPE)
+        bounds = buffers.empty(n, np.int32)
+        flare.prepare(*inputs, *shape_inputs, w, h, add, records.reshape(-1), shapes, bounds)
+        bins = _bin(records, bounds, grid)
+
+        image, alpha = buffers.empty_tensor((h, w, 3)), buffers.empty_tensor((h, w))
+        ends = np.empty(grid.tiles, np.int64)
+        tiles = (bins.entries, bins.starts, records.reshape(-1))
+        if shaped or add:
+            parallel(
+                flare.raster, *tiles, shapes, BLACK, w, h, grid.tiles_x, shaped, arcs is not None, add,
+                flat(image), flat(alpha), ends,
+            )  # fmt: skip
+        else:
+            parallel(
+                raster_forward.raster, *tiles, BLACK, w, h, grid.tiles_x, flat(image), flat(alpha), EMPTY, EMPTY, ends
+            )
+        ctx.save_for_backward(centres, covariances, opacities, colours, rings, arcs, image, alpha)
+        ctx.state = (add, grid, bins, ends, records, shapes)
+        ctx.set_materialize_grads(False)
+        return image, alpha
+
+    @staticmethod
+    def backward(ctx: Any, d_image: Tensor | None, d_alpha: Tensor | None) -> Any:  # type: ignore[override]
+        *inputs, image, alpha = ctx.saved_tensors
+        add, grid, bins, ends, records, shapes = ctx.state
+        covariances, opacities, colours, rings, arcs = inputs[1:]
+        h, w = grid.height, grid.width
+        v_image = buffers.zeros(h * w * 3) if d_image is None else flat(d_image)
+        v_alpha = buffers.zeros(h * w) if d_alpha is None else flat(d_alpha)
+        rows = buffers.empty(bins.slots * projection.RECORD)
+        tiles = (bins.entries, bins.starts, ends, records.reshape(-1))
+        pictures = (flat(image), flat(alpha))
+        shaped = rings is not None or arcs is not None
+        if shaped or add:
+            parallel(
+                flare.raster_backward, *tiles, shapes, BLACK, w, h, grid.tiles_x, shaped, arcs is not None, add,
+                *pictures, v_image, v_alpha, rows,
+            )  # fmt: skip
+        else:
+            parallel(
+                raster_backward.raster_backward, *tiles, BLACK, w, h, grid.tiles_x, *pictures, EMPTY,
+                v_image, v_alpha, EMPTY, rows,
+            )  # fmt: skip
+        gradients = [None if t is None else torch.empty(t.shape) for t in inputs]
+        flare.finish(
+            flat(covariances), flat(opacities), flat(colours), records.reshape(-1), rows, bins.firsts, bins.counts, add,
+            *(EMPTY if t is None else flat(t) for t in gradients),
+        )  # fmt: skip
+        return (*gradients, None, None)
+
+
+def splat(
+    centres: Tensor, covariances: Tensor, opacities: Tensor, colours: Tensor, width: int, height: int,
+    *, rings: Tensor | None, arcs: Tensor | None, blend: str,
+) -> Splats:  # fmt: skip
+    """See `splat` of the package; full resolution."""
+    tensors = [None if t is None else t.to(torch.float32) for t in (centres, covariances, opacities, colours, rings, arcs)]
+    colour, alpha = _Splat.apply(*tensors, blend == "add", Grid(width, height))
+    return Splats(colour, torch.ones_like(alpha) if blend == "add" else 1 - alpha)

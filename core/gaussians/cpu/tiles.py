@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""From records to tiles: what the scene and the flare have in common around the kernels of `binning`."""
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from . import binning, buffers
+from .threads import parallel
+
+EMPTY = np.empty(0, np.float32)
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A picture and its tiles."""
+
+    width: int
+    height: int
+
+    @property
+    def tiles_x(self) -> int:
+        return -(-self.width // binning.TILE_WIDTH)
+
+    @property
+    def tiles(self) -> int:
+        return self.tiles_x * -(-self.height // binning.TILE_HEIGHT)
+
+
+@dataclass(frozen=True)
+class Bins:
+    """Entries by tile, and the slots of each Gaussian; see `binning`."""
+
+    entries: np.ndarray
+    starts: np.ndarray
+    firsts: np.ndarray
+    counts: np.ndarray
+    slots: int
+
+
+def flat(tensor: Tensor) -> np.ndarray:
+    """The numbers of a tensor, as one contiguous row of float32."""
+    return tensor.detach().to(torch.float32).contiguous().reshape(-1).numpy()
+
+
+def bin_gaussians(
+    records: np.ndarray, bounds: np.ndarray, chunk_bounds: np.ndarray, grid: Grid, *, by_depth: bool = True
+) -> Bins:
+    """Sorts the records (n, 16) into tiles; by depth or in the order given."""
+    n = len(bounds)
+    starts_of_chunks = np.cumsum(chunk_bounds) - chunk_bounds
+    room = int(chunk_bounds.sum())
+    slots = buffers.empty(room, np.int32)
+    firsts, counts = buffers.empty(n, np.int32), buffers.empty(n, np.int32)
+    flat_records = records.reshape(-1)
+    parallel(
+        binning.list_tiles, flat_records, bounds, starts_of_chunks, grid.width, grid.height, grid.tiles_x,
+        slots, firsts, counts,
+    )  # fmt: skip
+    if by_depth:
+        keys, spare_keys = buffers.empty(n, np.uint32), buffers.empty(n, np.uint32)
+        order, spare_order = buffers.empty(n, np.int32), buffers.empty(n, np.int32)
+        m = binning.sort_by_depth(flat_records.view(np.uint32), counts, keys, spare_keys, order, spare_order)
+    else:
+        order = np.flatnonzero(counts).astype(np.int32)
+        m = len(order)
+    numbers = buffers.empty((torch.get_num_threads(), grid.tiles), np.int32)
+    starts = np.empty(grid.tiles + 1, np.int64)
+    parallel(binning.count, order, m, slots, firsts, counts, numbers)
+    binning.deal(numbers, starts)
+    entries = buffers.empty((int(starts[-1]), binning.ENTRY), np.int32)
+    parallel(binning.scatter, order, m, slots, firsts, counts, numbers, entries)
+    return Bins(entries, starts, firsts, counts, room)

@@ -7,17 +7,9 @@ lanes as a type), then each kernel with its mathematics in its head: `spherical_
 """
 from __future__ import annotations
 
+from .loss import l1_ssim
+from .optimiser import adam_step
 from .scene import rasterize_scene
 from .splats import splat
 
-__all__ = ["rasterize_scene", "splat"]
-
-
-def l1_ssim(image, target, lam):  # noqa
-    from ..loss import l1_ssim as plain
-    return plain(image, target, lam, kernels="torch")
-
-
-def adam_step(*a, **k):  # noqa
-    from ..optimiser import adam_step as plain
-    return plain(*a, **k)
+__all__ = ["adam_step", "l1_ssim", "rasterize_scene", "splat"]

@@ -1,0 +1,59 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""One step of Adam, in one pass over parameters, gradients and moments (the definition is `..optimiser`)."""
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from torch import Tensor
+
+from .compilation import kernel
+from .threads import parallel
+from .tiles import flat
+from .vector import LANES, fma, load, sqrt, store, take_number
+
+PIECE = 1 << 13
+"""Least number of values to a piece of work."""
+
+
+@kernel
+def advance(counter, parameter, gradient, first, second, rates, piece, beta1, beta2, root, epsilon):  # type: ignore[no-untyped-def]
+    """All flat. rates: repeats along the parameter, a multiple of 16 long, bias correction included; piece: a
+    multiple of its length. root: 1 / sqrt(1 - beta2^t)."""
+    n, period = parameter.size, rates.size
+    other1, other2 = np.float32(1) - beta1, np.float32(1) - beta2
+    while True:
+        start = take_number(counter) * piece
+        if start >= n:
+            break
+        end = min(start + piece, n)
+        whole = end - (end - start) % LANES
+        place = 0
+        for i in range(start, whole, LANES):
+            g = load(gradient, i)
+            m = fma(load(first, i), beta1, g * other1)
+            v = fma(load(second, i), beta2, g * g * other2)
+            store(first, i, m)
+            store(second, i, v)
+            store(parameter, i, load(parameter, i) - load(rates, place) * m / fma(sqrt(v), root, epsilon))
+            place += LANES
+            if place == period:
+                place = 0
+        for i in range(whole, end):
+            g = gradient[i]
+            first[i] = first[i] * beta1 + g * other1
+            second[i] = second[i] * beta2 + g * g * other2
+            parameter[i] -= rates[(i - start) % period] * first[i] / (math.sqrt(second[i]) * root + epsilon)
+
+
+def adam_step(
+    parameter: Tensor, gradient: Tensor, first: Tensor, second: Tensor,
+    *, step: int, rate: float | Tensor, beta1: float, beta2: float, epsilon: float,
+) -> None:  # fmt: skip
+    """See `..optimiser`; parameter and moments are contiguous float32, changed in place."""
+    row = flat(rate) if isinstance(rate, Tensor) else np.array([rate], np.float32)
+    rates = np.tile(row, math.lcm(row.size, LANES) // row.size) / np.float32(1 - beta1**step)
+    piece = -(-PIECE // rates.size) * rates.size
+    numbers = (np.float32(beta1), np.float32(beta2), np.float32(1 / math.sqrt(1 - beta2**step)), np.float32(epsilon))
+    arrays = (flat(t) for t in (parameter, gradient, first, second))
+    parallel(advance, *arrays, rates, piece, *numbers, limit=-(-parameter.numel() // piece))

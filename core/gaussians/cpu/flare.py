@@ -7,7 +7,7 @@ kernel of their own: they are a scene that is already projected. What else there
 
     r = sqrt(2 ln 2 (A u² + D d_y²))       Mahalanobis distance
     ring      G = 2^-(s (r - r0)²),         s = 1 / (2 ln 2 w²)
-    arc       G = G sigmoid(k (c - cos delta)),   c = (d_x cos theta0 + d_y sin theta0) / |d|
+    arc       G = G sigmoid(k (c - cos delta)),   c = (d_x cos theta0 + d_y sin theta0) / l,  l² = |d|² + 1/4
     add       picture = sum opacity colour G:   no order, no transmittance; its tiles are sums
 
 Backward, g = dL / d ln alpha as in the scene. A profile acts on centre and covariance through q alone, as the plain
@@ -15,8 +15,8 @@ one does with g replaced by
 
     h = -2 g d ln G / dq = g (r - r0) / (w² r)
 
-and an arc through the angle, too: d ln sigmoid = k (1 - sigmoid) dc, where with sin the sine of theta - theta0
-dc = sin dtheta0 and, by the centre, (-sin d_y, sin d_x) / |d|².
+and an arc through the angle, too: d ln sigmoid = k (1 - sigmoid) dc, where
+dc/dtheta0 = (-d_x sin theta0 + d_y cos theta0) / l and, by the centre, dc = (c d / l - (cos theta0, sin theta0)) / l.
 """
 from __future__ import annotations
 
@@ -24,6 +24,7 @@ import math
 
 import numpy as np
 
+from .. import rendering
 from .binning import END_ROW, FIRST_ROW, GAUSSIAN, SLOT, TILE_HEIGHT, TILE_WIDTH
 from .compilation import inlined, kernel
 from .projection import (
@@ -42,13 +43,13 @@ from .projection import (
     GREEN,
     HALF_X,
     HALF_Y,
+    K_REST,
     MARGIN,
     OPACITY,
     REACH,
     RECORD,
     RED,
     STEP,
-    K_REST,
     A,
     D,
     G,
@@ -56,8 +57,8 @@ from .projection import (
     X,
     Y,
 )
-from .raster_backward import V_BLUE, V_GREEN, V_RED, load_tile, row_gradient
 from .raster_backward import STATE as STATE_BACKWARD
+from .raster_backward import V_BLUE, V_GREEN, V_RED, load_tile, row_gradient
 from .raster_forward import (
     AHEAD,
     BLUE_PLANE,
@@ -101,8 +102,8 @@ SHAPE = 8
 # Places in a row of gradients after those of the scene.
 G_R0, G_WIDTH, G_ARC_X, G_ARC_Y, G_THETA0, G_COS_DELTA, G_ARC = range(9, 16)
 
-PROFILE_MIN = np.float32(1 / 4096)
-OPACITY_MAX = 0.99
+PROFILE_MIN, APEX2 = np.float32(rendering.PROFILE_MIN), np.float32(rendering.ARC_APEX**2)
+OPACITY_MAX = rendering.OPACITY_MAX
 TWO_LN2 = np.float32(2 * math.log(2))
 LOG2_E = np.float32(1 / math.log(2))
 RADIUS_MIN = np.float32(1e-6)
@@ -191,8 +192,8 @@ def _ring(shapes, shape, r):  # type: ignore[no-untyped-def]
 
 @inlined
 def _angle(shapes, shape, dx, dy):  # type: ignore[no-untyped-def]
-    """Cosine and sine of the angle from theta0, and the inverse of the distance, px."""
-    inverse = ONE / sqrt(maximum(fma(dx, dx, splat(dy * dy)), RADIUS2_MIN))
+    """Cosine and sine of the angle from theta0, and the inverse of the distance, px (kept from zero)."""
+    inverse = ONE / sqrt(fma(dx, dx, splat(dy * dy + APEX2)))
     cosine = fma(dx, shapes[shape + COS0], splat(dy * shapes[shape + SIN0])) * inverse
     sine = fma(dx, -shapes[shape + SIN0], splat(dy * shapes[shape + COS0])) * inverse
     return cosine, sine, inverse
@@ -355,6 +356,7 @@ def _shaped_backward(state, records, at, shapes, shape, left, top, first, end, a
     opacity = records[at + OPACITY]
     red, green, blue = records[at + RED], records[at + GREEN], records[at + BLUE]
     dx = lanes() + (np.float32(left) + HALF - records[at + X])
+    cos0, sin0 = shapes[shape + COS0], shapes[shape + SIN0]
     r0, sharpness = shapes[shape + R0], shapes[shape + SHARP] * TWO_LN2  # 1 / w²
     zero = splat(ZERO)
     moments, colours, mass = (zero, zero, zero, zero, zero), (zero, zero, zero), zero
@@ -384,8 +386,9 @@ def _shaped_backward(state, records, at, shapes, shape, left, top, first, end, a
             off = off * shapes[shape + ARC]
             d_cos = d_cos - off
             d_theta = fma(off, sine, d_theta)
-            turn = off * sine * inverse * inverse
-            arc_x, arc_y = arc_x - turn * dy, fma(turn, dx, arc_y)
+            off, across = off * inverse, cosine * inverse
+            arc_x = fma(off, across * dx - cos0, arc_x)
+            arc_y = fma(off, across * dy - sin0, arc_y)
     return totals((
         moments[0], moments[1], moments[2], moments[3], moments[4], mass, colours[0], colours[1], colours[2],
         d_r0 * sharpness, d_w * (sharpness / shapes[shape + WIDTH]), arc_x, arc_y, d_theta, d_cos, d_k,

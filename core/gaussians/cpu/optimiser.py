@@ -17,11 +17,10 @@ PIECE = 1 << 13
 
 
 @kernel
-def advance(counter, parameter, gradient, first, second, rates, piece, beta1, beta2, root, epsilon):  # type: ignore[no-untyped-def]
+def advance(counter, parameter, gradient, first, second, rates, piece, beta1, new1, beta2, new2, root, epsilon):  # type: ignore[no-untyped-def]
     """All flat. rates: repeats along the parameter, a multiple of 16 long, bias correction included; piece: a
-    multiple of its length. root: 1 / sqrt(1 - beta2^t)."""
+    multiple of its length. new: 1 - beta; root: 1 / sqrt(1 - beta2^t)."""
     n, period = parameter.size, rates.size
-    other1, other2 = np.float32(1) - beta1, np.float32(1) - beta2
     while True:
         start = take_number(counter) * piece
         if start >= n:
@@ -31,8 +30,8 @@ def advance(counter, parameter, gradient, first, second, rates, piece, beta1, be
         place = 0
         for i in range(start, whole, LANES):
             g = load(gradient, i)
-            m = fma(load(first, i), beta1, g * other1)
-            v = fma(load(second, i), beta2, g * g * other2)
+            m = fma(load(first, i), beta1, g * new1)
+            v = fma(load(second, i), beta2, g * g * new2)
             store(first, i, m)
             store(second, i, v)
             store(parameter, i, load(parameter, i) - load(rates, place) * m / fma(sqrt(v), root, epsilon))
@@ -41,8 +40,8 @@ def advance(counter, parameter, gradient, first, second, rates, piece, beta1, be
                 place = 0
         for i in range(whole, end):
             g = gradient[i]
-            first[i] = first[i] * beta1 + g * other1
-            second[i] = second[i] * beta2 + g * g * other2
+            first[i] = first[i] * beta1 + g * new1
+            second[i] = second[i] * beta2 + g * g * new2
             parameter[i] -= rates[(i - start) % period] * first[i] / (math.sqrt(second[i]) * root + epsilon)
 
 
@@ -54,6 +53,7 @@ def adam_step(
     row = flat(rate) if isinstance(rate, Tensor) else np.array([rate], np.float32)
     rates = np.tile(row, math.lcm(row.size, LANES) // row.size) / np.float32(1 - beta1**step)
     piece = -(-PIECE // rates.size) * rates.size
-    numbers = (np.float32(beta1), np.float32(beta2), np.float32(1 / math.sqrt(1 - beta2**step)), np.float32(epsilon))
+    root = 1 / math.sqrt(1 - beta2**step)
+    numbers = (np.float32(number) for number in (beta1, 1 - beta1, beta2, 1 - beta2, root, epsilon))
     arrays = (flat(t) for t in (parameter, gradient, first, second))
     parallel(advance, *arrays, rates, piece, *numbers, limit=-(-parameter.numel() // piece))

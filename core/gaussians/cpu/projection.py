@@ -24,6 +24,7 @@ import math
 
 import numpy as np
 
+from .. import rendering
 from . import spherical_harmonics as harmonics
 from .compilation import inlined, kernel
 from .vector import (
@@ -67,9 +68,8 @@ TILE_WIDTH, TILE_HEIGHT = LANES, 32
 H = np.float32(0.5 / math.log(2))
 TWO_LN2 = np.float32(2 * math.log(2))
 LN2 = np.float32(math.log(2))
-OPACITY_MAX = np.float32(0.99)
-ALPHA_MIN = np.float32(1 / 255)
-ALPHA_MIN_INVERSE = np.float32(255)
+OPACITY_MAX, ALPHA_MIN = np.float32(rendering.OPACITY_MAX), np.float32(rendering.ALPHA_MIN)
+ALPHA_MIN_INVERSE = np.float32(1 / rendering.ALPHA_MIN)
 MARGIN = np.float32(1e-4)
 """Added to the reach, a power of two: rounding must not lose a pixel at the rim, where alpha is tested anyway."""
 NORM2_MIN = np.float32(1e-16)

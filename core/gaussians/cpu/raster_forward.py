@@ -15,12 +15,27 @@ from __future__ import annotations
 
 import numpy as np
 
+from .. import rendering
 from .binning import END_ROW, FIRST_ROW, GAUSSIAN, TILE_HEIGHT, TILE_WIDTH
 from .compilation import inlined, kernel
-from .projection import ALPHA_MIN, BEND, BLUE, DEPTH, GREEN, OPACITY, RECORD, RED, STEP, A, D, K, K_REST, X, Y
-from .vector import LANES, any_of, exp2, fma, interleave, lanes, load, minimum, prefetch, splat, store, store_rows, take_number, where
+from .projection import ALPHA_MIN, BEND, BLUE, DEPTH, GREEN, K_REST, OPACITY, RECORD, RED, STEP, A, D, K, X, Y
+from .vector import (
+    LANES,
+    any_of,
+    exp2,
+    fma,
+    interleave,
+    lanes,
+    load,
+    prefetch,
+    splat,
+    store,
+    store_rows,
+    take_number,
+    where,
+)
 
-T_MIN = np.float32(1e-4)
+T_MIN = np.float32(rendering.TRANSMITTANCE_MIN)
 RUN = 16
 """Rows to a run of the recurrence: rounding grows with the square of its length."""
 STEEP = np.float32(32.0)
@@ -31,7 +46,7 @@ AHEAD = 6
 """Entries ahead of which records are asked for."""
 E_MAX = np.float32(126)
 ZERO, HALF, ONE, TWO = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
-DEPTH_ALPHA_MIN = np.float32(0.5 / 255)
+DEPTH_ALPHA_MIN = np.float32(rendering.ALPHA_MIN / 2)
 # The state of a tile: planes of 32 rows of 16.
 PLANE = TILE_WIDTH * TILE_HEIGHT
 T_PLANE, RED_PLANE, GREEN_PLANE, BLUE_PLANE, DEPTH_PLANE, MEDIAN_PLANE = (i * PLANE for i in range(6))

@@ -16,6 +16,7 @@ from .threads import parallel
 from .tiles import EMPTY, Grid, bin_gaussians, flat
 from .vector import LANES
 
+
 @dataclass(frozen=True)
 class _Frame(Grid):
     """What is not differentiated."""

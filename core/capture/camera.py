@@ -107,3 +107,19 @@ def rotation_from_quaternion(wxyz: ArrayLike) -> Floats:
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ])
+
+
+def quaternion_from_rotation(rotation: ArrayLike) -> Floats:
+    """(4,) unit quaternion (w, x, y, z), w >= 0, of a rotation (3, 3).
+
+    It is the eigenvector of the largest eigenvalue of Bar-Itzhack's matrix (2000), without special cases.
+    """
+    r = np.asarray(rotation, np.float64)
+    key = np.array([
+        [r[0, 0] + r[1, 1] + r[2, 2], r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]],
+        [r[2, 1] - r[1, 2], r[0, 0] - r[1, 1] - r[2, 2], r[0, 1] + r[1, 0], r[0, 2] + r[2, 0]],
+        [r[0, 2] - r[2, 0], r[0, 1] + r[1, 0], r[1, 1] - r[0, 0] - r[2, 2], r[1, 2] + r[2, 1]],
+        [r[1, 0] - r[0, 1], r[0, 2] + r[2, 0], r[1, 2] + r[2, 1], r[2, 2] - r[0, 0] - r[1, 1]],
+    ])
+    vector = np.linalg.eigh(key)[1][:, -1]
+    return vector if vector[0] >= 0 else -vector

@@ -28,7 +28,7 @@ from ..files import inside, read_json
 from ..pictures import SUFFIXES, Picture, picture_size, read_picture
 from .camera import Camera, Floats
 from .colmap import PointCloud, Posed, find_model, read_model
-from .lens import PINHOLES, Lens
+from .lens import PINHOLES, Lens, straightened
 from .transforms import FILE as TRANSFORMS
 from .transforms import read_transforms
 
@@ -272,8 +272,6 @@ class _Pictures:
                 self._used -= old.pixels.nbytes
 
     def _undistorted(self, picture: Picture, view: View, path: Path) -> Picture:
-        import cv2
-
         assert view.lens is not None
         if not _uniform(picture.size, view.camera.size):
             raise FrameError(f"{path} is {picture.size[0]} x {picture.size[1]} pixels, not "
@@ -288,12 +286,7 @@ class _Pictures:
                 self._maps[key] = maps
                 while len(self._maps) > 4:
                     self._maps.popitem(last=False)
-        # Cubic is sharper, but rings where linear light steps from 1 to 100.
-        how = cv2.INTER_CUBIC if picture.encoding == "srgb" else cv2.INTER_LINEAR
-        pixels = cv2.remap(picture.pixels, maps[0], maps[1], how, borderMode=cv2.BORDER_REPLICATE)
-        if picture.encoding == "srgb":
-            pixels = np.clip(pixels, 0.0, 1.0)
-        return Picture(np.asarray(pixels, np.float32), picture.encoding)
+        return straightened(picture, maps)
 
 
 def read_lights(path: Path) -> tuple[Light, ...]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""COLMAP sparse models, binary and text, read with numpy alone (Blender's own Python has no pycolmap).
+"""COLMAP sparse models, binary and text, read and written with numpy alone (Blender's own Python has no pycolmap).
 
 The format is COLMAP's documented one: cameras, images (pose as quaternion and translation, world to
 camera) and points3D. Counts in a file are checked against its length before anything is allocated.
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import struct
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,8 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import CaptureError
+from ..files import atomic_path
 from ..pictures import LARGEST
-from .camera import Floats, rotation_from_quaternion
+from .camera import Floats, quaternion_from_rotation, rotation_from_quaternion
 from .lens import MODELS, NAMES, Lens
 
 
@@ -82,6 +84,44 @@ def read_model(folder: Path) -> tuple[list[Posed], PointCloud]:
         pose[:3, :3], pose[:3, 3] = rotation_from_quaternion(quaternion), translation
         posed.append(Posed(name, lenses[camera], pose))
     return posed, points if points is not None else PointCloud.empty()
+
+
+@dataclass(frozen=True, eq=False)
+class Observed:
+    """A frame to be written: its name, lens and pose, and the points seen in it: pixels (n, 2) and the index
+    (n,) of each in the model's point cloud."""
+
+    name: str
+    lens: Lens
+    world_to_camera: Floats
+    pixels: Floats
+    points: NDArray[np.int64]
+
+
+def write_model(folder: Path, frames: Sequence[Observed], cloud: PointCloud) -> None:
+    """Write cameras.bin, images.bin and points3D.bin; frames that share a Lens object share a camera."""
+    lenses = list(dict.fromkeys(frame.lens for frame in frames))
+    cameras = [struct.pack("<Q", len(lenses))]
+    cameras += [struct.pack("<iiQQ", number, MODELS[lens.model][0], lens.width, lens.height)
+                + struct.pack(f"<{len(lens.params)}d", *lens.params) for number, lens in enumerate(lenses, 1)]
+    images = [struct.pack("<Q", len(frames))]
+    tracks: list[list[tuple[int, int]]] = [[] for _ in range(len(cloud))]
+    for number, frame in enumerate(frames, 1):
+        quaternion = quaternion_from_rotation(frame.world_to_camera[:3, :3])
+        images.append(struct.pack("<i7di", number, *quaternion, *frame.world_to_camera[:3, 3],
+                                  lenses.index(frame.lens) + 1) + frame.name.encode() + b"\0")
+        seen = np.zeros(len(frame.points), [("xy", "<f8", 2), ("id", "<i8")])
+        seen["xy"], seen["id"] = frame.pixels, frame.points + 1
+        images.append(struct.pack("<Q", len(seen)) + seen.tobytes())
+        for index, point in enumerate(frame.points):
+            tracks[point].append((number, index))
+    points = [struct.pack("<Q", len(cloud))]
+    for number, (xyz, rgb, error, track) in enumerate(zip(cloud.xyz, cloud.rgb, cloud.error, tracks, strict=True), 1):
+        points.append(struct.pack("<Q3d3Bd", number, *xyz.tolist(), *rgb.tolist(), float(error))
+                      + struct.pack(f"<Q{2 * len(track)}i", len(track), *(i for pair in track for i in pair)))
+    for name, parts in (("cameras", cameras), ("points3D", points), ("images", images)):
+        with atomic_path(folder / f"{name}.bin") as path:
+            path.write_bytes(b"".join(parts))
 
 
 def check_lens(lens: Lens, where: str) -> Lens:

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import CaptureError
+from ..pictures import Picture
 from .camera import Camera, Floats
 
 # COLMAP's number for each model, and its parameters in COLMAP's order.
@@ -131,7 +132,7 @@ class Lens:
         (fx, fy), (cx, cy) = self.focal, self.centre
         if self.model in PINHOLES:
             return fx, fy, cx, cy
-        border = self._border() - (cx, cy)
+        border = self.border - (cx, cy)
         zoom_cap = float(np.linalg.norm(border / (fx, fy), axis=1).max()) / WIDEST
         widest, narrowest = max(zoom_cap, 0.05), 20.0
         if not (fx > 0 and fy > 0) or not self._filled(border / (fx, fy) / narrowest):
@@ -160,7 +161,15 @@ class Lens:
         source = source.reshape(camera.height, camera.width, 2).astype(np.float32)
         return np.ascontiguousarray(source[..., 0]), np.ascontiguousarray(source[..., 1])
 
-    def _border(self) -> Floats:
+    @property
+    def bend(self) -> float:
+        """The largest distance, in pixels, between where the lens and where a pinhole puts a border point."""
+        plane = (self.border - self.centre) / self.focal
+        straight = plane * self.focal + self.centre
+        return float(np.nan_to_num(np.linalg.norm(self.distort(plane) - straight, axis=1), nan=np.inf).max())
+
+    @property
+    def border(self) -> Floats:
         """Points (n, 2) along the edge of the frame."""
         t = np.linspace(0.0, 1.0, 33)
         x, y, zero, one = t * self.width, t * self.height, np.zeros(33), np.ones(33)
@@ -179,6 +188,16 @@ class Lens:
         inside = (pixels[-1] >= -1e-6) & (pixels[-1] <= np.array([self.width, self.height]) + 1e-6)
         away = reach[-1] > 1e-9  # a border point on the principal point itself is not further out
         return bool(inside.all() and (np.diff(reach, axis=0) > 0)[:, away].all())
+
+
+def straightened(picture: Picture, maps: tuple[NDArray[np.float32], NDArray[np.float32]]) -> Picture:
+    """A distorted picture as the camera sees it whose `Lens.maps` these are."""
+    import cv2
+
+    # Cubic is sharper, but rings where linear light steps from 1 to 100.
+    how = cv2.INTER_CUBIC if picture.encoding == "srgb" else cv2.INTER_LINEAR
+    pixels = np.asarray(cv2.remap(picture.pixels, maps[0], maps[1], how, borderMode=cv2.BORDER_REPLICATE), np.float32)
+    return Picture(np.clip(pixels, 0.0, 1.0) if picture.encoding == "srgb" else pixels, picture.encoding)
 
 
 def _brown(x: Floats, y: Floats, p: Parameters, above: str, below: str = "") -> tuple[Floats, Floats]:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.capture import Camera
+from core.capture.camera import quaternion_from_rotation
 
 SIZE = (64, 48)
 
@@ -38,13 +39,6 @@ def orbit(number: int, radius: float = 4.0, size: tuple[int, int] = SIZE, arc: f
     return cameras
 
 
-def quaternion(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(w, x, y, z) of a rotation of less than half a turn."""
-    w = 0.5 * np.sqrt(1.0 + np.trace(rotation))
-    skew = rotation - rotation.T
-    return np.array([w, skew[2, 1] / (4 * w), skew[0, 2] / (4 * w), skew[1, 0] / (4 * w)])
-
-
 def picture(seed: int, size: tuple[int, int] = SIZE, depth: type = np.uint8) -> NDArray[np.generic]:
     """A smooth random picture (h, w, 3), B G R."""
     coarse = np.random.default_rng(seed).uniform(0, 1, (6, 8, 3))
@@ -66,7 +60,7 @@ def make_capture(folder: Path, views: int = 4, *, size: tuple[int, int] = SIZE, 
     lines = ["# images"]
     for i, camera in enumerate(orbit(views, size=size)):
         name = f"{i:04d}{suffix}"
-        q, t = quaternion(camera.world_to_camera[:3, :3]), camera.world_to_camera[:3, 3]
+        q, t = quaternion_from_rotation(camera.world_to_camera[:3, :3]), camera.world_to_camera[:3, 3]
         seen = [f"{x} {y} {number + 1}" for number, (x, y) in enumerate(camera.project(cloud)[0])]
         lines += [f"{i + 1} {' '.join(map(repr, map(float, (*q, *t))))} 1 {name}", " ".join(seen)]
         cv2.imwrite(str(folder / "images" / name), picture(i, size))

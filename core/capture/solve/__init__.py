@@ -1,0 +1,138 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Structure from motion: from frames or a video to a capture.
+
+    shots.py      which frames; small pictures and masks of them
+    pairs.py      which frames to match with which
+    mapping.py    pycolmap: features, matches, incremental mapping
+    world.py      which way is up, where the floor is, how large things are
+    develop.py    the model and the frames, undistorted, at full size
+    report.py     figures, and a picture of cameras and points
+
+Everything in progress lies in OUT/.solve and is taken up again by the next run; the capture itself appears
+whole at the end.
+"""
+from __future__ import annotations
+
+import shutil
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from ...errors import CaptureError
+from ...files import read_json, write_json
+from ...progress import Progress
+from ..lens import MODELS
+from .pairs import Matching
+
+REPORT, PICTURE, WORK = "solve.json", "solve.png", ".solve"
+
+
+@dataclass(frozen=True)
+class SolveSettings:
+    """How to solve.
+
+    frames: how many to choose, 0 = all of a folder and 150 of a video.
+    matching: which frames to match; "auto" takes what fits (pairs.py).
+    lens: COLMAP's camera model; one camera for all frames of one size.
+    size: long side in pixels at which features are found.
+    features: at most so many a frame.
+    output_size: long side of the frames written; 0 = as filmed.
+    mask: leave clipped pixels and their bloom out of feature extraction.
+    seed: of everything random.
+    """
+
+    frames: int = 0
+    matching: Matching = "auto"
+    lens: str = "OPENCV"
+    size: int = 1000
+    features: int = 4096
+    output_size: int = 0
+    mask: bool = True
+    seed: int = 0
+    keep_work: bool = False
+
+    def __post_init__(self) -> None:
+        if self.lens not in MODELS or self.lens == "EQUIRECTANGULAR":
+            raise CaptureError(f"{self.lens!r} is not a camera model to solve with; take one of "
+                               f"{', '.join(name for name in MODELS if name != 'EQUIRECTANGULAR')}.")
+        if self.matching not in ("auto", "exhaustive", "sequential", "similar"):
+            raise CaptureError(f"{self.matching!r} is not a way of matching; take auto, exhaustive, sequential "
+                               "or similar.")
+        if self.frames < 0 or self.output_size < 0 or not 100 <= self.size <= 20000 or self.features < 100:
+            raise CaptureError("Frames and output size cannot be negative, the working size lies within 100 and "
+                               "20000 pixels, and features are at least 100.")
+
+
+def solve(source: Path | str, out: Path | str, settings: SolveSettings | None = None,
+          progress: Progress | None = None) -> dict[str, Any]:
+    """Solve the frames of a folder or video and write the capture `out`; returns the report, also solve.json.
+
+    Frames that cannot be read, and those that find no place in the largest model, are left out and named.
+    An earlier run with the same source and settings is taken up where it stopped.
+
+    Raises CaptureError where there is nothing to solve or no parallax to solve it by, Cancelled when asked
+    to stop, EngineError without pycolmap.
+    """
+    from . import develop, mapping, report, shots, world
+
+    source, out, settings, progress = Path(source), Path(out), settings or SolveSettings(), progress or Progress()
+    if not source.exists():
+        raise CaptureError(f"{source} is missing.")
+    began = time.monotonic()
+    request = {"source": _fingerprint(source), "settings": {**asdict(settings), "keep_work": False}}
+    finished = _claim(source, out, request, progress)
+    if finished is not None:
+        return finished
+    work = out / WORK
+    chosen, left_out = shots.gather(source, work, settings.frames, settings.size, progress)
+    solved = mapping.solve(chosen, work, settings, shots.is_video(source), progress)
+    world.align(solved.model)
+    missing = sorted(set(range(len(chosen))) - {frame.shot for frame in solved.frames})
+    if missing:
+        names = ", ".join(Path(chosen[i].file).name for i in missing[:12]) + (", …" if len(missing) > 12 else "")
+        progress.say(f"{len(missing)} of {len(chosen)} frames found no place in the model and are left out: {names}.")
+    develop.write(chosen, solved, out, work, settings.output_size, progress)
+    data = report.figures(chosen, solved, left_out, request, time.monotonic() - began)
+    report.picture(solved, out / PICTURE)
+    write_json(out / REPORT, data)
+    if not settings.keep_work:
+        shutil.rmtree(work, ignore_errors=True)
+    return data
+
+
+def _fingerprint(source: Path) -> list[Any]:
+    """What tells one source from another: names, lengths and times."""
+    files = sorted(path for path in source.iterdir() if path.is_file()) if source.is_dir() else [source]
+    stats = [(path.name, path.stat()) for path in files]
+    return [str(source.resolve()), *([name, stat.st_size, stat.st_mtime_ns] for name, stat in stats)]
+
+
+def _claim(source: Path, out: Path, request: dict[str, Any], progress: Progress) -> dict[str, Any] | None:
+    """Make `out` ours, or return the report of a finished solve of the same.
+
+    Refused where `out` holds a capture that did not come from here, or the frames to be read.
+    """
+    if out.exists() and not out.is_dir():
+        raise CaptureError(f"{out} is a file; give a folder for the capture.")
+    if source.resolve() in (out.resolve(), (out / "images").resolve()):
+        raise CaptureError(f"The frames in {source} would be overwritten by their undistorted selves; give another "
+                           "folder for the capture.")
+    theirs = [name for name in ("images", "sparse", "transforms.json") if (out / name).exists()]
+    if (out / REPORT).is_file():
+        report = read_json(out / REPORT, CaptureError)
+        if report.get("request") == request:
+            progress.say(f"{out} is solved already.")
+            return dict(report)
+    elif theirs and not (out / WORK).is_dir():
+        raise CaptureError(f"{out} holds {theirs[0]} that did not come from a solve; give another folder.")
+    state = out / WORK / "request.json"
+    if not state.is_file() or read_json(state, CaptureError) != request:
+        shutil.rmtree(out / WORK, ignore_errors=True)
+        write_json(state, request)
+    else:
+        progress.say("Going on with the solve that was stopped.")
+    return None
+
+
+__all__ = ["SolveSettings", "solve"]

@@ -1,0 +1,285 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""pycolmap's part of a solve: features, matches and incremental mapping, in steps that can be stopped.
+
+Features and matches go into a database batch by batch; what it holds is not made again.
+"""
+from __future__ import annotations
+
+import contextlib
+import shutil
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...errors import CaptureError, EngineError
+from ...files import read_json, write_json, write_text
+from ...pictures import picture_size
+from ...progress import Progress
+from ..camera import Floats
+from ..lens import MODELS, Lens
+from .pairs import choose_matching, choose_pairs
+from .shots import Shot
+
+if TYPE_CHECKING:
+    from . import SolveSettings
+
+DEFAULT_FOCAL = 1.2  # of the long side, where the file does not tell; COLMAP's own guess
+MOVED = 1.0          # pixels of the small pictures; less is no motion
+
+
+@dataclass(eq=False)
+class SolvedFrame:
+    """A registered frame: index of its shot, lens and observations at the size of its small picture."""
+
+    shot: int
+    lens: Lens
+    world_to_camera: Floats
+    pixels: Floats
+    points: NDArray[np.int64]
+
+
+@dataclass(eq=False)
+class Model:
+    """Points (n, 3), colours (n, 3) uint8, errors (n,) in pixels of the small pictures, track lengths (n,)."""
+
+    xyz: Floats
+    rgb: NDArray[np.uint8]
+    error: Floats
+    tracks: NDArray[np.int64]
+    frames: list[SolvedFrame]
+
+
+@dataclass(eq=False)
+class Solved:
+    """The largest model, how many frames each model found has, and how the frames were matched."""
+
+    model: Model
+    sizes: list[int]
+    matching: str
+    pairs: int
+
+    @property
+    def frames(self) -> list[SolvedFrame]:
+        """The registered frames."""
+        return self.model.frames
+
+
+def solve(shots: Sequence[Shot], work: Path, settings: SolveSettings, video: bool, progress: Progress) -> Solved:
+    """From small pictures and masks below `work` to the largest model. See `core.capture.solve.solve`."""
+    pycolmap = load_pycolmap()
+    pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value
+    pycolmap.logging.verbose_level = -1
+    pycolmap.set_random_seed(settings.seed)
+    database = work / "database.db"
+    _refuse_one_picture(shots, work)
+    _extract(pycolmap, shots, work, database, settings, progress)
+    matching = choose_matching(settings.matching, len(shots), video)
+    pairs = _match(pycolmap, shots, work, database, matching, settings, progress)
+    models = _map(pycolmap, work, database, len(shots), settings, progress)
+    if not models:
+        raise CaptureError(_why_not(pycolmap, database, settings.size))
+    largest = max(models, key=lambda model: (model.num_reg_images(), model.num_points3D()))
+    names = {shot.name: index for index, shot in enumerate(shots)}
+    return Solved(_model(largest, names), sorted((m.num_reg_images() for m in models), reverse=True), matching, pairs)
+
+
+def load_pycolmap() -> Any:
+    """The module; EngineError where it is not installed.
+
+    OpenCV is imported first: the other way round its PNG writer finds pycolmap's libpng and aborts the process
+    (seen with pycolmap 4.2.1 and OpenCV 4.11).
+    """
+    try:
+        import cv2  # noqa: F401
+        import pycolmap
+    except ImportError as problem:
+        raise EngineError("solve needs pycolmap and OpenCV; install them with: pip install pycolmap "
+                          "opencv-contrib-python-headless.") from problem
+    return pycolmap
+
+
+def _refuse_one_picture(shots: Sequence[Shot], work: Path) -> None:
+    """Stop early where every frame shows the same: nothing moves."""
+    import cv2
+
+    first: Any = None
+    for shot in shots:
+        small = cv2.imread(str(work / "small" / shot.name), cv2.IMREAD_GRAYSCALE)
+        tiny = cv2.resize(small, (64, 64), interpolation=cv2.INTER_AREA).astype(np.float32)
+        first = tiny if first is None else first
+        if np.abs(tiny - first).max() > 3:
+            return
+    raise CaptureError(f"All {len(shots)} frames show the same picture; a solve needs a camera that moves.")
+
+
+def _extract(pycolmap: Any, shots: Sequence[Shot], work: Path, database: Path, settings: SolveSettings,
+             progress: Progress) -> None:
+    """Features of every frame that has none yet; one camera for all frames of one size and focal length."""
+    with _opened(pycolmap, database) as db:
+        done = {image.name for image in db.read_all_images()
+                if db.num_keypoints_for_image(image.image_id) or db.exists_descriptors(image.image_id)}
+        cameras: dict[tuple[int, int, float | None], int] = {}
+        known = {(c.width, c.height, round(c.params[0], 6)): c.camera_id for c in db.read_all_cameras()}
+        groups: dict[int, list[str]] = {}
+        for shot in shots:
+            key = (shot.width, shot.height, shot.focal)
+            if key not in cameras:
+                camera = _camera(pycolmap, picture_size(work / "small" / shot.name), shot.focal, settings.lens)
+                mark = (camera.width, camera.height, round(camera.params[0], 6))
+                cameras[key] = known.get(mark) or db.write_camera(camera)
+                known[mark] = cameras[key]
+            if shot.name not in done:
+                groups.setdefault(cameras[key], []).append(shot.name)
+    progress.stage("find features", len(shots), len(done))
+    options = pycolmap.FeatureExtractionOptions()
+    options.sift.max_num_features = settings.features
+    options.use_gpu = False
+    reader = pycolmap.ImageReaderOptions()
+    if settings.mask:
+        reader.mask_path = str(work / "masks")
+    for camera_id, names in groups.items():
+        reader.existing_camera_id = camera_id
+        for at in range(0, len(names), 8):
+            pycolmap.extract_features(database, work / "small", image_names=names[at:at + 8],
+                                      camera_mode=pycolmap.CameraMode.SINGLE, reader_options=reader,
+                                      extraction_options=options, device=pycolmap.Device.cpu)
+            progress.advance(len(names[at:at + 8]))
+
+
+def _camera(pycolmap: Any, size: tuple[int, int], focal: float | None, model: str) -> Any:
+    """A camera of the wanted model with a focal length to start from."""
+    width, height = size
+    camera = pycolmap.Camera.create_from_model_name(0, model, (focal or DEFAULT_FOCAL) * max(size), width, height)
+    camera.has_prior_focal_length = focal is not None
+    return camera
+
+
+def _match(pycolmap: Any, shots: Sequence[Shot], work: Path, database: Path, matching: Any,
+           settings: SolveSettings, progress: Progress) -> int:
+    """Match and verify the chosen pairs that have not been; returns how many were chosen."""
+    with _opened(pycolmap, database) as db:
+        ids = [db.read_image_with_name(shot.name).image_id for shot in shots]
+        pairs = choose_pairs(matching, len(shots), lambda i: np.asarray(db.read_descriptors(ids[i]).data),
+                             settings.seed)
+        open_pairs = [(i, j) for i, j in pairs if not db.exists_two_view_geometry(ids[i], ids[j])]
+    progress.stage("match frames", len(pairs), len(pairs) - len(open_pairs))
+    options = pycolmap.FeatureMatchingOptions()
+    options.use_gpu = False
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = settings.seed
+    listing = pycolmap.ImportedPairingOptions()
+    listing.match_list_path = str(work / "pairs.txt")
+    for at in range(0, len(open_pairs), 100):
+        batch = open_pairs[at:at + 100]
+        write_text(work / "pairs.txt", "".join(f"{shots[i].name} {shots[j].name}\n" for i, j in batch))
+        pycolmap.match_image_pairs(database, matching_options=options, pairing_options=listing,
+                                   verification_options=verification, device=pycolmap.Device.cpu)
+        progress.advance(len(batch))
+    return len(pairs)
+
+
+def _map(pycolmap: Any, work: Path, database: Path, frames: int, settings: SolveSettings,
+         progress: Progress) -> list[Any]:
+    """Incremental mapping; all models found, by this run or an earlier one."""
+    folder, record = work / "models", work / "mapped.json"
+    if record.is_file():
+        return [pycolmap.Reconstruction(str(folder / name)) for name in read_json(record, CaptureError)]
+    options = pycolmap.IncrementalPipelineOptions()
+    options.min_model_size = 3
+    options.max_num_models = 8
+    options.random_seed = settings.seed
+    options.mapper.random_seed = settings.seed
+    options.triangulation.random_seed = settings.seed
+    progress.stage("place cameras", frames)
+    token = pycolmap.CancellationToken()
+    placed = 0
+
+    def step(count: int) -> None:
+        # An exception may not cross pycolmap, so that a wish to stop becomes its token.
+        nonlocal placed
+        placed += count
+        try:
+            progress.advance(count if placed <= frames else 0)
+        except Exception:
+            token.cancel()
+
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
+    models = pycolmap.incremental_mapping(
+        database, work / "small", folder, options, initial_image_pair_callback=lambda: step(2),
+        next_image_callback=lambda: step(1), cancellation_token=token)
+    progress.check()
+    for number, model in models.items():
+        (folder / str(number)).mkdir(exist_ok=True)
+        model.write(str(folder / str(number)))
+    write_json(record, [str(number) for number in models])
+    return list(models.values())
+
+
+def _why_not(pycolmap: Any, database: Path, size: int) -> str:
+    """Why no model was found, from how matched features moved."""
+    with _opened(pycolmap, database) as db:
+        pair_ids, geometries = db.read_two_view_geometries()
+        moves, parallax = [], 0
+        for pair_id, geometry in zip(pair_ids, geometries, strict=True):
+            matches = np.asarray(geometry.inlier_matches)
+            if len(matches) < 15:
+                continue
+            first, second = (np.asarray(db.read_keypoints(image))[:, :2]
+                             for image in pycolmap.pair_id_to_image_pair(pair_id))
+            moves.append(float(np.median(np.linalg.norm(first[matches[:, 0]] - second[matches[:, 1]], axis=1))))
+            flat = (pycolmap.TwoViewGeometryConfiguration.PLANAR_OR_PANORAMIC,
+                    pycolmap.TwoViewGeometryConfiguration.PANORAMIC)
+            parallax += geometry.config not in flat
+    if not moves:
+        return ("The frames share too few features to place a camera; film with more overlap, more texture or less "
+                "blur.")
+    if np.median(moves) < MOVED:
+        return (f"The camera hardly moves: matched features shift by {np.median(moves):.2f} pixels at {size}; a solve "
+                "needs a camera that travels.")
+    if parallax < 0.2 * len(moves):
+        return ("The camera turns but does not travel, or sees one flat surface only: there is no parallax to measure "
+                "depth by.")
+    return ("The frames match, but no two of them give a reliable start; film with more sideways motion or choose "
+            "more frames.")
+
+
+def _model(reconstruction: Any, names: dict[str, int]) -> Model:
+    """pycolmap's reconstruction as plain arrays."""
+    ids = sorted(reconstruction.points3D)
+    index = {point: i for i, point in enumerate(ids)}
+    points = [reconstruction.points3D[i] for i in ids]
+    lenses = {number: Lens(camera.model.name, tuple(camera.params), camera.width, camera.height)
+              for number, camera in reconstruction.cameras.items()}
+    assert all(lens.model in MODELS for lens in lenses.values())
+    frames = []
+    for image in reconstruction.images.values():
+        if not image.has_pose:
+            continue
+        pose = np.eye(4)
+        pose[:3] = image.cam_from_world().matrix()
+        seen = image.get_observation_points2D()
+        frames.append(SolvedFrame(names[image.name], lenses[image.camera_id], pose,
+                                  np.array([point.xy for point in seen], np.float64).reshape(-1, 2),
+                                  np.array([index[point.point3D_id] for point in seen], np.int64)))
+    return Model(np.array([point.xyz for point in points], np.float64).reshape(-1, 3),
+                 np.array([point.color for point in points], np.uint8).reshape(-1, 3),
+                 np.array([point.error for point in points], np.float64),
+                 np.array([point.track.length() for point in points], np.int64),
+                 sorted(frames, key=lambda frame: frame.shot))
+
+
+@contextlib.contextmanager
+def _opened(pycolmap: Any, database: Path) -> Iterator[Any]:
+    db = pycolmap.Database.open(database)
+    try:
+        yield db
+    finally:
+        db.close()
+
+
+__all__ = ["Model", "Solved", "SolvedFrame", "solve"]

@@ -1,0 +1,71 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What a solve found: figures as JSON, and a picture of cameras and points from above and from the front."""
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...pictures import write_png
+from ..camera import Floats
+from .mapping import Solved
+from .shots import Shot
+
+PANEL = 720  # pixels, each of the two views
+INK, PATH, PAPER = (0.15, 0.15, 0.15), (0.85, 0.2, 0.1), 1.0
+
+
+def figures(shots: Sequence[Shot], solved: Solved, left_out: list[str], request: dict[str, Any],
+            seconds: float) -> dict[str, Any]:
+    """The report, JSON-able. Errors are in pixels of the small pictures features were found in."""
+    registered = {frame.shot for frame in solved.frames}
+    model = solved.model
+    lenses = list(dict.fromkeys(frame.lens for frame in solved.frames))
+    return {
+        "frames": len(shots), "registered": len(registered), "models": solved.sizes,
+        "unregistered": [Path(shots[i].file).name for i in range(len(shots)) if i not in registered],
+        "left_out": left_out, "matching": solved.matching, "pairs": solved.pairs,
+        "points": len(model.xyz), "observations": int(model.tracks.sum()),
+        "reprojection_error_px": round(float(model.error.mean()), 4),
+        "track_length": round(float(model.tracks.mean()), 3),
+        "cameras": [{"model": lens.model, "size": [lens.width, lens.height],
+                     "params": dict(zip(lens.named, map(float, lens.params), strict=True))} for lens in lenses],
+        "seconds": round(seconds, 1), "request": request,
+    }
+
+
+def picture(solved: Solved, path: Path) -> None:
+    """Draw points in their colours, cameras as wedges, and their path, from above and from the front."""
+    import cv2
+
+    model = solved.model
+    at = np.array([-frame.world_to_camera[:3, :3].T @ frame.world_to_camera[:3, 3] for frame in solved.frames])
+    ahead = np.array([frame.world_to_camera[2, :3] for frame in solved.frames])
+    good = model.tracks >= 3 if (model.tracks >= 3).sum() > 50 else np.ones(len(model.xyz), bool)
+    xyz, rgb = model.xyz[good], model.rgb[good]
+    low, high = np.percentile(xyz, (2, 98), axis=0)
+    low, high = np.minimum(low, at.min(axis=0)), np.maximum(high, at.max(axis=0))
+    middle, reach = (low + high) / 2, 0.55 * float((high - low).max())
+    sheet = np.full((PANEL, 2 * PANEL + 8, 3), PAPER, np.float32)
+    for left, axes, title in ((0, (0, 1), "from above"), (PANEL + 8, (0, 2), "from the front")):
+        panel = np.full((PANEL, PANEL, 3), PAPER, np.float32)
+
+        def place(points: Floats, axes: tuple[int, int] = axes) -> Any:
+            flat = (points[:, axes] - middle[list(axes)]) / reach * (1, -1)
+            return (0.5 * PANEL * (1 + flat)).round().astype(int)
+
+        spots = place(xyz)
+        inside = ((spots >= 1) & (spots < PANEL - 1)).all(axis=1)
+        for (x, y), colour in zip(spots[inside], rgb[inside] / 255.0, strict=True):
+            panel[y - 1:y + 1, x - 1:x + 1] = colour
+        cameras = place(at)
+        if len(cameras) > 1:
+            cv2.polylines(panel, [cameras.reshape(-1, 1, 2)], False, PATH, 1, cv2.LINE_AA)
+        for spot, tip in zip(cameras, place(at + 0.06 * reach * ahead), strict=True):
+            cv2.line(panel, tuple(map(int, spot)), tuple(map(int, tip)), INK, 1, cv2.LINE_AA)
+            cv2.circle(panel, tuple(map(int, spot)), 3, INK, -1, cv2.LINE_AA)
+        cv2.putText(panel, title, (12, 26), cv2.FONT_HERSHEY_SIMPLEX, 0.6, INK, 1, cv2.LINE_AA)
+        sheet[:, left:left + PANEL] = panel
+    write_png(path, sheet)

@@ -1,0 +1,212 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What is to be solved: the frames of a folder or a video, chosen, checked, and made small enough to match.
+
+From a video, or where fewer frames are asked for than there are, the shot is cut into equal stretches
+and the sharpest frame of each is taken: blur costs features, and even spacing keeps the overlap.
+"""
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...errors import CaptureError, FrameError
+from ...files import read_json, write_json
+from ...pictures import SUFFIXES, Picture, Pixels, picture_size, read_picture, write_png
+from ...progress import Progress
+from .exif import read_exif, upright
+
+VIDEOS = frozenset({".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".mts", ".m2ts", ".wmv"})
+CLIPPED = 0.98  # of full scale: at or above it the sensor says nothing about the surface
+
+
+@dataclass(frozen=True)
+class Shot:
+    """A frame to solve: `name` of its small picture and mask, the file it comes from, its full size in
+    pixels and its focal length as a multiple of the long side, where the file tells."""
+
+    name: str
+    file: str
+    width: int
+    height: int
+    focal: float | None
+    orientation: int
+
+
+def is_video(source: Path) -> bool:
+    """Whether a file's name is a video's."""
+    return source.suffix.lower() in VIDEOS
+
+
+def choose(sharpness: Sequence[float], number: int) -> list[int]:
+    """The index of the sharpest frame in each of `number` equal stretches; all where `number` is 0."""
+    total = len(sharpness)
+    if number <= 0 or number >= total:
+        return list(range(total))
+    edges = np.linspace(0, total, number + 1).round().astype(int)
+    return [int(start + np.argmax(sharpness[start:end])) for start, end in pairwise(edges)]
+
+
+def sharpness(grey: Pixels) -> float:
+    """Variance of the Laplacian at about 480 pixels: high where edges are crisp."""
+    import cv2
+
+    scale = 480 / max(grey.shape)
+    if scale < 1:
+        grey = np.asarray(cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.float32)
+    return float(cv2.Laplacian(grey, cv2.CV_32F).var())
+
+
+def gather(source: Path, work: Path, number: int, size: int, progress: Progress) -> tuple[list[Shot], list[str]]:
+    """Choose frames and write small pictures and masks of them below `work`.
+
+    `number`: how many (0: all of a folder, 150 of a video); `size`: long side of the small pictures.
+    Returns the shots, in order, and sentences about frames that had to be left out. What an earlier run
+    wrote is taken as it is. Raises CaptureError where there is nothing to choose from.
+    """
+    record = work / "shots.json"
+    if record.is_file():
+        data = read_json(record, CaptureError)
+        return [Shot(**shot) for shot in data["shots"]], list(data["left_out"])
+    if source.is_dir():
+        shots, left_out = _from_folder(source, work, number, size, progress)
+    elif source.is_file() and is_video(source):
+        shots, left_out = _from_video(source, work, number or 150, size, progress)
+    else:
+        raise CaptureError(f"{source} is neither a folder of frames nor a video.")
+    if len(shots) < 3:
+        why = f"; {left_out[0]}" if left_out else ""
+        raise CaptureError(f"{source} gives {len(shots)} usable frames, and a solve needs at least 3 that see the "
+                           f"scene from different places{why}".rstrip(".") + ".")
+    write_json(record, {"shots": [asdict(shot) for shot in shots], "left_out": left_out})
+    return shots, left_out
+
+
+def original(shot: Shot) -> Picture:
+    """The frame at full size, upright."""
+    return upright(read_picture(Path(shot.file)), shot.orientation)
+
+
+def _from_folder(source: Path, work: Path, number: int, size: int,
+                 progress: Progress) -> tuple[list[Shot], list[str]]:
+    files = sorted(path for path in source.iterdir() if path.suffix.lower() in SUFFIXES and path.is_file())
+    if not files:
+        raise CaptureError(f"{source} holds no frames (PNG, JPEG, TIFF or EXR).")
+    left_out: list[str] = []
+    if 0 < number < len(files):
+        progress.stage("choose frames", len(files))
+        scores = []
+        for file in files:
+            try:
+                scores.append(sharpness(read_picture(file).display().mean(axis=2)))
+            except FrameError:
+                scores.append(-1.0)
+            progress.advance()
+        files = [files[i] for i in choose(scores, number)]
+    progress.stage("read frames", len(files))
+    shots = []
+    for file in files:
+        try:
+            picture_size(file)
+            orientation, focal = read_exif(file)
+            picture = upright(read_picture(file), orientation)
+        except FrameError as problem:
+            left_out.append(str(problem))
+            progress.say(f"Left out: {problem}")
+        else:
+            # The suffix stays in the name: a.jpg and a.png may lie side by side.
+            shot = Shot(f"{file.name}.png", str(file.resolve()), *picture.size, focal, orientation)
+            _write_small(picture, work, shot.name, size)
+            shots.append(shot)
+        progress.advance()
+    return shots, left_out
+
+
+def _from_video(source: Path, work: Path, number: int, size: int,
+                progress: Progress) -> tuple[list[Shot], list[str]]:
+    """Two passes: the sharpness of every frame, then the chosen ones."""
+    import cv2
+
+    with _Video(source) as video:
+        progress.stage("choose frames", video.length)
+        scores = []
+        for frame in video:
+            scores.append(sharpness(np.asarray(cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY), np.float32)))
+            progress.advance()
+    if not scores:
+        raise CaptureError(f"{source} holds no frame that can be decoded; convert it to MP4 (H.264).")
+    chosen = choose(scores, number)
+    progress.stage("read frames", len(chosen))
+    shots = []
+    wanted = set(chosen)
+    with _Video(source) as video:
+        for index, frame in enumerate(video):
+            if index in wanted:
+                picture = Picture(frame[..., ::-1].astype(np.float32) / np.float32(255), "srgb")
+                file = work / "full" / f"{index:06d}.png"
+                write_png(file, picture.pixels)
+                shots.append(Shot(file.name, str(file.resolve()), *picture.size, None, 1))
+                _write_small(picture, work, file.name, size)
+                progress.advance()
+    return shots, []
+
+
+class _Video:
+    """The frames of a video, (h, w, 3) uint8 B G R, in order."""
+
+    def __init__(self, path: Path) -> None:
+        import cv2
+
+        self._reader = cv2.VideoCapture(str(path))
+        if not self._reader.isOpened():
+            raise CaptureError(f"{path} is not a video this program can decode; convert it to MP4 (H.264).")
+        self.length = max(int(self._reader.get(cv2.CAP_PROP_FRAME_COUNT)), 0)
+
+    def __enter__(self) -> _Video:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._reader.release()
+
+    def __iter__(self) -> Iterator[Any]:
+        while True:
+            good, frame = self._reader.read()
+            if not good:
+                return
+            yield frame
+
+
+def _write_small(picture: Picture, work: Path, name: str, size: int) -> None:
+    scale = min(1.0, size / max(picture.size))
+    width, height = (max(1, round(side * scale)) for side in picture.size)
+    small = picture.resized(width, height)
+    write_png(work / "small" / name, _exposed(small))
+    write_png(work / "masks" / f"{name}.png", usable(small).astype(np.float32))
+
+
+def _exposed(picture: Picture) -> Pixels:
+    """Display values; linear light is brought to a middle grey first, since EXR frames have no set exposure."""
+    if picture.encoding == "linear":
+        middle = float(np.median(picture.pixels.mean(axis=2)))
+        gain = np.float32(0.18 / middle) if middle > 1e-6 else np.float32(1.0)
+        return Picture(picture.pixels * gain, "linear").display()
+    return picture.display()
+
+
+def usable(picture: Picture) -> np.ndarray[Any, np.dtype[np.bool_]]:
+    """Where features may be taken (h, w): not in clipped pixels nor in the bloom just round them.
+
+    The rim of a clipped area moves with exposure and glare, not with the scene.
+    """
+    import cv2
+
+    clipped = (picture.pixels.max(axis=2) >= CLIPPED).astype(np.uint8)
+    # Lone pixels are sparkle on a texture, and good features.
+    clipped = cv2.morphologyEx(clipped, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    reach = max(2, round(0.008 * float(np.hypot(*picture.size))))
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
+    return np.asarray(cv2.dilate(clipped, disc)) == 0

@@ -8,7 +8,8 @@ At a pixel centre (x + 1/2, y + 1/2), with d its offset from a Gaussian's centre
     q = d^T covariance^-1 d                                       squared Mahalanobis distance
     G = exp(-q / 2)                                               the plain profile, or
     G = exp(-(sqrt(q) - r0)² / (2 w²))                            a ring (METHOD: r0 = 0, w = 1 is plain)
-    G = G * sigmoid(k (cos(theta - theta0) - cos delta))          an arc of either; theta = atan2(d_y, d_x)
+    G = G * sigmoid(k (c - cos delta))                            an arc of either, where
+    c = (d_x cos theta0 + d_y sin theta0) / sqrt(d_x² + d_y² + 1/4)    is cos(theta - theta0), theta = atan2(d_y, d_x)
 
     over:  alpha_i = min(opacity_i, 0.99) G_i, or 0 if that is below 1/255
            T_i = prod_{j before i} (1 - alpha_j)
@@ -26,6 +27,7 @@ from torch.utils.checkpoint import checkpoint
 from .projection import camera_position, determinants, project, visible_radii
 from .rendering import (
     ALPHA_MIN,
+    ARC_APEX,
     OPACITY_MAX,
     PROFILE_MIN,
     TRANSMITTANCE_MIN,
@@ -62,8 +64,7 @@ def profiles(
         g = torch.exp(-((q.clamp(min=RADIUS_MIN**2).sqrt() - r0) ** 2) / (2 * w * w))
     if arcs is not None:
         theta0, cos_delta, k = arcs[:, :, None].unbind(1)
-        distance = (dx * dx + dy * dy).clamp(min=RADIUS_MIN**2).sqrt()
-        cosine = (dx * theta0.cos() + dy * theta0.sin()) / distance
+        cosine = (dx * theta0.cos() + dy * theta0.sin()) * (dx * dx + dy * dy + ARC_APEX**2).rsqrt()
         g = g * torch.sigmoid(k * (cosine - cos_delta))
     return g
 

@@ -17,6 +17,9 @@ TRANSMITTANCE_MIN = 1e-4
 PROFILE_MIN = 1 / 4096
 """Added contributions are skipped where the profile is below this share of its own peak. Relative to
 the peak, so that the extent of a Gaussian (4.08 sigma) depends on neither its opacity nor its colour."""
+ARC_APEX = 0.5
+"""px: nearer to its centre than this an arc has no angle, which no pixel could show; and the angle's
+gradient, one over the distance, stays bounded where a centre falls on a pixel's."""
 NEAR = 0.2
 """Gaussians at this camera depth or nearer are culled."""
 DILATION = 0.3

@@ -27,6 +27,7 @@ from .projection import camera_position, determinants, half_sizes, project, visi
 from .reference import RADIUS_MIN
 from .rendering import (
     ALPHA_MIN,
+    ARC_APEX,
     OPACITY_MAX,
     PROFILE_MIN,
     TRANSMITTANCE_MIN,
@@ -37,11 +38,13 @@ from .rendering import (
 )
 from .spherical_harmonics import colours as colours_of
 
-TILE = 16
+TILE = 8
 CHUNK = 128
 """Entries of a list at a time."""
-GROUP = 8
+GROUP = 32
 """Tiles at a time; with the above, what bounds the memory: half a dozen tensors of 1 MiB."""
+AFTER_MIN = TRANSMITTANCE_MIN * (1 - OPACITY_MAX) / 2
+"""Below the transmittance behind anything that counts."""
 MARGIN = 1e-3
 """By how much lists reach further than the last contribution, so that rounding cannot lose one."""
 
@@ -57,15 +60,13 @@ class Lists(NamedTuple):
 
 
 class Gaussians(NamedTuple):
-    """What is drawn. whitening (n, 3): W's elements xx, yx, yy; centres (n, 2); peaks (n,); rings, arcs;
-    values (n, c), what is blended."""
+    """What is drawn. places (n, 5): centres x, y and whitening W xx, yx, yy; values (n, 1 + c): peaks, and what
+    is blended (where light adds, peaks are 1 and opacity is in the values); rings; arcs."""
 
-    whitening: Tensor
-    centres: Tensor
-    peaks: Tensor  # 1 where light adds, which is in the values then
+    places: Tensor
+    values: Tensor
     rings: Tensor | None
     arcs: Tensor | None
-    values: Tensor
 
 
 def whitening(covariances: Tensor) -> Tensor:
@@ -146,33 +147,30 @@ class _Chunk:
 
     def __init__(self, drawn: Gaussians, index: Tensor, origins: Tensor, pixels: Tensor) -> None:
         """index (b, k) rows of `drawn`; origins (b, 2) middles of the tiles, px; pixels as `_pixels`."""
-        dtype = drawn.values.dtype
         self.drawn, self.pixels = drawn, pixels
-        self.w_xx, self.w_yx, self.w_yy = drawn.whitening[index].to(dtype).unbind(-1)  # (b, k)
-        self.cx, self.cy = (drawn.centres[index] - origins[:, None]).to(dtype).unbind(-1)  # (b, k)
-        self.peaks = drawn.peaks[index][:, None]  # (b, 1, k)
-        self.values = drawn.values[index]  # (b, k, c)
-        zero = torch.zeros_like(self.cx)
+        places = drawn.places[index]
+        places[..., :2] -= origins[:, None]
+        # (b, k), from the middle of the tile
+        self.cx, self.cy, self.w_xx, self.w_yx, self.w_yy = places.to(pixels.dtype).unbind(-1)
+        values = drawn.values[index]
+        self.peaks, self.values = values[:, None, :, 0], values[..., 1:]  # (b, 1, k), (b, k, c)
+        zero, one = torch.zeros_like(self.cx), torch.ones_like(self.cx)
         self.u = self._linear(self.w_xx, zero)
         self.v = self._linear(self.w_yx, self.w_yy)
-        self.q = self.u * self.u
-        self.q.addcmul_(self.v, self.v)
+        q = (self.u * self.u).addcmul_(self.v, self.v)
         if drawn.rings is None:
-            log_g = self.q * -0.5
+            log_g = q.mul_(-0.5)
         else:
-            self.r0, self.w = drawn.rings[index][:, None].unbind(-1)
-            self.r = self.q.clamp(min=RADIUS_MIN**2).sqrt()
-            self.t = (self.r - self.r0) / self.w
+            r0, self.w = drawn.rings[index][:, None].unbind(-1)
+            self.r = q.clamp_(min=RADIUS_MIN**2).sqrt_()
+            self.t = (self.r - r0) / self.w
             log_g = self.t.square() * -0.5
         if drawn.arcs is not None:
             theta0, self.cos_delta, self.k = drawn.arcs[index][:, None].unbind(-1)
             self.cos, self.sin = theta0.cos(), theta0.sin()
-            one = torch.ones_like(self.cx)
             self.dx, self.dy = self._linear(one, zero), self._linear(zero, one)
-            squared = self.dx * self.dx + self.dy * self.dy
-            self.to_unit = squared.clamp(min=RADIUS_MIN**2).rsqrt()
-            self.on_apex = squared < RADIUS_MIN**2
-            self.cosine = (self.dx * self.cos + self.dy * self.sin) * self.to_unit
+            self.per_distance = (self.dx * self.dx + self.dy * self.dy + ARC_APEX**2).rsqrt()
+            self.cosine = (self.dx * self.cos + self.dy * self.sin) * self.per_distance
             self.angle = self.k * (self.cosine - self.cos_delta)
             log_g = log_g + logsigmoid(self.angle)
         self.g = log_g.exp_()
@@ -183,42 +181,30 @@ class _Chunk:
         return self.pixels @ torch.stack([along_x, along_y, offset], 1)
 
     def backward(self, h: Tensor) -> list[Tensor]:
-        """From h = dL/dlog g, the gradients (b, k, .) of whitening, centres, peaks, and rings and arcs if any."""
-        extras = [h.sum(1) / self.peaks[:, 0]]
-        if self.drawn.rings is None:
-            dq = h * -0.5
-        else:
-            dr = -h * self.t / self.w
-            extras.append(torch.stack([-dr.sum(1), -(dr * self.t).sum(1)], -1))
-            dq = torch.where(self.q > RADIUS_MIN**2, dr / (2 * self.r), 0)
-        # Sums over the pixels of du, dv times x, y, 1.
-        sx_u, _, s_u = (self.pixels.T @ (2 * dq * self.u)).unbind(1)
-        sx_v, sy_v, s_v = (self.pixels.T @ (2 * dq * self.v)).unbind(1)
-        d_whitening = torch.stack([sx_u - self.cx * s_u, sx_v - self.cx * s_v, sy_v - self.cy * s_v], -1)
-        d_centres = -torch.stack([self.w_xx * s_u + self.w_yx * s_v, self.w_yy * s_v], -1)
+        """From h = dL/dlog g, the gradients (b, k): five of the places, then those of the ring and the arc."""
+        extras = []
+        pull = h  # -2 dL/dq
+        if self.drawn.rings is not None:
+            dr = h * self.t / self.w  # dL/dr0
+            extras += [dr.sum(1), (dr * self.t).sum(1)]
+            pull = dr / self.r
+        # Sums over the pixels of -dL/du and -dL/dv times x, y, 1.
+        sx_u, _, s_u = (self.pixels.T @ (pull * self.u)).unbind(1)
+        sx_v, sy_v, s_v = (self.pixels.T @ (pull * self.v)).unbind(1)
+        d_cx, d_cy = self.w_xx * s_u + self.w_yx * s_v, self.w_yy * s_v
+        d_whitening = [self.cx * s_u - sx_u, self.cx * s_v - sx_v, self.cy * s_v - sy_v]
         if self.drawn.arcs is not None:
             d_angle = h * torch.sigmoid(-self.angle)
-            d_cosine = d_angle * self.k * self.to_unit
-            turned = (self.dy * self.cos - self.dx * self.sin) * d_cosine
-            extras.append(
-                torch.stack(
-                    [
-                        turned.sum(1),
-                        -(d_angle * self.k).sum(1),
-                        (d_angle * (self.cosine - self.cos_delta)).sum(1),
-                    ],
-                    -1,
-                )
-            )
-            radial = torch.where(self.on_apex, 0, self.cosine * self.to_unit)
-            d_centres -= torch.stack(
-                [
-                    (d_cosine * (self.cos - radial * self.dx)).sum(1),
-                    (d_cosine * (self.sin - radial * self.dy)).sum(1),
-                ],
-                -1,
-            )
-        return [d_whitening, d_centres, *extras]
+            d_cosine = d_angle * self.k * self.per_distance
+            extras += [
+                (d_cosine * (self.dy * self.cos - self.dx * self.sin)).sum(1),
+                -(d_angle * self.k).sum(1),
+                (d_angle * (self.cosine - self.cos_delta)).sum(1),
+            ]
+            radial = self.cosine * self.per_distance
+            d_cx = d_cx - (d_cosine * (self.cos - radial * self.dx)).sum(1)
+            d_cy = d_cy - (d_cosine * (self.sin - radial * self.dy)).sum(1)
+        return [d_cx, d_cy, *d_whitening, *extras]
 
 
 def _origins(tiles: Tensor, columns: int) -> Tensor:
@@ -227,11 +213,10 @@ def _origins(tiles: Tensor, columns: int) -> Tensor:
 
 
 def _with_nothing(drawn: Gaussians) -> Gaussians:
-    """One row more, of a Gaussian without colour or opacity, which fills up lists."""
-    fill = (0.0, 0.0, 1e-30, 1.0, 1.0, 0.0)
+    """One row more, of a Gaussian that shows nothing, which fills up lists."""
     return Gaussians(*(  # type: ignore[arg-type]
-        None if part is None else torch.cat([part, part.new_full((1, *part.shape[1:]), value)])
-        for part, value in zip(drawn, fill, strict=True)
+        None if part is None else torch.cat([part, part.new_full((1, part.shape[1]), fill)])
+        for part, fill in zip(drawn, (0.0, 0.0, 1.0, 0.0), strict=True)
     ))  # fmt: skip
 
 
@@ -243,10 +228,11 @@ class _Draw(torch.autograd.Function):
     def forward(ctx: Any, lists: Lists, blend: str, median: bool, *parts: Tensor | None) -> Any:
         ctx.lists, ctx.blend = lists, blend
         drawn = _with_nothing(Gaussians(*parts))  # type: ignore[arg-type]
+        n, channels = len(drawn.values) - 1, drawn.values.shape[1] - 1
         pixels = _pixels(drawn.values)
-        picture = drawn.values.new_zeros(lists.columns * lists.rows, TILE * TILE, drawn.values.shape[1])
+        picture = drawn.values.new_zeros(lists.columns * lists.rows, TILE * TILE, channels)
         halves = torch.full(picture.shape[:2], -1, dtype=torch.int64, device=picture.device)
-        for tiles, entries in _groups(lists, len(drawn.peaks) - 1):
+        for tiles, entries in _groups(lists, n):
             total = torch.zeros_like(picture[tiles])
             before = torch.ones_like(total[..., :1])
             for index in entries.split(CHUNK, 1):
@@ -270,30 +256,34 @@ class _Draw(torch.autograd.Function):
         picture, *parts = ctx.saved_tensors
         lists: Lists = ctx.lists
         drawn = _with_nothing(Gaussians(*parts))
-        sums = [torch.zeros_like(part) for part in drawn if part is not None]
+        columns = [0 if part is None else part.shape[1] for part in (drawn.values, *drawn[:1], *drawn[2:])]
+        sums = drawn.values.new_zeros(len(drawn.values), sum(columns))
         pixels = _pixels(drawn.values)
-        for tiles, entries in _groups(lists, len(drawn.peaks) - 1):
+        for tiles, entries in _groups(lists, len(drawn.values) - 1):
             upstream = gradient[tiles]
             left = (upstream * picture[tiles]).sum(-1, keepdim=True)  # of the sum, behind the entry
             before = torch.ones_like(left)
             for index in entries.split(CHUNK, 1):
                 chunk = _Chunk(drawn, index, _origins(tiles, lists.columns), pixels)
                 weights, after = _weigh(chunk, ctx.blend, before)
-                shares = weights * (upstream @ chunk.values.transpose(1, 2))
+                h = upstream @ chunk.values.transpose(1, 2)
+                h *= weights
                 if ctx.blend == "over":
-                    behind = left - shares.cumsum(-1)
+                    behind = left - h.cumsum(-1)
+                    # alpha / (1 - alpha), or 0 if the entry did not count
+                    h.addcmul_(weights / after.clamp(min=AFTER_MIN), behind, value=-1)
                     left, before = behind[..., -1:], after[..., -1:]
-                    alpha = chunk.peaks * chunk.g
-                    # 0 where the entry did not count
-                    odds = alpha / (1 - alpha) * (weights > 0)
-                    shares -= odds * behind
-                parts_of_sums = [*chunk.backward(shares), weights.transpose(1, 2) @ upstream]
-                for total, part in zip(sums, parts_of_sums, strict=True):
-                    total.index_add_(0, index.flatten(), part.flatten(0, 1).to(total.dtype))
+                d_peaks = h.sum(1) / chunk.peaks[:, 0].clamp(min=ALPHA_MIN)
+                d_values = weights.transpose(1, 2) @ upstream
+                found = torch.stack([d_peaks, *d_values.unbind(-1), *chunk.backward(h)], -1)
+                sums.index_add_(0, index.flatten(), found.flatten(0, 1))
                 if ctx.blend == "over" and float(before.max()) < TRANSMITTANCE_MIN:
                     break
-        found = iter(sums)
-        return None, None, None, *(None if part is None else next(found)[:-1] for part in parts)
+        values, places, rings, arcs = sums[:-1].split(columns, 1)
+        return (
+            None, None, None, places.to(drawn.places.dtype), values,
+            None if drawn.rings is None else rings, None if drawn.arcs is None else arcs,
+        )  # fmt: skip
 
 
 def _weigh(chunk: _Chunk, blend: str, before: Tensor) -> tuple[Tensor, Tensor]:
@@ -322,7 +312,10 @@ def _draw(
     """(height, width, c) sums of the values (n, c), weighted; and (height, width) rows, see `_Draw`."""
     white = whitening(covariances)
     lists = bin_tiles(centres, white, half_sizes(covariances, radii), radii, width, height)
-    picture, halves = _Draw.apply(lists, blend, median, white, centres, peaks, rings, arcs, values)
+    places = torch.cat([centres, white], -1)
+    picture, halves = _Draw.apply(
+        lists, blend, median, places, torch.cat([peaks[:, None], values], -1), rings, arcs
+    )
     shape = (lists.rows, lists.columns, TILE, TILE)
     picture = picture.reshape(*shape, -1).transpose(1, 2).reshape(lists.rows * TILE, lists.columns * TILE, -1)
     halves = halves.reshape(shape).transpose(1, 2).reshape(lists.rows * TILE, lists.columns * TILE)

@@ -1,11 +1,18 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Flares at mixed resolution: what is soft against the pixel is drawn small and enlarged.
 
-A 2D Gaussian whose narrowest feature is s px wide (its smaller standard deviation; times w for a ring)
-changes by at most peak / s² a px², so bilinear interpolation on a grid of f px is off by at most
-f²/8 * 2 * peak / s² = peak (f / (2 s))². A Gaussian is drawn at 1/f size where f / (2 s) <= 1/8: by 1/4 from
-s = 16 px, by 1/2 from 8 px, in full below. So each one is off by at most 1/64 of its peak, plus the step at
-which it is cut off (1/255 or 1/4096); flares are made of many faint ones, and their errors fall with 1/s².
+Bilinear interpolation on a grid of f px misses a picture by at most f²/8 times the sum of its second
+derivatives along the axes, and a cusp of slope m by at most m f / sqrt(2). With s the smaller standard
+deviation, px, and in shares of the peak:
+
+    Gaussian    |d²G| <= 1/s² along each axis
+    ring        1/(w s)² likewise; at its centre a cusp of slope r0 / (w² s) exp(-r0² / (2 w²))
+    arc         the window turns over k cos(theta): it adds (k²/10 + k/2) / rho² at the distance rho from its
+                apex, nothing of which is drawn where the ring's hole of radius (r0 - 2 w) s is
+
+The largest f of 4, 2, 1 at which that comes to no more than TOLERANCE of the peak is taken: a plain Gaussian
+is drawn at 1/4 size from s = 11.3 px, at 1/2 from 5.7 px. To the error comes the step at which a profile is
+cut off (1/255 or 1/4096). Flares are made of many faint Gaussians, of which few are close to the limit.
 
 "over" then also changes the order: full size in front, then 1/2, then 1/4.
 """
@@ -17,31 +24,38 @@ from torch import Tensor
 from .kernels import KernelSet
 from .rendering import Splats
 
-FEATURE_PER_STEP = 4.0
-"""Narrowest feature, in steps of the small grid, from which that grid is used."""
+TOLERANCE = 1 / 32
+"""Largest error of a Gaussian drawn small, as a share of its peak."""
 REDUCTIONS = (1, 2, 4)
 
 
-def narrowest(covariances: Tensor, rings: Tensor | None, arcs: Tensor | None) -> Tensor:
-    """(n,) px: the standard deviation of each Gaussian across its narrowest feature."""
+@torch.no_grad()
+def error_bound(factor: int, covariances: Tensor, rings: Tensor | None, arcs: Tensor | None) -> Tensor:
+    """(n,) largest error of each Gaussian drawn at 1/factor size, as a share of its peak; see above."""
     xx, xy, yy = covariances.unbind(-1)
-    largest = (xx + yy) / 2 + (((xx - yy) / 2) ** 2 + xy * xy).sqrt()
-    width = ((xx * yy - xy * xy) / largest.clamp(min=1e-12)).clamp(min=0).sqrt()  # no cancellation
+    larger = (xx + yy) / 2 + (((xx - yy) / 2) ** 2 + xy * xy).sqrt()
+    smaller = ((xx * yy - xy * xy) / larger).clamp(min=1e-12)  # without cancellation
+    curvature = 2 / smaller
+    slope = torch.zeros_like(smaller)
+    hole = torch.zeros_like(smaller)
     if rings is not None:
-        width = width * rings[:, 1].clamp(0, 1)
+        r0, w = rings.unbind(-1)
+        curvature = curvature / (w * w).clamp(max=1)
+        slope = r0.abs() / (w * w) * torch.exp(-((r0 / w) ** 2) / 2) * smaller.rsqrt()
+        hole = (r0 - 2 * w).clamp(min=0) * smaller.sqrt()
     if arcs is not None:
-        # An arc's window meets all angles at the centre, where nothing is wide: the window's edge takes
-        # 2 / k of angle, and what matters of it lies at the radius of the ring.
-        radius = rings[:, 0].clamp(min=0) if rings is not None else torch.zeros_like(width)
-        width = torch.minimum(width, width * radius * 2 / arcs[:, 2].abs().clamp(min=1e-6))
-    return width
+        k = arcs[:, 2].abs()
+        curvature = curvature + (k * k / 10 + k / 2) / (hole * hole).clamp(min=1e-12)
+    return factor**2 / 8 * curvature + factor / 2**0.5 * slope
 
 
+@torch.no_grad()
 def reductions(covariances: Tensor, rings: Tensor | None, arcs: Tensor | None) -> Tensor:
-    """(n,) 1, 2 or 4: at which share of the size each Gaussian is drawn; not differentiable."""
-    with torch.no_grad():
-        width = narrowest(covariances, rings, arcs)
-        return 1 + (width >= 2 * FEATURE_PER_STEP).int() + 2 * (width >= 4 * FEATURE_PER_STEP).int()
+    """(n,) 1, 2 or 4: at which share of the size each Gaussian is drawn."""
+    chosen = torch.ones(len(covariances), dtype=torch.int64, device=covariances.device)
+    for factor in REDUCTIONS[1:]:
+        chosen[error_bound(factor, covariances, rings, arcs) <= TOLERANCE] = factor
+    return chosen
 
 
 def enlarge(picture: Tensor, factor: int, width: int, height: int) -> Tensor:

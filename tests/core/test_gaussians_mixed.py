@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Flares at mixed resolution: how far they may be from the full one."""
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from core.gaussians import mixed, splat
+from core.gaussians.rendering import PROFILE_MIN
+
+SIZE = (150, 110)
+
+
+def ellipses(n: int, smallest: float, largest: float, seed: int) -> tuple[Tensor, Tensor]:
+    """Centres about the middle of the picture, and covariances."""
+    generator = torch.Generator().manual_seed(seed)
+    sigma = smallest * (largest / smallest) ** torch.rand(n, 2, generator=generator)
+    theta = math.pi * torch.rand(n, generator=generator)
+    c, s = theta.cos(), theta.sin()
+    a, b = sigma.square().unbind(1)
+    covariances = torch.stack([c * c * a + s * s * b, c * s * (a - b), s * s * a + c * c * b], 1)
+    return torch.tensor(SIZE) * (0.2 + 0.6 * torch.rand(n, 2, generator=generator)), covariances
+
+
+@pytest.mark.parametrize("what", ["plain", "rings", "arcs"])
+def test_each_is_within_its_bound(what: str) -> None:
+    n = 60
+    centres, covariances = ellipses(n, 4, 40, 1)
+    generator = torch.Generator().manual_seed(2)
+    rings = arcs = None
+    if what != "plain":
+        rings = torch.stack([3 * torch.rand(n, generator=generator), 0.2 + torch.rand(n, generator=generator)], 1)
+    if what == "arcs":
+        rings[:, 0] += 2
+        arcs = torch.stack([6 * torch.rand(n, generator=generator), torch.zeros(n), torch.full((n,), 4.0)], 1)
+    factors = mixed.reductions(covariances, rings, arcs)
+    assert (factors == 1).any() and (factors == 2).any() and (what == "arcs" or (factors == 4).any())
+    largest = 0.0
+    for i in range(n):
+        one = slice(i, i + 1)
+        arguments = {
+            "rings": None if rings is None else rings[one], "arcs": None if arcs is None else arcs[one],
+            "blend": "add", "kernels": "torch",
+        }  # fmt: skip
+        inputs = (centres[one], covariances[one], torch.ones(1), torch.ones(1, 3), *SIZE)
+        error = splat(*inputs, **arguments, resolution="mixed").colour - splat(*inputs, **arguments).colour
+        factor = int(factors[i])
+        bound = mixed.error_bound(factor, covariances[one], arguments["rings"], arguments["arcs"])
+        assert error.abs().max() <= (bound if factor > 1 else 0) + PROFILE_MIN
+        assert factor == 1 or bound <= mixed.TOLERANCE
+        largest = max(largest, error.abs().max().item())
+    assert largest > mixed.TOLERANCE / 4, "the bound says nothing if errors are far below it"
+
+
+@pytest.mark.parametrize(("blend", "limit"), [("over", 6e-3), ("add", 1e-3)])
+def test_a_flare_of_many(blend: str, limit: float) -> None:
+    """Faint Gaussians end in a step of 1/255 when blended, large against their peak: so "over" is off by more."""
+    n = 300
+    centres, covariances = ellipses(n, 2, 60, 3)
+    generator = torch.Generator().manual_seed(4)
+    opacities = 0.01 + 0.02 * torch.rand(n, generator=generator)
+    colours = torch.rand(n, 3, generator=generator)
+    full = splat(centres, covariances, opacities, colours, *SIZE, blend=blend, kernels="tiles")
+    fast = splat(centres, covariances, opacities, colours, *SIZE, blend=blend, kernels="tiles", resolution="mixed")
+    assert full.colour.mean() > 0.1
+    assert (fast.colour - full.colour).square().mean().sqrt() < limit
+    assert (fast.transmittance - full.transmittance).square().mean().sqrt() < limit
+
+
+def test_gradients_are_those_of_the_full_picture() -> None:
+    centres, covariances = ellipses(20, 8, 40, 5)
+    found = []
+    for resolution in ("full", "mixed"):
+        inputs = [t.clone().requires_grad_() for t in (centres, covariances, torch.full((20,), 0.2), torch.ones(20, 3))]
+        laid = splat(*inputs, *SIZE, blend="add", kernels="tiles", resolution=resolution)
+        pattern = torch.linspace(0, 3, SIZE[0]).sin()[None, :, None] + torch.linspace(0, 2, SIZE[1])[:, None, None]
+        (laid.colour * pattern).sum().backward()
+        found.append([t.grad for t in inputs])
+    for full, fast in zip(*found, strict=True):
+        assert torch.linalg.vector_norm(fast - full) < 0.02 * torch.linalg.vector_norm(full)
+
+
+def test_the_border_is_no_special_place() -> None:
+    """A ramp that runs off the frame: without neighbours outside, the outermost pixels would be level."""
+    inputs = (torch.tensor([[-20.0, 10.0]]), torch.tensor([[900.0, 0, 900.0]]), torch.ones(1), torch.ones(1, 3))
+    full = splat(*inputs, 50, 30, blend="add", kernels="torch").colour
+    fast = splat(*inputs, 50, 30, blend="add", kernels="torch", resolution="mixed").colour
+    assert (fast - full).abs().max() < 0.005

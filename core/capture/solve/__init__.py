@@ -34,20 +34,23 @@ class SolveSettings:
 
     frames: how many to choose, 0 = all of a folder and 150 of a video.
     matching: which frames to match; "auto" takes what fits (pairs.py).
-    lens: COLMAP's camera model; one camera for all frames of one size.
+    lens: COLMAP's camera model; one camera for all frames of one size. Without tangential terms by default: they
+        stand in for a shift of the principal point, about which flares turn.
     size: long side in pixels at which features are found.
     features: at most so many a frame.
     output_size: long side of the frames written; 0 = as filmed.
+    principal_point: find it too, since flares turn about it; kept at the middle where the frames do not tell.
     mask: leave clipped pixels and their bloom out of feature extraction.
     seed: of everything random.
     """
 
     frames: int = 0
     matching: Matching = "auto"
-    lens: str = "OPENCV"
+    lens: str = "RADIAL"
     size: int = 1000
     features: int = 4096
     output_size: int = 0
+    principal_point: bool = True
     mask: bool = True
     seed: int = 0
     keep_work: bool = False

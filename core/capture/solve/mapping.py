@@ -28,6 +28,8 @@ if TYPE_CHECKING:
     from . import SolveSettings
 
 DEFAULT_FOCAL = 1.2  # of the long side, where the file does not tell; COLMAP's own guess
+ENOUGH = 20          # frames from which a principal point can be told from a turn of the cameras
+OFF_CENTRE = 0.015   # of the long side; a principal point further from the middle is an artefact
 MOVED = 1.0          # pixels of the small pictures; less is no motion
 
 
@@ -71,8 +73,7 @@ class Solved:
 def solve(shots: Sequence[Shot], work: Path, settings: SolveSettings, video: bool, progress: Progress) -> Solved:
     """From small pictures and masks below `work` to the largest model. See `core.capture.solve.solve`."""
     pycolmap = load_pycolmap()
-    pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value
-    pycolmap.logging.verbose_level = -1
+    pycolmap.logging.minloglevel = int(pycolmap.logging.Level.ERROR)
     pycolmap.set_random_seed(settings.seed)
     database = work / "database.db"
     _refuse_one_picture(shots, work)
@@ -83,6 +84,10 @@ def solve(shots: Sequence[Shot], work: Path, settings: SolveSettings, video: boo
     if not models:
         raise CaptureError(_why_not(pycolmap, database, settings.size))
     largest = max(models, key=lambda model: (model.num_reg_images(), model.num_points3D()))
+    if settings.principal_point and largest.num_reg_images() >= ENOUGH:
+        progress.stage("find principal point", 1)
+        largest = _with_principal_point(pycolmap, largest)
+        progress.advance()
     names = {shot.name: index for index, shot in enumerate(shots)}
     return Solved(_model(largest, names), sorted((m.num_reg_images() for m in models), reverse=True), matching, pairs)
 
@@ -218,6 +223,27 @@ def _map(pycolmap: Any, work: Path, database: Path, frames: int, settings: Solve
         model.write(str(folder / str(number)))
     write_json(record, [str(number) for number in models])
     return list(models.values())
+
+
+def _with_principal_point(pycolmap: Any, found: Any) -> Any:
+    """The reconstruction adjusted once more with its principal points free, or as it was where one of them
+    strays further than a lens can be off centre: then the views do not determine it."""
+    moved = pycolmap.Reconstruction(found)
+    options = pycolmap.BundleAdjustmentOptions()
+    options.refine_principal_point = True
+    options.print_summary = False
+    # Not pycolmap.bundle_adjustment, which writes to standard error whatever the log level.
+    config = pycolmap.BundleAdjustmentConfig()
+    for image in moved.reg_image_ids():
+        config.add_image(image)
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    pycolmap.create_default_bundle_adjuster(options, config, moved).solve()
+    moved.update_point_3d_errors()
+    for camera in moved.cameras.values():
+        off = np.hypot(camera.principal_point_x - camera.width / 2, camera.principal_point_y - camera.height / 2)
+        if not off < OFF_CENTRE * max(camera.width, camera.height):
+            return found
+    return moved
 
 
 def _why_not(pycolmap: Any, database: Path, size: int) -> str:

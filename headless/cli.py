@@ -6,11 +6,12 @@ Status: 0 done; 1 it could not be done, and one sentence says why; 2 the words m
 from __future__ import annotations
 
 import argparse
+import contextlib
 import os
 import sys
 import traceback
-from collections.abc import Sequence
-from typing import Any, NoReturn
+from collections.abc import Iterator, Sequence
+from typing import Any, NoReturn, TextIO
 
 from ..core.errors import Cancelled, EngineError, FitFlareError
 from ..core.progress import JsonProgress, Progress, TerminalProgress, stoppable
@@ -68,7 +69,14 @@ def main(words: Sequence[str]) -> int:
     if not words:
         parser().print_help(sys.stderr)
         return MISUSED
-    progress = _progress(words)
+    try:
+        with _progress(words) as progress:
+            return _status(words, progress)
+    except BrokenPipeError:  # whoever listened has gone
+        return FAILED
+
+
+def _status(words: Sequence[str], progress: Progress) -> int:
     try:
         arguments = parser().parse_args(words)
         with stoppable(progress):
@@ -87,9 +95,8 @@ def main(words: Sequence[str]) -> int:
     except FitFlareError as problem:
         progress.error(str(problem))
         return FAILED
-    except BrokenPipeError:  # whoever listened has gone
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return FAILED
+    except BrokenPipeError:
+        raise
     except OSError as problem:
         where = f" ({problem.filename})" if problem.filename else ""
         progress.error(f"The system refused: {problem.strerror or problem}{where}.")
@@ -98,21 +105,48 @@ def main(words: Sequence[str]) -> int:
         traceback.print_exc()
         progress.error(f"A defect of Fit Flare, please report it: {type(problem).__name__}: {problem}.")
         return FAILED
-    finally:
-        progress.close()
 
 
-def _progress(words: Sequence[str]) -> Progress:
+@contextlib.contextmanager
+def _progress(words: Sequence[str]) -> Iterator[Progress]:
     """By --progress alone, read before the rest so that misuse is told in the same manner."""
     told = " ".join(words).replace("--progress=", "--progress ").split("--progress ")[1:]
-    if not told or told[-1].split(" ")[0] != "json":
-        return TerminalProgress()
-    if "bpy" not in sys.modules:
-        return JsonProgress()
-    # Blender prints to standard output as it likes: events keep that for themselves, the rest goes to errors.
-    events = os.fdopen(os.dup(1), "w", encoding="utf-8")
-    os.dup2(2, 1)
-    return JsonProgress(events)
+    if not told or told[-1].split(" ")[0] != "json" or "--help" in words:
+        progress: Progress = TerminalProgress()
+        try:
+            yield progress
+        finally:
+            progress.close()
+        return
+    # Blender and libraries print as they like: standard output is for events alone, the rest goes to errors.
+    with _pointed_at(2) as events, contextlib.redirect_stdout(sys.stderr):
+        yield JsonProgress(events)
+
+
+@contextlib.contextmanager
+def _pointed_at(target: int) -> Iterator[TextIO]:
+    """Point standard output at another file descriptor for a while; gives a stream to where it was."""
+    sys.stdout.flush()
+    before = os.dup(1)
+    os.dup2(target, 1)
+    try:
+        with os.fdopen(os.dup(before), "w", encoding="utf-8") as stream:
+            yield stream
+    finally:
+        sys.stdout.flush()
+        os.dup2(before, 1)
+        os.close(before)
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Silence standard output, where Blender writes many lines a frame."""
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    try:
+        with _pointed_at(nowhere):
+            yield
+    finally:
+        os.close(nowhere)
 
 
 def _run(command: Command, arguments: argparse.Namespace, words: Sequence[str], progress: Progress) -> dict[str, Any]:
@@ -127,7 +161,8 @@ def _run_step(step: Step, arguments: argparse.Namespace, words: Sequence[str], p
     if arguments.step and step.side == "blender" and "bpy" not in sys.modules:
         __import__("bpy")  # this process was started for it, in a Python that has Blender as a module
     if hand_off.here() == step.side:
-        return step.run(arguments, progress)
+        with _quiet() if step.side == "blender" else contextlib.nullcontext():
+            return step.run(arguments, progress)
     if arguments.step:
         raise EngineError(f"The step {step.name} was handed to {sys.executable}, which has no {step.side} either.")
     try:

@@ -133,7 +133,7 @@ def preset(name: Preset, *, model: Literal["paper", "ours"] = "paper", mode: Mod
     lengths = {"draft": 1000, "standard": 3000, "high": 10000, "paper": 30000}
     if name not in lengths:
         raise SettingsError(f"There is no preset {name!r}; choose {', '.join(lengths)}.")
-    length = iterations or lengths[name]
+    length = lengths[name] if iterations is None else iterations
     form = replace(PAPER if model == "paper" else OURS, line=mode != "2d")
     if blend is None:
         blend = "over" if model == "paper" else "add"

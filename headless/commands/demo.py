@@ -7,7 +7,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from ...core.errors import CaptureError
+from ...core.errors import CaptureError, RunError
 from ...core.progress import Progress
 from ..command import Command, Step
 from . import compose, evaluate
@@ -23,6 +23,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
                         help="folder for everything (default build/demo in the repository)")
     parser.add_argument("--capture", type=Path, default=SAMPLE, metavar="CAPTURE",
                         help="another capture than the sample")
+    parser.add_argument("--iterations", type=int, metavar="N", help="length of the fit (default: the preset's)")
     parser.add_argument("--preset", choices=("draft", "standard", "high"), default="draft",
                         help="how long and how fine (default draft)")
 
@@ -41,7 +42,9 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     capture, out = Capture.open(words.capture), words.out
     progress.say(f"{words.capture.name}: {len(capture.views)} frames, {len(capture.lights)} lights. "
                  f"{_supervision(capture)}")
-    made = fit(capture, preset(words.preset), out / "run", progress, resume=True)
+    settings = preset(words.preset, iterations=words.iterations)
+    _check_earlier(out / "run", settings, capture)
+    made = fit(capture, settings, out / "run", progress, resume=True)
     result = evaluate.scores_of(made.folder, progress)
     cameras = {view.name: view.camera for view in capture.views}
     bake(made, numbered(cameras), cameras, out / "layers", progress=progress, overwrite=True)
@@ -49,6 +52,17 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     progress.say(f"In {out} there are now the run, the layers of {len(cameras)} frames (EXR), and {SHEET}; "
                  f"{time.monotonic() - began:.0f} s.")
     return {**result, "run": str(made.folder), "layers": str(out / "layers"), "sheet": str(out / SHEET)}
+
+
+def _check_earlier(folder: Path, settings: Any, capture: Any) -> None:
+    """An earlier run is gone on with, so it must be the one that is asked for now."""
+    from ...core.fit.run import CONFIG, Run
+
+    if (folder / CONFIG).exists():
+        earlier = Run.open(folder)
+        if earlier.settings != settings or earlier.capture_folder != capture.folder.resolve():
+            raise RunError(f"{folder} holds a fit with other settings or of another capture; remove it, or choose "
+                           "another folder with --out.")
 
 
 def _supervision(capture: Any) -> str:

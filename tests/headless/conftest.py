@@ -1,0 +1,32 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The tree under the name that the commands give it, and a small capture to run them on."""
+from __future__ import annotations
+
+import importlib.util
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+RUN = ROOT / "headless" / "run.py"
+
+_spec = importlib.util.spec_from_file_location("fit_flare_run", RUN)
+assert _spec is not None
+assert _spec.loader is not None
+_run = importlib.util.module_from_spec(_spec)
+_spec.loader.exec_module(_run)
+_run.load()
+
+
+@pytest.fixture(scope="session")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A tiny capture with everything, shared by the tests."""
+    folder = ROOT / "tests" / "core"
+    if str(folder) not in sys.path:
+        sys.path.append(str(folder))
+    flared: ModuleType = __import__("flared")
+    make: Callable[..., Path] = flared.flared_capture
+    return make(tmp_path_factory.mktemp("capture") / "tiny", count=9, dots=60)

@@ -1,0 +1,162 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The command line: help, misuse, bad input, and the status each ends with."""
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any, get_args
+
+import pytest
+from fit_flare.core.errors import Cancelled, FitFlareError, SettingsError
+from fit_flare.core.fit import settings as fit_settings
+from fit_flare.core.progress import Progress
+from fit_flare.headless import cli
+from fit_flare.headless.command import Command, Step
+from fit_flare.headless.commands import COMMANDS, bake, fit
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def events(text: str) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in text.splitlines()]
+
+
+# ---- words ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_explains_itself(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main([name, "--help"]) == 0
+    told = capsys.readouterr().out
+    assert COMMANDS[name].summary in told
+    assert "run.py " + name in told.split("options:")[0].split("\n\n", 1)[1], "an example of its use"
+    assert "--progress" in told
+
+
+def test_the_list_of_commands(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["--help"]) == 0
+    told = capsys.readouterr().out
+    assert all(f"  {name} " in told for name in COMMANDS)
+    assert cli.main([]) == 2
+
+
+@pytest.mark.parametrize("words", [
+    ["fly"], ["fit"], ["fit", "a"], ["bake", "a"], ["fit", "a", "--out", "b", "--preset", "x"],
+    ["fit", "a", "--out", "b", "--seed", "x"], ["eval", "a", "--views", "none"]])
+def test_misuse_is_status_2_and_one_sentence(words: list[str], capfd: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(words) == 2
+    told = capfd.readouterr()
+    assert told.out == ""
+    assert told.err.startswith("error: ")
+    assert told.err.count("\n") == 1
+    assert cli.main([*words, "--progress", "json"]) == 2
+    (event,) = events(capfd.readouterr().out)
+    assert event["type"] == "error"
+
+
+@pytest.mark.parametrize("words", [
+    ["eval", "no/run"], ["bake", "no/run", "--out", "{tmp}/o"], ["fit", "no/capture", "--out", "{tmp}/o"],
+    ["demo", "--capture", "no/capture", "--out", "{tmp}/o"],
+    ["fit", "{capture}", "--out", "{tmp}/o", "--holdout", "no.json"],
+    ["fit", "{capture}", "--out", "{tmp}/o", "--iterations", "0"],
+    ["fit", "{capture}", "--out", "{tmp}/o", "--size", "-4"],
+    ["fit", "{capture}", "--out", "{tmp}/o", "--set", "flare"],
+    ["fit", "{capture}", "--out", "{tmp}/o", "--set", "flare.colour=1"],
+    ["fit", "{capture}", "--out", "{tmp}/o", "--set", "flare.count=many"],
+])
+def test_bad_input_is_status_1_and_one_sentence(words: list[str], capture: Path, tmp_path: Path,
+                                                capfd: pytest.CaptureFixture[str]) -> None:
+    assert cli.main([word.format(tmp=tmp_path, capture=capture) for word in words]) == 1
+    told = capfd.readouterr().err
+    assert told.startswith("error: ")
+    assert told.count("\n") == 1
+    assert not list(tmp_path.iterdir()), "nothing was written"
+
+
+# ---- how a command ends ---------------------------------------------------------------------------
+
+
+def ending_with(problem: BaseException | None, monkeypatch: pytest.MonkeyPatch) -> None:
+    def run(_words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
+        print("a library prints")
+        progress.say("working")
+        if problem:
+            raise problem
+        return {"made": 1}
+
+    command = Command("try", "Tries.", "", lambda _parser: None, (Step("try", "engine", run),))
+    monkeypatch.setitem(COMMANDS, "try", command)
+
+
+@pytest.mark.parametrize(("problem", "status", "sentence"), [
+    (FitFlareError("It is broken."), 1, "It is broken."),
+    (Cancelled("Stopped as asked."), 130, "Stopped as asked."),
+    (KeyboardInterrupt(), 130, "Stopped."),
+    (OSError(28, "No space left on device", "x.exr"), 1, "The system refused: No space left on device (x.exr)."),
+    (ZeroDivisionError("division by zero"), 1,
+     "A defect of Fit Flare, please report it: ZeroDivisionError: division by zero."),
+])
+def test_status_and_sentence(problem: BaseException, status: int, sentence: str, monkeypatch: pytest.MonkeyPatch,
+                             capfd: pytest.CaptureFixture[str]) -> None:
+    ending_with(problem, monkeypatch)
+    assert cli.main(["try", "--progress=json"]) == status
+    told = capfd.readouterr()
+    assert events(told.out) == [{"type": "say", "text": "working"}, {"type": "error", "text": sentence}]
+    assert ("Traceback" in told.err) == sentence.startswith("A defect")
+
+
+def test_events_have_standard_output_for_themselves(monkeypatch: pytest.MonkeyPatch,
+                                                    capfd: pytest.CaptureFixture[str]) -> None:
+    ending_with(None, monkeypatch)
+    assert cli.main(["try", "--progress", "json"]) == 0
+    told = capfd.readouterr()
+    assert [event["type"] for event in events(told.out)] == ["say", "result"]
+    assert "a library prints" in told.err
+    assert cli.main(["try"]) == 0
+    assert "a library prints" in capfd.readouterr().out
+
+
+# ---- the pieces -----------------------------------------------------------------------------------
+
+
+def test_choices_are_those_of_the_settings() -> None:
+    assert get_args(fit_settings.Preset) == fit.PRESETS
+    assert get_args(fit_settings.Mode) == fit.MODES
+
+
+def test_settings_on_the_command_line() -> None:
+    assert fit.change("flare.count=400") == ("flare.count", 400)
+    assert fit.change("flare.rates.network=1e-3") == ("flare.rates.network", 1e-3)
+    assert fit.change("detection = false") == ("detection", False)
+    assert fit.change("kernels=cpu") == ("kernels", "cpu")
+
+
+def test_a_holdout_is_a_number_or_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "split.json").write_text("{}")
+    monkeypatch.chdir(tmp_path)
+    assert fit.holdout("8") == 8
+    assert fit.holdout(None) is None
+    assert fit.holdout("split.json") == str(tmp_path / "split.json")
+
+
+def test_sizes() -> None:
+    assert bake.size(None, (480, 270)) is None
+    assert bake.size("960", (480, 270)) == (960, 540)
+    assert bake.size("100x30", (480, 270)) == (100, 30)
+    for text in ("0", "x", "12x", "-5", "1.5", "999999"):
+        with pytest.raises(SettingsError):
+            bake.size(text, (480, 270))
+
+
+def test_reading_the_words_needs_numpy_alone() -> None:
+    """As in Blender's own Python: every module of ours but the engine's comes in without these."""
+    code = (f"import importlib, runpy, sys\n"
+            f"sys.modules.update(dict.fromkeys(('torch', 'cv2', 'OpenEXR', 'numba', 'safetensors', 'tqdm')))\n"
+            f"sys.argv = ['run.py', 'fit', '--help']\n"
+            f"runpy.run_path({str(ROOT / 'headless' / 'run.py')!r}, run_name='__main__')")
+    done = subprocess.run([sys.executable, "-I", "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "--holdout" in done.stdout

@@ -1,0 +1,190 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Who is asked, in what order, and what crosses between two processes."""
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+from fit_flare.core.errors import Cancelled, EngineError, FitFlareError
+from fit_flare.core.progress import Progress, stoppable
+from fit_flare.headless import hand_off
+
+HERE = [sys.executable, str(hand_off.RUN)]
+
+
+class Heard(Progress):
+    """Remembers what was shown."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.lines: list[Any] = []
+
+    def say(self, text: str) -> None:
+        self.lines.append(text)
+
+    def _show_stage(self) -> None:
+        self.lines.append((self._stage, self._total, self._done))
+
+    def _show_progress(self, figures: dict[str, float]) -> None:
+        self.lines.append((self._done, figures))
+
+
+@pytest.fixture
+def bare(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """No variables, nothing on the PATH, and a repository without an environment; its folder."""
+    for name in ("FIT_FLARE_ENGINE", "FIT_FLARE_BLENDER"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("PATH", "")
+    monkeypatch.setattr(hand_off, "ROOT", tmp_path / "repository")
+    monkeypatch.setattr(hand_off, "_usual_places", lambda: iter(()))
+    return tmp_path / "repository"
+
+
+def without(monkeypatch: pytest.MonkeyPatch, package: str) -> None:
+    find = hand_off.importlib.util.find_spec
+    monkeypatch.setattr(hand_off.importlib.util, "find_spec", lambda name: None if name == package else find(name))
+
+
+# ---- who ------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def torchless(tmp_path: Path) -> Path:
+    """A Python without torch, as a virtual environment's folder."""
+    place = tmp_path / "torchless"
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(place)], check=True)
+    return place
+
+
+def test_the_engine_is_looked_for_in_order(bare: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(EngineError, match="make setup"):
+        hand_off.engine_command(None)
+    environment = Path(sys.prefix)
+    (bare.parent / ".venv").symlink_to(environment, target_is_directory=True)
+    beside = hand_off.engine_command(None)
+    assert beside[0].startswith(str(bare.parent / ".venv"))
+    bare.mkdir()
+    (bare / ".venv").symlink_to(environment, target_is_directory=True)
+    assert hand_off.engine_command(None)[0].startswith(str(bare / ".venv"))
+    monkeypatch.setattr(hand_off, "_engine_in_preferences", lambda: sys.executable)
+    assert hand_off.engine_command(None) == HERE
+    monkeypatch.setenv("FIT_FLARE_ENGINE", str(bare / ".venv"))
+    assert hand_off.engine_command(None)[0].startswith(str(bare / ".venv"))
+    assert hand_off.engine_command(sys.executable) == HERE
+
+
+def test_an_engine_that_is_named_must_be_one(bare: Path, torchless: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for place in (torchless, bare / "nowhere"):
+        with pytest.raises(EngineError, match="--engine names"):
+            hand_off.engine_command(str(place))
+    monkeypatch.setenv("FIT_FLARE_ENGINE", str(torchless))
+    with pytest.raises(EngineError, match="FIT_FLARE_ENGINE names"):
+        hand_off.engine_command(None)
+
+
+@pytest.mark.usefixtures("bare")
+def test_blender_is_looked_for_in_order(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    without(monkeypatch, "bpy")
+    with pytest.raises(EngineError, match="--blender"):
+        hand_off.blender_command(None)
+    program = tmp_path / ("blender.exe" if os.name == "nt" else "blender")
+    shutil.copy(sys.executable, program)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert Path(hand_off.blender_command(None)[0]).samefile(program)
+    monkeypatch.setattr(hand_off.importlib.util, "find_spec", lambda _name: object())
+    assert hand_off.blender_command(None) == HERE
+    monkeypatch.setenv("FIT_FLARE_BLENDER", "blender --gpu-backend opengl")
+    words = hand_off.blender_command(None)
+    assert words[:4] == ["blender", "--gpu-backend", "opengl", "-b"]
+    assert words[-2:] == [str(hand_off.RUN), "--"]
+    assert hand_off.blender_command(str(program))[0] == str(program)
+    with pytest.raises(EngineError, match="--blender names"):
+        hand_off.blender_command("no-such-blender -x")
+
+
+def test_a_process_is_one_side() -> None:
+    assert hand_off.here() == "engine"
+    assert "bpy" not in sys.modules
+
+
+# ---- how ------------------------------------------------------------------------------------------
+
+
+def child(tmp_path: Path, code: str) -> list[str]:
+    script = tmp_path / "child.py"
+    script.write_text("import json, os, signal, sys, time\n"
+                      "def tell(**event): print(json.dumps(event), flush=True)\n" + code)
+    return [sys.executable, str(script)]
+
+
+def test_events_of_the_other_process_become_ours(tmp_path: Path) -> None:
+    heard = Heard()
+    code = ("print('Blender 9.9')\n"
+            "tell(type='stage', name='bake', total=5, done=2)\n"
+            "tell(type='progress', done=4, total=5, figures={'loss': 0.5})\n"
+            "print('{not an event}')\n"
+            "tell(type='say', text='äh')\n"
+            "tell(type='result', data={'words': sys.argv[1:]})\n")
+    result = hand_off.run_there(child(tmp_path, code), ["demo", "--out", "a b"], "frames", heard)
+    assert result == {"words": ["demo", "--out", "a b", "--step", "frames", "--progress", "json"]}
+    assert heard.lines == [("bake", 5, 2), (4, {"loss": 0.5}), "äh"]
+
+
+def test_its_error_is_ours(tmp_path: Path) -> None:
+    code = "tell(type='error', text='The lamp is broken.')\nsys.exit(1)"
+    with pytest.raises(FitFlareError, match=r"^The lamp is broken\.$"):
+        hand_off.run_there(child(tmp_path, code), [], "x", Heard())
+
+
+def test_its_crash_is_told_with_its_last_words(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(EngineError, match="status 9"):
+        hand_off.run_there(child(tmp_path, "print('boom', file=sys.stderr)\nsys.exit(9)"), [], "x", Heard())
+    assert "boom" in capsys.readouterr().err
+
+
+def test_a_program_that_cannot_start_is_a_sentence(tmp_path: Path) -> None:
+    with pytest.raises(EngineError, match="cannot be started"):
+        hand_off.run_there([str(tmp_path / "nothing")], [], "x", Heard())
+
+
+@pytest.mark.skipif(os.name == "nt", reason="signals to oneself end the process on Windows")
+def test_a_stop_reaches_the_other_process_which_ends_by_itself(tmp_path: Path) -> None:
+    code = ("def stop(*_):\n"
+            "    tell(type='say', text='saving')\n"
+            "    open(sys.argv[1], 'w').write('whole')\n"
+            "    tell(type='error', text='Stopped.')\n"
+            "    sys.exit(130)\n"
+            "signal.signal(signal.SIGINT, stop)\n"
+            "tell(type='stage', name='fit', total=5, done=0)\n"
+            "time.sleep(30)\n")
+
+    class Stopping(Heard):
+        def _show_stage(self) -> None:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    heard, began = Stopping(), time.monotonic()
+    with pytest.raises(Cancelled), stoppable(heard):
+        hand_off.run_there(child(tmp_path, code), [str(tmp_path / "saved")], "x", heard)
+    assert (tmp_path / "saved").read_text() == "whole"
+    assert heard.lines == ["saving"]
+    assert time.monotonic() - began < 10
+
+
+@pytest.mark.skipif(os.name == "nt", reason="the test looks for the process by its number")
+def test_no_process_is_left_behind_when_ours_fails(tmp_path: Path) -> None:
+    class Failing(Heard):
+        def say(self, text: str) -> None:
+            raise BrokenPipeError(text)
+
+    code = "tell(type='say', text=str(os.getpid()))\ntime.sleep(30)\n"
+    with pytest.raises(BrokenPipeError) as problem:
+        hand_off.run_there(child(tmp_path, code), [], "x", Failing())
+    with pytest.raises(ProcessLookupError):
+        os.kill(int(str(problem.value)), 0)

@@ -134,15 +134,15 @@ def prepare(centres, covariances, opacities, colours, rings, arcs, width, height
     half = 0.5 / math.log(2.0)
     for i in range(opacities.size):
         at = i * RECORD
-        xx, xy, yy = float(covariances[3 * i]), float(covariances[3 * i + 1]), float(covariances[3 * i + 2])
+        xx, xy, yy = np.float64(covariances[3 * i]), np.float64(covariances[3 * i + 1]), np.float64(covariances[3 * i + 2])
         determinant = xx * yy - xy * xy
-        opacity = float(opacities[i]) if add else min(float(opacities[i]), OPACITY_MAX)
-        r0, w = (float(rings[2 * i]), float(rings[2 * i + 1])) if rings.size > 0 else (0.0, 1.0)
+        opacity = np.float64(opacities[i]) if add else min(np.float64(opacities[i]), OPACITY_MAX)
+        r0, w = (np.float64(rings[2 * i]), np.float64(rings[2 * i + 1])) if rings.size > 0 else (0.0, 1.0)
         reach = _reach(opacity, rings.size > 0, r0, w, add)
         bounds[i] = 0
         if not (determinant > 0 and xx > 0 and reach >= 0):
             continue
-        x, y, k = float(centres[2 * i]), float(centres[2 * i + 1]), -xy / yy
+        x, y, k = np.float64(centres[2 * i]), np.float64(centres[2 * i + 1]), -xy / yy
         major, minor = half * yy / determinant, half / yy
         half_x, half_y = reach * math.sqrt(xx), reach * math.sqrt(yy)
         if x + half_x <= 0 or y + half_y <= 0 or x - half_x >= width or y - half_y >= height:
@@ -151,7 +151,7 @@ def prepare(centres, covariances, opacities, colours, rings, arcs, width, height
         bend = major * k * k + minor
         records[at + X], records[at + Y] = x, y
         records[at + A], records[at + K], records[at + D] = major, k, minor
-        records[at + K_REST] = k - float(records[at + K])
+        records[at + K_REST] = k - np.float64(records[at + K])
         records[at + OPACITY] = 1.0 if add else opacity
         records[at + STEP], records[at + BEND] = 2.0 ** max(-2.0 * bend, -126.0), bend
         records[at + RED], records[at + GREEN] = gain * colours[3 * i], gain * colours[3 * i + 1]
@@ -170,7 +170,7 @@ def _write_shape(shapes, i, r0, w, arcs):  # type: ignore[no-untyped-def]
     shapes[at + R0], shapes[at + WIDTH] = r0, w
     shapes[at + SHARP] = 0.5 / (math.log(2.0) * w * w)
     if arcs.size > 0:
-        shapes[at + COS0], shapes[at + SIN0] = math.cos(float(arcs[3 * i])), math.sin(float(arcs[3 * i]))
+        shapes[at + COS0], shapes[at + SIN0] = math.cos(np.float64(arcs[3 * i])), math.sin(np.float64(arcs[3 * i]))
         shapes[at + COS_DELTA], shapes[at + ARC] = arcs[3 * i + 1], arcs[3 * i + 2]
 
 
@@ -454,7 +454,7 @@ def finish(
     row = np.empty(RECORD, np.float32)
     for i in range(opacities.size):
         _add_rows(gradients, firsts[i], counts[i], row)
-        xx, xy, yy = float(covariances[3 * i]), float(covariances[3 * i + 1]), float(covariances[3 * i + 2])
+        xx, xy, yy = np.float64(covariances[3 * i]), np.float64(covariances[3 * i + 1]), np.float64(covariances[3 * i + 2])
         determinant = xx * yy - xy * xy
         if not (determinant > 0 and yy > 0):
             determinant, yy = 1.0, 1.0

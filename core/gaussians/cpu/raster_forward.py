@@ -57,8 +57,8 @@ STATE = 6 * PLANE
 def offsets(records, at, left, y):  # type: ignore[no-untyped-def]
     """u along the pixel row y of the tile, and d_y. The sum of large numbers that is small near a needle is
     taken in float64."""
-    dy = y + 0.5 - float(records[at + Y])
-    u = left + 0.5 - float(records[at + X]) + (float(records[at + K]) + float(records[at + K_REST])) * dy
+    dy = y + 0.5 - np.float64(records[at + Y])
+    u = left + 0.5 - np.float64(records[at + X]) + (np.float64(records[at + K]) + np.float64(records[at + K_REST])) * dy
     return lanes() + np.float32(u), np.float32(dy)
 
 

@@ -84,8 +84,7 @@ class Adam:
         """
         for name in self.parameters if names is None else names:
             parameter, moments = self.parameters[name], self.moments[name]
-            parameter.data = parameter.data[index]
-            parameter.grad = None
+            replace_rows(parameter, parameter.data[index])
             self.moments[name] = Moments(moments.first[index], moments.second[index])
 
     @torch.no_grad()
@@ -94,8 +93,7 @@ class Adam:
         for name, new in rows.items():
             parameter, moments = self.parameters[name], self.moments[name]
             new = new.to(parameter)
-            parameter.data = torch.cat([parameter.data, new])
-            parameter.grad = None
+            replace_rows(parameter, torch.cat([parameter.data, new]))
             self.moments[name] = Moments(*(torch.cat([m, torch.zeros_like(new)]) for m in moments))
 
     @torch.no_grad()
@@ -122,6 +120,17 @@ class Adam:
                 raise RunError(f"The saved optimiser does not fit {name}; start the fit anew, without resuming.")
             self.moments[name] = Moments(*(moment.to(parameter, copy=True).contiguous() for moment in loaded))
             self.steps[name] = int(state["steps"][name])
+
+
+def replace_rows(parameter: Parameter, rows: Tensor) -> None:
+    """Gives a parameter other rows, of any number; its gradient is forgotten.
+
+    As long as an old graph is alive, autograd remembers the shape that the parameter had, and lets go of
+    it only at a change of type: hence the step in between.
+    """
+    parameter.data = torch.empty(0, dtype=torch.float16, device=rows.device)
+    parameter.data = rows
+    parameter.grad = None
 
 
 def adam_step(

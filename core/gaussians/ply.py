@@ -45,7 +45,7 @@ def write_ply(path: Path | str, scene: SceneGaussians) -> None:
             scene.means, scene.log_scales, scene.quaternions, scene.opacity_logits, scene.sh
         )
     )  # fmt: skip
-    rest = sh[:, 1:].transpose(0, 2, 1).reshape(n, -1)
+    rest = sh[:, 1:].transpose(0, 2, 1).reshape(n, 3 * (COEFFICIENTS - 1))
     table = np.concatenate(
         [means, np.zeros((n, 3), "<f4"), sh[:, 0], rest, opacities[:, None], log_scales, quaternions], 1
     )
@@ -94,7 +94,7 @@ def read_ply(path: Path | str) -> SceneGaussians:
     sh = torch.zeros(n, COEFFICIENTS, 3)
     sh[:, 0] = columns(DC)
     if rest_names:
-        sh[:, 1 : 1 + len(rest_names) // 3] = columns(rest_names).reshape(n, 3, -1).transpose(1, 2)
+        sh[:, 1 : 1 + len(rest_names) // 3] = columns(rest_names).reshape(n, 3, len(rest_names) // 3).transpose(1, 2)
     return SceneGaussians(
         columns(POSITION), columns(SCALE), columns(ROTATION), columns(("opacity",))[:, 0].clone(), sh
     )

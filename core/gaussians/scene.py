@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from ..capture import Camera, PointCloud
 from ..errors import SettingsError
 from . import spherical_harmonics
-from .optimiser import Rate
+from .optimiser import Rate, replace_rows
 from .ordering import nearest_distances
 from .rasterizer import Kernels, rasterization
 from .rendering import Rendering
@@ -81,7 +81,7 @@ class SceneGaussians(nn.Module):
         """As nn.Module's, for any number of Gaussians."""
         for name, parameter in self.named_parameters():
             if name in state_dict:
-                parameter.data = torch.empty_like(state_dict[name], device=parameter.device)
+                replace_rows(parameter, torch.empty_like(state_dict[name], device=parameter.device))
         return super().load_state_dict(state_dict, *arguments, **options)
 
     @property

@@ -1,0 +1,408 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What optimises a scene: loss, Adam, densification, order in space."""
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch
+from scipy.ndimage import correlate1d
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from core.capture import Camera, PointCloud
+from core.errors import RunError, SettingsError
+from core.gaussians import Adam, Rendering, SceneGaussians, l1_ssim, ssim
+from core.gaussians.densification import Classic, ClassicSettings, Mcmc, McmcSettings, shared
+from core.gaussians.ordering import morton_order, nearest_distances
+from core.gaussians.scene import learning_rates, means_rate, scene_extent, sh_degree_at
+
+
+def pictures(height: int, width: int, seed: int = 0) -> tuple[Tensor, Tensor]:
+    generator = torch.Generator().manual_seed(seed)
+    target = torch.rand(height, width, 3, generator=generator)
+    return (target + 0.2 * torch.randn(target.shape, generator=generator)).clamp(0, 1), target
+
+
+# Loss
+
+
+def test_ssim_by_another_way() -> None:
+    """Against the formula, windowed by scipy in double precision."""
+    image, target = (p.double().numpy() for p in pictures(23, 31))
+    x = np.arange(11) - 5
+    window = np.exp(-(x**2) / (2 * 1.5**2))
+    window /= window.sum()
+
+    def blur(p: np.ndarray) -> np.ndarray:
+        return correlate1d(correlate1d(p, window, 0, mode="constant"), window, 1, mode="constant")
+
+    a, b = blur(image), blur(target)
+    va, vb, cov = blur(image**2) - a**2, blur(target**2) - b**2, blur(image * target) - a * b
+    expected = (2 * a * b + 1e-4) * (2 * cov + 9e-4) / ((a**2 + b**2 + 1e-4) * (va + vb + 9e-4))
+    assert float(ssim(torch.tensor(image), torch.tensor(target))) == pytest.approx(expected.mean(), abs=1e-12)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (5, 40), (33, 47)])
+@pytest.mark.parametrize("lam", [0.0, 0.8, 1.0])
+def test_loss_in_single_precision(size: tuple[int, int], lam: float) -> None:
+    """Whichever kernels are at hand, against plain torch in double precision."""
+    image, target = pictures(*size)
+    exact_image = image.double().requires_grad_()
+    exact = l1_ssim(exact_image, target.double(), lam)
+    exact.backward()
+    image.requires_grad_()
+    loss = l1_ssim(image, target, lam)
+    (2 * loss).backward()
+    assert loss.item() == pytest.approx(exact.item(), abs=1e-6)
+    error = torch.linalg.vector_norm(image.grad / 2 - exact_image.grad)
+    assert error <= 1e-4 * torch.linalg.vector_norm(exact_image.grad)
+
+
+def test_loss_of_the_same_picture_is_nothing() -> None:
+    _, target = pictures(20, 20)
+    assert l1_ssim(target.clone(), target, 0.8).item() == pytest.approx(0, abs=1e-6)
+
+
+def test_loss_refuses_other_sizes() -> None:
+    with pytest.raises(SettingsError, match="must both be"):
+        l1_ssim(torch.zeros(4, 5, 3), torch.zeros(5, 4, 3), 0.8)
+
+
+# Adam
+
+
+def test_adam_is_torchs() -> None:
+    generator = torch.Generator().manual_seed(0)
+    start = {"a": torch.randn(7, 3, generator=generator), "b": torch.randn(5, generator=generator)}
+    ours = {name: torch.nn.Parameter(value.clone()) for name, value in start.items()}
+    theirs = {name: torch.nn.Parameter(value.clone()) for name, value in start.items()}
+    optimiser = Adam(ours, {"a": 0.01, "b": 0.3}, epsilon=1e-8)
+    reference = torch.optim.Adam(
+        [{"params": [theirs["a"]], "lr": 0.01}, {"params": [theirs["b"]], "lr": 0.3}], eps=1e-8, foreach=False
+    )
+    for step in range(60):
+        if step == 30:  # rates may change on the way
+            optimiser.rates["a"] = reference.param_groups[0]["lr"] = 0.002
+        for name in start:
+            gradient = torch.randn(start[name].shape, generator=generator) * 10 ** (step % 5 - 3)
+            ours[name].grad, theirs[name].grad = gradient.clone(), gradient.clone()
+        optimiser.step()
+        reference.step()
+    for name in start:
+        assert torch.allclose(ours[name], theirs[name], rtol=1e-5, atol=1e-6)
+
+
+def test_adam_with_rates_by_column() -> None:
+    rows = torch.nn.Parameter(torch.zeros(4, 2, 3))
+    rate = torch.zeros(2, 3)
+    rate[0], rate[1, 2] = 0.1, 0.5
+    optimiser = Adam({"rows": rows}, {"rows": rate})
+    rows.grad = torch.full_like(rows, 3.0)
+    optimiser.step()  # the first step has the length of the rate
+    assert torch.allclose(rows, (-rate).expand_as(rows), atol=1e-6)
+
+
+def test_adam_rows_keep_their_moments() -> None:
+    """Rows that move take along all that decides how they go on."""
+    generator = torch.Generator().manual_seed(1)
+    start, gradients = torch.randn(6, 2, generator=generator), torch.randn(10, 6, 2, generator=generator)
+
+    def run(order: Tensor | None) -> Tensor:
+        rows = torch.nn.Parameter(start.clone())
+        optimiser = Adam({"rows": rows}, 0.1)
+        for step, gradient in enumerate(gradients):
+            if step == 5 and order is not None:
+                optimiser.keep(order)
+            rows.grad = gradient[order] if step >= 5 and order is not None else gradient.clone()
+            optimiser.step()
+        return rows.detach()
+
+    order = torch.tensor([4, 0, 3])
+    assert torch.equal(run(order), run(None)[order])
+
+
+def test_adam_appends_and_forgets() -> None:
+    rows, other = torch.nn.Parameter(torch.zeros(2, 3)), torch.nn.Parameter(torch.zeros(1))
+    optimiser = Adam({"rows": rows, "other": other}, 0.1)
+    rows.grad = torch.ones(2, 3)
+    optimiser.step()
+    optimiser.append({"rows": torch.full((1, 3), 7.0)})
+    assert rows.shape == (3, 3) and rows.grad is None and (rows[2] == 7).all()
+    assert (optimiser.moments["rows"].first[:2] > 0).all() and (optimiser.moments["rows"].first[2] == 0).all()
+    optimiser.forget("rows", torch.tensor([0]))
+    assert (optimiser.moments["rows"].second[0] == 0).all() and (optimiser.moments["rows"].second[1] > 0).all()
+    assert (other == 0).all()  # no gradient, no step
+
+
+def test_adam_goes_on_from_its_state() -> None:
+    rows = torch.nn.Parameter(torch.zeros(3))
+    optimiser = Adam({"rows": rows}, 0.1)
+    for _ in range(3):
+        rows.grad = torch.tensor([1.0, -2.0, 0.5])
+        optimiser.step()
+    again = torch.nn.Parameter(rows.detach().clone())
+    resumed = Adam({"rows": again}, 0.1)
+    resumed.load_state_dict(optimiser.state_dict())
+    for parameter, adam in ((rows, optimiser), (again, resumed)):
+        parameter.grad = torch.tensor([0.3, 0.2, -1.0])
+        adam.step()
+    assert torch.equal(rows, again)
+    with pytest.raises(RunError, match="does not fit rows"):
+        Adam({"rows": torch.nn.Parameter(torch.zeros(4))}, 0.1).load_state_dict(optimiser.state_dict())
+    with pytest.raises(SettingsError, match="no parameter 'row'"):
+        Adam({"rows": rows}, {"row": 0.1})
+
+
+# Scene and order
+
+
+def test_a_scene_from_points() -> None:
+    rng = np.random.default_rng(0)
+    xyz = rng.normal(size=(400, 3)).astype(np.float32)
+    rgb = rng.integers(0, 256, (400, 3)).astype(np.uint8)
+    scene = SceneGaussians.from_points(PointCloud(xyz, rgb, np.zeros(400, np.float32)))
+    distances = cKDTree(xyz.astype(np.float64)).query(xyz, 4)[0][:, 1:]
+    expected = np.sqrt((distances**2).mean(1))
+    assert np.allclose(scene.scales.detach().numpy(), expected[:, None], rtol=1e-4)
+    assert np.allclose(scene.opacities.detach().numpy(), 0.1, atol=1e-6)
+    shown = scene.sh[:, 0].detach().numpy() * 0.28209479 + 0.5
+    assert np.allclose(shown * 255, rgb, atol=1e-3)
+    assert not scene.sh[:, 1:].any()
+    camera = Camera(40, 30, 40.0, 40.0, 20.0, 15.0, np.eye(4))
+    assert scene.render(camera, 0).colour.shape == (30, 40, 3)
+    with pytest.raises(SettingsError, match="no points"):
+        SceneGaussians.from_points(PointCloud(xyz[:0], rgb[:0], np.zeros(0, np.float32)))
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 500])
+def test_nearest_distances(n: int) -> None:
+    generator = torch.Generator().manual_seed(n)
+    points = torch.randn(n, 3, generator=generator)
+    points[n // 2 :, 0] += 100  # two clusters, far apart
+    found = nearest_distances(points)
+    expected = torch.cdist(points.double(), points.double()).sort(-1).values[:, 1:4]
+    assert found.shape == expected.shape
+    assert torch.allclose(found.double(), expected, atol=1e-4)
+
+
+def test_morton_order_brings_neighbours_together() -> None:
+    generator = torch.Generator().manual_seed(0)
+    points = torch.rand(4096, 3, generator=generator)
+    order = morton_order(points)
+    assert torch.equal(order.sort().values, torch.arange(4096))
+    step = torch.linalg.vector_norm(points[order].diff(dim=0), dim=-1).mean()
+    assert step < 0.2 * torch.linalg.vector_norm(points.diff(dim=0), dim=-1).mean()
+    corners = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0], [0, 0, 1], [1, 0, 1], [0, 1, 1], [1, 1, 1]])
+    assert torch.equal(morton_order(corners), torch.arange(8))  # x the lowest bit
+
+
+def test_schedules() -> None:
+    assert [sh_degree_at(i) for i in (0, 999, 1000, 2500, 9999)] == [0, 0, 1, 2, 3]
+    assert means_rate(2.0, 0, 100) == pytest.approx(3.2e-4)
+    assert means_rate(2.0, 100, 100) == pytest.approx(3.2e-6)
+    poses = [np.eye(4) for _ in range(2)]
+    poses[0][0, 3], poses[1][0, 3] = 3.0, -3.0
+    assert scene_extent([Camera(4, 4, 4.0, 4.0, 2.0, 2.0, pose) for pose in poses]) == pytest.approx(3.3)
+
+
+# Densification
+
+
+def some_scene(n: int = 60, seed: int = 0) -> tuple[SceneGaussians, Adam]:
+    generator = torch.Generator().manual_seed(seed)
+    scene = SceneGaussians(
+        torch.randn(n, 3, generator=generator),
+        torch.randn(n, 3, generator=generator) * 0.3 - 3,
+        torch.randn(n, 4, generator=generator),
+        torch.randn(n, generator=generator),
+        torch.randn(n, 16, 3, generator=generator) * 0.1,
+    )
+    optimiser = Adam(dict(scene.named_parameters()), learning_rates(1.0))
+    for parameter in scene.parameters():
+        parameter.grad = torch.ones_like(parameter)
+    optimiser.step()
+    return scene, optimiser
+
+
+def seen(n: int, gradients: Tensor) -> Rendering:
+    """A rendering whose statistics are these, in half pictures, of a picture of 2 x 2."""
+    zero = torch.zeros(2, 2)
+    return Rendering(
+        torch.zeros(2, 2, 3), zero, zero, zero, torch.zeros(n, 2), torch.ones(n),
+        torch.stack([gradients, torch.zeros(n)], 1),
+    )  # fmt: skip
+
+
+def test_classic_clones_splits_and_prunes() -> None:
+    scene, optimiser = some_scene(10)
+    strategy = Classic(scene, optimiser, 1.0, torch.Generator().manual_seed(0), ClassicSettings(start=0, every=1))
+    with torch.no_grad():
+        scene.opacity_logits.fill_(0.0)
+        scene.opacity_logits[0] = -8  # faint
+        scene.log_scales.fill_(math.log(0.005))
+        scene.log_scales[1] = math.log(0.05)  # to be split
+    before = {name: p.detach().clone() for name, p in scene.named_parameters()}
+    gradients = torch.zeros(10)
+    gradients[1] = gradients[2] = 1.0
+    strategy.observe(seen(10, gradients))
+    assert strategy.update(1)
+    assert len(scene) == 10 - 1 + 1 + 1  # pruned, split, cloned
+    kept = [i for i in range(10) if i not in (0, 1)]
+    assert torch.equal(scene.means[:8], before["means"][kept])
+    assert torch.equal(scene.means[8], before["means"][2]) and torch.equal(scene.sh[8], before["sh"][2])
+    halves = slice(9, 11)
+    assert torch.allclose(scene.scales[halves], torch.tensor(0.05 / 1.6))
+    away = torch.linalg.vector_norm(scene.means[halves] - before["means"][1], dim=-1)
+    assert (away > 0).all() and (away < 5 * 0.05).all()
+    for name, moments in optimiser.moments.items():
+        assert moments.first.shape == dict(scene.named_parameters())[name].shape
+        assert (moments.first[:8] != 0).any() and not moments.first[8:].any()
+
+
+def test_classic_holds_its_cap_by_score() -> None:
+    scene, optimiser = some_scene(20)
+    with torch.no_grad():
+        scene.opacity_logits.fill_(0.0)
+        scene.log_scales.fill_(-8)
+    before = scene.means.detach().clone()
+    settings = ClassicSettings(start=0, every=1, cap=23)
+    strategy = Classic(scene, optimiser, 1.0, torch.Generator().manual_seed(0), settings)
+    strategy.observe(seen(20, torch.arange(20.0)))
+    strategy.update(1)
+    assert len(scene) == 23
+    assert torch.equal(scene.means[20:], before[[17, 18, 19]])
+
+
+def test_classic_resets_opacities() -> None:
+    scene, optimiser = some_scene()
+    strategy = Classic(scene, optimiser, 1.0, torch.Generator(), ClassicSettings(start=10, reset_every=5))
+    before = scene.opacities.detach().clone()
+    assert not strategy.update(5)
+    assert torch.allclose(scene.opacities, before.clamp(max=0.01))
+    assert not optimiser.moments["opacity_logits"].first.any()
+    assert optimiser.moments["means"].first.any()
+
+
+def test_classic_waits_for_its_time() -> None:
+    scene, optimiser = some_scene()
+    strategy = Classic(scene, optimiser, 1.0, torch.Generator(), ClassicSettings(start=500, stop=700, every=100))
+    strategy.observe(seen(60, torch.ones(60)))
+    assert not any(strategy.update(i) for i in (1, 100, 500, 599, 800)) and len(scene) == 60
+    assert strategy.update(600)
+
+
+@pytest.mark.parametrize("copies", [1, 2, 3, 10, 51])
+def test_copies_look_as_one(copies: int) -> None:
+    """The double sum of the paper's equation 8, term by term."""
+    for opacity in (0.01, 0.3, 0.9, 0.99):
+        new, factor = shared(torch.tensor([opacity], dtype=torch.float64), torch.tensor([copies]))
+        assert (1 - float(new)) ** copies == pytest.approx(1 - opacity, rel=1e-9)
+        total = sum(
+            math.comb(i - 1, k) * (-1) ** k * float(new) ** (k + 1) / math.sqrt(k + 1)
+            for i in range(1, copies + 1)
+            for k in range(i)
+        )
+        assert float(factor) == pytest.approx(opacity / total, rel=1e-6)
+
+
+def test_mcmc_moves_the_dead_and_grows_to_its_cap() -> None:
+    scene, optimiser = some_scene(100)
+    with torch.no_grad():
+        scene.opacity_logits.fill_(0.5)
+        scene.opacity_logits[:30] = -9
+    alive = scene.means[30:].detach().clone()
+    settings = McmcSettings(cap=110, start=0, every=1, noise=0)
+    strategy = Mcmc(scene, optimiser, torch.Generator().manual_seed(0), settings)
+    counts = []
+    for iteration in range(1, 5):
+        assert strategy.update(iteration)
+        counts.append(len(scene))
+    assert counts == [105, 110, 110, 110]
+    found = (scene.means.detach()[:, None] == alive).all(-1).any(1)
+    assert found.all()  # all are where living ones were
+    assert (scene.opacities > 0.005).all()
+
+
+def test_mcmc_lets_only_the_faint_wander() -> None:
+    scene, optimiser = some_scene()
+    with torch.no_grad():
+        scene.opacity_logits.fill_(2.0)
+        scene.opacity_logits[:5] = -7
+        scene.log_scales.fill_(-1.0)
+    before = scene.means.detach().clone()
+    strategy = Mcmc(scene, optimiser, torch.Generator().manual_seed(0), McmcSettings(start=10**6))
+    assert not strategy.update(1)
+    moved = torch.linalg.vector_norm(scene.means - before, dim=-1)
+    assert (moved[:5] > 1e-3).all() and not moved[5:].any()
+    assert strategy.regulariser().item() > 0
+
+
+@pytest.mark.parametrize("kind", ["classic", "mcmc"])
+def test_the_seed_decides(kind: str) -> None:
+    def run(seed: int, interrupted: bool) -> Tensor:
+        scene, optimiser = some_scene()
+        generator = torch.Generator().manual_seed(seed)
+
+        def strategy(generator: torch.Generator) -> Classic | Mcmc:
+            if kind == "classic":
+                settings = ClassicSettings(start=0, every=2, small=0.0, cap=100)
+                return Classic(scene, optimiser, 1.0, generator, settings)
+            return Mcmc(scene, optimiser, generator, McmcSettings(cap=100, start=0, every=2))
+
+        current = strategy(generator)
+        for iteration in range(1, 9):
+            current.observe(seen(len(scene), torch.linspace(0, 1, len(scene))))
+            if interrupted and iteration == 5:
+                state = current.state_dict()
+                current = strategy(torch.Generator().manual_seed(99))
+                current.load_state_dict(state)
+            current.update(iteration)
+            order = morton_order(scene.means)
+            optimiser.keep(order)
+            current.reorder(order)
+        return scene.means.detach()
+
+    assert torch.equal(run(0, False), run(0, False))
+    assert torch.equal(run(0, False), run(0, True))
+    a, b = run(0, False), run(1, False)
+    assert a.shape != b.shape or not torch.equal(a, b)
+
+
+def test_training_finds_a_picture() -> None:
+    """The parts together: a scene learns another one's pictures, and grows on the way."""
+    truth, _ = some_scene(40, seed=3)
+    with torch.no_grad():
+        truth.means *= 0.5
+        truth.log_scales += 1.3
+        truth.opacity_logits += 2
+        truth.sh[:, 0] *= 10
+    cameras = []
+    for x in (-0.5, 0.0, 0.5):
+        pose = np.eye(4)
+        pose[:3, 3] = (x, 0, 4)
+        cameras.append(Camera(36, 28, 40.0, 40.0, 18.0, 14.0, pose))
+    targets = [truth.render(camera, 0).colour.detach() for camera in cameras]
+    rng = np.random.default_rng(0)
+    points = PointCloud(
+        rng.normal(0, 0.5, (30, 3)).astype(np.float32), np.full((30, 3), 128, np.uint8), np.zeros(30, np.float32)
+    )
+    scene = SceneGaussians.from_points(points)
+    optimiser = Adam(dict(scene.named_parameters()), learning_rates(10.0))
+    settings = ClassicSettings(start=20, every=20, stop=100, gradient=1e-3, cap=80)
+    strategy = Classic(scene, optimiser, 1.0, torch.Generator().manual_seed(0), settings)
+    losses, counts = [], []
+    for iteration in range(1, 151):
+        rendering = scene.render(cameras[iteration % 3], 0)
+        loss = l1_ssim(rendering.colour, targets[iteration % 3], 0.8)
+        optimiser.zero_grad()
+        loss.backward()
+        strategy.observe(rendering)
+        optimiser.step()
+        strategy.update(iteration)
+        losses.append(loss.item())
+        counts.append(len(scene))
+    assert np.mean(losses[-6:]) < 0.35 * np.mean(losses[:6])
+    assert 30 < counts[-1] <= 80 and all(b >= a - 10 for a, b in pairwise(counts))

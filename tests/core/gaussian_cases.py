@@ -50,7 +50,7 @@ def scene_case(seed: int) -> Case:
     """A random scene, of a kind that goes round with the seed."""
     rng = np.random.default_rng(seed)
     what = SCENES[seed % len(SCENES)]
-    n = int(rng.integers(1, 40))
+    n = int(rng.integers(150, 300)) if what == "layers" else int(rng.integers(1, 40))
     width, height = (int(v) for v in rng.integers(8, 34, 2))
     if what == "one pixel":
         width = height = 1
@@ -84,8 +84,8 @@ def scene_case(seed: int) -> Case:
         quats[0] = 0
         log_scales[rng.random((n, 3)) < 0.3] = -30.0
     elif what == "layers":
-        xy, z = xy * 0.2, np.sort(z)[::-1]
-        log_scales += 0.7
+        xy, z = xy * 0.5, np.sort(z)[::-1]
+        opacities *= rng.choice([0.1, 1.0])
     means = np.concatenate([xy, z[:, None]], 1)
 
     world_to_camera = np.eye(4)

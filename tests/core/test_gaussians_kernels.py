@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import pytest
 import torch
 
+from core.gaussians import tiles
 from core.gaussians.kernels import available
 from tests.core.gaussian_cases import differences, scene_case, splat_case
 
@@ -35,4 +36,13 @@ def test_scenes(kernels: str, part: int) -> None:
 @pytest.mark.parametrize("part", range(10))
 def test_splats(kernels: str, part: int) -> None:
     wrong = [line for seed in range(part, SPLATS, 10) for line in differences(splat_case(seed), kernels)]
+    assert not wrong, "\n".join(wrong)
+
+
+def test_tiles_in_small_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Long lists are drawn in parts, tiles in groups: where the parts end makes no difference."""
+    monkeypatch.setattr(tiles, "CHUNK", 7)
+    monkeypatch.setattr(tiles, "GROUP", 3)
+    cases = [scene_case(seed) for seed in range(11, 50, 13)] + [splat_case(seed) for seed in range(10)]
+    wrong = [line for case in cases for line in differences(case, "tiles")]
     assert not wrong, "\n".join(wrong)

@@ -1,0 +1,104 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Cycles on the CPU: one view to scene-linear pixels, and how much of a light a camera sees."""
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import bpy
+import numpy as np
+from mathutils import Matrix, Vector
+from numpy.typing import NDArray
+
+from core.pictures import read_picture
+
+from .description import Array, LightSource, Pinhole
+
+SHARE_SAMPLES = 512
+
+
+def set_up(camera: Pinhole, samples: int) -> Any:
+    """Render settings and a camera object with the intrinsics of `camera` (square pixels)."""
+    scene = bpy.context.scene
+    scene.render.engine = "CYCLES"
+    scene.cycles.device = "CPU"
+    scene.cycles.samples = samples
+    scene.cycles.use_adaptive_sampling = False
+    scene.cycles.use_denoising = True
+    scene.cycles.denoiser = "OPENIMAGEDENOISE"
+    scene.cycles.denoising_input_passes = "RGB_ALBEDO_NORMAL"
+    scene.cycles.denoising_prefilter = "ACCURATE"
+    scene.cycles.max_bounces = 4
+    scene.cycles.diffuse_bounces = 3
+    scene.cycles.glossy_bounces = 2
+    scene.cycles.caustics_reflective = scene.cycles.caustics_refractive = False
+    scene.cycles.sample_clamp_indirect = 4.0
+    scene.render.use_persistent_data = True
+    scene.render.resolution_x, scene.render.resolution_y = camera.width, camera.height
+    scene.render.resolution_percentage = 100
+    settings = scene.render.image_settings
+    settings.file_format, settings.color_mode, settings.color_depth = "OPEN_EXR", "RGB", "32"
+
+    data = bpy.data.cameras.new("Camera")
+    data.sensor_fit = "HORIZONTAL"
+    data.lens = camera.fx * data.sensor_width / camera.width
+    data.shift_x = (camera.width / 2 - camera.cx) / camera.width
+    data.shift_y = (camera.cy - camera.height / 2) / camera.width
+    data.clip_start, data.clip_end = 0.01, 1000.0
+    thing = bpy.data.objects.new("Camera", data)
+    scene.collection.objects.link(thing)
+    scene.camera = thing
+    return thing
+
+
+def aim(camera: Any, world_to_camera: Array) -> None:
+    """Move the camera object to a pose in OpenCV's axes."""
+    pose = np.linalg.inv(world_to_camera) @ np.diag([1.0, -1.0, -1.0, 1.0])
+    camera.matrix_world = Matrix(pose.tolist())
+    bpy.context.view_layer.update()
+
+
+def render(camera: Any, world_to_camera: Array, seed: int) -> NDArray[np.float32]:
+    """Scene-linear Rec. 709 pixels (height, width, 3)."""
+    aim(camera, world_to_camera)
+    scene = bpy.context.scene
+    scene.cycles.seed = seed
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "view.exr"
+        scene.render.filepath = str(path)
+        bpy.ops.render.render(write_still=True)
+        return read_picture(path).pixels
+
+
+def visible_share(light: LightSource, eye: Array) -> float:
+    """The part of the light's disc, as `eye` sees it, that no geometry hides: 0..1.
+
+    Rays go from the eye to points spread evenly over the disc (a sunflower spiral) and must reach it.
+    """
+    scene, graph = bpy.context.scene, bpy.context.evaluated_depsgraph_get()
+    centre, origin = np.array(light.xyz), np.asarray(eye, float)
+    towards = centre - origin
+    distance = float(np.linalg.norm(towards))
+    axis = towards / distance
+    side = np.cross(axis, (0.0, 0.0, 1.0))
+    side /= np.linalg.norm(side)
+    up = np.cross(side, axis)
+    index = np.arange(SHARE_SAMPLES) + 0.5
+    radius = light.radius * np.sqrt(index / SHARE_SAMPLES)
+    angle = index * np.pi * (3 - np.sqrt(5))
+    points = centre + radius[:, None] * (np.cos(angle)[:, None] * side + np.sin(angle)[:, None] * up)
+    bulbs = [thing for thing in scene.objects if thing.get("light_source")]
+    for bulb in bulbs:
+        bulb.hide_viewport = True
+    graph.update()
+    free = 0
+    for point in points:
+        ray = point - origin
+        length = float(np.linalg.norm(ray))
+        hit = scene.ray_cast(graph, Vector(origin), Vector(ray / length), distance=length - light.radius)[0]
+        free += not hit
+    for bulb in bulbs:
+        bulb.hide_viewport = False
+    graph.update()
+    return free / SHARE_SAMPLES

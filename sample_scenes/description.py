@@ -1,0 +1,112 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What a sample capture is made of: a camera path, lights, a lens, how bright things are. No Blender here.
+
+World axes are Blender's (z up); cameras are OpenCV's and COLMAP's (x right, y down, z forward). Lengths
+are scene units.
+"""
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Pinhole:
+    """A camera without distortion; pixel centres at +0.5."""
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+    def scaled(self, width: int, height: int) -> Pinhole:
+        """The same camera with another number of pixels."""
+        x, y = width / self.width, height / self.height
+        return Pinhole(width, height, self.fx * x, self.fy * y, self.cx * x, self.cy * y)
+
+
+@dataclass(frozen=True)
+class LightSource:
+    """A small bright sphere in the scene, and the strength of the flare that it causes.
+
+    colour: linear RGB, about 1 at its largest. radius: of the sphere, scene units. emission: what a
+    camera sees of it, linear. power: watts of the lamp that lights the scene. flare: strength of its
+    flare at `reference` units from the camera; it falls with the square of the distance, as light does,
+    unless `distant` (a sun).
+    """
+
+    name: str
+    xyz: tuple[float, float, float]
+    colour: tuple[float, float, float]
+    radius: float
+    emission: float
+    power: float
+    flare: float
+    reference: float = 5.0
+    distant: bool = False
+
+    def strength(self, distance: float) -> float:
+        """Flare strength seen from `distance` units."""
+        return self.flare if self.distant else self.flare * (self.reference / distance) ** 2
+
+
+@dataclass(frozen=True)
+class SceneDescription:
+    """Everything about a capture but its geometry, which `build` makes inside Blender."""
+
+    name: str
+    seed: int
+    first: int
+    views: int
+    camera: Pinhole
+    path: Callable[[Array], Array]
+    """world_to_camera (n, 4, 4) for the numbers of n views."""
+    build: Callable[[SceneDescription], None]
+    lights: tuple[LightSource, ...]
+    lens: str
+    """Name of a look in `flares.LOOKS`."""
+    samples: int = 40
+    test: tuple[int, ...] = field(default=())
+    """Numbers of views held out besides every eighth."""
+
+    @property
+    def numbers(self) -> NDArray[np.int64]:
+        """The views' numbers on the path; a file is called after its view's."""
+        return self.first + np.arange(self.views)
+
+    @property
+    def stems(self) -> list[str]:
+        """File names of the views without suffix: 0006, 0007, …"""
+        return [f"{number:04d}" for number in self.numbers]
+
+    @property
+    def poses(self) -> Array:
+        """world_to_camera (views, 4, 4)."""
+        return self.path(self.numbers.astype(float))
+
+
+def looking_at(eye: Array, target: Array, roll: float = 0.0) -> Array:
+    """world_to_camera (4, 4) of a camera at `eye` that looks at `target`, z up, rolled by `roll` radians."""
+    forward = target - eye
+    forward = forward / np.linalg.norm(forward)
+    right = np.cross(forward, (0.0, 0.0, 1.0))
+    right /= np.linalg.norm(right)
+    down = np.cross(forward, right)
+    cosine, sine = np.cos(roll), np.sin(roll)
+    rotation = np.stack([cosine * right + sine * down, cosine * down - sine * right, forward])
+    pose = np.eye(4)
+    pose[:3, :3] = rotation
+    pose[:3, 3] = -rotation @ eye
+    return pose
+
+
+def camera_positions(world_to_camera: Array) -> Array:
+    """Centres (n, 3) of cameras (n, 4, 4)."""
+    return -np.einsum("nij,ni->nj", world_to_camera[:, :3, :3], world_to_camera[:, :3, 3])

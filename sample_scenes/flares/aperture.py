@@ -1,0 +1,52 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The aperture stop: a polygon of slightly uneven, slightly curved blades."""
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Aperture:
+    """radius: of the circle through the corners, mm. turn: of the first corner from +x, degrees. curved:
+    0 straight blades, 1 a circle. uneven: spread of the blades' distances from the centre, of the radius.
+    dust: number of specks. seed: of what is uneven."""
+
+    radius: float
+    blades: int
+    turn: float = 0.0
+    curved: float = 0.1
+    uneven: float = 0.01
+    dust: int = 30
+    seed: int = 0
+
+
+def edge_radius(aperture: Aperture, sectors: int) -> Array:
+    """Distance of the edge from the centre, of the radius, for `sectors` directions from +x round to +y."""
+    rng = np.random.default_rng(aperture.seed)
+    angles = np.arange(sectors) / sectors * 2 * np.pi
+    normals = np.radians(aperture.turn) + (np.arange(aperture.blades) + 0.5) / aperture.blades * 2 * np.pi
+    apothem = np.cos(np.pi / aperture.blades) * (1 + aperture.uneven * rng.standard_normal(aperture.blades))
+    facing = np.cos(angles[:, None] - normals)
+    straight = np.where(facing > 0.05, apothem / np.maximum(facing, 0.05), np.inf).min(axis=1)
+    return (1 - aperture.curved) * straight + aperture.curved
+
+
+def transmission(aperture: Aperture, size: int, fill: float) -> Array:
+    """The stop as a picture (size, size), 0..1, its radius `fill` of half the side; with dust on the glass."""
+    axis = (np.arange(size) + 0.5) / size * 2 - 1
+    x, y = np.meshgrid(axis / fill, axis / fill)
+    radius, angle = np.hypot(x, y), np.arctan2(y, x)
+    table = edge_radius(aperture, 1440)
+    edge = np.interp(angle % (2 * np.pi), np.arange(1441) / 1440 * 2 * np.pi, np.append(table, table[0]))
+    mask = np.clip((edge - radius) * fill * size / 2 + 0.5, 0, 1)
+    rng = np.random.default_rng(aperture.seed + 1)
+    for _ in range(aperture.dust):
+        far, where, speck = np.sqrt(rng.random()), rng.uniform(0, 2 * np.pi), rng.uniform(0.004, 0.02)
+        away = np.hypot(x - far * np.cos(where), y - far * np.sin(where))
+        mask *= 1 - 0.9 * np.clip((speck - away) * fill * size / 2 + 0.5, 0, 1)
+    return mask

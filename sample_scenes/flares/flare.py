@@ -1,0 +1,120 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""A whole flare: what one light makes of one lens, as scene-linear light on a camera's pixels."""
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .aperture import Aperture
+from .ghosts import GhostSettings, Optics, coatings, draw_ghosts
+from .prescription import FOLDER, read_prescription
+from .starburst import (
+    Glare,
+    Ring,
+    Starburst,
+    Streak,
+    draw_glare,
+    draw_ring,
+    draw_starburst,
+    draw_streak,
+)
+
+Pixels = NDArray[np.float32]
+
+HOOD_BEGIN, HOOD_END = 0.7, 1.5
+"""tan of the field angle where the lens's hood begins to shade, and where no light comes in."""
+
+
+class Camera(Protocol):
+    """What is asked of a camera: pixels, with centres at +0.5."""
+
+    @property
+    def width(self) -> int: ...
+    @property
+    def height(self) -> int: ...
+    @property
+    def fx(self) -> float: ...
+    @property
+    def fy(self) -> float: ...
+    @property
+    def cx(self) -> float: ...
+    @property
+    def cy(self) -> float: ...
+
+
+@dataclass(frozen=True)
+class Look:
+    """A lens and how it flares. lens: a prescription's file name in `lenses`. stop_down: radius of the
+    stop, of the widest. coating: wavelengths in micrometres, in turn over the air-glass surfaces."""
+
+    lens: str
+    stop_down: float
+    blades: int
+    turn: float = 10.0
+    curved: float = 0.1
+    uneven: float = 0.012
+    seed: int = 0
+    coating: tuple[float, ...] = (0.52, 0.46, 0.58, 0.50, 0.62, 0.43)
+    ghosts: GhostSettings = field(default_factory=GhostSettings)
+    starburst: Starburst = field(default_factory=Starburst)
+    glare: Glare = field(default_factory=Glare)
+    rings: tuple[Ring, ...] = ()
+    streaks: tuple[Streak, ...] = ()
+
+
+@lru_cache(maxsize=8)
+def _optics(look: Look) -> tuple[Optics, list[tuple[int, int]]]:
+    lens = read_prescription(FOLDER / f"{look.lens}.lens")
+    aperture = Aperture(float(lens.semi_aperture[lens.stop]) * look.stop_down, look.blades, look.turn, look.curved,
+                        look.uneven, seed=look.seed)
+    optics = Optics(lens, coatings(lens, look.coating), aperture)
+    return optics, optics.pairs(look.ghosts.count)
+
+
+def render_flare(look: Look, camera: Camera, light: Sequence[float], *, colour: Sequence[float] = (1.0, 1.0, 1.0),
+                 intensity: float = 1.0, visible_share: float = 1.0) -> Pixels:
+    """The flare of one light: scene-linear Rec. 709, (height, width, 3) float32, never negative.
+
+    light: (x, y, z) in the camera's axes (x right, y down, z forward; any unit), or normalised (x/z, y/z)
+    of a light in front. Zero for a light behind the camera, one that is hidden, or one so far to the side
+    that the hood shades it. colour: linear RGB. visible_share: 0..1, scales the flare.
+    """
+    black = np.zeros((camera.height, camera.width, 3), np.float32)
+    if len(light) == 3:
+        if light[2] <= 1e-6:
+            return black
+        light = (light[0] / light[2], light[1] / light[2])
+    at = (float(light[0]), float(light[1]))
+    shade = min(max((HOOD_END - math.hypot(*at)) / (HOOD_END - HOOD_BEGIN), 0.0), 1.0)
+    shade *= shade * (3 - 2 * shade)
+    strength = intensity * visible_share * shade
+    if strength <= 0:
+        return black
+    optics, pairs = _optics(look)
+    flare = draw_ghosts(optics, pairs, look.ghosts, at, (camera.fx, camera.fy), (camera.cx, camera.cy),
+                        camera.width, camera.height)
+    x, y = np.meshgrid(((np.arange(camera.width) + 0.5 - camera.cx) / camera.fx).astype(np.float32),
+                       ((np.arange(camera.height) + 0.5 - camera.cy) / camera.fy).astype(np.float32))
+    u, v = x - np.float32(at[0]), y - np.float32(at[1])
+    flare += draw_starburst(optics.aperture, look.starburst, u, v)
+    flare += draw_glare(look.glare, u, v)
+    for ring in look.rings:
+        flare += draw_ring(ring, at, x, y)
+    for streak in look.streaks:
+        flare += draw_streak(streak, at, x, y)
+    return np.maximum(flare * (np.float32(strength) * np.asarray(colour, np.float32)), 0)
+
+
+LOOKS: dict[str, Look] = {
+    "fast": Look("US3576360", stop_down=0.34, blades=8, seed=3, coating=(0.44, 0.62, 0.50, 0.68, 0.47, 0.56),
+                 ghosts=GhostSettings(count=26, gain=480.0), starburst=Starburst(gain=1500.0, peak=9.0),
+                 glare=Glare(0.2, 0.03, 1.2, 0.02, 0.28, 0.002),
+                 rings=(Ring(gain=0.08, radius=0.25, width=0.02),)),
+}
+"""Looks by name, one for each sample capture."""

@@ -1,0 +1,244 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The ghosts of one light: every strong pair of reflections, traced and drawn.
+
+The lens is round but for its stop, so a light at field angle theta and azimuth phi is traced in the plane
+phi = 0 and turned afterwards; the stop's polygon keeps its place in the camera. Where rays of a cell end
+on the sensor gives the ghost's shape and brightness (the inverse of the area's change, as in Hullin et
+al. 2011, section 4.2); where they crossed the stop, interpolated by pixel, gives its edge.
+"""
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from .aperture import Aperture, edge_radius
+from .prescription import Prescription
+from .spectrum import responses, wavelengths
+from .trace import SENSOR_X, STOP_X, STRAY, WEIGHT, trace_grid
+
+Array = NDArray[np.float64]
+
+REFERENCE = 0.55
+"""Micrometres."""
+COARSE = 25
+"""Rays a side of the grid that looks for the bundle which comes through."""
+WIDEST = 1300
+"""Pixels a row beyond which ghosts are not drawn finer than the picture."""
+DENSEST = 40.0
+"""Where rays cross (caustics) the density of light has no bound; here it has."""
+
+
+@dataclass(frozen=True)
+class GhostSettings:
+    """count: ghosts kept, the brightest first. grid: rays a side. bands: wavelengths. gain: brightness.
+    rim: how much brighter the edge is than the inside (diffraction at the stop). size: standard deviation
+    (tan) of the blur that a light of some size gives its ghosts. supersample: pixels drawn for one."""
+
+    count: int = 22
+    grid: int = 40
+    bands: int = 9
+    gain: float = 1.0
+    rim: float = 0.35
+    size: float = 0.0014
+    supersample: int = 2
+
+
+@dataclass(frozen=True)
+class Optics:
+    """A lens in use: its prescription, coatings (micrometres per surface, 0 bare), and its stop."""
+
+    lens: Prescription
+    coating: Array
+    aperture: Aperture
+
+    @property
+    def sensor(self) -> float:
+        """z of the sensor, focused at infinity."""
+        return float(self.lens.vertices[-1] + self.lens.paraxial()[1])
+
+    def pairs(self, count: int, fill: float = 0.12) -> list[tuple[int, int]]:
+        """The `count` brightest pairs (first, second) for a light at tan(field angle) = `fill`."""
+        surfaces = _surfaces(self, REFERENCE)
+        optical = [at for at in range(len(self.coating)) if at != self.lens.stop]
+        scored = []
+        axis = np.linspace(-1, 1, 21) * self.lens.semi_aperture[0]
+        for position, first in enumerate(optical):
+            for second in optical[position + 1:]:
+                rays, arrived = trace_grid(axis, axis, fill, first, second, *surfaces)
+                radius = np.hypot(rays[..., STOP_X::2], rays[..., STOP_X + 1::2]).max(axis=-1)
+                passes = arrived & (rays[..., STRAY] < 1) & (radius < self.aperture.radius)
+                if passes.sum() < 2:
+                    continue
+                spread = np.ptp(rays[passes][:, :2], axis=0).max() + 0.02 * self.lens.paraxial()[0]
+                scored.append((rays[passes][:, WEIGHT].sum() / spread**2, first, second))
+        return [(first, second) for _, first, second in sorted(scored, reverse=True)[:count]]
+
+
+def coatings(lens: Prescription, design: tuple[float, ...], cemented: float = 0.0) -> Array:
+    """Quarter-wave wavelengths, `design` in turn over the surfaces between glass and air."""
+    values = np.full(len(lens.index), cemented)
+    before, turn = 1.0, 0
+    for at, after in enumerate(lens.index):
+        if at != lens.stop and (before == 1.0) != (after == 1.0):
+            values[at] = design[turn % len(design)]
+            turn += 1
+        before = after
+    return values
+
+
+@njit(cache=True)
+def _span(start: float, slope: float, left: float, right: float) -> tuple[float, float]:
+    """The part of left..right where start + slope u is not negative."""
+    if slope > 0.0:
+        return max(left, -start / slope), right
+    if slope < 0.0:
+        return left, min(right, -start / slope)
+    return (left, right) if start >= 0.0 else (1.0, 0.0)
+
+
+@njit(cache=True)
+def _draw(rays: Array, arrived: NDArray[np.bool_], px: Array, py: Array, light: Array, stop_x: Array,
+          stop_y: Array, radius: float, edges: Array, rim: float, colour: Array, picture: NDArray[np.float32]) -> None:
+    """Add the cells of a traced grid to `picture`. px, py: pixels; light: density by ray."""
+    rows, columns = px.shape
+    height, width = picture.shape[0], picture.shape[1]
+    sectors = edges.shape[0]
+    for row in range(rows - 1):
+        for column in range(columns - 1):
+            for half in range(2):
+                r0, c0 = row, column
+                if half == 0:
+                    r1, c1, r2, c2 = row, column + 1, row + 1, column + 1
+                else:
+                    r1, c1, r2, c2 = row + 1, column + 1, row + 1, column
+                if not (arrived[r0, c0] and arrived[r1, c1] and arrived[r2, c2]):
+                    continue
+                if min(rays[r0, c0, 2], rays[r1, c1, 2], rays[r2, c2, 2]) > 1.02:
+                    continue
+                x0, y0, x1, y1, x2, y2 = px[r0, c0], py[r0, c0], px[r1, c1], py[r1, c1], px[r2, c2], py[r2, c2]
+                low_x, high_x = min(x0, x1, x2), max(x0, x1, x2)
+                low_y, high_y = min(y0, y1, y2), max(y0, y1, y2)
+                if high_x < 0 or high_y < 0 or low_x > width or low_y > height:
+                    continue
+                area = (x1 - x0) * (y2 - y0) - (x2 - x0) * (y1 - y0)
+                if area == 0.0:
+                    continue
+                # How far the stop's coordinates run within a pixel is how soft its edge is drawn.
+                s0x, s0y = stop_x[r0, c0, 0], stop_y[r0, c0, 0]
+                stop_area = ((stop_x[r1, c1, 0] - s0x) * (stop_y[r2, c2, 0] - s0y)
+                             - (stop_x[r2, c2, 0] - s0x) * (stop_y[r1, c1, 0] - s0y))
+                ramp = math.sqrt(abs(stop_area / area)) / radius
+                ramp = min(max(ramp, 0.004), 0.6)
+                slope1, slope2 = (y2 - y0) / area, (y0 - y1) / area
+                for y in range(max(0, math.ceil(low_y - 0.5)), min(height - 1, math.floor(high_y - 0.5)) + 1):
+                    # Barycentric coordinates run linearly along a row: b = start + slope (u - x0).
+                    v = y + 0.5 - y0
+                    start1, start2 = (x0 - x2) * v / area, (x1 - x0) * v / area
+                    left, right = _span(start1, slope1, low_x - x0, high_x - x0)
+                    left, right = _span(start2, slope2, left, right)
+                    left, right = _span(1.0 - start1 - start2, -slope1 - slope2, left, right)
+                    first = max(0, math.ceil(left + x0 - 0.5))
+                    for x in range(first, min(width - 1, math.floor(right + x0 - 0.5)) + 1):
+                        u = x + 0.5 - x0
+                        b1, b2 = start1 + slope1 * u, start2 + slope2 * u
+                        b0 = 1.0 - b1 - b2
+                        stray = b0 * rays[r0, c0, 2] + b1 * rays[r1, c1, 2] + b2 * rays[r2, c2, 2]
+                        mask = min(max((1.0 - stray) / ramp + 0.5, 0.0), 1.0)
+                        if mask == 0.0:
+                            continue
+                        glow = 0.0
+                        for passage in range(3):
+                            if passage > 0 and stop_x[r0, c0, passage] == s0x:
+                                break
+                            sx = (b0 * stop_x[r0, c0, passage] + b1 * stop_x[r1, c1, passage]
+                                  + b2 * stop_x[r2, c2, passage])
+                            sy = (b0 * stop_y[r0, c0, passage] + b1 * stop_y[r1, c1, passage]
+                                  + b2 * stop_y[r2, c2, passage])
+                            angle = (math.atan2(sy, sx) / (2.0 * math.pi) % 1.0) * sectors
+                            low = int(angle)
+                            part = angle - low
+                            edge = edges[low % sectors] * (1.0 - part) + edges[(low + 1) % sectors] * part
+                            inside = edge - math.sqrt(sx * sx + sy * sy) / radius
+                            mask *= min(max(inside / ramp + 0.5, 0.0), 1.0)
+                            glow = max(glow, math.exp(-(inside * inside) / (0.0036 + ramp * ramp)))
+                        if mask == 0.0:
+                            continue
+                        value = mask * (1.0 + rim * glow)
+                        value *= b0 * light[r0, c0] + b1 * light[r1, c1] + b2 * light[r2, c2]
+                        for channel in range(3):
+                            picture[y, x, channel] += value * colour[channel]
+
+
+def _density(x: Array, y: Array, cell: float) -> Array:
+    """Area on the plane of entry (of pi f^2) over area on the sensor (tan^2), by ray."""
+    xr, xc = np.gradient(x)
+    yr, yc = np.gradient(y)
+    stretch = (xr * yc - xc * yr) / cell
+    return 1.0 / np.sqrt(stretch**2 + DENSEST**-2)
+
+
+def draw_ghosts(optics: Optics, pairs: list[tuple[int, int]], settings: GhostSettings, light: tuple[float, float],
+                focal: tuple[float, float], centre: tuple[float, float], width: int, height: int
+                ) -> NDArray[np.float32]:
+    """Linear light (height, width, 3) of the ghosts of a white light of strength 1.
+
+    light: normalised coordinates (x/z, y/z). focal, centre: pixels.
+    """
+    fine = max(1, min(settings.supersample, WIDEST // width))
+    picture = np.zeros((height * fine, width * fine, 3), np.float32)
+    lens = optics.lens
+    length, _ = lens.paraxial()
+    slope = math.hypot(*light)
+    azimuth = math.atan2(light[1], light[0])
+    cosine, sine = math.cos(azimuth), math.sin(azimuth)
+    edges = edge_radius(optics.aperture, 720)
+    bands = responses(settings.bands)
+    surfaces = _surfaces(optics, REFERENCE)
+    grids = {pair: _bundle(optics, slope, pair, surfaces, settings.grid) for pair in pairs}
+    for band, wavelength in enumerate(wavelengths(settings.bands)):
+        surfaces = _surfaces(optics, wavelength)
+        for pair, grid in grids.items():
+            if grid is None:
+                continue
+            rays, arrived = trace_grid(*grid, slope, *pair, *surfaces)
+            # The sensor's picture is upside down; set it upright and turn it to the light's azimuth.
+            x, y = -rays[..., SENSOR_X] / length, -rays[..., SENSOR_X + 1] / length
+            cell = (grid[0][1] - grid[0][0]) * (grid[1][1] - grid[1][0]) / (math.pi * length**2)
+            dense = _density(x, y, cell) * rays[..., WEIGHT] / math.sqrt(1 + slope**2)
+            px = fine * (centre[0] + focal[0] * (cosine * x - sine * y))
+            py = fine * (centre[1] + focal[1] * (sine * x + cosine * y))
+            sx, sy = rays[..., STOP_X::2], rays[..., STOP_X + 1::2]
+            _draw(rays, arrived, px, py, dense, cosine * sx - sine * sy, sine * sx + cosine * sy,
+                  optics.aperture.radius, edges, settings.rim, bands[band], picture)
+    soft = cv2.GaussianBlur(picture, (0, 0), max(settings.size * focal[0] * fine, 0.3))
+    small = cv2.resize(soft, (width, height), interpolation=cv2.INTER_AREA)
+    return (small * np.float32(settings.gain)).astype(np.float32)
+
+
+def _surfaces(optics: Optics, wavelength: float) -> tuple[Any, ...]:
+    """What `trace_grid` wants to know of the lens at a wavelength."""
+    lens = optics.lens
+    return (lens.curvature, lens.vertices, lens.indices(wavelength), lens.semi_aperture, optics.coating, lens.stop,
+            optics.sensor, wavelength)
+
+
+def _bundle(optics: Optics, slope: float, pair: tuple[int, int], surfaces: tuple[Any, ...], grid: int
+            ) -> tuple[Array, Array] | None:
+    """Where rays must enter to come through: a grid over the bounds of those of a coarse grid that do."""
+    reach = 1.15 * optics.lens.semi_aperture[0]
+    axis = np.linspace(-reach, reach, COARSE)
+    rays, arrived = trace_grid(axis, axis, slope, *pair, *surfaces)
+    radius = np.hypot(rays[..., STOP_X::2], rays[..., STOP_X + 1::2]).max(axis=-1)
+    passes = arrived & (rays[..., STRAY] < 1.05) & (radius < 1.05 * optics.aperture.radius)
+    if not passes.any():
+        return None
+    step = axis[1] - axis[0]
+    rows, columns = np.flatnonzero(passes.any(axis=1)), np.flatnonzero(passes.any(axis=0))
+    return (np.linspace(axis[columns[0]] - step, axis[columns[-1]] + step, grid),
+            np.linspace(axis[rows[0]] - step, axis[rows[-1]] + step, grid))

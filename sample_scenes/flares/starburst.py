@@ -1,0 +1,145 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Light spread about the light itself: starburst, veiling glare, a ring, a streak.
+
+Starburst: far-field diffraction at the stop is the power of its Fourier transform, wider for longer
+wavelengths in proportion. Veiling glare: scatter in glass and on sensor, two broad lobes. Ring: the
+diffraction of fine concentric grooves (a lens polished or moulded on a lathe), at an angle in proportion
+to the wavelength. Streak: what a cylindrical lens makes of a point.
+"""
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from .aperture import Aperture, transmission
+from .spectrum import responses, wavelengths
+
+Pixels = NDArray[np.float32]
+
+TEXTURE = 1024
+REFERENCE = 0.55
+BANDS = 25
+
+
+@dataclass(frozen=True)
+class Starburst:
+    """gain: brightness. extent: tan of the angle that half the pattern spans at 0.55 micrometres.
+    core: softening radius of the centre (tan). peak: what the core saturates at."""
+
+    gain: float = 1.0
+    extent: float = 0.6
+    core: float = 0.0022
+    peak: float = 12.0
+
+
+@dataclass(frozen=True)
+class Glare:
+    """Two lobes gain / (1 + (r / radius)^2)^power, r the tangent of the angle from the light, and a floor."""
+
+    gain: float = 0.25
+    radius: float = 0.035
+    power: float = 1.1
+    wide_gain: float = 0.03
+    wide_radius: float = 0.35
+    floor: float = 0.002
+
+
+@dataclass(frozen=True)
+class Ring:
+    """radius: tan at 0.55 micrometres; width: of one wavelength's ring, of the radius. follow: where the
+    centre lies on the line from the principal point (0) to the light (1). lean: how much brighter the far
+    side is. grow: further radius per tan of the field angle. dispersion: 1 as grooves have it, 0 white."""
+
+    gain: float = 0.05
+    radius: float = 0.3
+    width: float = 0.03
+    follow: float = 1.0
+    lean: float = 0.4
+    grow: float = 0.0
+    dispersion: float = 1.0
+
+
+@dataclass(frozen=True)
+class Streak:
+    """A line through the light along `turn` degrees: gain / (1 + (along / length)^2)^power, of Gaussian
+    `width` (tan) across. colour: linear RGB. mirror: share of a second one through the mirrored light."""
+
+    gain: float = 0.6
+    length: float = 0.12
+    power: float = 0.9
+    width: float = 0.004
+    turn: float = 0.0
+    colour: tuple[float, float, float] = (0.25, 0.5, 1.0)
+    mirror: float = 0.1
+
+
+@lru_cache(maxsize=8)
+def starburst_texture(aperture: Aperture, settings: Starburst) -> Pixels:
+    """The pattern (TEXTURE, TEXTURE, 3) about its centre; +-extent wide."""
+    stop = transmission(aperture, TEXTURE, 0.25)
+    power = np.abs(np.fft.fftshift(np.fft.fft2(np.fft.ifftshift(stop)))) ** 2
+    power = (power / stop.sum() ** 2).astype(np.float32)
+    texture = np.zeros((TEXTURE, TEXTURE, 3), np.float32)
+    centre = TEXTURE // 2
+    rows, columns = np.mgrid[:TEXTURE, :TEXTURE].astype(np.float32) - centre
+    for wavelength, share in zip(wavelengths(BANDS), responses(BANDS), strict=True):
+        scale = np.float32(REFERENCE / wavelength)
+        wide = cv2.remap(power, columns * scale + centre, rows * scale + centre, cv2.INTER_LINEAR)
+        texture += (wide * scale**2)[..., None] * share.astype(np.float32)
+    sigma = settings.core / settings.extent * centre
+    texture = cv2.GaussianBlur(texture, (0, 0), sigma).astype(np.float32)
+    reach = np.hypot(rows, columns) / centre
+    fade = np.clip((1 - reach) / 0.25, 0, 1)
+    texture *= (settings.gain * fade * fade * (3 - 2 * fade))[..., None]
+    return texture / (1 + texture.max(axis=2, keepdims=True) / settings.peak)
+
+
+def draw_starburst(aperture: Aperture, settings: Starburst, x: Pixels, y: Pixels) -> Pixels:
+    """The pattern at offsets (x, y) from the light (tan), each (height, width)."""
+    texture = starburst_texture(aperture, settings)
+    half = TEXTURE // 2
+    scale = half / settings.extent
+    columns, rows = (x * scale + half).astype(np.float32), (y * scale + half).astype(np.float32)
+    drawn = cv2.remap(texture, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=(0,))
+    return drawn.astype(np.float32)
+
+
+def draw_glare(settings: Glare, x: Pixels, y: Pixels) -> Pixels:
+    """White veil at offsets (x, y) from the light, (height, width, 3)."""
+    squared = x * x + y * y
+    veil = settings.gain / (1 + squared / settings.radius**2) ** settings.power
+    veil += settings.wide_gain / (1 + squared / settings.wide_radius**2) ** 2 + settings.floor
+    return np.repeat(veil[..., None], 3, axis=2).astype(np.float32)
+
+
+def draw_ring(settings: Ring, light: tuple[float, float], x: Pixels, y: Pixels) -> Pixels:
+    """A ring at image coordinates (x, y) (tan from the principal point), (height, width, 3)."""
+    u, v = x - settings.follow * light[0], y - settings.follow * light[1]
+    distance = np.hypot(u, v)
+    field = math.hypot(*light)
+    side = (u * light[0] + v * light[1]) / np.maximum(distance, 1e-6) / math.sqrt(field**2 + 0.05)
+    bright = settings.gain * np.maximum(1 - settings.lean * side, 0)
+    ring = np.zeros((*x.shape, 3), np.float32)
+    for wavelength, share in zip(wavelengths(BANDS), responses(BANDS), strict=True):
+        stretch = 1 + settings.dispersion * (wavelength / REFERENCE - 1)
+        radius = (settings.radius + settings.grow * field) * stretch
+        bell = np.exp(-0.5 * ((distance - radius) / (settings.width * radius)) ** 2) / stretch
+        ring += (bright * bell)[..., None] * share.astype(np.float32)
+    return ring
+
+
+def draw_streak(settings: Streak, light: tuple[float, float], x: Pixels, y: Pixels) -> Pixels:
+    """A streak through the light, and its fainter mirror image, (height, width, 3)."""
+    cosine, sine = math.cos(math.radians(settings.turn)), math.sin(math.radians(settings.turn))
+    total = np.zeros(x.shape, np.float32)
+    for side, share in ((1.0, 1.0), (-0.7, settings.mirror)):
+        u, v = x - side * light[0], y - side * light[1]
+        along, across = cosine * u + sine * v, cosine * v - sine * u
+        line = np.exp(-0.5 * (across / settings.width) ** 2)
+        total += share * settings.gain * line / (1 + (along / settings.length) ** 2) ** settings.power
+    return total[..., None] * np.array(settings.colour, np.float32)

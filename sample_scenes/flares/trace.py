@@ -1,0 +1,156 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Rays through a lens that are reflected twice on their way: the ghosts of Hullin et al. 2011.
+
+"Physically-Based Real-Time Lens Flare Rendering": a parallel beam enters the lens as a grid of rays; for a
+pair of surfaces (i, j), i < j, each ray is refracted up to j, reflected there, goes back to i, is reflected
+again and goes on to the sensor. What a ray brings along is where it met the stop, how far out of any
+surface's rim it strayed, and how much light Fresnel's equations leave it. The grid's cells, stretched or
+squeezed on the sensor, give the density of light.
+
+Axes: z from the front towards the sensor, the first vertex at 0, lengths in mm.
+"""
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+COATING_INDEX = 1.38
+"""Magnesium fluoride."""
+
+# What a traced ray holds.
+SENSOR_X, SENSOR_Y, STRAY, WEIGHT = 0, 1, 2, 3
+STOP_X, STOP_Y = 4, 5
+FIELDS = 10
+"""The four above and (x, y) of three passages through the stop."""
+
+
+@njit(cache=True)
+def reflectance(cosine: float, n0: float, n2: float, wavelength: float, coating: float) -> float:
+    """Unpolarised reflectance between n0 and n2 at an angle of incidence; 1 for total reflection.
+
+    coating: wavelength (micrometres) for which a layer of magnesium fluoride is a quarter wave thick; 0
+    for bare glass. One thin film: R = |(r01 + r12 e^{i d}) / (1 + r01 r12 e^{i d})|^2 for each polarisation.
+    """
+    sine = math.sqrt(max(0.0, 1.0 - cosine * cosine))
+    s2 = sine * n0 / n2
+    if s2 >= 1.0:
+        return 1.0
+    c2 = math.sqrt(1.0 - s2 * s2)
+    if coating <= 0.0:
+        rs = (n0 * cosine - n2 * c2) / (n0 * cosine + n2 * c2)
+        rp = (n2 * cosine - n0 * c2) / (n2 * cosine + n0 * c2)
+        return 0.5 * (rs * rs + rp * rp)
+    n1 = max(math.sqrt(n0 * n2), COATING_INDEX)
+    s1 = sine * n0 / n1
+    if s1 >= 1.0:
+        return 1.0
+    c1 = math.sqrt(1.0 - s1 * s1)
+    wave = math.cos(math.pi * coating / wavelength * c1)  # the layer is coating / (4 n1) thick
+    total = 0.0
+    for polarisation in range(2):
+        if polarisation == 0:
+            r01 = (n0 * cosine - n1 * c1) / (n0 * cosine + n1 * c1)
+            r12 = (n1 * c1 - n2 * c2) / (n1 * c1 + n2 * c2)
+        else:
+            r01 = (n1 * cosine - n0 * c1) / (n1 * cosine + n0 * c1)
+            r12 = (n2 * c1 - n1 * c2) / (n2 * c1 + n1 * c2)
+        both = r01 * r12
+        total += (r01 * r01 + r12 * r12 + 2.0 * both * wave) / (1.0 + both * both + 2.0 * both * wave)
+    return 0.5 * total
+
+
+@njit(cache=True)
+def trace_ray(x: float, y: float, slope: float, first: int, second: int, curvature: Array, vertices: Array,
+              index: Array, semi_aperture: Array, coating: Array, stop: int, sensor: float, wavelength: float,
+              out: Array) -> bool:
+    """One ray that meets the plane z = 0 at (x, y), from a light at tan(field angle) = `slope` along +x.
+
+    first < second: the pair that reflects; both -1 for none. False where the ray misses a surface or is
+    reflected totally. `out` (FIELDS,) receives the result.
+    """
+    length = math.sqrt(1.0 + slope * slope)
+    dx, dy, dz = -slope / length, 0.0, 1.0 / length
+    px, py, pz = x, y, 0.0
+    count = curvature.shape[0]
+    stray, weight, passages = 0.0, 1.0, 0
+    at, step, turns = 0, 1, 0
+    while at < count:
+        c, z0 = curvature[at], vertices[at]
+        # Meet the sphere (or plane): the root nearest to the vertex.
+        oz = pz - z0
+        a = c
+        b = dz - c * (px * dx + py * dy + oz * dz)
+        k = c * (px * px + py * py + oz * oz) - 2.0 * oz
+        inside = b * b - a * k
+        if inside < 0.0:
+            return False
+        root = math.sqrt(inside)
+        distance = k / (b + math.copysign(root, b))
+        px += distance * dx
+        py += distance * dy
+        pz += distance * dz
+        radius = math.sqrt(px * px + py * py)
+        if at == stop:
+            if passages < 3:
+                out[STOP_X + 2 * passages] = px
+                out[STOP_Y + 2 * passages] = py
+                passages += 1
+            at += step
+            continue
+        stray = max(stray, radius / semi_aperture[at])
+        before = index[at - 1] if at > 0 else 1.0
+        after = index[at]
+        n0, n2 = (before, after) if step > 0 else (after, before)
+        # Normal against the ray.
+        nx, ny, nz = -c * px, -c * py, 1.0 - c * (pz - z0)
+        cosine = nx * dx + ny * dy + nz * dz
+        if cosine < 0.0:
+            nx, ny, nz, cosine = -nx, -ny, -nz, -cosine
+        cosine = min(cosine, 1.0)
+        share = reflectance(cosine, n0, n2, wavelength, coating[at])
+        if (turns == 0 and at == second) or (turns == 1 and at == first):
+            weight *= share
+            dx -= 2.0 * cosine * nx
+            dy -= 2.0 * cosine * ny
+            dz -= 2.0 * cosine * nz
+            step = -step
+            turns += 1
+        else:
+            if share >= 1.0:
+                return False
+            weight *= 1.0 - share
+            ratio = n0 / n2
+            bend = math.sqrt(1.0 - ratio * ratio * (1.0 - cosine * cosine)) - ratio * cosine
+            dx = ratio * dx + bend * nx
+            dy = ratio * dy + bend * ny
+            dz = ratio * dz + bend * nz
+        at += step
+    distance = (sensor - pz) / dz
+    out[SENSOR_X] = px + distance * dx
+    out[SENSOR_Y] = py + distance * dy
+    out[STRAY] = stray
+    out[WEIGHT] = weight
+    for later in range(passages, 3):
+        out[STOP_X + 2 * later] = out[STOP_X]
+        out[STOP_Y + 2 * later] = out[STOP_Y]
+    return True
+
+
+@njit(cache=True)
+def trace_grid(xs: Array, ys: Array, slope: float, first: int, second: int, curvature: Array, vertices: Array,
+               index: Array, semi_aperture: Array, coating: Array, stop: int, sensor: float,
+               wavelength: float) -> tuple[Array, NDArray[np.bool_]]:
+    """Rays through the points xs x ys of the plane z = 0: (rows, columns, FIELDS), and which arrived."""
+    rays = np.zeros((ys.shape[0], xs.shape[0], FIELDS))
+    arrived = np.zeros((ys.shape[0], xs.shape[0]), np.bool_)
+    for row in range(ys.shape[0]):
+        for column in range(xs.shape[0]):
+            arrived[row, column] = trace_ray(xs[column], ys[row], slope, first, second, curvature, vertices,
+                                             index, semi_aperture, coating, stop, sensor, wavelength,
+                                             rays[row, column])
+    return rays, arrived

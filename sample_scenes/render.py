@@ -1,0 +1,131 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Make a sample capture: `python sample_scenes/render.py --out FOLDER [--scene desk]`.
+
+Renders the scene with Cycles, traces the flares, adds them in linear light, exposes the frames, matches
+features and triangulates the points. A view that is there already is not made again, so an interrupted
+run goes on where it stopped; delete truth/flare, images and removed to make the flares anew.
+"""
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from core.errors import CaptureError
+from core.files import read_json, write_json
+from core.pictures import read_picture
+from core.progress import Progress, TerminalProgress, stoppable
+from sample_scenes.description import SceneDescription, camera_positions
+from sample_scenes.flares import LOOKS, render_flare
+from sample_scenes.layers import FLARE_LEVEL, FRAME_SUFFIX, SCENE_LEVEL, write_frame, write_layer
+from sample_scenes.scenes import SCENES
+
+
+def render_scene(scene: SceneDescription, out: Path, progress: Progress) -> None:
+    """truth/scene and truth/visible_share.json, by Blender."""
+    target, table = out / "truth" / "scene", out / "truth" / "visible_share.json"
+    names, poses = scene.stems, scene.poses
+    missing = [i for i, name in enumerate(names) if not (target / f"{name}.exr").is_file()]
+    if not missing and table.is_file():
+        return
+    from sample_scenes import cycles
+
+    scene.build(scene)
+    camera = cycles.set_up(scene.camera, scene.samples)
+    eyes = camera_positions(poses)
+    write_json(table, {f"{name}{FRAME_SUFFIX}": {light.name: cycles.visible_share(light, eye) for light in scene.lights}
+                       for name, eye in zip(names, eyes, strict=True)})
+    progress.stage("render", len(names), len(names) - len(missing))
+    for index in missing:
+        with silent():
+            pixels = cycles.render(camera, poses[index], scene.seed * 1000 + int(scene.numbers[index]))
+        write_layer(target / f"{names[index]}.exr", pixels, SCENE_LEVEL)
+        progress.advance()
+
+
+def silent() -> Any:
+    """Blender's own lines go to the null device for as long as this context lasts."""
+    import contextlib
+
+    @contextlib.contextmanager
+    def redirected() -> Any:
+        sys.stdout.flush()
+        saved, null = os.dup(1), os.open(os.devnull, os.O_WRONLY)
+        os.dup2(null, 1)
+        try:
+            yield
+        finally:
+            os.dup2(saved, 1)
+            os.close(saved)
+            os.close(null)
+
+    return redirected()
+
+
+def add_flares(scene: SceneDescription, out: Path, progress: Progress) -> None:
+    """truth/flare, images and removed."""
+    names, poses = scene.stems, scene.poses
+    shares = read_json(out / "truth" / "visible_share.json", CaptureError)
+    look = LOOKS[scene.lens]
+    progress.stage("flares", len(names))
+    for index, name in enumerate(names):
+        layer, frame, clean = (out / "truth" / "flare" / f"{name}.exr", out / "images" / f"{name}{FRAME_SUFFIX}",
+                               out / "removed" / f"{name}{FRAME_SUFFIX}")
+        if not (layer.is_file() and frame.is_file() and clean.is_file()):
+            flare = np.zeros((scene.camera.height, scene.camera.width, 3), np.float32)
+            for light in scene.lights:
+                at = poses[index][:3, :3] @ np.array(light.xyz) + poses[index][:3, 3]
+                flare += render_flare(look, scene.camera, at, colour=light.colour,
+                                      intensity=light.strength(float(np.linalg.norm(at))),
+                                      visible_share=shares[f"{name}{FRAME_SUFFIX}"][light.name])
+            write_layer(layer, flare, FLARE_LEVEL)
+            # The frames are made of the layers as stored, so that the files agree to the last bit.
+            flare = read_picture(layer).pixels
+            picture = read_picture(out / "truth" / "scene" / f"{name}.exr").pixels
+            write_frame(clean, picture, (scene.seed, int(scene.numbers[index])))
+            write_frame(frame, picture + flare, (scene.seed, int(scene.numbers[index])))
+        progress.advance()
+
+
+def write_lists(scene: SceneDescription, out: Path) -> None:
+    """lights.json and split.json."""
+    write_json(out / "lights.json", {"lights": [
+        {"name": light.name, "xyz": list(light.xyz), "radius": light.radius, "colour": list(light.colour)}
+        for light in scene.lights]})
+    test = sorted(set(scene.stems[4::8]) | {f"{number:04d}" for number in scene.test})
+    write_json(out / "split.json", {"test": [f"{stem}{FRAME_SUFFIX}" for stem in test]})
+
+
+def make(scene: SceneDescription, out: Path, progress: Progress) -> None:
+    """The whole capture folder."""
+    from sample_scenes.solve import write_model
+
+    render_scene(scene, out, progress)
+    add_flares(scene, out, progress)
+    write_lists(scene, out)
+    write_model(scene, out, progress)
+
+
+def main() -> int:
+    """The command."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--out", type=Path, required=True, help="capture folder to write")
+    parser.add_argument("--scene", choices=sorted(SCENES), default="desk")
+    chosen = parser.parse_args()
+    progress = TerminalProgress()
+    with stoppable(progress):
+        make(SCENES[chosen.scene], chosen.out, progress)
+    progress.close()
+    sys.stdout.flush()
+    return 0
+
+
+if __name__ == "__main__":
+    code = main()
+    os._exit(code)  # Blender's library may hang when its interpreter winds down

@@ -1,0 +1,8 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The sample captures by name."""
+from __future__ import annotations
+
+from ..description import SceneDescription
+from . import desk
+
+SCENES: dict[str, SceneDescription] = {scene.name: scene for scene in (desk.DESK,)}

@@ -1,0 +1,61 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""A contact sheet of a capture: `python sample_scenes/sheet.py CAPTURE --out SHEET.png`.
+
+For each of some views, from top to bottom: the frame, the scene, the flare (display values). Prints what
+an empty flare would score, |frame - scene| against nothing, in dB.
+"""
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from core.files import atomic_path
+from core.pictures import read_picture
+
+
+def empty_flare(frame: NDArray[np.float32], scene: NDArray[np.float32]) -> float:
+    """PSNR of no flare at all against |frame - scene|, display values."""
+    return float(-10 * np.log10(np.mean((frame - scene) ** 2)))
+
+
+def contact_sheet(capture: Path, columns: int, rows: int, width: int) -> NDArray[np.uint8]:
+    """The sheet, (…, …, 3) BGR, of columns x rows views spread evenly over the capture."""
+    frames = sorted(path for path in (capture / "images").iterdir() if not path.name.startswith("."))
+    chosen = [frames[i] for i in np.linspace(0, len(frames) - 1, columns * rows).round().astype(int)]
+    tiles = []
+    for path in chosen:
+        frame = read_picture(path)
+        clean = capture / "removed" / path.name
+        scene = read_picture(clean if clean.is_file() else capture / "truth" / "scene" / f"{path.stem}.exr")
+        flare = read_picture(capture / "truth" / "flare" / f"{path.stem}.exr")
+        print(f"{path.stem}  empty flare {empty_flare(frame.display(), scene.display()):.2f} dB")
+        height = round(width * frame.size[1] / frame.size[0])
+        tiles.append(np.vstack([picture.resized(width, height).display() for picture in (frame, scene, flare)]))
+    lines = [np.hstack(tiles[at:at + columns]) for at in range(0, len(tiles), columns)]
+    return np.round(np.clip(np.vstack(lines), 0, 1) * 255).astype(np.uint8)[..., ::-1]
+
+
+def main() -> int:
+    """The command."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("capture", type=Path)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--columns", type=int, default=4)
+    parser.add_argument("--rows", type=int, default=2)
+    parser.add_argument("--width", type=int, default=360)
+    chosen = parser.parse_args()
+    sheet = contact_sheet(chosen.capture, chosen.columns, chosen.rows, chosen.width)
+    with atomic_path(chosen.out) as temporary:
+        cv2.imwrite(str(temporary), sheet)
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,214 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Building blocks for scenes in Blender: textured boxes, lathed shapes, lamps. Runs where bpy is."""
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import bmesh
+import bpy
+import numpy as np
+from mathutils import Matrix, Vector
+from numpy.typing import NDArray
+
+from .description import LightSource
+from .patterns import Texture
+
+Vec = Sequence[float] | NDArray[np.float64]
+
+
+def empty_scene() -> Any:
+    """Forget whatever Blender started with."""
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    return bpy.context.scene
+
+
+def picture_material(name: str, texture: Texture, roughness: float = 0.7) -> Any:
+    """A matt material that shows `texture` by the UV map."""
+    height, width = texture.shape[:2]
+    image = bpy.data.images.new(name, width, height)
+    pixels = np.ones((height, width, 4), np.float32)
+    pixels[..., :3] = texture[::-1]
+    image.pixels.foreach_set(pixels.ravel())
+    image.pack()
+    material = bpy.data.materials.new(name)
+    material.use_nodes = True
+    nodes, links = material.node_tree.nodes, material.node_tree.links
+    shader = next(node for node in nodes if node.type == "BSDF_PRINCIPLED")
+    shader.inputs["Roughness"].default_value = roughness
+    shader.inputs["Specular IOR Level"].default_value = 0.25
+    source = nodes.new("ShaderNodeTexImage")
+    source.image = image
+    links.new(source.outputs["Color"], shader.inputs["Base Color"])
+    return material
+
+
+def plain_material(name: str, colour: Vec, roughness: float = 0.5, metallic: float = 0.0) -> Any:
+    """One linear colour."""
+    material = bpy.data.materials.new(name)
+    material.use_nodes = True
+    shader = next(node for node in material.node_tree.nodes if node.type == "BSDF_PRINCIPLED")
+    shader.inputs["Base Color"].default_value = (*colour, 1.0)
+    shader.inputs["Roughness"].default_value = roughness
+    shader.inputs["Metallic"].default_value = metallic
+    return material
+
+
+def _add(name: str, mesh: bmesh.types.BMesh, materials: Sequence[Any], smooth: bool = False) -> Any:
+    data = bpy.data.meshes.new(name)
+    for face in mesh.faces:
+        face.smooth = smooth
+    mesh.to_mesh(data)
+    mesh.free()
+    for material in materials:
+        data.materials.append(material)
+    thing = bpy.data.objects.new(name, data)
+    bpy.context.scene.collection.objects.link(thing)
+    return thing
+
+
+def place(thing: Any, location: Vec, turn: float = 0.0, tilt: Vec = (0.0, 0.0)) -> Any:
+    """Put a thing at `location`, turned by `turn` degrees about z after `tilt` degrees about x and y."""
+    thing.rotation_euler = tuple(np.radians((*tilt, turn)))
+    thing.location = location
+    return thing
+
+
+def box(name: str, size: Vec, location: Vec, materials: Sequence[Any], turn: float = 0.0,
+        tilt: Vec = (0.0, 0.0), bevel: float = 0.0) -> Any:
+    """A box of `size`, its base centre at `location`.
+
+    Materials: one for all faces, or one each for the sides (-y, +x, +y, -x) and top; each face shows its
+    whole texture.
+    """
+    x, y, z = size[0] / 2, size[1] / 2, size[2]
+    mesh = bmesh.new()
+    uv = mesh.loops.layers.uv.new("UVMap")
+    corners = [(-x, -y), (x, -y), (x, y), (-x, y)]
+    faces = [[(*corners[i], 0.0), (*corners[(i + 1) % 4], 0.0), (*corners[(i + 1) % 4], z), (*corners[i], z)]
+             for i in range(4)]
+    faces.append([(*corner, z) for corner in corners])
+    faces.append([(*corner, 0.0) for corner in corners[::-1]])
+    for index, face in enumerate(faces):
+        made = mesh.faces.new([mesh.verts.new(corner) for corner in face])
+        made.material_index = min(index, len(materials) - 1)
+        for loop, at in zip(made.loops, ((0, 0), (1, 0), (1, 1), (0, 1)), strict=True):
+            loop[uv].uv = at
+    bmesh.ops.remove_doubles(mesh, verts=mesh.verts, dist=1e-6)
+    thing = place(_add(name, mesh, materials), location, turn, tilt)
+    if bevel > 0:
+        modifier = thing.modifiers.new("Bevel", "BEVEL")
+        modifier.width, modifier.segments = bevel, 2
+    return thing
+
+
+def sheet(name: str, width: float, height: float, location: Vec, material: Any, turn: float = 0.0,
+          tilt: Vec = (0.0, 0.0), repeat: Vec = (1.0, 1.0)) -> Any:
+    """A rectangle in x and y about its centre (tilt by 90 about x to stand it up)."""
+    mesh = bmesh.new()
+    uv = mesh.loops.layers.uv.new("UVMap")
+    x, y = width / 2, height / 2
+    face = mesh.faces.new([mesh.verts.new((a, b, 0.0)) for a, b in ((-x, -y), (x, -y), (x, y), (-x, y))])
+    for loop, at in zip(face.loops, ((0, 0), (1, 0), (1, 1), (0, 1)), strict=True):
+        loop[uv].uv = (at[0] * repeat[0], at[1] * repeat[1])
+    return place(_add(name, mesh, [material]), location, turn, tilt)
+
+
+def lathe(name: str, profile: Sequence[tuple[float, float]], location: Vec, material: Any,
+          segments: int = 48, turn: float = 0.0, tilt: Vec = (0.0, 0.0), repeat: Vec = (1.0, 1.0)) -> Any:
+    """A shape of revolution about z: `profile` is (radius, height) from below to the top."""
+    mesh = bmesh.new()
+    uv = mesh.loops.layers.uv.new("UVMap")
+    angles = np.linspace(0, 2 * np.pi, segments, endpoint=False)
+    rings = [[mesh.verts.new((r * np.cos(a), r * np.sin(a), h)) for a in angles] for r, h in profile]
+    lengths = np.hypot(*np.diff(np.array(profile), axis=0).T)
+    along = np.concatenate([[0.0], np.cumsum(lengths)]) / max(lengths.sum(), 1e-9)
+    for low in range(len(profile) - 1):
+        for side in range(segments):
+            after = (side + 1) % segments
+            around = [rings[low][side], rings[low][after], rings[low + 1][after], rings[low + 1][side]]
+            face = mesh.faces.new(around)
+            at = ((side, low), (side + 1, low), (side + 1, low + 1), (side, low + 1))
+            for loop, (u, v) in zip(face.loops, at, strict=True):
+                loop[uv].uv = (u / segments * repeat[0], along[v] * repeat[1])
+    return place(_add(name, mesh, [material], smooth=True), location, turn, tilt)
+
+
+def ball(name: str, radius: float, location: Vec, material: Any, turn: float = 0.0,
+         tilt: Vec = (0.0, 0.0)) -> Any:
+    """A sphere about `location`."""
+    steps = np.linspace(-np.pi / 2, np.pi / 2, 33)
+    profile = [(max(radius * float(np.cos(a)), 1e-4), radius * float(np.sin(a))) for a in steps]
+    return lathe(name, profile, location, material, 64, turn, tilt)
+
+
+def rod(name: str, start: Vec, end: Vec, radius: float, material: Any) -> Any:
+    """A cylinder from `start` to `end`."""
+    direction = Vector(end) - Vector(start)
+    thing = lathe(name, [(1e-4, 0.0), (radius, 0.0), (radius, direction.length), (1e-4, direction.length)],
+                  (0, 0, 0), material, 24)
+    thing.matrix_world = Matrix.Translation(Vector(start)) @ direction.to_track_quat("Z", "Y").to_matrix().to_4x4()
+    return thing
+
+
+def monkey(name: str, size: float, location: Vec, material: Any, turn: float = 0.0) -> Any:
+    """Blender's monkey head, subdivided once."""
+    bpy.ops.mesh.primitive_monkey_add(size=size, location=location, rotation=(0, 0, np.radians(turn)))
+    thing = bpy.context.object
+    thing.name = name
+    modifier = thing.modifiers.new("Smooth", "SUBSURF")
+    modifier.levels = modifier.render_levels = 1
+    for face in thing.data.polygons:
+        face.use_smooth = True
+    thing.data.materials.append(material)
+    return thing
+
+
+def lamp(light: LightSource) -> Any:
+    """A light source: a sphere that only the camera sees, and a point lamp of that size in its place.
+
+    The sphere is marked `light_source`, so that the ray casts of the visible share can leave it out.
+    """
+    material = bpy.data.materials.new(light.name)
+    material.use_nodes = True
+    nodes, links = material.node_tree.nodes, material.node_tree.links
+    nodes.clear()
+    emission = nodes.new("ShaderNodeEmission")
+    emission.inputs["Color"].default_value = (*light.colour, 1.0)
+    emission.inputs["Strength"].default_value = light.emission
+    links.new(emission.outputs[0], nodes.new("ShaderNodeOutputMaterial").inputs["Surface"])
+    bulb = ball(light.name, light.radius, light.xyz, material)
+    bulb["light_source"] = True
+    for ray in ("diffuse", "glossy", "transmission", "volume_scatter", "shadow"):
+        setattr(bulb, f"visible_{ray}", False)
+    if light.power > 0:
+        data = bpy.data.lights.new(light.name, "POINT")
+        data.energy, data.color, data.shadow_soft_size = light.power, light.colour, light.radius
+        source = bpy.data.objects.new(f"{light.name} lamp", data)
+        source.location = light.xyz
+        source.visible_camera = False
+        bpy.context.scene.collection.objects.link(source)
+    return bulb
+
+
+def softbox(name: str, location: Vec, target: Vec, size: Vec, power: float, colour: Vec) -> Any:
+    """An area light that faces `target`; cameras do not see it."""
+    data = bpy.data.lights.new(name, "AREA")
+    data.shape, data.size, data.size_y = "RECTANGLE", size[0], size[1]
+    data.energy, data.color = power, colour
+    thing = bpy.data.objects.new(name, data)
+    thing.location = location
+    thing.rotation_euler = (Vector(target) - Vector(location)).to_track_quat("-Z", "Y").to_euler()
+    thing.visible_camera = False
+    bpy.context.scene.collection.objects.link(thing)
+    return thing
+
+
+def surroundings(colour: Vec, strength: float) -> None:
+    """An even world."""
+    world = bpy.data.worlds.new("World")
+    bpy.context.scene.world = world
+    world.use_nodes = True
+    background = next(node for node in world.node_tree.nodes if node.type == "BACKGROUND")
+    background.inputs["Color"].default_value = (*colour, 1.0)
+    background.inputs["Strength"].default_value = strength

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -169,6 +169,9 @@ def set_up(scene: Any, layers: LayerFolder, *, keep_image: bool = False) -> Any:
     keep = keep_image and before is not None and before.node != source
     tree.links.new(before if keep else sockets["scene"], node.inputs["Scene"])
     tree.links.new(node.outputs["Image"], end)
+    if not any(other.bl_idname == "CompositorNodeViewer" for other in tree.nodes):
+        viewer = _node(tree, "CompositorNodeViewer", 1, -1)  # what the backdrop shows
+        tree.links.new(node.outputs["Image"], viewer.inputs["Image"])
     return node
 
 
@@ -236,27 +239,32 @@ def match_scene(scene: Any, layers: LayerFolder, size: tuple[int, int]) -> None:
     render.pixel_aspect_x = render.pixel_aspect_y = 1.0
 
 
+def plain_view(scene: Any) -> None:
+    """Show pictures in sRGB with no look and no dithering, as the footage was; Blender's own view is AgX."""
+    view = scene.view_settings
+    view.view_transform, view.look, view.exposure, view.gamma = "Standard", "None", 0.0, 1.0
+    scene.render.dither_intensity = 0.0
+
+
 def render_frames(scene: Any, frames: Iterable[int], path_of: Callable[[int, str], Path],
                   done: Callable[[int], None] = lambda _frame: None) -> None:
     """Render frames through the compositor: a half-float EXR and an 8 bit PNG each, written atomically.
 
-    path_of: from a frame's number and a suffix (".exr", ".png") to the file. The PNG shows the picture in
-    sRGB with no look ("Standard"), as the footage was. done: called after each frame.
+    path_of: from a frame's number and a suffix (".exr", ".png") to the file. The EXR is scene-linear, the
+    PNG as the scene's view shows it (see `plain_view`). done: called after each frame.
     """
     if hasattr(scene.render, "compositor_device"):
         scene.render.compositor_device = "CPU"
-    scene.render.dither_intensity = 0.0
-    with _standard_view(scene):
-        for frame in frames:
-            scene.frame_set(frame)
-            bpy.ops.render.render(scene=scene.name)
-            for suffix in (".exr", ".png"):
-                _set_format(scene.render.image_settings, suffix)
-                with atomic_path(path_of(frame, suffix)) as temporary:
-                    _render_result().save_render(str(temporary), scene=scene)
-                    if not temporary.stat().st_size:
-                        raise FrameError(f"Blender could not write frame {frame} to {temporary.parent}.")
-            done(frame)
+    for frame in frames:
+        scene.frame_set(frame)
+        bpy.ops.render.render(scene=scene.name)
+        for suffix in (".exr", ".png"):
+            _set_format(scene.render.image_settings, suffix)
+            with atomic_path(path_of(frame, suffix)) as temporary:
+                _render_result().save_render(str(temporary), scene=scene)
+                if not temporary.stat().st_size:
+                    raise FrameError(f"Blender could not write frame {frame} to {temporary.parent}.")
+        done(frame)
 
 
 def _render_result() -> Any:
@@ -271,20 +279,6 @@ def _set_format(settings: Any, suffix: str) -> None:
     settings.color_depth = "16" if suffix == ".exr" else "8"
     if suffix == ".exr":
         settings.exr_codec = "ZIP"
-
-
-@contextlib.contextmanager
-def _standard_view(scene: Any) -> Iterator[None]:
-    """The plain sRGB view while frames are saved."""
-    view = scene.view_settings
-    names = ("view_transform", "look", "exposure", "gamma")
-    before = {name: getattr(view, name) for name in names}
-    view.view_transform, view.look, view.exposure, view.gamma = "Standard", "None", 0.0, 1.0
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            setattr(view, name, value)
 
 
 def save_beside(path: Path) -> None:

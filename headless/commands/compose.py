@@ -50,6 +50,7 @@ def frames_of(folder: Path, out: Path, progress: Progress, *, wanted: str | None
     scene = bpy.context.scene
     node = compositor.set_up(scene, layers)
     compositor.match_scene(scene, layers, layers.size())
+    compositor.plain_view(scene)
     node.inputs["Intensity"].default_value = intensity
     node.inputs["Tint"].default_value = (*colour, 1.0)
     compositor.save_beside(out.resolve() / BLEND)

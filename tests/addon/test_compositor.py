@@ -113,3 +113,5 @@ def test_the_saved_file_shows_the_same_elsewhere_and_without_us(made: Made, blen
     assert facts == {"frames": [0, 1000], "size": [SIZE[1], SIZE[0]]}
     for number in NUMBERS:
         assert_half_equal(rgb(tmp_path / "again" / f"{number}.exr"), rgb(made.out / "changed" / f"{number}.exr"))
+    before, after = made.out / "changed" / f"{NUMBERS[-1]}.png", tmp_path / "again" / "last.png"
+    np.testing.assert_array_equal(rgb(after), rgb(before))

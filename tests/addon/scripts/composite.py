@@ -29,6 +29,7 @@ def empty() -> bpy.types.Scene:
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
     scene = bpy.context.scene
     compositor.match_scene(scene, layers, layers.size())
+    compositor.plain_view(scene)
     return scene
 
 

@@ -20,6 +20,9 @@ for number in map(int, numbers):
     scene.frame_set(number)
     scene.render.filepath = str(Path(out, f"{number}.exr"))
     bpy.ops.render.render(write_still=True)
+settings.file_format, settings.color_mode, settings.color_depth = "PNG", "RGB", "8"
+rendered = next(image for image in bpy.data.images if image.type == "RENDER_RESULT")
+rendered.save_render(str(Path(out, "last.png")), scene=scene)
 print(json.dumps({"frames": [scene.frame_start, scene.frame_end],
                   "size": [scene.render.resolution_x, scene.render.resolution_y]}))
 sys.stdout.flush()

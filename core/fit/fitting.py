@@ -106,7 +106,8 @@ def _preview(trainer: Trainer, run: Run) -> None:
     rows = []
     for index in spread(len(views), PREVIEW_ROWS):
         camera = trainer.frames.camera(views[index])
-        view = render(trainer.scene, trainer.flare, run.settings.blend, camera, run.settings.kernels)
+        view = render(trainer.scene, trainer.flare, run.settings.blend, camera, run.settings.kernels,
+                      visibility=run.settings.flare.occluded_by_scene)
         rows.append(row(trainer.frames.frame(views[index]), view))
     write_preview(run.folder / PREVIEW, rows)
 

@@ -10,8 +10,9 @@ from torch import Tensor
 from ..capture import Camera
 from ..flare.compositing import Blend, Layers, encode, joined, layers, splat_flare
 from ..flare.model import FlareModel
+from ..flare.visibility import VisibilitySettings, visible_shares
 from ..gaussians import Rendering, Splats
-from ..gaussians.rasterizer import Kernels, Resolution
+from ..gaussians.rasterizer import Kernels
 from ..gaussians.scene import SceneGaussians
 
 
@@ -32,28 +33,38 @@ def pose_and_intrinsics(camera: Camera) -> tuple[Tensor, Tensor]:
     return torch.from_numpy(camera.world_to_camera).double(), torch.from_numpy(camera.intrinsics).float()
 
 
-def render_flare(flare: FlareModel | None, blend: Blend, camera: Camera, kernels: Kernels = "auto",
-                 resolution: Resolution = "full") -> Splats | None:
-    """All lights' flares as one set of splats; None where there is no light in front of the camera."""
+def render_flare(flare: FlareModel | None, blend: Blend, camera: Camera, kernels: Kernels = "auto", *,
+                 scene: SceneGaussians | None = None, visibility: VisibilitySettings | None = None) -> Splats | None:
+    """All lights' flares as one set of splats; None where there is no light in front of the camera.
+
+    With `visibility` each flare is scaled by the share of its light that `scene` leaves visible.
+    """
     if flare is None:
         return None
     pose, intrinsics = pose_and_intrinsics(camera)
-    gaussians = joined(flare(pose))
+    gaussians = joined(flare(pose, _shares(flare, pose, scene, visibility, kernels)))
     if gaussians is None:
         return None
-    return splat_flare(gaussians, intrinsics, camera.width, camera.height, blend,
-                       kernels=kernels, resolution=resolution)
+    return splat_flare(gaussians, intrinsics, camera.width, camera.height, blend, kernels=kernels)
+
+
+def _shares(flare: FlareModel, pose: Tensor, scene: SceneGaussians | None, visibility: VisibilitySettings | None,
+            kernels: Kernels) -> dict[str, Tensor] | None:
+    if scene is None or visibility is None:
+        return None
+    return visible_shares(scene, flare, pose, visibility, kernels)
 
 
 @torch.no_grad()
 def render(scene: SceneGaussians, flare: FlareModel | None, blend: Blend, camera: Camera,
-           kernels: Kernels = "auto") -> RenderedView:
+           kernels: Kernels = "auto", *, visibility: VisibilitySettings | None = None) -> RenderedView:
     """Everything a view has to give, without gradients."""
     rendering = scene.render(camera, kernels=kernels)
     flares: dict[str, Splats] = {}
     if flare is not None:
         pose, intrinsics = pose_and_intrinsics(camera)
-        flares = {name: splat_flare(gaussians, intrinsics, camera.width, camera.height, blend, kernels=kernels)
-                  for name, gaussians in flare(pose).items()}
+        gaussians = flare(pose, _shares(flare, pose, scene, visibility, kernels))
+        flares = {name: splat_flare(one, intrinsics, camera.width, camera.height, blend, kernels=kernels)
+                  for name, one in gaussians.items()}
     parts = layers(rendering.colour.clamp(0, 1), flares, blend)
     return RenderedView(rendering, flares, encode(parts.composite.clamp_min(0)).clamp(0, 1), parts)

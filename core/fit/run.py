@@ -117,7 +117,8 @@ class Run:
     def view(self, camera: Camera) -> RenderedView:
         """Scene, flares and composite as tensors."""
         model = self.flare.model if self.flare else None
-        return render(self.scene, model, self.settings.blend, camera, self.settings.kernels)
+        return render(self.scene, model, self.settings.blend, camera, self.settings.kernels,
+                      visibility=self.settings.flare.occluded_by_scene)
 
     def render(self, camera: Camera) -> ViewLayers:
         """The layers of a view at the camera's size."""

@@ -20,6 +20,7 @@ from ..errors import RunError, SettingsError
 from ..files import write_text
 from ..flare.density import DensitySettings
 from ..flare.model import OURS, PAPER, FlareForm
+from ..flare.visibility import VisibilitySettings
 from ..gaussians.densification import ClassicSettings, McmcSettings
 
 Mode = Literal["default", "unsup", "in-flare", "2d", "3dgs"]
@@ -58,16 +59,25 @@ class SceneRates:
 
 @dataclass(frozen=True)
 class FlareSettings:
-    """The flare: its form, how many Gaussians a light starts with, density control, rates, warm start.
+    """The flare: its form, the Gaussians that a light starts with, density control, rates, occlusion.
 
     `detection` False puts every light at the centroid of the points plus uniform noise (ablation).
+    `occlusion` scales each flare by the share of its light that the scene leaves visible (`visibility`).
     """
 
     form: FlareForm = PAPER
     count: int = 200
+    opacity: float = 0.05
     density: DensitySettings = field(default_factory=DensitySettings)
     rates: FlareRates = field(default_factory=FlareRates)
     detection: bool = True
+    occlusion: bool = False
+    visibility: VisibilitySettings = field(default_factory=VisibilitySettings)
+
+    @property
+    def occluded_by_scene(self) -> VisibilitySettings | None:
+        """How the scene hides lights; None where it does not."""
+        return self.visibility if self.occlusion else None
 
 
 @dataclass(frozen=True)
@@ -114,6 +124,7 @@ class FitSettings:
             (self.width >= 0, "size must not be negative"),
             (0 <= self.ssim_share <= 1, "ssim_share must lie between 0 and 1"),
             (self.flare.count >= 1, "a flare starts with at least one Gaussian"),
+            (0 < self.flare.opacity < 1, "a flare's opacity must lie between 0 and 1"),
             (self.seed >= 0, "seed must not be negative"),
             (self.mode != "2d" or not self.flare.form.line, "mode 2d needs a form without the line"),
         )
@@ -140,6 +151,10 @@ def preset(name: Preset, *, model: Literal["paper", "ours"] = "paper", mode: Mod
     settings = FitSettings(mode=mode, blend=blend, iterations=length, flare=FlareSettings(form=form))
     if name != "paper":
         settings = _shortened(settings, {"draft": 300, "standard": 500, "high": 700}[name])
+    if blend == "add":
+        # Light that adds is fainter than what covers: a ghost is a hundredth of white, not a tenth of opaque.
+        density = replace(settings.flare.density, clone_above=5e-4, prune_below=2e-4)
+        settings = replace(settings, flare=replace(settings.flare, opacity=0.01, density=density))
     return settings.checked()
 
 
@@ -155,7 +170,8 @@ def _shortened(settings: FitSettings, count: int) -> FitSettings:
                       every=max(round(length / 50), 20), reset_every=10 * length, cap=60_000)
     scene = replace(settings.scene, classic=classic, sh_every=max(round(length / 6), 1),
                     rates=replace(settings.scene.rates, position=3.2e-4, position_final=3.2e-6))
-    return replace(settings, scene=scene, flare=replace(settings.flare, count=count, density=density, rates=rates))
+    flare = replace(settings.flare, count=count, density=density, rates=rates)
+    return replace(settings, preview_every=max(length // 8, 1), scene=scene, flare=flare)
 
 
 # ---- config.toml ----------------------------------------------------------------------------------

@@ -69,7 +69,8 @@ class Trainer:
         targets = self.frames.targets(self._view())
         self._set_rates()
         scene = self.scene.render(targets.camera, sh_degree=self._sh_degree(), kernels=settings.kernels)
-        flare = render_flare(self.flare, settings.blend, targets.camera, settings.kernels)
+        flare = render_flare(self.flare, settings.blend, targets.camera, settings.kernels, scene=self.scene,
+                             visibility=settings.flare.occluded_by_scene)
         picture = composite(scene.colour, flare, settings.blend)
         weight = 1 - settings.ssim_share
         loss = l1_ssim(picture, targets.frame, weight)
@@ -217,7 +218,7 @@ def _new_flare(capture: Capture, views: tuple[View, ...], settings: FitSettings)
             raise CaptureError(f"The light {name!r} is behind the camera in every view of {capture.folder}; "
                                "correct or remove it in lights.json.")
         query = QueryRange.of(torch.stack([one.camera for one in seen]), torch.stack([one.light for one in seen]))
-        flares.append(LightFlare(settings.flare.form, query, settings.flare.count, generator))
+        flares.append(LightFlare(settings.flare.form, query, settings.flare.count, generator, settings.flare.opacity))
     return FlareModel([light.name for light in capture.lights], positions, flares)
 
 

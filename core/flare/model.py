@@ -7,7 +7,7 @@ taken away and measured. A `FlareModel` holds one such flare for each light of a
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple, cast
 
@@ -80,11 +80,12 @@ class LightFlare(nn.Module):
     sh (n, k * 3), and where the form has them offsets (n, 2), rings (n, 2) as r0 and log w, latent (n, d).
     """
 
-    def __init__(self, form: FlareForm, query_range: QueryRange, count: int, generator: torch.Generator) -> None:
+    def __init__(self, form: FlareForm, query_range: QueryRange, count: int, generator: torch.Generator,
+                 opacity: float = 0.05) -> None:
         super().__init__()
         self.form, self.query_range = form, query_range
         self.gaussians = nn.ParameterDict(
-            {name: nn.Parameter(rows) for name, rows in _canonical(form, count, generator).items()})
+            {name: nn.Parameter(rows) for name, rows in _canonical(form, count, opacity, generator).items()})
         deformed = [name for name in self.gaussians if name not in ("offsets", "latent")]
         heads = {name: self.gaussians[name].shape[1] for name in deformed}
         if form.line and form.plane_offset:
@@ -138,7 +139,7 @@ def _rings(raw: Tensor) -> Tensor:
     return torch.stack([raw[:, 0], raw[:, 1].clamp(-3, 3).exp()], -1)
 
 
-def _canonical(form: FlareForm, count: int, generator: torch.Generator) -> dict[str, Tensor]:
+def _canonical(form: FlareForm, count: int, opacity: float, generator: torch.Generator) -> dict[str, Tensor]:
     """`count` Gaussians spread along the line, small enough to leave most of the frame free.
 
     Sizes are log-uniform from 0.01 to 0.06 of the normalised plane (a 50 mm frame is about 0.7 wide).
@@ -158,7 +159,7 @@ def _canonical(form: FlareForm, count: int, generator: torch.Generator) -> dict[
         "positions": positions,
         "log_scales": log_scales,
         "rotations": rotations,
-        "opacity_logits": torch.full((count, 1), math.log(0.05 / 0.95)),
+        "opacity_logits": torch.full((count, 1), math.log(opacity / (1 - opacity))),
         "sh": torch.zeros(count, 3 * (form.sh_degree + 1) ** 2),
     }
     if form.static_offset:
@@ -195,7 +196,13 @@ class FlareModel(nn.Module):
         """Every light seen from one pose (4, 4)."""
         return [ViewOfLight.of(world_to_camera, xyz) for xyz in self.positions]
 
-    def forward(self, world_to_camera: Tensor) -> dict[str, PlaneGaussians]:
-        """The Gaussians of every light in front of the camera, by the light's name."""
+    def forward(self, world_to_camera: Tensor, shares: Mapping[str, Tensor] | None = None) -> dict[str, PlaneGaussians]:
+        """The Gaussians of every light in front of the camera, by the light's name.
+
+        shares: how much of each light is visible, 0..1 (see `visibility`); it scales the opacities.
+        """
         seen = zip(self.names, self.lights, self.views(world_to_camera), strict=True)
-        return {name: flare(view) for name, flare, view in seen if view.depth > 0}
+        flares = {name: flare(view) for name, flare, view in seen if view.depth > 0}
+        if shares is None:
+            return flares
+        return {name: one._replace(opacities=one.opacities * shares[name]) for name, one in flares.items()}

@@ -15,6 +15,7 @@ from torch import Tensor
 from ..gaussians import rasterization
 from ..gaussians.rasterizer import Kernels
 from ..gaussians.scene import SceneGaussians
+from .model import FlareModel
 
 
 @dataclass(frozen=True)
@@ -25,6 +26,15 @@ class VisibilitySettings:
     radius: float = 0.01
     margin: float = 0.06
     pixels: int = 9
+
+
+def visible_shares(scene: SceneGaussians, model: FlareModel, world_to_camera: Tensor, settings: VisibilitySettings,
+                   kernels: Kernels = "auto") -> dict[str, Tensor]:
+    """The visible share of each light from a pose (4, 4), by the light's name."""
+    pose = world_to_camera.double()
+    camera = -pose[:3, :3].T @ pose[:3, 3]
+    return {name: visible_share(scene, camera, light, settings, kernels)
+            for name, light in zip(model.names, model.positions, strict=True)}
 
 
 def visible_share(scene: SceneGaussians, camera: Tensor, light: Tensor, settings: VisibilitySettings | None = None,

@@ -69,7 +69,8 @@ class Look:
 
 
 @lru_cache(maxsize=8)
-def _optics(look: Look) -> tuple[Optics, list[tuple[int, int]]]:
+def optics_of(look: Look) -> tuple[Optics, list[tuple[int, int]]]:
+    """The look's lens, ready to trace, and its brightest ghosts' pairs of surfaces."""
     lens = read_prescription(FOLDER / f"{look.lens}.lens")
     aperture = Aperture(float(lens.semi_aperture[lens.stop]) * look.stop_down, look.blades, look.turn, look.curved,
                         look.uneven, seed=look.seed)
@@ -96,7 +97,7 @@ def render_flare(look: Look, camera: Camera, light: Sequence[float], *, colour: 
     strength = intensity * visible_share * shade
     if strength <= 0:
         return black
-    optics, pairs = _optics(look)
+    optics, pairs = optics_of(look)
     flare = draw_ghosts(optics, pairs, look.ghosts, at, (camera.fx, camera.fy), (camera.cx, camera.cy),
                         camera.width, camera.height)
     x, y = np.meshgrid(((np.arange(camera.width) + 0.5 - camera.cx) / camera.fx).astype(np.float32),

@@ -1,0 +1,106 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What a detector says of one picture, whatever the detector."""
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..pictures import Picture
+
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class Detection:
+    """A light source in one picture.
+
+    xy: (2,) sub-pixel centroid in pixels, pixel centres at +0.5.
+    radius: of the disc of the same area, in pixels.
+    score: 0..1, how sure the detector is.
+    colour: (3,) linear Rec. 709 of the glow round the clipped core, its largest channel 1.
+    mask: (h, w) of the source within its box; corner: (x, y) of the box in the picture.
+    cut: whether it touches the frame's edge, so that its centroid is not the source's.
+    """
+
+    xy: NDArray[np.float64]
+    radius: float
+    score: float
+    colour: NDArray[np.float64]
+    mask: Mask
+    corner: tuple[int, int]
+    cut: bool
+
+    @property
+    def box(self) -> tuple[int, int, int, int]:
+        """(left, top, right, bottom) in pixels, right and bottom exclusive."""
+        height, width = self.mask.shape
+        return self.corner[0], self.corner[1], self.corner[0] + width, self.corner[1] + height
+
+
+class Detector(Protocol):
+    """Finds light sources in a picture."""
+
+    def detect(self, picture: Picture) -> list[Detection]:
+        """The light sources, best first."""
+        ...
+
+
+def union(detections: Sequence[Detection], size: tuple[int, int]) -> Mask:
+    """(h, w) of all masks in a picture of `size` (width, height)."""
+    whole = np.zeros((size[1], size[0]), np.bool_)
+    for detection in detections:
+        left, top, right, bottom = detection.box
+        whole[top:bottom, left:right] |= detection.mask
+    return whole
+
+
+def measured(mask: Mask, corner: tuple[int, int], picture: Picture, display: NDArray[np.float32],
+             score: float) -> Detection:
+    """A detection from its mask (h, w) at `corner` of a picture whose display values are given.
+
+    The centroid weighs pixels from 0.8 of full scale up, one pixel past the mask: the rim's partly covered
+    pixels then say where between two pixels the edge lies.
+    """
+    import cv2
+
+    height, width = display.shape[:2]
+    left, top = corner[0] - 1, corner[1] - 1
+    grown = cv2.dilate(np.pad(mask, 1).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    rows = slice(max(top, 0), min(top + grown.shape[0], height))
+    columns = slice(max(left, 0), min(left + grown.shape[1], width))
+    grown = grown[rows.start - top:rows.stop - top, columns.start - left:columns.stop - left]
+    value = display[rows, columns].max(axis=2)
+    weight = np.where(grown, np.clip((value - 0.8) / 0.2, 1e-3, 1.0), 0.0)
+    v, u = np.mgrid[rows, columns] + 0.5
+    xy = np.array([(weight * u).sum(), (weight * v).sum()]) / weight.sum()
+    bottom, right = corner[1] + mask.shape[0], corner[0] + mask.shape[1]
+    cut = bool((corner[0] == 0 and mask[:, 0].any()) or (corner[1] == 0 and mask[0].any())
+               or (right == width and mask[:, -1].any()) or (bottom == height and mask[-1].any()))
+    return Detection(xy, float(np.sqrt(mask.sum() / np.pi)), score, _glow(mask, corner, picture), mask, corner, cut)
+
+
+def _glow(mask: Mask, corner: tuple[int, int], picture: Picture) -> NDArray[np.float64]:
+    """Colour of the glow: what the pixels just round the source have more than those further out."""
+    import cv2
+
+    reach = max(3, round(float(np.sqrt(mask.sum() / np.pi))))
+    height, width = picture.pixels.shape[:2]
+    left, top = max(corner[0] - 3 * reach, 0), max(corner[1] - 3 * reach, 0)
+    right, bottom = (min(corner[0] + mask.shape[1] + 3 * reach, width),
+                     min(corner[1] + mask.shape[0] + 3 * reach, height))
+    area = np.zeros((bottom - top, right - left), np.uint8)
+    y, x = corner[1] - top, corner[0] - left
+    area[y:y + mask.shape[0], x:x + mask.shape[1]] = mask
+    away = cv2.distanceTransform(1 - area, cv2.DIST_L2, 3)
+    around = Picture(picture.pixels[top:bottom, left:right], picture.encoding).linear()
+    near, far = (away > 1) & (away <= 1 + 0.5 * reach), (away > 2 * reach) & (away <= 3 * reach)
+    if not near.any():
+        return np.ones(3)
+    glow = around[near].mean(axis=0).astype(np.float64)
+    if far.any():
+        glow = np.maximum(glow - np.minimum(around[far].mean(axis=0), glow), 0.0)
+    return glow / glow.max() if glow.max() > 1e-4 else np.ones(3)

@@ -1,0 +1,107 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Light sources as over-exposed spots: needs no weights.
+
+A source is far brighter than what it lights. In the picture it is a clipped region that is compact (solid,
+not long, small against the frame), white to the core (all channels clip, where a bright coloured surface
+clips one), and brighter than its surroundings on all sides (a clipped patch of sky or wall goes on into
+pixels nearly as bright). Each of these is a soft step; their product is the score.
+"""
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..pictures import Picture
+from .detection import Detection, measured
+
+SMALLEST = 12  # pixels; below it noise and sparkle
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """The detector; `threshold` 0..1 of the score, `clipped` of full scale (HSV value)."""
+
+    threshold: float = 0.5
+    clipped: float = 0.98
+
+    def detect(self, picture: Picture) -> list[Detection]:
+        """The light sources of a picture, best first."""
+        import cv2
+
+        display = picture.display()
+        clipped = (display.max(axis=2) >= self.clipped).astype(np.uint8)
+        number, labels, boxes, _ = cv2.connectedComponentsWithStats(clipped, connectivity=8)
+        found = []
+        for label in range(1, number):
+            left, top, width, height, area = map(int, boxes[label])
+            if area < SMALLEST:
+                continue
+            mask = _core(labels[top:top + height, left:left + width] == label)
+            # What is mostly hairs and branches is a texture.
+            score = _score(mask, (left, top), display) * _step(mask.sum() / area, 0.6, 0.9)
+            if score >= self.threshold:
+                rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+                tight = mask[rows[0]:rows[-1] + 1, columns[0]:columns[-1] + 1]
+                corner = (left + int(columns[0]), top + int(rows[0]))
+                found.append(measured(tight, corner, picture, display, score))
+        return sorted(found, key=lambda detection: -detection.score)
+
+
+def _core(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """The mask without spikes and hairs thinner than a third of its thickest part, holes filled."""
+    import cv2
+
+    padded = np.pad(mask, 1).astype(np.uint8)
+    outline, _ = cv2.findContours(padded, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    cv2.drawContours(padded, outline, -1, (1.0,), cv2.FILLED)
+    thickest = float(cv2.distanceTransform(padded, cv2.DIST_L2, 5).max())
+    reach = int(thickest / 3)
+    if reach >= 1:
+        disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
+        opened = cv2.morphologyEx(np.pad(padded, reach), cv2.MORPH_OPEN, disc)[reach:-reach, reach:-reach]
+        number, labels, boxes, _ = cv2.connectedComponentsWithStats(opened, connectivity=4)
+        if number > 1:
+            padded = (labels == 1 + int(np.argmax(boxes[1:, cv2.CC_STAT_AREA]))).astype(np.uint8)
+    return np.asarray(padded[1:-1, 1:-1] > 0)
+
+
+def _step(value: float, low: float, high: float) -> float:
+    """0 below `low`, 1 above `high`, smooth between (for low > high: the other way round)."""
+    t = min(max((value - low) / (high - low), 0.0), 1.0)
+    return t * t * (3 - 2 * t)
+
+
+def _score(mask: NDArray[np.bool_], corner: tuple[int, int], display: NDArray[np.float32]) -> float:
+    import cv2
+
+    height, width = display.shape[:2]
+    area = int(mask.sum())
+    outline, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    hull = cv2.convexHull(np.concatenate(outline))
+    # A contour runs through pixel centres: half a pixel all round is missing from its area.
+    solid = area / (cv2.contourArea(hull) + 0.5 * cv2.arcLength(hull, True) + 1.0)
+    sides = np.sort(np.asarray(cv2.minAreaRect(hull)[1]) + 1.0)
+    here = display[corner[1]:corner[1] + mask.shape[0], corner[0]:corner[0] + mask.shape[1]][mask]
+    return (_step(solid, 0.84, 0.95) * _step(sides[1] / sides[0], 9.0, 5.0)
+            * _step(area / (width * height), 0.025, 0.005)
+            * _step(float(here.min(axis=1).mean()), 0.78, 0.97)
+            * _step(_surroundings(mask, corner, display), 0.97, 0.9))
+
+
+def _surroundings(mask: NDArray[np.bool_], corner: tuple[int, int], display: NDArray[np.float32]) -> float:
+    """How bright the picture is a radius away from the mask (HSV value); 1 where nothing is there."""
+    import cv2
+
+    height, width = display.shape[:2]
+    reach = max(4, round(float(np.sqrt(mask.sum() / np.pi))))
+    left, top = max(corner[0] - 2 * reach, 0), max(corner[1] - 2 * reach, 0)
+    right = min(corner[0] + mask.shape[1] + 2 * reach, width)
+    bottom = min(corner[1] + mask.shape[0] + 2 * reach, height)
+    area = np.zeros((bottom - top, right - left), np.uint8)
+    area[corner[1] - top:corner[1] - top + mask.shape[0], corner[0] - left:corner[0] - left + mask.shape[1]] = mask
+    away: Any = cv2.distanceTransform(1 - area, cv2.DIST_L2, 3)
+    ring = (away > reach) & (away <= 1.5 * reach)
+    return float(display[top:bottom, left:right][ring].max(axis=1).mean()) if ring.any() else 1.0

@@ -19,7 +19,7 @@ from . import hand_off
 from .command import Command, Step
 from .commands import COMMANDS
 
-DONE, FAILED, MISUSED, STOPPED = 0, 1, 2, 130
+DONE, FAILED, MISUSED, STOPPED = 0, 1, 2, hand_off.STOPPED
 
 _DESCRIPTION = """\
 Takes lens flares out of footage, learns them, and gives them back as layers.

@@ -28,6 +28,7 @@ from .command import Side
 ROOT = Path(__file__).resolve().parents[1]
 RUN = ROOT / "headless" / "run.py"
 WINDOWS = os.name == "nt"
+STOPPED = 130  # the status of a process that was asked to stop, and did
 PATIENCE_S = 60.0  # for a stopped process to write what it must
 
 
@@ -155,7 +156,7 @@ def run_there(command: Sequence[str], words: Sequence[str], step: str, progress:
             sys.stderr.write("".join(noise.read().decode("utf-8", "replace").splitlines(keepends=True)[-40:]))
             raise EngineError(f"{Path(whole[0]).name} ended with status {child.returncode} during {step}; "
                               "its last words stand above.")
-        raise FitFlareError(error)
+        raise Cancelled(error) if child.returncode == STOPPED else FitFlareError(error)
 
 
 def _relayed(child: subprocess.Popen[str], progress: Progress) -> tuple[dict[str, Any], str | None]:

@@ -36,11 +36,22 @@ class Renderer(Protocol):
 
 @dataclass(frozen=True)
 class BakeSettings:
-    """size: (width, height) in pixels, None for each camera's own. half: 16 bit floats. edits: see `edits`."""
+    """What the layers are to be.
 
-    size: tuple[int, int] | None = None
+    width, height: in pixels; without a height the frame's proportions are kept, without either its size.
+    half: 16 bit floats. edits: see `edits`.
+    """
+
+    width: int | None = None
+    height: int | None = None
     half: bool = True
     edits: tuple[str, ...] = ()
+
+    def scaled(self, camera: Camera) -> Camera:
+        """A frame's camera at the size asked for."""
+        if not self.width:
+            return camera
+        return camera.scaled(self.width, self.height or max(round(self.width * camera.height / camera.width), 1))
 
 
 def bake(renderer: Renderer, frames: Sequence[Frame], cameras: Mapping[str, Camera], out: Path | str,
@@ -55,7 +66,7 @@ def bake(renderer: Renderer, frames: Sequence[Frame], cameras: Mapping[str, Came
     settings, progress, out = settings or BakeSettings(), progress or Progress(), Path(out)
     factors = gains(settings.edits, renderer.lights)
     made_from = {"renderer": renderer.fingerprint, "half": settings.half, "edits": list(settings.edits),
-                 "size": list(settings.size) if settings.size else None}
+                 "size": [settings.width, settings.height]}
     record = _earlier(out, made_from, overwrite)
     record["layers"] = layer_names(renderer.lights)
     done = {entry["file"] for entry in record["frames"] if (out / entry["file"]).is_file()}
@@ -63,9 +74,7 @@ def bake(renderer: Renderer, frames: Sequence[Frame], cameras: Mapping[str, Came
     left = [frame for frame in frames if frame.file not in done]
     progress.stage("bake", len(frames), len(frames) - len(left))
     for frame in left:
-        camera = cameras[frame.view]
-        if settings.size:
-            camera = camera.scaled(*settings.size)
+        camera = settings.scaled(cameras[frame.view])
         layers = layers_of(renderer.render(camera), factors)
         write_layers(out / frame.file, layers, half=settings.half,
                      notes={"view": frame.view, "frame": frame.number, **made_from})

@@ -36,21 +36,20 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     capture = Capture.open(words.capture or made.capture_folder, need_frames=False)
     cameras = {view.name: view.camera for view in capture.views}
     frames = chosen(numbered(cameras), words.frames)
-    settings = BakeSettings(size(words.size, cameras[frames[0].view].size), not words.float, tuple(words.edits))
+    settings = BakeSettings(*size(words.size), half=not words.float, edits=tuple(words.edits))
     record = bake(made, frames, cameras, words.out, settings, progress, overwrite=words.overwrite)
     progress.say(f"{len(record['frames'])} frames of layers are in {words.out}.")
     return {"layers": str(words.out), "frames": len(record["frames"])}
 
 
-def size(text: str | None, frame: tuple[int, int]) -> tuple[int, int] | None:
-    """"960x540", or "960" with the height that keeps the frame's (width, height) in proportion."""
+def size(text: str | None) -> tuple[int | None, int | None]:
+    """"960x540" as (960, 540), "960" as (960, None), None as (None, None)."""
     if text is None:
-        return None
+        return None, None
     match = re.fullmatch(r"([1-9]\d{0,4})(?:x([1-9]\d{0,4}))?", text)
     if not match:
         raise SettingsError(f"--size {text} is not a width such as 960, or a size such as 960x540.")
-    width = int(match[1])
-    return width, int(match[2]) if match[2] else max(round(width * frame[1] / frame[0]), 1)
+    return int(match[1]), int(match[2]) if match[2] else None
 
 
 COMMAND = Command(

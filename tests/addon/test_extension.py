@@ -54,9 +54,12 @@ def test_the_package_holds_the_program_and_nothing_else(package: Path) -> None:
 
 def test_it_installs_and_registers(facts: Any) -> None:
     assert facts["enabled"]
-    assert facts["preferences"] == ""
     classes = {"FITFLARE_OT_set_up_compositor", "FITFLARE_PT_compositor", "FITFLARE_AP_preferences"}
     assert classes <= set(facts["classes"])
+
+
+def test_the_preferences_name_the_engine(facts: Any, blender: Blender) -> None:
+    assert facts["engine"] == ["", str(blender.python)]
 
 
 def test_its_button_works_and_refuses_in_words(facts: Any) -> None:

@@ -173,7 +173,7 @@ def test_frames_are_chosen_by_ranges() -> None:
 
 
 def test_bake_writes_every_frame_at_the_size_asked_for(tmp_path: Path) -> None:
-    record = bake(FakeRenderer(), FRAMES, CAMERAS, tmp_path, BakeSettings(size=(24, 16), edits=("lamp.intensity=2",)))
+    record = bake(FakeRenderer(), FRAMES, CAMERAS, tmp_path, BakeSettings(24, edits=("lamp.intensity=2",)))
     assert [entry["file"] for entry in record["frames"]] == [frame.file for frame in FRAMES]
     assert record == read_record(tmp_path)
     again = read_layers(tmp_path / FRAMES[0].file)

@@ -15,13 +15,17 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
 
-from core.bake.exr import read_layers
+from core.bake.exr import read_layers, write_layers
+from core.bake.layers import layers_of
+from core.capture import Capture
+from core.fit.run import Run
 from core.pictures import picture_size, read_picture, srgb_from_linear
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -115,6 +119,19 @@ def test_everything_is_there(finished: Ended, out: Path, capture: Path) -> None:
     assert scores["reference"] == "truth"
     assert {"composite", "scene", "flare", "flare_linear", "views"} <= set(scores)
     assert finished.result["scores"]["flare"] == scores["flare"]
+
+
+@pytest.mark.usefixtures("finished")
+@pytest.mark.parametrize("blend", ["over", "add"])
+def test_layers_add_up_to_the_fitted_picture(blend: Any, out: Path, capture: Path, tmp_path: Path) -> None:
+    """Whatever the fit puts together in display space, the linear layers sum to."""
+    made, camera = Run.open(out / "run"), Capture.open(capture).views[4].camera
+    made.settings = replace(made.settings, blend=blend)
+    write_layers(tmp_path / "a.exr", layers_of(made.render(camera)))
+    baked = read_layers(tmp_path / "a.exr")
+    shown = np.clip(srgb_from_linear(baked.scene + baked.flare), 0, 1)
+    np.testing.assert_allclose(shown, made.view(camera).composite.numpy(), atol=1e-3)
+    assert np.abs(baked.flare).max() > 0.01, "there is a flare to speak of"
 
 
 def assert_composited(out: Path) -> None:

@@ -143,12 +143,12 @@ def test_a_holdout_is_a_number_or_a_file(tmp_path: Path, monkeypatch: pytest.Mon
 
 
 def test_sizes() -> None:
-    assert bake.size(None, (480, 270)) is None
-    assert bake.size("960", (480, 270)) == (960, 540)
-    assert bake.size("100x30", (480, 270)) == (100, 30)
+    assert bake.size(None) == (None, None)
+    assert bake.size("960") == (960, None)
+    assert bake.size("100x30") == (100, 30)
     for text in ("0", "x", "12x", "-5", "1.5", "999999"):
         with pytest.raises(SettingsError):
-            bake.size(text, (480, 270))
+            bake.size(text)
 
 
 def test_reading_the_words_needs_numpy_alone() -> None:

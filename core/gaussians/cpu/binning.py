@@ -205,7 +205,6 @@ def scatter(counter, order, m, slots, firsts, counts, places, entries):  # type:
                 tile = word >> (2 * ROW_BITS)
                 place = places[part, tile]
                 places[part, tile] = place + 1
-                entries[place, GAUSSIAN] = i
-                entries[place, FIRST_ROW] = (word >> ROW_BITS) & ROW_MASK
-                entries[place, END_ROW] = (word & ROW_MASK) + 1
-                entries[place, SLOT] = slot
+                at = place * ENTRY
+                entries[at + GAUSSIAN], entries[at + SLOT] = i, slot
+                entries[at + FIRST_ROW], entries[at + END_ROW] = (word >> ROW_BITS) & ROW_MASK, (word & ROW_MASK) + 1

@@ -25,7 +25,7 @@ import math
 import numpy as np
 
 from .. import rendering
-from .binning import END_ROW, FIRST_ROW, GAUSSIAN, SLOT, TILE_HEIGHT, TILE_WIDTH
+from .binning import END_ROW, ENTRY, FIRST_ROW, GAUSSIAN, SLOT, TILE_HEIGHT, TILE_WIDTH
 from .compilation import inlined, kernel
 from .projection import (
     ALPHA_MIN,
@@ -57,6 +57,7 @@ from .projection import (
     X,
     Y,
 )
+from .raster_backward import ROW as ROW_BACKWARD
 from .raster_backward import STATE as STATE_BACKWARD
 from .raster_backward import V_BLUE, V_GREEN, V_RED, load_tile, row_gradient
 from .raster_forward import (
@@ -67,6 +68,7 @@ from .raster_forward import (
     ONE,
     PAUSE,
     RED_PLANE,
+    ROW,
     RUN,
     STATE,
     STEEP,
@@ -74,7 +76,7 @@ from .raster_forward import (
     blend_row,
     falloff,
     finished,
-    offsets,
+    needle_offsets,
     ratio,
     start_tile,
     write_tile,
@@ -83,6 +85,7 @@ from .vector import (
     LANES,
     exp2,
     fma,
+    get,
     lanes,
     load,
     maximum,
@@ -94,6 +97,7 @@ from .vector import (
     take_number,
     totals,
     where,
+    workspace,
 )
 
 # Places in a shape: ring and arc of a Gaussian. SHARP: s above; ARC: k.
@@ -225,14 +229,14 @@ def _add_plain(state, records, at, left, top, first, end):  # type: ignore[no-un
     rows = np.float32(min(end - first, RUN))
     if records[at + BEND] * rows * rows > STEEP:
         for row in range(first, end):
-            u, dy = offsets(records, at, left, top + row)
-            _add_row(state, row * LANES, falloff(major, minor, u, dy), red, green, blue)
+            u, dy = needle_offsets(records, at, left, top + row)
+            _add_row(state, row * ROW, falloff(records, at, u, dy), red, green, blue)
         return
     for run in range(first, end, RUN):
-        u, dy = offsets(records, at, left, top + run)
-        e, r = falloff(major, minor, u, dy), ratio(major, k, minor, u, dy)
+        u, dy = needle_offsets(records, at, left, top + run)
+        e, r = falloff(records, at, u, dy), ratio(records, at, u, dy)
         for row in range(run, min(run + RUN, end)):
-            _add_row(state, row * LANES, e, red, green, blue)
+            _add_row(state, row * ROW, e, red, green, blue)
             e = e * r
             r = r * step
 
@@ -244,14 +248,14 @@ def _draw_shaped(state, records, at, shapes, shape, left, top, first, end, arcs,
     red, green, blue = records[at + RED], records[at + GREEN], records[at + BLUE]
     dx = lanes() + (np.float32(left) + HALF - records[at + X])
     for row in range(first, end):
-        u, dy = offsets(records, at, left, top + row)
+        u, dy = needle_offsets(records, at, left, top + row)
         e = _ring(shapes, shape, _distance(records, at, u, dy)) * opacity
         if arcs:
             e = e * _window(shapes, shape, _angle(shapes, shape, dx, dy)[0])
         if add:
-            _add_row(state, row * LANES, e, red, green, blue)
+            _add_row(state, row * ROW, e, red, green, blue)
         else:
-            blend_row(state, row * LANES, e, red, green, blue, ZERO, False)
+            blend_row(state, row * ROW, e, records, at, False)
 
 
 @inlined
@@ -260,8 +264,8 @@ def _draw_tile(entries, begin, end, records, shapes, left, top, state, shaped, a
     for e in range(begin, end):
         if not add and (e - begin) & (PAUSE - 1) == PAUSE - 1 and finished(state):
             return e
-        i = entries[e, GAUSSIAN]
-        at, first, last = i * RECORD, entries[e, FIRST_ROW], entries[e, END_ROW]
+        i = get(entries, e * ENTRY + GAUSSIAN)
+        at, first, last = i * RECORD, get(entries, e * ENTRY + FIRST_ROW), get(entries, e * ENTRY + END_ROW)
         if shaped:
             _draw_shaped(state, records, at, shapes, i * SHAPE, left, top, first, last, arcs, add)
         else:
@@ -275,14 +279,14 @@ def raster(
 ):  # type: ignore[no-untyped-def]  # fmt: skip
     """Colour (h w 3) and alpha (h w), flat; ends (tiles,): where each tile stopped. shaped, arcs: whether
     rings (or arcs) are drawn, or plain Gaussians; these only where light adds."""
-    state = np.empty(STATE, np.float32)
+    state = workspace(STATE)
     while True:
         tile = take_number(counter)
         if tile >= ends.size:
             break
         left, top = (tile % tiles_x) * TILE_WIDTH, (tile // tiles_x) * TILE_HEIGHT
         begin, end = starts[tile], starts[tile + 1]
-        start_tile(state, left, top, width, height)
+        start_tile(state, ROW, left, top, width, height)
         if not shaped:
             end = _draw_tile(entries, begin, end, records, shapes, left, top, state, False, False, True)
         elif add:
@@ -332,14 +336,14 @@ def _plain_backward(state, records, at, left, top, first, end):  # type: ignore[
     rows = np.float32(min(end - first, RUN))
     steep = records[at + BEND] * rows * rows > STEEP
     for run in range(first, end, RUN):
-        u, dy = offsets(records, at, left, top + run)
-        e, r = falloff(major, minor, u, dy), ratio(major, k, minor, u, dy)
+        u, dy = needle_offsets(records, at, left, top + run)
+        e, r = falloff(records, at, u, dy), ratio(records, at, u, dy)
         for row in range(run, min(run + RUN, end)):
             if steep:
-                u, dy = offsets(records, at, left, top + row)
-                e = falloff(major, minor, u, dy)
-            g, w = _add_gradient(state, row * LANES, e, red, green, blue)
-            colours = _add_colours(state, row * LANES, w, colours)
+                u, dy = needle_offsets(records, at, left, top + row)
+                e = falloff(records, at, u, dy)
+            g, w = _add_gradient(state, row * ROW_BACKWARD, e, red, green, blue)
+            colours = _add_colours(state, row * ROW_BACKWARD, w, colours)
             moments = _add_moments(moments, g, u, dy)
             dy += ONE
             u = u + k
@@ -362,7 +366,7 @@ def _shaped_backward(state, records, at, shapes, shape, left, top, first, end, a
     moments, colours, mass = (zero, zero, zero, zero, zero), (zero, zero, zero), zero
     d_r0, d_w, arc_x, arc_y, d_theta, d_cos, d_k = zero, zero, zero, zero, zero, zero, zero
     for row in range(first, end):
-        u, dy = offsets(records, at, left, top + row)
+        u, dy = needle_offsets(records, at, left, top + row)
         r = _distance(records, at, u, dy)
         e = _ring(shapes, shape, r) * opacity
         cosine, sine, inverse, window = zero, zero, zero, zero
@@ -371,10 +375,10 @@ def _shaped_backward(state, records, at, shapes, shape, left, top, first, end, a
             window = _window(shapes, shape, cosine)
             e = e * window
         if add:
-            g, w = _add_gradient(state, row * LANES, e, red, green, blue)
+            g, w = _add_gradient(state, row * ROW_BACKWARD, e, red, green, blue)
         else:
-            g, w = row_gradient(state, row * LANES, e, red, green, blue, ZERO, False)
-        colours = _add_colours(state, row * LANES, w, colours)
+            g, w = row_gradient(state, row * ROW_BACKWARD, e, records, at, False)
+        colours = _add_colours(state, row * ROW_BACKWARD, w, colours)
         mass = mass + g
         z = r - r0
         gz = g * z
@@ -398,16 +402,16 @@ def _shaped_backward(state, records, at, shapes, shape, left, top, first, end, a
 @inlined
 def _tile_backward(entries, begin, used, end, records, shapes, left, top, state, shaped, arcs, add, gradients):  # type: ignore[no-untyped-def]
     for e in range(begin, used):
-        prefetch(gradients, entries[min(e + AHEAD, end - 1), SLOT] * RECORD)
-        i = entries[e, GAUSSIAN]
-        at, first, last = i * RECORD, entries[e, FIRST_ROW], entries[e, END_ROW]
+        prefetch(gradients, get(entries, min(e + AHEAD, end - 1) * ENTRY + SLOT) * RECORD)
+        i = get(entries, e * ENTRY + GAUSSIAN)
+        at, first, last = i * RECORD, get(entries, e * ENTRY + FIRST_ROW), get(entries, e * ENTRY + END_ROW)
         if shaped:
             row = _shaped_backward(state, records, at, shapes, i * SHAPE, left, top, first, last, arcs, add)
         else:
             row = _plain_backward(state, records, at, left, top, first, last)
-        store(gradients, entries[e, SLOT] * RECORD, row)
+        store(gradients, get(entries, e * ENTRY + SLOT) * RECORD, row)
     for e in range(used, end):
-        store(gradients, entries[e, SLOT] * RECORD, splat(ZERO))
+        store(gradients, get(entries, e * ENTRY + SLOT) * RECORD, splat(ZERO))
 
 
 @kernel
@@ -416,7 +420,7 @@ def raster_backward(
     image, alphas, d_image, d_alphas, gradients,
 ):  # type: ignore[no-untyped-def]  # fmt: skip
     """gradients: the row of each slot."""
-    state = np.empty(STATE_BACKWARD, np.float32)
+    state = workspace(STATE_BACKWARD)
     edge = np.zeros((6, 3 * LANES), np.float32)
     while True:
         tile = take_number(counter)

@@ -19,21 +19,21 @@ from __future__ import annotations
 
 import numpy as np
 
-from .binning import END_ROW, FIRST_ROW, GAUSSIAN, SLOT, TILE_HEIGHT, TILE_WIDTH
+from .binning import END_ROW, ENTRY, FIRST_ROW, GAUSSIAN, SLOT, TILE_HEIGHT, TILE_WIDTH
 from .compilation import inlined, kernel
-from .projection import ALPHA_MIN, BEND, BLUE, DEPTH, GREEN, OPACITY, RECORD, RED, STEP, A, D, K, X
+from .projection import ALPHA_MIN, BLUE, DEPTH, GREEN, OPACITY, RECORD, RED, STEP, A, D, K, X
 from .raster_forward import (
     AHEAD,
     DEPTH_ALPHA_MIN,
     HALF,
     ONE,
-    PLANE,
     RUN,
-    STEEP,
     T_MIN,
     T_PLANE,
     ZERO,
     falloff,
+    is_steep,
+    needle_offsets,
     offsets,
     ratio,
     start_tile,
@@ -42,19 +42,23 @@ from .vector import (
     LANES,
     deinterleave,
     fma,
+    get,
     lanes,
     load,
+    opaque,
     prefetch,
     splat,
     store,
     take_number,
     totals,
     where,
+    workspace,
 )
 
 # The state of a tile after T: what is left behind, and the gradients of the pixels.
-S_PLANE, V_RED, V_GREEN, V_BLUE, V_ALPHA, V_DEPTH = (i * PLANE for i in range(1, 7))
-STATE = 7 * PLANE
+S_PLANE, V_RED, V_GREEN, V_BLUE, V_ALPHA, V_DEPTH = (i * LANES for i in range(1, 7))
+ROW = 7 * LANES
+STATE = ROW * TILE_HEIGHT
 TWO = np.float32(2)
 
 
@@ -63,7 +67,7 @@ def _load_gradients(
     state, row, y, left, width, background, image, alphas, depths, d_image, d_alphas, d_depths, with_depth
 ):  # type: ignore[no-untyped-def]  # fmt: skip
     """One row of pixel gradients, and S before the first Gaussian, for pixels left .. left + 15."""
-    at, pixel = row * LANES, y * width + left
+    at, pixel = row * ROW, y * width + left
     colour = deinterleave((load(image, 3 * pixel), load(image, 3 * pixel + 16), load(image, 3 * pixel + 32)))
     v = deinterleave((load(d_image, 3 * pixel), load(d_image, 3 * pixel + 16), load(d_image, 3 * pixel + 32)))
     alpha = load(alphas, pixel)
@@ -86,16 +90,16 @@ def _load_gradients(
 
 
 @inlined
-def row_gradient(state, at, e, red, green, blue, depth, with_depth):  # type: ignore[no-untyped-def]
+def row_gradient(state, at, e, records, record, with_depth):  # type: ignore[no-untyped-def]
     """g and w of one row, and the state after it."""
     t, s = load(state, at + T_PLANE), load(state, at + S_PLANE)
     alpha = where((e >= ALPHA_MIN) & (t >= T_MIN), e, ZERO)
     w = t * alpha
-    vc = fma(load(state, at + V_RED), red, load(state, at + V_ALPHA))
-    vc = fma(load(state, at + V_GREEN), green, vc)
-    vc = fma(load(state, at + V_BLUE), blue, vc)
+    vc = fma(load(state, at + V_RED), get(records, record + RED), load(state, at + V_ALPHA))
+    vc = fma(load(state, at + V_GREEN), get(records, record + GREEN), vc)
+    vc = fma(load(state, at + V_BLUE), get(records, record + BLUE), vc)
     if with_depth:
-        vc = fma(load(state, at + V_DEPTH), depth, vc)
+        vc = fma(load(state, at + V_DEPTH), get(records, record + DEPTH), vc)
     wvc = w * vc
     s = s - wvc
     store(state, at + S_PLANE, s)
@@ -116,19 +120,19 @@ def _add_colours(state, at, w, sums, with_depth):  # type: ignore[no-untyped-def
 @inlined
 def _needle(state, records, at, left, top, first, end, with_depth):  # type: ignore[no-untyped-def]
     """Sums of g u, g d_y, g u², g u d_y, g d_y², g and colours, each row by its own exponential."""
-    major, minor, opacity = records[at + A], records[at + D], records[at + OPACITY]
-    red, green, blue, depth = records[at + RED], records[at + GREEN], records[at + BLUE], records[at + DEPTH]
     zero = splat(ZERO)
     m, mu, my, muu, muy, myy = zero, zero, zero, zero, zero, zero
     colours = (zero, zero, zero, zero)
-    for row in range(first, end):
-        u, dy = offsets(records, at, left, top + row)
-        e = falloff(major, minor, u, dy) * opacity
-        g, w = row_gradient(state, row * LANES, e, red, green, blue, depth, with_depth)
-        colours = _add_colours(state, row * LANES, w, colours, with_depth)
+    row, one = first, opaque(1)
+    while row < end:
+        u, dy = needle_offsets(records, at, left, top + row)
+        e = falloff(records, at, u, dy) * get(records, at + OPACITY)
+        g, w = row_gradient(state, row * ROW, e, records, at, with_depth)
+        colours = _add_colours(state, row * ROW, w, colours, with_depth)
         gu, gy = g * u, g * dy
         m, mu, my = m + g, mu + gu, my + gy
         muu, muy, myy = fma(gu, u, muu), fma(gu, dy, muy), fma(gy, dy, myy)
+        row += one
     return mu, my, muu, muy, myy, m, colours
 
 
@@ -139,25 +143,27 @@ def _ordinary(state, records, at, left, top, first, end, with_depth):  # type: i
     sum g u = d_x m0 + k m1,   sum g u d_y = d_x m1 + k m2,   sum g u² = d_x (d_x m0 + 2 k m1) + k² m2
     where m_i = sum g d_y^i.
     """
-    major, k, minor, opacity = records[at + A], records[at + K], records[at + D], records[at + OPACITY]
-    red, green, blue, depth = records[at + RED], records[at + GREEN], records[at + BLUE], records[at + DEPTH]
-    step = records[at + STEP]
+    k, step, one = get(records, at + K), get(records, at + STEP), opaque(1)
     zero = splat(ZERO)
     m0, m1, m2 = zero, zero, zero
     colours = (zero, zero, zero, zero)
-    for run in range(first, end, RUN):
+    run = first
+    while run < end:
         u, dy = offsets(records, at, left, top + run)
-        e = falloff(major, minor, u, dy) * opacity
-        r = ratio(major, k, minor, u, dy)
-        for row in range(run, min(run + RUN, end)):
-            g, w = row_gradient(state, row * LANES, e, red, green, blue, depth, with_depth)
-            colours = _add_colours(state, row * LANES, w, colours, with_depth)
+        e = falloff(records, at, u, dy) * get(records, at + OPACITY)
+        r = ratio(records, at, u, dy)
+        row, stop = run, min(run + RUN, end)
+        while row < stop:
+            g, w = row_gradient(state, row * ROW, e, records, at, with_depth)
+            colours = _add_colours(state, row * ROW, w, colours, with_depth)
             gy = g * dy
             m0, m1, m2 = m0 + g, m1 + gy, fma(gy, dy, m2)
             dy += ONE
             e = e * r
             r = r * step
-    dx = lanes() + (np.float32(left) + HALF - records[at + X])
+            row += one
+        run += RUN
+    dx = lanes() + (np.float32(left) + HALF - get(records, at + X))
     mu = fma(dx, m0, m1 * k)
     muy = fma(dx, m1, m2 * k)
     muu = fma(dx, fma(m1, k, mu), m2 * (k * k))
@@ -167,8 +173,7 @@ def _ordinary(state, records, at, left, top, first, end, with_depth):  # type: i
 @inlined
 def _gradient_row(state, records, at, left, top, first, end, with_depth):  # type: ignore[no-untyped-def]
     """The row of gradients (see `projection`) of one Gaussian in one tile."""
-    rows = np.float32(min(end - first, RUN))
-    if records[at + BEND] * rows * rows > STEEP:
+    if is_steep(records, at, first, end):
         mu, my, muu, muy, myy, m, colours = _needle(state, records, at, left, top, first, end, with_depth)
     else:
         mu, my, muu, muy, myy, m, colours = _ordinary(state, records, at, left, top, first, end, with_depth)
@@ -180,7 +185,7 @@ def load_tile(
     state, left, top, width, height, background, image, alphas, depths, d_image, d_alphas, d_depths, with_depth, edge
 ):  # type: ignore[no-untyped-def]  # fmt: skip
     """The state of a tile before its first Gaussian; edge: workspace for tiles that the picture's edge cuts."""
-    start_tile(state, left, top, width, height)
+    start_tile(state, ROW, left, top, width, height)
     for row in range(min(TILE_HEIGHT, height - top)):
         y = top + row
         if left + LANES <= width:
@@ -204,15 +209,14 @@ def load_tile(
 @inlined
 def _tile_backward(entries, begin, used, end, records, left, top, state, gradients, with_depth):  # type: ignore[no-untyped-def]
     for e in range(begin, used):
-        ahead = min(e + AHEAD, end - 1)
-        prefetch(records, entries[ahead, GAUSSIAN] * RECORD)
-        prefetch(gradients, entries[ahead, SLOT] * RECORD)
-        at = entries[e, GAUSSIAN] * RECORD
-        first, last = entries[e, FIRST_ROW], entries[e, END_ROW]
-        row = _gradient_row(state, records, at, left, top, first, last, with_depth)
-        store(gradients, entries[e, SLOT] * RECORD, row)
+        ahead = min(e + AHEAD, end - 1) * ENTRY
+        prefetch(records, get(entries, ahead + GAUSSIAN) * RECORD)
+        prefetch(gradients, get(entries, ahead + SLOT) * RECORD)
+        at, slot = get(entries, e * ENTRY + GAUSSIAN) * RECORD, get(entries, e * ENTRY + SLOT)
+        first, last = get(entries, e * ENTRY + FIRST_ROW), get(entries, e * ENTRY + END_ROW)
+        store(gradients, slot * RECORD, _gradient_row(state, records, at, left, top, first, last, with_depth))
     for e in range(used, end):
-        store(gradients, entries[e, SLOT] * RECORD, splat(ZERO))
+        store(gradients, get(entries, e * ENTRY + SLOT) * RECORD, splat(ZERO))
 
 
 @kernel
@@ -221,7 +225,7 @@ def raster_backward(
     d_image, d_alphas, d_depths, gradients,
 ):  # type: ignore[no-untyped-def]  # fmt: skip
     """gradients: the row of each slot. d_depths may be empty."""
-    state = np.empty(STATE, np.float32)
+    state = workspace(STATE)
     edge = np.zeros((6, 3 * LANES), np.float32)
     with_depth = d_depths.size > 0
     while True:

@@ -71,6 +71,6 @@ def bin_gaussians(
     starts = np.empty(grid.tiles + 1, np.int64)
     parallel(binning.count, order, m, slots, firsts, counts, numbers)
     binning.deal(numbers, starts)
-    entries = buffers.empty((int(starts[-1]), binning.ENTRY), np.int32)
+    entries = buffers.empty(int(starts[-1]) * binning.ENTRY, np.int32)
     parallel(binning.scatter, order, m, slots, firsts, counts, numbers, entries)
     return Bins(entries, starts, firsts, counts, room)

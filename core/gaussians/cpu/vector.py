@@ -23,6 +23,8 @@ from numba.extending import intrinsic, lower_builtin, models, register_model
 from .compilation import inlined
 
 LANES = 16
+LINE = 64
+"""Bytes of a cache line, and of a vector."""
 
 
 class Vector(types.Type):
@@ -164,6 +166,49 @@ def load(typing_context, array, index):  # type: ignore[no-untyped-def]  # noqa:
         return builder.load(builder.bitcast(address, _LLVM[kind.kind].as_pointer()), align=4)
 
     return kind(array, types.int64), emit
+
+
+@intrinsic
+def get(typing_context, array, index):  # type: ignore[no-untyped-def]  # noqa: ARG001
+    """One value at a flat index >= 0 of a contiguous array (array[index] would look for negative ones first)."""
+
+    def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
+        return builder.load(_address(context, builder, sig.args[0], *args))
+
+    return array.dtype(array, types.int64), emit
+
+
+@intrinsic
+def opaque(typing_context, number):  # type: ignore[no-untyped-def]  # noqa: ARG001
+    """The same int64, which LLVM cannot know: a loop by such a step is not unrolled into several, each of
+    which would have an end for the processor to guess."""
+
+    def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:  # noqa: ARG001
+        of = ir.FunctionType(args[0].type, [args[0].type])
+        return builder.call(ir.InlineAsm(of, "", "=r,0"), args)
+
+    return types.int64(types.int64), emit
+
+
+@intrinsic
+def _misalignment(typing_context, array):  # type: ignore[no-untyped-def]  # noqa: ARG001
+    """Elements of 4 bytes between an array's start and the next cache line."""
+
+    def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
+        word = ir.IntType(64)
+        address = _address(context, builder, sig.args[0], args[0], ir.Constant(word, 0))
+        address = builder.neg(builder.ptrtoint(address, word))
+        return builder.lshr(builder.and_(address, ir.Constant(word, LINE - 1)), ir.Constant(word, 2))
+
+    return types.int64(array), emit
+
+
+@inlined
+def workspace(size):  # type: ignore[no-untyped-def]
+    """An array of undefined float32 that starts at a cache line: vectors across two lines take twice the time."""
+    array = np.empty(size + LANES, np.float32)
+    first = _misalignment(array)
+    return array[first : first + size]
 
 
 @intrinsic
@@ -395,8 +440,27 @@ def _pack(context: Any, builder: ir.IRBuilder, values: Sequence[ir.Value]) -> ir
 
 def _halves(builder: ir.IRBuilder, a: ir.Value, b: ir.Value, step: int) -> tuple[ir.Value, ir.Value]:
     """Of each group of 2 * step lanes, the lower halves of a and b side by side, and the upper ones."""
-    low = [(i & ~(2 * step - 1)) + (i & (step - 1)) + (LANES if i & step else 0) for i in range(LANES)]
+    count = a.type.count
+    low = [(i & ~(2 * step - 1)) + (i & (step - 1)) + (count if i & step else 0) for i in range(count)]
     return _shuffle(builder, a, b, low), _shuffle(builder, a, b, [i + step for i in low])
+
+
+def _eight_sums(builder: ir.IRBuilder, vectors: Sequence[ir.Value]) -> ir.Value:
+    """Up to 8 vectors of 16 lanes to 8 lanes with their sums: a transposition that adds at each step."""
+    low, high = range(LANES // 2), range(LANES // 2, LANES)
+    level: list[ir.Value | None] = [
+        builder.fadd(_shuffle(builder, v, None, low), _shuffle(builder, v, None, high)) for v in vectors
+    ]
+    level += [None] * (LANES // 2 - len(level))
+    for step in (4, 2, 1):
+        half = len(level) // 2
+        following: list[ir.Value | None] = []
+        for a, b in zip(level[:half], level[half:], strict=True):
+            if a is not None:
+                a = builder.fadd(*_halves(builder, a, ir.Constant(a.type, ir.Undefined) if b is None else b, step))
+            following.append(a)
+        level = following
+    return level[0]
 
 
 @intrinsic
@@ -414,27 +478,13 @@ def total(typing_context, a):  # type: ignore[no-untyped-def]  # noqa: ARG001
 
 @intrinsic
 def totals(typing_context, vectors):  # type: ignore[no-untyped-def]  # noqa: ARG001
-    """A vector of the sums of up to 16 vectors, in their order (further lanes: undefined).
-
-    All at once, as a transposition that adds at each of its four steps.
-    """
-    count = len(vectors)
+    """A vector of the sums of up to 16 vectors, in their order (further lanes: undefined)."""
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:  # noqa: ARG001
-        level: list[ir.Value | None] = [builder.extract_value(args[0], i) for i in range(count)]
-        level += [None] * (LANES - count)
-        # After the step of 8, lane 8 j + i sums vector j (of a pair); after 4, quads of lanes belong to four.
-        for step in (8, 4, 2, 1):
-            half = len(level) // 2
-            following: list[ir.Value | None] = []
-            for a, b in zip(level[:half], level[half:], strict=True):
-                if a is None:
-                    following.append(None)
-                    continue
-                low, high = _halves(builder, a, ir.Constant(a.type, ir.Undefined) if b is None else b, step)
-                following.append(builder.fadd(low, high))
-            level = following
-        return level[0]
+        values = [builder.extract_value(args[0], i) for i in range(len(vectors))]
+        low = _eight_sums(builder, values[:8])
+        high = _eight_sums(builder, values[8:]) if len(values) > 8 else ir.Constant(low.type, ir.Undefined)
+        return _shuffle(builder, low, high, range(LANES))
 
     return FLOATS(vectors), emit
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -37,11 +37,13 @@ class Adam:
     parameters  by name; the objects stay the same, whatever happens to their rows
     rates       one for all, or by name; a float, or a tensor of the shape of one row. `self.rates` may be
                 changed between steps; a name that is missing there does not move
+    kernels     "torch" leaves the fused CPU kernel unused
     """
 
     def __init__(
         self, parameters: Mapping[str, Parameter], rates: Rate | Mapping[str, Rate],
         *, betas: tuple[float, float] = (0.9, 0.999), epsilon: float = 1e-15,
+        kernels: Literal["auto", "torch"] = "auto",
     ) -> None:  # fmt: skip
         self.parameters = dict(parameters)
         self.rates: dict[str, Rate] = (
@@ -51,6 +53,7 @@ class Adam:
             raise SettingsError(f"There is no parameter {min(unknown)!r} to give a learning rate to.")
         self.betas = betas
         self.epsilon = epsilon
+        self.kernels = kernels
         self.moments = {name: _zeros(p) for name, p in self.parameters.items()}
         self.steps = dict.fromkeys(self.parameters, 0)
 
@@ -64,7 +67,7 @@ class Adam:
             self.steps[name] += 1
             moments = self.moments[name]
             data = parameter.data
-            cpu = fused(data) if data.is_contiguous() else None
+            cpu = fused(data) if self.kernels == "auto" and data.is_contiguous() else None
             advance = adam_step if cpu is None else cpu.adam_step
             advance(
                 data, parameter.grad.contiguous(), moments.first, moments.second, step=self.steps[name],

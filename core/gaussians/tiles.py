@@ -1,42 +1,23 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The picture of `reference.py` in torch, tile by tile, with analytic gradients: for machines without a
-faster kernel set.
+"""Tiles drawn in torch, with analytic gradients: for machines without a faster kernel set.
 
-The frame is cut into tiles; each has the list of the Gaussians that reach it, front to back (`bin_tiles`).
 Tiles whose lists are about as long are worked on together, a chunk of their lists at a time, as tensors of
-tiles x pixels x entries. A Gaussian enters whitened: with covariance = M M^T, M lower triangular, and
-W = M^-1, the squared Mahalanobis distance is u² + v², (u, v) = W d, which loses far fewer digits on needles
-than the quadratic form; u and v are matrix products of the pixels with the Gaussians. Geometry per Gaussian
-is in double precision where there is any, for the same reason.
-
-Backward goes through the lists in the same order. With g_i = dL/dcolour . values_i, transmittance T_i before
-entry i and S_i = sum_{j > i} alpha_j T_j g_j, which is what is left of the whole sum:
-
-    dL/dalpha_i = T_i g_i - S_i / (1 - alpha_i)
+tiles x pixels x entries; (u, v) of `tiled.py` are matrix products of the pixels with the Gaussians.
 """
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from functools import partial
+from typing import Any
 
 import torch
 from torch import Tensor
 from torch.nn.functional import logsigmoid, threshold
 
-from .projection import camera_position, determinants, half_sizes, project, visible_radii
+from . import tiled
 from .reference import RADIUS_MIN
-from .rendering import (
-    ALPHA_MIN,
-    ARC_APEX,
-    OPACITY_MAX,
-    PROFILE_MIN,
-    TRANSMITTANCE_MIN,
-    Rendering,
-    Splats,
-    extent,
-    record_gradient,
-)
-from .spherical_harmonics import colours as colours_of
+from .rendering import ALPHA_MIN, ARC_APEX, OPACITY_MAX, PROFILE_MIN, TRANSMITTANCE_MIN
+from .tiled import Gaussians, Lists
 
 TILE = 8
 CHUNK = 128
@@ -45,80 +26,6 @@ GROUP = 32
 """Tiles at a time; with the above, what bounds the memory: half a dozen tensors of 1 MiB."""
 AFTER_MIN = TRANSMITTANCE_MIN * (1 - OPACITY_MAX) / 2
 """Below the transmittance behind anything that counts."""
-MARGIN = 1e-3
-"""By how much lists reach further than the last contribution, so that rounding cannot lose one."""
-
-
-class Lists(NamedTuple):
-    """Gaussians of each tile. entries (m,) row numbers, tile by tile, in row order; starts (tiles + 1,) where
-    each tile's begin; columns and rows: of tiles."""
-
-    entries: Tensor
-    starts: Tensor
-    columns: int
-    rows: int
-
-
-class Gaussians(NamedTuple):
-    """What is drawn. places (n, 5): centres x, y and whitening W xx, yx, yy; values (n, 1 + c): peaks, and what
-    is blended (where light adds, peaks are 1 and opacity is in the values); rings; arcs."""
-
-    places: Tensor
-    values: Tensor
-    rings: Tensor | None
-    arcs: Tensor | None
-
-
-def whitening(covariances: Tensor) -> Tensor:
-    """(n, 3) elements xx, yx, yy of the inverse Cholesky factors of (n, 3) covariances."""
-    xx, xy, yy = covariances.unbind(-1)
-    w_xx = xx.rsqrt()
-    w_yy = (yy - xy * xy / xx).rsqrt()
-    return torch.stack([w_xx, -xy / xx * w_yy, w_yy], -1)
-
-
-@torch.no_grad()
-def bin_tiles(centres: Tensor, whitening: Tensor, half: Tensor, radii: Tensor, width: int, height: int) -> Lists:
-    """Lists of the tiles that the ellipses of Mahalanobis radius `radii` (n,), inside boxes of half size
-    `half` (n, 2) px, touch."""
-    columns, rows = -(-width // TILE), -(-height // TILE)
-    grid = torch.tensor([columns, rows], device=centres.device)
-    low = ((centres - half) / TILE).floor().clamp(min=-1, max=2**30).long().clamp(min=0)
-    high = ((centres + half) / TILE).floor().clamp(min=-1, max=2**30).long()
-    high = torch.minimum(high, grid - 1)
-    span = (high - low + 1).clamp(min=0) * (radii > 0)[:, None]
-    counts = span.prod(-1)
-
-    # One entry for each tile of each box, then without those that the ellipse inside the box misses.
-    entries = torch.repeat_interleave(counts)
-    number = torch.arange(len(entries), device=centres.device) - (counts.cumsum(0) - counts)[entries]
-    across = span[entries, 0]
-    x, y = low[entries, 0] + number % across, low[entries, 1] + number // across
-    near = _nearest(centres[entries], whitening[entries], torch.stack([x, y], -1) * TILE)
-    hit = near <= (radii * (1 + MARGIN) + MARGIN)[entries] ** 2
-    tiles, entries = (y * columns + x)[hit], entries[hit]
-
-    order = torch.argsort(tiles, stable=True)
-    starts = torch.searchsorted(tiles[order], torch.arange(columns * rows + 1, device=centres.device))
-    return Lists(entries[order], starts, columns, rows)
-
-
-def _nearest(centres: Tensor, whitening: Tensor, corners: Tensor) -> Tensor:
-    """(m,) least squared Mahalanobis distance to tiles with these upper left corners: at the centre if that
-    is inside, else on one of the two edges that face it."""
-    low = corners - centres
-    high = low + TILE
-    bx, by = torch.zeros_like(low).clamp(low, high).unbind(-1)
-    w_xx, w_yx, w_yy = whitening.unbind(-1)
-    slope = w_yx / w_yy  # v = w_yy (dy + slope dx)
-
-    def distance(dx: Tensor, dy: Tensor) -> Tensor:
-        return (w_xx * dx) ** 2 + (w_yy * dy + w_yx * dx) ** 2
-
-    on_vertical = distance(bx, (-slope * bx).clamp(low[:, 1], high[:, 1]))
-    a = w_xx**2 + w_yx**2
-    on_horizontal = distance((-w_yx * w_yy * by / a).clamp(low[:, 0], high[:, 0]), by)
-    return torch.minimum(on_vertical, on_horizontal)
 
 
 def _pixels(like: Tensor) -> Tensor:
@@ -221,8 +128,7 @@ def _with_nothing(drawn: Gaussians) -> Gaussians:
 
 
 class _Draw(torch.autograd.Function):
-    """Pictures of tiles, (tiles, TILE², c), sums of the values by their weights; and the row of `drawn` at
-    which transmittance falls below 1/2, or -1, (tiles, TILE²), if `median`."""
+    """See `tiled.Draw`."""
 
     @staticmethod
     def forward(ctx: Any, lists: Lists, blend: str, median: bool, *parts: Tensor | None) -> Any:
@@ -305,87 +211,10 @@ def _half_lost(before: Tensor, after: Tensor, index: Tensor) -> Tensor:
     return torch.where(crosses, index.gather(1, place.clamp(max=index.shape[1] - 1)), -1)
 
 
-def _draw(
-    centres: Tensor, covariances: Tensor, radii: Tensor, peaks: Tensor, values: Tensor, width: int, height: int,
-    *, blend: str, median: bool = False, rings: Tensor | None = None, arcs: Tensor | None = None,
-) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """(height, width, c) sums of the values (n, c), weighted; and (height, width) rows, see `_Draw`."""
-    white = whitening(covariances)
-    lists = bin_tiles(centres, white, half_sizes(covariances, radii), radii, width, height)
-    places = torch.cat([centres, white], -1)
-    picture, halves = _Draw.apply(
-        lists, blend, median, places, torch.cat([peaks[:, None], values], -1), rings, arcs
-    )
-    shape = (lists.rows, lists.columns, TILE, TILE)
-    picture = picture.reshape(*shape, -1).transpose(1, 2).reshape(lists.rows * TILE, lists.columns * TILE, -1)
-    halves = halves.reshape(shape).transpose(1, 2).reshape(lists.rows * TILE, lists.columns * TILE)
-    return picture[:height, :width], halves[:height, :width]
+def draw(lists: Lists, blend: str, median: bool, drawn: Gaussians) -> tuple[Tensor, Tensor]:
+    """See `tiled.Draw`."""
+    return _Draw.apply(lists, blend, median, *drawn)
 
 
-def _geometry(tensor: Tensor) -> Tensor:
-    """In double precision, where the device has it."""
-    return tensor if tensor.device.type == "mps" else tensor.double()
-
-
-def rasterize_scene(
-    means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, sh: Tensor,
-    world_to_camera: Tensor, intrinsics: Tensor, width: int, height: int,
-    *, background: Tensor | None, sh_degree: int, near: float, dilation: float,
-) -> Rendering:  # fmt: skip
-    """See `rasterization`."""
-    dtype = means.dtype
-    seen = project(
-        _geometry(means), _geometry(quats), _geometry(scales), _geometry(world_to_camera),
-        _geometry(intrinsics), width, height, near, dilation,
-    )  # fmt: skip
-    with torch.no_grad():
-        reach = extent(opacities[seen.indices].clamp(max=OPACITY_MAX))
-        visible = visible_radii(seen.centres, seen.covariances, reach, width, height)
-        order = torch.argsort(seen.depths, stable=True)
-        order = order[visible[order] > 0]
-        all_centres = torch.zeros_like(means[:, :2]).index_copy_(0, seen.indices, seen.centres.to(dtype))
-        radii = torch.zeros_like(means[:, 0]).index_copy_(0, seen.indices, visible.to(dtype))
-    index, centres, covariances, depths = (part[order] for part in seen)
-    depths = depths.to(dtype)
-    colours = colours_of((means - camera_position(world_to_camera))[index], sh[index], sh_degree)
-    values = torch.cat([colours, depths[:, None], torch.ones_like(depths)[:, None]], -1)
-
-    gradients = record_gradient(centres, index, len(means))
-
-    peaks = opacities[index].clamp(max=OPACITY_MAX)
-    picture, halves = _draw(
-        centres, covariances, reach[order], peaks, values, width, height, blend="over", median=True
-    )
-    alpha = picture[..., 4]
-    colour = picture[..., :3]
-    if background is not None:
-        colour = colour + (1 - alpha)[..., None] * background
-    depth = picture[..., 3] / alpha.clamp(min=ALPHA_MIN / 2)
-    median_depth = torch.cat([depths, depths.new_zeros(1)]).detach()[halves]
-    return Rendering(colour, alpha, depth, median_depth, all_centres, radii, gradients)
-
-
-def splat(
-    centres: Tensor, covariances: Tensor, opacities: Tensor, colours: Tensor, width: int, height: int,
-    *, rings: Tensor | None, arcs: Tensor | None, blend: str,
-) -> Splats:  # fmt: skip
-    """See `splat` of the package; full resolution."""
-    centres, covariances = _geometry(centres), _geometry(covariances)
-    index = torch.nonzero(determinants(covariances) > 0)[:, 0]
-    centres, covariances, opacities, colours = (
-        part[index] for part in (centres, covariances, opacities, colours)
-    )
-    rings, arcs = (None if part is None else part[index] for part in (rings, arcs))
-    if blend == "over":
-        peaks = opacities.clamp(max=OPACITY_MAX)
-    else:
-        peaks = torch.ones_like(opacities)
-        colours = opacities[:, None] * colours
-    with torch.no_grad():
-        reach = extent(peaks, blend, rings)
-    values = torch.cat([colours, torch.ones_like(colours[:, :1])], -1)
-    picture, _ = _draw(
-        centres, covariances, reach, peaks, values, width, height, blend=blend, rings=rings, arcs=arcs
-    )
-    alpha = picture[..., 3]
-    return Splats(picture[..., :3], 1 - alpha if blend == "over" else torch.ones_like(alpha))
+rasterize_scene = partial(tiled.rasterize_scene, draw, TILE)
+splat = partial(tiled.splat, draw, TILE)

@@ -1,0 +1,244 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Tiles drawn by NVIDIA Warp, which compiles these kernels where they run, with a compiler of its own.
+
+One thread for each pixel, one block for each tile: all threads of a block read the same Gaussian at the same
+time. In the backward pass a block sums each gradient over its pixels before it adds it to memory. The order of
+those last additions is not fixed on a GPU: gradients of one picture differ by rounding from run to run.
+
+On Warp's CPU device, which has a thread and blocks of one, the same kernels can be tested without a GPU.
+"""
+# Kernels are written in Warp's language, not Python's: no static types, and no postponed annotations.
+# mypy: ignore-errors
+import functools
+import logging
+from typing import Any
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from . import rendering
+from .reference import RADIUS_MIN
+from .tiled import Gaussians, Lists
+
+wp.config.log_level = logging.WARNING
+wp.init()
+
+TILE = 16
+BLOCK = TILE * TILE
+PLACES, SHAPES = 5, 5
+"""Columns of a Gaussian's place (centre and whitening) and of its shape (ring and arc)."""
+
+_Place = wp.types.vector(length=PLACES, dtype=wp.float32)
+_Shape = wp.types.vector(length=SHAPES, dtype=wp.float32)
+_ALPHA_MIN = wp.constant(rendering.ALPHA_MIN)
+_PROFILE_MIN = wp.constant(rendering.PROFILE_MIN)
+_TRANSMITTANCE_MIN = wp.constant(rendering.TRANSMITTANCE_MIN)
+_APEX2 = wp.constant(rendering.ARC_APEX**2)
+_RADIUS2_MIN = wp.constant(RADIUS_MIN**2)
+_CHECK = wp.constant(32)
+"""Entries between two looks at whether all pixels of a tile are finished."""
+
+
+@wp.func
+def _window(shape: _Shape, cosine: float) -> float:
+    return 1.0 / (1.0 + wp.exp(-shape[4] * (cosine - shape[3])))
+
+
+@wp.func
+def _profile(dx: float, dy: float, place: _Place, shape: _Shape, rings: bool, arcs: bool) -> float:
+    """G of `reference.py` at the offset dx, dy."""
+    u = place[2] * dx
+    v = place[3] * dx + place[4] * dy
+    q = u * u + v * v
+    g = wp.exp(-0.5 * q)
+    if rings:
+        t = (wp.sqrt(wp.max(q, _RADIUS2_MIN)) - shape[0]) / shape[1]
+        g = wp.exp(-0.5 * t * t)
+    if arcs:
+        cosine = (dx * wp.cos(shape[2]) + dy * wp.sin(shape[2])) / wp.sqrt(dx * dx + dy * dy + _APEX2)
+        g = g * _window(shape, cosine)
+    return g
+
+
+@functools.cache
+def _kernels(channels: int) -> tuple[Any, Any]:
+    """Forward and backward for pictures of so many channels."""
+    Values = wp.types.vector(length=channels, dtype=wp.float32)
+    Gradients = wp.types.vector(length=1 + channels + PLACES + SHAPES, dtype=wp.float32)
+    VALUES, PLACE, SHAPE = 1, 1 + channels, 1 + channels + PLACES  # where they begin in Gradients
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def forward(
+        entries: wp.array(dtype=wp.int32), starts: wp.array(dtype=wp.int32), columns: int,
+        places: wp.array(dtype=_Place), peaks: wp.array(dtype=wp.float32), values: wp.array(dtype=Values),
+        shapes: wp.array(dtype=_Shape), rings: bool, arcs: bool, add: bool,
+        picture: wp.array(dtype=Values), halves: wp.array(dtype=wp.int32),
+    ):  # fmt: skip
+        i = wp.tid()
+        tile, pixel = i // BLOCK, i % BLOCK
+        x = float((tile % columns) * TILE + pixel % TILE) + 0.5
+        y = float((tile // columns) * TILE + pixel // TILE) + 0.5
+        total = Values()
+        transmittance = wp.float32(1.0)
+        half = wp.int32(-1)
+        for j in range(starts[tile], starts[tile + 1]):
+            row = entries[j]
+            place = places[row]
+            g = _profile(x - place[0], y - place[1], place, shapes[row], rings, arcs)
+            if add:
+                if g >= _PROFILE_MIN:
+                    total += g * values[row]
+            else:
+                alpha = peaks[row] * g
+                if alpha >= _ALPHA_MIN:
+                    total += alpha * transmittance * values[row]
+                    if transmittance >= 0.5 and transmittance * (1.0 - alpha) < 0.5:
+                        half = row
+                    transmittance *= 1.0 - alpha
+                    if transmittance < _TRANSMITTANCE_MIN:
+                        break
+        picture[i] = total
+        halves[i] = half
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def backward(
+        entries: wp.array(dtype=wp.int32), starts: wp.array(dtype=wp.int32), columns: int,
+        places: wp.array(dtype=_Place), peaks: wp.array(dtype=wp.float32), values: wp.array(dtype=Values),
+        shapes: wp.array(dtype=_Shape), rings: bool, arcs: bool, add: bool,
+        picture: wp.array(dtype=Values), upstream: wp.array(dtype=Values), sums: wp.array(dtype=Gradients),
+    ):  # fmt: skip
+        i = wp.tid()
+        tile, pixel = i // BLOCK, i % BLOCK
+        x = float((tile % columns) * TILE + pixel % TILE) + 0.5
+        y = float((tile // columns) * TILE + pixel // TILE) + 0.5
+        above = upstream[i]
+        left = float(wp.dot(above, picture[i]))  # of the sum, behind the entry
+        transmittance = wp.float32(1.0)
+        start = starts[tile]
+        # Every thread of a block goes through the whole loop: they sum together.
+        for j in range(start, starts[tile + 1]):
+            if (j - start) % _CHECK == _CHECK - 1:
+                alive = wp.where(transmittance >= _TRANSMITTANCE_MIN, 1.0, 0.0)
+                if wp.tile_extract(wp.tile_sum(wp.tile(alive)), 0) == 0.0:
+                    break
+            row = entries[j]
+            place, shape = places[row], shapes[row]
+            dx, dy = x - place[0], y - place[1]
+            g = _profile(dx, dy, place, shape, rings, arcs)
+            seen = wp.dot(above, values[row])
+            weight = wp.float32(0.0)
+            h = wp.float32(0.0)  # dL/dlog g
+            d_peak = wp.float32(0.0)
+            if add:
+                if g >= _PROFILE_MIN:
+                    weight = g
+                    h = g * seen
+            else:
+                alpha = peaks[row] * g
+                if alpha >= _ALPHA_MIN and transmittance >= _TRANSMITTANCE_MIN:
+                    weight = alpha * transmittance
+                    left -= weight * seen
+                    h = weight * seen - left * alpha / (1.0 - alpha)
+                    d_peak = h / peaks[row]
+                    transmittance *= 1.0 - alpha
+            found = Gradients()
+            found[0] = d_peak
+            for c in range(channels):
+                found[VALUES + c] = weight * above[c]
+            u = place[2] * dx
+            v = place[3] * dx + place[4] * dy
+            pull = float(h)  # -2 dL/dq
+            if rings:
+                r = wp.sqrt(wp.max(u * u + v * v, _RADIUS2_MIN))
+                t = (r - shape[0]) / shape[1]
+                found[SHAPE] = h * t / shape[1]
+                found[SHAPE + 1] = found[SHAPE] * t
+                pull = found[SHAPE] / r
+            pull_u, pull_v = pull * u, pull * v
+            d_cx = place[2] * pull_u + place[3] * pull_v
+            d_cy = place[4] * pull_v
+            if arcs:
+                cos, sin = wp.cos(shape[2]), wp.sin(shape[2])
+                per_distance = 1.0 / wp.sqrt(dx * dx + dy * dy + _APEX2)
+                cosine = (dx * cos + dy * sin) * per_distance
+                d_angle = h * (1.0 - _window(shape, cosine))
+                d_cosine = d_angle * shape[4] * per_distance
+                found[SHAPE + 2] = d_cosine * (dy * cos - dx * sin)
+                found[SHAPE + 3] = -d_angle * shape[4]
+                found[SHAPE + 4] = d_angle * (cosine - shape[3])
+                d_cx -= d_cosine * (cos - cosine * per_distance * dx)
+                d_cy -= d_cosine * (sin - cosine * per_distance * dy)
+            found[PLACE] = d_cx
+            found[PLACE + 1] = d_cy
+            found[PLACE + 2] = -pull_u * dx
+            found[PLACE + 3] = -pull_v * dx
+            found[PLACE + 4] = -pull_v * dy
+            wp.tile_atomic_add(sums, wp.tile_sum(wp.tile(found, preserve_type=True)), offset=(row,))
+
+    return forward, backward
+
+
+class _Draw(torch.autograd.Function):
+    """See `tiled.Draw`."""
+
+    @staticmethod
+    def forward(ctx: Any, lists: Lists, blend: str, *parts: Tensor | None) -> Any:
+        ctx.lists, ctx.blend = lists, blend
+        _, values, _, _ = parts
+        assert values is not None
+        channels = values.shape[1] - 1
+        picture = values.new_empty(lists.rows * lists.columns, BLOCK, channels)
+        halves = torch.empty(picture.shape[:2], dtype=torch.int32, device=picture.device)
+        _launch(
+            _kernels(channels)[0], lists, blend, parts, [_rows(picture.view(-1, channels)), _rows(halves.view(-1))]
+        )
+        ctx.save_for_backward(picture, *parts)
+        ctx.mark_non_differentiable(halves)
+        return picture, halves
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor, _: Tensor) -> Any:
+        picture, *parts = ctx.saved_tensors
+        places, values, rings, arcs = parts
+        channels = values.shape[1] - 1
+        sums = values.new_zeros(len(values), 1 + channels + PLACES + SHAPES)
+        arrays = [_rows(part.contiguous().view(-1, channels)) for part in (picture, gradient)]
+        _launch(_kernels(channels)[1], ctx.lists, ctx.blend, parts, [*arrays, _rows(sums)])
+        d_values, d_places, d_rings, d_arcs = sums.split([1 + channels, PLACES, 2, 3], 1)
+        return (
+            None, None, d_places.to(places.dtype), d_values,
+            None if rings is None else d_rings, None if arcs is None else d_arcs,
+        )  # fmt: skip
+
+
+def _rows(tensor: Tensor) -> Any:
+    """A Warp array of a tensor's rows, without a copy."""
+    if tensor.ndim == 1:
+        return wp.from_torch(tensor.detach(), requires_grad=False)
+    kind = wp.types.vector(length=tensor.shape[1], dtype=wp.float32)
+    return wp.from_torch(tensor.detach(), dtype=kind, requires_grad=False)
+
+
+def _launch(kernel: Any, lists: Lists, blend: str, parts: Any, more: list[Any]) -> None:
+    places, values, rings, arcs = parts
+    shapes = values.new_zeros(len(values), SHAPES)
+    if rings is not None:
+        shapes[:, :2] = rings
+    if arcs is not None:
+        shapes[:, 2:] = arcs
+    device = wp.device_from_torch(values.device)
+    inputs = [
+        _rows(lists.entries.int()), _rows(lists.starts.int()), lists.columns,
+        _rows(places.float().contiguous()), _rows(values[:, 0].contiguous()), _rows(values[:, 1:].contiguous()),
+        _rows(shapes), rings is not None, arcs is not None, blend == "add", *more,
+    ]  # fmt: skip
+    stream = wp.stream_from_torch(values.device) if device.is_cuda else None
+    wp.launch(
+        kernel, dim=lists.rows * lists.columns * BLOCK, inputs=inputs, device=device, stream=stream, block_dim=BLOCK
+    )
+
+
+def draw(lists: Lists, blend: str, median: bool, drawn: Gaussians) -> tuple[Tensor, Tensor]:  # noqa: ARG001
+    """See `tiled.Draw`."""
+    return _Draw.apply(lists, blend, *drawn)

@@ -1,0 +1,79 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""lights.json, and what a hand has changed in it.
+
+    {"lights": [{"name": "light1", "xyz": [x, y, z], "colour": [r, g, b], "support": 36, "views": 60,
+                 "residual_px": 0.6, "uncertainty": 0.006, "far": false, "how": "triangulated"}],
+     "found": [[x, y, z], ...]}
+
+`found` remembers the places an earlier run wrote. With `keep`, entries stay as they are, whatever was renamed,
+moved or added; a light found again is not added twice, and one that was found before and is gone from the
+list was taken out by hand and stays out.
+"""
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..capture import read_lights
+from ..capture.camera import Camera
+from ..errors import CaptureError
+from ..files import read_json, write_json
+from .gather import FoundLight
+
+NEAR = 0.02  # of the frame's diagonal: projections nearer than this are one light
+
+
+def write_lights(path: Path, found: Sequence[FoundLight], views: Sequence[tuple[str, Camera]],
+                 keep: bool = False) -> list[dict[str, Any]]:
+    """Write lights.json and return its entries. `keep`: see the module's head.
+
+    Raises CaptureError where an existing file is to be kept and cannot be read.
+    """
+    entries: list[dict[str, Any]] = []
+    found_before: list[Any] = []
+    if keep and path.exists():
+        read_lights(path)  # checks it
+        data = read_json(path, CaptureError)
+        entries = list(data["lights"])
+        found_before = data.get("found", [])
+        if not all(isinstance(xyz, list) and len(xyz) == 3 for xyz in found_before):
+            raise CaptureError(f"{path}: found should be a list of places; remove that entry.")
+    known = [*(entry["xyz"] for entry in entries), *found_before]
+    for light in found:
+        if any(_one(light.xyz, xyz, views) for xyz in known):
+            continue
+        entries.append(_entry(light, _free_name({entry["name"] for entry in entries})))
+    places = [[round(float(x), 6) for x in light.xyz] for light in found]
+    places += [xyz for xyz in found_before if not any(_one(place, xyz, views) for place in places)]
+    write_json(path, {"lights": entries, "found": places})
+    return entries
+
+
+def _entry(light: FoundLight, name: str) -> dict[str, Any]:
+    digits = 6 if not light.far else 3
+    return {"name": name, "xyz": [round(float(x), digits) for x in light.xyz],
+            "colour": [round(float(c), 3) for c in light.colour], "support": len(light.support),
+            "views": light.visible, "residual_px": round(light.residual, 3),
+            "uncertainty": round(light.uncertainty, 5), "far": light.far, "how": light.how}
+
+
+def _free_name(taken: set[str]) -> str:
+    number = 1
+    while f"light{number}" in taken:
+        number += 1
+    return f"light{number}"
+
+
+def _one(xyz: Any, other: Any, views: Sequence[tuple[str, Camera]]) -> bool:
+    """Whether two places fall on one spot in most views that have either in frame."""
+    together = apart = 0
+    for _, camera in views:
+        pixels, depth = camera.project([xyz, other])
+        if camera.contains(pixels, depth).any():
+            near = (depth > 0).all() and np.linalg.norm(pixels[0] - pixels[1]) < NEAR * np.hypot(*camera.size)
+            together += bool(near)
+            apart += not near
+    return together > apart

@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Lights from a fitted scene, the paper's way (section "Light Positions"): detections are lifted on to scene
+Gaussians, those are clustered, and each cluster's centroid is a light.
+
+A Gaussian belongs to a light if, of the views that see it, enough have it inside a detection. Hidden ones do
+not count: in each view only what lies near the front of its cell of a coarse depth buffer is seen.
+"""
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..capture.camera import Camera, Floats
+from .detection import Detection, union
+from .gather import FoundLight
+
+CELLS = 120      # of the depth buffer along the frame's long side
+IN_FRONT = 1.05  # of the nearest depth in a cell still counts as its front
+OPAQUE = 0.3     # opacity below which a Gaussian hides nothing and is no part of a light
+REACH = 0.03     # extents between neighbours of one cluster
+MOST = 4000      # Gaussians clustered, those with the most views first
+
+
+def lift(views: Sequence[tuple[str, Camera]], detections: Sequence[Sequence[Detection]], means: ArrayLike,
+         opacities: ArrayLike, extent: float, min_views: int = 3, share: float = 0.3) -> list[FoundLight]:
+    """Lights from detections of each view and scene Gaussians: means (n, 3), opacities (n,) in 0..1.
+
+    `share` of the views that see a Gaussian must have it inside a detection.
+    """
+    xyz, opacity = np.asarray(means, np.float64), np.asarray(opacities, np.float64)
+    xyz, opacity = xyz[opacity > OPAQUE], opacity[opacity > OPAQUE]
+    inside, seen = np.zeros(len(xyz), np.int64), np.zeros(len(xyz), np.int64)
+    for (_, camera), some in zip(views, detections, strict=True):
+        pixels, depth = camera.project(xyz)
+        front = _front(camera, pixels, depth)
+        seen[front] += 1
+        if some:
+            mask = union(some, camera.size)
+            column, row = np.minimum(pixels[front].astype(int), np.array(camera.size) - 1).T
+            inside[front[mask[row, column]]] += 1
+    chosen = np.flatnonzero((inside >= min_views) & (inside >= share * np.maximum(seen, 1)))
+    chosen = chosen[np.argsort(-inside[chosen], kind="stable")][:MOST]
+    found = []
+    for members in _clusters(xyz[chosen], REACH * extent):
+        worth = (inside * opacity)[chosen[members]]
+        centre = (xyz[chosen[members]] * worth[:, None]).sum(axis=0) / worth.sum()
+        spread = float(np.sqrt((((xyz[chosen[members]] - centre) ** 2).sum(axis=1) * worth).sum() / worth.sum()))
+        light = _light(centre, spread, views, detections)
+        if len(light.support) >= min_views:
+            found.append(light)
+    return sorted(found, key=lambda light: -len(light.support))
+
+
+def _front(camera: Camera, pixels: Floats, depth: Floats) -> NDArray[np.int64]:
+    """Indices of the points in frame that nothing hides."""
+    index = np.flatnonzero(camera.contains(pixels, depth))
+    size = max(camera.size) / CELLS
+    column, row = (pixels[index] / size).astype(int).T
+    cell = row * (CELLS + 1) + column
+    nearest = np.full((CELLS + 1) ** 2, np.inf)
+    np.minimum.at(nearest, cell, depth[index])
+    return index[depth[index] <= IN_FRONT * nearest[cell]]
+
+
+def _clusters(xyz: Floats, reach: float) -> list[NDArray[np.int64]]:
+    """Index sets of points linked by steps shorter than `reach`, three points or more."""
+    open_ = np.ones(len(xyz), bool)
+    found = []
+    while open_.any():
+        members = np.zeros(len(xyz), bool)
+        edge = np.flatnonzero(open_)[:1]
+        while len(edge):
+            members[edge] = True
+            open_[edge] = False
+            rest = np.flatnonzero(open_)
+            if not len(rest):
+                break
+            near = np.zeros(len(rest), bool)
+            for point in xyz[edge]:
+                near |= ((xyz[rest] - point) ** 2).sum(axis=1) < reach ** 2
+            edge = rest[near]
+        if members.sum() >= 3:
+            found.append(np.flatnonzero(members))
+    return found
+
+
+def _light(centre: Floats, spread: float, views: Sequence[tuple[str, Camera]],
+           detections: Sequence[Sequence[Detection]]) -> FoundLight:
+    """The light at a cluster's centroid, with the detections that it falls on."""
+    support, off, visible, used = [], [], 0, []
+    for (name, camera), some in zip(views, detections, strict=True):
+        pixels, depth = camera.project(centre[None])
+        if not camera.contains(pixels, depth)[0]:
+            continue
+        visible += 1
+        near = [(float(np.linalg.norm(one.xy - pixels[0])), one) for one in some]
+        near = [(gap, one) for gap, one in near if gap < one.radius + 0.006 * np.hypot(*camera.size)]
+        if near:
+            gap, one = min(near, key=lambda pair: pair[0])
+            support.append(name)
+            off.append(gap)
+            used.append((name, one))
+    colour = np.median([one.colour for _, one in used], axis=0) if used else np.ones(3)
+    return FoundLight(centre, False, tuple(support), visible, float(np.median(off)) if off else 0.0, spread,
+                      colour / max(float(colour.max()), 1e-6),
+                      float(np.median([one.radius for _, one in used])) if used else 0.0,
+                      how="lifted on to the scene", detections=tuple(used))

@@ -1,0 +1,74 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Pictures of what was found: every view small, detections ringed, lights marked where they fall."""
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..capture import Capture
+from ..pictures import write_png
+from .detection import Detection
+from .gather import FoundLight
+
+COLUMNS, ROWS, WIDE = 4, 5, 360
+PALETTE = ((1.0, 0.35, 0.2), (0.25, 0.75, 1.0), (1.0, 0.85, 0.1), (0.9, 0.35, 1.0), (0.35, 1.0, 0.6))
+RING = (0.4, 1.0, 0.3)
+
+
+def write_sheets(folder: Path, capture: Capture, detections: Sequence[Sequence[Detection]],
+                 lights: Sequence[tuple[str, FoundLight]]) -> list[Path]:
+    """Write sheet1.png, sheet2.png, ... of all views into `folder`; returns their paths.
+
+    A green ring is a detection; a cross with a name is a light's projection, thick where the view supports it. An
+    arrow at the edge points to a light out of frame.
+    """
+    for old in folder.glob("sheet*.png"):
+        old.unlink()
+    each = COLUMNS * ROWS
+    paths = []
+    for start in range(0, len(capture.views), each):
+        tiles = [_tile(capture, i, detections[i], lights)
+                 for i in range(start, min(start + each, len(capture.views)))]
+        height = max(tile.shape[0] for tile in tiles)
+        tiles = [np.pad(tile, ((0, height - tile.shape[0]), (0, 0), (0, 0))) for tile in tiles]
+        blank = np.zeros_like(tiles[0])
+        tiles += [blank] * (-len(tiles) % COLUMNS)
+        rows = [np.concatenate(tiles[i:i + COLUMNS], axis=1) for i in range(0, len(tiles), COLUMNS)]
+        path = folder / f"sheet{start // each + 1}.png"
+        write_png(path, np.concatenate(rows, axis=0))
+        paths.append(path)
+    return paths
+
+
+def _tile(capture: Capture, number: int, detections: Sequence[Detection],
+          lights: Sequence[tuple[str, FoundLight]]) -> NDArray[np.float32]:
+    import cv2
+
+    view = capture.views[number]
+    scale = WIDE / view.camera.width
+    size = (WIDE, round(view.camera.height * scale))
+    tile = np.ascontiguousarray(capture.frame(view).resized(*size).display())
+    for detection in detections:
+        at = tuple(int(x) for x in detection.xy * scale)
+        cv2.circle(tile, at, max(4, round(detection.radius * scale) + 3), RING, 1, cv2.LINE_AA)
+    for i, (name, light) in enumerate(lights):
+        colour = PALETTE[i % len(PALETTE)]
+        pixels, depth = view.camera.project(light.xyz[None])
+        x, y = pixels[0] * scale
+        if depth[0] <= 0:
+            continue
+        if 0 <= x < size[0] and 0 <= y < size[1]:
+            thick = 2 if view.name in light.support else 1
+            cv2.drawMarker(tile, (int(x), int(y)), colour, cv2.MARKER_CROSS, 14, thick, cv2.LINE_AA)
+            cv2.putText(tile, name, (int(x) + 9, int(y) - 5), cv2.FONT_HERSHEY_SIMPLEX, 0.4, colour, 1, cv2.LINE_AA)
+        else:
+            middle = np.array(size) / 2
+            away = np.array([x, y]) - middle
+            tip = middle + away * min((middle - 6) / np.maximum(np.abs(away), 1e-9))
+            tail = tip - 16 * away / np.linalg.norm(away)
+            cv2.arrowedLine(tile, tuple(map(int, tail)), tuple(map(int, tip)), colour, 1, cv2.LINE_AA, tipLength=0.4)
+    cv2.putText(tile, view.name, (4, size[1] - 5), cv2.FONT_HERSHEY_SIMPLEX, 0.35, (1.0, 1.0, 1.0), 1, cv2.LINE_AA)
+    return np.asarray(tile, np.float32)

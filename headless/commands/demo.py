@@ -10,7 +10,7 @@ from typing import Any
 from ...core.errors import CaptureError, RunError
 from ...core.progress import Progress
 from ..command import Command, Step
-from . import compose, evaluate
+from . import compose, evaluate, fit
 
 ROOT = Path(__file__).resolve().parents[2]
 SAMPLE = ROOT / "sample_scenes" / "desk"
@@ -23,6 +23,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
                         help="folder for everything (default build/demo in the repository)")
     parser.add_argument("--capture", type=Path, default=SAMPLE, metavar="CAPTURE",
                         help="another capture than the sample")
+    parser.add_argument("--model", choices=fit.MODELS, help="the flare's form, as of `fit`")
     parser.add_argument("--iterations", type=int, metavar="N", help="length of the fit (default: the preset's)")
     parser.add_argument("--preset", choices=("draft", "standard", "high"), default="draft",
                         help="how long and how fine (default draft)")
@@ -33,7 +34,8 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     from ...core.bake.bake import bake
     from ...core.bake.frames import numbered
     from ...core.capture import Capture
-    from ...core.fit import fit, preset
+    from ...core.fit import fit as fit_capture
+    from ...core.fit import preset
 
     if not words.capture.is_dir():
         raise CaptureError(f"There is no capture in {words.capture}; the sample comes with the repository, "
@@ -42,9 +44,10 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     capture, out = Capture.open(words.capture), words.out
     progress.say(f"{words.capture.name}: {len(capture.views)} frames, {len(capture.lights)} lights. "
                  f"{_supervision(capture)}")
-    settings = preset(words.preset, iterations=words.iterations)
+    given = {"model": words.model} if words.model else {}
+    settings = preset(words.preset, iterations=words.iterations, **given)
     _check_earlier(out / "run", settings, capture)
-    made = fit(capture, settings, out / "run", progress, resume=True)
+    made = fit_capture(capture, settings, out / "run", progress, resume=True)
     result = evaluate.scores_of(made.folder, progress)
     cameras = {view.name: view.camera for view in capture.views}
     bake(made, numbered(cameras), cameras, out / "layers", progress=progress, overwrite=True)

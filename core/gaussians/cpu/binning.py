@@ -84,7 +84,7 @@ def _list_gaussian(records, i, slot, width, height, tiles_x, slots):  # type: ig
 
 
 @kernel
-def list_tiles(counter, records, bounds, chunk_starts, width, height, tiles_x, slots, firsts, counts):  # type: ignore[no-untyped-def]
+def list_tiles(counter, scratch, records, bounds, chunk_starts, width, height, tiles_x, slots, firsts, counts):  # type: ignore[no-untyped-def]
     """slots: tile, first and last row of every pair of Gaussian and tile, in the Gaussians' order;
     those of Gaussian i are the counts[i] from firsts[i] on. chunk_starts: where each chunk may write."""
     n = bounds.size
@@ -104,11 +104,12 @@ def list_tiles(counter, records, bounds, chunk_starts, width, height, tiles_x, s
 
 
 @kernel
-def sort_by_depth(bits, counts, keys, spare_keys, order, spare_order):  # type: ignore[no-untyped-def]
+def sort_by_depth(bits, counts, places, keys, spare_keys, order, spare_order):  # type: ignore[no-untyped-def]
     """Writes to `order` the Gaussians that meet any tile, nearest first, and returns how many.
 
     bits: the records as uint32; depths are positive, so their bits sort as they do. Three passes of a radix
-    sort, stable, by digits as short as the range of the depths allows; the other arrays (n,) are its workspace.
+    sort, stable, by digits as short as the range of the depths allows; places (DIGITS, 2^11) and
+    the arrays (n,) are its workspace.
     """
     smallest, largest, m = np.uint32(0xFFFFFFFF), np.uint32(0), 0
     for i in range(counts.size):
@@ -125,7 +126,7 @@ def sort_by_depth(bits, counts, keys, spare_keys, order, spare_order):  # type: 
         length += 1
     digit = (length + DIGITS - 1) // DIGITS
     mask = (1 << digit) - 1
-    places = np.zeros((DIGITS, 1 << digit), np.int32)
+    places[:, : mask + 1] = 0
     for i in range(m):
         key = spare_keys[i] - smallest
         spare_keys[i] = key
@@ -160,7 +161,7 @@ def _part(order_size, parts, part):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def count(counter, order, m, slots, firsts, counts, numbers):  # type: ignore[no-untyped-def]
+def count(counter, scratch, order, m, slots, firsts, counts, numbers):  # type: ignore[no-untyped-def]
     """numbers (parts, tiles): how often each tile is met by each part of the sorted Gaussians."""
     parts = numbers.shape[0]
     while True:
@@ -190,7 +191,7 @@ def deal(numbers, starts):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def scatter(counter, order, m, slots, firsts, counts, places, entries):  # type: ignore[no-untyped-def]
+def scatter(counter, scratch, order, m, slots, firsts, counts, places, entries):  # type: ignore[no-untyped-def]
     """Writes the entries of all tiles, nearest first; places: from `deal`, used up."""
     parts = places.shape[0]
     while True:

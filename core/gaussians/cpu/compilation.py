@@ -18,8 +18,13 @@ from typing import Any
 
 import numba
 
-FLAGS = {"contract", "nsz"}
-"""Of fast-math, what changes no result by more than a rounding; no reordering, no assumptions on NaN."""
+OPTIONS: dict[str, Any] = {
+    # Division by zero gives infinity; products and sums may fuse; nothing is reordered.
+    "error_model": "numpy",
+    "fastmath": {"contract", "nsz"},
+    # Without reference counts, which would cost more than some loops do: kernels allocate nothing.
+    "_nrt": False,
+}
 
 
 def _user_folder() -> Path:
@@ -65,13 +70,11 @@ def kernel(function: Callable[..., Any]) -> Any:
     before = numba.config.CACHE_DIR
     numba.config.CACHE_DIR = str(CACHE_FOLDER)
     try:
-        return numba.njit(nogil=True, cache=True, error_model="numpy", fastmath=FLAGS)(function)
+        return numba.njit(nogil=True, cache=True, **OPTIONS)(function)
     finally:
         numba.config.CACHE_DIR = before
 
 
 def inlined(function: Callable[..., Any]) -> Any:
     """A part of a kernel, with a name of its own and no cost."""
-    return numba.njit(
-        forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy", fastmath=FLAGS
-    )(function)
+    return numba.njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, **OPTIONS)(function)

@@ -59,7 +59,7 @@ from .projection import (
 )
 from .raster_backward import ROW as ROW_BACKWARD
 from .raster_backward import STATE as STATE_BACKWARD
-from .raster_backward import V_BLUE, V_GREEN, V_RED, load_tile, row_gradient
+from .raster_backward import EDGE, SCRATCH, V_BLUE, V_GREEN, V_RED, load_tile, row_gradient
 from .raster_forward import (
     AHEAD,
     BLUE_PLANE,
@@ -70,7 +70,6 @@ from .raster_forward import (
     RED_PLANE,
     ROW,
     RUN,
-    STATE,
     STEEP,
     ZERO,
     blend_row,
@@ -97,7 +96,6 @@ from .vector import (
     take_number,
     totals,
     where,
-    workspace,
 )
 
 # Places in a shape: ring and arc of a Gaussian. SHARP: s above; ARC: k.
@@ -275,11 +273,11 @@ def _draw_tile(entries, begin, end, records, shapes, left, top, state, shaped, a
 
 @kernel
 def raster(
-    counter, entries, starts, records, shapes, background, width, height, tiles_x, shaped, arcs, add, image, alphas, ends
+    counter, state, entries, starts, records, shapes, background, width, height, tiles_x, shaped, arcs, add,
+    image, alphas, ends,
 ):  # type: ignore[no-untyped-def]  # fmt: skip
     """Colour (h w 3) and alpha (h w), flat; ends (tiles,): where each tile stopped. shaped, arcs: whether
     rings (or arcs) are drawn, or plain Gaussians; these only where light adds."""
-    state = workspace(STATE)
     while True:
         tile = take_number(counter)
         if tile >= ends.size:
@@ -416,12 +414,11 @@ def _tile_backward(entries, begin, used, end, records, shapes, left, top, state,
 
 @kernel
 def raster_backward(
-    counter, entries, starts, ends, records, shapes, background, width, height, tiles_x, shaped, arcs, add,
+    counter, scratch, entries, starts, ends, records, shapes, background, width, height, tiles_x, shaped, arcs, add,
     image, alphas, d_image, d_alphas, gradients,
 ):  # type: ignore[no-untyped-def]  # fmt: skip
     """gradients: the row of each slot."""
-    state = workspace(STATE_BACKWARD)
-    edge = np.zeros((6, 3 * LANES), np.float32)
+    state, edge = scratch[:STATE_BACKWARD], scratch[STATE_BACKWARD:SCRATCH].reshape(6, EDGE)
     while True:
         tile = take_number(counter)
         if tile >= ends.size:
@@ -451,11 +448,11 @@ def _add_rows(gradients, first, count, row):  # type: ignore[no-untyped-def]
 
 @kernel
 def finish(
-    covariances, opacities, colours, records, gradients, firsts, counts, add,
+    row, covariances, opacities, colours, gradients, firsts, counts, add,
     d_centres, d_covariances, d_opacities, d_colours, d_rings, d_arcs,
 ):  # type: ignore[no-untyped-def]  # fmt: skip
-    """Gradients of the inputs from the rows; see `projection` for the moments. d_rings, d_arcs may be empty."""
-    row = np.empty(RECORD, np.float32)
+    """Gradients of the inputs from the rows; see `projection` for the moments. d_rings, d_arcs may be empty.
+    row: workspace of 16."""
     for i in range(opacities.size):
         _add_rows(gradients, firsts[i], counts[i], row)
         xx, xy, yy = np.float64(covariances[3 * i]), np.float64(covariances[3 * i + 1]), np.float64(covariances[3 * i + 2])

@@ -29,7 +29,7 @@ from . import buffers
 from .compilation import inlined, kernel
 from .threads import parallel
 from .tiles import flat
-from .vector import LANES, absolute, fma, lanes, load, splat, store, take_number, where
+from .vector import LANES, absolute, fma, lanes, load, splat, store, take_number, total, where
 
 HALO = definition.WINDOW // 2
 PAD = 16  # at least 3 HALO zeros on both sides of a scratch row
@@ -60,7 +60,7 @@ def _rows_around(y, height):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _down_moments(x, y, row, at, length, height, scratch, out):  # type: ignore[no-untyped-def]
+def _down_moments(x, y, row, at, length, height, rows, out):  # type: ignore[no-untyped-def]
     """E[x], E[xx] and E[xy] down the columns, 16 of them, into the three scratch rows."""
     first, end = _rows_around(row, height)
     m, xx, xy = splat(ZERO), splat(ZERO), splat(ZERO)
@@ -70,9 +70,9 @@ def _down_moments(x, y, row, at, length, height, scratch, out):  # type: ignore[
         m = m + w
         xx = fma(w, a, xx)
         xy = fma(w, load(y, r * length + at), xy)
-    store(scratch[0], out, m)
-    store(scratch[1], out, xx)
-    store(scratch[2], out, xy)
+    store(rows[0], out, m)
+    store(rows[1], out, xx)
+    store(rows[2], out, xy)
 
 
 @inlined
@@ -89,11 +89,11 @@ def _similarity(mu, xx, xy, mu_y, s_y):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def compare(counter, x, y, mu_y, s_y, width, height, maps, sums):  # type: ignore[no-untyped-def]
+def compare(counter, scratch, x, y, mu_y, s_y, width, height, maps, sums):  # type: ignore[no-untyped-def]
     """maps (3, h, 3w): derivatives of S by the means; sums (h, 2): of |x - y| and of S, by row."""
     length = STEP * width
-    scratch = np.zeros((3, length + 2 * PAD), np.float32)
-    totals = np.empty((2, LANES), np.float32)
+    rows = scratch[: 3 * (length + 2 * PAD)].reshape(3, length + 2 * PAD)
+    rows[:, :] = ZERO
     while True:
         band = take_number(counter) * BAND
         if band >= height:
@@ -101,33 +101,28 @@ def compare(counter, x, y, mu_y, s_y, width, height, maps, sums):  # type: ignor
         for row in range(band, min(band + BAND, height)):
             for block in range(0, length, LANES):
                 at = min(block, length - LANES)
-                _down_moments(x, y, row, at, length, height, scratch, PAD + at)
+                _down_moments(x, y, row, at, length, height, rows, PAD + at)
             l1, similar = splat(ZERO), splat(ZERO)
             for block in range(0, length, LANES):
                 at = min(block, length - LANES)
                 fresh = lanes() >= np.float32(block - at)  # the last block overlaps the one before
                 i = row * length + at
-                mu, xx, xy = _along(scratch[0], PAD + at), _along(scratch[1], PAD + at), _along(scratch[2], PAD + at)
+                mu, xx, xy = _along(rows[0], PAD + at), _along(rows[1], PAD + at), _along(rows[2], PAD + at)
                 s, by_mu, by_xx, by_xy = _similarity(mu, xx, xy, load(mu_y, i), load(s_y, i))
                 store(maps[0], i, by_mu)
                 store(maps[1], i, by_xx)
                 store(maps[2], i, by_xy)
                 similar = similar + where(fresh, s, ZERO)
                 l1 = l1 + where(fresh, absolute(load(x, i) - load(y, i)), ZERO)
-            store(totals[0], 0, l1)
-            store(totals[1], 0, similar)
-            for k in range(2):
-                total = 0.0
-                for lane in range(LANES):
-                    total += totals[k, lane]
-                sums[row, k] = total
+            sums[row, 0], sums[row, 1] = total(l1), total(similar)
 
 
 @kernel
-def gradient(counter, x, y, maps, width, height, by_l1, by_similarity, out):  # type: ignore[no-untyped-def]
+def gradient(counter, scratch, x, y, maps, width, height, by_l1, by_similarity, out):  # type: ignore[no-untyped-def]
     """out = by_l1 sign(x - y) + by_similarity dS/dx."""
     length = STEP * width
-    scratch = np.zeros((3, length + 2 * PAD), np.float32)
+    rows = scratch[: 3 * (length + 2 * PAD)].reshape(3, length + 2 * PAD)
+    rows[:, :] = ZERO
     while True:
         band = take_number(counter) * BAND
         if band >= height:
@@ -142,24 +137,25 @@ def gradient(counter, x, y, maps, width, height, by_l1, by_similarity, out):  # 
                     a = fma(load(maps[0], r * length + at), weight, a)
                     b = fma(load(maps[1], r * length + at), weight, b)
                     c = fma(load(maps[2], r * length + at), weight, c)
-                store(scratch[0], PAD + at, a)
-                store(scratch[1], PAD + at, b)
-                store(scratch[2], PAD + at, c)
+                store(rows[0], PAD + at, a)
+                store(rows[1], PAD + at, b)
+                store(rows[2], PAD + at, c)
             for block in range(0, length, LANES):
                 at = min(block, length - LANES)
                 i = row * length + at
                 vx, vy = load(x, i), load(y, i)
-                g = fma(vx * TWO, _along(scratch[1], PAD + at), _along(scratch[0], PAD + at))
-                g = fma(vy, _along(scratch[2], PAD + at), g) * by_similarity
+                g = fma(vx * TWO, _along(rows[1], PAD + at), _along(rows[0], PAD + at))
+                g = fma(vy, _along(rows[2], PAD + at), g) * by_similarity
                 sign = where(vx > vy, splat(by_l1), where(vx < vy, splat(-by_l1), ZERO))
                 store(out, i, g + sign)
 
 
 @kernel
-def describe(counter, y, width, height, mu_y, s_y):  # type: ignore[no-untyped-def]
+def describe(counter, scratch, y, width, height, mu_y, s_y):  # type: ignore[no-untyped-def]
     """The target's part: means and variances."""
     length = STEP * width
-    scratch = np.zeros((3, length + 2 * PAD), np.float32)
+    rows = scratch[: 3 * (length + 2 * PAD)].reshape(3, length + 2 * PAD)
+    rows[:, :] = ZERO
     while True:
         band = take_number(counter) * BAND
         if band >= height:
@@ -167,12 +163,16 @@ def describe(counter, y, width, height, mu_y, s_y):  # type: ignore[no-untyped-d
         for row in range(band, min(band + BAND, height)):
             for block in range(0, length, LANES):
                 at = min(block, length - LANES)
-                _down_moments(y, y, row, at, length, height, scratch, PAD + at)
+                _down_moments(y, y, row, at, length, height, rows, PAD + at)
             for block in range(0, length, LANES):
                 at = min(block, length - LANES)
-                mu = _along(scratch[0], PAD + at)
+                mu = _along(rows[0], PAD + at)
                 store(mu_y, row * length + at, mu)
-                store(s_y, row * length + at, _along(scratch[1], PAD + at) - mu * mu)
+                store(s_y, row * length + at, _along(rows[1], PAD + at) - mu * mu)
+
+
+def _scratch_size(width: int) -> int:
+    return 3 * (STEP * width + 2 * PAD)
 
 
 class _Described:
@@ -189,7 +189,7 @@ class _Described:
         if known is None or known[0]() is not target or known[1] != target._version:
             height, width, _ = target.shape
             described = np.empty((2, target.numel()), np.float32)
-            parallel(describe, flat(target), width, height, described[0], described[1])
+            parallel(describe, flat(target), width, height, *described, scratch=_scratch_size(width))
             known = (weakref.ref(target, lambda _: self._known.pop(key, None)), target._version, described)
         self._known[key] = known  # the latest is last
         room = self.LIMIT
@@ -210,12 +210,12 @@ class _L1Ssim(torch.autograd.Function):
         mu_y, s_y = _described(target)
         x, y = flat(image), flat(target)
         maps, sums = buffers.empty((3, x.size)), np.empty((height, 2))
-        parallel(compare, x, y, mu_y, s_y, width, height, maps, sums)
+        parallel(compare, x, y, mu_y, s_y, width, height, maps, sums, scratch=_scratch_size(width))
         l1, similarity = sums.sum(0) / x.size
         if ctx.needs_input_grad[0]:
             d_image = buffers.empty_tensor(tuple(image.shape))
             scales = np.float32(lam / x.size), np.float32((lam - 1) / x.size)
-            parallel(gradient, x, y, maps, width, height, *scales, flat(d_image))
+            parallel(gradient, x, y, maps, width, height, *scales, flat(d_image), scratch=_scratch_size(width))
             ctx.save_for_backward(d_image)
         return image.new_tensor(lam * l1 + (1 - lam) * (1 - similarity))
 

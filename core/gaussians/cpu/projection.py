@@ -61,6 +61,9 @@ CAMERA = 25
 # Sums over Gaussians for the camera's gradient: rotation 0..8, translation 9..11, fx fy cx cy, then
 POSITION_SUM, CAMERA_SUMS = 16, 32
 
+TURNED = harmonics.ROWS * LANES
+SCRATCH = 2 * TURNED + RECORD * LANES + CAMERA_SUMS * LANES
+
 CHUNK = 1024
 """Gaussians to a piece of work."""
 TILE_WIDTH, TILE_HEIGHT = LANES, 32
@@ -286,13 +289,12 @@ def _store2(array, first, x, y):  # type: ignore[no-untyped-def]
 
 @kernel
 def project(
-    counter, means, quats, scales, opacities, sh, sh_width, degree, camera, width, height,
+    counter, turned, means, quats, scales, opacities, sh, sh_width, degree, camera, width, height,
     records, centres, radii, bounds, chunk_bounds,
 ):  # type: ignore[no-untyped-def]  # fmt: skip
     """Writes a record, the centre, the radius and a bound on the number of tiles for each of n >= 16 Gaussians;
     chunk_bounds: the sums of the bounds over chunks."""
     n = opacities.size
-    turned = np.empty(harmonics.ROWS * LANES, np.float32)
     while True:
         chunk = take_number(counter)
         start, end = chunk * CHUNK, min(chunk * CHUNK + CHUNK, n)
@@ -448,7 +450,7 @@ def _project_block_backward(
 
 @kernel
 def project_backward(
-    counter, means, quats, scales, opacities, sh, sh_width, degree, camera, records, gradients, slots, counts,
+    counter, scratch, means, quats, scales, opacities, sh, sh_width, degree, camera, records, gradients, slots, counts,
     d_means, d_quats, d_scales, d_opacities, d_sh, d_centres, d_camera, with_camera,
 ):  # type: ignore[no-untyped-def]  # fmt: skip
     """Gradients of all inputs from the rasterizer's rows.
@@ -457,17 +459,16 @@ def project_backward(
     slots[i] on. d_camera: sums of each chunk, (chunks, CAMERA_SUMS), if with_camera.
     """
     n = opacities.size
-    turned = np.empty(harmonics.ROWS * LANES, np.float32)
-    turned_out = np.empty(harmonics.ROWS * LANES, np.float32)
-    rows = np.empty(LANES * LANES, np.float32)
-    sums = np.empty(CAMERA_SUMS * LANES, np.float32)
+    turned, turned_out = scratch[:TURNED], scratch[TURNED : 2 * TURNED]
+    rows, sums = scratch[2 * TURNED : 2 * TURNED + RECORD * LANES], scratch[2 * TURNED + RECORD * LANES : SCRATCH]
     while True:
         chunk = take_number(counter)
         start, end = chunk * CHUNK, min(chunk * CHUNK + CHUNK, n)
         if start >= n:
             break
         if with_camera:
-            sums[:] = ZERO
+            for i in range(0, CAMERA_SUMS * LANES, LANES):
+                store(sums, i, splat(ZERO))
         for block in range(start, end, LANES):
             first = min(block, n - LANES)
             fields = _gathered(gradients, slots, counts, first, rows)

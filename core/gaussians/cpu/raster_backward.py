@@ -52,13 +52,14 @@ from .vector import (
     take_number,
     totals,
     where,
-    workspace,
 )
 
 # The state of a tile after T: what is left behind, and the gradients of the pixels.
 S_PLANE, V_RED, V_GREEN, V_BLUE, V_ALPHA, V_DEPTH = (i * LANES for i in range(1, 7))
 ROW = 7 * LANES
 STATE = ROW * TILE_HEIGHT
+EDGE = 3 * LANES
+SCRATCH = STATE + 6 * EDGE
 TWO = np.float32(2)
 
 
@@ -221,12 +222,11 @@ def _tile_backward(entries, begin, used, end, records, left, top, state, gradien
 
 @kernel
 def raster_backward(
-    counter, entries, starts, ends, records, background, width, height, tiles_x, image, alphas, depths,
+    counter, scratch, entries, starts, ends, records, background, width, height, tiles_x, image, alphas, depths,
     d_image, d_alphas, d_depths, gradients,
 ):  # type: ignore[no-untyped-def]  # fmt: skip
     """gradients: the row of each slot. d_depths may be empty."""
-    state = workspace(STATE)
-    edge = np.zeros((6, 3 * LANES), np.float32)
+    state, edge = scratch[:STATE], scratch[STATE:SCRATCH].reshape(6, EDGE)
     with_depth = d_depths.size > 0
     while True:
         tile = take_number(counter)

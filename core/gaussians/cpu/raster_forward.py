@@ -35,7 +35,6 @@ from .vector import (
     store_rows,
     take_number,
     where,
-    workspace,
 )
 
 T_MIN = np.float32(rendering.TRANSMITTANCE_MIN)
@@ -97,7 +96,10 @@ def is_steep(records, at, first, end):  # type: ignore[no-untyped-def]
 @inlined
 def start_tile(state, row_length, left, top, width, height):  # type: ignore[no-untyped-def]
     """Transmittance 1 in the picture and 0 outside, where nothing needs to be done."""
-    state[:] = ZERO
+    at, line = 0, opaque(LANES)
+    while at < row_length * TILE_HEIGHT:
+        store(state, at, splat(ZERO))
+        at += line
     x = lanes() + np.float32(left)
     inside = where(x < np.float32(width), splat(ONE), ZERO)
     row, one = 0, opaque(1)
@@ -224,13 +226,12 @@ def _raster_tile(entries, begin, end, records, left, top, state, with_depth):  #
 
 @kernel
 def raster(
-    counter, entries, starts, records, background, width, height, tiles_x, image, alphas, depths, medians, ends
+    counter, state, entries, starts, records, background, width, height, tiles_x, image, alphas, depths, medians, ends
 ):  # type: ignore[no-untyped-def]  # fmt: skip
     """Colour (h w 3) and alpha (h w), flat; expected and median depth too unless `depths` is empty.
 
     ends (tiles,): where each tile stopped.
     """
-    state = workspace(STATE)
     with_depth = depths.size > 0
     while True:
         tile = take_number(counter)

@@ -90,6 +90,7 @@ class _Rasterize(torch.autograd.Function):
         parallel(
             raster_backward.raster_backward, bins.entries, bins.starts, ctx.ends, records.reshape(-1), ctx.behind, w, h,
             frame.tiles_x, flat(image), flat(alpha), flat(depth), v_image, v_alpha, v_depth, rows.reshape(-1),
+            scratch=raster_backward.SCRATCH,
         )  # fmt: skip
         inputs = (means, quats, scales, opacities, sh)
         gradients = [buffers.empty_tensor(tuple(t.shape)) for t in inputs]
@@ -99,7 +100,7 @@ class _Rasterize(torch.autograd.Function):
         parallel(
             projection.project_backward, *(flat(t) for t in inputs), sh.shape[1] * 3, frame.sh_degree, ctx.camera,
             records.reshape(-1), rows.reshape(-1), bins.firsts, bins.counts, *(flat(t) for t in gradients),
-            flat(d_centres), sums, with_camera,
+            flat(d_centres), sums, with_camera, scratch=projection.SCRATCH,
         )  # fmt: skip
         ctx.centre_gradients.add_(d_centres)
         d_world_to_camera, d_intrinsics = _camera_gradients(sums, ctx.camera) if with_camera else (None, None)

@@ -69,16 +69,17 @@ class _Splat(torch.autograd.Function):
         if shaped or add:
             parallel(
                 flare.raster_backward, *tiles, shapes, BLACK, w, h, grid.tiles_x, shaped, arcs is not None, add,
-                *pictures, v_image, v_alpha, rows,
+                *pictures, v_image, v_alpha, rows, scratch=raster_backward.SCRATCH,
             )  # fmt: skip
         else:
             parallel(
                 raster_backward.raster_backward, *tiles, BLACK, w, h, grid.tiles_x, *pictures, EMPTY,
-                v_image, v_alpha, EMPTY, rows,
+                v_image, v_alpha, EMPTY, rows, scratch=raster_backward.SCRATCH,
             )  # fmt: skip
         gradients = [None if t is None else torch.empty(t.shape) for t in inputs]
         flare.finish(
-            flat(covariances), flat(opacities), flat(colours), records.reshape(-1), rows, bins.firsts, bins.counts, add,
+            np.empty(projection.RECORD, np.float32), flat(covariances), flat(opacities), flat(colours), rows,
+            bins.firsts, bins.counts, add,
             *(EMPTY if t is None else flat(t) for t in gradients),
         )  # fmt: skip
         return (*gradients, None, None)

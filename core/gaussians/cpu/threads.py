@@ -16,17 +16,34 @@ from typing import Any
 import numpy as np
 import torch
 
+from . import buffers
+
+
+class _Scratch(threading.local):
+    """Memory of a thread for its kernels, at the start of a cache line: vectors across two take twice the time."""
+
+    def __init__(self) -> None:
+        self._array = buffers.empty(1 << 12)
+
+    def __call__(self, size: int) -> np.ndarray:
+        if self._array.size < size:
+            self._array = buffers.empty(size)
+        return self._array
+
+
+_scratch = _Scratch()
+
 
 class _Worker:
     """A thread that waits for a call, makes it, and waits for the next."""
 
     def __init__(self, number: int) -> None:
-        self._calls: SimpleQueue[tuple[Callable[..., Any], tuple[Any, ...]]] = SimpleQueue()
+        self._calls: SimpleQueue[tuple[Callable[..., Any], int, tuple[Any, ...]]] = SimpleQueue()
         self._results: SimpleQueue[BaseException | None] = SimpleQueue()
         threading.Thread(target=self._run, name=f"kernels-{number}", daemon=True).start()
 
-    def start(self, function: Callable[..., Any], arguments: tuple[Any, ...]) -> None:
-        self._calls.put((function, arguments))
+    def start(self, function: Callable[..., Any], scratch: int, arguments: tuple[Any, ...]) -> None:
+        self._calls.put((function, scratch, arguments))
 
     def wait(self) -> BaseException | None:
         return self._results.get()
@@ -34,26 +51,27 @@ class _Worker:
     def _run(self) -> None:
         torch.set_flush_denormal(True)  # a register of the thread
         while True:
-            function, arguments = self._calls.get()
+            function, scratch, (counter, *arguments) = self._calls.get()
             try:
-                function(*arguments)
+                function(counter, _scratch(scratch), *arguments)
             except BaseException as error:
                 self._results.put(error)
             else:
                 self._results.put(None)
-            del function, arguments
+            del function, counter, arguments
 
 
 _idle: list[_Worker] = []
 
 
-def parallel(function: Callable[..., Any], *arguments: Any, limit: int | None = None) -> None:
-    """Calls function(counter, *arguments) on every thread, at most `limit` of them, and waits for all.
+def parallel(function: Callable[..., Any], *arguments: Any, scratch: int = 0, limit: int | None = None) -> None:
+    """Calls function(counter, scratch, *arguments) on every thread, on at most `limit` of them, and waits for all.
 
-    counter: an int64 array of one element, 0, the same for all threads.
+    counter: an int64 array of one element, 0, the same for all threads. scratch: float32, at least of this size,
+    one for each thread.
     """
     count = torch.get_num_threads() if limit is None else max(1, min(limit, torch.get_num_threads()))
-    call = (np.zeros(1, np.int64), *arguments)
+    counter = np.zeros(1, np.int64)
     if not getattr(function, "signatures", True):  # compile here, not on all threads at once
         count = 1
     workers = []
@@ -63,9 +81,9 @@ def parallel(function: Callable[..., Any], *arguments: Any, limit: int | None = 
         except IndexError:
             workers.append(_Worker(number))
     for worker in workers:
-        worker.start(function, call)
+        worker.start(function, scratch, (counter, *arguments))
     try:
-        function(*call)
+        function(counter, _scratch(scratch), *arguments)
     finally:
         errors = [worker.wait() for worker in workers]
         _idle.extend(workers)

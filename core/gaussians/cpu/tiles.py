@@ -62,8 +62,9 @@ def bin_gaussians(
     )  # fmt: skip
     if by_depth:
         keys, spare_keys = buffers.empty(n, np.uint32), buffers.empty(n, np.uint32)
+        places = buffers.empty((binning.DIGITS, 1 << 11), np.int32)
         order, spare_order = buffers.empty(n, np.int32), buffers.empty(n, np.int32)
-        m = binning.sort_by_depth(flat_records.view(np.uint32), counts, keys, spare_keys, order, spare_order)
+        m = binning.sort_by_depth(flat_records.view(np.uint32), counts, places, keys, spare_keys, order, spare_order)
     else:
         order = np.flatnonzero(counts).astype(np.int32)
         m = len(order)

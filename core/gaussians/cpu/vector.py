@@ -23,8 +23,6 @@ from numba.extending import intrinsic, lower_builtin, models, register_model
 from .compilation import inlined
 
 LANES = 16
-LINE = 64
-"""Bytes of a cache line, and of a vector."""
 
 
 class Vector(types.Type):
@@ -188,27 +186,6 @@ def opaque(typing_context, number):  # type: ignore[no-untyped-def]  # noqa: ARG
         return builder.call(ir.InlineAsm(of, "", "=r,0"), args)
 
     return types.int64(types.int64), emit
-
-
-@intrinsic
-def _misalignment(typing_context, array):  # type: ignore[no-untyped-def]  # noqa: ARG001
-    """Elements of 4 bytes between an array's start and the next cache line."""
-
-    def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
-        word = ir.IntType(64)
-        address = _address(context, builder, sig.args[0], args[0], ir.Constant(word, 0))
-        address = builder.neg(builder.ptrtoint(address, word))
-        return builder.lshr(builder.and_(address, ir.Constant(word, LINE - 1)), ir.Constant(word, 2))
-
-    return types.int64(array), emit
-
-
-@inlined
-def workspace(size):  # type: ignore[no-untyped-def]
-    """An array of undefined float32 that starts at a cache line: vectors across two lines take twice the time."""
-    array = np.empty(size + LANES, np.float32)
-    first = _misalignment(array)
-    return array[first : first + size]
 
 
 @intrinsic

@@ -37,7 +37,7 @@ class LightSource:
     """A small bright sphere in the scene, and the strength of the flare that it causes.
 
     colour: linear RGB, about 1 at its largest. radius: of the sphere, scene units. emission: what a
-    camera sees of it, linear. power: watts of the lamp that lights the scene. flare: strength of its
+    camera sees of it, linear. power: of the lamp that lights the scene, watts (a sun: W/m^2). flare: strength of its
     flare at `reference` units from the camera; it falls with the square of the distance, as light does,
     unless `distant` (a sun).
     """

@@ -189,3 +189,39 @@ def weave(rng: np.random.Generator, height: int, width: int, palette: Palette) -
             cv2.circle(picture, (x, y), reach // 3, _colour(rng, palette), -1, cv2.LINE_AA)
     worn = 0.75 + 0.35 * noise(rng, height, width, border, 3)[..., None]
     return np.clip(picture.astype(np.float32) / 255 * worn, 0, 1)
+
+
+def facade(rng: np.random.Generator, height: int, width: int, palette: Palette, floors: int, bays: int) -> Texture:
+    """The front of a house: plaster, rows of windows with shutters, a door or two, a cornice."""
+    plaster = np.array(_colour(rng, palette), np.float32) / 255
+    picture = plaster * (0.75 + 0.35 * noise(rng, height, width, height / 5, 4)[..., None])
+    tall, wide = height / floors, width / bays
+    shutter = np.array(_colour(rng, palette), np.float32) / 255 * 0.8
+    for floor in range(floors):
+        for bay in range(bays):
+            top, left = int((floor + 0.22) * tall), int((bay + 0.3) * wide)
+            down = int((floor + (1.0 if floor == floors - 1 and rng.random() < 0.4 else 0.78)) * tall)
+            right = int((bay + 0.7) * wide)
+            edge = max(3, int(0.06 * wide))
+            picture[top - edge:down + edge, left - edge:right + edge] = (0.82, 0.78, 0.7)
+            picture[top:down, left:right] = np.array((0.10, 0.13, 0.17)) * rng.uniform(0.6, 2.4)
+            picture[top:down, (left + right) // 2 - 2:(left + right) // 2 + 2] = (0.75, 0.72, 0.66)
+            picture[(top + down) // 2 - 2:(top + down) // 2 + 2, left:right] = (0.75, 0.72, 0.66)
+            if rng.random() < 0.7:
+                picture[top:down, left - 4 * edge:left - edge] = shutter
+                picture[top:down, right + edge:right + 4 * edge] = shutter
+    picture[:int(0.05 * height)] = plaster * 0.6
+    for floor in range(1, floors):
+        picture[int(floor * tall) - 4:int(floor * tall) + 4] = plaster * 0.7
+    return np.clip(picture, 0, 1).astype(np.float32)
+
+
+def sky(rng: np.random.Generator, height: int, width: int, low: tuple[int, int, int], high: tuple[int, int, int],
+        cloud: tuple[int, int, int]) -> Texture:
+    """An evening sky for the inside of a dome: glow at the horizon (the picture's middle), streaks of cloud."""
+    up = np.clip(1 - 2 * (np.arange(height, dtype=np.float32) + 0.5) / height, 0, 1)[:, None, None] ** 0.6
+    colours = [np.array(colour, np.float32) / 255 for colour in (low, high, cloud)]
+    clouds = noise(rng, height, width, height / 5, 5, stretch=5.0)
+    clouds = np.clip((clouds - 0.5) * 2.2, 0, 0.8)[..., None]
+    clear = colours[0] * (1 - up) + colours[1] * up
+    return (clear * (1 - clouds) + colours[2] * clouds).astype(np.float32)

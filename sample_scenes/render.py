@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Make a sample capture: `python sample_scenes/render.py --out FOLDER [--scene desk]`.
+"""Make a sample capture: `python sample_scenes/render.py [--scene desk] [--out FOLDER]`.
 
 Renders the scene with Cycles, traces the flares, adds them in linear light, exposes the frames, matches
 features and triangulates the points. A view that is there already is not made again, so an interrupted
@@ -15,7 +15,8 @@ from typing import Any
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
 
 from core.errors import CaptureError
 from core.files import read_json, write_json
@@ -115,12 +116,13 @@ def make(scene: SceneDescription, out: Path, progress: Progress) -> None:
 def main() -> int:
     """The command."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--out", type=Path, required=True, help="capture folder to write")
+    parser.add_argument("--out", type=Path, help="capture folder to write; else build/sample_scenes/SCENE")
     parser.add_argument("--scene", choices=sorted(SCENES), default="desk")
     chosen = parser.parse_args()
+    out = chosen.out or ROOT / "build" / "sample_scenes" / chosen.scene
     progress = TerminalProgress()
     with stoppable(progress):
-        make(SCENES[chosen.scene], chosen.out, progress)
+        make(SCENES[chosen.scene], out, progress)
     progress.close()
     sys.stdout.flush()
     return 0

@@ -12,7 +12,7 @@ from mathutils import Matrix, Vector
 from numpy.typing import NDArray
 
 from .description import LightSource
-from .patterns import Texture
+from .patterns import Palette, Texture, framed, poster
 
 Vec = Sequence[float] | NDArray[np.float64]
 
@@ -165,7 +165,7 @@ def monkey(name: str, size: float, location: Vec, material: Any, turn: float = 0
 
 
 def lamp(light: LightSource) -> Any:
-    """A light source: a sphere that only the camera sees, and a point lamp of that size in its place.
+    """A light source: a sphere that only the camera sees, and a lamp in its place (a sun, if distant).
 
     The sphere is marked `light_source`, so that the ray casts of the visible share can leave it out.
     """
@@ -182,10 +182,15 @@ def lamp(light: LightSource) -> Any:
     for ray in ("diffuse", "glossy", "transmission", "volume_scatter", "shadow"):
         setattr(bulb, f"visible_{ray}", False)
     if light.power > 0:
-        data = bpy.data.lights.new(light.name, "POINT")
-        data.energy, data.color, data.shadow_soft_size = light.power, light.colour, light.radius
+        data = bpy.data.lights.new(light.name, "SUN" if light.distant else "POINT")
+        data.energy, data.color = light.power, light.colour
         source = bpy.data.objects.new(f"{light.name} lamp", data)
         source.location = light.xyz
+        if light.distant:
+            data.angle = 2 * np.arctan(light.radius / np.linalg.norm(light.xyz))
+            source.rotation_euler = (-Vector(light.xyz)).to_track_quat("-Z", "Y").to_euler()
+        else:
+            data.shadow_soft_size = light.radius
         source.visible_camera = False
         bpy.context.scene.collection.objects.link(source)
     return bulb
@@ -212,3 +217,29 @@ def surroundings(colour: Vec, strength: float) -> None:
     background = next(node for node in world.node_tree.nodes if node.type == "BACKGROUND")
     background.inputs["Color"].default_value = (*colour, 1.0)
     background.inputs["Strength"].default_value = strength
+
+
+def dome(radius: float, texture: Texture, strength: float) -> Any:
+    """The sky: a sphere about the origin that shines inwards."""
+    material = picture_material("sky", texture)
+    nodes, links = material.node_tree.nodes, material.node_tree.links
+    emission = nodes.new("ShaderNodeEmission")
+    emission.inputs["Strength"].default_value = strength
+    source = next(node for node in nodes if node.type == "TEX_IMAGE")
+    links.new(source.outputs["Color"], emission.inputs["Color"])
+    output = next(node for node in nodes if node.type == "OUTPUT_MATERIAL")
+    links.new(emission.outputs[0], output.inputs["Surface"])
+    shell = ball("sky", radius, (0, 0, 0), material)
+    shell.visible_shadow = False  # a sun stands outside
+    return shell
+
+
+def poster_box(name: str, rng: np.random.Generator, size: Vec, location: Vec, palette: Palette,
+               turn: float = 0.0) -> Any:
+    """A box with a drawing of its own on each side, as crates, cubes and plinths are."""
+    x, y, z = size
+    sides = [(x, z), (y, z), (x, z), (y, z), (x, y)]
+    scale = 420 / max(size)
+    textures = [framed(poster(rng, max(int(scale * high), 60), max(int(scale * wide), 60), palette, 12), 0.08)
+                for wide, high in sides]
+    return box(name, size, location, [picture_material(f"{name} {i}", t, 0.75) for i, t in enumerate(textures)], turn)

@@ -51,7 +51,8 @@ class Camera(Protocol):
 @dataclass(frozen=True)
 class Look:
     """A lens and how it flares. lens: a prescription's file name in `lenses`. stop_down: radius of the
-    stop, of the widest. coating: wavelengths in micrometres, in turn over the air-glass surfaces."""
+    stop, of the widest. squeeze: of an anamorphic lens, which stretches its ghosts along x.
+    coating: wavelengths in micrometres, in turn over the air-glass surfaces."""
 
     lens: str
     stop_down: float
@@ -60,6 +61,7 @@ class Look:
     curved: float = 0.1
     uneven: float = 0.012
     seed: int = 0
+    squeeze: float = 1.0
     coating: tuple[float, ...] = (0.52, 0.46, 0.58, 0.50, 0.62, 0.43)
     ghosts: GhostSettings = field(default_factory=GhostSettings)
     starburst: Starburst = field(default_factory=Starburst)
@@ -78,8 +80,9 @@ def optics_of(look: Look) -> tuple[Optics, list[tuple[int, int]]]:
     return optics, optics.pairs(look.ghosts.count)
 
 
-def render_flare(look: Look, camera: Camera, light: Sequence[float], *, colour: Sequence[float] = (1.0, 1.0, 1.0),
-                 intensity: float = 1.0, visible_share: float = 1.0) -> Pixels:
+def render_flare(look: Look, camera: Camera, light: Sequence[float] | NDArray[np.float64], *,
+                 colour: Sequence[float] = (1.0, 1.0, 1.0), intensity: float = 1.0, visible_share: float = 1.0
+                 ) -> Pixels:
     """The flare of one light: scene-linear Rec. 709, (height, width, 3) float32, never negative.
 
     light: (x, y, z) in the camera's axes (x right, y down, z forward; any unit), or normalised (x/z, y/z)
@@ -98,8 +101,8 @@ def render_flare(look: Look, camera: Camera, light: Sequence[float], *, colour: 
     if strength <= 0:
         return black
     optics, pairs = optics_of(look)
-    flare = draw_ghosts(optics, pairs, look.ghosts, at, (camera.fx, camera.fy), (camera.cx, camera.cy),
-                        camera.width, camera.height)
+    flare = draw_ghosts(optics, pairs, look.ghosts, (at[0] / look.squeeze, at[1]),
+                        (camera.fx * look.squeeze, camera.fy), (camera.cx, camera.cy), camera.width, camera.height)
     x, y = np.meshgrid(((np.arange(camera.width) + 0.5 - camera.cx) / camera.fx).astype(np.float32),
                        ((np.arange(camera.height) + 0.5 - camera.cy) / camera.fy).astype(np.float32))
     u, v = x - np.float32(at[0]), y - np.float32(at[1])
@@ -117,5 +120,20 @@ LOOKS: dict[str, Look] = {
                  ghosts=GhostSettings(count=26, gain=480.0), starburst=Starburst(gain=1500.0, peak=9.0),
                  glare=Glare(0.2, 0.03, 1.2, 0.02, 0.28, 0.002),
                  rings=(Ring(gain=0.08, radius=0.25, width=0.02),)),
+    "anamorphic": Look("FR1233449", stop_down=0.33, blades=6, turn=0.0, seed=8, squeeze=1.6,
+                       coating=(0.50, 0.60, 0.46, 0.54, 0.66, 0.44), ghosts=GhostSettings(count=18, gain=260.0),
+                       starburst=Starburst(gain=700.0, peak=9.0), glare=Glare(0.2, 0.03, 1.2, 0.03, 0.3, 0.002),
+                       streaks=(Streak(gain=1.6, length=0.05, power=0.75, width=0.0035),
+                                Streak(gain=0.25, length=0.25, power=1.0, width=0.011, mirror=0.3))),
+    "wide": Look("DE2205380", stop_down=0.55, blades=5, turn=27.0, seed=12,
+                 coating=(0.48, 0.63, 0.55, 0.44, 0.68), ghosts=GhostSettings(count=16, gain=500.0),
+                 starburst=Starburst(gain=1300.0, peak=9.0), glare=Glare(0.15, 0.03, 1.2, 0.015, 0.3, 0.002),
+                 rings=(Ring(gain=0.05, radius=0.16, width=0.05, follow=-0.55, lean=0.6, grow=0.1),)),
+    "ringed": Look("US4099850", stop_down=0.55, blades=7, turn=5.0, seed=21,
+                   coating=(0.56, 0.47, 0.62, 0.51), ghosts=GhostSettings(count=8, gain=350.0),
+                   starburst=Starburst(gain=250.0, peak=6.0), glare=Glare(0.12, 0.025, 1.3, 0.01, 0.3, 0.001),
+                   rings=(Ring(gain=0.28, radius=0.20, width=0.025), Ring(gain=0.22, radius=0.09, width=0.09,
+                          dispersion=0.2, lean=0.2), Ring(gain=0.16, radius=0.13, width=0.06, follow=-0.7, grow=0.15,
+                          lean=0.8, dispersion=0.5))),
 }
 """Looks by name, one for each sample capture."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from ..description import SceneDescription
-from . import desk
+from . import desk, gallery, garden, street
 
-SCENES: dict[str, SceneDescription] = {scene.name: scene for scene in (desk.DESK,)}
+SCENES: dict[str, SceneDescription] = {scene.name: scene for scene in (
+    desk.DESK, street.STREET, gallery.GALLERY, garden.GARDEN)}

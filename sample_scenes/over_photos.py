@@ -1,0 +1,103 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Lay traced flares over a real capture: `python sample_scenes/over_photos.py CAPTURE --light X Y Z --out FOLDER`.
+
+The capture has images/ and sparse/0 (cameras without distortion, or with it: frames are undistorted). A
+light is put at a place in its world, its flare is traced for every view and added in linear light, and the
+result is clipped and stored as a frame. The new capture has those in images/, the untouched photographs in
+removed/, the flares in truth/flare, lights.json, and cameras scaled to the new size. What a photograph
+shows in front of the light hides nothing: the visible share is 1 in every view.
+"""
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from core.capture import Capture, View
+from core.errors import FitFlareError
+from core.files import write_json
+from core.pictures import linear_from_srgb, read_picture, srgb_from_linear, write_png
+from core.progress import Progress, TerminalProgress, stoppable
+from sample_scenes.flares import LOOKS, Look, render_flare
+from sample_scenes.layers import FLARE_LEVEL, write_layer
+
+
+def add_flares(capture: Capture, out: Path, look: Look, light: NDArray[np.float64], colour: tuple[float, ...],
+               intensity: float, width: int, progress: Progress) -> None:
+    """Write the new capture; views that are there already are kept. light: world coordinates (3,)."""
+    progress.stage("flares", len(capture.views))
+    for view in capture.views:
+        stem = Path(view.name).stem
+        frame, clean, layer = (out / "images" / f"{stem}.png", out / "removed" / f"{stem}.png",
+                               out / "truth" / "flare" / f"{stem}.exr")
+        if not (frame.is_file() and clean.is_file() and layer.is_file()):
+            camera = view.camera.scaled(*_size(view, width))
+            photo = np.round(capture.frame(view, _size(view, width)).display() * 255) / np.float32(255)
+            pose = view.camera.world_to_camera
+            flare = render_flare(look, camera, pose[:3, :3] @ light + pose[:3, 3], colour=colour,
+                                 intensity=intensity)
+            write_layer(layer, flare, FLARE_LEVEL)
+            flare = read_picture(layer).pixels  # as stored, so that the files agree
+            write_png(clean, photo)
+            write_png(frame, srgb_from_linear(np.clip(linear_from_srgb(photo) + flare, 0, 1)))
+        progress.advance()
+    write_json(out / "lights.json", {"lights": [{"name": "light", "xyz": light.tolist()}]})
+    _write_model(capture, out / "sparse" / "0", width)
+
+
+def _size(view: View, width: int) -> tuple[int, int]:
+    return width, round(width * view.camera.height / view.camera.width)
+
+
+def _write_model(capture: Capture, folder: Path, width: int) -> None:
+    """Cameras at the new size and the capture's points, as a COLMAP model."""
+    import pycolmap
+
+    model = pycolmap.Reconstruction()
+    for number, view in enumerate(capture.views, 1):
+        camera = view.camera.scaled(*_size(view, width))
+        model.add_camera_with_trivial_rig(pycolmap.Camera(
+            model="PINHOLE", width=camera.width, height=camera.height, camera_id=number,
+            params=[camera.fx, camera.fy, camera.cx, camera.cy]))
+        image = pycolmap.Image(name=f"{Path(view.name).stem}.png", keypoints=np.zeros((0, 2)), camera_id=number,
+                               image_id=number)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(view.camera.world_to_camera[:3]))
+    for xyz, rgb, error in zip(capture.points.xyz, capture.points.rgb, capture.points.error, strict=True):
+        number = model.add_point3D(xyz.astype(float), pycolmap.Track(), rgb)
+        model.points3D[number].error = float(error)
+    folder.mkdir(parents=True, exist_ok=True)
+    model.write(folder)
+
+
+def main() -> int:
+    """The command."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("capture", type=Path, help="folder with images/ and sparse/0")
+    parser.add_argument("--out", type=Path, required=True, help="capture folder to write")
+    parser.add_argument("--light", type=float, nargs=3, required=True, metavar=("X", "Y", "Z"),
+                        help="the light's place, world coordinates")
+    parser.add_argument("--colour", type=float, nargs=3, default=(1.0, 0.85, 0.65), metavar=("R", "G", "B"))
+    parser.add_argument("--intensity", type=float, default=1.0)
+    parser.add_argument("--lens", choices=sorted(LOOKS), default="fast")
+    parser.add_argument("--width", type=int, default=640, help="of the new frames, pixels")
+    chosen = parser.parse_args()
+    progress = TerminalProgress()
+    try:
+        with stoppable(progress):
+            add_flares(Capture.open(chosen.capture), chosen.out, LOOKS[chosen.lens], np.array(chosen.light),
+                       tuple(chosen.colour), chosen.intensity, chosen.width, progress)
+    except FitFlareError as problem:
+        progress.error(str(problem))
+        return 1
+    finally:
+        progress.close()
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -18,6 +18,8 @@ cut off (1/255 or 1/4096). Flares are made of many faint Gaussians, of which few
 """
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -58,11 +60,39 @@ def reductions(covariances: Tensor, rings: Tensor | None, arcs: Tensor | None) -
     return chosen
 
 
-def enlarge(picture: Tensor, factor: int, width: int, height: int) -> Tensor:
-    """(h, w, c) from a picture `factor` times smaller with a border of one pixel, bilinear."""
-    planes = picture.permute(2, 0, 1)[None]
-    planes = torch.nn.functional.interpolate(planes, scale_factor=factor, mode="bilinear")
-    return planes[0, :, factor : factor + height, factor : factor + width].permute(1, 2, 0)
+def enlarge(picture: Tensor, factor: int) -> Tensor:
+    """((h - 2) factor, (w - 2) factor, c) from (h, w, c), bilinear; the border pixels are neighbours only."""
+    across = _EnlargeRows.apply(picture.transpose(0, 1), factor)
+    return _EnlargeRows.apply(across.transpose(0, 1), factor)
+
+
+class _EnlargeRows(torch.autograd.Function):
+    """((h - 2) factor, w, c) from (h, w, c): each row becomes `factor` rows, mixed from it and its neighbours."""
+
+    @staticmethod
+    def forward(ctx: Any, picture: Tensor, factor: int) -> Tensor:
+        picture = picture.contiguous()
+        height, *row = picture.shape
+        ctx.row, ctx.factor = row, factor
+        size = row[0] * row[1]
+        neighbours = picture.as_strided((height - 2, 3, size), (size, size, 1))  # overlapping, not copied
+        return (_mixture(factor, picture) @ neighbours).view((height - 2) * factor, *row)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
+        size = ctx.row[0] * ctx.row[1]
+        parts = gradient.contiguous().view(-1, ctx.factor, size)
+        shares = _mixture(ctx.factor, gradient).T @ parts
+        total = gradient.new_zeros(len(parts) + 2, size)
+        for place, share in enumerate(shares.unbind(1)):
+            total[place : place + len(parts)] += share
+        return total.view(-1, *ctx.row), None
+
+
+def _mixture(factor: int, like: Tensor) -> Tensor:
+    """(factor, 3) shares of the row before, the row itself and the row after, in each new row."""
+    place = (torch.arange(factor, dtype=like.dtype, device=like.device) + 0.5) / factor - 0.5
+    return torch.stack([(-place).clamp(min=0), 1 - place.abs(), place.clamp(min=0)], 1)
 
 
 def splat_mixed(
@@ -71,8 +101,7 @@ def splat_mixed(
 ) -> Splats:  # fmt: skip
     """`splat` with resolution "mixed"."""
     factors = reductions(covariances, rings, arcs)
-    colour = centres.new_zeros(height, width, 3)
-    transmittance = centres.new_ones(height, width)
+    picture = None
     for factor in REDUCTIONS:  # front to back
         index = torch.nonzero(factors == factor)[:, 0]
         if len(index) == 0:
@@ -87,11 +116,20 @@ def splat_mixed(
         )  # fmt: skip
         if factor > 1:
             planes = torch.cat([layer.colour, layer.transmittance[..., None]], -1)
-            planes = enlarge(planes, factor, width, height)
+            planes = enlarge(planes, factor)[:height, :width]
             layer = Splats(planes[..., :3], planes[..., 3])
-        if blend == "add":
-            colour = colour + layer.colour
-        else:
-            colour = colour + transmittance[..., None] * layer.colour
-            transmittance = transmittance * layer.transmittance
-    return Splats(colour, transmittance)
+        picture = layer if picture is None else _behind(picture, layer, blend)
+    if picture is None:
+        return kernels.splat(
+            centres, covariances, opacities, colours, width, height, rings=rings, arcs=arcs, blend=blend
+        )
+    return picture
+
+
+def _behind(front: Splats, back: Splats, blend: str) -> Splats:
+    """Two layers as one."""
+    if blend == "add":
+        return Splats(front.colour + back.colour, front.transmittance)
+    return Splats(
+        front.colour + front.transmittance[..., None] * back.colour, front.transmittance * back.transmittance
+    )

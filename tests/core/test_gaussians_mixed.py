@@ -89,3 +89,19 @@ def test_the_border_is_no_special_place() -> None:
     full = splat(*inputs, 50, 30, blend="add", kernels="torch").colour
     fast = splat(*inputs, 50, 30, blend="add", kernels="torch", resolution="mixed").colour
     assert (fast - full).abs().max() < 0.005
+
+
+@pytest.mark.parametrize("factor", [2, 4])
+def test_enlarging_is_torchs(factor: int) -> None:
+    generator = torch.Generator().manual_seed(0)
+    small = torch.rand(7, 5, 4, dtype=torch.float64, generator=generator, requires_grad=True)
+    planes = small.permute(2, 0, 1)[None]
+    expected = torch.nn.functional.interpolate(planes, scale_factor=factor, mode="bilinear")[0].permute(1, 2, 0)
+    assert torch.allclose(mixed.enlarge(small, factor), expected[factor:-factor, factor:-factor])
+    assert torch.autograd.gradcheck(lambda s: mixed.enlarge(s, factor), small)
+
+
+def test_nothing_is_nothing() -> None:
+    inputs = (torch.zeros(0, 2), torch.zeros(0, 3), torch.zeros(0), torch.zeros(0, 3))
+    laid = splat(*inputs, 5, 3, resolution="mixed")
+    assert laid.colour.shape == (3, 5, 3) and not laid.colour.any() and (laid.transmittance == 1).all()

@@ -286,11 +286,11 @@ def raster(
         begin, end = starts[tile], starts[tile + 1]
         start_tile(state, ROW, left, top, width, height)
         if not shaped:
-            end = _draw_tile(entries, begin, end, records, shapes, left, top, state, False, False, True)
+            end = _draw_tile(entries, begin, end, records, shapes, left, top, state, shaped, arcs, add)
         elif add:
-            end = _draw_tile(entries, begin, end, records, shapes, left, top, state, True, arcs, True)
+            end = _draw_tile(entries, begin, end, records, shapes, left, top, state, shaped, arcs, add)
         else:
-            end = _draw_tile(entries, begin, end, records, shapes, left, top, state, True, arcs, False)
+            end = _draw_tile(entries, begin, end, records, shapes, left, top, state, shaped, arcs, add)
         ends[tile] = end
         write_tile(image, alphas, alphas, alphas, state, left, top, width, height, background, False)
 
@@ -430,12 +430,16 @@ def raster_backward(
         )
         if not shaped:
             _tile_backward(
-                entries, begin, used, end, records, shapes, left, top, state, False, False, True, gradients
+                entries, begin, used, end, records, shapes, left, top, state, shaped, arcs, add, gradients
             )
         elif add:
-            _tile_backward(entries, begin, used, end, records, shapes, left, top, state, True, arcs, True, gradients)
+            _tile_backward(
+                entries, begin, used, end, records, shapes, left, top, state, shaped, arcs, add, gradients
+            )
         else:
-            _tile_backward(entries, begin, used, end, records, shapes, left, top, state, True, arcs, False, gradients)
+            _tile_backward(
+                entries, begin, used, end, records, shapes, left, top, state, shaped, arcs, add, gradients
+            )
 
 
 @inlined

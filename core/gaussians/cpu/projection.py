@@ -33,6 +33,7 @@ from .vector import (
     deinterleave,
     exp2,
     fma,
+    get,
     interleave,
     lanes,
     load,
@@ -40,6 +41,7 @@ from .vector import (
     log2,
     maximum,
     minimum,
+    opaque,
     splat,
     sqrt,
     store,
@@ -62,7 +64,8 @@ CAMERA = 25
 POSITION_SUM, CAMERA_SUMS = 16, 32
 
 TURNED = harmonics.ROWS * LANES
-SCRATCH = 2 * TURNED + RECORD * LANES + CAMERA_SUMS * LANES
+SQUARE = LANES * LANES
+SCRATCH = TURNED + SQUARE + CAMERA_SUMS * LANES
 
 CHUNK = 1024
 """Gaussians to a piece of work."""
@@ -230,7 +233,7 @@ def _tiles_bound(x, y, half_x, half_y, visible, width, height):  # type: ignore[
 
 @inlined
 def _project_block(
-    means, quats, scales, opacities, sh, sh_width, degree, camera, width, height, first, turned,
+    means, quats, scales, opacities, sh, sh_width, degree, camera, width, height, first, turned, basis,
     records, centres, radii, bounds,
 ):  # type: ignore[no-untyped-def]  # fmt: skip
     """Projects the 16 Gaussians from `first` on."""
@@ -272,7 +275,7 @@ def _project_block(
     if any_of(visible):
         harmonics.gather(sh, first, sh_width, 3 * (degree + 1) * (degree + 1), turned)
         direction, _ = _direction(mean, camera)
-        red, green, blue = harmonics.colours(turned, degree, direction[0], direction[1], direction[2])
+        red, green, blue = harmonics.colours(turned, degree, direction[0], direction[1], direction[2], basis)
     rows = transpose((
         x, y, major, k, minor, opacity, exp2(bend * -TWO), bend,
         maximum(red, ZERO), maximum(green, ZERO), maximum(blue, ZERO), pz,
@@ -289,12 +292,13 @@ def _store2(array, first, x, y):  # type: ignore[no-untyped-def]
 
 @kernel
 def project(
-    counter, turned, means, quats, scales, opacities, sh, sh_width, degree, camera, width, height,
+    counter, scratch, means, quats, scales, opacities, sh, sh_width, degree, camera, width, height,
     records, centres, radii, bounds, chunk_bounds,
 ):  # type: ignore[no-untyped-def]  # fmt: skip
     """Writes a record, the centre, the radius and a bound on the number of tiles for each of n >= 16 Gaussians;
     chunk_bounds: the sums of the bounds over chunks."""
     n = opacities.size
+    turned, basis = scratch[:TURNED], scratch[TURNED : TURNED + SQUARE]
     while True:
         chunk = take_number(counter)
         start, end = chunk * CHUNK, min(chunk * CHUNK + CHUNK, n)
@@ -303,7 +307,7 @@ def project(
         for block in range(start, end, LANES):
             first = min(block, n - LANES)  # the last block overlaps the one before and writes the same again
             _project_block(
-                means, quats, scales, opacities, sh, sh_width, degree, camera, width, height, first, turned,
+                means, quats, scales, opacities, sh, sh_width, degree, camera, width, height, first, turned, basis,
                 records, centres, radii, bounds,
             )  # fmt: skip
         total = 0
@@ -335,9 +339,10 @@ def _from_moments(fields, xx, xy, yy, determinant):  # type: ignore[no-untyped-d
 @inlined
 def _sum_rows(gradients, first_slot, count):  # type: ignore[no-untyped-def]
     """The sum of the gradient rows of one Gaussian."""
-    row = splat(ZERO)
-    for slot in range(first_slot, first_slot + count):
-        row = row + load(gradients, slot * RECORD)
+    row, at, end, step = splat(ZERO), first_slot * RECORD, (first_slot + count) * RECORD, opaque(RECORD)
+    while at < end:
+        row = row + load(gradients, at)
+        at += step
     return row
 
 
@@ -345,7 +350,7 @@ def _sum_rows(gradients, first_slot, count):  # type: ignore[no-untyped-def]
 def _gathered(gradients, slots, counts, first, rows):  # type: ignore[no-untyped-def]
     """The fields of the gradient rows of 16 Gaussians, one vector a field."""
     for i in range(LANES):
-        store(rows, i * LANES, _sum_rows(gradients, slots[first + i], counts[first + i]))
+        store(rows, i * LANES, _sum_rows(gradients, get(slots, first + i), get(counts, first + i)))
     return transpose(load_rows(rows, 0, LANES))
 
 
@@ -372,7 +377,7 @@ def _camera_sums(sums, fresh, mean, q, dv, dp, d_direction, intrinsics):  # type
 
 @inlined
 def _project_block_backward(
-    means, quats, scales, opacities, sh, sh_width, degree, camera, records, first, fresh, fields, turned, turned_out,
+    means, quats, scales, opacities, sh, sh_width, degree, camera, records, first, fresh, fields, turned, rows,
     d_means, d_quats, d_scales, d_opacities, d_sh, d_centres, sums, with_camera,
 ):  # type: ignore[no-untyped-def]  # fmt: skip
     mean, scale = _load3(means, first), _load3(scales, first)
@@ -433,8 +438,8 @@ def _project_block_backward(
     )
     direction, inverse_distance = _direction(mean, camera)
     harmonics.gather(sh, first, sh_width, 3 * (degree + 1) * (degree + 1), turned)
-    g = harmonics.colours_backward(turned, degree, direction[0], direction[1], direction[2], d_colour, turned_out)
-    harmonics.scatter(turned_out, first, sh_width, d_sh)
+    g = harmonics.colours_backward(turned, degree, direction[0], direction[1], direction[2], d_colour, rows)
+    harmonics.scatter(turned, first, sh_width, d_sh)
     d_direction = _scaled(inverse_distance, _sum(g, -_dot(g, direction), direction))
 
     d_mean = (
@@ -459,8 +464,7 @@ def project_backward(
     slots[i] on. d_camera: sums of each chunk, (chunks, CAMERA_SUMS), if with_camera.
     """
     n = opacities.size
-    turned, turned_out = scratch[:TURNED], scratch[TURNED : 2 * TURNED]
-    rows, sums = scratch[2 * TURNED : 2 * TURNED + RECORD * LANES], scratch[2 * TURNED + RECORD * LANES : SCRATCH]
+    turned, rows, sums = scratch[:TURNED], scratch[TURNED : TURNED + SQUARE], scratch[TURNED + SQUARE : SCRATCH]
     while True:
         chunk = take_number(counter)
         start, end = chunk * CHUNK, min(chunk * CHUNK + CHUNK, n)
@@ -475,7 +479,7 @@ def project_backward(
             fresh = lanes() >= np.float32(block - first)
             _project_block_backward(
                 means, quats, scales, opacities, sh, sh_width, degree, camera, records, first, fresh, fields,
-                turned, turned_out, d_means, d_quats, d_scales, d_opacities, d_sh, d_centres, sums, with_camera,
+                turned, rows, d_means, d_quats, d_scales, d_opacities, d_sh, d_centres, sums, with_camera,
             )  # fmt: skip
         if with_camera:
             for i in range(CAMERA_SUMS):

@@ -65,10 +65,10 @@ TWO = np.float32(2)
 
 @inlined
 def _load_gradients(
-    state, row, y, left, width, background, image, alphas, depths, d_image, d_alphas, d_depths, with_depth
+    state, row, pixel, background, image, alphas, depths, d_image, d_alphas, d_depths, with_depth
 ):  # type: ignore[no-untyped-def]  # fmt: skip
-    """One row of pixel gradients, and S before the first Gaussian, for pixels left .. left + 15."""
-    at, pixel = row * ROW, y * width + left
+    """One row of pixel gradients, and S before the first Gaussian, for 16 pixels from a flat index on."""
+    at = row * ROW
     colour = deinterleave((load(image, 3 * pixel), load(image, 3 * pixel + 16), load(image, 3 * pixel + 32)))
     v = deinterleave((load(d_image, 3 * pixel), load(d_image, 3 * pixel + 16), load(d_image, 3 * pixel + 32)))
     alpha = load(alphas, pixel)
@@ -182,29 +182,42 @@ def _gradient_row(state, records, at, left, top, first, end, with_depth):  # typ
 
 
 @inlined
+def _edge_row(edge, pixel, count, image, alphas, depths, d_image, d_alphas, d_depths, with_depth):  # type: ignore[no-untyped-def]
+    """Copies what is in the picture of a row that its edge cuts."""
+    edge[:, :] = ZERO
+    lane, one = 0, opaque(1)
+    while lane < 3 * count:
+        edge[0, lane], edge[1, lane] = image[3 * pixel + lane], d_image[3 * pixel + lane]
+        lane += one
+    lane = 0
+    while lane < count:
+        edge[2, lane], edge[3, lane] = alphas[pixel + lane], d_alphas[pixel + lane]
+        if with_depth:
+            edge[4, lane], edge[5, lane] = depths[pixel + lane], d_depths[pixel + lane]
+        lane += one
+
+
+@inlined
 def load_tile(
     state, left, top, width, height, background, image, alphas, depths, d_image, d_alphas, d_depths, with_depth, edge
 ):  # type: ignore[no-untyped-def]  # fmt: skip
     """The state of a tile before its first Gaussian; edge: workspace for tiles that the picture's edge cuts."""
     start_tile(state, ROW, left, top, width, height)
-    for row in range(min(TILE_HEIGHT, height - top)):
-        y = top + row
+    row, one = 0, opaque(1)
+    while row < min(TILE_HEIGHT, height - top):
+        pixel = (top + row) * width + left
         if left + LANES <= width:
             _load_gradients(
-                state, row, y, left, width, background, image, alphas, depths, d_image, d_alphas, d_depths, with_depth
+                state, row, pixel, background, image, alphas, depths, d_image, d_alphas, d_depths, with_depth
             )
-            continue
-        edge[:, :] = ZERO
-        for lane in range(width - left):
-            pixel = y * width + left + lane
-            for c in range(3):
-                edge[0, 3 * lane + c], edge[1, 3 * lane + c] = image[3 * pixel + c], d_image[3 * pixel + c]
-            edge[2, lane], edge[3, lane] = alphas[pixel], d_alphas[pixel]
-            if with_depth:
-                edge[4, lane], edge[5, lane] = depths[pixel], d_depths[pixel]
-        _load_gradients(
-            state, row, 0, 0, width, background, edge[0], edge[2], edge[4], edge[1], edge[3], edge[5], with_depth
-        )
+        else:
+            _edge_row(
+                edge, pixel, width - left, image, alphas, depths, d_image, d_alphas, d_depths, with_depth
+            )
+            _load_gradients(
+                state, row, pixel * 0, background, edge[0], edge[2], edge[4], edge[1], edge[3], edge[5], with_depth
+            )
+        row += one
 
 
 @inlined
@@ -234,15 +247,11 @@ def raster_backward(
             break
         left, top = (tile % tiles_x) * TILE_WIDTH, (tile // tiles_x) * TILE_HEIGHT
         begin, used, end = starts[tile], ends[tile], starts[tile + 1]
-        if with_depth:
-            load_tile(
-                state, left, top, width, height, background, image, alphas, depths, d_image, d_alphas, d_depths,
-                True, edge,
-            )  # fmt: skip
-            _tile_backward(entries, begin, used, end, records, left, top, state, gradients, True)
+        load_tile(
+            state, left, top, width, height, background, image, alphas, depths, d_image, d_alphas, d_depths,
+            with_depth, edge,
+        )  # fmt: skip
+        if with_depth:  # two loops for LLVM to specialise
+            _tile_backward(entries, begin, used, end, records, left, top, state, gradients, with_depth)
         else:
-            load_tile(
-                state, left, top, width, height, background, image, alphas, depths, d_image, d_alphas, d_depths,
-                False, edge,
-            )  # fmt: skip
-            _tile_backward(entries, begin, used, end, records, left, top, state, gradients, False)
+            _tile_backward(entries, begin, used, end, records, left, top, state, gradients, with_depth)

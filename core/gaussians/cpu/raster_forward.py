@@ -166,45 +166,41 @@ def _blend(state, records, at, left, top, first, end, with_depth):  # type: igno
 
 
 @inlined
-def _write_row(image, alphas, depths, medians, state, row, left, y, width, background, with_depth):  # type: ignore[no-untyped-def]
-    at = row * ROW
-    t = load(state, at + T_PLANE)
-    pixel = y * width + left
-    red = fma(t, get(background, 0), load(state, at + RED_PLANE))
-    green = fma(t, get(background, 1), load(state, at + GREEN_PLANE))
-    blue = fma(t, get(background, 2), load(state, at + BLUE_PLANE))
-    alpha = ONE - t
-    if with_depth:
-        depth = load(state, at + DEPTH_PLANE) / where(alpha > DEPTH_ALPHA_MIN, alpha, DEPTH_ALPHA_MIN)
-        store(state, at + DEPTH_PLANE, depth)
-    if left + LANES <= width:
-        store_rows(image, 3 * pixel, LANES, interleave((red, green, blue)))
-        store(alphas, pixel, alpha)
-        if with_depth:
-            store(depths, pixel, load(state, at + DEPTH_PLANE))
-            store(medians, pixel, load(state, at + MEDIAN_PLANE))
+def _copy(source, at, target, to, count):  # type: ignore[no-untyped-def]
+    """The first `count` of a vector's numbers, or all."""
+    if count >= LANES:
+        store(target, to, load(source, at))
         return
-    store(state, at + RED_PLANE, red)
-    store(state, at + GREEN_PLANE, green)
-    store(state, at + BLUE_PLANE, blue)
     lane, one = 0, opaque(1)
-    while lane < width - left:
-        image[3 * (pixel + lane)] = state[at + RED_PLANE + lane]
-        image[3 * (pixel + lane) + 1] = state[at + GREEN_PLANE + lane]
-        image[3 * (pixel + lane) + 2] = state[at + BLUE_PLANE + lane]
-        alphas[pixel + lane] = ONE - state[at + T_PLANE + lane]
-        if with_depth:
-            depths[pixel + lane] = state[at + DEPTH_PLANE + lane]
-            medians[pixel + lane] = state[at + MEDIAN_PLANE + lane]
+    while lane < count:
+        target[to + lane] = source[at + lane]
         lane += one
 
 
 @inlined
 def write_tile(image, alphas, depths, medians, state, left, top, width, height, background, with_depth):  # type: ignore[no-untyped-def]
-    """The finished tile into the picture."""
+    """The finished tile into the picture. Uses the state as workspace."""
+    seen = width - left
     row, one = 0, opaque(1)
     while row < min(TILE_HEIGHT, height - top):
-        _write_row(image, alphas, depths, medians, state, row, left, top + row, width, background, with_depth)
+        at, pixel = row * ROW, (top + row) * width + left
+        t = load(state, at + T_PLANE)
+        alpha = ONE - t
+        red = fma(t, get(background, 0), load(state, at + RED_PLANE))
+        green = fma(t, get(background, 1), load(state, at + GREEN_PLANE))
+        blue = fma(t, get(background, 2), load(state, at + BLUE_PLANE))
+        store(state, at + T_PLANE, alpha)
+        store_rows(state, at + RED_PLANE, LANES, interleave((red, green, blue)))
+        _copy(state, at + T_PLANE, alphas, pixel, seen)
+        third = 0
+        while third < 3 * LANES:
+            _copy(state, at + RED_PLANE + third, image, 3 * pixel + third, 3 * seen - third)
+            third += one * LANES
+        if with_depth:
+            depth = load(state, at + DEPTH_PLANE) / where(alpha > DEPTH_ALPHA_MIN, alpha, DEPTH_ALPHA_MIN)
+            store(state, at + DEPTH_PLANE, depth)
+            _copy(state, at + DEPTH_PLANE, depths, pixel, seen)
+            _copy(state, at + MEDIAN_PLANE, medians, pixel, seen)
         row += one
 
 
@@ -240,8 +236,8 @@ def raster(
         left, top = (tile % tiles_x) * TILE_WIDTH, (tile // tiles_x) * TILE_HEIGHT
         begin, end = starts[tile], starts[tile + 1]
         start_tile(state, ROW, left, top, width, height)
-        if with_depth:
-            ends[tile] = _raster_tile(entries, begin, end, records, left, top, state, True)
+        if with_depth:  # LLVM makes two of the loop, and takes out what it needs not ask in each
+            ends[tile] = _raster_tile(entries, begin, end, records, left, top, state, with_depth)
         else:
-            ends[tile] = _raster_tile(entries, begin, end, records, left, top, state, False)
+            ends[tile] = _raster_tile(entries, begin, end, records, left, top, state, with_depth)
         write_tile(image, alphas, depths, medians, state, left, top, width, height, background, with_depth)

@@ -58,6 +58,7 @@ class _Rasterize(torch.autograd.Function):
         parallel(
             projection.project, *inputs, sh_width, frame.sh_degree, camera, frame.width, frame.height,
             records.reshape(-1), flat(centres), flat(radii), bounds, chunk_bounds,
+            scratch=projection.SCRATCH,
         )  # fmt: skip
         bins = bin_gaussians(records, bounds, chunk_bounds, frame)
 

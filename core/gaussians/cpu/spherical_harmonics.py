@@ -17,129 +17,123 @@ from ..spherical_harmonics import C1 as _C1
 from ..spherical_harmonics import C2 as _C2
 from ..spherical_harmonics import C3 as _C3
 from .compilation import inlined
-from .vector import LANES, fma, load, load_rows, splat, store, store_rows, transpose
+from .vector import LANES, fma, load, load_rows, opaque, splat, store, store_rows, transpose
 
 C0, C1 = np.float32(_C0), np.float32(_C1)
 C20, C21, C22 = (np.float32(c) for c in _C2)
 C30, C31, C32, C33, C34 = (np.float32(c) for c in _C3)
 ROWS = 48
-TWO, THREE, FOUR = np.float32(2), np.float32(3), np.float32(4)
+ZERO, HALF, TWO, THREE, FOUR, EIGHT = (np.float32(number) for number in (0, 0.5, 2, 3, 4, 8))
 
 
 @inlined
 def gather(sh, first, width, used, turned):  # type: ignore[no-untyped-def]
     """Turns `used` of the `width` numbers of 16 Gaussians, from row `first` of sh (n, width) on."""
-    for column in range(0, used, LANES):
-        at = first * width + column
+    one = opaque(1)
+    column = 0
+    while column < used:
         if column + LANES <= width:
-            store_rows(turned, column * LANES, LANES, transpose(load_rows(sh, at, width)))
+            rows = load_rows(sh, first * width + column, width)
+            store_rows(turned, column * LANES, LANES, transpose(rows))
+            column += LANES
         else:
-            for j in range(column, used):
-                for i in range(LANES):
-                    turned[j * LANES + i] = sh[(first + i) * width + j]
+            i = 0
+            while i < LANES:
+                turned[column * LANES + i] = sh[(first + i) * width + column]
+                i += one
+            column += one
 
 
 @inlined
 def scatter(turned, first, width, sh):  # type: ignore[no-untyped-def]
     """The inverse: writes all `width` numbers of 16 Gaussians."""
-    for column in range(0, width, LANES):
-        at = first * width + column
+    one = opaque(1)
+    column = 0
+    while column < width:
         if column + LANES <= width:
-            store_rows(sh, at, width, transpose(load_rows(turned, column * LANES, LANES)))
+            rows = load_rows(turned, column * LANES, LANES)
+            store_rows(sh, first * width + column, width, transpose(rows))
+            column += LANES
         else:
-            for j in range(column, width):
-                for i in range(LANES):
-                    sh[(first + i) * width + j] = turned[j * LANES + i]
+            i = 0
+            while i < LANES:
+                sh[(first + i) * width + column] = turned[column * LANES + i]
+                i += one
+            column += one
 
 
 @inlined
-def _add(turned, k, b, colour):  # type: ignore[no-untyped-def]
-    """colour + b sh_k."""
-    at = 3 * k * LANES
-    return (
-        fma(b, load(turned, at), colour[0]),
-        fma(b, load(turned, at + LANES), colour[1]),
-        fma(b, load(turned, at + 2 * LANES), colour[2]),
-    )
-
-
-@inlined
-def colours(turned, degree, x, y, z):  # type: ignore[no-untyped-def]
-    """The colours (r, g, b), not yet cut off at 0, along unit directions."""
-    half = splat(np.float32(0.5))
-    c = _add(turned, 0, splat(C0), (half, half, half))
+def _basis(degree, x, y, z, b):  # type: ignore[no-untyped-def]
+    """Writes the basis functions up to this degree, one vector each."""
+    store(b, 0, splat(C0))
     if degree >= 1:
-        c = _add(turned, 1, y * -C1, c)
-        c = _add(turned, 2, z * C1, c)
-        c = _add(turned, 3, x * -C1, c)
+        store_rows(b, LANES, LANES, (y * -C1, z * C1, x * -C1))
     if degree >= 2:
         xx, yy, zz = x * x, y * y, z * z
-        c = _add(turned, 4, x * y * C20, c)
-        c = _add(turned, 5, y * z * -C20, c)
-        c = _add(turned, 6, (zz * TWO - xx - yy) * C21, c)
-        c = _add(turned, 7, x * z * -C20, c)
-        c = _add(turned, 8, (xx - yy) * C22, c)
-    if degree >= 3:
-        xx, yy, zz = x * x, y * y, z * z
-        c = _add(turned, 9, y * (xx * THREE - yy) * -C30, c)
-        c = _add(turned, 10, x * y * z * C31, c)
-        c = _add(turned, 11, y * (zz * FOUR - xx - yy) * -C32, c)
-        c = _add(turned, 12, z * (zz * TWO - xx * THREE - yy * THREE) * C33, c)
-        c = _add(turned, 13, x * (zz * FOUR - xx - yy) * -C32, c)
-        c = _add(turned, 14, z * (xx - yy) * C34, c)
-        c = _add(turned, 15, x * (xx - yy * THREE) * -C30, c)
-    return c
+        store_rows(b, 4 * LANES, LANES, (
+            x * y * C20, y * z * -C20, (zz * TWO - xx - yy) * C21, x * z * -C20, (xx - yy) * C22
+        ))  # fmt: skip
+        if degree >= 3:
+            four = zz * FOUR - xx - yy
+            store_rows(b, 9 * LANES, LANES, (
+                y * (xx * THREE - yy) * -C30, x * y * z * C31, y * four * -C32,
+                z * (zz * TWO - xx * THREE - yy * THREE) * C33,
+                x * four * -C32, z * (xx - yy) * C34, x * (xx - yy * THREE) * -C30,
+            ))  # fmt: skip
 
 
 @inlined
-def _share(turned, out, k, b, v):  # type: ignore[no-untyped-def]
-    """Writes d sh_k and returns h_k."""
-    at = 3 * k * LANES
-    store(out, at, b * v[0])
-    store(out, at + LANES, b * v[1])
-    store(out, at + 2 * LANES, b * v[2])
-    h = fma(load(turned, at + LANES), v[1], load(turned, at) * v[0])
-    return fma(load(turned, at + 2 * LANES), v[2], h)
+def colours(turned, degree, x, y, z, b):  # type: ignore[no-untyped-def]
+    """The colours (r, g, b), not yet cut off at 0, along unit directions. b: workspace of 16 vectors."""
+    _basis(degree, x, y, z, b)
+    red, green, blue = splat(HALF), splat(HALF), splat(HALF)
+    for k in range((degree + 1) * (degree + 1)):
+        value, at = load(b, k * LANES), 3 * k * LANES
+        red = fma(value, load(turned, at), red)
+        green = fma(value, load(turned, at + LANES), green)
+        blue = fma(value, load(turned, at + 2 * LANES), blue)
+    return red, green, blue
 
 
 @inlined
-def colours_backward(turned, degree, x, y, z, v, out):  # type: ignore[no-untyped-def]
-    """Writes the gradient of the coefficients to out and returns that of the unit directions."""
-    zero = splat(np.float32(0))
+def colours_backward(turned, degree, x, y, z, v, h):  # type: ignore[no-untyped-def]
+    """Turns the coefficients into their gradients and returns that of the unit directions. h: workspace of 16
+    vectors: first b_k, then h_k."""
+    _basis(degree, x, y, z, h)
+    used = (degree + 1) * (degree + 1)
+    for k in range(used):
+        b, at = load(h, k * LANES), 3 * k * LANES
+        sum_k = fma(load(turned, at + LANES), v[1], load(turned, at) * v[0])
+        store(h, k * LANES, fma(load(turned, at + 2 * LANES), v[2], sum_k))
+        store_rows(turned, at, LANES, (b * v[0], b * v[1], b * v[2]))
+    for row in range(3 * used, ROWS):
+        store(turned, row * LANES, splat(ZERO))
+    return _along_directions(degree, x, y, z, h)
+
+
+@inlined
+def _along_directions(degree, x, y, z, h):  # type: ignore[no-untyped-def]
+    """sum_k h_k grad b_k."""
+    zero = splat(ZERO)
     dx, dy, dz = zero, zero, zero
-    _share(turned, out, 0, splat(C0), v)
-    for row in range(3 * (degree + 1) * (degree + 1), ROWS):
-        store(out, row * LANES, zero)
     if degree >= 1:
-        dy = dy - _share(turned, out, 1, y * -C1, v) * C1
-        dz = dz + _share(turned, out, 2, z * C1, v) * C1
-        dx = dx - _share(turned, out, 3, x * -C1, v) * C1
+        dx, dy, dz = load(h, 3 * LANES) * -C1, load(h, LANES) * -C1, load(h, 2 * LANES) * C1
     if degree >= 2:
-        xx, yy, zz = x * x, y * y, z * z
-        h = _share(turned, out, 4, x * y * C20, v) * C20
-        dx, dy = fma(h, y, dx), fma(h, x, dy)
-        h = _share(turned, out, 5, y * z * -C20, v) * -C20
-        dy, dz = fma(h, z, dy), fma(h, y, dz)
-        h = _share(turned, out, 6, (zz * TWO - xx - yy) * C21, v) * (C21 * TWO)
-        dx, dy, dz = dx - h * x, dy - h * y, fma(h * TWO, z, dz)
-        h = _share(turned, out, 7, x * z * -C20, v) * -C20
-        dx, dz = fma(h, z, dx), fma(h, x, dz)
-        h = _share(turned, out, 8, (xx - yy) * C22, v) * (C22 * TWO)
-        dx, dy = fma(h, x, dx), dy - h * y
+        h4, h5, h7 = load(h, 4 * LANES) * C20, load(h, 5 * LANES) * -C20, load(h, 7 * LANES) * -C20
+        h6, h8 = load(h, 6 * LANES) * (C21 * TWO), load(h, 8 * LANES) * (C22 * TWO)
+        dx = dx + h4 * y + h7 * z + (h8 - h6) * x
+        dy = dy + h4 * x + h5 * z - (h8 + h6) * y
+        dz = dz + h5 * y + h7 * x + h6 * TWO * z
     if degree >= 3:
         xx, yy, zz = x * x, y * y, z * z
-        h = _share(turned, out, 9, y * (xx * THREE - yy) * -C30, v) * (-C30 * THREE)
-        dx, dy = fma(h * TWO, x * y, dx), fma(h, xx - yy, dy)
-        h = _share(turned, out, 10, x * y * z * C31, v) * C31
-        dx, dy, dz = fma(h, y * z, dx), fma(h, x * z, dy), fma(h, x * y, dz)
-        h = _share(turned, out, 11, y * (zz * FOUR - xx - yy) * -C32, v) * -C32
-        dx, dy, dz = dx - h * TWO * x * y, fma(h, zz * FOUR - xx - yy * THREE, dy), fma(h * np.float32(8), y * z, dz)
-        h = _share(turned, out, 12, z * (zz * TWO - xx * THREE - yy * THREE) * C33, v) * (C33 * THREE)
-        dx, dy, dz = dx - h * TWO * x * z, dy - h * TWO * y * z, fma(h, zz * TWO - xx - yy, dz)
-        h = _share(turned, out, 13, x * (zz * FOUR - xx - yy) * -C32, v) * -C32
-        dx, dy, dz = fma(h, zz * FOUR - xx * THREE - yy, dx), dy - h * TWO * x * y, fma(h * np.float32(8), x * z, dz)
-        h = _share(turned, out, 14, z * (xx - yy) * C34, v) * C34
-        dx, dy, dz = fma(h * TWO, x * z, dx), dy - h * TWO * y * z, fma(h, xx - yy, dz)
-        h = _share(turned, out, 15, x * (xx - yy * THREE) * -C30, v) * (-C30 * THREE)
-        dx, dy = fma(h, xx - yy, dx), dy - h * TWO * x * y
+        h9, h10, h11 = load(h, 9 * LANES) * (C30 * -THREE), load(h, 10 * LANES) * C31, load(h, 11 * LANES) * -C32
+        h12, h13 = load(h, 12 * LANES) * (C33 * THREE), load(h, 13 * LANES) * -C32
+        h14, h15 = load(h, 14 * LANES) * C34, load(h, 15 * LANES) * (C30 * -THREE)
+        xy, difference = x * y * TWO, xx - yy
+        mixed = h12 * z * -TWO
+        dx = dx + h9 * xy + h10 * y * z - h11 * xy + mixed * x + h13 * (zz * FOUR - xx * THREE - yy)
+        dx = dx + h14 * x * z * TWO + h15 * difference
+        dy = dy + h9 * difference + h10 * x * z + h11 * (zz * FOUR - xx - yy * THREE) + mixed * y
+        dy = dy - h13 * xy - h14 * y * z * TWO - h15 * xy
+        dz = dz + h10 * x * y + (h11 * y + h13 * x) * z * EIGHT + h12 * (zz * TWO - xx - yy) + h14 * difference
     return dx, dy, dz

@@ -15,8 +15,7 @@ from typing import Any
 
 import numpy as np
 
-ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from core.errors import CaptureError
 from core.files import read_json, write_json
@@ -27,6 +26,8 @@ from sample_scenes.flares import LOOKS, render_flare
 from sample_scenes.layers import FLARE_LEVEL, FRAME_SUFFIX, SCENE_LEVEL, write_frame, write_layer
 from sample_scenes.scenes import SCENES
 
+CACHE = Path(__file__).resolve().parents[1] / "build" / "sample_scenes"
+
 
 def render_scene(scene: SceneDescription, out: Path, progress: Progress) -> None:
     """truth/scene and truth/visible_share.json, by Blender."""
@@ -35,17 +36,17 @@ def render_scene(scene: SceneDescription, out: Path, progress: Progress) -> None
     missing = [i for i, name in enumerate(names) if not (target / f"{name}.exr").is_file()]
     if not missing and table.is_file():
         return
-    from sample_scenes import cycles
+    from sample_scenes import shots
 
     scene.build(scene)
-    camera = cycles.set_up(scene.camera, scene.samples)
+    camera = shots.set_up(scene.camera, scene.samples)
     eyes = camera_positions(poses)
-    write_json(table, {f"{name}{FRAME_SUFFIX}": {light.name: cycles.visible_share(light, eye) for light in scene.lights}
+    write_json(table, {f"{name}{FRAME_SUFFIX}": {light.name: shots.visible_share(light, eye) for light in scene.lights}
                        for name, eye in zip(names, eyes, strict=True)})
     progress.stage("render", len(names), len(names) - len(missing))
     for index in missing:
         with silent():
-            pixels = cycles.render(camera, poses[index], scene.seed * 1000 + int(scene.numbers[index]))
+            pixels = shots.render(camera, poses[index], scene.seed * 1000 + int(scene.numbers[index]))
         write_layer(target / f"{names[index]}.exr", pixels, SCENE_LEVEL)
         progress.advance()
 
@@ -119,7 +120,7 @@ def main() -> int:
     parser.add_argument("--out", type=Path, help="capture folder to write; else build/sample_scenes/SCENE")
     parser.add_argument("--scene", choices=sorted(SCENES), default="desk")
     chosen = parser.parse_args()
-    out = chosen.out or ROOT / "build" / "sample_scenes" / chosen.scene
+    out = chosen.out or CACHE / chosen.scene
     progress = TerminalProgress()
     with stoppable(progress):
         make(SCENES[chosen.scene], out, progress)

@@ -76,5 +76,5 @@ def build(scene: SceneDescription) -> None:
 
 
 GALLERY = SceneDescription(
-    name="gallery", seed=47, first=0, views=40, samples=24, camera=Pinhole(480, 270, 395.0, 395.0, 243.1, 131.6), path=path,
-    build=build, lights=(PENDANT, SIGN, STUDIO), lens="wide")
+    name="gallery", seed=47, first=0, views=40, camera=Pinhole(480, 270, 395.0, 395.0, 243.1, 131.6), path=path,
+    build=build, samples=24, lights=(PENDANT, SIGN, STUDIO), lens="wide")

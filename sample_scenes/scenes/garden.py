@@ -74,5 +74,5 @@ def build(scene: SceneDescription) -> None:
 
 
 GARDEN = SceneDescription(
-    name="garden", seed=63, first=0, views=40, samples=24, camera=Pinhole(480, 270, 440.0, 440.0, 236.9, 137.4), path=path,
-    build=build, lights=(LAMP,), lens="ringed")
+    name="garden", seed=63, first=0, views=40, camera=Pinhole(480, 270, 440.0, 440.0, 236.9, 137.4), path=path,
+    build=build, samples=24, lights=(LAMP,), lens="ringed")

@@ -66,5 +66,5 @@ def build(scene: SceneDescription) -> None:
 
 
 STREET = SceneDescription(
-    name="street", seed=31, first=0, views=40, samples=24, camera=Pinhole(480, 270, 415.0, 415.0, 238.4, 136.2), path=path,
-    build=build, lights=(SUN,), lens="anamorphic")
+    name="street", seed=31, first=0, views=40, camera=Pinhole(480, 270, 415.0, 415.0, 238.4, 136.2), path=path,
+    build=build, samples=24, lights=(SUN,), lens="anamorphic")

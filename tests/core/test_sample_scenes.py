@@ -17,16 +17,19 @@ from numpy.typing import NDArray
 from core.capture import Capture
 from core.errors import SettingsError
 from core.pictures import read_picture, srgb_from_linear
+from core.progress import Progress
 from sample_scenes.description import Pinhole, looking_at
 from sample_scenes.flares import LOOKS, Look, render_flare
 from sample_scenes.flares.aperture import Aperture
 from sample_scenes.flares.flare import optics_of
 from sample_scenes.flares.ghosts import GhostSettings, draw_ghosts
 from sample_scenes.flares.prescription import FOLDER, read_prescription
-from sample_scenes.flares.starburst import Ring, Starburst, draw_ring, starburst_texture
+from sample_scenes.flares.starburst import Glare, Ring, Starburst, Streak, draw_ring, draw_streak, starburst_texture
 from sample_scenes.flares.trace import FIELDS, SENSOR_X, reflectance, trace_ray
 from sample_scenes.layers import exposed, write_layer
+from sample_scenes.over_photos import add_flares
 from sample_scenes.scenes import SCENES
+from tests.core.captures import make_capture
 
 SAMPLE = Path(__file__).parents[2] / "sample_scenes" / "desk"
 SMALL = Pinhole(120, 68, 118.0, 118.0, 60.0, 34.0)
@@ -56,6 +59,13 @@ def straight(name: str, x: float, slope: float) -> tuple[float, float]:
 def test_prescription_gives_the_focal_length_it_is_known_for(name: str) -> None:
     stated = float((FOLDER / f"{name}.lens").read_text().split(" mm,")[0].split()[-1])
     assert read_prescription(FOLDER / f"{name}.lens").paraxial()[0] == pytest.approx(stated, rel=0.05)
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_prescription_focuses_where_its_last_line_puts_the_film(name: str) -> None:
+    """Sensitive to every digit: a radius or thickness copied wrong moves the focus."""
+    lens = read_prescription(FOLDER / f"{name}.lens")
+    assert lens.paraxial()[1] == pytest.approx(lens.thickness[-1], rel=0.003)
 
 
 @pytest.mark.parametrize("name", LENSES)
@@ -98,11 +108,12 @@ def test_reflectance_is_a_share_and_the_same_both_ways(
 
 @pytest.mark.parametrize("name", sorted(LOOKS))
 def test_a_flare_is_the_same_twice_finite_and_never_dark(name: str) -> None:
+    look = replace(LOOKS[name], ghosts=replace(LOOKS[name].ghosts, bands=2, count=6))
     light = (-0.22, -0.13)
-    flare = render_flare(LOOKS[name], SMALL, light)
+    flare = render_flare(look, SMALL, light)
     assert flare.shape == (68, 120, 3) and flare.dtype == np.float32
     assert np.isfinite(flare).all() and flare.min() >= 0 and flare.max() > 1
-    assert np.array_equal(flare, render_flare(LOOKS[name], SMALL, light))
+    assert np.array_equal(flare, render_flare(look, SMALL, light))
 
 
 def test_energy_follows_share_intensity_and_colour() -> None:
@@ -179,6 +190,47 @@ def test_ring_is_wider_for_longer_wavelengths() -> None:
     red, green, blue = (float((ring[:, c] * np.abs(x[0])).sum() / ring[:, c].sum()) for c in range(3))
     assert red > green > blue and green == pytest.approx(0.3, rel=0.06)
     assert ring[120].max() < 1e-3 * ring.max()  # the hole is a hole
+
+
+def test_an_anamorphic_lens_draws_its_ghosts_and_streak_along_x() -> None:
+    bare = replace(ROUND, starburst=Starburst(gain=0.0), glare=Glare(0.0, wide_gain=0.0, floor=0.0))
+    camera = Pinhole(400, 120, 80.0, 80.0, 200.0, 60.0)
+    columns = np.arange(400) + 0.5 - 200
+    spread = []
+    for look, light in ((bare, (0.1, 0.1)), (replace(bare, squeeze=2.0), (0.2, 0.1))):
+        ghosts = render_flare(look, camera, light).sum(axis=2)
+        spread.append((ghosts * np.abs(columns)).sum() / ghosts.sum())
+    assert spread[1] == pytest.approx(2 * spread[0], rel=0.03)
+    x, y = np.meshgrid(np.linspace(-1, 1, 81, dtype=np.float32), np.linspace(-1, 1, 81, dtype=np.float32))
+    streak = draw_streak(Streak(width=0.02), (0.0, 0.0), x, y)
+    assert streak[40, 0].min() > 20 * streak[0, 40].max()
+
+
+def test_every_scene_has_a_look_and_a_lens_of_its_own() -> None:
+    assert len({scene.seed for scene in SCENES.values()}) == len(SCENES) >= 4
+    lenses = [LOOKS[scene.lens].lens for scene in SCENES.values()]
+    assert len(set(lenses)) == len(lenses) and set(lenses) <= set(LENSES)
+    for scene in SCENES.values():
+        np.testing.assert_allclose(np.linalg.det(scene.poses[:, :3, :3]), 1.0)
+        assert scene.views == len(scene.poses) == len(set(scene.stems))
+
+
+def test_flares_over_photographs(tmp_path: Path) -> None:
+    make_capture(tmp_path / "photos", 3)
+    capture = Capture.open(tmp_path / "photos")
+    add_flares(capture, tmp_path / "out", ROUND, np.array([0.3, -0.2, 1.0]), (1.0, 0.8, 0.6), 2.0, 48, Progress())
+    made = Capture.open(tmp_path / "out")
+    assert [light.xyz.tolist() for light in made.lights] == [[0.3, -0.2, 1.0]]
+    for view, source in zip(made.views, capture.views, strict=True):
+        np.testing.assert_allclose(view.camera.world_to_camera, source.camera.world_to_camera, atol=1e-9)
+        assert view.camera.fx == pytest.approx(source.camera.fx * 0.75)
+        removed, flare = made.removed(view), made.truth_flare(view)
+        assert removed and flare and flare.pixels.max() > 0.5
+        np.testing.assert_allclose(removed.display(), capture.frame(source, (48, 36)).display(), atol=0.51 / 255)
+        both = srgb_from_linear(np.clip(removed.linear() + flare.pixels, 0, 1))
+        np.testing.assert_allclose(made.frame(view).display(), both, atol=0.51 / 255)
+        place = view.camera.project(np.array([[0.3, -0.2, 1.0]]))[0][0]
+        assert made.frame(view).display()[int(place[1]), int(place[0])].min() > 0.8
 
 
 def test_looking_at_puts_the_target_in_the_middle() -> None:

@@ -134,23 +134,29 @@ class FitSettings:
         return self
 
 
-def preset(name: Preset, *, model: Literal["paper", "ours"] = "paper", mode: Mode = "default",
+def preset(name: Preset, *, model: Literal["paper", "ours"] | None = None, mode: Mode = "default",
            blend: Literal["over", "add"] | None = None, iterations: int | None = None) -> FitSettings:
     """Settings by name, with every schedule stretched to the number of iterations.
 
-    paper     the paper's figures, 30,000 iterations
-    draft, standard, high: shorter schedules with higher rates (README has times and figures)
+    paper     the paper's form and figures, 30,000 iterations
+    draft, standard, high: our form, shorter schedules with higher rates (README has times and figures)
+
+    `model` and `blend` choose another form: the paper's covers in display space, ours adds in linear light
+    and is hidden by the scene.
     """
     lengths = {"draft": 1000, "standard": 3000, "high": 10000, "paper": 30000}
     if name not in lengths:
         raise SettingsError(f"There is no preset {name!r}; choose {', '.join(lengths)}.")
     length = lengths[name] if iterations is None else iterations
+    model = model or ("paper" if name == "paper" else "ours")
     form = replace(PAPER if model == "paper" else OURS, line=mode != "2d")
     if blend is None:
         blend = "over" if model == "paper" else "add"
-    settings = FitSettings(mode=mode, blend=blend, iterations=length, flare=FlareSettings(form=form))
+    flare = FlareSettings(form=form, occlusion=model == "ours")
+    settings = FitSettings(mode=mode, blend=blend, iterations=length, flare=flare)
     if name != "paper":
-        settings = _shortened(settings, {"draft": 300, "standard": 500, "high": 700}[name])
+        count, most = {"draft": (300, 40_000), "standard": (500, 60_000), "high": (700, 200_000)}[name]
+        settings = _shortened(settings, count, most)
     if blend == "add":
         # Light that adds is fainter than what covers: a ghost is a hundredth of white, not a tenth of opaque.
         density = replace(settings.flare.density, clone_above=5e-4, prune_below=2e-4)
@@ -158,8 +164,11 @@ def preset(name: Preset, *, model: Literal["paper", "ours"] = "paper", mode: Mod
     return settings.checked()
 
 
-def _shortened(settings: FitSettings, count: int) -> FitSettings:
-    """A schedule for a short fit: the same events at the same shares of the whole, and higher rates."""
+def _shortened(settings: FitSettings, count: int, most: int) -> FitSettings:
+    """A schedule for a short fit: the same events at the same shares of the whole, and higher rates.
+
+    A light starts with `count` Gaussians; the scene has at most `most`.
+    """
     length = settings.iterations
     every = max(round(length / 40), 20)
     density = replace(settings.flare.density, start=max(round(length * 0.1), every), stop=round(length * 0.6),
@@ -167,7 +176,7 @@ def _shortened(settings: FitSettings, count: int) -> FitSettings:
     rates = replace(settings.flare.rates, network=1e-3, grids=5e-3, position=1.6e-3, position_final=1.6e-5,
                     features=1e-2, scale=0.02, rotation=5e-3)
     classic = replace(settings.scene.classic, start=round(length * 0.05), stop=round(length * 0.6),
-                      every=max(round(length / 50), 20), reset_every=10 * length, cap=60_000)
+                      every=max(round(length / 50), 20), reset_every=10 * length, cap=most)
     scene = replace(settings.scene, classic=classic, sh_every=max(round(length / 6), 1),
                     rates=replace(settings.scene.rates, position=3.2e-4, position_final=3.2e-6))
     flare = replace(settings.flare, count=count, density=density, rates=rates)

@@ -22,7 +22,7 @@ def test_json_lines_are_whole_and_in_order() -> None:
     progress.say("done")
     progress.result(run="a")
     events = [json.loads(line) for line in stream.getvalue().splitlines()]
-    assert [event["type"] for event in events][0] == "stage"
+    assert events[0]["type"] == "stage"
     assert events[-1] == {"type": "result", "data": {"run": "a"}}
     last = [event for event in events if event["type"] == "progress"][-1]
     assert (last["done"], last["total"], last["left_s"]) == (3, 3, 0.0)

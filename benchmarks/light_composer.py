@@ -18,10 +18,12 @@ from core.pictures import Picture, Pixels, linear_from_srgb, srgb_from_linear
 
 @dataclass(frozen=True, eq=False)
 class Composed:
-    """A picture with lights: `masks` (n, h, w) of the emitting shapes, `centres` (n, 2) in pixels."""
+    """A picture with lights: `masks` (n, h, w) of the emitting shapes, `clipped` (h, w) where the lights' own light,
+    glare included, reaches white in every channel, `centres` (n, 2) in pixels."""
 
     picture: Picture
     masks: NDArray[np.bool_]
+    clipped: NDArray[np.bool_]
     centres: NDArray[np.float64]
 
 
@@ -50,7 +52,8 @@ def compose(photo: Picture, rng: np.random.Generator, number: int) -> Composed:
     display = np.clip(srgb_from_linear(linear_from_srgb(photo.pixels) + light), 0, 1)
     _, jpeg = cv2.imencode(".jpg", (display[..., ::-1] * 255 + 0.5).astype(np.uint8), [cv2.IMWRITE_JPEG_QUALITY, 92])
     stored = cv2.imdecode(jpeg, cv2.IMREAD_COLOR)[..., ::-1].astype(np.float32) / np.float32(255)
-    return Composed(Picture(stored, "srgb"), np.array(masks), np.array(centres))
+    return Composed(Picture(stored, "srgb"), np.array(masks).reshape(-1, height, width), light.min(axis=2) >= 1,
+                    np.array(centres).reshape(-1, 2))
 
 
 def _shape(size: tuple[int, int], centre: NDArray[np.float64], radius: float, rng: np.random.Generator) -> Pixels:

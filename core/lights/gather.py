@@ -21,19 +21,21 @@ from ..capture.camera import Camera, Floats
 from .detection import Detection
 
 FAR = 1000.0      # distance of a far light, in extents of the cameras' path
-TRIES = 4000      # pairs of detections tried; all of them where there are fewer
 STEPS = 20
+PATIENCE = 6      # places of too few views in a row, after which there is nothing left
 
 
 @dataclass(frozen=True)
 class GatherSettings:
     """tolerance: of a projection, as a share of the frame's diagonal, to which half the source's radius is added;
     min_views: fewer do not make a light; min_share: of the views that should show the light, so many must;
-    seed: of the pairs tried."""
+    most: lights at most. tries: pairs of detections tried, all of them where there are fewer; seed: of their choice."""
 
     tolerance: float = 0.006
     min_views: int = 3
     min_share: float = 0.12
+    most: int = 32
+    tries: int = 4000
     seed: int = 0
 
 
@@ -100,18 +102,21 @@ def gather(views: Sequence[tuple[str, Camera]], detections: Sequence[Sequence[De
     rng = np.random.default_rng(settings.seed)
     open_ = np.ones(len(seen.view), bool)
     found: list[FoundLight] = []
-    while open_.sum() >= settings.min_views:
-        place = _best(seen, open_, rng)
+    failures = 0
+    while open_.sum() >= settings.min_views and failures < PATIENCE and len(found) < settings.most:
+        place = _best(seen, open_, rng, settings.tries)
         if place is None:
             break
         place, inliers, covariance = _settled(seen, place, open_, extent)
         if len(np.unique(seen.view[inliers])) < settings.min_views:
             open_[_near(seen, place, open_)] = False  # spent, or the search would find it for ever
+            failures += 1
             continue
         light = _light(seen, place, inliers, covariance, extent)
         open_[inliers] = False
         if len(light.support) >= settings.min_share * light.visible:
             found.append(light)
+            failures = 0
     return merged(found, views, extent)
 
 
@@ -130,7 +135,7 @@ def _sightings(views: Sequence[tuple[str, Camera]], detections: Sequence[Sequenc
                       [detection for _, detection in flat])
 
 
-def _best(seen: _Sightings, open_: NDArray[np.bool_], rng: np.random.Generator) -> Floats | None:
+def _best(seen: _Sightings, open_: NDArray[np.bool_], rng: np.random.Generator, tries: int) -> Floats | None:
     """The place (4,) that the most open detections, by worth, agree on; None where no two are of two views."""
     index = np.flatnonzero(open_)
     first, second = np.triu_indices(len(index), 1)
@@ -139,9 +144,9 @@ def _best(seen: _Sightings, open_: NDArray[np.bool_], rng: np.random.Generator) 
     first, second = first[apart], second[apart]
     if not len(first):
         return None
-    if len(first) > TRIES:
+    if len(first) > tries:
         worth = seen.worth[first] * seen.worth[second]
-        chosen = rng.choice(len(first), TRIES, replace=False, p=worth / worth.sum())
+        chosen = rng.choice(len(first), tries, replace=False, p=worth / worth.sum())
         first, second = first[chosen], second[chosen]
     places = np.concatenate([_crossing(seen, first, second), _direction(seen, first, second)])
     best, value = None, 0.0
@@ -179,11 +184,11 @@ def _worth(seen: _Sightings, places: Floats, index: NDArray[np.int64]) -> Floats
     more the nearer it is."""
     pixels, front = seen.project(places)
     view = seen.view[index]
-    off = np.linalg.norm(pixels[:, view] - seen.pixel[index], axis=2) / seen.tolerance[index]
-    gain = np.where(front[:, view] & (off < 1), seen.worth[index] * (1 - off ** 2), 0.0)
-    best = np.zeros((len(places), len(seen.cameras)))
-    np.maximum.at(best.T, view, gain.T)
-    return np.asarray(best.sum(axis=1))
+    off = ((pixels[:, view] - seen.pixel[index]) ** 2).sum(axis=2) / seen.tolerance[index] ** 2
+    gain = np.where(front[:, view] & (off < 1), seen.worth[index] * (1 - off), 0.0)
+    # Detections come in the order of their views.
+    starts = np.flatnonzero(np.diff(view, prepend=-1))
+    return np.asarray(np.maximum.reduceat(gain, starts, axis=1).sum(axis=1))
 
 
 def _near(seen: _Sightings, place: Floats, open_: NDArray[np.bool_], loose: float = 1.0) -> NDArray[np.int64]:

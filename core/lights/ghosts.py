@@ -24,7 +24,7 @@ from .gather import FoundLight, GatherSettings, gather
 
 SHARES = -np.exp(np.linspace(np.log(0.12), np.log(2.5), 28))
 MIN_VIEWS, MIN_SHARE = 6, 0.35
-BLOBS = 24  # a picture; the strongest
+BLOBS = 20  # a picture; the strongest
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +103,7 @@ def _with_share(views: Sequence[tuple[str, Camera]], blobs: Sequence[Sequence[Bl
         claims.append([Detection(centre + (blob.xy - centre) / share, 0.02 * diagonal / abs(share), 1.0,
                                  np.ones(3), np.ones((1, 1), bool), (0, 0), False) for blob in some
                        if not camera.contains([centre + (blob.xy - centre) / share])[0]])
-    settings = GatherSettings(tolerance=0.0, min_views=MIN_VIEWS, min_share=0.0, seed=seed)
+    settings = GatherSettings(tolerance=0.0, min_views=MIN_VIEWS, min_share=0.0, most=2, tries=1500, seed=seed)
     for light in gather(views, claims, extent, settings):
         if len(light.support) >= MIN_SHARE * len(views) and light.visible - len(light.support) < 0.2 * len(views):
             return light

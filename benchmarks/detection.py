@@ -1,0 +1,159 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""How well light sources are found: in single pictures, and in 3D.
+
+    python benchmarks/detection.py --photos PHOTOS [--pictures 500] [--method exposure]
+    python benchmarks/detection.py --capture sample_scenes/desk
+
+Pictures: 1 to 5 synthetic sources over each photograph (light_composer.py), the union of detected masks
+against the union of exact masks by pixel (precision, recall, F1, IoU over all pictures together, as in the
+appendix of the paper), by threshold of the score, and by light: found where a detection's centroid lies on
+it. Two truths: `shape` is the emitting shape alone, `glare` the region that the source and its own glare clip,
+which is all that a picture shows of it. The photographs are taken as they are: lamps and windows of their own
+count against the detector.
+
+Captures: lights found from the frames against lights.json, in pixels (median over the views that have the
+light in frame) and in scene units.
+"""
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from benchmarks.light_composer import Composed, compose
+from core.capture import Capture
+from core.errors import EngineError, FitFlareError
+from core.lights import Detection, Detector, detector_for, find_lights, union
+from core.pictures import read_picture
+
+PHOTOS = (".jpg", ".jpeg", ".png")
+THRESHOLDS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
+
+
+@dataclass
+class Tally:
+    """Counts over all pictures at one threshold."""
+
+    pixels: dict[str, np.ndarray] = field(default_factory=lambda: {"shape": np.zeros(3), "glare": np.zeros(3)})
+    found: int = 0
+    lights: int = 0
+    false: int = 0
+
+    def add(self, picture: Composed, detections: Sequence[Detection]) -> None:
+        """Count one picture."""
+        claimed = union(detections, picture.picture.size)
+        for name, truth in (("shape", picture.masks.any(axis=0)), ("glare", picture.clipped)):
+            self.pixels[name] += [(claimed & truth).sum(), (claimed & ~truth).sum(), (truth & ~claimed).sum()]
+        hit = set()
+        for one in detections:
+            x, y = one.xy.astype(int)
+            on = np.flatnonzero(picture.masks[:, y, x])
+            hit.update(on.tolist())
+            self.false += not len(on)
+        self.found += len(hit)
+        self.lights += len(picture.masks)
+
+    def row(self, truth: str) -> tuple[float, float, float, float]:
+        """Precision, recall, F1 and IoU by pixel."""
+        hit, false, missed = self.pixels[truth]
+        precision, recall = hit / max(hit + false, 1), hit / max(hit + missed, 1)
+        harmonic = 2 * precision * recall / max(precision + recall, 1e-9)
+        return precision, recall, harmonic, hit / max(hit + false + missed, 1)
+
+
+def pictures(photos: Sequence[Path], number: int, seed: int) -> Iterator[Composed]:
+    """`number` compositions over the photographs in turn."""
+    for i in range(number):
+        rng = np.random.default_rng((seed, i))
+        yield compose(read_picture(photos[i % len(photos)]), rng, int(rng.integers(1, 6)))
+
+
+def in_pictures(detector: Detector, photos: Sequence[Path], number: int, seed: int) -> dict[float, Tally]:
+    """Tallies by threshold, from one detection a picture at the lowest."""
+    tallies = {threshold: Tally() for threshold in THRESHOLDS}
+    for picture in pictures(photos, number, seed):
+        detections = detector.detect(picture.picture)
+        for threshold, tally in tallies.items():
+            tally.add(picture, [one for one in detections if one.score >= threshold])
+    return tallies
+
+
+def in_captures(folders: Sequence[Path], detector: Detector) -> None:
+    """Print the 3D error of every light of every capture."""
+    print(f"{'capture':24s} {'light':12s} {'error':>9s} {'of extent':>9s} {'median px':>9s} {'support':>8s}")
+    for folder in folders:
+        try:
+            capture = Capture.open(folder)
+        except FitFlareError as problem:
+            print(f"skipped: {problem}")
+            continue
+        found = find_lights(capture, detector).lights
+        left = list(found)
+        for light in capture.lights:
+            if not left:
+                print(f"{folder.name:24s} {light.name:12s} not found")
+                continue
+            nearest = min(left, key=lambda one: float(np.linalg.norm(one.xyz - light.xyz)))
+            left.remove(nearest)
+            off = []
+            for view in capture.views:
+                pixel, depth = view.camera.project([light.xyz])
+                if view.camera.contains(pixel, depth)[0]:
+                    off.append(np.linalg.norm(view.camera.project([nearest.xyz])[0][0] - pixel[0]))
+            error = float(np.linalg.norm(nearest.xyz - light.xyz))
+            print(f"{folder.name:24s} {light.name:12s} {error:9.4f} {error / capture.extent:9.4f} "
+                  f"{np.median(off):9.3f} {len(nearest.support):4d}/{nearest.visible}")
+        print(f"{folder.name:24s} {len(capture.lights)} lights, {len(found)} found, {len(left)} invented")
+
+
+def main() -> None:
+    """Read the words and print the tables."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--photos", type=Path, help="folder of photographs, searched with its subfolders")
+    parser.add_argument("--pictures", type=int, default=500)
+    parser.add_argument("--capture", type=Path, action="append", default=[], help="capture with lights.json")
+    parser.add_argument("--method", action="append", choices=("exposure", "grounded"), default=[])
+    parser.add_argument("--boxes", help="GroundingDINO's weights: folder or hub name")
+    parser.add_argument("--masks", help="SAM 2's weights: folder or hub name")
+    parser.add_argument("--seed", type=int, default=0)
+    words = parser.parse_args()
+    for method in words.method or ["exposure", "grounded"]:
+        try:
+            detector = detector_for(method, THRESHOLDS[0], words.boxes, words.masks)
+        except EngineError as problem:
+            print(f"{method}: skipped. {problem}")
+            continue
+        if words.photos is not None:
+            photos = sorted(path for path in words.photos.rglob("*") if path.suffix.lower() in PHOTOS)
+            if not photos:
+                print(f"{method}: skipped, {words.photos} holds no photographs.")
+            else:
+                _print(method, in_pictures(detector, photos, words.pictures, words.seed), words.pictures)
+        if words.capture:
+            in_captures(words.capture, detector_for(method, None, words.boxes, words.masks))
+    if words.photos is None and not words.capture:
+        print("Nothing to measure: give --photos FOLDER, --capture FOLDER or both.")
+
+
+def _print(method: str, tallies: dict[float, Tally], number: int) -> None:
+    print(f"{method}, {number} pictures, {next(iter(tallies.values())).lights} lights")
+    print("          |        shape             |        glare             | by light")
+    print("threshold |  P     R     F1    IoU   |  P     R     F1    IoU   | recall  precision  false a picture")
+    for threshold, tally in tallies.items():
+        cells = " | ".join(" ".join(f"{x:.3f}" for x in tally.row(truth)) + " " for truth in ("shape", "glare"))
+        precision = tally.found / max(tally.found + tally.false, 1)
+        print(f"   {threshold:.2f}   | {cells} |  {tally.found / max(tally.lights, 1):.3f}    {precision:.3f}      "
+              f"{tally.false / number:.2f}")
+    for truth in ("shape", "glare"):
+        threshold = max(tallies, key=lambda t: tallies[t].row(truth)[2])
+        print(f"best F1 by {truth}: {tallies[threshold].row(truth)[2]:.3f} at threshold {threshold:.2f}")
+
+
+if __name__ == "__main__":
+    main()

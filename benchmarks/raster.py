@@ -70,7 +70,7 @@ def our_engine(name: str) -> Engine:
     """One of our kernel sets as an engine."""
 
     def render(*arguments: object) -> Tensor:
-        return rasterization(*arguments, kernels=name).colour  # type: ignore[arg-type]
+        return rasterization(*arguments, kernels=name, depth=False).colour  # type: ignore[arg-type]
 
     return render
 
@@ -141,8 +141,9 @@ class Iteration:
     def step(self) -> None:
         s, size = self.scene, (self.job.width, self.job.height)
         picture = rasterization(
-            s.means, s.quaternions, s.scales, s.opacities, s.sh, *self.camera, *size, kernels=self.kernel_set  # type: ignore[arg-type]
-        ).colour
+            s.means, s.quaternions, s.scales, s.opacities, s.sh, *self.camera, *size,
+            kernels=self.kernel_set, depth=False,  # type: ignore[arg-type]
+        ).colour  # fmt: skip
         if self.job.flares:
             laid = splat(*self.flares, *size, kernels=self.kernel_set)  # type: ignore[arg-type]
             picture = laid.colour + laid.transmittance[..., None] * picture

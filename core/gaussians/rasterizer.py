@@ -21,7 +21,7 @@ def rasterization(
     means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, sh: Tensor,
     world_to_camera: Tensor, intrinsics: Tensor, width: int, height: int,
     *, background: Tensor | None = None, sh_degree: int | None = None,
-    kernels: Kernels = "auto", near: float = NEAR, dilation: float = DILATION,
+    kernels: Kernels = "auto", near: float = NEAR, dilation: float = DILATION, depth: bool = True,
 ) -> Rendering:  # fmt: skip
     """Renders n 3D Gaussians (Kerbl et al. 2023), nearest first; `reference.py` has the definition.
 
@@ -37,6 +37,7 @@ def rasterization(
     kernels          see `kernels.py`
     near             camera depth at which Gaussians are culled, world units
     dilation         px², added to both diagonal elements of the projected covariances
+    depth            False leaves depth and median_depth empty, (0, 0), which saves time
 
     Differentiable by every tensor. Raises SettingsError for shapes and values that do not fit,
     EngineError for kernels that are not installed.
@@ -58,7 +59,7 @@ def rasterization(
         degree = sh_degree
     return choose(kernels, means).rasterize_scene(
         means, quats, scales, opacities, sh, world_to_camera, intrinsics, width, height,
-        background=background, sh_degree=degree, near=near, dilation=dilation,
+        background=background, sh_degree=degree, near=near, dilation=dilation, depth=depth,
     )  # fmt: skip
 
 

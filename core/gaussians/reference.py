@@ -98,7 +98,7 @@ def _in_chunks(pixels: Tensor, count: int, shade: Callable[[Tensor], Tensor]) ->
 def rasterize_scene(
     means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, sh: Tensor,
     world_to_camera: Tensor, intrinsics: Tensor, width: int, height: int,
-    *, background: Tensor | None, sh_degree: int, near: float, dilation: float,
+    *, background: Tensor | None, sh_degree: int, near: float, dilation: float, depth: bool,
 ) -> Rendering:  # fmt: skip
     """See `rasterization`."""
     seen = project(means, quats, scales, world_to_camera, intrinsics, width, height, near, dilation)
@@ -121,7 +121,7 @@ def rasterize_scene(
 
     pixels = pixel_centres(width, height, means)
     with torch.no_grad():
-        median_depth = _in_chunks(pixels, len(index), median).reshape(height, width)
+        median_depth = _in_chunks(pixels, len(index), median).reshape(height, width) if depth else means.new_empty(0, 0)
         all_centres = torch.zeros_like(means[:, :2]).index_copy_(0, index, centres)
         reach = extent(opacities.clamp(max=OPACITY_MAX))
         radii = torch.zeros_like(means[:, 0]).index_copy_(
@@ -132,8 +132,8 @@ def rasterize_scene(
     colour = picture[..., :3]
     if background is not None:
         colour = colour + (1 - alpha)[..., None] * background
-    depth = picture[..., 3] / alpha.clamp(min=ALPHA_MIN / 2)
-    return Rendering(colour, alpha, depth, median_depth, all_centres, radii, gradients)
+    mean_depth = picture[..., 3] / alpha.clamp(min=ALPHA_MIN / 2) if depth else median_depth
+    return Rendering(colour, alpha, mean_depth, median_depth, all_centres, radii, gradients)
 
 
 def splat(

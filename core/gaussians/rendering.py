@@ -34,7 +34,7 @@ class Rendering:
     alpha             (h, w)     0..1, one minus the transmittance left behind all Gaussians
     depth             (h, w)     mean camera depth, weighted by contribution; 0 where alpha is 0
     median_depth      (h, w)     depth of the Gaussian at which transmittance falls below 1/2, 0 where
-                                 none does; not differentiable
+                                 none does; not differentiable. Both (0, 0) if not asked for
     centres           (n, 2)     projected centres, px; 0 for those culled; detached
     radii             (n,)       3 sigma of the longer axis, px; 0 for those that touch no pixel; detached
     centre_gradients  (n, 2)     zero until backward, which adds the gradient of the loss by the centres,

@@ -96,7 +96,7 @@ class SceneGaussians(nn.Module):
 
     def render(
         self, camera: Camera, sh_degree: int | None = None, background: Tensor | None = None,
-        *, kernels: Kernels = "auto",
+        *, kernels: Kernels = "auto", depth: bool = True,
     ) -> Rendering:  # fmt: skip
         """The scene as the camera sees it; see `rasterization`. Differentiable by the Gaussians."""
         return rasterization(
@@ -104,6 +104,7 @@ class SceneGaussians(nn.Module):
             torch.as_tensor(camera.world_to_camera).to(self.means),
             torch.as_tensor(camera.intrinsics).to(self.means),
             camera.width, camera.height, background=background, sh_degree=sh_degree, kernels=kernels,
+            depth=depth,
         )  # fmt: skip
 
 

@@ -136,7 +136,7 @@ def rasterize_scene(
     draw: Draw, size: int,
     means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, sh: Tensor,
     world_to_camera: Tensor, intrinsics: Tensor, width: int, height: int,
-    *, background: Tensor | None, sh_degree: int, near: float, dilation: float,
+    *, background: Tensor | None, sh_degree: int, near: float, dilation: float, depth: bool,
 ) -> Rendering:  # fmt: skip
     """See `rasterization`; with this drawing, in tiles of this size."""
     dtype = means.dtype
@@ -166,14 +166,17 @@ def rasterize_scene(
     )
     reach = reach[order]
     half = half_sizes(covariances.detach(), reach)
-    picture, rows = draw_tiles(draw, size, drawn, reach, half, width, height, blend="over", median=True)
+    picture, rows = draw_tiles(draw, size, drawn, reach, half, width, height, blend="over", median=depth)
     alpha = picture[..., 4]
     colour = picture[..., :3]
     if background is not None:
         colour = colour + (1 - alpha)[..., None] * background
-    depth = picture[..., 3] / alpha.clamp(min=ALPHA_MIN / 2)
-    median_depth = torch.cat([depths, depths.new_zeros(1)]).detach()[rows]
-    return Rendering(colour, alpha, depth, median_depth, all_centres, radii, gradients)
+    if depth:
+        mean_depth = picture[..., 3] / alpha.clamp(min=ALPHA_MIN / 2)
+        median_depth = torch.cat([depths, depths.new_zeros(1)]).detach()[rows]
+    else:
+        mean_depth = median_depth = means.new_empty(0, 0)
+    return Rendering(colour, alpha, mean_depth, median_depth, all_centres, radii, gradients)
 
 
 def splat(

@@ -198,6 +198,20 @@ def test_degree_and_dilation(kernels: str) -> None:
     assert wide.radii.item() == pytest.approx(3 * math.sqrt(4 + 9), abs=1e-4)
 
 
+@pytest.mark.parametrize("kernels", SETS)
+def test_without_depth(kernels: str) -> None:
+    """The same picture and the same gradients."""
+    found = []
+    for depth in (True, False):
+        means = scene()["means"].requires_grad_()
+        r = rasterization(**{**scene(), "means": means}, width=20, height=16, depth=depth, kernels=kernels)
+        r.colour.square().sum().backward()
+        assert r.depth.shape == r.median_depth.shape == ((16, 20) if depth else (0, 0))
+        found.append((r.colour, r.alpha, means.grad))
+    for full, fast in zip(*found, strict=True):
+        assert torch.allclose(full, fast, rtol=1e-5, atol=1e-6)
+
+
 def test_what_does_not_fit_is_refused() -> None:
     good = scene() | {"width": 5, "height": 5}
     for name, value, message in (

@@ -1,0 +1,165 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Frames per second of a fitted scene with its flares, each stage apart, and writes docs/engine.md.
+
+    python benchmarks/render.py               a synthetic scene of the paper's size
+    python benchmarks/render.py --run FOLDER  the scene and flares of a run; its first light, again, for more lights
+
+The paper (an RTX 4090, 1920x1080, 162,283 scene and 10,965 flare Gaussians): 3.92 ms deformation, 6.86 ms
+rasterization, 10.79 ms a frame; 3.9, 6.8 and 11.1 ms deformation for one, two and three lights.
+"""
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from benchmarks import report, workload
+from benchmarks.report import milliseconds, table
+from benchmarks.timing import medians
+from core.capture import Camera
+from core.fit.run import Run
+from core.flare.compositing import Blend, composite, joined
+from core.flare.deformation import QueryRange
+from core.flare.model import OURS, PAPER, FlareForm, FlareModel, LightFlare
+from core.flare.placement import PlaneGaussians, pixels
+from core.gaussians import SceneGaussians, kernels, splat
+
+SIZES = ((1920, 1080), (3840, 2160))
+SCENE, FLARE = 162_283, 10_965
+DEFORMATION = {1: 3.9, 2: 6.8, 3: 11.1}
+"""What the paper measured, ms, by the number of lights."""
+STAGES = ("deformation", "projection", "flare raster", "flare raster, mixed", "scene", "composite")
+
+
+class Fitted(NamedTuple):
+    """What is rendered: a flare for each light, in the order in which they are switched on."""
+
+    scene: SceneGaussians
+    flares: list[LightFlare]
+    positions: Tensor
+    blend: Blend
+    pose: np.ndarray
+    focal: float
+    """Of a picture one pixel wide."""
+
+
+def synthetic(form: FlareForm, blend: Blend, size: int = SCENE, flare: int = FLARE) -> Fitted:
+    """Three lights in front of the workload's camera, with untrained flares."""
+    generator = torch.Generator().manual_seed(0)
+    positions = torch.tensor([[0.6, -0.4, 3.0], [-1.0, 0.3, 4.0], [0.2, 0.8, 5.0]], dtype=torch.float64)
+    query = QueryRange((-1, -1, -1), (1, 1, 1), (1, 1, 1))
+    flares = [LightFlare(form, query, flare, generator) for _ in positions]
+    return Fitted(SceneGaussians(*workload.scene(size)), flares, positions, blend, np.eye(4), 0.5 / workload.TAN)
+
+
+def of_run(folder: Path) -> Fitted:
+    """A run's scene and flares, seen by its capture's first camera with a light in front of it."""
+    from core.capture import Capture
+
+    run = Run.open(folder)
+    if run.flare is None:
+        raise SystemExit(f"{folder} has no flare.")
+    flares, positions = list(run.flare.model.lights), run.flare.model.positions
+    while len(flares) < 3:
+        flares, positions = [*flares, flares[0]], torch.cat([positions, positions[:1]])
+    for view in Capture.open(run.capture_folder, need_frames=False).views:
+        pose = torch.from_numpy(view.camera.world_to_camera)
+        if all(one.depth > 0 for one in run.flare.model.views(pose)):
+            camera = view.camera
+            return Fitted(
+                run.scene, flares, positions, run.flare.blend, camera.world_to_camera, camera.fx / camera.width
+            )
+    raise SystemExit(f"No camera of {run.capture_folder} has all lights in front of it.")
+
+
+def stages(
+    fitted: Fitted, lights: int, width: int, height: int, kernel_set: str, device: str
+) -> dict[str, Callable[[], object]]:
+    """Each stage of a frame, as work to be timed."""
+    focal = fitted.focal * width
+    camera = Camera(width, height, focal, focal, width / 2, height / 2, fitted.pose)
+    pose = torch.from_numpy(camera.world_to_camera)
+    intrinsics = torch.from_numpy(camera.intrinsics).float().to(device)
+    model = FlareModel([str(i) for i in range(lights)], fitted.positions[:lights], fitted.flares[:lights])
+    scene = fitted.scene.to(device)
+
+    def deformed() -> PlaneGaussians:
+        found = joined(model(pose))
+        assert found is not None
+        return PlaneGaussians(*(None if part is None else part.to(device) for part in found))
+
+    def raster(resolution: str) -> Callable[[], object]:
+        return lambda: splat(
+            *placed, flare.opacities, flare.colours, width, height, rings=flare.rings, blend=fitted.blend,
+            resolution=resolution, kernels=kernel_set,  # type: ignore[arg-type]
+        )  # fmt: skip
+
+    def rendered() -> Tensor:
+        return scene.render(camera, kernels=kernel_set, depth=False).colour  # type: ignore[arg-type]
+
+    flare = deformed()
+    placed = pixels(flare, intrinsics)
+    behind, front = rendered(), splat(
+        *placed, flare.opacities, flare.colours, width, height, blend=fitted.blend, kernels=kernel_set  # type: ignore[arg-type]
+    )
+    work: tuple[Callable[[], object], ...] = (
+        deformed, lambda: pixels(flare, intrinsics), raster("full"), raster("mixed"), rendered,
+        lambda: composite(behind, front, fitted.blend),
+    )  # fmt: skip
+    return dict(zip(STAGES, work, strict=True))
+
+
+def measured(fitted: Fitted, kernel_set: str, device: str, rounds: int) -> str:
+    """The table."""
+    rows = []
+    for width, height in SIZES:
+        for lights in (1, 2, 3):
+            times = medians(stages(fitted, lights, width, height, kernel_set, device), rounds)
+            shared = sum(times[stage] for stage in ("deformation", "projection", "scene", "composite"))
+            full, mixed = shared + times["flare raster"], shared + times["flare raster, mixed"]
+            paper = (str(DEFORMATION[lights]), "10.79" if lights == 1 else "–") if width == 1920 else ("–", "–")
+            shown = [milliseconds(seconds) for seconds in (*times.values(), full, mixed)]
+            rows.append([f"{width}x{height}, {lights}", *shown, f"{1 / mixed:.1f}", *paper])
+    head = ["ms; picture, lights", *STAGES, "frame", "frame, mixed", "frames/s, mixed"]
+    return table([*head, "paper's deformation (RTX 4090)", "paper's frame"], rows)
+
+
+def main() -> None:
+    """See the module's head."""
+    parser = argparse.ArgumentParser(description="Frames per second of a fitted scene, each stage apart.")
+    parser.add_argument("--run", type=Path, help="folder of a run; a synthetic scene without it")
+    parser.add_argument("--form", choices=("paper", "ours"), default="paper", help="of the synthetic flares")
+    parser.add_argument("--blend", choices=("over", "add"), default="over", help="of the synthetic flares")
+    parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
+    parser.add_argument("--kernels", default="auto", choices=["auto", *kernels.MODULES])
+    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--out", type=Path, default=report.ROOT / "docs" / "engine.md")
+    arguments = parser.parse_args()
+    if arguments.run:
+        fitted = of_run(arguments.run)
+    else:
+        fitted = synthetic(PAPER if arguments.form == "paper" else OURS, arguments.blend)
+    conditions = report.conditions()
+    with torch.no_grad():
+        text = measured(fitted, arguments.kernels, arguments.device, arguments.rounds)
+    what = (
+        f"{len(fitted.scene):,} scene Gaussians, {fitted.flares[0].count:,} for each light, blend {fitted.blend}, "
+        f"{'a run' if arguments.run else f'synthetic, untrained flares of the form {arguments.form!r}'}, "
+        f"on {arguments.device.upper()}, {torch.get_num_threads()} threads. Scene: projection, sorting and raster."
+    )
+    name = "a run" if arguments.run else f"{arguments.form}, {arguments.blend}"
+    text = f"## Rendering: {name}\n\n{what}\n\n{text}\n\n{conditions}"
+    report.write_section(arguments.out, f"render {name}", text)
+    sys.stdout.write(text + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from ..command import Command
-from . import bake, compose, demo, evaluate, fit
+from . import bake, compose, demo, evaluate, fit, lights, solve
 
-_MODULES = (demo, fit, evaluate, bake, compose)
+_MODULES = (demo, solve, lights, fit, evaluate, bake, compose)
 
 COMMANDS: dict[str, Command] = {module.COMMAND.name: module.COMMAND for module in _MODULES}

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ...errors import CaptureError, FrameError
 from ...files import read_json, write_json
@@ -197,16 +198,41 @@ def _exposed(picture: Picture) -> Pixels:
     return picture.display()
 
 
-def usable(picture: Picture) -> np.ndarray[Any, np.dtype[np.bool_]]:
-    """Where features may be taken (h, w): not in clipped pixels nor in the bloom just round them.
-
-    The rim of a clipped area moves with exposure and glare, not with the scene.
-    """
+def usable(picture: Picture) -> NDArray[np.bool_]:
+    """Where features may be taken (h, w): not in clipped pixels nor in the bloom just round them, whose rim moves
+    with exposure and glare; and not along the lines from compact clipped spots through the middle of the frame,
+    where the ghosts of a light have their centres, which move with the lens."""
     import cv2
 
     clipped = (picture.pixels.max(axis=2) >= CLIPPED).astype(np.uint8)
     # Lone pixels are sparkle on a texture, and good features.
     clipped = cv2.morphologyEx(clipped, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
-    reach = max(2, round(0.008 * float(np.hypot(*picture.size))))
+    diagonal = float(np.hypot(*picture.size))
+    lines = _ghost_lines(clipped, max(3, round(0.015 * diagonal)))
+    reach = max(2, round(0.008 * diagonal))
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
-    return np.asarray(cv2.dilate(clipped, disc)) == 0
+    return (np.asarray(cv2.dilate(clipped, disc)) == 0) & ~lines
+
+
+def _ghost_lines(clipped: NDArray[np.uint8], thickness: int) -> NDArray[np.bool_]:
+    """Bands (h, w) of the thickness in pixels, for the four largest compact spots at most."""
+    import cv2
+
+    height, width = clipped.shape
+    drawn = np.zeros((height, width), np.uint8)
+    number, _, boxes, centres = cv2.connectedComponentsWithStats(clipped, connectivity=8)
+    middle = np.array([width, height]) / 2
+    spots = []
+    for label in range(1, number):
+        _, _, wide, high, area = map(int, boxes[label])
+        # A disc fills 0.79 of its box; a spot with spikes less, a window frame or a text far less.
+        if 9 <= area <= 0.01 * width * height and area >= 0.4 * wide * high and max(wide, high) <= 3 * min(wide, high):
+            spots.append((area, label))
+    for _, label in sorted(spots, reverse=True)[:4]:
+        away = middle - centres[label]
+        length = float(np.linalg.norm(away))
+        if length > 2 * thickness:
+            reach = float(np.hypot(width, height)) * away / length
+            start, end = (middle - reach).astype(int), (middle + reach).astype(int)
+            cv2.line(drawn, tuple(map(int, start)), tuple(map(int, end)), (1.0,), thickness)
+    return drawn > 0

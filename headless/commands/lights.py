@@ -1,0 +1,82 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""lights: the light sources of a capture, found in its frames."""
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from ...core.progress import Progress
+from ..command import Command, Step
+
+METHODS = ("exposure", "grounded")
+
+
+def arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("capture", type=Path, metavar="CAPTURE", help="folder with images/ and a camera solve")
+    parser.add_argument("--keep", action="store_true",
+                        help="leave what lights.json has as it is: what was renamed, moved, added or taken out by "
+                             "hand stays so; only lights not found before are added")
+    parser.add_argument("--method", choices=METHODS, default="exposure",
+                        help="exposure: over-exposed compact spots; grounded: GroundingDINO and SAM 2, if transformers "
+                             "and weights are at hand (default exposure)")
+    parser.add_argument("--threshold", type=float, metavar="SCORE",
+                        help="of a detection, 0 to 1 (default 0.3 for exposure, 0.35 for grounded)")
+    parser.add_argument("--boxes", metavar="FOLDER_OR_NAME", help="GroundingDINO's weights, for grounded")
+    parser.add_argument("--masks", metavar="FOLDER_OR_NAME", help="SAM 2's weights, for grounded")
+    parser.add_argument("--min-views", type=int, default=3, metavar="N",
+                        help="views that must show a light (default 3)")
+    parser.add_argument("--scene", type=Path, metavar="SCENE.PLY",
+                        help="a fitted scene (RUN/scene.ply): lift detections on to its Gaussians, as the paper does")
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="of all randomness (default 0)")
+
+
+def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
+    from ...core.capture import Capture
+    from ...core.lights import GatherSettings, detector_for, find_lights, record
+
+    capture = Capture.open(words.capture)
+    detector = detector_for(words.method, words.threshold, words.boxes, words.masks)
+    settings = GatherSettings(min_views=words.min_views, seed=words.seed)
+    gaussians = _gaussians(words.scene) if words.scene else None
+    findings = find_lights(capture, detector, progress, settings, gaussians=gaussians)
+    report = record(capture, findings, keep=words.keep)
+    for sentence in findings.says:
+        progress.say(sentence)
+    for light in report["lights"]:
+        progress.say(_sentence(light))
+    if findings.doubtful:
+        progress.say(f"{len(findings.doubtful)} more were seen in fewer than {words.min_views} views and left out; "
+                     f"--min-views 2 takes them.")
+    progress.say(f"Look at {words.capture / report['sheets'][0]}; lights.json can be edited, and `--keep` respects it.")
+    return {"lights": report["lights"], "file": str(words.capture / "lights.json"),
+            "sheets": [str(words.capture / sheet) for sheet in report["sheets"]]}
+
+
+def _sentence(light: dict[str, Any]) -> str:
+    """One light, for a person."""
+    x, y, z = light["xyz"]
+    if "support" not in light:
+        return f"{light['name']}: at {x:.3g}, {y:.3g}, {z:.3g}, by hand."
+    sure = (f"direction within {light['uncertainty']:.2g} degrees, far away" if light["far"]
+            else f"within {light['uncertainty']:.2g} units")
+    return (f"{light['name']}: at {x:.3g}, {y:.3g}, {z:.3g}, {sure}; {light['support']} of {light['views']} views, "
+            f"{light['residual_px']:.2f} px; {light['how']}.")
+
+
+def _gaussians(path: Path) -> tuple[Any, Any]:
+    """Means (n, 3) and opacities (n,) of a scene in the standard 3DGS PLY."""
+    from ...core.gaussians.ply import read_ply
+
+    scene = read_ply(path)
+    return scene.means.detach().numpy(), scene.opacities.detach().numpy()
+
+
+COMMAND = Command(
+    "lights", "Finds the light sources of a capture.",
+    """Writes CAPTURE/lights.json and pictures of every view with what was found, CAPTURE/lights/sheetN.png.
+Detections of all views are gathered into places in 3D; far lights keep their direction. A light that is
+never in frame is found by its ghosts, if many views show one.
+
+  run.py lights captures/shot""",
+    arguments, (Step("lights", "engine", run),))

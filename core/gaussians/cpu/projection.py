@@ -62,6 +62,7 @@ FX, FY, CX, CY, LOW_X, HIGH_X, LOW_Y, HIGH_Y, POSITION, NEAR, DILATION = 12, 13,
 CAMERA = 25
 # Sums over Gaussians for the camera's gradient: rotation 0..8, translation 9..11, fx fy cx cy, then
 POSITION_SUM, CAMERA_SUMS = 16, 32
+SLOPES = 9
 
 TURNED = harmonics.ROWS * LANES
 SQUARE = LANES * LANES
@@ -234,9 +235,9 @@ def _tiles_bound(x, y, half_x, half_y, visible, width, height):  # type: ignore[
 @inlined
 def _project_block(
     means, quats, scales, opacities, sh, sh_width, degree, camera, width, height, first, turned, basis,
-    records, centres, radii, bounds,
+    records, centres, radii, bounds, slopes_out,
 ):  # type: ignore[no-untyped-def]  # fmt: skip
-    """Projects the 16 Gaussians from `first` on."""
+    """Projects the 16 Gaussians from `first` on. slopes_out: see `project`."""
     mean = _load3(means, first)
     px, py, pz = _seen(camera, mean)
     before = pz > camera[NEAR]
@@ -274,8 +275,13 @@ def _project_block(
     red, green, blue = zero, zero, zero
     if any_of(visible):
         harmonics.gather(sh, first, sh_width, 3 * (degree + 1) * (degree + 1), turned)
-        direction, _ = _direction(mean, camera)
+        direction, inverse = _direction(mean, camera)
         red, green, blue = harmonics.colours(turned, degree, direction[0], direction[1], direction[2], basis)
+        if slopes_out.size > 0:
+            _colour_slopes(turned, degree, direction, inverse, slopes_out)
+    elif slopes_out.size > 0:
+        for i in range(SLOPES):
+            store(slopes_out, i * LANES, zero)
     rows = transpose((
         x, y, major, k, minor, opacity, exp2(bend * -TWO), bend,
         maximum(red, ZERO), maximum(green, ZERO), maximum(blue, ZERO), pz,
@@ -290,13 +296,23 @@ def _store2(array, first, x, y):  # type: ignore[no-untyped-def]
     store_rows(array, 2 * first, LANES, interleave((x, y)))
 
 
+@inlined
+def _colour_slopes(turned, degree, direction, inverse_distance, out):  # type: ignore[no-untyped-def]
+    """Writes the gradient of each colour by the mean: what of the slope lies along the sphere of directions."""
+    for channel in range(3):
+        g = harmonics.slope(turned, degree, direction[0], direction[1], direction[2], channel)
+        g = _scaled(inverse_distance, _sum(g, -_dot(g, direction), direction))
+        store_rows(out, 3 * channel * LANES, LANES, g)
+
+
 @kernel
 def project(
     counter, scratch, means, quats, scales, opacities, sh, sh_width, degree, camera, width, height,
-    records, centres, radii, bounds, chunk_bounds,
+    records, centres, radii, bounds, chunk_bounds, slopes,
 ):  # type: ignore[no-untyped-def]  # fmt: skip
     """Writes a record, the centre, the radius and a bound on the number of tiles for each of n >= 16 Gaussians;
-    chunk_bounds: the sums of the bounds over chunks."""
+    chunk_bounds: the sums of the bounds over chunks. slopes: gradients of the colours by the means, 9 vectors
+    a block of 16; empty where no gradients are wanted."""
     n = opacities.size
     turned, basis = scratch[:TURNED], scratch[TURNED : TURNED + SQUARE]
     while True:
@@ -308,7 +324,7 @@ def project(
             first = min(block, n - LANES)  # the last block overlaps the one before and writes the same again
             _project_block(
                 means, quats, scales, opacities, sh, sh_width, degree, camera, width, height, first, turned, basis,
-                records, centres, radii, bounds,
+                records, centres, radii, bounds, slopes[block * SLOPES :],
             )  # fmt: skip
         total = 0
         for i in range(start, end):
@@ -360,25 +376,34 @@ def _add_to(sums, place, value, mask):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _camera_sums(sums, fresh, mean, q, dv, dp, d_direction, intrinsics):  # type: ignore[no-untyped-def]
+def _camera_sums(sums, fresh, mean, q, dv, dp, offset, intrinsics):  # type: ignore[no-untyped-def]
     """Adds what 16 Gaussians say about the camera; fresh: lanes that have not been counted yet.
 
-    V = R Q gives dV Q^T, p = R m + t gives dp m^T, and the position of the camera minus the directions'.
+    V = R Q gives dV Q^T, p = R m + t gives dp m^T, and the position of the camera the opposite of the
+    means' part by direction.
     """
     for i in range(3):
         _add_to(sums, 3 * i, _dot(dv[i], q[0]) + dp[i] * mean[0], fresh)
         _add_to(sums, 3 * i + 1, _dot(dv[i], q[1]) + dp[i] * mean[1], fresh)
         _add_to(sums, 3 * i + 2, _dot(dv[i], q[2]) + dp[i] * mean[2], fresh)
         _add_to(sums, 9 + i, dp[i], fresh)
-        _add_to(sums, POSITION_SUM + i, -d_direction[i], fresh)
+        _add_to(sums, POSITION_SUM + i, -offset[i], fresh)
     for i in range(4):
         _add_to(sums, 12 + i, intrinsics[i], fresh)
 
 
 @inlined
+def _offset_gradient(d_colour, slopes):  # type: ignore[no-untyped-def]
+    """Gradient of the offset from the camera to the means, by way of the colours."""
+    result = _scaled(d_colour[0], (load(slopes, 0), load(slopes, 16), load(slopes, 32)))
+    result = _sum(result, d_colour[1], (load(slopes, 48), load(slopes, 64), load(slopes, 80)))
+    return _sum(result, d_colour[2], (load(slopes, 96), load(slopes, 112), load(slopes, 128)))
+
+
+@inlined
 def _project_block_backward(
-    means, quats, scales, opacities, sh, sh_width, degree, camera, records, first, fresh, fields, turned, rows,
-    d_means, d_quats, d_scales, d_opacities, d_sh, d_centres, sums, with_camera,
+    means, quats, scales, opacities, sh_width, degree, camera, records, colour_slopes, first, fresh, fields,
+    turned, rows, d_means, d_quats, d_scales, d_opacities, d_sh, d_centres, sums, with_camera,
 ):  # type: ignore[no-untyped-def]  # fmt: skip
     mean, scale = _load3(means, first), _load3(scales, first)
     px, py, pz = _seen(camera, mean)
@@ -436,26 +461,25 @@ def _project_block_backward(
         where(shown[GREEN] > ZERO, fields[G_GREEN], ZERO),
         where(shown[BLUE] > ZERO, fields[G_BLUE], ZERO),
     )
-    direction, inverse_distance = _direction(mean, camera)
-    harmonics.gather(sh, first, sh_width, 3 * (degree + 1) * (degree + 1), turned)
-    g = harmonics.colours_backward(turned, degree, direction[0], direction[1], direction[2], d_colour, rows)
+    direction, _ = _direction(mean, camera)
+    harmonics.coefficients_backward(degree, direction[0], direction[1], direction[2], d_colour, rows, turned)
     harmonics.scatter(turned, first, sh_width, d_sh)
-    d_direction = _scaled(inverse_distance, _sum(g, -_dot(g, direction), direction))
-
+    offset = _offset_gradient(d_colour, colour_slopes)
     d_mean = (
-        fma(dp[0], camera[0], fma(dp[1], camera[3], fma(dp[2], camera[6], d_direction[0]))),
-        fma(dp[0], camera[1], fma(dp[1], camera[4], fma(dp[2], camera[7], d_direction[1]))),
-        fma(dp[0], camera[2], fma(dp[1], camera[5], fma(dp[2], camera[8], d_direction[2]))),
+        fma(dp[0], camera[0], fma(dp[1], camera[3], fma(dp[2], camera[6], offset[0]))),
+        fma(dp[0], camera[1], fma(dp[1], camera[4], fma(dp[2], camera[7], offset[1]))),
+        fma(dp[0], camera[2], fma(dp[1], camera[5], fma(dp[2], camera[8], offset[2]))),
     )
     _store3(d_means, first, d_mean)
     if with_camera:
         intrinsics = (fma(dx, slopes[0], a_da / camera[FX]), fma(dy, slopes[1], b_db / camera[FY]), dx, dy)
-        _camera_sums(sums, fresh, mean, q, dv, dp, d_direction, intrinsics)
+        _camera_sums(sums, fresh, mean, q, dv, dp, offset, intrinsics)
 
 
 @kernel
 def project_backward(
-    counter, scratch, means, quats, scales, opacities, sh, sh_width, degree, camera, records, gradients, slots, counts,
+    counter, scratch, means, quats, scales, opacities, sh_width, degree, camera, records, slopes,
+    gradients, slots, counts,
     d_means, d_quats, d_scales, d_opacities, d_sh, d_centres, d_camera, with_camera,
 ):  # type: ignore[no-untyped-def]  # fmt: skip
     """Gradients of all inputs from the rasterizer's rows.
@@ -478,8 +502,8 @@ def project_backward(
             fields = _gathered(gradients, slots, counts, first, rows)
             fresh = lanes() >= np.float32(block - first)
             _project_block_backward(
-                means, quats, scales, opacities, sh, sh_width, degree, camera, records, first, fresh, fields,
-                turned, rows, d_means, d_quats, d_scales, d_opacities, d_sh, d_centres, sums, with_camera,
+                means, quats, scales, opacities, sh_width, degree, camera, records, slopes[block * SLOPES :], first,
+                fresh, fields, turned, rows, d_means, d_quats, d_scales, d_opacities, d_sh, d_centres, sums, with_camera,
             )  # fmt: skip
         if with_camera:
             for i in range(CAMERA_SUMS):

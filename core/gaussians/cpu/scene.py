@@ -54,10 +54,12 @@ class _Rasterize(torch.autograd.Function):
         camera = camera_numbers(world_to_camera, intrinsics, frame)
         records, bounds = buffers.empty((n, projection.RECORD)), buffers.empty(n, np.int32)
         centres, radii = buffers.empty_tensor((n, 2)), buffers.empty_tensor((n,))
+        blocks = -(-n // LANES) if any(ctx.needs_input_grad) else 0
+        slopes = buffers.empty(blocks * LANES * projection.SLOPES)
         chunk_bounds = np.zeros(-(-n // projection.CHUNK), np.int64)
         parallel(
             projection.project, *inputs, sh_width, frame.sh_degree, camera, frame.width, frame.height,
-            records.reshape(-1), flat(centres), flat(radii), bounds, chunk_bounds,
+            records.reshape(-1), flat(centres), flat(radii), bounds, chunk_bounds, slopes,
             scratch=projection.SCRATCH,
         )  # fmt: skip
         bins = bin_gaussians(records, bounds, chunk_bounds, frame)
@@ -73,6 +75,7 @@ class _Rasterize(torch.autograd.Function):
             flat(image), flat(alpha), flat(depth), flat(median), ends,
         )  # fmt: skip
         ctx.save_for_backward(means, quats, scales, opacities, sh, image, alpha, depth)
+        ctx.slopes = slopes
         ctx.frame, ctx.bins, ctx.ends, ctx.records, ctx.camera, ctx.behind = frame, bins, ends, records, camera, behind
         ctx.centre_gradients = centre_gradients
         ctx.mark_non_differentiable(median, centres, radii)
@@ -99,8 +102,8 @@ class _Rasterize(torch.autograd.Function):
         with_camera = ctx.needs_input_grad[5] or ctx.needs_input_grad[6]
         sums = np.zeros((-(-n // projection.CHUNK), projection.CAMERA_SUMS), np.float32)
         parallel(
-            projection.project_backward, *(flat(t) for t in inputs), sh.shape[1] * 3, frame.sh_degree, ctx.camera,
-            records.reshape(-1), rows.reshape(-1), bins.firsts, bins.counts, *(flat(t) for t in gradients),
+            projection.project_backward, *(flat(t) for t in inputs[:4]), sh.shape[1] * 3, frame.sh_degree, ctx.camera,
+            records.reshape(-1), ctx.slopes, rows.reshape(-1), bins.firsts, bins.counts, *(flat(t) for t in gradients),
             flat(d_centres), sums, with_camera, scratch=projection.SCRATCH,
         )  # fmt: skip
         ctx.centre_gradients.add_(d_centres)

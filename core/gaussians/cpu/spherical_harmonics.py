@@ -6,7 +6,9 @@
 with the basis b of `..spherical_harmonics`. Coefficients come turned: 48 rows (k, c) of 16 Gaussians each, one
 vector a row (`gather`). Backward, with the gradient v_c of the colours:
 
-    d sh_kc = b_k v_c        d direction = sum_k h_k grad b_k,   h_k = sum_c sh_kc v_c
+    d sh_kc = b_k v_c        d direction = sum_c v_c slope_c,   slope_c = sum_k sh_kc grad b_k
+
+The slopes are taken forward, while the coefficients are at hand: those are most of what there is to read.
 """
 from __future__ import annotations
 
@@ -17,7 +19,7 @@ from ..spherical_harmonics import C1 as _C1
 from ..spherical_harmonics import C2 as _C2
 from ..spherical_harmonics import C3 as _C3
 from .compilation import inlined
-from .vector import LANES, fma, load, load_rows, opaque, splat, store, store_rows, transpose
+from .vector import LANES, fma, load, load_rows, opaque, splat, store, store_rows, stream_rows, transpose
 
 C0, C1 = np.float32(_C0), np.float32(_C1)
 C20, C21, C22 = (np.float32(c) for c in _C2)
@@ -52,7 +54,10 @@ def scatter(turned, first, width, sh):  # type: ignore[no-untyped-def]
     while column < width:
         if column + LANES <= width:
             rows = load_rows(turned, column * LANES, LANES)
-            store_rows(sh, first * width + column, width, transpose(rows))
+            if width == ROWS:
+                stream_rows(sh, first * width + column, width, transpose(rows))
+            else:
+                store_rows(sh, first * width + column, width, transpose(rows))
             column += LANES
         else:
             i = 0
@@ -96,39 +101,36 @@ def colours(turned, degree, x, y, z, b):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def colours_backward(turned, degree, x, y, z, v, h):  # type: ignore[no-untyped-def]
-    """Turns the coefficients into their gradients and returns that of the unit directions. h: workspace of 16
-    vectors: first b_k, then h_k."""
-    _basis(degree, x, y, z, h)
+def coefficients_backward(degree, x, y, z, v, b, turned):  # type: ignore[no-untyped-def]
+    """Writes the gradients of the coefficients, turned, from those of the colours."""
+    _basis(degree, x, y, z, b)
     used = (degree + 1) * (degree + 1)
     for k in range(used):
-        b, at = load(h, k * LANES), 3 * k * LANES
-        sum_k = fma(load(turned, at + LANES), v[1], load(turned, at) * v[0])
-        store(h, k * LANES, fma(load(turned, at + 2 * LANES), v[2], sum_k))
-        store_rows(turned, at, LANES, (b * v[0], b * v[1], b * v[2]))
+        value = load(b, k * LANES)
+        store_rows(turned, 3 * k * LANES, LANES, (value * v[0], value * v[1], value * v[2]))
     for row in range(3 * used, ROWS):
         store(turned, row * LANES, splat(ZERO))
-    return _along_directions(degree, x, y, z, h)
 
 
 @inlined
-def _along_directions(degree, x, y, z, h):  # type: ignore[no-untyped-def]
-    """sum_k h_k grad b_k."""
+def slope(turned, degree, x, y, z, channel):  # type: ignore[no-untyped-def]
+    """The gradient of a colour by the direction: sum_k sh_k grad b_k, not yet along the sphere."""
+    h, three = turned[channel * LANES :], 3 * LANES
     zero = splat(ZERO)
     dx, dy, dz = zero, zero, zero
     if degree >= 1:
-        dx, dy, dz = load(h, 3 * LANES) * -C1, load(h, LANES) * -C1, load(h, 2 * LANES) * C1
+        dx, dy, dz = load(h, 3 * three) * -C1, load(h, three) * -C1, load(h, 2 * three) * C1
     if degree >= 2:
-        h4, h5, h7 = load(h, 4 * LANES) * C20, load(h, 5 * LANES) * -C20, load(h, 7 * LANES) * -C20
-        h6, h8 = load(h, 6 * LANES) * (C21 * TWO), load(h, 8 * LANES) * (C22 * TWO)
+        h4, h5, h7 = load(h, 4 * three) * C20, load(h, 5 * three) * -C20, load(h, 7 * three) * -C20
+        h6, h8 = load(h, 6 * three) * (C21 * TWO), load(h, 8 * three) * (C22 * TWO)
         dx = dx + h4 * y + h7 * z + (h8 - h6) * x
         dy = dy + h4 * x + h5 * z - (h8 + h6) * y
         dz = dz + h5 * y + h7 * x + h6 * TWO * z
     if degree >= 3:
         xx, yy, zz = x * x, y * y, z * z
-        h9, h10, h11 = load(h, 9 * LANES) * (C30 * -THREE), load(h, 10 * LANES) * C31, load(h, 11 * LANES) * -C32
-        h12, h13 = load(h, 12 * LANES) * (C33 * THREE), load(h, 13 * LANES) * -C32
-        h14, h15 = load(h, 14 * LANES) * C34, load(h, 15 * LANES) * (C30 * -THREE)
+        h9, h10, h11 = load(h, 9 * three) * (C30 * -THREE), load(h, 10 * three) * C31, load(h, 11 * three) * -C32
+        h12, h13 = load(h, 12 * three) * (C33 * THREE), load(h, 13 * three) * -C32
+        h14, h15 = load(h, 14 * three) * C34, load(h, 15 * three) * (C30 * -THREE)
         xy, difference = x * y * TWO, xx - yy
         mixed = h12 * z * -TWO
         dx = dx + h9 * xy + h10 * y * z - h11 * xy + mixed * x + h13 * (zz * FOUR - xx * THREE - yy)

@@ -232,6 +232,23 @@ def store_rows(typing_context, array, index, stride, rows):  # type: ignore[no-u
 
 
 @intrinsic
+def stream_rows(typing_context, array, index, stride, rows):  # type: ignore[no-untyped-def]  # noqa: ARG001
+    """As store_rows, past the caches: for what is not read soon. All addresses must be those of cache lines."""
+    count = len(rows)
+
+    def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
+        for i in range(count):
+            at = builder.add(args[1], builder.mul(args[2], ir.Constant(ir.IntType(64), i)))
+            address = _address(context, builder, sig.args[0], args[0], at)
+            row = builder.extract_value(args[3], i)
+            written = builder.store(row, builder.bitcast(address, row.type.as_pointer()), align=4 * LANES)
+            written.set_metadata("nontemporal", builder.module.add_metadata([ir.Constant(_INT, 1)]))
+        return context.get_dummy_value()
+
+    return types.none(array, types.int64, types.int64, rows), emit
+
+
+@intrinsic
 def prefetch(typing_context, array, index):  # type: ignore[no-untyped-def]  # noqa: ARG001
     """Asks for the cache line of a flat index, to be read or written soon; any index is safe."""
 

@@ -23,6 +23,8 @@ from .projection import camera_position, determinants, half_sizes, project, visi
 from .rendering import ALPHA_MIN, OPACITY_MAX, Rendering, Splats, extent, record_gradient
 from .spherical_harmonics import colours as colours_of
 
+ENTRIES_MAX = 1 << 24
+"""Entries of all lists at a time; what bounds the memory that they take."""
 MARGIN = 1e-3
 """By how much lists reach further than the last contribution, so that rounding cannot lose one."""
 
@@ -62,6 +64,14 @@ def whitening(covariances: Tensor) -> Tensor:
     return torch.stack([w_xx, -xy / xx * w_yy, w_yy], -1)
 
 
+def _span(centres: Tensor, half: Tensor, radii: Tensor, columns: int, rows: int, size: int) -> tuple[Tensor, Tensor]:
+    """First tile x, y (n, 2) of the boxes of half size `half` (n, 2) px, and how many they span (n, 2)."""
+    low = ((centres - half) / size).floor().clamp(min=-1, max=2**30).long().clamp(min=0)
+    high = ((centres + half) / size).floor().clamp(min=-1, max=2**30).long()
+    high = torch.minimum(high, torch.tensor([columns - 1, rows - 1], device=centres.device))
+    return low, (high - low + 1).clamp(min=0) * (radii > 0)[:, None]
+
+
 @torch.no_grad()
 def bin_tiles(
     centres: Tensor, whitening: Tensor, half: Tensor, radii: Tensor, width: int, height: int, size: int
@@ -69,11 +79,7 @@ def bin_tiles(
     """Lists of the tiles that the ellipses of Mahalanobis radius `radii` (n,), inside boxes of half size
     `half` (n, 2) px, touch."""
     columns, rows = -(-width // size), -(-height // size)
-    grid = torch.tensor([columns, rows], device=centres.device)
-    low = ((centres - half) / size).floor().clamp(min=-1, max=2**30).long().clamp(min=0)
-    high = ((centres + half) / size).floor().clamp(min=-1, max=2**30).long()
-    high = torch.minimum(high, grid - 1)
-    span = (high - low + 1).clamp(min=0) * (radii > 0)[:, None]
+    low, span = _span(centres, half, radii, columns, rows, size)
     counts = span.prod(-1)
 
     # One entry for each tile of each box, then without those that the ellipse inside the box misses.
@@ -116,9 +122,20 @@ def draw_tiles(
 
     radii (n,): Mahalanobis distance up to which each Gaussian is drawn; half (n, 2): of the box around it, px;
     size: of a tile, px."""
-    lists = bin_tiles(drawn.places[:, :2], drawn.places[:, 2:], half, radii, width, height, size)
-    picture, rows = (_assembled(part, lists)[:height, :width] for part in draw(lists, blend, median, drawn))
-    return picture, rows
+    centres = drawn.places.detach()[:, :2]
+    columns, rows = -(-width // size), -(-height // size)
+    entries = int(_span(centres, half, radii, columns, rows, size)[1].prod(-1).sum())
+    if entries > ENTRIES_MAX and rows > 1:  # too many for one go: the upper half of the picture, then the lower
+        middle = rows // 2 * size
+        down = drawn.places.new_tensor([0, middle, 0, 0, 0])
+        halves = [
+            draw_tiles(draw, size, part, radii, half, width, part_height, blend=blend, median=median)
+            for part, part_height in ((drawn, middle), (drawn._replace(places=drawn.places - down), height - middle))
+        ]
+        return torch.cat([picture for picture, _ in halves]), torch.cat([which for _, which in halves])
+    lists = bin_tiles(centres, drawn.places.detach()[:, 2:], half, radii, width, height, size)
+    picture, which = (_assembled(part, lists)[:height, :width] for part in draw(lists, blend, median, drawn))
+    return picture, which
 
 
 def _assembled(parts: Tensor, lists: Lists) -> Tensor:

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import pytest
 import torch
 
-from core.gaussians import tiles
+from core.gaussians import tiled, tiles
 from core.gaussians.kernels import available
 from tests.core.gaussian_cases import differences, scene_case, splat_case
 
@@ -40,9 +40,10 @@ def test_splats(kernels: str, part: int) -> None:
 
 
 def test_tiles_in_small_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Long lists are drawn in parts, tiles in groups: where the parts end makes no difference."""
+    """Long lists are drawn in parts, tiles in groups, pictures in bands: where the parts end makes no difference."""
     monkeypatch.setattr(tiles, "CHUNK", 7)
     monkeypatch.setattr(tiles, "GROUP", 3)
+    monkeypatch.setattr(tiled, "ENTRIES_MAX", 50)
     cases = [scene_case(seed) for seed in range(11, 50, 13)] + [splat_case(seed) for seed in range(10)]
     wrong = [line for case in cases for line in differences(case, "tiles")]
     assert not wrong, "\n".join(wrong)

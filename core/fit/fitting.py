@@ -71,6 +71,7 @@ def _train(trainer: Trainer, run: Run, progress: Progress) -> None:
         figures = trainer.step()
         here = trainer.iteration
         if here % FIGURES_EVERY == 0 or here == settings.iterations:
+            trainer.check_finite()
             counts = {"scene_gaussians": len(trainer.scene.means),
                       "flare_gaussians": trainer.flare.count if trainer.flare else 0}
             pace = (time.monotonic() - began) / (here - first)

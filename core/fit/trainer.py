@@ -160,6 +160,15 @@ class Trainer:
             names = {name: f"{number}.gaussians.{name}" for name in light.gaussians}
             clone_and_prune(light, self.flare_adam, names, settings, self._generator(self.iteration, 2 + number))
 
+    def check_finite(self) -> None:
+        """Raise RunError where a parameter has become NaN or infinite: rasterizers skip those and hide them."""
+        models = (self.scene,) if self.flare is None else (self.scene, self.flare)
+        for model in models:
+            for name, parameter in model.named_parameters():
+                if not parameter.detach().sum().isfinite():
+                    raise RunError(f"The fit diverged before iteration {self.iteration} ({name} is not finite); start "
+                                   "it anew with lower learning rates.")
+
     # ---- state ------------------------------------------------------------------------------------
 
     def state(self) -> State:

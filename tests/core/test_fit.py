@@ -176,6 +176,13 @@ def test_a_capture_without_what_the_mode_needs_is_refused_and_nothing_written(tm
     assert not (tmp_path / "run").exists()
 
 
+def test_a_fit_that_diverges_says_so_and_writes_no_result(tmp_path: Path, capture: Capture) -> None:
+    settings = quick(120, **{"scene.rates.features": 1e38})
+    with pytest.raises(RunError, match="diverged"):
+        fit(capture, settings, tmp_path / "run")
+    assert not (tmp_path / "run" / "scene.ply").exists()
+
+
 def test_a_run_folder_is_not_overwritten(tmp_path: Path, capture: Capture) -> None:
     with pytest.raises(Cancelled):
         fit(capture, quick(), tmp_path / "run", StopAt(2))

@@ -3,16 +3,16 @@
 
 Tiles are 16 pixels wide, one vector, and 32 high. The extent of a Gaussian is that of the ellipse where alpha is
 1/255, which opacity makes smaller (SnugBox of Hanson et al. 2025, Speedy-Splat). In a column of tiles it meets
-exactly the pixel rows between the ellipse's lowest and highest point there (as their AccuTile): with X the
+just the pixel rows between the ellipse's lowest and highest point there (as their AccuTile): with X the
 offset of a pixel column from the centre, and the record's A, k, D, C and reach t,
 
     A (X + k y)² + D y² = t   at   y = (-A k X ± sqrt(C t - A D X²)) / C
 
 and the extreme points of the whole ellipse, y = ± half_y, lie at X = ∓ k half_y.
 
-Three steps: `list_tiles` writes down the tiles of each Gaussian, in the Gaussians' own order, each in a slot;
-`sort_by_depth` orders the Gaussians; `count`, `deal` and `scatter` walk them in that order and deal the slots out to
-the tiles, so that no tile needs sorting. A slot number also is the place of the gradient that the tile sends
+First, `list_and_sort` writes down the tiles of each Gaussian, in the Gaussians' own order, each in a slot, and
+orders the Gaussians by depth; then `count`, `deal` and `scatter` walk them in that order and deal the slots out
+to the tiles, so that no tile needs sorting. A slot number also is the place of the gradient that the tile sends
 back to the Gaussian.
 """
 from __future__ import annotations
@@ -23,7 +23,7 @@ import numpy as np
 
 from .compilation import inlined, kernel
 from .projection import BEND, CHUNK, DEPTH, HALF_X, HALF_Y, REACH, RECORD, A, D, K, X, Y
-from .vector import take_number
+from .vector import get, opaque, prefetch, take_number
 
 TILE_SHIFT_X, TILE_SHIFT_Y = 4, 5
 TILE_WIDTH, TILE_HEIGHT = 1 << TILE_SHIFT_X, 1 << TILE_SHIFT_Y
@@ -32,95 +32,141 @@ ROW_MASK = TILE_HEIGHT - 1
 # An entry of a tile: which Gaussian, first row and end row within the tile, slot.
 GAUSSIAN, FIRST_ROW, END_ROW, SLOT, ENTRY = 0, 1, 2, 3, 4
 DIGITS = 3
+AHEAD = 8
 HALF, ZERO, ONE = np.float32(0.5), np.float32(0), np.float32(1)
 SLACK = np.float32(0.02)
 """Pixels by which the row range is widened against rounding."""
 
 
 @inlined
-def _column_rows(records, at, left, height):  # type: ignore[no-untyped-def]
-    """First and last pixel row that the ellipse meets among the pixel columns left .. left + 15."""
-    half_y = records[at + HALF_Y]
-    tip = records[at + K] * half_y  # the highest point lies at -tip, the lowest at tip
-    x0 = np.float32(left) + HALF - records[at + X]
-    x1 = x0 + np.float32(TILE_WIDTH - 1)
-    bend = records[at + BEND]
-    inverse = ONE / bend
-    slope = -records[at + A] * records[at + K] * inverse
-    quadratic = records[at + A] * records[at + D]
-    constant = bend * records[at + REACH]
-    root0 = math.sqrt(max(constant - quadratic * x0 * x0, ZERO)) * inverse
-    root1 = math.sqrt(max(constant - quadratic * x1 * x1, ZERO)) * inverse
-    low, high = -half_y, half_y
-    if not (x0 <= tip <= x1):
-        low = min(slope * x0 - root0, slope * x1 - root1)
-    if not (x0 <= -tip <= x1):
-        high = max(slope * x0 + root0, slope * x1 + root1)
-    y = records[at + Y] - HALF
-    first = max(y + max(low, -half_y) - SLACK, ZERO)
-    last = min(y + min(high, half_y) + SLACK, np.float32(height - 1))
-    if last < ZERO or first > last:
-        return 1, 0
-    return int(math.ceil(first)), int(last)
+def _least(a, b):  # type: ignore[no-untyped-def]
+    return a if a < b else b  # one instruction; numba's own also ask for NaN
+
+
+@inlined
+def _most(a, b):  # type: ignore[no-untyped-def]
+    return a if a > b else b
+
+
+@inlined
+def _pixel_rows(y, low, high, height):  # type: ignore[no-untyped-def]
+    """First and last pixel row whose centre lies within y + low .. y + high; first > last if none does."""
+    top = _most(y + low - (HALF + SLACK), ZERO)
+    bottom = _least(y + high - (HALF - SLACK), np.float32(height - 1))
+    first = int(top)
+    if np.float32(first) < top:
+        first += 1
+    return first, int(bottom) if bottom >= ZERO else -1
+
+
+@inlined
+def _crossing(records, at, x):  # type: ignore[no-untyped-def]
+    """Lowest and highest point of the ellipse at the horizontal offset x, or where it is nearest to that."""
+    half_x, inverse = get(records, at + HALF_X), ONE / get(records, at + BEND)
+    x = _least(_most(x, -half_x), half_x)
+    major = get(records, at + A) * inverse
+    square = inverse * (get(records, at + REACH) - major * get(records, at + D) * x * x)
+    root = math.sqrt(_most(square, ZERO))
+    middle = -major * get(records, at + K) * x
+    return middle - root, middle + root
+
+
+@inlined
+def _write_column(column, top, bottom, tiles_x, slots, slot):  # type: ignore[no-untyped-def]
+    """Writes the tiles of a column that pixel rows top .. bottom meet; returns the next slot."""
+    row, one = top >> TILE_SHIFT_Y, opaque(1)
+    while row << TILE_SHIFT_Y <= bottom:
+        base = row << TILE_SHIFT_Y
+        first = top - base if top > base else 0
+        last = bottom - base if bottom - base < ROW_MASK else ROW_MASK
+        slots[slot] = (((row * tiles_x + column) << ROW_BITS | first) << ROW_BITS) | last
+        slot += one
+        row += one
+    return slot
 
 
 @inlined
 def _list_gaussian(records, i, slot, width, height, tiles_x, slots):  # type: ignore[no-untyped-def]
     """Writes the tiles of Gaussian i from this slot on; returns the slot after the last."""
     at = i * RECORD
-    x, half_x = records[at + X], records[at + HALF_X]
-    first_column = int(min(max(x - half_x - SLACK, ZERO), np.float32(width - 1))) >> TILE_SHIFT_X
-    last_column = int(min(max(x + half_x + SLACK, ZERO), np.float32(width - 1))) >> TILE_SHIFT_X
-    for column in range(first_column, last_column + 1):
-        top, bottom = _column_rows(records, at, column << TILE_SHIFT_X, height)
-        if top > bottom:
-            continue
-        for row in range(top >> TILE_SHIFT_Y, (bottom >> TILE_SHIFT_Y) + 1):
-            base = row << TILE_SHIFT_Y
-            first, last = max(top - base, 0), min(bottom - base, ROW_MASK)
-            slots[slot] = (((row * tiles_x + column) << ROW_BITS | first) << ROW_BITS) | last
-            slot += 1
+    x, half_x = get(records, at + X), get(records, at + HALF_X) + SLACK
+    y, half_y = get(records, at + Y), get(records, at + HALF_Y)
+    column = int(_most(x - half_x, ZERO)) >> TILE_SHIFT_X
+    last_column = int(_least(x + half_x, np.float32(width - 1))) >> TILE_SHIFT_X
+    if column == last_column:
+        top, bottom = _pixel_rows(y, -half_y, half_y, height)
+        return _write_column(column, top, bottom, tiles_x, slots, slot)
+    tip = get(records, at + K) * half_y  # the highest point lies at -tip, the lowest at tip
+    one = opaque(1)
+    left = np.float32(column << TILE_SHIFT_X) - x
+    low0, high0 = _crossing(records, at, left)
+    while column <= last_column:
+        right = left + np.float32(TILE_WIDTH)
+        low1, high1 = _crossing(records, at, right)
+        low = -half_y if left <= tip <= right else _least(low0, low1)
+        high = half_y if left <= -tip <= right else _most(high0, high1)
+        top, bottom = _pixel_rows(y, low, high, height)
+        slot = _write_column(column, top, bottom, tiles_x, slots, slot)
+        left, low0, high0 = right, low1, high1
+        column += one
     return slot
 
 
+@inlined
+def _list_chunk(chunk, records, bounds, chunk_starts, width, height, tiles_x, slots, firsts, counts):  # type: ignore[no-untyped-def]
+    slot = chunk_starts[chunk]
+    for i in range(chunk * CHUNK, min(chunk * CHUNK + CHUNK, bounds.size)):
+        first = slot
+        if bounds[i] > 0:
+            slot = _list_gaussian(records, i, slot, width, height, tiles_x, slots)
+        firsts[i] = first
+        counts[i] = slot - first
+
+
 @kernel
-def list_tiles(counter, scratch, records, bounds, chunk_starts, width, height, tiles_x, slots, firsts, counts):  # type: ignore[no-untyped-def]
-    """slots: tile, first and last row of every pair of Gaussian and tile, in the Gaussians' order;
-    those of Gaussian i are the counts[i] from firsts[i] on. chunk_starts: where each chunk may write."""
-    n = bounds.size
+def list_and_sort(
+    counter, scratch, records, bits, bounds, chunk_starts, width, height, tiles_x, by_depth,
+    slots, firsts, counts, places, keys, spare_keys, order, spare_order,
+):  # type: ignore[no-untyped-def]  # fmt: skip
+    """slots: tile, first and last row of every pair of Gaussian and tile, in the Gaussians' order; those of
+    Gaussian i are the counts[i] from firsts[i] on. chunk_starts: where each chunk may write. order: see `_sort`;
+    as many as there are bounds > 0. bits: the records as uint32."""
     while True:
-        chunk = take_number(counter)
-        start, end = chunk * CHUNK, min(chunk * CHUNK + CHUNK, n)
-        if start >= n:
+        piece = take_number(counter)
+        if piece > chunk_starts.size:
             break
-        room = chunk_starts[chunk]
-        for i in range(start, end):
-            slot = room
-            if bounds[i] > 0:
-                slot = _list_gaussian(records, i, slot, width, height, tiles_x, slots)
-            firsts[i] = room
-            counts[i] = slot - room
-            room = slot
+        if piece > 0:
+            _list_chunk(
+                piece - 1, records, bounds, chunk_starts, width, height, tiles_x, slots, firsts, counts
+            )
+        elif by_depth:  # the longest piece goes first
+            _sort(bits, bounds, places, keys, spare_keys, order, spare_order)
+        else:
+            m = 0
+            for i in range(bounds.size):
+                if bounds[i] > 0:
+                    order[m] = i
+                    m += 1
 
 
-@kernel
-def sort_by_depth(bits, counts, places, keys, spare_keys, order, spare_order):  # type: ignore[no-untyped-def]
-    """Writes to `order` the Gaussians that meet any tile, nearest first, and returns how many.
+@inlined
+def _sort(bits, bounds, places, keys, spare_keys, order, spare_order):  # type: ignore[no-untyped-def]
+    """Writes to `order` the Gaussians whose bound is not 0, nearest first.
 
-    bits: the records as uint32; depths are positive, so their bits sort as they do. Three passes of a radix
-    sort, stable, by digits as short as the range of the depths allows; places (DIGITS, 2^11) and
-    the arrays (n,) are its workspace.
+    Depths are positive, so their bits sort as they do. Three passes of a radix sort, stable, by digits as short
+    as the range of the depths allows; places (DIGITS, 2^11) and the arrays (n,) are its workspace.
     """
     smallest, largest, m = np.uint32(0xFFFFFFFF), np.uint32(0), 0
-    for i in range(counts.size):
-        if counts[i] > 0:
-            key = bits[i * RECORD + DEPTH]
-            smallest, largest = min(smallest, key), max(largest, key)
+    for i in range(bounds.size):
+        if bounds[i] > 0:
+            key = get(bits, i * RECORD + DEPTH)
+            smallest = key if key < smallest else smallest
+            largest = key if key > largest else largest
             spare_keys[m] = key
             spare_order[m] = i
             m += 1
     if m == 0:
-        return 0
+        return
     length = 1
     while (largest - smallest) >> np.uint32(length) > 0:
         length += 1
@@ -132,10 +178,9 @@ def sort_by_depth(bits, counts, places, keys, spare_keys, order, spare_order):  
         spare_keys[i] = key
         for d in range(DIGITS):
             places[d, (key >> np.uint32(d * digit)) & mask] += 1
-    _distribute(spare_keys, spare_order, m, 0, mask, places[0], keys, order)
+    _distribute(spare_keys, spare_order, m, digit * 0, mask, places[0], keys, order)
     _distribute(keys, order, m, digit, mask, places[1], spare_keys, spare_order)
     _distribute(spare_keys, spare_order, m, 2 * digit, mask, places[2], keys, order)
-    return m
 
 
 @inlined
@@ -160,6 +205,15 @@ def _part(order_size, parts, part):  # type: ignore[no-untyped-def]
     return order_size * part // parts, order_size * (part + 1) // parts
 
 
+@inlined
+def _prefetch_slots(j, end, order, slots, firsts, counts):  # type: ignore[no-untyped-def]
+    """Asks for what the walk in order of depth will need soon: it jumps about in memory."""
+    far = get(order, _least(j + 2 * AHEAD, end - 1))
+    prefetch(firsts, far)
+    prefetch(counts, far)
+    prefetch(slots, get(firsts, get(order, _least(j + AHEAD, end - 1))))
+
+
 @kernel
 def count(counter, scratch, order, m, slots, firsts, counts, numbers):  # type: ignore[no-untyped-def]
     """numbers (parts, tiles): how often each tile is met by each part of the sorted Gaussians."""
@@ -171,9 +225,12 @@ def count(counter, scratch, order, m, slots, firsts, counts, numbers):  # type: 
         numbers[part] = 0
         start, end = _part(m, parts, part)
         for j in range(start, end):
+            _prefetch_slots(j, end, order, slots, firsts, counts)
             i = order[j]
-            for slot in range(firsts[i], firsts[i] + counts[i]):
-                numbers[part, slots[slot] >> (2 * ROW_BITS)] += 1
+            slot, stop, one = get(firsts, i), get(firsts, i) + get(counts, i), opaque(1)
+            while slot < stop:
+                numbers[part, get(slots, slot) >> (2 * ROW_BITS)] += 1
+                slot += one
 
 
 @kernel
@@ -200,12 +257,15 @@ def scatter(counter, scratch, order, m, slots, firsts, counts, places, entries):
             break
         start, end = _part(m, parts, part)
         for j in range(start, end):
+            _prefetch_slots(j, end, order, slots, firsts, counts)
             i = order[j]
-            for slot in range(firsts[i], firsts[i] + counts[i]):
-                word = slots[slot]
+            slot, stop, one = get(firsts, i), get(firsts, i) + get(counts, i), opaque(1)
+            while slot < stop:
+                word = get(slots, slot)
                 tile = word >> (2 * ROW_BITS)
                 place = places[part, tile]
                 places[part, tile] = place + 1
                 at = place * ENTRY
                 entries[at + GAUSSIAN], entries[at + SLOT] = i, slot
                 entries[at + FIRST_ROW], entries[at + END_ROW] = (word >> ROW_BITS) & ROW_MASK, (word & ROW_MASK) + 1
+                slot += one

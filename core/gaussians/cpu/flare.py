@@ -57,9 +57,9 @@ from .projection import (
     X,
     Y,
 )
+from .raster_backward import EDGE, SCRATCH, V_BLUE, V_GREEN, V_RED, load_tile, moments, row_gradient
 from .raster_backward import ROW as ROW_BACKWARD
 from .raster_backward import STATE as STATE_BACKWARD
-from .raster_backward import EDGE, SCRATCH, V_BLUE, V_GREEN, V_RED, load_tile, row_gradient
 from .raster_forward import (
     AHEAD,
     BLUE_PLANE,
@@ -69,19 +69,18 @@ from .raster_forward import (
     PAUSE,
     RED_PLANE,
     ROW,
-    RUN,
-    STEEP,
     ZERO,
     blend_row,
     falloff,
     finished,
+    is_steep,
     needle_offsets,
     ratio,
     start_tile,
     write_tile,
 )
 from .vector import (
-    LANES,
+    any_of,
     exp2,
     fma,
     get,
@@ -89,6 +88,7 @@ from .vector import (
     load,
     maximum,
     minimum,
+    opaque,
     prefetch,
     splat,
     sqrt,
@@ -98,8 +98,9 @@ from .vector import (
     where,
 )
 
-# Places in a shape: ring and arc of a Gaussian. SHARP: s above; ARC: k.
-R0, SHARP, WIDTH, COS0, SIN0, COS_DELTA, ARC = range(7)
+# Places in a shape: ring and arc of a Gaussian. SHARP: s above; LIMIT: the
+# power of two below which nothing is drawn; ARC: k.
+R0, SHARP, WIDTH, LIMIT, COS0, SIN0, COS_DELTA, ARC = range(8)
 SHAPE = 8
 # Places in a row of gradients after those of the scene.
 G_R0, G_WIDTH, G_ARC_X, G_ARC_Y, G_THETA0, G_COS_DELTA, G_ARC = range(9, 16)
@@ -136,7 +137,8 @@ def prepare(centres, covariances, opacities, colours, rings, arcs, width, height
     half = 0.5 / math.log(2.0)
     for i in range(opacities.size):
         at = i * RECORD
-        xx, xy, yy = np.float64(covariances[3 * i]), np.float64(covariances[3 * i + 1]), np.float64(covariances[3 * i + 2])
+        xx, xy = np.float64(covariances[3 * i]), np.float64(covariances[3 * i + 1])
+        yy = np.float64(covariances[3 * i + 2])
         determinant = xx * yy - xy * xy
         opacity = np.float64(opacities[i]) if add else min(np.float64(opacities[i]), OPACITY_MAX)
         r0, w = (np.float64(rings[2 * i]), np.float64(rings[2 * i + 1])) if rings.size > 0 else (0.0, 1.0)
@@ -155,22 +157,23 @@ def prepare(centres, covariances, opacities, colours, rings, arcs, width, height
         records[at + A], records[at + K], records[at + D] = major, k, minor
         records[at + K_REST] = k - np.float64(records[at + K])
         records[at + OPACITY] = 1.0 if add else opacity
-        records[at + STEP], records[at + BEND] = 2.0 ** max(-2.0 * bend, -126.0), bend
+        records[at + STEP], records[at + BEND] = math.expm1(-2.0 * bend * math.log(2.0)), bend
         records[at + RED], records[at + GREEN] = gain * colours[3 * i], gain * colours[3 * i + 1]
         records[at + BLUE], records[at + DEPTH] = gain * colours[3 * i + 2], 0.0
         records[at + REACH] = half * reach * reach + MARGIN
         records[at + HALF_X], records[at + HALF_Y] = half_x, half_y
-        _write_shape(shapes, i, r0, w, arcs)
+        _write_shape(shapes, i, r0, w, reach - r0, arcs)
         columns = (int(min(x + half_x + 0.5, width - 1)) >> 4) - (int(max(x - half_x - 0.5, 0.0)) >> 4) + 1
         rows = (int(min(y + half_y + 0.5, height - 1)) >> 5) - (int(max(y - half_y - 0.5, 0.0)) >> 5) + 1
         bounds[i] = min(columns, tiles_x) * min(rows, tiles_y)
 
 
 @inlined
-def _write_shape(shapes, i, r0, w, arcs):  # type: ignore[no-untyped-def]
+def _write_shape(shapes, i, r0, w, reach, arcs):  # type: ignore[no-untyped-def]
     at = i * SHAPE
     shapes[at + R0], shapes[at + WIDTH] = r0, w
     shapes[at + SHARP] = 0.5 / (math.log(2.0) * w * w)
+    shapes[at + LIMIT] = shapes[at + SHARP] * reach * reach + MARGIN
     if arcs.size > 0:
         shapes[at + COS0], shapes[at + SIN0] = math.cos(np.float64(arcs[3 * i])), math.sin(np.float64(arcs[3 * i]))
         shapes[at + COS_DELTA], shapes[at + ARC] = arcs[3 * i + 1], arcs[3 * i + 2]
@@ -180,31 +183,31 @@ def _write_shape(shapes, i, r0, w, arcs):  # type: ignore[no-untyped-def]
 
 
 @inlined
+def _start(records, at, left, y):  # type: ignore[no-untyped-def]
+    """u of lane 0 and d_y in the pixel row y, and k, which is what u grows by from row to row; all float64."""
+    dy = y + 0.5 - np.float64(get(records, at + Y))
+    k = np.float64(get(records, at + K)) + np.float64(get(records, at + K_REST))
+    return left + 0.5 - np.float64(get(records, at + X)) + k * dy, dy, k
+
+
+@inlined
 def _distance(records, at, u, dy):  # type: ignore[no-untyped-def]
     """r, Mahalanobis."""
-    power = fma(u * records[at + A], u, splat(records[at + D] * dy * dy))
+    power = fma(u * get(records, at + A), u, get(records, at + D) * dy * dy)
     return sqrt(maximum(power * TWO_LN2, RADIUS2_MIN))
 
 
 @inlined
-def _ring(shapes, shape, r):  # type: ignore[no-untyped-def]
-    z = r - shapes[shape + R0]
-    return exp2(z * z * -shapes[shape + SHARP])
-
-
-@inlined
 def _angle(shapes, shape, dx, dy):  # type: ignore[no-untyped-def]
-    """Cosine and sine of the angle from theta0, and the inverse of the distance, px (kept from zero)."""
-    inverse = ONE / sqrt(fma(dx, dx, splat(dy * dy + APEX2)))
-    cosine = fma(dx, shapes[shape + COS0], splat(dy * shapes[shape + SIN0])) * inverse
-    sine = fma(dx, -shapes[shape + SIN0], splat(dy * shapes[shape + COS0])) * inverse
-    return cosine, sine, inverse
+    """Cosine of the angle from theta0, and the inverse of the distance, px (kept from zero)."""
+    inverse = ONE / sqrt(fma(dx, dx, dy * dy + APEX2))
+    return fma(dx, get(shapes, shape + COS0), dy * get(shapes, shape + SIN0)) * inverse, inverse
 
 
 @inlined
 def _window(shapes, shape, cosine):  # type: ignore[no-untyped-def]
     """The sigmoid of an arc."""
-    x = (cosine - shapes[shape + COS_DELTA]) * shapes[shape + ARC]
+    x = (cosine - get(shapes, shape + COS_DELTA)) * get(shapes, shape + ARC)
     return ONE / (exp2(minimum(x * -LOG2_E, np.float32(120))) + ONE)
 
 
@@ -212,48 +215,55 @@ def _window(shapes, shape, cosine):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _add_row(state, at, e, red, green, blue):  # type: ignore[no-untyped-def]
+def _add_row(state, at, e, records, record):  # type: ignore[no-untyped-def]
+    """Adds one row of a Gaussian."""
     e = where(e >= PROFILE_MIN, e, ZERO)
-    store(state, at + RED_PLANE, fma(e, red, load(state, at + RED_PLANE)))
-    store(state, at + GREEN_PLANE, fma(e, green, load(state, at + GREEN_PLANE)))
-    store(state, at + BLUE_PLANE, fma(e, blue, load(state, at + BLUE_PLANE)))
+    store(state, at + RED_PLANE, fma(e, get(records, record + RED), load(state, at + RED_PLANE)))
+    store(state, at + GREEN_PLANE, fma(e, get(records, record + GREEN), load(state, at + GREEN_PLANE)))
+    store(state, at + BLUE_PLANE, fma(e, get(records, record + BLUE), load(state, at + BLUE_PLANE)))
 
 
 @inlined
 def _add_plain(state, records, at, left, top, first, end):  # type: ignore[no-untyped-def]
     """A plain Gaussian, rows first .. end; by the recurrence unless it is a needle (see `raster_forward`)."""
-    major, k, minor, step = records[at + A], records[at + K], records[at + D], records[at + STEP]
-    red, green, blue = records[at + RED], records[at + GREEN], records[at + BLUE]
-    rows = np.float32(min(end - first, RUN))
-    if records[at + BEND] * rows * rows > STEEP:
-        for row in range(first, end):
+    step, one, row = get(records, at + STEP), opaque(1), first
+    if is_steep(records, at, first, end):
+        while row < end:
             u, dy = needle_offsets(records, at, left, top + row)
-            _add_row(state, row * ROW, falloff(records, at, u, dy), red, green, blue)
+            _add_row(state, row * ROW, falloff(records, at, u, dy), records, at)
+            row += one
         return
-    for run in range(first, end, RUN):
-        u, dy = needle_offsets(records, at, left, top + run)
-        e, r = falloff(records, at, u, dy), ratio(records, at, u, dy)
-        for row in range(run, min(run + RUN, end)):
-            _add_row(state, row * ROW, e, red, green, blue)
-            e = e * r
-            r = r * step
+    u, dy = needle_offsets(records, at, left, top + first)
+    e, r = falloff(records, at, u, dy), ratio(records, at, u, dy)
+    while row < end:
+        _add_row(state, row * ROW, e, records, at)
+        e = e * r
+        r = fma(r, step, r)
+        row += one
 
 
 @inlined
 def _draw_shaped(state, records, at, shapes, shape, left, top, first, end, arcs, add):  # type: ignore[no-untyped-def]
-    """A ring or arc, rows first .. end."""
-    opacity = records[at + OPACITY]
-    red, green, blue = records[at + RED], records[at + GREEN], records[at + BLUE]
-    dx = lanes() + (np.float32(left) + HALF - records[at + X])
-    for row in range(first, end):
-        u, dy = needle_offsets(records, at, left, top + row)
-        e = _ring(shapes, shape, _distance(records, at, u, dy)) * opacity
-        if arcs:
-            e = e * _window(shapes, shape, _angle(shapes, shape, dx, dy)[0])
-        if add:
-            _add_row(state, row * ROW, e, red, green, blue)
-        else:
-            blend_row(state, row * ROW, e, records, at, False)
+    """A ring or arc, rows first .. end; rows that it does not reach cost little."""
+    start, y, k = _start(records, at, left, top + first)
+    dx = lanes() + (np.float32(left) + HALF - get(records, at + X))
+    r0, sharp, limit = get(shapes, shape + R0), get(shapes, shape + SHARP), get(shapes, shape + LIMIT)
+    row, one = first, opaque(1)
+    while row < end:
+        dy = np.float32(y)
+        z = _distance(records, at, lanes() + np.float32(start), dy) - r0
+        power = z * z * sharp
+        if any_of(power <= limit):
+            e = exp2(-power)
+            if arcs:
+                e = e * _window(shapes, shape, _angle(shapes, shape, dx, dy)[0])
+            if add:
+                _add_row(state, row * ROW, e, records, at)
+            else:
+                blend_row(state, row * ROW, e * get(records, at + OPACITY), records, at, False)
+        row += one
+        start += k
+        y += 1.0
 
 
 @inlined
@@ -278,6 +288,7 @@ def raster(
 ):  # type: ignore[no-untyped-def]  # fmt: skip
     """Colour (h w 3) and alpha (h w), flat; ends (tiles,): where each tile stopped. shaped, arcs: whether
     rings (or arcs) are drawn, or plain Gaussians; these only where light adds."""
+    no_depth = np.bool_(False)
     while True:
         tile = take_number(counter)
         if tile >= ends.size:
@@ -285,25 +296,26 @@ def raster(
         left, top = (tile % tiles_x) * TILE_WIDTH, (tile // tiles_x) * TILE_HEIGHT
         begin, end = starts[tile], starts[tile + 1]
         start_tile(state, ROW, left, top, width, height)
-        if not shaped:
+        if not shaped:  # noqa: SIM114 - three loops for LLVM to specialise
             end = _draw_tile(entries, begin, end, records, shapes, left, top, state, shaped, arcs, add)
         elif add:
             end = _draw_tile(entries, begin, end, records, shapes, left, top, state, shaped, arcs, add)
         else:
             end = _draw_tile(entries, begin, end, records, shapes, left, top, state, shaped, arcs, add)
         ends[tile] = end
-        write_tile(image, alphas, alphas, alphas, state, left, top, width, height, background, False)
+        write_tile(image, alphas, alphas, alphas, state, left, top, width, height, background, no_depth)
 
 
 # --- backward --------------------------------------------------------------------------------------------
 
 
 @inlined
-def _add_gradient(state, at, e, red, green, blue):  # type: ignore[no-untyped-def]
+def _add_gradient(state, at, e, records, record):  # type: ignore[no-untyped-def]
     """g and w where light adds: each Gaussian by itself."""
     w = where(e >= PROFILE_MIN, e, ZERO)
-    vc = fma(load(state, at + V_GREEN), green, load(state, at + V_RED) * red)
-    return w * fma(load(state, at + V_BLUE), blue, vc), w
+    vc = load(state, at + V_RED) * get(records, record + RED)
+    vc = fma(load(state, at + V_GREEN), get(records, record + GREEN), vc)
+    return w * fma(load(state, at + V_BLUE), get(records, record + BLUE), vc), w
 
 
 @inlined
@@ -316,84 +328,98 @@ def _add_colours(state, at, w, colours):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _add_moments(moments, h, u, dy):  # type: ignore[no-untyped-def]
+def _add_moments(sums, h, u, dy):  # type: ignore[no-untyped-def]
     """Adds h times u, d_y, u², u d_y, d_y²."""
     hu, hy = h * u, h * dy
-    return (
-        moments[0] + hu, moments[1] + hy, fma(hu, u, moments[2]), fma(hu, dy, moments[3]), fma(hy, dy, moments[4])
-    )  # fmt: skip
+    return sums[0] + hu, sums[1] + hy, fma(hu, u, sums[2]), fma(hu, dy, sums[3]), fma(hy, dy, sums[4])
+
+
+@inlined
+def _needle_backward(state, records, at, left, top, first, end):  # type: ignore[no-untyped-def]
+    """The row of gradients of a plain Gaussian whose light adds, an exponential for each row."""
+    zero = splat(ZERO)
+    sums, colours = (zero, zero, zero, zero, zero), (zero, zero, zero)
+    row, one = first, opaque(1)
+    while row < end:
+        u, dy = needle_offsets(records, at, left, top + row)
+        g, w = _add_gradient(state, row * ROW_BACKWARD, falloff(records, at, u, dy), records, at)
+        colours = _add_colours(state, row * ROW_BACKWARD, w, colours)
+        sums = _add_moments(sums, g, u, dy)
+        row += one
+    return totals((sums[0], sums[1], sums[2], sums[3], sums[4], zero, colours[0], colours[1], colours[2]))
 
 
 @inlined
 def _plain_backward(state, records, at, left, top, first, end):  # type: ignore[no-untyped-def]
-    """The row of gradients of a plain Gaussian whose light adds."""
-    major, k, minor, step = records[at + A], records[at + K], records[at + D], records[at + STEP]
-    red, green, blue = records[at + RED], records[at + GREEN], records[at + BLUE]
+    """The same by the recurrence and by sums of sums (see `raster_backward`)."""
+    step, one = get(records, at + STEP), opaque(1)
     zero = splat(ZERO)
-    moments, colours = (zero, zero, zero, zero, zero), (zero, zero, zero)
-    rows = np.float32(min(end - first, RUN))
-    steep = records[at + BEND] * rows * rows > STEEP
-    for run in range(first, end, RUN):
-        u, dy = needle_offsets(records, at, left, top + run)
-        e, r = falloff(records, at, u, dy), ratio(records, at, u, dy)
-        for row in range(run, min(run + RUN, end)):
-            if steep:
-                u, dy = needle_offsets(records, at, left, top + row)
-                e = falloff(records, at, u, dy)
-            g, w = _add_gradient(state, row * ROW_BACKWARD, e, red, green, blue)
-            colours = _add_colours(state, row * ROW_BACKWARD, w, colours)
-            moments = _add_moments(moments, g, u, dy)
-            dy += ONE
-            u = u + k
-            e = e * r
-            r = r * step
-    return totals((
-        moments[0], moments[1], moments[2], moments[3], moments[4], zero, colours[0], colours[1], colours[2]
-    ))  # fmt: skip
+    s0, s1, s2, colours = zero, zero, zero, (zero, zero, zero)
+    u, dy = needle_offsets(records, at, left, top + first)
+    e, r = falloff(records, at, u, dy), ratio(records, at, u, dy)
+    row = first
+    while row < end:
+        g, w = _add_gradient(state, row * ROW_BACKWARD, e, records, at)
+        colours = _add_colours(state, row * ROW_BACKWARD, w, colours)
+        s0 = s0 + g
+        s1 = s1 + s0
+        s2 = s2 + s1
+        e = e * r
+        r = fma(r, step, r)
+        row += one
+    mu, my, muu, muy, myy = moments(records, at, left, dy + np.float32(end - first), s0, s1, s2)
+    return totals((mu, my, muu, muy, myy, zero, colours[0], colours[1], colours[2]))
 
 
 @inlined
 def _shaped_backward(state, records, at, shapes, shape, left, top, first, end, arcs, add):  # type: ignore[no-untyped-def]
     """The row of gradients of a ring or arc."""
-    opacity = records[at + OPACITY]
-    red, green, blue = records[at + RED], records[at + GREEN], records[at + BLUE]
-    dx = lanes() + (np.float32(left) + HALF - records[at + X])
-    cos0, sin0 = shapes[shape + COS0], shapes[shape + SIN0]
-    r0, sharpness = shapes[shape + R0], shapes[shape + SHARP] * TWO_LN2  # 1 / w²
+    start, y, k = _start(records, at, left, top + first)
+    dx = lanes() + (np.float32(left) + HALF - get(records, at + X))
+    r0, sharp, limit = get(shapes, shape + R0), get(shapes, shape + SHARP), get(shapes, shape + LIMIT)
     zero = splat(ZERO)
-    moments, colours, mass = (zero, zero, zero, zero, zero), (zero, zero, zero), zero
+    sums, colours, mass = (zero, zero, zero, zero, zero), (zero, zero, zero), zero
     d_r0, d_w, arc_x, arc_y, d_theta, d_cos, d_k = zero, zero, zero, zero, zero, zero, zero
-    for row in range(first, end):
-        u, dy = needle_offsets(records, at, left, top + row)
+    row, one = first, opaque(1)
+    while row < end:
+        dy, u = np.float32(y), lanes() + np.float32(start)
         r = _distance(records, at, u, dy)
-        e = _ring(shapes, shape, r) * opacity
-        cosine, sine, inverse, window = zero, zero, zero, zero
-        if arcs:
-            cosine, sine, inverse = _angle(shapes, shape, dx, dy)
-            window = _window(shapes, shape, cosine)
-            e = e * window
-        if add:
-            g, w = _add_gradient(state, row * ROW_BACKWARD, e, red, green, blue)
-        else:
-            g, w = row_gradient(state, row * ROW_BACKWARD, e, records, at, False)
-        colours = _add_colours(state, row * ROW_BACKWARD, w, colours)
-        mass = mass + g
         z = r - r0
-        gz = g * z
-        d_r0, d_w = d_r0 + gz, fma(gz, z, d_w)
-        moments = _add_moments(moments, where(r > RADIUS_MIN, gz * sharpness / r, ZERO), u, dy)
-        if arcs:
-            off = g * (ONE - window)
-            d_k = fma(off, cosine - shapes[shape + COS_DELTA], d_k)
-            off = off * shapes[shape + ARC]
-            d_cos = d_cos - off
-            d_theta = fma(off, sine, d_theta)
-            off, across = off * inverse, cosine * inverse
-            arc_x = fma(off, across * dx - cos0, arc_x)
-            arc_y = fma(off, across * dy - sin0, arc_y)
+        power = z * z * sharp
+        if any_of(power <= limit):
+            e = exp2(-power)
+            cosine, inverse, window = zero, zero, zero
+            if arcs:
+                cosine, inverse = _angle(shapes, shape, dx, dy)
+                window = _window(shapes, shape, cosine)
+                e = e * window
+            if add:
+                g, w = _add_gradient(state, row * ROW_BACKWARD, e, records, at)
+            else:
+                e = e * get(records, at + OPACITY)
+                g, w = row_gradient(state, row * ROW_BACKWARD, e, records, at, False)
+            colours = _add_colours(state, row * ROW_BACKWARD, w, colours)
+            mass = mass + g
+            gz = g * z
+            d_r0, d_w = d_r0 + gz, fma(gz, z, d_w)
+            sums = _add_moments(sums, where(r > RADIUS_MIN, gz / r, ZERO), u, dy)
+            if arcs:
+                off = g * (ONE - window)
+                d_k = fma(off, cosine - get(shapes, shape + COS_DELTA), d_k)
+                d_cos = d_cos + off
+                off = off * inverse
+                d_theta = fma(off, dy * get(shapes, shape + COS0) - dx * get(shapes, shape + SIN0), d_theta)
+                across = cosine * inverse
+                arc_x = fma(off, across * dx - get(shapes, shape + COS0), arc_x)
+                arc_y = fma(off, across * dy - get(shapes, shape + SIN0), arc_y)
+        row += one
+        start += k
+        y += 1.0
+    slope, arc = sharp * TWO_LN2, get(shapes, shape + ARC)  # 1 / w², k
     return totals((
-        moments[0], moments[1], moments[2], moments[3], moments[4], mass, colours[0], colours[1], colours[2],
-        d_r0 * sharpness, d_w * (sharpness / shapes[shape + WIDTH]), arc_x, arc_y, d_theta, d_cos, d_k,
+        sums[0] * slope, sums[1] * slope, sums[2] * slope, sums[3] * slope, sums[4] * slope, mass,
+        colours[0], colours[1], colours[2], d_r0 * slope, d_w * (slope / get(shapes, shape + WIDTH)),
+        arc_x * arc, arc_y * arc, d_theta * arc, d_cos * -arc, d_k,
     ))  # fmt: skip
 
 
@@ -401,13 +427,15 @@ def _shaped_backward(state, records, at, shapes, shape, left, top, first, end, a
 def _tile_backward(entries, begin, used, end, records, shapes, left, top, state, shaped, arcs, add, gradients):  # type: ignore[no-untyped-def]
     for e in range(begin, used):
         prefetch(gradients, get(entries, min(e + AHEAD, end - 1) * ENTRY + SLOT) * RECORD)
-        i = get(entries, e * ENTRY + GAUSSIAN)
+        i, slot = get(entries, e * ENTRY + GAUSSIAN), get(entries, e * ENTRY + SLOT)
         at, first, last = i * RECORD, get(entries, e * ENTRY + FIRST_ROW), get(entries, e * ENTRY + END_ROW)
         if shaped:
             row = _shaped_backward(state, records, at, shapes, i * SHAPE, left, top, first, last, arcs, add)
+        elif is_steep(records, at, first, last):
+            row = _needle_backward(state, records, at, left, top, first, last)
         else:
             row = _plain_backward(state, records, at, left, top, first, last)
-        store(gradients, get(entries, e * ENTRY + SLOT) * RECORD, row)
+        store(gradients, slot * RECORD, row)
     for e in range(used, end):
         store(gradients, get(entries, e * ENTRY + SLOT) * RECORD, splat(ZERO))
 
@@ -419,27 +447,23 @@ def raster_backward(
 ):  # type: ignore[no-untyped-def]  # fmt: skip
     """gradients: the row of each slot."""
     state, edge = scratch[:STATE_BACKWARD], scratch[STATE_BACKWARD:SCRATCH].reshape(6, EDGE)
+    no_depth = np.bool_(False)
     while True:
         tile = take_number(counter)
         if tile >= ends.size:
             break
         left, top = (tile % tiles_x) * TILE_WIDTH, (tile // tiles_x) * TILE_HEIGHT
-        begin, used, end = starts[tile], ends[tile], starts[tile + 1]
+        a, b, c = starts[tile], ends[tile], starts[tile + 1]
         load_tile(
-            state, left, top, width, height, background, image, alphas, alphas, d_image, d_alphas, d_alphas, False, edge
-        )
-        if not shaped:
-            _tile_backward(
-                entries, begin, used, end, records, shapes, left, top, state, shaped, arcs, add, gradients
-            )
+            state, left, top, width, height, background, image, alphas, alphas, d_image, d_alphas, d_alphas,
+            no_depth, edge,
+        )  # fmt: skip
+        if not shaped:  # noqa: SIM114 - three loops for LLVM to specialise
+            _tile_backward(entries, a, b, c, records, shapes, left, top, state, shaped, arcs, add, gradients)
         elif add:
-            _tile_backward(
-                entries, begin, used, end, records, shapes, left, top, state, shaped, arcs, add, gradients
-            )
+            _tile_backward(entries, a, b, c, records, shapes, left, top, state, shaped, arcs, add, gradients)
         else:
-            _tile_backward(
-                entries, begin, used, end, records, shapes, left, top, state, shaped, arcs, add, gradients
-            )
+            _tile_backward(entries, a, b, c, records, shapes, left, top, state, shaped, arcs, add, gradients)
 
 
 @inlined
@@ -459,7 +483,8 @@ def finish(
     row: workspace of 16."""
     for i in range(opacities.size):
         _add_rows(gradients, firsts[i], counts[i], row)
-        xx, xy, yy = np.float64(covariances[3 * i]), np.float64(covariances[3 * i + 1]), np.float64(covariances[3 * i + 2])
+        xx, xy = np.float64(covariances[3 * i]), np.float64(covariances[3 * i + 1])
+        yy = np.float64(covariances[3 * i + 2])
         determinant = xx * yy - xy * xy
         if not (determinant > 0 and yy > 0):
             determinant, yy = 1.0, 1.0

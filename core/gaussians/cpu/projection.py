@@ -12,7 +12,7 @@ xx yy - xy² suffers for needles. For the same reason a record does not hold the
     q / (2 ln 2) = A (d_x + k d_y)² + D d_y²,   k = -xy / yy,  A = h yy / det,  D = h / yy,  h = 1 / (2 ln 2)
 
 so alpha = opacity 2^-(A u² + D d_y²), u = d_x + k d_y. From one pixel row to the next the exponent's second
-difference is -2 C with C = A k² + D; `step` = 2^(-2 C) serves the recurrence of the rasterizer.
+difference is -2 C with C = A k² + D; `step` = 2^(-2 C) - 1 serves the recurrence of the rasterizer.
 
 Backward: the rasterizer sends moments of g = dL / d ln alpha over the pixels: sums of g, g u, g d_y, g u²,
 g u d_y, g d_y², which give the gradients of centre, covariance and opacity (`_from_moments`), and those of the
@@ -31,7 +31,7 @@ from .vector import (
     LANES,
     any_of,
     deinterleave,
-    exp2,
+    exp2_less_one,
     fma,
     get,
     interleave,
@@ -283,7 +283,7 @@ def _project_block(
         for i in range(SLOPES):
             store(slopes_out, i * LANES, zero)
     rows = transpose((
-        x, y, major, k, minor, opacity, exp2(bend * -TWO), bend,
+        x, y, major, k, minor, opacity, exp2_less_one(bend * -TWO), bend,
         maximum(red, ZERO), maximum(green, ZERO), maximum(blue, ZERO), pz,
         reach + MARGIN, half_x, half_y, zero,
     ))  # fmt: skip

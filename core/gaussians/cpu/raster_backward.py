@@ -8,9 +8,9 @@ what is left of the sum over all (known from the final picture) as the walk goes
     w = T alpha,   S' = S - w vc,   T' = T - w,   dL/dalpha = T vc - S' / (1 - alpha)
     g = dL / d ln alpha = w vc - S' alpha / (1 - alpha)
 
-Sums of g times 1, u, d_y and their products over the pixels are all that the projection needs; rows of one
-lane share u up to k d_y, so that three sums a lane do (`_Moments` below), combined after the last row. Needles
-(see `raster_forward`) sum the products themselves, which would cancel otherwise.
+Sums of g times 1, u, d_y and their products over the pixels are all that the projection needs. In each lane u
+depends on the row through k d_y alone, so that three sums a lane do, combined after the last row (`moments`).
+Needles (see `raster_forward`) sum the products themselves, which would cancel otherwise.
 
 Every pair of Gaussian and tile writes a row of its own: no two threads meet, and the sums do not depend on
 the number of threads.
@@ -27,7 +27,6 @@ from .raster_forward import (
     DEPTH_ALPHA_MIN,
     HALF,
     ONE,
-    RUN,
     T_MIN,
     T_PLANE,
     ZERO,
@@ -138,37 +137,45 @@ def _needle(state, records, at, left, top, first, end, with_depth):  # type: ign
 
 
 @inlined
-def _ordinary(state, records, at, left, top, first, end, with_depth):  # type: ignore[no-untyped-def]
-    """The same by the recurrence and by sums over the rows of each lane: with u = d_x + k d_y,
+def moments(records, at, left, y, s0, s1, s2):  # type: ignore[no-untyped-def]
+    """Sums of g times u, d_y, u², u d_y, d_y² in each lane from three that take an addition each a row.
 
-    sum g u = d_x m0 + k m1,   sum g u d_y = d_x m1 + k m2,   sum g u² = d_x (d_x m0 + 2 k m1) + k² m2
-    where m_i = sum g d_y^i.
+    With n - i the rows from row i to the end, where d_y is y: s0 = sum g, s1 = sum g (n - i),
+    s2 = sum g (n - i) (n - i + 1) / 2. So, m_i being sum g d_y^i, m1 = y s0 - s1 and
+    m2 = y² s0 - 2 y s1 + 2 s2 - s1; and as u = d_x + k d_y, with one d_x in each lane,
+
+    sum g u = d_x s0 + k m1,   sum g u d_y = d_x m1 + k m2,   sum g u² = d_x (d_x s0 + 2 k m1) + k² m2
     """
-    k, step, one = get(records, at + K), get(records, at + STEP), opaque(1)
-    zero = splat(ZERO)
-    m0, m1, m2 = zero, zero, zero
-    colours = (zero, zero, zero, zero)
-    run = first
-    while run < end:
-        u, dy = offsets(records, at, left, top + run)
-        e = falloff(records, at, u, dy) * get(records, at + OPACITY)
-        r = ratio(records, at, u, dy)
-        row, stop = run, min(run + RUN, end)
-        while row < stop:
-            g, w = row_gradient(state, row * ROW, e, records, at, with_depth)
-            colours = _add_colours(state, row * ROW, w, colours, with_depth)
-            gy = g * dy
-            m0, m1, m2 = m0 + g, m1 + gy, fma(gy, dy, m2)
-            dy += ONE
-            e = e * r
-            r = r * step
-            row += one
-        run += RUN
+    k = get(records, at + K)
     dx = lanes() + (np.float32(left) + HALF - get(records, at + X))
-    mu = fma(dx, m0, m1 * k)
-    muy = fma(dx, m1, m2 * k)
-    muu = fma(dx, fma(m1, k, mu), m2 * (k * k))
-    return mu, m1, muu, muy, m2, m0, colours
+    m1 = s0 * y - s1
+    m2 = (m1 - s1) * y + (s2 * TWO - s1)
+    mu = fma(dx, s0, m1 * k)
+    return mu, m1, fma(dx, fma(m1, k, mu), m2 * (k * k)), fma(dx, m1, m2 * k), m2
+
+
+@inlined
+def _ordinary(state, records, at, left, top, first, end, with_depth):  # type: ignore[no-untyped-def]
+    """The same by the recurrence, and by sums of sums (`moments`)."""
+    step, one = get(records, at + STEP), opaque(1)
+    u, dy = offsets(records, at, left, top + first)
+    e = falloff(records, at, u, dy) * get(records, at + OPACITY)
+    r = ratio(records, at, u, dy)
+    zero = splat(ZERO)
+    s0, s1, s2 = zero, zero, zero
+    colours = (zero, zero, zero, zero)
+    row = first
+    while row < end:
+        g, w = row_gradient(state, row * ROW, e, records, at, with_depth)
+        colours = _add_colours(state, row * ROW, w, colours, with_depth)
+        s0 = s0 + g
+        s1 = s1 + s0
+        s2 = s2 + s1
+        e = e * r
+        r = fma(r, step, r)
+        row += one
+    mu, my, muu, muy, myy = moments(records, at, left, dy + np.float32(end - first), s0, s1, s2)
+    return mu, my, muu, muy, myy, s0, colours
 
 
 @inlined

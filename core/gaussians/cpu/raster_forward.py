@@ -6,10 +6,10 @@ One vector is a row of a tile. For the rows of an entry, with e = opacity 2^-(A 
     alpha = e where e >= 1/255 and T >= 1e-4, else 0
     w = T alpha,   C = C + w colour,   T = T - w
 
-From row to row e follows a recurrence instead of an exponential each: e' = e r, r' = r step, where
-r = 2^-(A (2 u k + k²) + D (2 d_y + 1)). It starts anew every 16 rows; and where rows differ by more than a
-dozens of powers of two (`STEEP`: thin needles), it would lose its start below the smallest float, so that e is
-computed for each row.
+From row to row e follows a recurrence instead of an exponential each: e' = e r, r' = r + r step, where
+r = 2^-(A (2 u k + k²) + D (2 d_y + 1)) and step = 2^(-2 C) - 1, small and exact where rows are many. Where
+rows differ by dozens of powers of two (`STEEP`: thin needles), it would lose its start below the smallest
+float, so that e is computed for each row.
 """
 from __future__ import annotations
 
@@ -38,8 +38,6 @@ from .vector import (
 )
 
 T_MIN = np.float32(rendering.TRANSMITTANCE_MIN)
-RUN = 16
-"""Rows to a run of the recurrence: rounding grows with the square of its length."""
 STEEP = np.float32(64.0)
 """Largest C n² (powers of two over n rows) for the recurrence."""
 PAUSE = 32
@@ -89,7 +87,7 @@ def ratio(records, at, u, dy):  # type: ignore[no-untyped-def]
 @inlined
 def is_steep(records, at, first, end):  # type: ignore[no-untyped-def]
     """Whether rows differ too much for the recurrence."""
-    rows = np.float32(min(end - first, RUN))
+    rows = np.float32(end - first)
     return get(records, at + BEND) * rows * rows > STEEP
 
 
@@ -151,18 +149,15 @@ def _blend_needle(state, records, at, left, top, first, end, with_depth):  # typ
 def _blend(state, records, at, left, top, first, end, with_depth):  # type: ignore[no-untyped-def]
     """The same by the recurrence."""
     step, one = get(records, at + STEP), opaque(1)
-    run = first
-    while run < end:
-        u, dy = offsets(records, at, left, top + run)
-        e = falloff(records, at, u, dy) * get(records, at + OPACITY)
-        r = ratio(records, at, u, dy)
-        row, stop = run, min(run + RUN, end)
-        while row < stop:
-            blend_row(state, row * ROW, e, records, at, with_depth)
-            e = e * r
-            r = r * step
-            row += one
-        run += RUN
+    u, dy = offsets(records, at, left, top + first)
+    e = falloff(records, at, u, dy) * get(records, at + OPACITY)
+    r = ratio(records, at, u, dy)
+    row = first
+    while row < end:
+        blend_row(state, row * ROW, e, records, at, with_depth)
+        e = e * r
+        r = fma(r, step, r)
+        row += one
 
 
 @inlined

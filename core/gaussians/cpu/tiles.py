@@ -56,18 +56,15 @@ def bin_gaussians(
     slots = buffers.empty(room, np.int32)
     firsts, counts = buffers.empty(n, np.int32), buffers.empty(n, np.int32)
     flat_records = records.reshape(-1)
+    keys, spare_keys = buffers.empty(n, np.uint32), buffers.empty(n, np.uint32)
+    places = buffers.empty((binning.DIGITS, 1 << 11), np.int32)
+    order, spare_order = buffers.empty(n, np.int32), buffers.empty(n, np.int32)
     parallel(
-        binning.list_tiles, flat_records, bounds, starts_of_chunks, grid.width, grid.height, grid.tiles_x,
-        slots, firsts, counts,
+        binning.list_and_sort, flat_records, flat_records.view(np.uint32), bounds, starts_of_chunks,
+        grid.width, grid.height, grid.tiles_x, by_depth, slots, firsts, counts,
+        places, keys, spare_keys, order, spare_order,
     )  # fmt: skip
-    if by_depth:
-        keys, spare_keys = buffers.empty(n, np.uint32), buffers.empty(n, np.uint32)
-        places = buffers.empty((binning.DIGITS, 1 << 11), np.int32)
-        order, spare_order = buffers.empty(n, np.int32), buffers.empty(n, np.int32)
-        m = binning.sort_by_depth(flat_records.view(np.uint32), counts, places, keys, spare_keys, order, spare_order)
-    else:
-        order = np.flatnonzero(counts).astype(np.int32)
-        m = len(order)
+    m = int(np.count_nonzero(bounds))
     numbers = buffers.empty((torch.get_num_threads(), grid.tiles), np.int32)
     starts = np.empty(grid.tiles + 1, np.int64)
     parallel(binning.count, order, m, slots, firsts, counts, numbers)

@@ -565,6 +565,17 @@ def exp2(x):  # type: ignore[no-untyped-def]
     return as_floats(as_ints(p) + (as_ints(rounded) << 23))
 
 
+@inlined
+def exp2_less_one(x):  # type: ignore[no-untyped-def]
+    """2^x - 1, exact to the last bits also where it is near 0."""
+    f = minimum(maximum(x, np.float32(-0.5)), np.float32(0.5))
+    p = fma(f, _EXP2[5], _EXP2[4])
+    p = fma(f, p, _EXP2[3])
+    p = fma(f, p, _EXP2[2])
+    p = fma(f, p, _EXP2[1])
+    return where(absolute(x) <= np.float32(0.5), f * p, exp2(x) - np.float32(1))
+
+
 _SQRT2 = np.float32(1.4142135)
 # 2 / ln 2 times the series of the inverse hyperbolic tangent
 _LOG2 = tuple(np.float32(2.8853900817779268 / k) for k in (1, 3, 5, 7, 9))

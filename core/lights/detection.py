@@ -84,7 +84,8 @@ def measured(mask: Mask, corner: tuple[int, int], picture: Picture, display: NDA
 
 
 def _glow(mask: Mask, corner: tuple[int, int], picture: Picture) -> NDArray[np.float64]:
-    """Colour of the glow: what the pixels just round the source have more than those further out."""
+    """Colour of the glow: what the pixels just round the source have more than those further out, of which no more
+    than half is taken for background, lest a bright surface nearby leave none."""
     import cv2
 
     reach = max(3, round(float(np.sqrt(mask.sum() / np.pi))))
@@ -102,5 +103,5 @@ def _glow(mask: Mask, corner: tuple[int, int], picture: Picture) -> NDArray[np.f
         return np.ones(3)
     glow = around[near].mean(axis=0).astype(np.float64)
     if far.any():
-        glow = np.maximum(glow - np.minimum(around[far].mean(axis=0), glow), 0.0)
+        glow = glow - np.minimum(np.median(around[far], axis=0), 0.5 * glow)
     return glow / glow.max() if glow.max() > 1e-4 else np.ones(3)

@@ -25,7 +25,7 @@ SMALLEST = 12  # pixels; below it noise and sparkle
 class Exposure:
     """The detector; `threshold` 0..1 of the score, `clipped` of full scale (HSV value)."""
 
-    threshold: float = 0.5
+    threshold: float = 0.7
     clipped: float = 0.98
 
     def detect(self, picture: Picture) -> list[Detection]:

@@ -62,9 +62,9 @@ def find_lights(capture: Capture, detector: Detector, progress: Progress | None 
         if lights:
             says.append("One view gives directions only: distances are those of the points nearby, or a guess.")
     else:
-        found = gather(views, detections, capture.extent, replace(settings, min_views=2))
-        lights = [light for light in found if len(light.support) >= enough]
-        doubtful = [light for light in found if len(light.support) < enough]
+        found = gather(views, detections, capture.extent, replace(settings, min_views=2, accidents=np.inf))
+        lights = [light for light in found if _sure(light, enough, settings)]
+        doubtful = [light for light in found if not _sure(light, enough, settings)]
     if ghosts and not lights and len(views) > 1:
         lights = _follow_ghosts(capture, progress, settings.seed)
         if lights:
@@ -73,6 +73,10 @@ def find_lights(capture: Capture, detector: Detector, progress: Progress | None 
     if not lights:
         says.append("No light was found: none is in frame in enough views, or none is over-exposed.")
     return Findings(lights, doubtful, detections, says)
+
+
+def _sure(light: FoundLight, min_views: int, settings: GatherSettings) -> bool:
+    return len(light.support) >= min_views and light.accidents <= settings.accidents
 
 
 def record(capture: Capture, findings: Findings, keep: bool = False) -> dict[str, Any]:
@@ -112,7 +116,7 @@ def _shown(entry: dict[str, Any], lights: Sequence[FoundLight]) -> FoundLight:
     for light in lights:
         if np.linalg.norm(light.xyz - xyz) <= 1e-4 * max(1.0, float(np.linalg.norm(xyz))):
             return light
-    return FoundLight(xyz, False, (), 0, 0.0, 0.0, np.ones(3), 0.0, "by hand")
+    return FoundLight(xyz, False, (), 0, 0.0, 0.0, np.ones(3), 0.0, how="by hand")
 
 
 def _from_one_view(capture: Capture, detections: Sequence[Detection]) -> list[FoundLight]:
@@ -129,7 +133,8 @@ def _from_one_view(capture: Capture, detections: Sequence[Detection]) -> list[Fo
         distance = FAR * capture.extent if far else float(np.median(depth[near])) / float(ray @ view.camera.forward)
         uncertainty = 0.0 if far else distance
         found.append(FoundLight(view.camera.position + distance * ray, far, (view.name,), 1, 0.0, uncertainty,
-                                one.colour, one.radius, "one view, distance guessed", detections=((view.name, one),)))
+                                one.colour, one.radius, how="one view, distance guessed",
+                                detections=((view.name, one),)))
     return found
 
 

@@ -3,7 +3,9 @@
 
 Every pair of detections proposes a place, finite and at infinity; a place is worth the detections near its
 projections. The best is refined, its detections are taken away, and so on until nothing has enough views.
-What slides over the views, as highlights on glossy things do, finds no place that many views agree on.
+What slides over the views, as highlights on glossy things do, finds no place that many views agree on; what
+agrees in so few that it may be an accident is told by the expected number of accidents (a contrario, Desolneux,
+Moisan and Morel 2000): pairs tried, times the chance that so many more of the other views have a detection there.
 
 A place is held as direction and inverse distance from the middle of the cameras that see it (Civera et
 al. 2008), so that the sun is no special case: its inverse distance is zero within its uncertainty, and it is
@@ -11,6 +13,7 @@ put far away in its direction.
 """
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
@@ -28,12 +31,12 @@ PATIENCE = 6      # places of too few views in a row, after which there is nothi
 @dataclass(frozen=True)
 class GatherSettings:
     """tolerance: of a projection, as a share of the frame's diagonal, to which half the source's radius is added;
-    min_views: fewer do not make a light; min_share: of the views that should show the light, so many must;
+    min_views: fewer do not make a light; accidents: as many expected by chance are allowed at most;
     most: lights at most. tries: pairs of detections tried, all of them where there are fewer; seed: of their choice."""
 
     tolerance: float = 0.006
     min_views: int = 3
-    min_share: float = 0.12
+    accidents: float = 0.02
     most: int = 32
     tries: int = 4000
     seed: int = 0
@@ -47,6 +50,7 @@ class FoundLight:
     support: names of the views that show it; visible: how many views have it in frame.
     residual: median distance in pixels of detections from its projections.
     uncertainty: one standard deviation, scene units along the worst direction; degrees of direction where far.
+    accidents: how many places of this support chance alone would give.
     colour: (3,) linear, largest channel 1. radius: median of its detections, pixels. how: where it is from.
     """
 
@@ -58,8 +62,8 @@ class FoundLight:
     uncertainty: float
     colour: Floats
     radius: float
+    accidents: float = 0.0
     how: str = "triangulated"
-    name: str = ""
     detections: tuple[tuple[str, Detection], ...] = field(default=(), repr=False)
 
 
@@ -114,7 +118,7 @@ def gather(views: Sequence[tuple[str, Camera]], detections: Sequence[Sequence[De
             continue
         light = _light(seen, place, inliers, covariance, extent)
         open_[inliers] = False
-        if len(light.support) >= settings.min_share * light.visible:
+        if light.accidents <= settings.accidents:
             found.append(light)
             failures = 0
     return merged(found, views, extent)
@@ -299,10 +303,22 @@ def _light(seen: _Sightings, place: Floats, inliers: NDArray[np.int64], covarian
     colours = np.array([seen.detection[i].colour for i in inliers])
     colour = np.median(colours, axis=0)
     support = tuple(sorted({seen.names[v] for v in view}))
-    return FoundLight(xyz, far, support, int(max(in_frame.sum(), len(support))), float(np.median(off)), uncertainty,
-                      colour / max(float(colour.max()), 1e-6), float(np.median([seen.detection[i].radius
-                                                                                for i in inliers])),
+    visible = int(max(in_frame.sum(), len(support)))
+    radius = float(np.median([seen.detection[i].radius for i in inliers]))
+    return FoundLight(xyz, far, support, visible, float(np.median(off)), uncertainty,
+                      colour / max(float(colour.max()), 1e-6), radius, _accidents(seen, len(support), visible),
                       detections=tuple((seen.names[seen.view[i]], seen.detection[i]) for i in inliers))
+
+
+def _accidents(seen: _Sightings, support: int, visible: int) -> float:
+    """How many places chance would give that `support` of `visible` views agree on: every pair of detections claims
+    one, and each other view has one of its detections within its tolerance of it with a small probability."""
+    area = seen.size.prod(axis=1)
+    cover = np.pi * seen.tolerance ** 2 / area[seen.view]
+    share = min(float(np.bincount(seen.view, cover, len(seen.cameras)).mean()), 0.5)
+    others, more = visible - 2, support - 2
+    chance = sum(math.comb(others, k) * share ** k * (1 - share) ** (others - k) for k in range(more, others + 1))
+    return math.comb(len(seen.view), 2) * chance
 
 
 def merged(lights: Sequence[FoundLight], views: Sequence[tuple[str, Camera]], extent: float) -> list[FoundLight]:

@@ -1,0 +1,370 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Lights in pictures, in 3D, on disk."""
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from core.capture import Camera, Capture
+from core.errors import CaptureError, EngineError, SettingsError
+from core.lights import Detection, Exposure, GatherSettings, detector_for, find_lights, gather, record, union
+from core.lights.file import write_lights
+from core.lights.ghosts import find_blobs, gather_ghosts
+from core.lights.lifted import lift
+from core.pictures import Picture, srgb_from_linear
+from tests.core.captures import make_capture, orbit, picture
+
+SIZE = (320, 240)
+EXTENT = 2.5
+
+
+def backdrop(seed: int = 0, size: tuple[int, int] = SIZE) -> NDArray[np.float64]:
+    """A smooth picture in linear light, nowhere clipped."""
+    return (picture(seed, size)[..., ::-1].astype(np.float64) / 255) ** 2.2 * 0.2
+
+
+def with_disc(light: NDArray[np.float64], at: tuple[float, float], radius: float, radiance: float = 30.0,
+              colour: tuple[float, float, float] = (1.0, 0.8, 0.6), glare: float = 1.0) -> NDArray[np.float64]:
+    """A disc and its glare, added."""
+    v, u = np.mgrid[:light.shape[0], :light.shape[1]] + 0.5
+    away = np.hypot(u - at[0], v - at[1])
+    shape = np.clip(radius - away + 0.5, 0, 1) * radiance + glare * radius ** 2 / (radius ** 2 + away ** 2)
+    return light + shape[..., None] * np.array(colour)
+
+
+def stored(light: NDArray[np.float64]) -> Picture:
+    """As an 8 bit file holds it."""
+    return Picture(np.round(np.clip(srgb_from_linear(light), 0, 1) * 255).astype(np.float32) / 255, "srgb")
+
+
+class TestExposure:
+    @pytest.mark.parametrize("at", [(100.5, 80.5), (100.3, 80.8), (211.9, 133.1)])
+    @pytest.mark.parametrize("radius", [3.0, 7.3])
+    def test_a_lamp_is_found_where_it_is(self, at: tuple[float, float], radius: float) -> None:
+        (found,) = Exposure().detect(stored(with_disc(backdrop(), at, radius)))
+        assert np.linalg.norm(found.xy - at) < 0.25
+        assert found.radius == pytest.approx(radius, rel=0.25)
+        assert found.score > 0.8 and not found.cut
+
+    def test_the_colour_is_that_of_the_glow(self) -> None:
+        scene = with_disc(np.full((240, 320, 3), 0.1), (150, 100), 7)
+        (found,) = Exposure().detect(stored(scene))
+        np.testing.assert_allclose(found.colour, (1.0, 0.8, 0.6), atol=0.05)
+
+    def test_two_lamps_and_their_masks(self) -> None:
+        scene = with_disc(with_disc(backdrop(), (60, 60), 6), (250, 150), 9, colour=(0.6, 0.8, 1))
+        found = Exposure().detect(stored(scene))
+        assert len(found) == 2
+        mask = union(found, SIZE)
+        assert mask[60, 60] and mask[150, 250] and not mask[100, 150] and 300 < mask.sum() < 700
+
+    def test_spikes_and_a_bright_bracket_do_not_hide_a_lamp(self) -> None:
+        scene = with_disc(backdrop(), (150, 100), 9)
+        cv2.line(scene, (150, 100), (190, 140), (20.0, 20.0, 20.0), 3)
+        cv2.line(scene, (150, 100), (150, 70), (20.0, 20.0, 20.0), 1)
+        (found,) = Exposure().detect(stored(scene))
+        assert np.linalg.norm(found.xy - (150, 100)) < 2
+
+    def test_a_lamp_at_the_edge_is_said_to_be_cut(self) -> None:
+        (found,) = Exposure(0.1).detect(stored(with_disc(backdrop(), (160, 2), 8)))
+        assert found.cut
+
+    @pytest.mark.parametrize("what", ["wall", "sky", "window", "red", "sparkle", "stripe", "nothing", "white"])
+    def test_what_is_no_lamp(self, what: str) -> None:
+        scene = backdrop()
+        if what == "wall":
+            scene[40:200, 30:200] = 1.2
+        elif what == "sky":  # clipped in one place of a bright gradient
+            v, u = np.mgrid[:240, :320]
+            scene[:] = np.clip(1.02 - 0.0008 * np.hypot(u - 160, v - 120), 0, 1)[..., None]
+        elif what == "window":
+            for x in range(60, 260, 40):
+                for y in range(30, 200, 40):
+                    scene[y:y + 36, x:x + 36] = 1.5
+            scene[100:104, 60:256] = 1.5  # and its panes run together
+        elif what == "red":
+            cv2.circle(scene, (150, 100), 9, (1.4, 0.05, 0.02), -1)
+        elif what == "sparkle":
+            scene[::24, ::24] = 3.0
+        elif what == "stripe":
+            scene[100:104, 20:300] = 2.0
+        elif what == "white":
+            scene[:] = 1.0
+        assert not union(Exposure().detect(stored(scene)), SIZE).any()
+
+    def test_linear_pictures(self) -> None:
+        scene = with_disc(backdrop(), (150.2, 99.6), 8)
+        (found,) = Exposure().detect(Picture(scene.astype(np.float32), "linear"))
+        assert np.linalg.norm(found.xy - (150.2, 99.6)) < 0.15
+
+
+def spot(xy: NDArray[np.float64], radius: float = 3.0, score: float = 1.0) -> Detection:
+    return Detection(np.asarray(xy, np.float64), radius, score, np.array([1.0, 0.9, 0.7]), np.ones((3, 3), bool),
+                     (int(xy[0]), int(xy[1])), False)
+
+
+def scene(lights: list[tuple[float, float, float]], cameras: list[Camera], noise: float = 0.4, clutter: int = 2,
+          hidden: float = 0.0, seed: int = 0) -> list[list[Detection]]:
+    """Detections of lights in every view that has them in frame, with noise, misses and clutter."""
+    rng = np.random.default_rng(seed)
+    all_views = []
+    for camera in cameras:
+        pixels, depth = camera.project(lights)
+        some = [spot(pixel + rng.normal(0, noise, 2)) for pixel, seen in
+                zip(pixels, camera.contains(pixels, depth), strict=True) if seen and rng.uniform() >= hidden]
+        some += [spot(rng.uniform((0, 0), SIZE), score=0.5) for _ in range(clutter)]
+        all_views.append(some)
+    return all_views
+
+
+def named(cameras: list[Camera]) -> list[tuple[str, Camera]]:
+    return [(f"{i:04d}.png", camera) for i, camera in enumerate(cameras)]
+
+
+class TestGather:
+    def test_lights_are_found_and_none_invented(self) -> None:
+        lights = [(0.4, -0.5, 0.3), (-0.9, -0.2, 1.5), (0.1, 0.3, -1.0)]
+        cameras = orbit(30, size=SIZE)
+        found = gather(named(cameras), scene(lights, cameras, hidden=0.3), EXTENT)
+        assert len(found) == 3
+        for light in lights:
+            nearest = min(found, key=lambda one: float(np.linalg.norm(one.xyz - light)))
+            error = float(np.linalg.norm(nearest.xyz - light))
+            assert error < 0.02 and not nearest.far
+            assert error < 4 * nearest.uncertainty < 0.1
+            assert nearest.residual < 1 and len(nearest.support) > 12
+
+    def test_clutter_alone_is_no_light(self) -> None:
+        cameras = orbit(24, size=SIZE)
+        assert not gather(named(cameras), scene([], cameras, clutter=3), EXTENT)
+
+    def test_dirt_on_the_lens_is_no_light(self) -> None:
+        cameras = orbit(30, size=SIZE, arc=2.2)
+        detections = [[spot(np.array([60.0, 50.0]))] for _ in cameras]
+        assert not [light for light in gather(named(cameras), detections, EXTENT) if len(light.support) > 8]
+
+    def test_the_sun_keeps_its_direction(self) -> None:
+        direction = np.array([0.15, -0.25, 1.0])
+        direction /= np.linalg.norm(direction)
+        cameras = orbit(30, size=SIZE, arc=0.7)
+        (found,) = gather(named(cameras), scene([tuple(1e7 * direction)], cameras, clutter=1), EXTENT)
+        assert found.far and np.linalg.norm(found.xyz) > 100 * EXTENT
+        away = found.xyz - np.mean([camera.position for camera in cameras], axis=0)
+        angle = np.degrees(np.arccos(away @ direction / np.linalg.norm(away)))
+        assert angle < 0.2 and angle < 4 * found.uncertainty + 0.02
+
+    def test_few_views_mean_more_uncertainty(self) -> None:
+        light = [(0.2, -0.3, 0.1)]
+        cameras = orbit(40, size=SIZE)
+        some = {}
+        for number in (3, 40):
+            (one,) = gather(named(cameras[:number]), scene(light, cameras[:number], clutter=0), EXTENT)
+            some[number] = one
+            assert np.linalg.norm(one.xyz - light[0]) < 4 * one.uncertainty
+        assert some[3].uncertainty > 5 * some[40].uncertainty
+
+    def test_too_few_views(self) -> None:
+        cameras = orbit(20, size=SIZE)
+        detections = scene([(0.2, -0.3, 0.1)], cameras, clutter=0)
+        detections[2:] = [[] for _ in detections[2:]]
+        assert not gather(named(cameras), detections, EXTENT)
+        (light,) = gather(named(cameras), detections, EXTENT, GatherSettings(min_views=2, accidents=1))
+        assert light.support == ("0000.png", "0001.png")
+
+    def test_one_lamp_found_twice_is_one(self) -> None:
+        """A lamp and its glow, a little apart, in the same views."""
+        cameras = orbit(20, size=SIZE)
+        detections = [[spot(camera.project([(0.2, -0.3, 0.1)])[0][0], 8.0),
+                       spot(camera.project([(0.24, -0.3, 0.1)])[0][0], 8.0)] for camera in cameras]
+        assert len(gather(named(cameras), detections, EXTENT)) == 1
+
+    def test_the_same_seed_gives_the_same_lights(self) -> None:
+        cameras = orbit(20, size=SIZE)
+        detections = scene([(0.4, -0.5, 0.3)], cameras, clutter=6)
+        first, second = (gather(named(cameras), detections, EXTENT) for _ in range(2))
+        assert [light.xyz.tolist() for light in first] == [light.xyz.tolist() for light in second]
+
+
+def turning(number: int) -> list[Camera]:
+    """Cameras that travel and turn, the light of `TestGhosts` above all their frames."""
+    rng = np.random.default_rng(4)
+    return [Camera(*SIZE, 300, 300, 160, 120, rotated @ camera.world_to_camera) for camera, rotated in
+            zip(orbit(number, size=SIZE), (tilt(x, y) for x, y in rng.uniform(-0.12, 0.12, (number, 2))), strict=True)]
+
+
+def tilt(x: float, y: float) -> NDArray[np.float64]:
+    turn = np.eye(4)
+    turn[:3, :3] = cv2.Rodrigues(np.array([x, y, 0.0]))[0]
+    return turn
+
+
+class TestGhosts:
+    light = np.array([0.5, -2.6, 1.0])
+
+    def frames(self, cameras: list[Camera], share: float) -> list[Picture]:
+        """Pictures with a ghost of the light, and some static bright points of the scene."""
+        static = np.random.default_rng(0).uniform((-1, -0.8, -0.5), (1, 0.8, 1), (6, 3))
+        made = []
+        for camera in cameras:
+            light = np.full((SIZE[1], SIZE[0], 3), 0.1)
+            v, u = np.mgrid[:SIZE[1], :SIZE[0]] + 0.5
+            spots = [(pixel, 4.0, 0.25) for pixel in camera.project(static)[0]]
+            pixel = camera.project(self.light[None])[0][0]
+            centre = np.array([camera.cx, camera.cy])
+            if share:
+                spots.append((centre + share * (pixel - centre), 7.0, 0.12))
+            for at, radius, strength in spots:
+                light += strength * (np.hypot(u - at[0], v - at[1]) < radius)[..., None] * np.array([0.5, 0.8, 1.0])
+            made.append(stored(light))
+        return made
+
+    def test_a_light_out_of_frame_is_found_by_its_ghost(self) -> None:
+        cameras = turning(16)
+        for camera in cameras:
+            assert not camera.contains(*camera.project(self.light[None]))[0]
+        blobs = [find_blobs(frame) for frame in self.frames(cameras, -0.35)]
+        (found,) = gather_ghosts(named(cameras), blobs, EXTENT)
+        middle = np.mean([camera.position for camera in cameras], axis=0)
+        a, b = found.xyz - middle, self.light - middle
+        assert np.degrees(np.arccos(a @ b / np.linalg.norm(a) / np.linalg.norm(b))) < 2
+        assert len(found.support) >= 12 and "ghost" in found.how
+
+    def test_without_ghosts_none_is_invented(self) -> None:
+        cameras = turning(16)
+        blobs = [find_blobs(frame) for frame in self.frames(cameras, 0.0)]
+        assert not gather_ghosts(named(cameras), blobs, EXTENT)
+
+
+def test_lifting_on_to_a_scene() -> None:
+    """Gaussians of a lamp, a wall behind it and haze of no opacity: the lamp's centroid comes out."""
+    rng = np.random.default_rng(0)
+    lamp = np.array([0.3, -0.4, 0.2])
+    means = np.concatenate([lamp + rng.normal(0, 0.02, (60, 3)),
+                            np.stack([*rng.uniform(-2, 2, (2, 3000)), np.full(3000, 1.5)], axis=1),
+                            rng.uniform(-1, 1, (500, 3))])
+    opacities = np.concatenate([np.full(3060, 0.9), np.full(500, 0.05)])
+    cameras = orbit(15, size=SIZE)
+    detections = []
+    for camera in cameras:
+        pixel = camera.project(lamp[None])[0][0]
+        corner = (int(pixel[0]) - 5, int(pixel[1]) - 5)
+        detections.append([Detection(pixel, 5.0, 1.0, np.ones(3), np.ones((11, 11), bool), corner, False)])
+    (light,) = lift(named(cameras), detections, means, opacities, EXTENT)
+    assert np.linalg.norm(light.xyz - lamp) < 0.01
+    assert len(light.support) == 15 and light.residual < 1
+    assert not lift(named(cameras), [[] for _ in cameras], means, opacities, EXTENT)
+
+
+class TestFile:
+    def found(self, *places: tuple[float, float, float]) -> list:
+        cameras = orbit(12, size=SIZE)
+        return gather(named(cameras), scene(list(places), cameras, noise=0.1, clutter=0), EXTENT)
+
+    def test_written_and_read(self, tmp_path: Path) -> None:
+        folder = make_capture(tmp_path / "c")
+        write_lights(folder / "lights.json", self.found((0.4, -0.5, 0.3)), named(orbit(12, size=SIZE)))
+        (light,) = Capture.open(folder).lights
+        assert light.name == "light1" and np.linalg.norm(light.xyz - (0.4, -0.5, 0.3)) < 0.02
+        entry = json.loads((folder / "lights.json").read_text())["lights"][0]
+        assert entry["support"] == 12 and entry["residual_px"] < 1 and entry["colour"][0] == 1
+
+    def test_editing_by_hand_survives(self, tmp_path: Path) -> None:
+        path, views = tmp_path / "lights.json", named(orbit(12, size=SIZE))
+        a, b, c = (0.4, -0.5, 0.3), (-0.6, -0.2, 0.5), (0.0, 0.5, 0.0)
+        write_lights(path, self.found(a, b, c), views)
+        data = json.loads(path.read_text())
+        assert len(data["lights"]) == 3
+
+        def entry(place: tuple[float, float, float]) -> dict:
+            return min(data["lights"], key=lambda one: np.linalg.norm(np.subtract(one["xyz"], place)))
+
+        entry(a)["name"] = "lamp"  # renamed
+        entry(b)["xyz"] = [-0.6, -0.22, 0.5]  # moved a little
+        data["lights"].remove(entry(c))  # taken out
+        data["lights"].append({"name": "moon", "xyz": [0, -900, 100], "note": "mine"})  # added
+        path.write_text(json.dumps(data))
+        before = json.loads(path.read_text())["lights"]
+        write_lights(path, self.found(a, b, c), views, keep=True)
+        assert json.loads(path.read_text())["lights"] == before
+        new = (0.7, 0.3, -0.4)
+        write_lights(path, self.found(a, b, c, new), views, keep=True)
+        after = json.loads(path.read_text())["lights"]
+        assert after[:-1] == before and np.linalg.norm(np.subtract(after[-1]["xyz"], new)) < 0.02
+        write_lights(path, self.found(a), views)  # and without keep the file is made afresh
+        assert len(json.loads(path.read_text())["lights"]) == 1
+
+    def test_a_file_that_cannot_be_kept(self, tmp_path: Path) -> None:
+        path = tmp_path / "lights.json"
+        path.write_text("{")
+        with pytest.raises(CaptureError, match=r"lights\.json"):
+            write_lights(path, [], [], keep=True)
+        assert path.read_text() == "{"
+
+
+def lit_capture(folder: Path, views: int, places: list[tuple[float, float, float]]) -> Path:
+    """A capture whose frames show lamps at these places."""
+    make_capture(folder, views=views, size=SIZE)
+    for i, camera in enumerate(orbit(views, size=SIZE)):
+        light = backdrop(i)
+        for place in places:
+            light = with_disc(light, tuple(camera.project([place])[0][0]), 6)
+        display = stored(light).pixels[..., ::-1]
+        cv2.imwrite(str(folder / "images" / f"{i:04d}.png"), (display * 255 + 0.5).astype(np.uint8))
+    return folder
+
+
+class TestFind:
+    def test_from_frames_to_files(self, tmp_path: Path) -> None:
+        places = [(0.4, -0.5, 0.3), (-0.6, 0.2, 0.5)]
+        capture = Capture.open(lit_capture(tmp_path / "c", 9, places))
+        findings = find_lights(capture, Exposure(0.3))
+        record(capture, findings)
+        lights = Capture.open(tmp_path / "c").lights
+        assert len(lights) == 2
+        for place in places:
+            assert min(np.linalg.norm(light.xyz - place) for light in lights) < 0.02
+        assert cv2.imread(str(tmp_path / "c/lights/sheet1.png")).shape[1] == 4 * 360
+        report = json.loads((tmp_path / "c/lights/report.json").read_text())
+        assert len(report["views"]) == 9 and all(len(view["detections"]) == 2 for view in report["views"])
+
+    def test_no_light_in_any_view(self, tmp_path: Path) -> None:
+        capture = Capture.open(lit_capture(tmp_path / "c", 6, []))
+        findings = find_lights(capture, Exposure(0.3))
+        assert not findings.lights and "No light was found" in findings.says[-1]
+        record(capture, findings)
+        assert Capture.open(tmp_path / "c").lights == ()
+
+    def test_one_view_only(self, tmp_path: Path) -> None:
+        capture = Capture.open(lit_capture(tmp_path / "c", 1, [(0.4, -0.5, 0.3)]))
+        findings = find_lights(capture, Exposure(0.3))
+        (light,) = findings.lights
+        ray = light.xyz - capture.views[0].camera.position
+        true = np.array((0.4, -0.5, 0.3)) - capture.views[0].camera.position
+        assert ray @ true / np.linalg.norm(ray) / np.linalg.norm(true) > 0.9999
+        assert "guess" in findings.says[-1] and "guessed" in light.how
+
+    def test_a_light_that_two_of_many_views_show_is_doubtful(self, tmp_path: Path) -> None:
+        folder = lit_capture(tmp_path / "c", 8, [(0.4, -0.5, 0.3)])
+        for i in range(2, 8):
+            cv2.imwrite(str(folder / "images" / f"{i:04d}.png"), picture(i, SIZE) // 2)
+        findings = find_lights(Capture.open(folder), Exposure(0.3))
+        assert not findings.lights and len(findings.doubtful) == 1
+        assert np.linalg.norm(findings.doubtful[0].xyz - (0.4, -0.5, 0.3)) < 4 * findings.doubtful[0].uncertainty
+
+    def test_bad_settings(self, tmp_path: Path) -> None:
+        with pytest.raises(SettingsError, match="0 and 1"):
+            detector_for("exposure", 2.0)
+        with pytest.raises(SettingsError, match="magic"):
+            detector_for("magic")
+        with pytest.raises(SettingsError, match="at least 1"):
+            find_lights(Capture.open(make_capture(tmp_path / "c")), Exposure(), settings=GatherSettings(min_views=0))
+
+
+def test_grounded_without_its_libraries_or_weights(tmp_path: Path) -> None:
+    with pytest.raises(EngineError, match="exposure method"):
+        detector_for("grounded", boxes=tmp_path / "none", masks=tmp_path / "none")

@@ -22,7 +22,7 @@ import math
 import numpy as np
 
 from .compilation import inlined, kernel
-from .projection import BEND, CHUNK, DEPTH, HALF_X, HALF_Y, REACH, RECORD, A, D, K, X, Y
+from .projection import CHUNK, DEPTH, HALF_X, HALF_Y, REACH, RECORD, A, D, K, X, Y
 from .vector import get, opaque, prefetch, take_number
 
 TILE_SHIFT_X, TILE_SHIFT_Y = 4, 5
@@ -62,12 +62,13 @@ def _pixel_rows(y, low, high, height):  # type: ignore[no-untyped-def]
 @inlined
 def _crossing(records, at, x):  # type: ignore[no-untyped-def]
     """Lowest and highest point of the ellipse at the horizontal offset x, or where it is nearest to that."""
-    half_x, inverse = get(records, at + HALF_X), ONE / get(records, at + BEND)
+    half_x, k, major = get(records, at + HALF_X), get(records, at + K), get(records, at + A)
+    inverse = ONE / (major * k * k + get(records, at + D))
     x = _least(_most(x, -half_x), half_x)
-    major = get(records, at + A) * inverse
+    major = major * inverse
     square = inverse * (get(records, at + REACH) - major * get(records, at + D) * x * x)
     root = math.sqrt(_most(square, ZERO))
-    middle = -major * get(records, at + K) * x
+    middle = -major * k * x
     return middle - root, middle + root
 
 

@@ -29,7 +29,6 @@ from .binning import END_ROW, ENTRY, FIRST_ROW, GAUSSIAN, SLOT, TILE_HEIGHT, TIL
 from .compilation import inlined, kernel
 from .projection import (
     ALPHA_MIN,
-    BEND,
     BLUE,
     DEPTH,
     G_BLUE,
@@ -49,6 +48,8 @@ from .projection import (
     REACH,
     RECORD,
     RED,
+    RUN,
+    RUN_POWERS,
     STEP,
     A,
     D,
@@ -73,9 +74,10 @@ from .raster_forward import (
     blend_row,
     falloff,
     finished,
-    is_steep,
+    is_needle,
     needle_offsets,
     ratio,
+    run_length,
     start_tile,
     write_tile,
 )
@@ -157,7 +159,8 @@ def prepare(centres, covariances, opacities, colours, rings, arcs, width, height
         records[at + A], records[at + K], records[at + D] = major, k, minor
         records[at + K_REST] = k - np.float64(records[at + K])
         records[at + OPACITY] = 1.0 if add else opacity
-        records[at + STEP], records[at + BEND] = math.expm1(-2.0 * bend * math.log(2.0)), bend
+        records[at + STEP] = math.expm1(-2.0 * bend * math.log(2.0))
+        records[at + RUN] = min(math.sqrt(RUN_POWERS / bend), 1.0 * TILE_HEIGHT)
         records[at + RED], records[at + GREEN] = gain * colours[3 * i], gain * colours[3 * i + 1]
         records[at + BLUE], records[at + DEPTH] = gain * colours[3 * i + 2], 0.0
         records[at + REACH] = half * reach * reach + MARGIN
@@ -226,20 +229,17 @@ def _add_row(state, at, e, records, record):  # type: ignore[no-untyped-def]
 @inlined
 def _add_plain(state, records, at, left, top, first, end):  # type: ignore[no-untyped-def]
     """A plain Gaussian, rows first .. end; by the recurrence unless it is a needle (see `raster_forward`)."""
-    step, one, row = get(records, at + STEP), opaque(1), first
-    if is_steep(records, at, first, end):
-        while row < end:
-            u, dy = needle_offsets(records, at, left, top + row)
-            _add_row(state, row * ROW, falloff(records, at, u, dy), records, at)
-            row += one
-        return
-    u, dy = needle_offsets(records, at, left, top + first)
-    e, r = falloff(records, at, u, dy), ratio(records, at, u, dy)
+    step, one, run, row = get(records, at + STEP), opaque(1), run_length(records, at), first
+    needle = is_needle(records, at, end - first)
     while row < end:
-        _add_row(state, row * ROW, e, records, at)
-        e = e * r
-        r = fma(r, step, r)
-        row += one
+        u, dy = needle_offsets(records, at, left, top + row)
+        e, r = falloff(records, at, u, dy), ratio(records, at, u, dy)
+        stop = row + 1 if needle else min(row + run, end)
+        while row < stop:
+            _add_row(state, row * ROW, e, records, at)
+            e = e * r
+            r = fma(r, step, r)
+            row += one
 
 
 @inlined
@@ -351,23 +351,24 @@ def _needle_backward(state, records, at, left, top, first, end):  # type: ignore
 
 @inlined
 def _plain_backward(state, records, at, left, top, first, end):  # type: ignore[no-untyped-def]
-    """The same by the recurrence and by sums of sums (see `raster_backward`)."""
-    step, one = get(records, at + STEP), opaque(1)
+    """The same by the recurrence and by three sums a lane (see `raster_backward`)."""
+    step, one, run, row = get(records, at + STEP), opaque(1), run_length(records, at), first
     zero = splat(ZERO)
-    s0, s1, s2, colours = zero, zero, zero, (zero, zero, zero)
-    u, dy = needle_offsets(records, at, left, top + first)
-    e, r = falloff(records, at, u, dy), ratio(records, at, u, dy)
-    row = first
+    m0, m1, m2, colours = zero, zero, zero, (zero, zero, zero)
     while row < end:
-        g, w = _add_gradient(state, row * ROW_BACKWARD, e, records, at)
-        colours = _add_colours(state, row * ROW_BACKWARD, w, colours)
-        s0 = s0 + g
-        s1 = s1 + s0
-        s2 = s2 + s1
-        e = e * r
-        r = fma(r, step, r)
-        row += one
-    mu, my, muu, muy, myy = moments(records, at, left, dy + np.float32(end - first), s0, s1, s2)
+        u, dy = needle_offsets(records, at, left, top + row)
+        e, r = falloff(records, at, u, dy), ratio(records, at, u, dy)
+        stop = min(row + run, end)
+        while row < stop:
+            g, w = _add_gradient(state, row * ROW_BACKWARD, e, records, at)
+            colours = _add_colours(state, row * ROW_BACKWARD, w, colours)
+            gy = g * dy
+            m0, m1, m2 = m0 + g, m1 + gy, fma(gy, dy, m2)
+            dy += ONE
+            e = e * r
+            r = fma(r, step, r)
+            row += one
+    mu, my, muu, muy, myy = moments(records, at, left, m0, m1, m2)
     return totals((mu, my, muu, muy, myy, zero, colours[0], colours[1], colours[2]))
 
 
@@ -431,7 +432,7 @@ def _tile_backward(entries, begin, used, end, records, shapes, left, top, state,
         at, first, last = i * RECORD, get(entries, e * ENTRY + FIRST_ROW), get(entries, e * ENTRY + END_ROW)
         if shaped:
             row = _shaped_backward(state, records, at, shapes, i * SHAPE, left, top, first, last, arcs, add)
-        elif is_steep(records, at, first, last):
+        elif is_needle(records, at, last - first):
             row = _needle_backward(state, records, at, left, top, first, last)
         else:
             row = _plain_backward(state, records, at, left, top, first, last)

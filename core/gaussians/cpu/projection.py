@@ -12,7 +12,8 @@ xx yy - xy² suffers for needles. For the same reason a record does not hold the
     q / (2 ln 2) = A (d_x + k d_y)² + D d_y²,   k = -xy / yy,  A = h yy / det,  D = h / yy,  h = 1 / (2 ln 2)
 
 so alpha = opacity 2^-(A u² + D d_y²), u = d_x + k d_y. From one pixel row to the next the exponent's second
-difference is -2 C with C = A k² + D; `step` = 2^(-2 C) - 1 serves the recurrence of the rasterizer.
+difference is -2 C with C = A k² + D; `step` = 2^(-2 C) - 1 and `run` = sqrt(32 / C), the rows over which e falls
+from its peak to 2^-32, serve the recurrence of the rasterizer.
 
 Backward: the rasterizer sends moments of g = dL / d ln alpha over the pixels: sums of g, g u, g d_y, g u²,
 g u d_y, g d_y², which give the gradients of centre, covariance and opacity (`_from_moments`), and those of the
@@ -53,7 +54,7 @@ from .vector import (
 )
 
 # Places in a record.
-X, Y, A, K, D, OPACITY, STEP, BEND, RED, GREEN, BLUE, DEPTH, REACH, HALF_X, HALF_Y, K_REST = range(16)
+X, Y, A, K, D, OPACITY, STEP, RUN, RED, GREEN, BLUE, DEPTH, REACH, HALF_X, HALF_Y, K_REST = range(16)
 RECORD = 16
 # Places in a row of gradients from the rasterizer.
 G_U, G_Y, G_UU, G_UY, G_YY, G, G_RED, G_GREEN, G_BLUE, G_DEPTH = range(10)
@@ -83,6 +84,8 @@ NORM2_MIN = np.float32(1e-16)
 TINY = np.float32(1e-24)
 ZERO, HALF, ONE, TWO = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
 LARGEST = np.float32(1e30)
+RUN_POWERS, TILE_ROWS = np.float32(32), np.float32(TILE_HEIGHT)
+"""Powers of two by which a recurrence may fall away from its peak, see `raster_forward`."""
 
 
 @inlined
@@ -283,7 +286,7 @@ def _project_block(
         for i in range(SLOPES):
             store(slopes_out, i * LANES, zero)
     rows = transpose((
-        x, y, major, k, minor, opacity, exp2_less_one(bend * -TWO), bend,
+        x, y, major, k, minor, opacity, exp2_less_one(bend * -TWO), minimum(sqrt(RUN_POWERS / bend), TILE_ROWS),
         maximum(red, ZERO), maximum(green, ZERO), maximum(blue, ZERO), pz,
         reach + MARGIN, half_x, half_y, zero,
     ))  # fmt: skip

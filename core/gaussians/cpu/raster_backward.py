@@ -2,7 +2,7 @@
 """The gradients of `raster_forward`, in the same order, front to back.
 
 With v the gradient of a pixel's colour, one number per pixel and Gaussian matters: vc = v . colour, plus the
-gradients of alpha and depth. What lies behind a Gaussian contributes S' = sum of w vc over all later ones, which is
+gradient of alpha, plus that of depth times (its depth - the pixel's) / alpha. What lies behind a Gaussian contributes S' = sum of w vc over all later ones, which is
 what is left of the sum over all (known from the final picture) as the walk goes on:
 
     w = T alpha,   S' = S - w vc,   T' = T - w,   dL/dalpha = T vc - S' / (1 - alpha)
@@ -21,7 +21,7 @@ import numpy as np
 
 from .binning import END_ROW, ENTRY, FIRST_ROW, GAUSSIAN, SLOT, TILE_HEIGHT, TILE_WIDTH
 from .compilation import inlined, kernel
-from .projection import ALPHA_MIN, BLUE, DEPTH, GREEN, OPACITY, RECORD, RED, STEP, A, D, K, X
+from .projection import ALPHA_MIN, BLUE, DEPTH, GREEN, OPACITY, RECORD, RED, STEP, K, X
 from .raster_forward import (
     AHEAD,
     DEPTH_ALPHA_MIN,
@@ -31,10 +31,11 @@ from .raster_forward import (
     T_PLANE,
     ZERO,
     falloff,
-    is_steep,
+    is_needle,
     needle_offsets,
     offsets,
     ratio,
+    run_length,
     start_tile,
 )
 from .vector import (
@@ -54,12 +55,11 @@ from .vector import (
 )
 
 # The state of a tile after T: what is left behind, and the gradients of the pixels.
-S_PLANE, V_RED, V_GREEN, V_BLUE, V_ALPHA, V_DEPTH = (i * LANES for i in range(1, 7))
-ROW = 7 * LANES
+S_PLANE, V_RED, V_GREEN, V_BLUE, V_ALPHA, V_DEPTH, MEAN_DEPTH = (i * LANES for i in range(1, 8))
+ROW = 8 * LANES
 STATE = ROW * TILE_HEIGHT
 EDGE = 3 * LANES
 SCRATCH = STATE + 6 * EDGE
-TWO = np.float32(2)
 
 
 @inlined
@@ -76,12 +76,8 @@ def _load_gradients(
     v_alpha = load(d_alphas, pixel) - behind
     s = fma(v[0], colour[0], fma(v[1], colour[1], v[2] * colour[2])) - t * behind
     if with_depth:
-        share = ONE / where(alpha > DEPTH_ALPHA_MIN, alpha, DEPTH_ALPHA_MIN)
-        v_depth = load(d_depths, pixel) * share
-        depth = load(depths, pixel)
-        v_alpha = v_alpha - where(alpha > DEPTH_ALPHA_MIN, v_depth * depth, ZERO)
-        s = fma(v_depth, depth / share, s)
-        store(state, at + V_DEPTH, v_depth)
+        store(state, at + V_DEPTH, load(d_depths, pixel) / where(alpha > DEPTH_ALPHA_MIN, alpha, DEPTH_ALPHA_MIN))
+        store(state, at + MEAN_DEPTH, load(depths, pixel))
     store(state, at + S_PLANE, fma(v_alpha, alpha, s))
     store(state, at + V_RED, v[0])
     store(state, at + V_GREEN, v[1])
@@ -99,7 +95,7 @@ def row_gradient(state, at, e, records, record, with_depth):  # type: ignore[no-
     vc = fma(load(state, at + V_GREEN), get(records, record + GREEN), vc)
     vc = fma(load(state, at + V_BLUE), get(records, record + BLUE), vc)
     if with_depth:
-        vc = fma(load(state, at + V_DEPTH), get(records, record + DEPTH), vc)
+        vc = fma(load(state, at + V_DEPTH), get(records, record + DEPTH) - load(state, at + MEAN_DEPTH), vc)
     wvc = w * vc
     s = s - wvc
     store(state, at + S_PLANE, s)
@@ -137,51 +133,47 @@ def _needle(state, records, at, left, top, first, end, with_depth):  # type: ign
 
 
 @inlined
-def moments(records, at, left, y, s0, s1, s2):  # type: ignore[no-untyped-def]
-    """Sums of g times u, d_y, u², u d_y, d_y² in each lane from three that take an addition each a row.
+def moments(records, at, left, m0, m1, m2):  # type: ignore[no-untyped-def]
+    """Sums of g times u, d_y, u², u d_y, d_y² in each lane, from m_i = sum g d_y^i. As u = d_x + k d_y,
 
-    With n - i the rows from row i to the end, where d_y is y: s0 = sum g, s1 = sum g (n - i),
-    s2 = sum g (n - i) (n - i + 1) / 2. So, m_i being sum g d_y^i, m1 = y s0 - s1 and
-    m2 = y² s0 - 2 y s1 + 2 s2 - s1; and as u = d_x + k d_y, with one d_x in each lane,
-
-    sum g u = d_x s0 + k m1,   sum g u d_y = d_x m1 + k m2,   sum g u² = d_x (d_x s0 + 2 k m1) + k² m2
+    sum g u = d_x m0 + k m1,   sum g u d_y = d_x m1 + k m2,   sum g u² = d_x (d_x m0 + 2 k m1) + k² m2
     """
     k = get(records, at + K)
     dx = lanes() + (np.float32(left) + HALF - get(records, at + X))
-    m1 = s0 * y - s1
-    m2 = (m1 - s1) * y + (s2 * TWO - s1)
-    mu = fma(dx, s0, m1 * k)
+    mu = fma(dx, m0, m1 * k)
     return mu, m1, fma(dx, fma(m1, k, mu), m2 * (k * k)), fma(dx, m1, m2 * k), m2
 
 
 @inlined
 def _ordinary(state, records, at, left, top, first, end, with_depth):  # type: ignore[no-untyped-def]
-    """The same by the recurrence, and by sums of sums (`moments`)."""
-    step, one = get(records, at + STEP), opaque(1)
-    u, dy = offsets(records, at, left, top + first)
-    e = falloff(records, at, u, dy) * get(records, at + OPACITY)
-    r = ratio(records, at, u, dy)
+    """The same by the recurrence, and by three sums a lane."""
+    step, one, run = get(records, at + STEP), opaque(1), run_length(records, at)
     zero = splat(ZERO)
-    s0, s1, s2 = zero, zero, zero
+    m0, m1, m2 = zero, zero, zero
     colours = (zero, zero, zero, zero)
     row = first
     while row < end:
-        g, w = row_gradient(state, row * ROW, e, records, at, with_depth)
-        colours = _add_colours(state, row * ROW, w, colours, with_depth)
-        s0 = s0 + g
-        s1 = s1 + s0
-        s2 = s2 + s1
-        e = e * r
-        r = fma(r, step, r)
-        row += one
-    mu, my, muu, muy, myy = moments(records, at, left, dy + np.float32(end - first), s0, s1, s2)
-    return mu, my, muu, muy, myy, s0, colours
+        u, dy = offsets(records, at, left, top + row)
+        e = falloff(records, at, u, dy) * get(records, at + OPACITY)
+        r = ratio(records, at, u, dy)
+        stop = min(row + run, end)
+        while row < stop:
+            g, w = row_gradient(state, row * ROW, e, records, at, with_depth)
+            colours = _add_colours(state, row * ROW, w, colours, with_depth)
+            gy = g * dy
+            m0, m1, m2 = m0 + g, m1 + gy, fma(gy, dy, m2)
+            dy += ONE
+            e = e * r
+            r = fma(r, step, r)
+            row += one
+    mu, my, muu, muy, myy = moments(records, at, left, m0, m1, m2)
+    return mu, my, muu, muy, myy, m0, colours
 
 
 @inlined
 def _gradient_row(state, records, at, left, top, first, end, with_depth):  # type: ignore[no-untyped-def]
     """The row of gradients (see `projection`) of one Gaussian in one tile."""
-    if is_steep(records, at, first, end):
+    if is_needle(records, at, end - first):
         mu, my, muu, muy, myy, m, colours = _needle(state, records, at, left, top, first, end, with_depth)
     else:
         mu, my, muu, muy, myy, m, colours = _ordinary(state, records, at, left, top, first, end, with_depth)

@@ -7,9 +7,9 @@ One vector is a row of a tile. For the rows of an entry, with e = opacity 2^-(A 
     w = T alpha,   C = C + w colour,   T = T - w
 
 From row to row e follows a recurrence instead of an exponential each: e' = e r, r' = r + r step, where
-r = 2^-(A (2 u k + k²) + D (2 d_y + 1)) and step = 2^(-2 C) - 1, small and exact where rows are many. Where
-rows differ by dozens of powers of two (`STEEP`: thin needles), it would lose its start below the smallest
-float, so that e is computed for each row.
+r = 2^-(A (2 u k + k²) + D (2 d_y + 1)) and step = 2^(-2 C) - 1, small and exact where rows are many. It starts
+anew after `run` rows, over which e changes by 32 powers of two, so that neither its start is lost below the
+smallest float, nor its precision. Where runs would be too short for it (needles), e is computed for each row.
 """
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ import numpy as np
 from .. import rendering
 from .binning import END_ROW, ENTRY, FIRST_ROW, GAUSSIAN, TILE_HEIGHT, TILE_WIDTH
 from .compilation import inlined, kernel
-from .projection import ALPHA_MIN, BEND, BLUE, DEPTH, GREEN, K_REST, OPACITY, RECORD, RED, STEP, A, D, K, X, Y
+from .projection import ALPHA_MIN, BLUE, DEPTH, GREEN, K_REST, OPACITY, RECORD, RED, RUN, STEP, A, D, K, X, Y
 from .vector import (
     LANES,
     any_of,
@@ -38,8 +38,8 @@ from .vector import (
 )
 
 T_MIN = np.float32(rendering.TRANSMITTANCE_MIN)
-STEEP = np.float32(64.0)
-"""Largest C n² (powers of two over n rows) for the recurrence."""
+SHORT = 4
+"""Rows below which a run is not worth its start."""
 PAUSE = 32
 """Entries between two looks at whether all pixels of the tile are done."""
 AHEAD = 6
@@ -85,10 +85,15 @@ def ratio(records, at, u, dy):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def is_steep(records, at, first, end):  # type: ignore[no-untyped-def]
+def run_length(records, at):  # type: ignore[no-untyped-def]
+    return int(get(records, at + RUN))
+
+
+@inlined
+def is_needle(records, at, rows):  # type: ignore[no-untyped-def]
     """Whether rows differ too much for the recurrence."""
-    rows = np.float32(end - first)
-    return get(records, at + BEND) * rows * rows > STEEP
+    run = run_length(records, at)
+    return run < rows and run < SHORT
 
 
 @inlined
@@ -148,16 +153,18 @@ def _blend_needle(state, records, at, left, top, first, end, with_depth):  # typ
 @inlined
 def _blend(state, records, at, left, top, first, end, with_depth):  # type: ignore[no-untyped-def]
     """The same by the recurrence."""
-    step, one = get(records, at + STEP), opaque(1)
-    u, dy = offsets(records, at, left, top + first)
-    e = falloff(records, at, u, dy) * get(records, at + OPACITY)
-    r = ratio(records, at, u, dy)
+    step, one, run = get(records, at + STEP), opaque(1), run_length(records, at)
     row = first
     while row < end:
-        blend_row(state, row * ROW, e, records, at, with_depth)
-        e = e * r
-        r = fma(r, step, r)
-        row += one
+        u, dy = offsets(records, at, left, top + row)
+        e = falloff(records, at, u, dy) * get(records, at + OPACITY)
+        r = ratio(records, at, u, dy)
+        stop = min(row + run, end)
+        while row < stop:
+            blend_row(state, row * ROW, e, records, at, with_depth)
+            e = e * r
+            r = fma(r, step, r)
+            row += one
 
 
 @inlined
@@ -208,7 +215,7 @@ def _raster_tile(entries, begin, end, records, left, top, state, with_depth):  #
         prefetch(records, get(entries, min(e + AHEAD, end - 1) * ENTRY + GAUSSIAN) * RECORD)
         at = get(entries, e * ENTRY + GAUSSIAN) * RECORD
         first, last = get(entries, e * ENTRY + FIRST_ROW), get(entries, e * ENTRY + END_ROW)
-        if is_steep(records, at, first, last):
+        if is_needle(records, at, last - first):
             _blend_needle(state, records, at, left, top, first, last, with_depth)
         else:
             _blend(state, records, at, left, top, first, last, with_depth)

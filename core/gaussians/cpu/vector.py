@@ -565,14 +565,21 @@ def exp2(x):  # type: ignore[no-untyped-def]
     return as_floats(as_ints(p) + (as_ints(rounded) << 23))
 
 
+# (2^f - 1) / f on [-1/2, 1/2].
+_EXP2_LESS_ONE = tuple(
+    np.float32(c) for c in (0.6931471807, 0.2402265068, 0.05550358232, 0.009618535704, 0.001339278274, 0.0001527416535)
+)
+
+
 @inlined
 def exp2_less_one(x):  # type: ignore[no-untyped-def]
-    """2^x - 1, exact to the last bits also where it is near 0."""
+    """2^x - 1, relative to itself as exact near 0 as elsewhere."""
     f = minimum(maximum(x, np.float32(-0.5)), np.float32(0.5))
-    p = fma(f, _EXP2[5], _EXP2[4])
-    p = fma(f, p, _EXP2[3])
-    p = fma(f, p, _EXP2[2])
-    p = fma(f, p, _EXP2[1])
+    p = fma(f, _EXP2_LESS_ONE[5], _EXP2_LESS_ONE[4])
+    p = fma(f, p, _EXP2_LESS_ONE[3])
+    p = fma(f, p, _EXP2_LESS_ONE[2])
+    p = fma(f, p, _EXP2_LESS_ONE[1])
+    p = fma(f, p, _EXP2_LESS_ONE[0])
     return where(absolute(x) <= np.float32(0.5), f * p, exp2(x) - np.float32(1))
 
 

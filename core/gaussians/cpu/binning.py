@@ -39,17 +39,17 @@ SLACK = np.float32(0.02)
 
 
 @inlined
-def _least(a, b):  # type: ignore[no-untyped-def]
+def _least(a, b):
     return a if a < b else b  # one instruction; numba's own also ask for NaN
 
 
 @inlined
-def _most(a, b):  # type: ignore[no-untyped-def]
+def _most(a, b):
     return a if a > b else b
 
 
 @inlined
-def _pixel_rows(y, low, high, height):  # type: ignore[no-untyped-def]
+def _pixel_rows(y, low, high, height):
     """First and last pixel row whose centre lies within y + low .. y + high; first > last if none does."""
     top = _most(y + low - (HALF + SLACK), ZERO)
     bottom = _least(y + high - (HALF - SLACK), np.float32(height - 1))
@@ -60,7 +60,7 @@ def _pixel_rows(y, low, high, height):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _crossing(records, at, x):  # type: ignore[no-untyped-def]
+def _crossing(records, at, x):
     """Lowest and highest point of the ellipse at the horizontal offset x, or where it is nearest to that."""
     half_x, k, major = get(records, at + HALF_X), get(records, at + K), get(records, at + A)
     inverse = ONE / (major * k * k + get(records, at + D))
@@ -73,7 +73,7 @@ def _crossing(records, at, x):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _write_column(column, top, bottom, tiles_x, slots, slot):  # type: ignore[no-untyped-def]
+def _write_column(column, top, bottom, tiles_x, slots, slot):
     """Writes the tiles of a column that pixel rows top .. bottom meet; returns the next slot."""
     row, one = top >> TILE_SHIFT_Y, opaque(1)
     while row << TILE_SHIFT_Y <= bottom:
@@ -87,7 +87,7 @@ def _write_column(column, top, bottom, tiles_x, slots, slot):  # type: ignore[no
 
 
 @inlined
-def _list_gaussian(records, i, slot, width, height, tiles_x, slots):  # type: ignore[no-untyped-def]
+def _list_gaussian(records, i, slot, width, height, tiles_x, slots):
     """Writes the tiles of Gaussian i from this slot on; returns the slot after the last."""
     at = i * RECORD
     x, half_x = get(records, at + X), get(records, at + HALF_X) + SLACK
@@ -114,7 +114,7 @@ def _list_gaussian(records, i, slot, width, height, tiles_x, slots):  # type: ig
 
 
 @inlined
-def _list_chunk(chunk, records, bounds, chunk_starts, width, height, tiles_x, slots, firsts, counts):  # type: ignore[no-untyped-def]
+def _list_chunk(chunk, records, bounds, chunk_starts, width, height, tiles_x, slots, firsts, counts):
     slot = chunk_starts[chunk]
     for i in range(chunk * CHUNK, min(chunk * CHUNK + CHUNK, bounds.size)):
         first = slot
@@ -126,9 +126,9 @@ def _list_chunk(chunk, records, bounds, chunk_starts, width, height, tiles_x, sl
 
 @kernel
 def list_and_sort(
-    counter, scratch, records, bits, bounds, chunk_starts, width, height, tiles_x, by_depth,
+    counter, records, bits, bounds, chunk_starts, width, height, tiles_x, by_depth,
     slots, firsts, counts, places, keys, spare_keys, order, spare_order,
-):  # type: ignore[no-untyped-def]  # fmt: skip
+):  # fmt: skip
     """slots: tile, first and last row of every pair of Gaussian and tile, in the Gaussians' order; those of
     Gaussian i are the counts[i] from firsts[i] on. chunk_starts: where each chunk may write. order: see `_sort`;
     as many as there are bounds > 0. bits: the records as uint32."""
@@ -151,7 +151,7 @@ def list_and_sort(
 
 
 @inlined
-def _sort(bits, bounds, places, keys, spare_keys, order, spare_order):  # type: ignore[no-untyped-def]
+def _sort(bits, bounds, places, keys, spare_keys, order, spare_order):
     """Writes to `order` the Gaussians whose bound is not 0, nearest first.
 
     Depths are positive, so their bits sort as they do. Three passes of a radix sort, stable, by digits as short
@@ -185,7 +185,7 @@ def _sort(bits, bounds, places, keys, spare_keys, order, spare_order):  # type: 
 
 
 @inlined
-def _distribute(keys, order, m, shift, mask, places, to_keys, to_order):  # type: ignore[no-untyped-def]
+def _distribute(keys, order, m, shift, mask, places, to_keys, to_order):
     """One pass: by the digit above `shift`, whose counts are in `places`."""
     total = 0
     for b in range(mask + 1):
@@ -202,12 +202,12 @@ def _distribute(keys, order, m, shift, mask, places, to_keys, to_order):  # type
 
 
 @inlined
-def _part(order_size, parts, part):  # type: ignore[no-untyped-def]
+def _part(order_size, parts, part):
     return order_size * part // parts, order_size * (part + 1) // parts
 
 
 @inlined
-def _prefetch_slots(j, end, order, slots, firsts, counts):  # type: ignore[no-untyped-def]
+def _prefetch_slots(j, end, order, slots, firsts, counts):
     """Asks for what the walk in order of depth will need soon: it jumps about in memory."""
     far = get(order, _least(j + 2 * AHEAD, end - 1))
     prefetch(firsts, far)
@@ -216,7 +216,7 @@ def _prefetch_slots(j, end, order, slots, firsts, counts):  # type: ignore[no-un
 
 
 @kernel
-def count(counter, scratch, order, m, slots, firsts, counts, numbers):  # type: ignore[no-untyped-def]
+def count(counter, order, m, slots, firsts, counts, numbers):
     """numbers (parts, tiles): how often each tile is met by each part of the sorted Gaussians."""
     parts = numbers.shape[0]
     while True:
@@ -235,7 +235,7 @@ def count(counter, scratch, order, m, slots, firsts, counts, numbers):  # type: 
 
 
 @kernel
-def deal(numbers, starts):  # type: ignore[no-untyped-def]
+def deal(numbers, starts):
     """Turns numbers into the place where each part starts in each tile; starts (tiles + 1,): of the tiles."""
     parts, tiles = numbers.shape
     total = 0
@@ -249,7 +249,7 @@ def deal(numbers, starts):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def scatter(counter, scratch, order, m, slots, firsts, counts, places, entries):  # type: ignore[no-untyped-def]
+def scatter(counter, order, m, slots, firsts, counts, places, entries):
     """Writes the entries of all tiles, nearest first; places: from `deal`, used up."""
     parts = places.shape[0]
     while True:

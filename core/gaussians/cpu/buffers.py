@@ -12,15 +12,18 @@ from collections import defaultdict
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
+
+Array = npt.NDArray[Any]
 
 LINE = 64
 """Bytes of a cache line; where arrays start."""
 KEPT = 6
 """Blocks of one size kept on the shelf."""
 
-_shelves: dict[int, list[np.ndarray]] = defaultdict(list)
+_shelves: dict[int, list[Array]] = defaultdict(list)
 
 
 def _size_class(size: int) -> int:
@@ -29,13 +32,13 @@ def _size_class(size: int) -> int:
     return max(-(-size // step) * step, 4096)
 
 
-def _give_back(block: np.ndarray) -> None:
+def _give_back(block: Array) -> None:
     shelf = _shelves[block.size]
     if len(shelf) < KEPT:
         shelf.append(block)
 
 
-def empty(shape: tuple[int, ...] | int, dtype: Any = np.float32) -> np.ndarray:
+def empty(shape: tuple[int, ...] | int, dtype: Any = np.float32) -> Array:
     """An array of undefined contents that starts at a cache line."""
     shape = (shape,) if isinstance(shape, int) else shape
     dtype = np.dtype(dtype)
@@ -57,7 +60,7 @@ def empty(shape: tuple[int, ...] | int, dtype: Any = np.float32) -> np.ndarray:
     return array
 
 
-def zeros(shape: tuple[int, ...] | int, dtype: Any = np.float32) -> np.ndarray:
+def zeros(shape: tuple[int, ...] | int, dtype: Any = np.float32) -> Array:
     """The same, filled with zeros."""
     array = empty(shape, dtype)
     array.fill(0)

@@ -120,7 +120,7 @@ TWO = np.float32(2)
 
 
 @inlined
-def _reach(opacity, ring, r0, w, add):  # type: ignore[no-untyped-def]
+def _reach(opacity, ring, r0, w, add):
     """Mahalanobis radius beyond which nothing is drawn; negative if nothing is at all."""
     share = 4096.0 if add else opacity * 255.0
     if share < 1.0:
@@ -130,7 +130,7 @@ def _reach(opacity, ring, r0, w, add):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def prepare(centres, covariances, opacities, colours, rings, arcs, width, height, add, records, shapes, bounds):  # type: ignore[no-untyped-def]
+def prepare(centres, covariances, opacities, colours, rings, arcs, width, height, add, records, shapes, bounds):
     """Writes record, shape and bound on the number of tiles of each Gaussian; in float64, for needles.
 
     rings, arcs: empty where there are none. Where light adds, the opacity goes into the colour.
@@ -172,7 +172,7 @@ def prepare(centres, covariances, opacities, colours, rings, arcs, width, height
 
 
 @inlined
-def _write_shape(shapes, i, r0, w, reach, arcs):  # type: ignore[no-untyped-def]
+def _write_shape(shapes, i, r0, w, reach, arcs):
     at = i * SHAPE
     shapes[at + R0], shapes[at + WIDTH] = r0, w
     shapes[at + SHARP] = 0.5 / (math.log(2.0) * w * w)
@@ -186,7 +186,7 @@ def _write_shape(shapes, i, r0, w, reach, arcs):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _start(records, at, left, y):  # type: ignore[no-untyped-def]
+def _start(records, at, left, y):
     """u of lane 0 and d_y in the pixel row y, and k, which is what u grows by from row to row; all float64."""
     dy = y + 0.5 - np.float64(get(records, at + Y))
     k = np.float64(get(records, at + K)) + np.float64(get(records, at + K_REST))
@@ -194,21 +194,21 @@ def _start(records, at, left, y):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _distance(records, at, u, dy):  # type: ignore[no-untyped-def]
+def _distance(records, at, u, dy):
     """r, Mahalanobis."""
     power = fma(u * get(records, at + A), u, get(records, at + D) * dy * dy)
     return sqrt(maximum(power * TWO_LN2, RADIUS2_MIN))
 
 
 @inlined
-def _angle(shapes, shape, dx, dy):  # type: ignore[no-untyped-def]
+def _angle(shapes, shape, dx, dy):
     """Cosine of the angle from theta0, and the inverse of the distance, px (kept from zero)."""
     inverse = ONE / sqrt(fma(dx, dx, dy * dy + APEX2))
     return fma(dx, get(shapes, shape + COS0), dy * get(shapes, shape + SIN0)) * inverse, inverse
 
 
 @inlined
-def _window(shapes, shape, cosine):  # type: ignore[no-untyped-def]
+def _window(shapes, shape, cosine):
     """The sigmoid of an arc."""
     x = (cosine - get(shapes, shape + COS_DELTA)) * get(shapes, shape + ARC)
     return ONE / (exp2(minimum(x * -LOG2_E, np.float32(120))) + ONE)
@@ -218,7 +218,7 @@ def _window(shapes, shape, cosine):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _add_row(state, at, e, records, record):  # type: ignore[no-untyped-def]
+def _add_row(state, at, e, records, record):
     """Adds one row of a Gaussian."""
     e = where(e >= PROFILE_MIN, e, ZERO)
     store(state, at + RED_PLANE, fma(e, get(records, record + RED), load(state, at + RED_PLANE)))
@@ -227,7 +227,7 @@ def _add_row(state, at, e, records, record):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _add_plain(state, records, at, left, top, first, end):  # type: ignore[no-untyped-def]
+def _add_plain(state, records, at, left, top, first, end):
     """A plain Gaussian, rows first .. end; by the recurrence unless it is a needle (see `raster_forward`)."""
     step, one, run, row = get(records, at + STEP), opaque(1), run_length(records, at), first
     needle = is_needle(records, at, end - first)
@@ -243,7 +243,7 @@ def _add_plain(state, records, at, left, top, first, end):  # type: ignore[no-un
 
 
 @inlined
-def _draw_shaped(state, records, at, shapes, shape, left, top, first, end, arcs, add):  # type: ignore[no-untyped-def]
+def _draw_shaped(state, records, at, shapes, shape, left, top, first, end, arcs, add):
     """A ring or arc, rows first .. end; rows that it does not reach cost little."""
     start, y, k = _start(records, at, left, top + first)
     dx = lanes() + (np.float32(left) + HALF - get(records, at + X))
@@ -267,7 +267,7 @@ def _draw_shaped(state, records, at, shapes, shape, left, top, first, end, arcs,
 
 
 @inlined
-def _draw_tile(entries, begin, end, records, shapes, left, top, state, shaped, arcs, add):  # type: ignore[no-untyped-def]
+def _draw_tile(entries, begin, end, records, shapes, left, top, state, shaped, arcs, add):
     """All entries of a tile, or those up to where all pixels are done; returns the end of them."""
     for e in range(begin, end):
         if not add and (e - begin) & (PAUSE - 1) == PAUSE - 1 and finished(state):
@@ -285,7 +285,7 @@ def _draw_tile(entries, begin, end, records, shapes, left, top, state, shaped, a
 def raster(
     counter, state, entries, starts, records, shapes, background, width, height, tiles_x, shaped, arcs, add,
     image, alphas, ends,
-):  # type: ignore[no-untyped-def]  # fmt: skip
+):  # fmt: skip
     """Colour (h w 3) and alpha (h w), flat; ends (tiles,): where each tile stopped. shaped, arcs: whether
     rings (or arcs) are drawn, or plain Gaussians; these only where light adds."""
     no_depth = np.bool_(False)
@@ -310,7 +310,7 @@ def raster(
 
 
 @inlined
-def _add_gradient(state, at, e, records, record):  # type: ignore[no-untyped-def]
+def _add_gradient(state, at, e, records, record):
     """g and w where light adds: each Gaussian by itself."""
     w = where(e >= PROFILE_MIN, e, ZERO)
     vc = load(state, at + V_RED) * get(records, record + RED)
@@ -319,7 +319,7 @@ def _add_gradient(state, at, e, records, record):  # type: ignore[no-untyped-def
 
 
 @inlined
-def _add_colours(state, at, w, colours):  # type: ignore[no-untyped-def]
+def _add_colours(state, at, w, colours):
     return (
         fma(w, load(state, at + V_RED), colours[0]),
         fma(w, load(state, at + V_GREEN), colours[1]),
@@ -328,14 +328,14 @@ def _add_colours(state, at, w, colours):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _add_moments(sums, h, u, dy):  # type: ignore[no-untyped-def]
+def _add_moments(sums, h, u, dy):
     """Adds h times u, d_y, u², u d_y, d_y²."""
     hu, hy = h * u, h * dy
     return sums[0] + hu, sums[1] + hy, fma(hu, u, sums[2]), fma(hu, dy, sums[3]), fma(hy, dy, sums[4])
 
 
 @inlined
-def _needle_backward(state, records, at, left, top, first, end):  # type: ignore[no-untyped-def]
+def _needle_backward(state, records, at, left, top, first, end):
     """The row of gradients of a plain Gaussian whose light adds, an exponential for each row."""
     zero = splat(ZERO)
     sums, colours = (zero, zero, zero, zero, zero), (zero, zero, zero)
@@ -350,7 +350,7 @@ def _needle_backward(state, records, at, left, top, first, end):  # type: ignore
 
 
 @inlined
-def _plain_backward(state, records, at, left, top, first, end):  # type: ignore[no-untyped-def]
+def _plain_backward(state, records, at, left, top, first, end):
     """The same by the recurrence and by three sums a lane (see `raster_backward`)."""
     step, one, run, row = get(records, at + STEP), opaque(1), run_length(records, at), first
     zero = splat(ZERO)
@@ -373,7 +373,7 @@ def _plain_backward(state, records, at, left, top, first, end):  # type: ignore[
 
 
 @inlined
-def _shaped_backward(state, records, at, shapes, shape, left, top, first, end, arcs, add):  # type: ignore[no-untyped-def]
+def _shaped_backward(state, records, at, shapes, shape, left, top, first, end, arcs, add):
     """The row of gradients of a ring or arc."""
     start, y, k = _start(records, at, left, top + first)
     dx = lanes() + (np.float32(left) + HALF - get(records, at + X))
@@ -425,7 +425,7 @@ def _shaped_backward(state, records, at, shapes, shape, left, top, first, end, a
 
 
 @inlined
-def _tile_backward(entries, begin, used, end, records, shapes, left, top, state, shaped, arcs, add, gradients):  # type: ignore[no-untyped-def]
+def _tile_backward(entries, begin, used, end, records, shapes, left, top, state, shaped, arcs, add, gradients):
     for e in range(begin, used):
         prefetch(gradients, get(entries, min(e + AHEAD, end - 1) * ENTRY + SLOT) * RECORD)
         i, slot = get(entries, e * ENTRY + GAUSSIAN), get(entries, e * ENTRY + SLOT)
@@ -445,7 +445,7 @@ def _tile_backward(entries, begin, used, end, records, shapes, left, top, state,
 def raster_backward(
     counter, scratch, entries, starts, ends, records, shapes, background, width, height, tiles_x, shaped, arcs, add,
     image, alphas, d_image, d_alphas, gradients,
-):  # type: ignore[no-untyped-def]  # fmt: skip
+):  # fmt: skip
     """gradients: the row of each slot."""
     state, edge = scratch[:STATE_BACKWARD], scratch[STATE_BACKWARD:SCRATCH].reshape(6, EDGE)
     no_depth = np.bool_(False)
@@ -468,7 +468,7 @@ def raster_backward(
 
 
 @inlined
-def _add_rows(gradients, first, count, row):  # type: ignore[no-untyped-def]
+def _add_rows(gradients, first, count, row):
     total = splat(ZERO)
     for slot in range(first, first + count):
         total = total + load(gradients, slot * RECORD)
@@ -479,7 +479,7 @@ def _add_rows(gradients, first, count, row):  # type: ignore[no-untyped-def]
 def finish(
     row, covariances, opacities, colours, gradients, firsts, counts, add,
     d_centres, d_covariances, d_opacities, d_colours, d_rings, d_arcs,
-):  # type: ignore[no-untyped-def]  # fmt: skip
+):  # fmt: skip
     """Gradients of the inputs from the rows; see `projection` for the moments. d_rings, d_arcs may be empty.
     row: workspace of 16."""
     for i in range(opacities.size):

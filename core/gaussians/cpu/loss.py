@@ -26,6 +26,7 @@ from torch import Tensor
 
 from .. import loss as definition
 from . import buffers
+from .buffers import Array
 from .compilation import inlined, kernel
 from .threads import parallel
 from .tiles import flat
@@ -43,7 +44,7 @@ ZERO, ONE, TWO = np.float32(0), np.float32(1), np.float32(2)
 
 
 @inlined
-def _along(row, at):  # type: ignore[no-untyped-def]
+def _along(row, at):
     """The window along a scratch row."""
     s = load(row, at) * W0
     s = fma(load(row, at - STEP) + load(row, at + STEP), W1, s)
@@ -54,13 +55,13 @@ def _along(row, at):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _rows_around(y, height):  # type: ignore[no-untyped-def]
+def _rows_around(y, height):
     """The rows under the window of row y: first and end."""
     return max(y - HALO, 0), min(y + HALO + 1, height)
 
 
 @inlined
-def _down_moments(x, y, row, at, length, height, rows, out):  # type: ignore[no-untyped-def]
+def _down_moments(x, y, row, at, length, height, rows, out):
     """E[x], E[xx] and E[xy] down the columns, 16 of them, into the three scratch rows."""
     first, end = _rows_around(row, height)
     m, xx, xy = splat(ZERO), splat(ZERO), splat(ZERO)
@@ -76,7 +77,7 @@ def _down_moments(x, y, row, at, length, height, rows, out):  # type: ignore[no-
 
 
 @inlined
-def _similarity(mu, xx, xy, mu_y, s_y):  # type: ignore[no-untyped-def]
+def _similarity(mu, xx, xy, mu_y, s_y):
     """S and its derivatives by E[x], E[xx], E[xy]."""
     cross, squares = mu * mu_y, fma(mu, mu, mu_y * mu_y)
     a1, a2 = fma(cross, TWO, splat(C1)), fma(xy - cross, TWO, splat(C2))
@@ -89,7 +90,7 @@ def _similarity(mu, xx, xy, mu_y, s_y):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def compare(counter, scratch, x, y, mu_y, s_y, width, height, maps, sums):  # type: ignore[no-untyped-def]
+def compare(counter, scratch, x, y, mu_y, s_y, width, height, maps, sums):
     """maps (3, h, 3w): derivatives of S by the means; sums (h, 2): of |x - y| and of S, by row."""
     length = STEP * width
     rows = scratch[: 3 * (length + 2 * PAD)].reshape(3, length + 2 * PAD)
@@ -118,7 +119,7 @@ def compare(counter, scratch, x, y, mu_y, s_y, width, height, maps, sums):  # ty
 
 
 @kernel
-def gradient(counter, scratch, x, y, maps, width, height, by_l1, by_similarity, out):  # type: ignore[no-untyped-def]
+def gradient(counter, scratch, x, y, maps, width, height, by_l1, by_similarity, out):
     """out = by_l1 sign(x - y) + by_similarity dS/dx."""
     length = STEP * width
     rows = scratch[: 3 * (length + 2 * PAD)].reshape(3, length + 2 * PAD)
@@ -151,7 +152,7 @@ def gradient(counter, scratch, x, y, maps, width, height, by_l1, by_similarity, 
 
 
 @kernel
-def describe(counter, scratch, y, width, height, mu_y, s_y):  # type: ignore[no-untyped-def]
+def describe(counter, scratch, y, width, height, mu_y, s_y):
     """The target's part: means and variances."""
     length = STEP * width
     rows = scratch[: 3 * (length + 2 * PAD)].reshape(3, length + 2 * PAD)
@@ -181,9 +182,9 @@ class _Described:
     LIMIT = 256 << 20
 
     def __init__(self) -> None:
-        self._known: dict[int, tuple[weakref.ref[Tensor], int, np.ndarray]] = {}
+        self._known: dict[int, tuple[weakref.ref[Tensor], int, Array]] = {}
 
-    def __call__(self, target: Tensor) -> np.ndarray:
+    def __call__(self, target: Tensor) -> Array:
         key = id(target)
         known = self._known.pop(key, None)
         if known is None or known[0]() is not target or known[1] != target._version:

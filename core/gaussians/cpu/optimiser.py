@@ -17,7 +17,7 @@ PIECE = 1 << 13
 
 
 @kernel
-def advance(counter, scratch, parameter, gradient, first, second, rates, piece, beta1, new1, beta2, new2, root, epsilon):  # type: ignore[no-untyped-def]
+def advance(counter, parameter, gradient, first, second, rates, piece, beta1, new1, beta2, new2, root, epsilon):
     """All flat. rates: repeats along the parameter, a multiple of 16 long, bias correction included; piece: a
     multiple of its length. new: 1 - beta; root: 1 / sqrt(1 - beta2^t)."""
     n, period = parameter.size, rates.size

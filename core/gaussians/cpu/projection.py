@@ -89,23 +89,23 @@ RUN_POWERS, TILE_ROWS = np.float32(32), np.float32(TILE_HEIGHT)
 
 
 @inlined
-def _dot(a, b):  # type: ignore[no-untyped-def]
+def _dot(a, b):
     return fma(a[0], b[0], fma(a[1], b[1], a[2] * b[2]))
 
 
 @inlined
-def _scaled(s, a):  # type: ignore[no-untyped-def]
+def _scaled(s, a):
     return a[0] * s, a[1] * s, a[2] * s
 
 
 @inlined
-def _sum(a, s, b):  # type: ignore[no-untyped-def]
+def _sum(a, s, b):
     """a + s b."""
     return fma(s, b[0], a[0]), fma(s, b[1], a[1]), fma(s, b[2], a[2])
 
 
 @inlined
-def _rotation(w, x, y, z):  # type: ignore[no-untyped-def]
+def _rotation(w, x, y, z):
     """Rows of the rotation of a unit quaternion."""
     x2, y2, z2 = x * TWO, y * TWO, z * TWO
     xx, yy, zz = x * x2, y * y2, z * z2
@@ -119,7 +119,7 @@ def _rotation(w, x, y, z):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _rotation_backward(w, x, y, z, g):  # type: ignore[no-untyped-def]
+def _rotation_backward(w, x, y, z, g):
     """Gradient of the unit quaternion from that of the rotation's rows."""
     s01, s02, s12 = g[0][1] + g[1][0], g[0][2] + g[2][0], g[1][2] + g[2][1]
     d10, d02, d21 = g[1][0] - g[0][1], g[0][2] - g[2][0], g[2][1] - g[1][2]
@@ -132,14 +132,14 @@ def _rotation_backward(w, x, y, z, g):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _unit(q):  # type: ignore[no-untyped-def]
+def _unit(q):
     """A quaternion at length 1, and the inverse of its length; zero stays zero."""
     inverse = ONE / sqrt(maximum(fma(q[0], q[0], _dot((q[1], q[2], q[3]), (q[1], q[2], q[3]))), NORM2_MIN))
     return (q[0] * inverse, q[1] * inverse, q[2] * inverse, q[3] * inverse), inverse
 
 
 @inlined
-def _seen(camera, mean):  # type: ignore[no-untyped-def]
+def _seen(camera, mean):
     """Camera coordinates of points (x, y, z)."""
     x, y, z = mean
     return (
@@ -150,7 +150,7 @@ def _seen(camera, mean):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _turned(camera, rows):  # type: ignore[no-untyped-def]
+def _turned(camera, rows):
     """R Q, by rows."""
     q0, q1, q2 = rows
     return (
@@ -161,7 +161,7 @@ def _turned(camera, rows):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _turned_back(camera, rows):  # type: ignore[no-untyped-def]
+def _turned_back(camera, rows):
     """R^T G, by rows."""
     g0, g1, g2 = rows
     return (
@@ -172,12 +172,12 @@ def _turned_back(camera, rows):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _times(a, s):  # type: ignore[no-untyped-def]
+def _times(a, s):
     return a[0] * s[0], a[1] * s[1], a[2] * s[2]
 
 
 @inlined
-def _picture_axes(camera, v, scales, slopes, inverse_z):  # type: ignore[no-untyped-def]
+def _picture_axes(camera, v, scales, slopes, inverse_z):
     """The rows a and b of T, and the slopes u at which J is taken."""
     ux = minimum(maximum(slopes[0], camera[LOW_X]), camera[HIGH_X])
     uy = minimum(maximum(slopes[1], camera[LOW_Y]), camera[HIGH_Y])
@@ -187,7 +187,7 @@ def _picture_axes(camera, v, scales, slopes, inverse_z):  # type: ignore[no-unty
 
 
 @inlined
-def _covariance(a, b, dilation):  # type: ignore[no-untyped-def]
+def _covariance(a, b, dilation):
     """xx, xy, yy and the determinant."""
     aa, bb, ab = _dot(a, a), _dot(b, b), _dot(a, b)
     n = (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
@@ -196,7 +196,7 @@ def _covariance(a, b, dilation):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _direction(mean, camera):  # type: ignore[no-untyped-def]
+def _direction(mean, camera):
     """Unit vectors from the camera to the means, and the inverse distances."""
     x, y, z = mean[0] - camera[POSITION], mean[1] - camera[POSITION + 1], mean[2] - camera[POSITION + 2]
     inverse = ONE / sqrt(maximum(_dot((x, y, z), (x, y, z)), TINY))
@@ -204,28 +204,28 @@ def _direction(mean, camera):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _load3(array, first):  # type: ignore[no-untyped-def]
+def _load3(array, first):
     return deinterleave((load(array, 3 * first), load(array, 3 * first + 16), load(array, 3 * first + 32)))
 
 
 @inlined
-def _load4(array, first):  # type: ignore[no-untyped-def]
+def _load4(array, first):
     at = 4 * first
     return deinterleave((load(array, at), load(array, at + 16), load(array, at + 32), load(array, at + 48)))
 
 
 @inlined
-def _store3(array, first, values):  # type: ignore[no-untyped-def]
+def _store3(array, first, values):
     store_rows(array, 3 * first, LANES, interleave(values))
 
 
 @inlined
-def _store4(array, first, values):  # type: ignore[no-untyped-def]
+def _store4(array, first, values):
     store_rows(array, 4 * first, LANES, interleave(values))
 
 
 @inlined
-def _tiles_bound(x, y, half_x, half_y, visible, width, height):  # type: ignore[no-untyped-def]
+def _tiles_bound(x, y, half_x, half_y, visible, width, height):
     """How many tiles the box around each Gaussian meets."""
     right, bottom = np.float32(width - 1), np.float32(height - 1)
     x0 = to_ints(minimum(maximum(x - half_x, ZERO), right)) >> 4
@@ -239,7 +239,7 @@ def _tiles_bound(x, y, half_x, half_y, visible, width, height):  # type: ignore[
 def _project_block(
     means, quats, scales, opacities, sh, sh_width, degree, camera, width, height, first, turned, basis,
     records, centres, radii, bounds, slopes_out,
-):  # type: ignore[no-untyped-def]  # fmt: skip
+):  # fmt: skip
     """Projects the 16 Gaussians from `first` on. slopes_out: see `project`."""
     mean = _load3(means, first)
     px, py, pz = _seen(camera, mean)
@@ -294,13 +294,13 @@ def _project_block(
 
 
 @inlined
-def _store2(array, first, x, y):  # type: ignore[no-untyped-def]
+def _store2(array, first, x, y):
     """Writes 16 rows of an (n, 2) array."""
     store_rows(array, 2 * first, LANES, interleave((x, y)))
 
 
 @inlined
-def _colour_slopes(turned, degree, direction, inverse_distance, out):  # type: ignore[no-untyped-def]
+def _colour_slopes(turned, degree, direction, inverse_distance, out):
     """Writes the gradient of each colour by the mean: what of the slope lies along the sphere of directions."""
     for channel in range(3):
         g = harmonics.slope(turned, degree, direction[0], direction[1], direction[2], channel)
@@ -312,7 +312,7 @@ def _colour_slopes(turned, degree, direction, inverse_distance, out):  # type: i
 def project(
     counter, scratch, means, quats, scales, opacities, sh, sh_width, degree, camera, width, height,
     records, centres, radii, bounds, chunk_bounds, slopes,
-):  # type: ignore[no-untyped-def]  # fmt: skip
+):  # fmt: skip
     """Writes a record, the centre, the radius and a bound on the number of tiles for each of n >= 16 Gaussians;
     chunk_bounds: the sums of the bounds over chunks. slopes: gradients of the colours by the means, 9 vectors
     a block of 16; empty where no gradients are wanted."""
@@ -336,7 +336,7 @@ def project(
 
 
 @inlined
-def _from_moments(fields, xx, xy, yy, determinant):  # type: ignore[no-untyped-def]
+def _from_moments(fields, xy, yy, determinant):
     """Gradients of the centre and of the covariance (xx, xy counted once for both places, yy).
 
     With e = covariance^-1 d: dL/dcentre = sum g e, dL/dcovariance = sum g e e^T / 2. In terms of u and d_y,
@@ -356,7 +356,7 @@ def _from_moments(fields, xx, xy, yy, determinant):  # type: ignore[no-untyped-d
 
 
 @inlined
-def _sum_rows(gradients, first_slot, count):  # type: ignore[no-untyped-def]
+def _sum_rows(gradients, first_slot, count):
     """The sum of the gradient rows of one Gaussian."""
     row, at, end, step = splat(ZERO), first_slot * RECORD, (first_slot + count) * RECORD, opaque(RECORD)
     while at < end:
@@ -366,7 +366,7 @@ def _sum_rows(gradients, first_slot, count):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _gathered(gradients, slots, counts, first, rows):  # type: ignore[no-untyped-def]
+def _gathered(gradients, slots, counts, first, rows):
     """The fields of the gradient rows of 16 Gaussians, one vector a field."""
     for i in range(LANES):
         store(rows, i * LANES, _sum_rows(gradients, get(slots, first + i), get(counts, first + i)))
@@ -374,12 +374,12 @@ def _gathered(gradients, slots, counts, first, rows):  # type: ignore[no-untyped
 
 
 @inlined
-def _add_to(sums, place, value, mask):  # type: ignore[no-untyped-def]
+def _add_to(sums, place, value, mask):
     store(sums, place * LANES, load(sums, place * LANES) + where(mask, value, ZERO))
 
 
 @inlined
-def _camera_sums(sums, fresh, mean, q, dv, dp, offset, intrinsics):  # type: ignore[no-untyped-def]
+def _camera_sums(sums, fresh, mean, q, dv, dp, offset, intrinsics):
     """Adds what 16 Gaussians say about the camera; fresh: lanes that have not been counted yet.
 
     V = R Q gives dV Q^T, p = R m + t gives dp m^T, and the position of the camera the opposite of the
@@ -396,7 +396,7 @@ def _camera_sums(sums, fresh, mean, q, dv, dp, offset, intrinsics):  # type: ign
 
 
 @inlined
-def _offset_gradient(d_colour, slopes):  # type: ignore[no-untyped-def]
+def _offset_gradient(d_colour, slopes):
     """Gradient of the offset from the camera to the means, by way of the colours."""
     result = _scaled(d_colour[0], (load(slopes, 0), load(slopes, 16), load(slopes, 32)))
     result = _sum(result, d_colour[1], (load(slopes, 48), load(slopes, 64), load(slopes, 80)))
@@ -407,7 +407,7 @@ def _offset_gradient(d_colour, slopes):  # type: ignore[no-untyped-def]
 def _project_block_backward(
     means, quats, scales, opacities, sh_width, degree, camera, records, colour_slopes, first, fresh, fields,
     turned, rows, d_means, d_quats, d_scales, d_opacities, d_sh, d_centres, sums, with_camera,
-):  # type: ignore[no-untyped-def]  # fmt: skip
+):  # fmt: skip
     mean, scale = _load3(means, first), _load3(scales, first)
     px, py, pz = _seen(camera, mean)
     before = pz > camera[NEAR]
@@ -417,10 +417,10 @@ def _project_block_backward(
     q = _rotation(qw, qx, qy, qz)
     v = _turned(camera, q)
     a, b, ux, uy = _picture_axes(camera, v, scale, slopes, inverse_z)
-    xx, xy, yy, determinant = _covariance(a, b, camera[DILATION])
+    _, xy, yy, determinant = _covariance(a, b, camera[DILATION])
     usable = before & (determinant > ZERO) & (determinant < LARGEST) & (yy > ZERO)
     yy, determinant = where(usable, yy, ONE), where(usable, determinant, ONE)
-    dx, dy, d_xx, d_xy, d_yy = _from_moments(fields, xx, xy, yy, determinant)
+    dx, dy, d_xx, d_xy, d_yy = _from_moments(fields, xy, yy, determinant)
     _store2(d_centres, first, dx, dy)
 
     opacity = load(opacities, first)
@@ -484,7 +484,7 @@ def project_backward(
     counter, scratch, means, quats, scales, opacities, sh_width, degree, camera, records, slopes,
     gradients, slots, counts,
     d_means, d_quats, d_scales, d_opacities, d_sh, d_centres, d_camera, with_camera,
-):  # type: ignore[no-untyped-def]  # fmt: skip
+):  # fmt: skip
     """Gradients of all inputs from the rasterizer's rows.
 
     gradients: one row for each pair of Gaussian and tile; those of Gaussian i are counts[i] rows from
@@ -505,8 +505,9 @@ def project_backward(
             fields = _gathered(gradients, slots, counts, first, rows)
             fresh = lanes() >= np.float32(block - first)
             _project_block_backward(
-                means, quats, scales, opacities, sh_width, degree, camera, records, slopes[block * SLOPES :], first,
-                fresh, fields, turned, rows, d_means, d_quats, d_scales, d_opacities, d_sh, d_centres, sums, with_camera,
+                means, quats, scales, opacities, sh_width, degree, camera, records, slopes[block * SLOPES :],
+                first, fresh, fields, turned, rows,
+                d_means, d_quats, d_scales, d_opacities, d_sh, d_centres, sums, with_camera,
             )  # fmt: skip
         if with_camera:
             for i in range(CAMERA_SUMS):

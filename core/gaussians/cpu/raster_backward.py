@@ -2,8 +2,9 @@
 """The gradients of `raster_forward`, in the same order, front to back.
 
 With v the gradient of a pixel's colour, one number per pixel and Gaussian matters: vc = v . colour, plus the
-gradient of alpha, plus that of depth times (its depth - the pixel's) / alpha. What lies behind a Gaussian contributes S' = sum of w vc over all later ones, which is
-what is left of the sum over all (known from the final picture) as the walk goes on:
+gradient of alpha, plus that of depth times (its depth - the pixel's) / alpha. What lies behind a Gaussian
+contributes S' = sum of w vc over all later ones, which is what is left of the sum over all (known from the
+final picture) as the walk goes on:
 
     w = T alpha,   S' = S - w vc,   T' = T - w,   dL/dalpha = T vc - S' / (1 - alpha)
     g = dL / d ln alpha = w vc - S' alpha / (1 - alpha)
@@ -65,7 +66,7 @@ SCRATCH = STATE + 6 * EDGE
 @inlined
 def _load_gradients(
     state, row, pixel, background, image, alphas, depths, d_image, d_alphas, d_depths, with_depth
-):  # type: ignore[no-untyped-def]  # fmt: skip
+):  # fmt: skip
     """One row of pixel gradients, and S before the first Gaussian, for 16 pixels from a flat index on."""
     at = row * ROW
     colour = deinterleave((load(image, 3 * pixel), load(image, 3 * pixel + 16), load(image, 3 * pixel + 32)))
@@ -86,7 +87,7 @@ def _load_gradients(
 
 
 @inlined
-def row_gradient(state, at, e, records, record, with_depth):  # type: ignore[no-untyped-def]
+def row_gradient(state, at, e, records, record, with_depth):
     """g and w of one row, and the state after it."""
     t, s = load(state, at + T_PLANE), load(state, at + S_PLANE)
     alpha = where((e >= ALPHA_MIN) & (t >= T_MIN), e, ZERO)
@@ -104,7 +105,7 @@ def row_gradient(state, at, e, records, record, with_depth):  # type: ignore[no-
 
 
 @inlined
-def _add_colours(state, at, w, sums, with_depth):  # type: ignore[no-untyped-def]
+def _add_colours(state, at, w, sums, with_depth):
     """Adds w v to the sums for red, green, blue and depth."""
     d_red = fma(w, load(state, at + V_RED), sums[0])
     d_green = fma(w, load(state, at + V_GREEN), sums[1])
@@ -114,7 +115,7 @@ def _add_colours(state, at, w, sums, with_depth):  # type: ignore[no-untyped-def
 
 
 @inlined
-def _needle(state, records, at, left, top, first, end, with_depth):  # type: ignore[no-untyped-def]
+def _needle(state, records, at, left, top, first, end, with_depth):
     """Sums of g u, g d_y, g u², g u d_y, g d_y², g and colours, each row by its own exponential."""
     zero = splat(ZERO)
     m, mu, my, muu, muy, myy = zero, zero, zero, zero, zero, zero
@@ -133,7 +134,7 @@ def _needle(state, records, at, left, top, first, end, with_depth):  # type: ign
 
 
 @inlined
-def moments(records, at, left, m0, m1, m2):  # type: ignore[no-untyped-def]
+def moments(records, at, left, m0, m1, m2):
     """Sums of g times u, d_y, u², u d_y, d_y² in each lane, from m_i = sum g d_y^i. As u = d_x + k d_y,
 
     sum g u = d_x m0 + k m1,   sum g u d_y = d_x m1 + k m2,   sum g u² = d_x (d_x m0 + 2 k m1) + k² m2
@@ -145,7 +146,7 @@ def moments(records, at, left, m0, m1, m2):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _ordinary(state, records, at, left, top, first, end, with_depth):  # type: ignore[no-untyped-def]
+def _ordinary(state, records, at, left, top, first, end, with_depth):
     """The same by the recurrence, and by three sums a lane."""
     step, one, run = get(records, at + STEP), opaque(1), run_length(records, at)
     zero = splat(ZERO)
@@ -171,7 +172,7 @@ def _ordinary(state, records, at, left, top, first, end, with_depth):  # type: i
 
 
 @inlined
-def _gradient_row(state, records, at, left, top, first, end, with_depth):  # type: ignore[no-untyped-def]
+def _gradient_row(state, records, at, left, top, first, end, with_depth):
     """The row of gradients (see `projection`) of one Gaussian in one tile."""
     if is_needle(records, at, end - first):
         mu, my, muu, muy, myy, m, colours = _needle(state, records, at, left, top, first, end, with_depth)
@@ -181,7 +182,7 @@ def _gradient_row(state, records, at, left, top, first, end, with_depth):  # typ
 
 
 @inlined
-def _edge_row(edge, pixel, count, image, alphas, depths, d_image, d_alphas, d_depths, with_depth):  # type: ignore[no-untyped-def]
+def _edge_row(edge, pixel, count, image, alphas, depths, d_image, d_alphas, d_depths, with_depth):
     """Copies what is in the picture of a row that its edge cuts."""
     edge[:, :] = ZERO
     lane, one = 0, opaque(1)
@@ -199,7 +200,7 @@ def _edge_row(edge, pixel, count, image, alphas, depths, d_image, d_alphas, d_de
 @inlined
 def load_tile(
     state, left, top, width, height, background, image, alphas, depths, d_image, d_alphas, d_depths, with_depth, edge
-):  # type: ignore[no-untyped-def]  # fmt: skip
+):  # fmt: skip
     """The state of a tile before its first Gaussian; edge: workspace for tiles that the picture's edge cuts."""
     start_tile(state, ROW, left, top, width, height)
     row, one = 0, opaque(1)
@@ -220,7 +221,7 @@ def load_tile(
 
 
 @inlined
-def _tile_backward(entries, begin, used, end, records, left, top, state, gradients, with_depth):  # type: ignore[no-untyped-def]
+def _tile_backward(entries, begin, used, end, records, left, top, state, gradients, with_depth):
     for e in range(begin, used):
         ahead = min(e + AHEAD, end - 1) * ENTRY
         prefetch(records, get(entries, ahead + GAUSSIAN) * RECORD)
@@ -236,7 +237,7 @@ def _tile_backward(entries, begin, used, end, records, left, top, state, gradien
 def raster_backward(
     counter, scratch, entries, starts, ends, records, background, width, height, tiles_x, image, alphas, depths,
     d_image, d_alphas, d_depths, gradients,
-):  # type: ignore[no-untyped-def]  # fmt: skip
+):  # fmt: skip
     """gradients: the row of each slot. d_depths may be empty."""
     state, edge = scratch[:STATE], scratch[STATE:SCRATCH].reshape(6, EDGE)
     with_depth = d_depths.size > 0

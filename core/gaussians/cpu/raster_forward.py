@@ -54,14 +54,14 @@ STATE = ROW * TILE_HEIGHT
 
 
 @inlined
-def offsets(records, at, left, y):  # type: ignore[no-untyped-def]
+def offsets(records, at, left, y):
     """u along the pixel row y of the tile, and d_y."""
     dy = np.float32(y) + HALF - get(records, at + Y)
     return lanes() + (np.float32(left) + HALF - get(records, at + X)) + get(records, at + K) * dy, dy
 
 
 @inlined
-def needle_offsets(records, at, left, y):  # type: ignore[no-untyped-def]
+def needle_offsets(records, at, left, y):
     """The same, where the sum of large numbers is small: in float64."""
     dy = y + 0.5 - np.float64(get(records, at + Y))
     k = np.float64(get(records, at + K)) + np.float64(get(records, at + K_REST))
@@ -70,14 +70,14 @@ def needle_offsets(records, at, left, y):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def falloff(records, at, u, dy):  # type: ignore[no-untyped-def]
+def falloff(records, at, u, dy):
     """2^-(A u² + D d_y²); 0 instead of what is below 2^-126."""
     power = fma(u * get(records, at + A), u, get(records, at + D) * dy * dy)
     return where(power < E_MAX, exp2(-power), ZERO)
 
 
 @inlined
-def ratio(records, at, u, dy):  # type: ignore[no-untyped-def]
+def ratio(records, at, u, dy):
     """The factor from this row to the next. Its limit only meets rows of zeros."""
     k, slope = get(records, at + K), get(records, at + A) * get(records, at + K)
     constant = slope * k + get(records, at + D) * (TWO * dy + ONE)
@@ -85,19 +85,19 @@ def ratio(records, at, u, dy):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def run_length(records, at):  # type: ignore[no-untyped-def]
+def run_length(records, at):
     return int(get(records, at + RUN))
 
 
 @inlined
-def is_needle(records, at, rows):  # type: ignore[no-untyped-def]
+def is_needle(records, at, rows):
     """Whether rows differ too much for the recurrence."""
     run = run_length(records, at)
     return run < rows and run < SHORT
 
 
 @inlined
-def start_tile(state, row_length, left, top, width, height):  # type: ignore[no-untyped-def]
+def start_tile(state, row_length, left, top, width, height):
     """Transmittance 1 in the picture and 0 outside, where nothing needs to be done."""
     at, line = 0, opaque(LANES)
     while at < row_length * TILE_HEIGHT:
@@ -112,7 +112,7 @@ def start_tile(state, row_length, left, top, width, height):  # type: ignore[no-
 
 
 @inlined
-def finished(state):  # type: ignore[no-untyped-def]
+def finished(state):
     """Whether no pixel takes any more light."""
     most = load(state, T_PLANE)
     for row in range(1, TILE_HEIGHT):
@@ -122,7 +122,7 @@ def finished(state):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def blend_row(state, at, e, records, record, with_depth):  # type: ignore[no-untyped-def]
+def blend_row(state, at, e, records, record, with_depth):
     """Adds one row of a Gaussian."""
     t = load(state, at + T_PLANE)
     alpha = where((e >= ALPHA_MIN) & (t >= T_MIN), e, ZERO)
@@ -140,7 +140,7 @@ def blend_row(state, at, e, records, record, with_depth):  # type: ignore[no-unt
 
 
 @inlined
-def _blend_needle(state, records, at, left, top, first, end, with_depth):  # type: ignore[no-untyped-def]
+def _blend_needle(state, records, at, left, top, first, end, with_depth):
     """One Gaussian over rows first .. end of the tile, an exponential each."""
     row, one = first, opaque(1)
     while row < end:
@@ -151,7 +151,7 @@ def _blend_needle(state, records, at, left, top, first, end, with_depth):  # typ
 
 
 @inlined
-def _blend(state, records, at, left, top, first, end, with_depth):  # type: ignore[no-untyped-def]
+def _blend(state, records, at, left, top, first, end, with_depth):
     """The same by the recurrence."""
     step, one, run = get(records, at + STEP), opaque(1), run_length(records, at)
     row = first
@@ -168,7 +168,7 @@ def _blend(state, records, at, left, top, first, end, with_depth):  # type: igno
 
 
 @inlined
-def _copy(source, at, target, to, count):  # type: ignore[no-untyped-def]
+def _copy(source, at, target, to, count):
     """The first `count` of a vector's numbers, or all."""
     if count >= LANES:
         store(target, to, load(source, at))
@@ -180,7 +180,7 @@ def _copy(source, at, target, to, count):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def write_tile(image, alphas, depths, medians, state, left, top, width, height, background, with_depth):  # type: ignore[no-untyped-def]
+def write_tile(image, alphas, depths, medians, state, left, top, width, height, background, with_depth):
     """The finished tile into the picture. Uses the state as workspace."""
     seen = width - left
     row, one = 0, opaque(1)
@@ -207,7 +207,7 @@ def write_tile(image, alphas, depths, medians, state, left, top, width, height, 
 
 
 @inlined
-def _raster_tile(entries, begin, end, records, left, top, state, with_depth):  # type: ignore[no-untyped-def]
+def _raster_tile(entries, begin, end, records, left, top, state, with_depth):
     """Draws a tile; returns the end of the entries it needed."""
     for e in range(begin, end):
         if (e - begin) & (PAUSE - 1) == PAUSE - 1 and finished(state):
@@ -225,7 +225,7 @@ def _raster_tile(entries, begin, end, records, left, top, state, with_depth):  #
 @kernel
 def raster(
     counter, state, entries, starts, records, background, width, height, tiles_x, image, alphas, depths, medians, ends
-):  # type: ignore[no-untyped-def]  # fmt: skip
+):  # fmt: skip
     """Colour (h w 3) and alpha (h w), flat; expected and median depth too unless `depths` is empty.
 
     ends (tiles,): where each tile stopped.

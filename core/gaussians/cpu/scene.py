@@ -12,6 +12,7 @@ from torch import Tensor
 from ..projection import FRUSTUM_MARGIN
 from ..rendering import Rendering
 from . import buffers, projection, raster_backward, raster_forward
+from .buffers import Array
 from .threads import parallel
 from .tiles import EMPTY, Grid, bin_gaussians, flat
 from .vector import LANES
@@ -27,7 +28,7 @@ class _Frame(Grid):
     depth: bool
 
 
-def camera_numbers(world_to_camera: Tensor, intrinsics: Tensor, frame: _Frame) -> np.ndarray:
+def camera_numbers(world_to_camera: Tensor, intrinsics: Tensor, frame: _Frame) -> Array:
     """The camera as `projection` wants it."""
     matrix, k = world_to_camera.detach().double().numpy(), intrinsics.detach().double().numpy()
     rotation, translation = matrix[:3, :3], matrix[:3, 3]
@@ -44,7 +45,7 @@ def camera_numbers(world_to_camera: Tensor, intrinsics: Tensor, frame: _Frame) -
 
 class _Rasterize(torch.autograd.Function):
     @staticmethod
-    def forward(  # type: ignore[override]
+    def forward(
         ctx: Any, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, sh: Tensor,
         world_to_camera: Tensor, intrinsics: Tensor, background: Tensor, frame: _Frame, centre_gradients: Tensor,
     ) -> tuple[Tensor, ...]:  # fmt: skip
@@ -72,7 +73,7 @@ class _Rasterize(torch.autograd.Function):
         behind = flat(background)
         parallel(
             raster_forward.raster, bins.entries, bins.starts, records.reshape(-1), behind, w, h, frame.tiles_x,
-            flat(image), flat(alpha), flat(depth), flat(median), ends,
+            flat(image), flat(alpha), flat(depth), flat(median), ends, scratch=raster_forward.STATE,
         )  # fmt: skip
         ctx.save_for_backward(means, quats, scales, opacities, sh, image, alpha, depth)
         ctx.slopes = slopes
@@ -83,7 +84,7 @@ class _Rasterize(torch.autograd.Function):
         return image, alpha, depth, median, centres, radii
 
     @staticmethod
-    def backward(ctx: Any, d_image: Tensor | None, d_alpha: Tensor | None, d_depth: Tensor | None, *_: Any) -> Any:  # type: ignore[override]
+    def backward(ctx: Any, d_image: Tensor | None, d_alpha: Tensor | None, d_depth: Tensor | None, *_: Any) -> Any:
         means, quats, scales, opacities, sh, image, alpha, depth = ctx.saved_tensors
         frame, bins, records = ctx.frame, ctx.bins, ctx.records
         n, h, w = len(means), frame.height, frame.width
@@ -114,7 +115,7 @@ class _Rasterize(torch.autograd.Function):
         return (*gradients, d_world_to_camera, d_intrinsics, d_background, None, None)
 
 
-def _camera_gradients(sums: np.ndarray, camera: np.ndarray) -> tuple[Tensor, Tensor]:
+def _camera_gradients(sums: Array, camera: Array) -> tuple[Tensor, Tensor]:
     """Of world_to_camera (4, 4) and of intrinsics (3, 3), from the sums of all chunks."""
     total = sums.astype(np.float64).sum(0)
     rotation, translation = camera[:9].reshape(3, 3).astype(np.float64), camera[9:12].astype(np.float64)

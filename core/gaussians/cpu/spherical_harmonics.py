@@ -29,7 +29,7 @@ ZERO, HALF, TWO, THREE, FOUR, EIGHT = (np.float32(number) for number in (0, 0.5,
 
 
 @inlined
-def gather(sh, first, width, used, turned):  # type: ignore[no-untyped-def]
+def gather(sh, first, width, used, turned):
     """Turns `used` of the `width` numbers of 16 Gaussians, from row `first` of sh (n, width) on."""
     one = opaque(1)
     column = 0
@@ -47,7 +47,7 @@ def gather(sh, first, width, used, turned):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def scatter(turned, first, width, sh):  # type: ignore[no-untyped-def]
+def scatter(turned, first, width, sh):
     """The inverse: writes all `width` numbers of 16 Gaussians."""
     one = opaque(1)
     column = 0
@@ -68,7 +68,7 @@ def scatter(turned, first, width, sh):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _basis(degree, x, y, z, b):  # type: ignore[no-untyped-def]
+def _basis(degree, x, y, z, b):
     """Writes the basis functions up to this degree, one vector each."""
     store(b, 0, splat(C0))
     if degree >= 1:
@@ -88,7 +88,7 @@ def _basis(degree, x, y, z, b):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def colours(turned, degree, x, y, z, b):  # type: ignore[no-untyped-def]
+def colours(turned, degree, x, y, z, b):
     """The colours (r, g, b), not yet cut off at 0, along unit directions. b: workspace of 16 vectors."""
     _basis(degree, x, y, z, b)
     red, green, blue = splat(HALF), splat(HALF), splat(HALF)
@@ -101,7 +101,7 @@ def colours(turned, degree, x, y, z, b):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def coefficients_backward(degree, x, y, z, v, b, turned):  # type: ignore[no-untyped-def]
+def coefficients_backward(degree, x, y, z, v, b, turned):
     """Writes the gradients of the coefficients, turned, from those of the colours."""
     _basis(degree, x, y, z, b)
     used = (degree + 1) * (degree + 1)
@@ -113,7 +113,7 @@ def coefficients_backward(degree, x, y, z, v, b, turned):  # type: ignore[no-unt
 
 
 @inlined
-def slope(turned, degree, x, y, z, channel):  # type: ignore[no-untyped-def]
+def slope(turned, degree, x, y, z, channel):
     """The gradient of a colour by the direction: sum_k sh_k grad b_k, not yet along the sphere."""
     h, three = turned[channel * LANES :], 3 * LANES
     zero = splat(ZERO)

@@ -10,13 +10,14 @@ from torch import Tensor
 
 from ..rendering import Splats
 from . import buffers, flare, projection, raster_backward, raster_forward
+from .buffers import Array
 from .threads import parallel
 from .tiles import EMPTY, Bins, Grid, bin_gaussians, flat
 
 BLACK = np.zeros(3, np.float32)
 
 
-def _bin(records: np.ndarray, bounds: np.ndarray, grid: Grid) -> Bins:
+def _bin(records: Array, bounds: Array, grid: Grid) -> Bins:
     chunks = np.arange(0, len(bounds), projection.CHUNK)
     sums = np.add.reduceat(bounds, chunks, dtype=np.int64) if len(bounds) else np.zeros(0, np.int64)
     return bin_gaussians(records, bounds, sums, grid, by_depth=False)
@@ -24,7 +25,7 @@ def _bin(records: np.ndarray, bounds: np.ndarray, grid: Grid) -> Bins:
 
 class _Splat(torch.autograd.Function):
     @staticmethod
-    def forward(  # type: ignore[override]
+    def forward(
         ctx: Any, centres: Tensor, covariances: Tensor, opacities: Tensor, colours: Tensor,
         rings: Tensor | None, arcs: Tensor | None, add: bool, grid: Grid,
     ) -> tuple[Tensor, Tensor]:  # fmt: skip
@@ -43,19 +44,20 @@ class _Splat(torch.autograd.Function):
         if shaped or add:
             parallel(
                 flare.raster, *tiles, shapes, BLACK, w, h, grid.tiles_x, shaped, arcs is not None, add,
-                flat(image), flat(alpha), ends,
+                flat(image), flat(alpha), ends, scratch=raster_forward.STATE,
             )  # fmt: skip
         else:
             parallel(
-                raster_forward.raster, *tiles, BLACK, w, h, grid.tiles_x, flat(image), flat(alpha), EMPTY, EMPTY, ends
-            )
+                raster_forward.raster, *tiles, BLACK, w, h, grid.tiles_x, flat(image), flat(alpha), EMPTY, EMPTY, ends,
+                scratch=raster_forward.STATE,
+            )  # fmt: skip
         ctx.save_for_backward(centres, covariances, opacities, colours, rings, arcs, image, alpha)
         ctx.state = (add, grid, bins, ends, records, shapes)
         ctx.set_materialize_grads(False)
         return image, alpha
 
     @staticmethod
-    def backward(ctx: Any, d_image: Tensor | None, d_alpha: Tensor | None) -> Any:  # type: ignore[override]
+    def backward(ctx: Any, d_image: Tensor | None, d_alpha: Tensor | None) -> Any:
         *inputs, image, alpha = ctx.saved_tensors
         add, grid, bins, ends, records, shapes = ctx.state
         covariances, opacities, colours, rings, arcs = inputs[1:]
@@ -90,6 +92,7 @@ def splat(
     *, rings: Tensor | None, arcs: Tensor | None, blend: str,
 ) -> Splats:  # fmt: skip
     """See `splat` of the package; full resolution."""
-    tensors = [None if t is None else t.to(torch.float32) for t in (centres, covariances, opacities, colours, rings, arcs)]
-    colour, alpha = _Splat.apply(*tensors, blend == "add", Grid(width, height))
+    given = (centres, covariances, opacities, colours, rings, arcs)
+    inputs = (None if t is None else t.to(torch.float32) for t in given)
+    colour, alpha = _Splat.apply(*inputs, blend == "add", Grid(width, height))
     return Splats(colour, torch.ones_like(alpha) if blend == "add" else 1 - alpha)

@@ -17,6 +17,7 @@ import numpy as np
 import torch
 
 from . import buffers
+from .buffers import Array
 
 
 class _Scratch(threading.local):
@@ -25,7 +26,7 @@ class _Scratch(threading.local):
     def __init__(self) -> None:
         self._array = buffers.empty(1 << 12)
 
-    def __call__(self, size: int) -> np.ndarray:
+    def __call__(self, size: int) -> Array:
         if self._array.size < size:
             self._array = buffers.empty(size)
         return self._array
@@ -51,27 +52,31 @@ class _Worker:
     def _run(self) -> None:
         torch.set_flush_denormal(True)  # a register of the thread
         while True:
-            function, scratch, (counter, *arguments) = self._calls.get()
+            function, scratch, arguments = self._calls.get()
             try:
-                function(counter, _scratch(scratch), *arguments)
+                _call(function, scratch, arguments)
             except BaseException as error:
                 self._results.put(error)
             else:
                 self._results.put(None)
-            del function, counter, arguments
+            del function, arguments
 
 
 _idle: list[_Worker] = []
 
 
-def parallel(function: Callable[..., Any], *arguments: Any, scratch: int = 0, limit: int | None = None) -> None:
-    """Calls function(counter, scratch, *arguments) on every thread, on at most `limit` of them, and waits for all.
+def _call(function: Callable[..., Any], scratch: int, arguments: tuple[Any, ...]) -> None:
+    counter, *others = arguments
+    function(counter, *([_scratch(scratch)] if scratch else []), *others)
 
-    counter: an int64 array of one element, 0, the same for all threads. scratch: float32, at least of this size,
-    one for each thread.
+
+def parallel(function: Callable[..., Any], *arguments: Any, scratch: int = 0, limit: int | None = None) -> None:
+    """Calls function(counter, *arguments) on every thread, on at most `limit` of them, and waits for all.
+
+    counter: an int64 array of one element, 0, the same for all threads. scratch: how many float32 of memory
+    of its own a thread needs; passed after the counter, unless 0.
     """
     count = torch.get_num_threads() if limit is None else max(1, min(limit, torch.get_num_threads()))
-    counter = np.zeros(1, np.int64)
     if not getattr(function, "signatures", True):  # compile here, not on all threads at once
         count = 1
     workers = []
@@ -80,10 +85,11 @@ def parallel(function: Callable[..., Any], *arguments: Any, scratch: int = 0, li
             workers.append(_idle.pop())
         except IndexError:
             workers.append(_Worker(number))
+    call = (np.zeros(1, np.int64), *arguments)
     for worker in workers:
-        worker.start(function, scratch, (counter, *arguments))
+        worker.start(function, scratch, call)
     try:
-        function(counter, _scratch(scratch), *arguments)
+        _call(function, scratch, call)
     finally:
         errors = [worker.wait() for worker in workers]
         _idle.extend(workers)

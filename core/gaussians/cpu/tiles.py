@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from . import binning, buffers
+from .buffers import Array
 from .threads import parallel
 
 EMPTY = np.empty(0, np.float32)
@@ -34,20 +35,20 @@ class Grid:
 class Bins:
     """Entries by tile, and the slots of each Gaussian; see `binning`."""
 
-    entries: np.ndarray
-    starts: np.ndarray
-    firsts: np.ndarray
-    counts: np.ndarray
+    entries: Array
+    starts: Array
+    firsts: Array
+    counts: Array
     slots: int
 
 
-def flat(tensor: Tensor) -> np.ndarray:
+def flat(tensor: Tensor) -> Array:
     """The numbers of a tensor, as one contiguous row of float32."""
     return tensor.detach().to(torch.float32).contiguous().reshape(-1).numpy()
 
 
 def bin_gaussians(
-    records: np.ndarray, bounds: np.ndarray, chunk_bounds: np.ndarray, grid: Grid, *, by_depth: bool = True
+    records: Array, bounds: Array, chunk_bounds: Array, grid: Grid, *, by_depth: bool = True
 ) -> Bins:
     """Sorts the records (n, 16) into tiles; by depth or in the order given."""
     n = len(bounds)

@@ -155,7 +155,7 @@ def _address(context: Any, builder: ir.IRBuilder, of: types.Array, array: ir.Val
 
 
 @intrinsic
-def load(typing_context, array, index):  # type: ignore[no-untyped-def]  # noqa: ARG001
+def load(typing_context, array, index):  # noqa: ARG001
     """16 values from the flat index of a contiguous float32 or int32 array on."""
     kind = FLOATS if array.dtype == types.float32 else INTS
 
@@ -167,7 +167,7 @@ def load(typing_context, array, index):  # type: ignore[no-untyped-def]  # noqa:
 
 
 @intrinsic
-def get(typing_context, array, index):  # type: ignore[no-untyped-def]  # noqa: ARG001
+def get(typing_context, array, index):  # noqa: ARG001
     """One value at a flat index >= 0 of a contiguous array (array[index] would look for negative ones first)."""
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
@@ -177,7 +177,7 @@ def get(typing_context, array, index):  # type: ignore[no-untyped-def]  # noqa: 
 
 
 @intrinsic
-def opaque(typing_context, number):  # type: ignore[no-untyped-def]  # noqa: ARG001
+def opaque(typing_context, number):  # noqa: ARG001
     """The same int64, which LLVM cannot know: a loop by such a step is not unrolled into several, each of
     which would have an end for the processor to guess."""
 
@@ -189,7 +189,7 @@ def opaque(typing_context, number):  # type: ignore[no-untyped-def]  # noqa: ARG
 
 
 @intrinsic
-def store(typing_context, array, index, value):  # type: ignore[no-untyped-def]  # noqa: ARG001
+def store(typing_context, array, index, value):  # noqa: ARG001
     """Writes 16 values from the flat index of a contiguous array on."""
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
@@ -201,7 +201,7 @@ def store(typing_context, array, index, value):  # type: ignore[no-untyped-def] 
 
 
 @intrinsic
-def load_rows(typing_context, array, index, stride):  # type: ignore[no-untyped-def]  # noqa: ARG001
+def load_rows(typing_context, array, index, stride):  # noqa: ARG001
     """16 vectors, from the flat index on and each `stride` elements further."""
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
@@ -216,7 +216,7 @@ def load_rows(typing_context, array, index, stride):  # type: ignore[no-untyped-
 
 
 @intrinsic
-def store_rows(typing_context, array, index, stride, rows):  # type: ignore[no-untyped-def]  # noqa: ARG001
+def store_rows(typing_context, array, index, stride, rows):  # noqa: ARG001
     """Writes a tuple of vectors, from the flat index on and each `stride` elements further."""
     count = len(rows)
 
@@ -232,7 +232,7 @@ def store_rows(typing_context, array, index, stride, rows):  # type: ignore[no-u
 
 
 @intrinsic
-def stream_rows(typing_context, array, index, stride, rows):  # type: ignore[no-untyped-def]  # noqa: ARG001
+def stream_rows(typing_context, array, index, stride, rows):  # noqa: ARG001
     """As store_rows, past the caches: for what is not read soon. All addresses must be those of cache lines."""
     count = len(rows)
 
@@ -249,7 +249,7 @@ def stream_rows(typing_context, array, index, stride, rows):  # type: ignore[no-
 
 
 @intrinsic
-def prefetch(typing_context, array, index):  # type: ignore[no-untyped-def]  # noqa: ARG001
+def prefetch(typing_context, array, index):  # noqa: ARG001
     """Asks for the cache line of a flat index, to be read or written soon; any index is safe."""
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
@@ -263,7 +263,7 @@ def prefetch(typing_context, array, index):  # type: ignore[no-untyped-def]  # n
 
 
 @intrinsic
-def take_number(typing_context, counter):  # type: ignore[no-untyped-def]  # noqa: ARG001
+def take_number(typing_context, counter):  # noqa: ARG001
     """Adds one to an int64 array's first element and returns what it was, without two threads getting the same."""
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
@@ -274,7 +274,7 @@ def take_number(typing_context, counter):  # type: ignore[no-untyped-def]  # noq
 
 
 @intrinsic
-def splat(typing_context, value):  # type: ignore[no-untyped-def]  # noqa: ARG001
+def splat(typing_context, value):  # noqa: ARG001
     """A number in all 16 lanes, as float32."""
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
@@ -284,7 +284,7 @@ def splat(typing_context, value):  # type: ignore[no-untyped-def]  # noqa: ARG00
 
 
 @intrinsic
-def lanes(typing_context):  # type: ignore[no-untyped-def]  # noqa: ARG001
+def lanes(typing_context):  # noqa: ARG001
     """0, 1, ... 15 as float32."""
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:  # noqa: ARG001
@@ -294,7 +294,7 @@ def lanes(typing_context):  # type: ignore[no-untyped-def]  # noqa: ARG001
 
 
 @intrinsic
-def where(typing_context, mask, a, b):  # type: ignore[no-untyped-def]  # noqa: ARG001
+def where(typing_context, mask, a, b):  # noqa: ARG001
     """a where the mask is true, else b; one of them may be a number."""
     kind = _kind_of((a, b))
     if mask != MASKS or kind is None:
@@ -309,7 +309,7 @@ def where(typing_context, mask, a, b):  # type: ignore[no-untyped-def]  # noqa: 
 
 def _smaller_or_larger(sign: str) -> Callable[..., Any]:
     # A comparison and a choice: one instruction everywhere, where llvm.minnum adds a test for NaN.
-    def define(typing_context, a, b):  # type: ignore[no-untyped-def]  # noqa: ARG001
+    def define(typing_context, a, b):  # noqa: ARG001
         if _kind_of((a, b)) != "float32":
             return None
 
@@ -327,7 +327,7 @@ maximum = intrinsic(_smaller_or_larger(">"))
 
 
 @intrinsic
-def fma(typing_context, a, b, c):  # type: ignore[no-untyped-def]  # noqa: ARG001
+def fma(typing_context, a, b, c):  # noqa: ARG001
     """a * b + c, rounded once where the machine can (llvm.fma would call a library where it cannot)."""
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
@@ -338,7 +338,7 @@ def fma(typing_context, a, b, c):  # type: ignore[no-untyped-def]  # noqa: ARG00
 
 
 @intrinsic
-def sqrt(typing_context, a):  # type: ignore[no-untyped-def]  # noqa: ARG001
+def sqrt(typing_context, a):  # noqa: ARG001
     """Square roots."""
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:  # noqa: ARG001
@@ -348,7 +348,7 @@ def sqrt(typing_context, a):  # type: ignore[no-untyped-def]  # noqa: ARG001
 
 
 @intrinsic
-def absolute(typing_context, a):  # type: ignore[no-untyped-def]  # noqa: ARG001
+def absolute(typing_context, a):  # noqa: ARG001
     """Absolute values."""
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:  # noqa: ARG001
@@ -358,7 +358,7 @@ def absolute(typing_context, a):  # type: ignore[no-untyped-def]  # noqa: ARG001
 
 
 @intrinsic
-def any_of(typing_context, mask):  # type: ignore[no-untyped-def]  # noqa: ARG001
+def any_of(typing_context, mask):  # noqa: ARG001
     """Whether any lane is true."""
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:  # noqa: ARG001
@@ -369,7 +369,7 @@ def any_of(typing_context, mask):  # type: ignore[no-untyped-def]  # noqa: ARG00
 
 
 @intrinsic
-def bits_of(typing_context, mask):  # type: ignore[no-untyped-def]  # noqa: ARG001
+def bits_of(typing_context, mask):  # noqa: ARG001
     """The mask as a number, lane 0 its lowest bit."""
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:  # noqa: ARG001
@@ -379,7 +379,7 @@ def bits_of(typing_context, mask):  # type: ignore[no-untyped-def]  # noqa: ARG0
 
 
 @intrinsic
-def as_ints(typing_context, a):  # type: ignore[no-untyped-def]  # noqa: ARG001
+def as_ints(typing_context, a):  # noqa: ARG001
     """The same 32 bits a lane, read as integers."""
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:  # noqa: ARG001
@@ -389,7 +389,7 @@ def as_ints(typing_context, a):  # type: ignore[no-untyped-def]  # noqa: ARG001
 
 
 @intrinsic
-def as_floats(typing_context, a):  # type: ignore[no-untyped-def]  # noqa: ARG001
+def as_floats(typing_context, a):  # noqa: ARG001
     """The same 32 bits a lane, read as floating point."""
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:  # noqa: ARG001
@@ -399,7 +399,7 @@ def as_floats(typing_context, a):  # type: ignore[no-untyped-def]  # noqa: ARG00
 
 
 @intrinsic
-def to_floats(typing_context, a):  # type: ignore[no-untyped-def]  # noqa: ARG001
+def to_floats(typing_context, a):  # noqa: ARG001
     """Integers as the floating-point numbers of the same value."""
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:  # noqa: ARG001
@@ -409,7 +409,7 @@ def to_floats(typing_context, a):  # type: ignore[no-untyped-def]  # noqa: ARG00
 
 
 @intrinsic
-def to_ints(typing_context, a):  # type: ignore[no-untyped-def]  # noqa: ARG001
+def to_ints(typing_context, a):  # noqa: ARG001
     """Rounded towards zero; must lie within int32."""
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:  # noqa: ARG001
@@ -458,7 +458,7 @@ def _eight_sums(builder: ir.IRBuilder, vectors: Sequence[ir.Value]) -> ir.Value:
 
 
 @intrinsic
-def total(typing_context, a):  # type: ignore[no-untyped-def]  # noqa: ARG001
+def total(typing_context, a):  # noqa: ARG001
     """The sum of all lanes, float32; the same order on every machine."""
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:  # noqa: ARG001
@@ -471,7 +471,7 @@ def total(typing_context, a):  # type: ignore[no-untyped-def]  # noqa: ARG001
 
 
 @intrinsic
-def totals(typing_context, vectors):  # type: ignore[no-untyped-def]  # noqa: ARG001
+def totals(typing_context, vectors):  # noqa: ARG001
     """A vector of the sums of up to 16 vectors, in their order (further lanes: undefined)."""
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:  # noqa: ARG001
@@ -484,7 +484,7 @@ def totals(typing_context, vectors):  # type: ignore[no-untyped-def]  # noqa: AR
 
 
 @intrinsic
-def transpose(typing_context, vectors):  # type: ignore[no-untyped-def]  # noqa: ARG001
+def transpose(typing_context, vectors):  # noqa: ARG001
     """16 vectors with rows and columns exchanged: lane j of result i is lane i of argument j."""
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:  # noqa: ARG001
@@ -499,7 +499,7 @@ def transpose(typing_context, vectors):  # type: ignore[no-untyped-def]  # noqa:
 
 
 @intrinsic
-def interleave(typing_context, vectors):  # type: ignore[no-untyped-def]  # noqa: ARG001
+def interleave(typing_context, vectors):  # noqa: ARG001
     """k vectors a, b, c ... to k vectors that read a0 b0 c0 a1 b1 c1 ... one after the other."""
     count = len(vectors)
 
@@ -520,7 +520,7 @@ def interleave(typing_context, vectors):  # type: ignore[no-untyped-def]  # noqa
 
 
 @intrinsic
-def deinterleave(typing_context, vectors):  # type: ignore[no-untyped-def]  # noqa: ARG001
+def deinterleave(typing_context, vectors):  # noqa: ARG001
     """The inverse of `interleave`."""
     count = len(vectors)
 
@@ -552,7 +552,7 @@ _EXP2_MAX = np.float32(126.5)
 
 
 @inlined
-def exp2(x):  # type: ignore[no-untyped-def]
+def exp2(x):
     """2^x; below -126 as at -126 (1e-38, not zero), from 126.5 on as there."""
     x = minimum(maximum(x, _EXP2_MIN), _EXP2_MAX)
     rounded = x + _ROUND
@@ -572,7 +572,7 @@ _EXP2_LESS_ONE = tuple(
 
 
 @inlined
-def exp2_less_one(x):  # type: ignore[no-untyped-def]
+def exp2_less_one(x):
     """2^x - 1, relative to itself as exact near 0 as elsewhere."""
     f = minimum(maximum(x, np.float32(-0.5)), np.float32(0.5))
     p = fma(f, _EXP2_LESS_ONE[5], _EXP2_LESS_ONE[4])
@@ -589,7 +589,7 @@ _LOG2 = tuple(np.float32(2.8853900817779268 / k) for k in (1, 3, 5, 7, 9))
 
 
 @inlined
-def log2(x):  # type: ignore[no-untyped-def]
+def log2(x):
     """log2 x for normal x > 0 (2e-7 absolute near 1)."""
     bits = as_ints(x)
     exponent = to_floats(((bits >> 23) & 255) - 127)

@@ -62,7 +62,8 @@ def find_lights(capture: Capture, detector: Detector, progress: Progress | None 
         if lights:
             says.append("One view gives directions only: distances are those of the points nearby, or a guess.")
     else:
-        found = gather(views, detections, capture.extent, replace(settings, min_views=2, accidents=np.inf))
+        everything = replace(settings, min_views=2, accidents=np.inf, min_share=0.0)
+        found = gather(views, detections, capture.extent, everything)
         lights = [light for light in found if _sure(light, enough, settings)]
         doubtful = [light for light in found if not _sure(light, enough, settings)]
     if ghosts and not lights and len(views) > 1:
@@ -76,7 +77,8 @@ def find_lights(capture: Capture, detector: Detector, progress: Progress | None 
 
 
 def _sure(light: FoundLight, min_views: int, settings: GatherSettings) -> bool:
-    return len(light.support) >= min_views and light.accidents <= settings.accidents
+    return (len(light.support) >= max(min_views, settings.min_share * light.visible)
+            and light.accidents <= settings.accidents)
 
 
 def record(capture: Capture, findings: Findings, keep: bool = False) -> dict[str, Any]:

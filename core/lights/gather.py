@@ -32,11 +32,13 @@ PATIENCE = 6      # places of too few views in a row, after which there is nothi
 class GatherSettings:
     """tolerance: of a projection, as a share of the frame's diagonal, to which half the source's radius is added;
     min_views: fewer do not make a light; accidents: as many expected by chance are allowed at most;
+    min_share: of the views that have its place in frame, hidden or not, so many must show a light;
     most: lights at most. tries: pairs of detections tried, all of them where there are fewer; seed: of their choice."""
 
     tolerance: float = 0.006
     min_views: int = 3
     accidents: float = 0.02
+    min_share: float = 0.15
     most: int = 32
     tries: int = 4000
     seed: int = 0
@@ -118,7 +120,7 @@ def gather(views: Sequence[tuple[str, Camera]], detections: Sequence[Sequence[De
             continue
         light = _light(seen, place, inliers, covariance, extent)
         open_[inliers] = False
-        if light.accidents <= settings.accidents:
+        if light.accidents <= settings.accidents and len(light.support) >= settings.min_share * light.visible:
             found.append(light)
             failures = 0
     return merged(found, views, extent)

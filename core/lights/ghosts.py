@@ -104,7 +104,7 @@ def _with_share(views: Sequence[tuple[str, Camera]], blobs: Sequence[Sequence[Bl
         claims.append([Detection(centre + (blob.xy - centre) / share, 0.02 * diagonal / abs(share), 1.0,
                                  np.ones(3), np.ones((1, 1), bool), (0, 0), False) for blob in some
                        if not camera.contains([centre + (blob.xy - centre) / share])[0]])
-    settings = GatherSettings(tolerance=0.0, min_views=MIN_VIEWS, most=2, tries=1200, seed=seed)
+    settings = GatherSettings(tolerance=0.0, min_views=MIN_VIEWS, min_share=0.0, most=2, tries=1200, seed=seed)
     diagonal = float(np.hypot(*views[0][1].size))
     for light in gather(views, claims, extent, settings):
         moved = np.ptp([one.xy * share for _, one in light.detections], axis=0).max()

@@ -34,6 +34,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     from ...core.capture import Capture
     from ...core.lights import GatherSettings, detector_for, find_lights, record
+    from ...core.lights.find import REPORT, SHEETS
 
     capture = Capture.open(words.capture)
     detector = detector_for(words.method, words.threshold, words.boxes, words.masks)
@@ -46,8 +47,8 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     for light in report["lights"]:
         progress.say(_sentence(light))
     if findings.doubtful:
-        progress.say(f"{len(findings.doubtful)} more were seen in fewer than {words.min_views} views and left out; "
-                     f"--min-views 2 takes them.")
+        progress.say(f"{len(findings.doubtful)} more are doubtful, in too few of the views that should show them, and "
+                     f"left out: {words.capture / SHEETS / REPORT} lists them.")
     progress.say(f"Look at {words.capture / report['sheets'][0]}; lights.json can be edited, and `--keep` respects it.")
     return {"lights": report["lights"], "file": str(words.capture / "lights.json"),
             "sheets": [str(words.capture / sheet) for sheet in report["sheets"]]}

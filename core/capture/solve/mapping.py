@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 DEFAULT_FOCAL = 1.2  # of the long side, where the file does not tell; COLMAP's own guess
 ENOUGH = 20          # frames from which a principal point can be told from a turn of the cameras
 OFF_CENTRE = 0.015   # of the long side; a principal point further from the middle is an artefact
+MATCHES = 15         # verified ones from which two frames count as matched
 MOVED = 1.0          # pixels of the small pictures; less is no motion
 
 
@@ -80,9 +81,11 @@ def solve(shots: Sequence[Shot], work: Path, settings: SolveSettings, video: boo
     _extract(pycolmap, shots, work, database, settings, progress)
     matching = choose_matching(settings.matching, len(shots), video)
     pairs = _match(pycolmap, shots, work, database, matching, settings, progress)
+    _refuse_without_parallax(pycolmap, database, settings.size)
     models = _map(pycolmap, work, database, len(shots), settings, progress)
     if not models:
-        raise CaptureError(_why_not(pycolmap, database, settings.size))
+        raise CaptureError("The frames match, but no two of them give a reliable start; film with more sideways "
+                           "motion or choose more frames.")
     largest = max(models, key=lambda model: (model.num_reg_images(), model.num_points3D()))
     if settings.principal_point and largest.num_reg_images() >= ENOUGH:
         progress.stage("find principal point", 1)
@@ -214,9 +217,13 @@ def _map(pycolmap: Any, work: Path, database: Path, frames: int, settings: Solve
 
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir()
-    models = pycolmap.incremental_mapping(
-        database, work / "small", folder, options, initial_image_pair_callback=lambda: step(2),
-        next_image_callback=lambda: step(1), cancellation_token=token)
+    try:
+        models = pycolmap.incremental_mapping(
+            database, work / "small", folder, options, initial_image_pair_callback=lambda: step(2),
+            next_image_callback=lambda: step(1), cancellation_token=token)
+    except InterruptedError:
+        progress.check()
+        raise
     progress.check()
     for number, model in models.items():
         (folder / str(number)).mkdir(exist_ok=True)
@@ -246,32 +253,30 @@ def _with_principal_point(pycolmap: Any, found: Any) -> Any:
     return moved
 
 
-def _why_not(pycolmap: Any, database: Path, size: int) -> str:
-    """Why no model was found, from how matched features moved."""
+def _refuse_without_parallax(pycolmap: Any, database: Path, size: int) -> None:
+    """Stop before mapping where matched features show that depth cannot be measured: mapping would go on for long
+    and might come back with a model of nothing."""
+    configuration = pycolmap.TwoViewGeometryConfiguration
+    flat = (configuration.PLANAR_OR_PANORAMIC, configuration.PANORAMIC)
+    moves, parallax = [], 0
     with _opened(pycolmap, database) as db:
-        pair_ids, geometries = db.read_two_view_geometries()
-        moves, parallax = [], 0
-        for pair_id, geometry in zip(pair_ids, geometries, strict=True):
+        for pair_id, geometry in zip(*db.read_two_view_geometries(), strict=True):
             matches = np.asarray(geometry.inlier_matches)
-            if len(matches) < 15:
+            if len(matches) < MATCHES:
                 continue
-            first, second = (np.asarray(db.read_keypoints(image))[:, :2]
+            first, second = (np.asarray(db.read_keypoints(image), np.float64)[:, :2]
                              for image in pycolmap.pair_id_to_image_pair(pair_id))
             moves.append(float(np.median(np.linalg.norm(first[matches[:, 0]] - second[matches[:, 1]], axis=1))))
-            flat = (pycolmap.TwoViewGeometryConfiguration.PLANAR_OR_PANORAMIC,
-                    pycolmap.TwoViewGeometryConfiguration.PANORAMIC)
             parallax += geometry.config not in flat
     if not moves:
-        return ("The frames share too few features to place a camera; film with more overlap, more texture or less "
-                "blur.")
+        raise CaptureError("The frames share too few features to place a camera; film with more overlap, more texture "
+                           "or less blur.")
     if np.median(moves) < MOVED:
-        return (f"The camera hardly moves: matched features shift by {np.median(moves):.2f} pixels at {size}; a solve "
-                "needs a camera that travels.")
-    if parallax < 0.2 * len(moves):
-        return ("The camera turns but does not travel, or sees one flat surface only: there is no parallax to measure "
-                "depth by.")
-    return ("The frames match, but no two of them give a reliable start; film with more sideways motion or choose "
-            "more frames.")
+        raise CaptureError(f"The camera hardly moves: matched features shift by {np.median(moves):.2f} pixels at "
+                           f"{size}; a solve needs a camera that travels.")
+    if parallax < 0.02 * len(moves):
+        raise CaptureError("The camera turns but does not travel, or sees one flat surface only: there is no parallax "
+                           "to measure depth by.")
 
 
 def _model(reconstruction: Any, names: dict[str, int]) -> Model:

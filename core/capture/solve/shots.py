@@ -208,7 +208,7 @@ def usable(picture: Picture) -> NDArray[np.bool_]:
     # Lone pixels are sparkle on a texture, and good features.
     clipped = cv2.morphologyEx(clipped, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     diagonal = float(np.hypot(*picture.size))
-    lines = _ghost_lines(clipped, max(3, round(0.015 * diagonal)))
+    lines = _ghost_lines(np.asarray(clipped, np.uint8), max(3, round(0.015 * diagonal)))
     reach = max(2, round(0.008 * diagonal))
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
     return (np.asarray(cv2.dilate(clipped, disc)) == 0) & ~lines

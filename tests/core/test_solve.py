@@ -1,0 +1,422 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Structure from motion on small rendered shots, and every way in which there is nothing to solve."""
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from core.capture import Camera, Capture
+from core.capture.camera import quaternion_from_rotation, rotation_from_quaternion
+from core.capture.colmap import Observed, PointCloud, read_model, write_model
+from core.capture.lens import Lens
+from core.capture.solve import SolveSettings, solve
+from core.capture.solve.exif import read_exif, upright
+from core.capture.solve.pairs import choose_matching, choose_pairs
+from core.capture.solve.shots import choose, usable
+from core.capture.solve.world import up_direction
+from core.errors import Cancelled, CaptureError
+from core.pictures import Picture
+from core.progress import Progress
+from tests.core.captures import look_at, orbit
+
+SIZE = (320, 240)
+QUICK = SolveSettings(features=800)
+
+
+def texture(seed: int) -> NDArray[np.uint8]:
+    """A wall with detail at every scale, (512, 512, 3)."""
+    rng = np.random.default_rng(seed)
+    wall = np.zeros((512, 512, 3))
+    for cells in (8, 24, 64, 160):
+        wall += cv2.resize(rng.uniform(0, 1, (cells, cells, 3)), (512, 512), interpolation=cv2.INTER_CUBIC) / 4
+    return (np.clip((wall - 0.5) * 2 + 0.5, 0.05, 0.9) * 255).astype(np.uint8)
+
+
+WALLS = [(texture(i), corner, right, down) for i, (corner, right, down) in enumerate((
+    ((-3.0, -2.0, 2.5), (6.0, 0.0, 0.0), (0.0, 4.0, 0.0)),    # behind
+    ((-3.0, 1.0, -2.0), (6.0, 0.0, 0.0), (0.0, 0.0, 4.5)),    # floor
+    ((-0.9, -0.6, 0.3), (1.2, 0.0, 0.5), (0.0, 1.6, 0.0)),    # in front
+))]
+
+
+def render(camera: Camera) -> NDArray[np.uint8]:
+    """Three textured walls, (h, w, 3) B G R."""
+    frame = np.full((camera.height, camera.width, 3), 60, np.uint8)
+    for wall, corner, right, down in WALLS:
+        across = np.stack([*np.array([right, down]) / 512, corner], axis=1)
+        turn = camera.world_to_camera[:3, :3] @ across
+        turn[:, 2] += camera.world_to_camera[:3, 3]
+        to_frame = camera.intrinsics @ turn
+        drawn = cv2.warpPerspective(wall, to_frame, camera.size, flags=cv2.INTER_AREA)
+        mask = cv2.warpPerspective(np.full((512, 512), 255, np.uint8), to_frame, camera.size)
+        frame = np.where(mask[..., None] > 127, drawn, frame)
+    return frame
+
+
+def shoot(folder: Path, cameras: list[Camera], suffix: str = ".png") -> Path:
+    """Frames of the walls."""
+    folder.mkdir(parents=True)
+    for i, camera in enumerate(cameras):
+        cv2.imwrite(str(folder / f"{i:03d}{suffix}"), render(camera))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def solved(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Camera], dict[str, Any]]:
+    """One solved shot, of frames through a lens with distortion."""
+    folder = tmp_path_factory.mktemp("solve")
+    cameras = orbit(10, size=SIZE, arc=0.9)
+    frames = shoot(folder / "frames", cameras)
+    lens = Lens("SIMPLE_RADIAL", (0.9 * SIZE[0], SIZE[0] / 2, SIZE[1] / 2, -0.08), *SIZE)
+    v, u = np.mgrid[:SIZE[1], :SIZE[0]] + 0.5
+    bent = (lens.undistort(np.stack([u, v], axis=-1)) * lens.focal + lens.centre - 0.5).reshape(*SIZE[::-1], 2)
+    for file in frames.iterdir():
+        straight = cv2.imread(str(file))
+        cv2.imwrite(str(file), cv2.remap(straight, bent.astype(np.float32), None, cv2.INTER_CUBIC))
+    (frames / "004.png").write_bytes(b"\x89PNG\r\n\x1a\nbroken")
+    report = solve(frames, folder / "out", QUICK)
+    return folder / "out", cameras, report
+
+
+def test_cameras_come_out_right(solved: tuple[Path, list[Camera], dict[str, Any]]) -> None:
+    out, cameras, report = solved
+    capture = Capture.open(out)
+    assert report["registered"] == len(capture.views) == 9 and report["reprojection_error_px"] < 0.6
+    true = np.array([cameras[int(view.name[:3])].position for view in capture.views])
+    ours = np.array([view.camera.position for view in capture.views])
+    extent = np.linalg.norm(np.ptp(true, axis=0))
+    a, b = true - true.mean(axis=0), ours - ours.mean(axis=0)
+    left, size, right = np.linalg.svd(a.T @ b)
+    flip = np.diag([1, 1, np.sign(np.linalg.det(left @ right))])
+    moved = b @ (left @ flip @ right).T * (size * np.diag(flip)).sum() / (b ** 2).sum()
+    assert np.linalg.norm(moved - a, axis=1).max() < 0.005 * extent
+    up = left @ flip @ right @ np.array([0, 0, 1.0])
+    assert up @ np.array([0, -1.0, 0]) > 0.99  # the shot's world has y down
+    assert capture.views[0].camera.fx == pytest.approx(0.9 * SIZE[0], rel=0.05)
+
+
+def test_frames_are_straight_and_points_lie_on_them(solved: tuple[Path, list[Camera], dict[str, Any]]) -> None:
+    """Every view is a pinhole's, and the points' colours are those of the pixels they fall on."""
+    capture = Capture.open(solved[0])
+    off, beside = [], []
+    for view in capture.views:
+        assert view.lens is None and view.camera.size == SIZE
+        pixels, depth = view.camera.project(capture.points.xyz)
+        seen = view.camera.contains(pixels, depth) & (capture.points.error < 0.5)
+        column, row = pixels[seen].astype(int).T
+        off.append(np.abs(capture.frame(view).pixels[row, column] * 255 - capture.points.rgb[seen]).mean(axis=1))
+        # A few pixels further, and the same points fall on other colours.
+        column, row = np.clip((pixels[seen] + 6).astype(int), 0, np.array(SIZE) - 1).T
+        beside.append(np.abs(capture.frame(view).pixels[row, column] * 255 - capture.points.rgb[seen]).mean(axis=1))
+    assert np.median(np.concatenate(off)) < 0.5 * np.median(np.concatenate(beside))
+
+
+def test_the_model_is_colmaps(solved: tuple[Path, list[Camera], dict[str, Any]]) -> None:
+    import pycolmap
+
+    model = pycolmap.Reconstruction(str(solved[0] / "sparse" / "0"))
+    assert model.num_reg_images() == 9 and model.num_points3D() == solved[2]["points"]
+    error = model.compute_mean_reprojection_error()
+    model.update_point_3d_errors()
+    assert model.compute_mean_reprojection_error() == pytest.approx(error, rel=0.02)  # tracks belong to points
+    assert error < 0.7
+
+
+def test_the_report(solved: tuple[Path, list[Camera], dict[str, Any]]) -> None:
+    out, _, report = solved
+    assert json.loads((out / "solve.json").read_text()) == report
+    assert len(report["left_out"]) == 1 and "004.png" in report["left_out"][0]
+    assert report["track_length"] > 3 and report["cameras"][0]["model"] == "RADIAL"
+    sheet = cv2.imread(str(out / "solve.png"))
+    assert sheet.shape[1] > 1000 and (sheet < 128).any()
+    assert not (out / ".solve").exists()
+
+
+def test_a_solved_shot_is_not_solved_again(solved: tuple[Path, list[Camera], dict[str, Any]]) -> None:
+    out, _, report = solved
+    before = (out / "solve.json").stat().st_mtime_ns
+    assert solve(out.parent / "frames", out, QUICK) == report
+    assert (out / "solve.json").stat().st_mtime_ns == before
+
+
+class Stopping(Progress):
+    """Asks to stop at the `count`-th step of a stage, and notes all stages."""
+
+    def __init__(self, stage: str = "", count: int = 1) -> None:
+        super().__init__()
+        self.at, self.count, self.seen = stage, count, {}
+
+    def stage(self, name: str, total: int, done: int = 0) -> None:
+        self.seen[name] = (total, done)
+        super().stage(name, total, done)
+
+    def advance(self, steps: int = 1, **figures: float) -> None:
+        if self._stage == self.at:
+            self.count -= 1
+            if self.count <= 0:
+                self.request_stop()
+        super().advance(steps, **figures)
+
+
+def test_stopped_and_taken_up_again(tmp_path: Path) -> None:
+    frames = shoot(tmp_path / "frames", orbit(9, size=SIZE, arc=0.9))
+    out = tmp_path / "out"
+    for stage in ("read frames", "find features", "match frames", "place cameras", "write frames"):
+        with pytest.raises(Cancelled):
+            solve(frames, out, QUICK, Stopping(stage))
+        assert not (out / "sparse").exists() and not (out / "images").exists() and not (out / "solve.json").exists()
+    last = Stopping()
+    report = solve(frames, out, QUICK, last)
+    assert last.seen["find features"] == (9, 9) and last.seen["match frames"] == (36, 36)
+    assert "place cameras" not in last.seen
+    assert report["registered"] == 9 and len(Capture.open(out).views) == 9
+
+
+def test_frames_of_different_sizes(tmp_path: Path) -> None:
+    cameras = orbit(10, size=SIZE, arc=0.9)
+    cameras[7:] = [camera.scaled(400, 300) for camera in cameras[7:]]
+    report = solve(shoot(tmp_path / "frames", cameras), tmp_path / "out", QUICK)
+    capture = Capture.open(tmp_path / "out")
+    assert report["registered"] == 10 and len(report["cameras"]) == 2
+    assert [view.camera.width for view in capture.views] == [320] * 7 + [400] * 3
+    assert capture.views[0].camera.fx == pytest.approx(capture.views[9].camera.fx * 320 / 400, rel=0.05)
+
+
+def write_video(path: Path, frames: list[NDArray[np.uint8]]) -> Path:
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), 25, SIZE)
+    for frame in frames:
+        writer.write(frame)
+    writer.release()
+    return path
+
+
+def test_a_video(tmp_path: Path) -> None:
+    """The sharpest frame of each stretch is taken: two of three are blurred here."""
+    frames = [render(camera) for camera in orbit(30, size=SIZE, arc=0.9)]
+    frames = [frame if i % 3 == 1 else cv2.GaussianBlur(frame, (0, 0), 3) for i, frame in enumerate(frames)]
+    video = write_video(tmp_path / "shot.mp4", frames)
+    report = solve(video, tmp_path / "out", SolveSettings(frames=10, features=800))
+    names = [view.name for view in Capture.open(tmp_path / "out").views]
+    assert report["matching"] == "sequential" and report["registered"] == 10
+    assert names == [f"{i:06d}.png" for i in range(1, 30, 3)]
+
+
+def refusal(source: Path, out: Path, settings: SolveSettings = QUICK) -> str:
+    """The sentence with which a solve is refused; nothing of a capture is left."""
+    with pytest.raises(CaptureError) as caught:
+        solve(source, out, settings)
+    assert not any((out / name).exists() for name in ("images", "sparse", "solve.json"))
+    message = str(caught.value)
+    assert message.endswith(".") and "\n" not in message
+    return message
+
+
+def test_a_video_without_motion(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    still = render(orbit(1, size=SIZE)[0]).astype(np.float64)
+    frames = [np.clip(still + rng.normal(0, 6, still.shape), 0, 255).astype(np.uint8) for _ in range(12)]
+    message = refusal(write_video(tmp_path / "still.mp4", frames), tmp_path / "out", SolveSettings(frames=6))
+    assert "same picture" in message or "hardly moves" in message
+
+
+def test_all_frames_identical(tmp_path: Path) -> None:
+    frames = shoot(tmp_path / "frames", orbit(1, size=SIZE) * 6)
+    assert "same picture" in refusal(frames, tmp_path / "out")
+
+
+def test_a_camera_that_only_turns(tmp_path: Path) -> None:
+    turn = [cv2.Rodrigues(np.array([0.0, 0.05 * i, 0.0]))[0] for i in range(7)]
+    still = look_at((0.0, -0.3, -3.0))
+    cameras = []
+    for rotation in turn:
+        pose = still.copy()
+        pose[:3] = rotation @ pose[:3]
+        cameras.append(Camera(*SIZE, 288, 288, 160, 120, pose))
+    assert "parallax" in refusal(shoot(tmp_path / "frames", cameras), tmp_path / "out")
+
+
+def test_frames_that_share_nothing(tmp_path: Path) -> None:
+    folder = tmp_path / "frames"
+    folder.mkdir()
+    for i in range(4):
+        cv2.imwrite(str(folder / f"{i}.png"), cv2.resize(texture(100 + i), SIZE))
+    assert "overlap" in refusal(folder, tmp_path / "out")
+
+
+@pytest.mark.parametrize("case", ["absent", "empty", "two", "broken", "text", "own images", "own folder", "theirs",
+                                  "file"])
+def test_nothing_to_solve(tmp_path: Path, case: str) -> None:
+    source, out = tmp_path / "frames", tmp_path / "out"
+    if case not in ("absent", "text"):
+        shoot(source, orbit(2 if case in ("two", "broken") else 4, size=SIZE))
+    if case == "empty":
+        for file in source.iterdir():
+            file.unlink()
+    elif case == "broken":
+        (source / "000.png").write_bytes(b"")
+    elif case == "text":
+        source = tmp_path / "notes.txt"
+        source.write_text("no video")
+    elif case == "own images":
+        source.rename(tmp_path / "images")
+        source, out = tmp_path / "images", tmp_path
+    elif case == "own folder":
+        out = source
+    elif case == "theirs":
+        (out / "sparse" / "0").mkdir(parents=True)
+    elif case == "file":
+        out.write_text("")
+    before = sorted(tmp_path.rglob("*"))
+    with pytest.raises(CaptureError) as caught:
+        solve(source, out, QUICK)
+    assert str(caught.value).endswith(".")
+    assert [path for path in sorted(tmp_path.rglob("*")) if ".solve" not in path.parts and path != out] == [
+        path for path in before if path != out]
+
+
+def test_a_video_that_is_none(tmp_path: Path) -> None:
+    (tmp_path / "shot.mp4").write_bytes(b"no video at all")
+    assert "shot.mp4" in refusal(tmp_path / "shot.mp4", tmp_path / "out")
+
+
+@pytest.mark.parametrize("bad", [{"lens": "PERISCOPE"}, {"frames": -1}, {"matching": "none"}, {"size": 10}])
+def test_bad_settings(bad: dict[str, Any]) -> None:
+    with pytest.raises(CaptureError):
+        SolveSettings(**bad)
+
+
+def test_the_sharpest_of_each_stretch() -> None:
+    assert choose([1, 5, 2, 9, 1, 1, 3, 4], 4) == [1, 3, 4, 7]
+    assert choose([1, 2, 3], 0) == choose([1, 2, 3], 9) == [0, 1, 2]
+
+
+def test_pairs() -> None:
+    rng = np.random.default_rng(0)
+    places = rng.integers(0, 256, (5, 300, 128)).astype(np.uint8)  # five places, visited again and again
+    def descriptors(i: int) -> NDArray[np.uint8]:
+        noise = rng.integers(-8, 9, (300, 128))
+        return np.clip(places[i % 5].astype(int) + noise, 0, 255).astype(np.uint8)
+
+    assert choose_matching("auto", 20, False) == "exhaustive" and choose_matching("auto", 500, False) == "similar"
+    assert choose_matching("auto", 20, True) == "sequential"
+    assert len(choose_pairs("exhaustive", 20, descriptors)) == 190
+    pairs = choose_pairs("sequential", 60, descriptors)
+    assert all(0 <= i < j < 60 for i, j in pairs) and len(pairs) == len(set(pairs)) < 900
+    assert {(i, i + 1) for i in range(59)} <= set(pairs)
+    loops = [(i, j) for i, j in pairs if j - i > 16 and j - i not in (32,)]
+    assert len(loops) > 40 and np.mean([(j - i) % 5 == 0 for i, j in loops]) > 0.9
+
+
+def test_masks_leave_out_clipped_pixels_and_ghost_lines() -> None:
+    pixels = np.full((240, 320, 3), 0.4, np.float32)
+    cv2.circle(pixels, (60, 50), 8, (1.0, 1.0, 1.0), -1)
+    pixels[200, 300] = 1.0  # sparkle
+    free = usable(Picture(pixels, "srgb"))
+    assert not free[50, 60] and not free[50, 69] and free[200, 300]
+    assert not free[120, 160] and not free[190, 260]  # the line through the middle, and its far side
+    assert free[50, 260] and free[190, 60] and free.mean() > 0.85
+    pixels[30:120, 150:300] = 1.0  # a bright wall clips but casts no line
+    assert usable(Picture(pixels, "srgb"))[230, 60]
+
+
+def test_up() -> None:
+    rng = np.random.default_rng(0)
+    up = np.array([0.2, -0.9, 0.3])
+    up /= np.linalg.norm(up)
+    rotations = []
+    for _ in range(20):
+        ahead = rng.normal(size=3)
+        ahead += (0.4 * rng.normal() - ahead @ up) * up  # anywhere round, a little up or down
+        ahead /= np.linalg.norm(ahead)
+        right = np.cross(ahead, up)
+        right /= np.linalg.norm(right)
+        rotations.append(cv2.Rodrigues(rng.normal(0, 0.02, 3))[0] @ np.stack([right, np.cross(ahead, right), ahead]))
+    assert up_direction(rotations) @ up > 0.999
+    assert up_direction(rotations[:1] * 5) @ -rotations[0][1] > 0.9  # all look one way: the frames' own up
+
+
+def test_models_are_written_as_read(tmp_path: Path) -> None:
+    import pycolmap
+
+    lens = Lens("OPENCV", (50.0, 51.0, 32.0, 24.0, 0.1, 0.01, 0.0, 0.001), 64, 48)
+    rng = np.random.default_rng(0)
+    cloud = PointCloud(rng.normal(size=(5, 3)).astype(np.float32), rng.integers(0, 256, (5, 3)).astype(np.uint8),
+                       rng.uniform(size=5).astype(np.float32))
+    poses = [rotated(rng) for _ in range(3)]
+    frames = [Observed(f"ä {i}.png", lens, pose, rng.uniform(0, 48, (3, 2)), np.array([0, 2, 4]))
+              for i, pose in enumerate(poses)]
+    write_model(tmp_path, frames, cloud)
+    posed, again = read_model(tmp_path)
+    for one, frame in zip(posed, frames, strict=True):
+        assert one.name == frame.name and one.lens.params == lens.params
+        np.testing.assert_allclose(one.world_to_camera, frame.world_to_camera, atol=1e-12)
+    np.testing.assert_array_equal(again.xyz, cloud.xyz)
+    np.testing.assert_array_equal(again.rgb, cloud.rgb)
+    theirs = pycolmap.Reconstruction(str(tmp_path))
+    assert theirs.num_reg_images() == 3 and theirs.points3D[3].track.length() == 3
+    assert theirs.images[2].points2D[1].point3D_id == 3
+
+
+def rotated(rng: np.random.Generator) -> NDArray[np.float64]:
+    pose = np.eye(4)
+    pose[:3, :3] = cv2.Rodrigues(rng.normal(size=3) * 2)[0]
+    pose[:3, 3] = rng.normal(size=3)
+    return pose
+
+
+def test_quaternions() -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        rotation = rotated(rng)[:3, :3]
+        np.testing.assert_allclose(rotation_from_quaternion(quaternion_from_rotation(rotation)), rotation, atol=1e-12)
+    for axis in np.eye(3):  # half turns
+        rotation = 2 * np.outer(axis, axis) - np.eye(3)
+        np.testing.assert_allclose(rotation_from_quaternion(quaternion_from_rotation(rotation)), rotation, atol=1e-12)
+
+
+def exif(order: str, orientation: int, focal: int) -> bytes:
+    """A JPEG's Exif segment with orientation and 35 mm focal length."""
+    sign = "little" if order == "II" else "big"
+
+    def number(value: int, size: int) -> bytes:
+        return value.to_bytes(size, sign)
+
+    def entry(tag: int, kind: int, value: int) -> bytes:
+        return number(tag, 2) + number(kind, 2) + number(1, 4) + (number(value, 2) + b"\0\0" if kind == 3 else
+                                                                  number(value, 4))
+
+    block = order.encode() + number(42, 2) + number(8, 4)
+    block += number(2, 2) + entry(0x0112, 3, orientation) + entry(0x8769, 4, 38) + number(0, 4)
+    block += number(1, 2) + entry(0xA405, 3, focal) + number(0, 4)
+    return b"\xff\xe1" + (len(block) + 8).to_bytes(2, "big") + b"Exif\0\0" + block
+
+
+@pytest.mark.parametrize("order", ["II", "MM"])
+def test_exif(tmp_path: Path, order: str) -> None:
+    _, data = cv2.imencode(".jpg", np.zeros((8, 8, 3), np.uint8))
+    raw = data.tobytes()
+    (tmp_path / "a.jpg").write_bytes(raw[:2] + exif(order, 6, 27) + raw[2:])
+    assert read_exif(tmp_path / "a.jpg") == (6, 0.75)
+    (tmp_path / "b.jpg").write_bytes(raw)
+    assert read_exif(tmp_path / "b.jpg") == (1, None)
+    (tmp_path / "c.jpg").write_bytes(raw[:2] + exif(order, 6, 27)[:40])
+    assert read_exif(tmp_path / "c.jpg") == (1, None)
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_upright(orientation: int) -> None:
+    """As OpenCV turns a JPEG of that orientation."""
+    picture = np.zeros((16, 24, 3), np.uint8)
+    picture[:8, :8], picture[8:, 16:] = (255, 0, 0), (0, 255, 0)
+    _, data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 100])
+    raw = data.tobytes()
+    turned = cv2.imdecode(np.frombuffer(raw[:2] + exif("MM", orientation, 27) + raw[2:], np.uint8), cv2.IMREAD_COLOR)
+    plain = cv2.imdecode(data, cv2.IMREAD_COLOR)
+    ours = upright(Picture(plain.astype(np.float32), "srgb"), orientation)
+    np.testing.assert_array_equal(ours.pixels, turned)

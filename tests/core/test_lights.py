@@ -173,7 +173,7 @@ class TestGather:
         detections = scene([(0.2, -0.3, 0.1)], cameras, clutter=0)
         detections[2:] = [[] for _ in detections[2:]]
         assert not gather(named(cameras), detections, EXTENT)
-        (light,) = gather(named(cameras), detections, EXTENT, GatherSettings(min_views=2, accidents=1))
+        (light,) = gather(named(cameras), detections, EXTENT, GatherSettings(min_views=2, accidents=1, min_share=0))
         assert light.support == ("0000.png", "0001.png")
 
     def test_one_lamp_found_twice_is_one(self) -> None:

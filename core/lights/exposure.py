@@ -86,13 +86,16 @@ def _core(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def _attached(core: NDArray[np.bool_], whole: NDArray[np.bool_]) -> float:
-    """The share of the core's rim at which the clipped region goes on: high for a patch cut out of a surface."""
+    """The share of a ring half the core's radius outside it in which the clipped region goes on: high for a patch cut
+    out of a surface, low past the short spikes of a star or beside a bracket."""
     import cv2
 
-    padded = np.pad(core, 3).astype(np.uint8)
-    inner = cv2.dilate(padded, np.ones((3, 3), np.uint8))
-    rim = (cv2.dilate(inner, np.ones((3, 3), np.uint8)) > 0) & (inner == 0)
-    return float(np.pad(whole, 3)[rim].mean())
+    radius = float(np.sqrt(core.sum() / np.pi))
+    room = 3 + int(radius)
+    away: Any = cv2.distanceTransform(1 - np.pad(core, room).astype(np.uint8), cv2.DIST_L2, 5)
+    middle = max(1.5, 0.5 * radius)
+    ring = (away > middle - 1) & (away <= middle + 1)
+    return float(np.pad(whole, room)[ring].mean())
 
 
 def _step(value: float, low: float, high: float) -> float:

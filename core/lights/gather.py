@@ -123,7 +123,7 @@ def gather(views: Sequence[tuple[str, Camera]], detections: Sequence[Sequence[De
         if light.accidents <= settings.accidents and len(light.support) >= settings.min_share * light.visible:
             found.append(light)
             failures = 0
-    return merged(found, views, extent)
+    return without_ghosts(merged(found, views, extent), views)
 
 
 def _sightings(views: Sequence[tuple[str, Camera]], detections: Sequence[Sequence[Detection]],
@@ -337,6 +337,36 @@ def merged(lights: Sequence[FoundLight], views: Sequence[tuple[str, Camera]], ex
         else:
             kept.append(light)
     return sorted(kept, key=lambda light: -len(light.support))
+
+
+def without_ghosts(lights: Sequence[FoundLight], views: Sequence[tuple[str, Camera]]) -> list[FoundLight]:
+    """Without those that are ghosts of a better supported light: in every frame at the same share mu of the way from
+    the principal point p to that light l, g = p + mu (l - p), while l moves over the frame."""
+    kept: list[FoundLight] = []
+    cameras = dict(views)
+    for light in sorted(lights, key=lambda light: -len(light.support)):
+        if not any(_is_ghost(light, other, cameras) for other in kept):
+            kept.append(light)
+    return kept
+
+
+def _is_ghost(light: FoundLight, other: FoundLight, cameras: dict[str, Camera]) -> bool:
+    ghost, source, allowed = [], [], []
+    for name, detection in light.detections:
+        camera = cameras[name]
+        pixel, depth = camera.project(other.xyz[None])
+        if depth[0] > 0:
+            centre = np.array([camera.cx, camera.cy])
+            ghost.append(detection.xy - centre)
+            source.append(pixel[0] - centre)
+            allowed.append(0.006 * float(np.hypot(*camera.size)) + 0.25 * detection.radius)
+    if len(ghost) < 3:
+        return False
+    g, s = np.array(ghost), np.array(source)
+    share = float((g * s).sum() / (s * s).sum())
+    off = np.linalg.norm(g - share * s, axis=1) / allowed
+    moved = float(np.linalg.norm(np.ptp(g, axis=0))) / float(np.median(allowed))
+    return bool(np.median(off) < 1 and moved > 8 and abs(share - 1) > 0.05)
 
 
 def _same(light: FoundLight, other: FoundLight, views: Sequence[tuple[str, Camera]], extent: float) -> bool:

@@ -14,6 +14,7 @@ from core.capture import Camera, Capture
 from core.errors import CaptureError, EngineError, SettingsError
 from core.lights import Detection, Exposure, GatherSettings, detector_for, find_lights, gather, record, union
 from core.lights.file import write_lights
+from core.lights.gather import FoundLight, without_ghosts
 from core.lights.ghosts import find_blobs, gather_ghosts
 from core.lights.lifted import lift
 from core.pictures import Picture, srgb_from_linear
@@ -69,6 +70,16 @@ class TestExposure:
         cv2.line(scene, (150, 100), (150, 70), (20.0, 20.0, 20.0), 1)
         (found,) = Exposure().detect(stored(scene))
         assert np.linalg.norm(found.xy - (150, 100)) < 2
+
+    def test_a_starburst(self) -> None:
+        scene = with_disc(backdrop(), (150, 100), 9)
+        for angle in np.linspace(0, 2 * np.pi, 8, endpoint=False):
+            base = np.array([-np.sin(angle), np.cos(angle)]) * 2.5
+            tip = (np.array([np.cos(angle), np.sin(angle)]) * 17, base, -base)
+            cv2.fillPoly(scene, [np.round([np.array([150, 100]) + point for point in tip]).astype(np.int32)],
+                         (20.0, 20.0, 20.0))
+        (found,) = Exposure().detect(stored(scene))
+        assert np.linalg.norm(found.xy - (150, 100)) < 1
 
     def test_a_lamp_at_the_edge_is_said_to_be_cut(self) -> None:
         (found,) = Exposure(0.1).detect(stored(with_disc(backdrop(), (160, 2), 8)))
@@ -182,6 +193,21 @@ class TestGather:
         detections = [[spot(camera.project([(0.2, -0.3, 0.1)])[0][0], 8.0),
                        spot(camera.project([(0.24, -0.3, 0.1)])[0][0], 8.0)] for camera in cameras]
         assert len(gather(named(cameras), detections, EXTENT)) == 1
+
+    @pytest.mark.parametrize("share", [0.75, -0.5, 1.0])
+    def test_a_ghost_of_a_light_is_no_light(self, share: float) -> None:
+        """Spots that follow a light at a fixed share of the way to it; a second light beside it (share 1) stays."""
+        views = named(turning(20))
+        light, beside = np.array((0.4, -0.5, 0.3)), np.array((0.9, -0.2, -0.4))
+        follows = []
+        for name, camera in views:
+            centre = np.array([camera.cx, camera.cy])
+            pixel = camera.project([light if share != 1 else beside])[0][0]
+            follows.append((name, spot(centre + share * (pixel - centre))))
+        real = FoundLight(light, False, tuple(name for name, _ in views), 20, 0.5, 0.01, np.ones(3), 3.0)
+        other = FoundLight(beside, False, tuple(name for name, _ in views[:15]), 20, 2.0, 0.01, np.ones(3), 3.0,
+                           detections=tuple(follows[:15]))
+        assert without_ghosts([other, real], views) == ([real, other] if share == 1 else [real])
 
     def test_the_same_seed_gives_the_same_lights(self) -> None:
         cameras = orbit(20, size=SIZE)

@@ -144,7 +144,7 @@ def preset(name: Preset, *, model: Literal["paper", "ours"] | None = None, mode:
     `model` and `blend` choose another form: the paper's covers in display space, ours adds in linear light
     and is hidden by the scene.
     """
-    lengths = {"draft": 1000, "standard": 3000, "high": 10000, "paper": 30000}
+    lengths = {"draft": 1500, "standard": 3000, "high": 10000, "paper": 30000}
     if name not in lengths:
         raise SettingsError(f"There is no preset {name!r}; choose {', '.join(lengths)}.")
     length = lengths[name] if iterations is None else iterations

@@ -25,8 +25,8 @@ def arguments(parser: argparse.ArgumentParser) -> None:
                         help="another capture than the sample")
     parser.add_argument("--model", choices=fit.MODELS, help="the flare's form, as of `fit`")
     parser.add_argument("--iterations", type=int, metavar="N", help="length of the fit (default: the preset's)")
-    parser.add_argument("--preset", choices=("draft", "standard", "high"), default="standard",
-                        help="how long and how fine (default standard)")
+    parser.add_argument("--preset", choices=("draft", "standard", "high"), default="draft",
+                        help="how long and how fine (default draft)")
 
 
 def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:

@@ -53,7 +53,7 @@ def visible_share(scene: SceneGaussians, camera: Tensor, light: Tensor, settings
     intrinsics = torch.tensor([[focal, 0, half], [0, focal, half], [0, 0, 1]])
     alpha = rasterization(scene.means[chosen], scene.quaternions[chosen], scene.log_scales[chosen].exp(),
                           scene.opacity_logits[chosen].sigmoid(), scene.sh[chosen, :1], pose, intrinsics, size, size,
-                          near=1e-3 * distance, kernels=kernels).alpha
+                          near=1e-3 * distance, depth=False, kernels=kernels).alpha
     offset = torch.arange(size) + 0.5 - half
     window = torch.exp(-0.5 * (offset / (half / 2)) ** 2)
     weights = window[:, None] * window

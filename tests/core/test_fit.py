@@ -48,9 +48,10 @@ def quick(iterations: int = 40, **changes: Any) -> FitSettings:
     Without occlusion: in this capture the light shines through whatever stands before it.
     """
     settings = preset("draft", iterations=iterations)
-    return changed(settings, {"flare.count": 60, "holdout": 4, "preview_every": 15, "flare.density.start": 10,
-                              "flare.density.every": 10, "flare.density.stop": 30, "scene.classic.start": 5,
-                              "scene.classic.every": 10, "flare.occlusion": False, "scene.reorder_every": 12, "scene.sh_every": 8, **changes})
+    return changed(settings, {
+        "flare.count": 60, "flare.occlusion": False, "holdout": 4, "preview_every": 15, "flare.density.start": 10,
+        "flare.density.every": 10, "flare.density.stop": 30, "scene.classic.start": 5, "scene.classic.every": 10,
+        "scene.reorder_every": 12, "scene.sh_every": 8, **changes})
 
 
 class StopAt(Progress):

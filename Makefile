@@ -3,10 +3,14 @@
 PYTHON ?= python3.11
 PIP = -m pip --disable-pip-version-check --quiet
 
-.PHONY: demo test check setup package clean
+.PHONY: demo pictures test check setup package clean
 
 demo: .venv/.ready
 	.venv/bin/python headless/run.py demo
+
+# The pictures of the README, from the demo.
+pictures: demo
+	.venv/bin/python -c "import cv2; cv2.imwrite('docs/contact_sheet.jpg', cv2.imread('build/demo/contact_sheet.png'), [cv2.IMWRITE_JPEG_QUALITY, 88])"
 
 test: setup check
 	.venv/bin/python -m pytest

@@ -25,6 +25,7 @@ from .detection import Detection
 
 FAR = 1000.0      # distance of a far light, in extents of the cameras' path
 STEPS = 20
+PAIRS = 60000     # of rays tested for meeting
 PATIENCE = 6      # places of too few views in a row, after which there is nothing left
 
 
@@ -33,14 +34,16 @@ class GatherSettings:
     """tolerance: of a projection, as a share of the frame's diagonal, to which half the source's radius is added;
     min_views: fewer do not make a light; accidents: as many expected by chance are allowed at most;
     min_share: of the views that have its place in frame, hidden or not, so many must show a light;
-    most: lights at most. tries: pairs of detections tried, all of them where there are fewer; seed: of their choice."""
+    anywhere: a light may be seen out of frame too, as ghosts claim it; most: lights at most;
+    tries: places tried, each where a pair of rays meets, all of them where there are fewer; seed: of their choice."""
 
     tolerance: float = 0.006
     min_views: int = 3
     accidents: float = 0.02
     min_share: float = 0.15
+    anywhere: bool = False
     most: int = 32
-    tries: int = 4000
+    tries: int = 3000
     seed: int = 0
 
 
@@ -118,7 +121,7 @@ def gather(views: Sequence[tuple[str, Camera]], detections: Sequence[Sequence[De
             open_[_near(seen, place, open_)] = False  # spent, or the search would find it for ever
             failures += 1
             continue
-        light = _light(seen, place, inliers, covariance, extent)
+        light = _light(seen, place, inliers, covariance, extent, settings.anywhere)
         open_[inliers] = False
         if light.accidents <= settings.accidents and len(light.support) >= settings.min_share * light.visible:
             found.append(light)
@@ -150,11 +153,16 @@ def _best(seen: _Sightings, open_: NDArray[np.bool_], rng: np.random.Generator, 
     first, second = first[apart], second[apart]
     if not len(first):
         return None
-    if len(first) > tries:
+    if len(first) > PAIRS:
         worth = seen.worth[first] * seen.worth[second]
-        chosen = rng.choice(len(first), tries, replace=False, p=worth / worth.sum())
+        chosen = rng.choice(len(first), PAIRS, replace=False, p=worth / worth.sum())
         first, second = first[chosen], second[chosen]
     places = np.concatenate([_crossing(seen, first, second), _direction(seen, first, second)])
+    first, second = np.tile(first, 2), np.tile(second, 2)
+    meet = np.flatnonzero(_on(seen, places, first) & _on(seen, places, second))
+    if len(meet) > tries:
+        meet = rng.choice(meet, tries, replace=False)
+    places = places[meet]
     best, value = None, 0.0
     for at in range(0, len(places), 512):
         some = places[at:at + 512]
@@ -163,6 +171,15 @@ def _best(seen: _Sightings, open_: NDArray[np.bool_], rng: np.random.Generator, 
         if value_of[top] > value:
             best, value = some[top], float(value_of[top])
     return best
+
+
+def _on(seen: _Sightings, places: Floats, index: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Whether each place (n, 4) falls on the detection of the same row, within its tolerance."""
+    view = seen.view[index]
+    local = np.einsum("nij,nj->ni", seen.rotation[view], places[:, :3] - places[:, 3:] * seen.position[view])
+    front = local[:, 2] > 1e-9
+    pixel = local[:, :2] / np.where(front, local[:, 2], 1.0)[:, None] * seen.focal[view] + seen.centre[view]
+    return np.asarray(front & (((pixel - seen.pixel[index]) ** 2).sum(axis=1) < seen.tolerance[index] ** 2))
 
 
 def _crossing(seen: _Sightings, first: NDArray[np.int64], second: NDArray[np.int64]) -> Floats:
@@ -282,8 +299,8 @@ def _across(direction: Floats) -> Floats:
     return np.stack([first, np.cross(direction, first)], axis=1)
 
 
-def _light(seen: _Sightings, place: Floats, inliers: NDArray[np.int64], covariance: Floats,
-           extent: float) -> FoundLight:
+def _light(seen: _Sightings, place: Floats, inliers: NDArray[np.int64], covariance: Floats, extent: float,
+           anywhere: bool) -> FoundLight:
     view = seen.view[inliers]
     middle = seen.position[view].mean(axis=0)
     offset = place[:3] - place[3] * middle
@@ -300,7 +317,7 @@ def _light(seen: _Sightings, place: Floats, inliers: NDArray[np.int64], covarian
         uncertainty = max(spread / inverse ** 2, angle / inverse)
     homogeneous = np.array([[*(direction if far else xyz), 0.0 if far else 1.0]])
     pixels, front = seen.project(homogeneous)
-    in_frame = front[0] & (pixels[0] >= 0).all(axis=1) & (pixels[0] <= seen.size).all(axis=1)
+    in_frame = front[0] & (anywhere | ((pixels[0] >= 0) & (pixels[0] <= seen.size)).all(axis=1))
     off = np.linalg.norm(pixels[0, view] - seen.pixel[inliers], axis=1)
     colours = np.array([seen.detection[i].colour for i in inliers])
     colour = np.median(colours, axis=0)

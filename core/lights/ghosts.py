@@ -23,8 +23,8 @@ from .detection import Detection
 from .gather import FoundLight, GatherSettings, gather
 
 SHARES = -np.exp(np.linspace(np.log(0.12), np.log(2.5), 28))
-MIN_VIEWS, MIN_SHARE = 6, 0.35
-MOVES = 0.05  # of the diagonal; what keeps its place in the frame is dirt, not a ghost
+MIN_VIEWS, MIN_SHARE, ACCIDENTS = 6, 0.35, 1e-6  # see GatherSettings; blobs of one scene are no independent accidents
+MOVES = 0.01  # of the diagonal; what keeps its place in the frame is dirt, not a ghost
 BLOBS = 20  # a picture; the strongest
 
 
@@ -104,11 +104,18 @@ def _with_share(views: Sequence[tuple[str, Camera]], blobs: Sequence[Sequence[Bl
         claims.append([Detection(centre + (blob.xy - centre) / share, 0.02 * diagonal / abs(share), 1.0,
                                  np.ones(3), np.ones((1, 1), bool), (0, 0), False) for blob in some
                        if not camera.contains([centre + (blob.xy - centre) / share])[0]])
-    settings = GatherSettings(tolerance=0.0, min_views=MIN_VIEWS, min_share=0.0, most=2, tries=1200, seed=seed)
+    settings = GatherSettings(tolerance=0.0, min_views=MIN_VIEWS, accidents=ACCIDENTS / len(SHARES),
+                              min_share=MIN_SHARE, anywhere=True, most=2, tries=1000, seed=seed)
     diagonal = float(np.hypot(*views[0][1].size))
     for light in gather(views, claims, extent, settings):
         moved = np.ptp([one.xy * share for _, one in light.detections], axis=0).max()
-        if (len(light.support) >= MIN_SHARE * len(views) and light.visible - len(light.support) < 0.2 * len(views)
-                and moved > MOVES * diagonal):
+        if sum(_well_inside(camera, light.xyz) for _, camera in views) < 0.2 * len(views) and moved > MOVES * diagonal:
             return light
     return None
+
+
+def _well_inside(camera: Camera, xyz: NDArray[np.float64]) -> bool:
+    """Whether a light is so far inside the frame that it would be seen itself."""
+    pixels, depth = camera.project(xyz[None])
+    margin = 0.05 * float(np.hypot(*camera.size))
+    return bool(depth[0] > 0 and (pixels[0] > margin).all() and (pixels[0] < np.array(camera.size) - margin).all())

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 DEFAULT_FOCAL = 1.2  # of the long side, where the file does not tell; COLMAP's own guess
 ENOUGH = 20          # frames from which a principal point can be told from a turn of the cameras
 OFF_CENTRE = 0.015   # of the long side; a principal point further from the middle is an artefact
+PLAIN = 800          # corners below which a frame has too little texture for the usual threshold of features
 MATCHES = 15         # verified ones from which two frames count as matched
 MOVED = 1.0          # pixels of the small pictures; less is no motion
 
@@ -132,7 +133,7 @@ def _extract(pycolmap: Any, shots: Sequence[Shot], work: Path, database: Path, s
                 if db.num_keypoints_for_image(image.image_id) or db.exists_descriptors(image.image_id)}
         cameras: dict[tuple[int, int, float | None], int] = {}
         known = {(c.width, c.height, round(c.params[0], 6)): c.camera_id for c in db.read_all_cameras()}
-        groups: dict[int, list[str]] = {}
+        groups: dict[tuple[int, bool], list[str]] = {}
         for shot in shots:
             key = (shot.width, shot.height, shot.focal)
             if key not in cameras:
@@ -141,7 +142,7 @@ def _extract(pycolmap: Any, shots: Sequence[Shot], work: Path, database: Path, s
                 cameras[key] = known.get(mark) or db.write_camera(camera)
                 known[mark] = cameras[key]
             if shot.name not in done:
-                groups.setdefault(cameras[key], []).append(shot.name)
+                groups.setdefault((cameras[key], _is_plain(work / "small" / shot.name)), []).append(shot.name)
     progress.stage("find features", len(shots), len(done))
     options = pycolmap.FeatureExtractionOptions()
     options.sift.max_num_features = settings.features
@@ -149,13 +150,24 @@ def _extract(pycolmap: Any, shots: Sequence[Shot], work: Path, database: Path, s
     reader = pycolmap.ImageReaderOptions()
     if settings.mask:
         reader.mask_path = str(work / "masks")
-    for camera_id, names in groups.items():
+    usual = options.sift.peak_threshold
+    for (camera_id, plain), names in groups.items():
         reader.existing_camera_id = camera_id
+        # Walls and skies: weak features are better than none.
+        options.sift.peak_threshold = 0.4 * usual if plain else usual
         for at in range(0, len(names), 8):
             pycolmap.extract_features(database, work / "small", image_names=names[at:at + 8],
                                       camera_mode=pycolmap.CameraMode.SINGLE, reader_options=reader,
                                       extraction_options=options, device=pycolmap.Device.cpu)
             progress.advance(len(names[at:at + 8]))
+
+
+def _is_plain(small: Path) -> bool:
+    """Whether a picture has little texture, by a quick count of corners."""
+    import cv2
+
+    grey = cv2.imread(str(small), cv2.IMREAD_GRAYSCALE)
+    return grey is not None and len(cv2.FastFeatureDetector.create(12).detect(grey)) < PLAIN
 
 
 def _camera(pycolmap: Any, size: tuple[int, int], focal: float | None, model: str) -> Any:

@@ -1,0 +1,59 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The commands `solve` and `lights`, as scripts start them."""
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from core.capture import Capture
+from tests.core.captures import orbit
+from tests.core.test_lights import lit_capture
+from tests.core.test_solve import SIZE, shoot
+
+RUN = Path(__file__).resolve().parents[2] / "headless" / "run.py"
+
+
+def run(*words: object) -> tuple[int, list[dict[str, Any]]]:
+    """Exit status and events."""
+    done = subprocess.run([sys.executable, str(RUN), *map(str, words), "--progress", "json"], capture_output=True,
+                          text=True, check=False)
+    return done.returncode, [json.loads(line) for line in done.stdout.splitlines()]
+
+
+def test_from_frames_to_lights(tmp_path: Path) -> None:
+    frames = shoot(tmp_path / "frames", orbit(9, size=SIZE, arc=0.9))
+    status, events = run("solve", frames, "--out", tmp_path / "c")
+    assert status == 0 and events[-1]["data"]["registered"] == 9
+    stages = [event["name"] for event in events if event["type"] == "stage"]
+    assert stages == ["read frames", "find features", "match frames", "place cameras", "write frames"]
+    status, events = run("lights", tmp_path / "c")
+    assert status == 0 and events[-1]["data"]["lights"] == []
+    assert any("No light was found" in event["text"] for event in events if event["type"] == "say")
+
+
+def test_lights_and_keep(tmp_path: Path) -> None:
+    folder = lit_capture(tmp_path / "c", 8, [(0.4, -0.5, 0.3)])
+    status, events = run("lights", folder)
+    (light,) = events[-1]["data"]["lights"]
+    assert status == 0 and light["support"] == 8 and Path(events[-1]["data"]["sheets"][0]).is_file()
+    file = folder / "lights.json"
+    data = json.loads(file.read_text())
+    data["lights"][0]["name"] = "lamp"
+    file.write_text(json.dumps(data))
+    assert run("lights", folder, "--keep")[0] == 0
+    assert [light.name for light in Capture.open(folder).lights] == ["lamp"]
+
+
+@pytest.mark.parametrize("words", [("solve", "nowhere", "--out", "c"), ("lights", "nowhere"),
+                                   ("lights", "nowhere", "--threshold", "3")])
+def test_a_clear_sentence_and_a_status(tmp_path: Path, words: tuple[str, ...]) -> None:
+    rest = [tmp_path / word if word == "c" else word for word in words[2:]]
+    status, events = run(words[0], tmp_path / words[1], *rest)
+    assert status == 1 and [event["type"] for event in events] == ["error"]
+    assert "nowhere" in events[0]["text"] and events[0]["text"].endswith(".")
+    assert not list(tmp_path.iterdir())

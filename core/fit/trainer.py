@@ -68,8 +68,7 @@ class Trainer:
         settings = self.settings
         targets = self.frames.targets(self._view())
         self._set_rates()
-        scene = self.scene.render(targets.camera, sh_degree=self._sh_degree(), depth=False, kernels=settings.kernels,
-                                  depth=False)
+        scene = self.scene.render(targets.camera, sh_degree=self._sh_degree(), depth=False, kernels=settings.kernels)
         flare = render_flare(self.flare, settings.blend, targets.camera, settings.kernels, scene=self.scene,
                              visibility=settings.flare.occluded_by_scene)
         picture = composite(scene.colour, flare, settings.blend)

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Which Gaussians meet which tile, nearest first.
 
-Tiles are 16 pixels wide, one vector, and 32 high. The extent of a Gaussian is that of the ellipse where alpha is
+The extent of a Gaussian is that of the ellipse where alpha is
 1/255, which opacity makes smaller (SnugBox of Hanson et al. 2025, Speedy-Splat). In a column of tiles it meets
 just the pixel rows between the ellipse's lowest and highest point there (as their AccuTile): with X the
-offset of a pixel column from the centre, and the record's A, k, D, C and reach t,
+offset of the column's edge from the centre, and the record's A, k, D, C and reach t (all but k negative),
 
     A (X + k y)² + D y² = t   at   y = (-A k X ± sqrt(C t - A D X²)) / C
 
@@ -22,18 +22,36 @@ import math
 import numpy as np
 
 from .compilation import inlined, kernel
-from .projection import CHUNK, DEPTH, HALF_X, HALF_Y, REACH, RECORD, A, D, K, X, Y
+from .layout import (
+    DEPTH,
+    END_ROW,
+    ENTRY,
+    FIRST_ROW,
+    GAUSSIAN,
+    HALF,
+    HALF_X,
+    HALF_Y,
+    ONE,
+    REACH,
+    RECORD,
+    SLOT,
+    TILE_HEIGHT,
+    TILE_SHIFT_X,
+    TILE_SHIFT_Y,
+    TILE_WIDTH,
+    ZERO,
+    A,
+    D,
+    K,
+    X,
+    Y,
+)
+from .projection import CHUNK
 from .vector import get, opaque, prefetch, take_number
 
-TILE_SHIFT_X, TILE_SHIFT_Y = 4, 5
-TILE_WIDTH, TILE_HEIGHT = 1 << TILE_SHIFT_X, 1 << TILE_SHIFT_Y
-ROW_BITS = TILE_SHIFT_Y
-ROW_MASK = TILE_HEIGHT - 1
-# An entry of a tile: which Gaussian, first row and end row within the tile, slot.
-GAUSSIAN, FIRST_ROW, END_ROW, SLOT, ENTRY = 0, 1, 2, 3, 4
+ROW_BITS, ROW_MASK = TILE_SHIFT_Y, TILE_HEIGHT - 1
 DIGITS = 3
 AHEAD = 8
-HALF, ZERO, ONE = np.float32(0.5), np.float32(0), np.float32(1)
 SLACK = np.float32(0.02)
 """Pixels by which the row range is widened against rounding."""
 

@@ -5,7 +5,7 @@ The definition is `..reference`: plain Gaussians, rings and arcs; "over" in the 
 tiles and moments are those of the scene (`projection`, `binning`), so that plain Gaussians "over" need no
 kernel of their own: they are a scene that is already projected. What else there is, a row at a time:
 
-    r = sqrt(2 ln 2 (A u² + D d_y²))       Mahalanobis distance
+    r = sqrt(-2 ln 2 (A u² + D d_y²))      Mahalanobis distance
     ring      G = 2^-(s (r - r0)²),         s = 1 / (2 ln 2 w²)
     arc       G = G sigmoid(k (c - cos delta)),   c = (d_x cos theta0 + d_y sin theta0) / l,  l² = |d|² + 1/4
     add       picture = sum opacity colour G:   no order, no transmittance; its tiles are sums
@@ -25,32 +25,47 @@ import math
 import numpy as np
 
 from .. import rendering
-from .binning import END_ROW, ENTRY, FIRST_ROW, GAUSSIAN, SLOT, TILE_HEIGHT, TILE_WIDTH
 from .compilation import inlined, kernel
-from .projection import (
+from .layout import (
     ALPHA_MIN,
     BLUE,
     DEPTH,
+    END_ROW,
+    ENTRY,
+    FIRST_ROW,
+    G_ARC_X,
+    G_ARC_Y,
     G_BLUE,
     G_GREEN,
+    G_R0,
     G_RED,
+    G_THETA0,
     G_U,
     G_UU,
     G_UY,
+    G_WIDTH,
     G_Y,
     G_YY,
+    GAUSSIAN,
     GREEN,
+    HALF,
     HALF_X,
     HALF_Y,
     K_REST,
-    MARGIN,
+    ONE,
     OPACITY,
+    OPACITY_MAX,
     REACH,
     RECORD,
     RED,
     RUN,
-    RUN_POWERS,
+    SLOT,
     STEP,
+    TILE_HEIGHT,
+    TILE_SHIFT_X,
+    TILE_SHIFT_Y,
+    TILE_WIDTH,
+    ZERO,
     A,
     D,
     G,
@@ -58,6 +73,7 @@ from .projection import (
     X,
     Y,
 )
+from .projection import MARGIN, RUN_MAX, RUN_POWERS
 from .raster_backward import EDGE, SCRATCH, V_BLUE, V_GREEN, V_RED, load_tile, moments, row_gradient
 from .raster_backward import ROW as ROW_BACKWARD
 from .raster_backward import STATE as STATE_BACKWARD
@@ -65,19 +81,18 @@ from .raster_forward import (
     AHEAD,
     BLUE_PLANE,
     GREEN_PLANE,
-    HALF,
-    ONE,
     PAUSE,
     RED_PLANE,
     ROW,
-    ZERO,
     blend_row,
     falloff,
     finished,
     is_needle,
     needle_offsets,
+    next_entry,
     ratio,
     run_length,
+    start_run,
     start_tile,
     write_tile,
 )
@@ -104,16 +119,12 @@ from .vector import (
 # power of two below which nothing is drawn; ARC: k.
 R0, SHARP, WIDTH, LIMIT, COS0, SIN0, COS_DELTA, ARC = range(8)
 SHAPE = 8
-# Places in a row of gradients after those of the scene.
-G_R0, G_WIDTH, G_ARC_X, G_ARC_Y, G_THETA0, G_COS_DELTA, G_ARC = range(9, 16)
 
 PROFILE_MIN, APEX2 = np.float32(rendering.PROFILE_MIN), np.float32(rendering.ARC_APEX**2)
-OPACITY_MAX = rendering.OPACITY_MAX
 TWO_LN2 = np.float32(2 * math.log(2))
 LOG2_E = np.float32(1 / math.log(2))
 RADIUS_MIN = np.float32(1e-6)
 RADIUS2_MIN = np.float32(1e-12)
-TWO = np.float32(2)
 
 
 # --- records ---------------------------------------------------------------------------------------------
@@ -129,20 +140,25 @@ def _reach(opacity, ring, r0, w, add):
     return r0 + abs(w) * radius if ring else radius
 
 
+@inlined
+def _tiles(centre, half, size, shift):
+    """How many tiles centre - half .. centre + half meets, along one axis."""
+    return (int(min(centre + half, size - 1.0)) >> shift) - (int(max(centre - half, 0.0)) >> shift) + 1
+
+
 @kernel
 def prepare(centres, covariances, opacities, colours, rings, arcs, width, height, add, records, shapes, bounds):
     """Writes record, shape and bound on the number of tiles of each Gaussian; in float64, for needles.
 
     rings, arcs: empty where there are none. Where light adds, the opacity goes into the colour.
     """
-    tiles_x, tiles_y = -(-width // TILE_WIDTH), -(-height // TILE_HEIGHT)
-    half = 0.5 / math.log(2.0)
+    half = -0.5 / math.log(2.0)
     for i in range(opacities.size):
         at = i * RECORD
         xx, xy = np.float64(covariances[3 * i]), np.float64(covariances[3 * i + 1])
         yy = np.float64(covariances[3 * i + 2])
         determinant = xx * yy - xy * xy
-        opacity = np.float64(opacities[i]) if add else min(np.float64(opacities[i]), OPACITY_MAX)
+        opacity = np.float64(opacities[i]) if add else min(np.float64(opacities[i]), rendering.OPACITY_MAX)
         r0, w = (np.float64(rings[2 * i]), np.float64(rings[2 * i + 1])) if rings.size > 0 else (0.0, 1.0)
         reach = _reach(opacity, rings.size > 0, r0, w, add)
         bounds[i] = 0
@@ -159,16 +175,15 @@ def prepare(centres, covariances, opacities, colours, rings, arcs, width, height
         records[at + A], records[at + K], records[at + D] = major, k, minor
         records[at + K_REST] = k - np.float64(records[at + K])
         records[at + OPACITY] = 1.0 if add else opacity
-        records[at + STEP] = math.expm1(-2.0 * bend * math.log(2.0))
-        records[at + RUN] = min(math.sqrt(RUN_POWERS / bend), 1.0 * TILE_HEIGHT)
+        records[at + STEP] = math.expm1(2.0 * bend * math.log(2.0))
+        records[at + RUN] = min(math.sqrt(RUN_POWERS / -bend), np.float64(RUN_MAX))
         records[at + RED], records[at + GREEN] = gain * colours[3 * i], gain * colours[3 * i + 1]
         records[at + BLUE], records[at + DEPTH] = gain * colours[3 * i + 2], 0.0
-        records[at + REACH] = half * reach * reach + MARGIN
+        records[at + REACH] = half * reach * reach - MARGIN
         records[at + HALF_X], records[at + HALF_Y] = half_x, half_y
         _write_shape(shapes, i, r0, w, reach - r0, arcs)
-        columns = (int(min(x + half_x + 0.5, width - 1)) >> 4) - (int(max(x - half_x - 0.5, 0.0)) >> 4) + 1
-        rows = (int(min(y + half_y + 0.5, height - 1)) >> 5) - (int(max(y - half_y - 0.5, 0.0)) >> 5) + 1
-        bounds[i] = min(columns, tiles_x) * min(rows, tiles_y)
+        columns = _tiles(x, half_x + 0.5, width, TILE_SHIFT_X)
+        bounds[i] = columns * _tiles(y, half_y + 0.5, height, TILE_SHIFT_Y)
 
 
 @inlined
@@ -197,7 +212,7 @@ def _start(records, at, left, y):
 def _distance(records, at, u, dy):
     """r, Mahalanobis."""
     power = fma(u * get(records, at + A), u, get(records, at + D) * dy * dy)
-    return sqrt(maximum(power * TWO_LN2, RADIUS2_MIN))
+    return sqrt(maximum(power * -TWO_LN2, RADIUS2_MIN))
 
 
 @inlined
@@ -227,19 +242,23 @@ def _add_row(state, at, e, records, record):
 
 
 @inlined
-def _add_plain(state, records, at, left, top, first, end):
+def _add_plain(state, records, at, left, top, first, end, start):
     """A plain Gaussian, rows first .. end; by the recurrence unless it is a needle (see `raster_forward`)."""
-    step, one, run, row = get(records, at + STEP), opaque(1), run_length(records, at), first
-    needle = is_needle(records, at, end - first)
-    while row < end:
-        u, dy = needle_offsets(records, at, left, top + row)
-        e, r = falloff(records, at, u, dy), ratio(records, at, u, dy)
-        stop = row + 1 if needle else min(row + run, end)
+    step, one = get(records, at + STEP), opaque(1)
+    needle, run = is_needle(records, at, end - first), run_length(records, at)
+    e, r, _ = start
+    row, stop = first, first if needle else min(first + run, end)
+    while True:
         while row < stop:
             _add_row(state, row * ROW, e, records, at)
             e = e * r
             r = fma(r, step, r)
             row += one
+        if row >= end:
+            break
+        u, dy = needle_offsets(records, at, left, top + row)
+        e, r = falloff(records, at, u, dy), ratio(records, at, u, dy)
+        stop = row + 1 if needle else min(row + run, end)
 
 
 @inlined
@@ -267,17 +286,26 @@ def _draw_shaped(state, records, at, shapes, shape, left, top, first, end, arcs,
 
 
 @inlined
-def _draw_tile(entries, begin, end, records, shapes, left, top, state, shaped, arcs, add):
-    """All entries of a tile, or those up to where all pixels are done; returns the end of them."""
+def _draw_plain(entries, begin, end, records, left, top, state):
+    """All entries of a tile, plain Gaussians whose light adds."""
+    if begin == end:
+        return
+    coming = next_entry(entries, begin, end, records, left, top)
+    for e in range(begin, end):
+        at, first, last, start = coming
+        coming = next_entry(entries, e + 1, end, records, left, top)
+        _add_plain(state, records, at, left, top, first, last, start)
+
+
+@inlined
+def _draw_tile(entries, begin, end, records, shapes, left, top, state, arcs, add):
+    """All entries of a tile, rings or arcs, or those up to where all pixels are done; returns the end of them."""
     for e in range(begin, end):
         if not add and (e - begin) & (PAUSE - 1) == PAUSE - 1 and finished(state):
             return e
         i = get(entries, e * ENTRY + GAUSSIAN)
-        at, first, last = i * RECORD, get(entries, e * ENTRY + FIRST_ROW), get(entries, e * ENTRY + END_ROW)
-        if shaped:
-            _draw_shaped(state, records, at, shapes, i * SHAPE, left, top, first, last, arcs, add)
-        else:
-            _add_plain(state, records, at, left, top, first, last)
+        first, last = get(entries, e * ENTRY + FIRST_ROW), get(entries, e * ENTRY + END_ROW)
+        _draw_shaped(state, records, i * RECORD, shapes, i * SHAPE, left, top, first, last, arcs, add)
     return end
 
 
@@ -296,12 +324,12 @@ def raster(
         left, top = (tile % tiles_x) * TILE_WIDTH, (tile // tiles_x) * TILE_HEIGHT
         begin, end = starts[tile], starts[tile + 1]
         start_tile(state, ROW, left, top, width, height)
-        if not shaped:  # noqa: SIM114 - three loops for LLVM to specialise
-            end = _draw_tile(entries, begin, end, records, shapes, left, top, state, shaped, arcs, add)
-        elif add:
-            end = _draw_tile(entries, begin, end, records, shapes, left, top, state, shaped, arcs, add)
+        if not shaped:
+            _draw_plain(entries, begin, end, records, left, top, state)
+        elif add:  # two loops for LLVM to specialise
+            end = _draw_tile(entries, begin, end, records, shapes, left, top, state, arcs, add)
         else:
-            end = _draw_tile(entries, begin, end, records, shapes, left, top, state, shaped, arcs, add)
+            end = _draw_tile(entries, begin, end, records, shapes, left, top, state, arcs, add)
         ends[tile] = end
         write_tile(image, alphas, alphas, alphas, state, left, top, width, height, background, no_depth)
 
@@ -350,15 +378,14 @@ def _needle_backward(state, records, at, left, top, first, end):
 
 
 @inlined
-def _plain_backward(state, records, at, left, top, first, end):
+def _plain_backward(state, records, at, left, top, first, end, start):
     """The same by the recurrence and by three sums a lane (see `raster_backward`)."""
-    step, one, run, row = get(records, at + STEP), opaque(1), run_length(records, at), first
+    step, one, run = get(records, at + STEP), opaque(1), run_length(records, at)
     zero = splat(ZERO)
     m0, m1, m2, colours = zero, zero, zero, (zero, zero, zero)
-    while row < end:
-        u, dy = needle_offsets(records, at, left, top + row)
-        e, r = falloff(records, at, u, dy), ratio(records, at, u, dy)
-        stop = min(row + run, end)
+    e, r, dy = start
+    row, stop = first, min(first + run, end)
+    while True:
         while row < stop:
             g, w = _add_gradient(state, row * ROW_BACKWARD, e, records, at)
             colours = _add_colours(state, row * ROW_BACKWARD, w, colours)
@@ -368,6 +395,10 @@ def _plain_backward(state, records, at, left, top, first, end):
             e = e * r
             r = fma(r, step, r)
             row += one
+        if row >= end:
+            break
+        e, r, dy = start_run(records, at, left, top + row)
+        stop = min(row + run, end)
     mu, my, muu, muy, myy = moments(records, at, left, m0, m1, m2)
     return totals((mu, my, muu, muy, myy, zero, colours[0], colours[1], colours[2]))
 
@@ -425,18 +456,31 @@ def _shaped_backward(state, records, at, shapes, shape, left, top, first, end, a
 
 
 @inlined
-def _tile_backward(entries, begin, used, end, records, shapes, left, top, state, shaped, arcs, add, gradients):
-    for e in range(begin, used):
+def _tile_backward_plain(entries, begin, end, records, left, top, state, gradients):
+    """Plain Gaussians whose light adds."""
+    if begin == end:
+        return
+    coming = next_entry(entries, begin, end, records, left, top)
+    for e in range(begin, end):
+        at, first, last, start = coming
+        coming = next_entry(entries, e + 1, end, records, left, top)
         prefetch(gradients, get(entries, min(e + AHEAD, end - 1) * ENTRY + SLOT) * RECORD)
-        i, slot = get(entries, e * ENTRY + GAUSSIAN), get(entries, e * ENTRY + SLOT)
-        at, first, last = i * RECORD, get(entries, e * ENTRY + FIRST_ROW), get(entries, e * ENTRY + END_ROW)
-        if shaped:
-            row = _shaped_backward(state, records, at, shapes, i * SHAPE, left, top, first, last, arcs, add)
-        elif is_needle(records, at, last - first):
+        if is_needle(records, at, last - first):
             row = _needle_backward(state, records, at, left, top, first, last)
         else:
-            row = _plain_backward(state, records, at, left, top, first, last)
-        store(gradients, slot * RECORD, row)
+            row = _plain_backward(state, records, at, left, top, first, last, start)
+        store(gradients, get(entries, e * ENTRY + SLOT) * RECORD, row)
+
+
+@inlined
+def _tile_backward(entries, begin, used, end, records, shapes, left, top, state, arcs, add, gradients):
+    """Rings or arcs."""
+    for e in range(begin, used):
+        prefetch(gradients, get(entries, min(e + AHEAD, end - 1) * ENTRY + SLOT) * RECORD)
+        i = get(entries, e * ENTRY + GAUSSIAN)
+        first, last = get(entries, e * ENTRY + FIRST_ROW), get(entries, e * ENTRY + END_ROW)
+        row = _shaped_backward(state, records, i * RECORD, shapes, i * SHAPE, left, top, first, last, arcs, add)
+        store(gradients, get(entries, e * ENTRY + SLOT) * RECORD, row)
     for e in range(used, end):
         store(gradients, get(entries, e * ENTRY + SLOT) * RECORD, splat(ZERO))
 
@@ -459,12 +503,12 @@ def raster_backward(
             state, left, top, width, height, background, image, alphas, alphas, d_image, d_alphas, d_alphas,
             no_depth, edge,
         )  # fmt: skip
-        if not shaped:  # noqa: SIM114 - three loops for LLVM to specialise
-            _tile_backward(entries, a, b, c, records, shapes, left, top, state, shaped, arcs, add, gradients)
-        elif add:
-            _tile_backward(entries, a, b, c, records, shapes, left, top, state, shaped, arcs, add, gradients)
+        if not shaped:
+            _tile_backward_plain(entries, a, c, records, left, top, state, gradients)
+        elif add:  # two loops for LLVM to specialise
+            _tile_backward(entries, a, b, c, records, shapes, left, top, state, arcs, add, gradients)
         else:
-            _tile_backward(entries, a, b, c, records, shapes, left, top, state, shaped, arcs, add, gradients)
+            _tile_backward(entries, a, b, c, records, shapes, left, top, state, arcs, add, gradients)
 
 
 @inlined

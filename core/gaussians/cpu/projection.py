@@ -9,10 +9,10 @@ frustum's margin, and V = R Q the Gaussian's axes seen by the camera, the rows o
 Its determinant is |a x b|² + dilation (a² + b²) + dilation²: a sum of squares, without the cancellation that
 xx yy - xy² suffers for needles. For the same reason a record does not hold the conic but its square completed:
 
-    q / (2 ln 2) = A (d_x + k d_y)² + D d_y²,   k = -xy / yy,  A = h yy / det,  D = h / yy,  h = 1 / (2 ln 2)
+    q / (-2 ln 2) = A (d_x + k d_y)² + D d_y²,   k = -xy / yy,  A = h yy / det,  D = h / yy,  h = -1 / (2 ln 2)
 
-so alpha = opacity 2^-(A u² + D d_y²), u = d_x + k d_y. From one pixel row to the next the exponent's second
-difference is -2 C with C = A k² + D; `step` = 2^(-2 C) - 1 and `run` = sqrt(32 / C), the rows over which e falls
+so alpha = opacity 2^(A u² + D d_y²), u = d_x + k d_y. From one pixel row to the next the exponent's second
+difference is 2 C with C = A k² + D; `step` = 2^(2 C) - 1 and `run` = sqrt(-32 / C), the rows over which e falls
 from its peak to 2^-32, serve the recurrence of the rasterizer.
 
 Backward: the rasterizer sends moments of g = dL / d ln alpha over the pixels: sums of g, g u, g d_y, g u²,
@@ -28,6 +28,30 @@ import numpy as np
 from .. import rendering
 from . import spherical_harmonics as harmonics
 from .compilation import inlined, kernel
+from .layout import (
+    ALPHA_MIN,
+    BLUE,
+    G_BLUE,
+    G_DEPTH,
+    G_GREEN,
+    G_RED,
+    G_U,
+    G_UU,
+    G_UY,
+    G_Y,
+    G_YY,
+    GREEN,
+    HALF,
+    ONE,
+    OPACITY_MAX,
+    RECORD,
+    RED,
+    TILE_SHIFT_X,
+    TILE_SHIFT_Y,
+    TWO,
+    ZERO,
+    G,
+)
 from .vector import (
     LANES,
     any_of,
@@ -53,11 +77,6 @@ from .vector import (
     where,
 )
 
-# Places in a record.
-X, Y, A, K, D, OPACITY, STEP, RUN, RED, GREEN, BLUE, DEPTH, REACH, HALF_X, HALF_Y, K_REST = range(16)
-RECORD = 16
-# Places in a row of gradients from the rasterizer.
-G_U, G_Y, G_UU, G_UY, G_YY, G, G_RED, G_GREEN, G_BLUE, G_DEPTH = range(10)
 # Places in the camera's numbers: rotation 0..8, translation 9..11, then
 FX, FY, CX, CY, LOW_X, HIGH_X, LOW_Y, HIGH_Y, POSITION, NEAR, DILATION = 12, 13, 14, 15, 16, 17, 18, 19, 20, 23, 24
 CAMERA = 25
@@ -71,21 +90,17 @@ SCRATCH = TURNED + SQUARE + CAMERA_SUMS * LANES
 
 CHUNK = 1024
 """Gaussians to a piece of work."""
-TILE_WIDTH, TILE_HEIGHT = LANES, 32
-
-H = np.float32(0.5 / math.log(2))
+H = np.float32(-0.5 / math.log(2))
 TWO_LN2 = np.float32(2 * math.log(2))
 LN2 = np.float32(math.log(2))
-OPACITY_MAX, ALPHA_MIN = np.float32(rendering.OPACITY_MAX), np.float32(rendering.ALPHA_MIN)
 ALPHA_MIN_INVERSE = np.float32(1 / rendering.ALPHA_MIN)
 MARGIN = np.float32(1e-4)
 """Added to the reach, a power of two: rounding must not lose a pixel at the rim, where alpha is tested anyway."""
 NORM2_MIN = np.float32(1e-16)
 TINY = np.float32(1e-24)
-ZERO, HALF, ONE, TWO = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
 LARGEST = np.float32(1e30)
-RUN_POWERS, TILE_ROWS = np.float32(32), np.float32(TILE_HEIGHT)
-"""Powers of two by which a recurrence may fall away from its peak, see `raster_forward`."""
+RUN_POWERS, RUN_MAX = np.float32(32), np.float32(32)
+"""Powers of two, and rows, over which a recurrence runs (see `raster_forward`): rounding adds up."""
 
 
 @inlined
@@ -228,10 +243,10 @@ def _store4(array, first, values):
 def _tiles_bound(x, y, half_x, half_y, visible, width, height):
     """How many tiles the box around each Gaussian meets."""
     right, bottom = np.float32(width - 1), np.float32(height - 1)
-    x0 = to_ints(minimum(maximum(x - half_x, ZERO), right)) >> 4
-    x1 = to_ints(minimum(maximum(x + half_x, ZERO), right)) >> 4
-    y0 = to_ints(minimum(maximum(y - half_y, ZERO), bottom)) >> 5
-    y1 = to_ints(minimum(maximum(y + half_y, ZERO), bottom)) >> 5
+    x0 = to_ints(minimum(maximum(x - half_x, ZERO), right)) >> TILE_SHIFT_X
+    x1 = to_ints(minimum(maximum(x + half_x, ZERO), right)) >> TILE_SHIFT_X
+    y0 = to_ints(minimum(maximum(y - half_y, ZERO), bottom)) >> TILE_SHIFT_Y
+    y1 = to_ints(minimum(maximum(y + half_y, ZERO), bottom)) >> TILE_SHIFT_Y
     return where(visible, (x1 - x0 + 1) * (y1 - y0 + 1), 0)
 
 
@@ -286,9 +301,9 @@ def _project_block(
         for i in range(SLOPES):
             store(slopes_out, i * LANES, zero)
     rows = transpose((
-        x, y, major, k, minor, opacity, exp2_less_one(bend * -TWO), minimum(sqrt(RUN_POWERS / bend), TILE_ROWS),
+        x, y, major, k, minor, opacity, exp2_less_one(bend * TWO), minimum(sqrt(RUN_POWERS / -bend), RUN_MAX),
         maximum(red, ZERO), maximum(green, ZERO), maximum(blue, ZERO), pz,
-        reach + MARGIN, half_x, half_y, zero,
+        -(reach + MARGIN), half_x, half_y, zero,
     ))  # fmt: skip
     store_rows(records, first * RECORD, RECORD, rows)
 

@@ -20,27 +20,40 @@ from __future__ import annotations
 
 import numpy as np
 
-from .binning import END_ROW, ENTRY, FIRST_ROW, GAUSSIAN, SLOT, TILE_HEIGHT, TILE_WIDTH
 from .compilation import inlined, kernel
-from .projection import ALPHA_MIN, BLUE, DEPTH, GREEN, OPACITY, RECORD, RED, STEP, K, X
+from .layout import (
+    ALPHA_MIN,
+    BLUE,
+    DEPTH,
+    ENTRY,
+    GREEN,
+    HALF,
+    ONE,
+    OPACITY,
+    RECORD,
+    RED,
+    SLOT,
+    STEP,
+    T_MIN,
+    TILE_HEIGHT,
+    TILE_WIDTH,
+    ZERO,
+    K,
+    X,
+)
 from .raster_forward import (
     AHEAD,
     DEPTH_ALPHA_MIN,
-    HALF,
-    ONE,
-    T_MIN,
     T_PLANE,
-    ZERO,
     falloff,
     is_needle,
     needle_offsets,
-    offsets,
-    ratio,
+    next_entry,
     run_length,
+    start_run,
     start_tile,
 )
 from .vector import (
-    LANES,
     deinterleave,
     fma,
     get,
@@ -56,10 +69,10 @@ from .vector import (
 )
 
 # The state of a tile after T: what is left behind, and the gradients of the pixels.
-S_PLANE, V_RED, V_GREEN, V_BLUE, V_ALPHA, V_DEPTH, MEAN_DEPTH = (i * LANES for i in range(1, 8))
-ROW = 8 * LANES
+S_PLANE, V_RED, V_GREEN, V_BLUE, V_ALPHA, V_DEPTH, MEAN_DEPTH = (i * TILE_WIDTH for i in range(1, 8))
+ROW = 8 * TILE_WIDTH
 STATE = ROW * TILE_HEIGHT
-EDGE = 3 * LANES
+EDGE = 3 * TILE_WIDTH
 SCRATCH = STATE + 6 * EDGE
 
 
@@ -69,8 +82,9 @@ def _load_gradients(
 ):  # fmt: skip
     """One row of pixel gradients, and S before the first Gaussian, for 16 pixels from a flat index on."""
     at = row * ROW
-    colour = deinterleave((load(image, 3 * pixel), load(image, 3 * pixel + 16), load(image, 3 * pixel + 32)))
-    v = deinterleave((load(d_image, 3 * pixel), load(d_image, 3 * pixel + 16), load(d_image, 3 * pixel + 32)))
+    at_colour = 3 * pixel
+    colour = deinterleave((load(image, at_colour), load(image, at_colour + 16), load(image, at_colour + 32)))
+    v = deinterleave((load(d_image, at_colour), load(d_image, at_colour + 16), load(d_image, at_colour + 32)))
     alpha = load(alphas, pixel)
     t = ONE - alpha
     behind = fma(v[0], background[0], fma(v[1], background[1], v[2] * background[2]))
@@ -146,18 +160,15 @@ def moments(records, at, left, m0, m1, m2):
 
 
 @inlined
-def _ordinary(state, records, at, left, top, first, end, with_depth):
+def _ordinary(state, records, at, left, top, first, end, start, with_depth):
     """The same by the recurrence, and by three sums a lane."""
     step, one, run = get(records, at + STEP), opaque(1), run_length(records, at)
     zero = splat(ZERO)
     m0, m1, m2 = zero, zero, zero
     colours = (zero, zero, zero, zero)
-    row = first
-    while row < end:
-        u, dy = offsets(records, at, left, top + row)
-        e = falloff(records, at, u, dy) * get(records, at + OPACITY)
-        r = ratio(records, at, u, dy)
-        stop = min(row + run, end)
+    e, r, dy = start
+    row, stop = first, min(first + run, end)
+    while True:
         while row < stop:
             g, w = row_gradient(state, row * ROW, e, records, at, with_depth)
             colours = _add_colours(state, row * ROW, w, colours, with_depth)
@@ -167,17 +178,21 @@ def _ordinary(state, records, at, left, top, first, end, with_depth):
             e = e * r
             r = fma(r, step, r)
             row += one
+        if row >= end:
+            break
+        e, r, dy = start_run(records, at, left, top + row)
+        stop = min(row + run, end)
     mu, my, muu, muy, myy = moments(records, at, left, m0, m1, m2)
     return mu, my, muu, muy, myy, m0, colours
 
 
 @inlined
-def _gradient_row(state, records, at, left, top, first, end, with_depth):
+def _gradient_row(state, records, at, left, top, first, end, start, with_depth):
     """The row of gradients (see `projection`) of one Gaussian in one tile."""
     if is_needle(records, at, end - first):
         mu, my, muu, muy, myy, m, colours = _needle(state, records, at, left, top, first, end, with_depth)
     else:
-        mu, my, muu, muy, myy, m, colours = _ordinary(state, records, at, left, top, first, end, with_depth)
+        mu, my, muu, muy, myy, m, colours = _ordinary(state, records, at, left, top, first, end, start, with_depth)
     return totals((mu, my, muu, muy, myy, m, colours[0], colours[1], colours[2], colours[3]))
 
 
@@ -206,7 +221,7 @@ def load_tile(
     row, one = 0, opaque(1)
     while row < min(TILE_HEIGHT, height - top):
         pixel = (top + row) * width + left
-        if left + LANES <= width:
+        if left + TILE_WIDTH <= width:
             _load_gradients(
                 state, row, pixel, background, image, alphas, depths, d_image, d_alphas, d_depths, with_depth
             )
@@ -222,13 +237,14 @@ def load_tile(
 
 @inlined
 def _tile_backward(entries, begin, used, end, records, left, top, state, gradients, with_depth):
-    for e in range(begin, used):
-        ahead = min(e + AHEAD, end - 1) * ENTRY
-        prefetch(records, get(entries, ahead + GAUSSIAN) * RECORD)
-        prefetch(gradients, get(entries, ahead + SLOT) * RECORD)
-        at, slot = get(entries, e * ENTRY + GAUSSIAN) * RECORD, get(entries, e * ENTRY + SLOT)
-        first, last = get(entries, e * ENTRY + FIRST_ROW), get(entries, e * ENTRY + END_ROW)
-        store(gradients, slot * RECORD, _gradient_row(state, records, at, left, top, first, last, with_depth))
+    if begin < used:
+        coming = next_entry(entries, begin, end, records, left, top)
+        for e in range(begin, used):
+            at, first, last, start = coming
+            coming = next_entry(entries, e + 1, end, records, left, top)
+            prefetch(gradients, get(entries, min(e + AHEAD, end - 1) * ENTRY + SLOT) * RECORD)
+            row = _gradient_row(state, records, at, left, top, first, last, start, with_depth)
+            store(gradients, get(entries, e * ENTRY + SLOT) * RECORD, row)
     for e in range(used, end):
         store(gradients, get(entries, e * ENTRY + SLOT) * RECORD, splat(ZERO))
 

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Blends Gaussians front to back, tile by tile.
 
-One vector is a row of a tile. For the rows of an entry, with e = opacity 2^-(A u² + D d_y²) (see `projection`):
+One vector is a row of a tile. For the rows of an entry, with e = opacity 2^(A u² + D d_y²) (see `projection`):
 
     alpha = e where e >= 1/255 and T >= 1e-4, else 0
     w = T alpha,   C = C + w colour,   T = T - w
 
 From row to row e follows a recurrence instead of an exponential each: e' = e r, r' = r + r step, where
-r = 2^-(A (2 u k + k²) + D (2 d_y + 1)) and step = 2^(-2 C) - 1, small and exact where rows are many. It starts
+r = 2^(A (2 u k + k²) + D (2 d_y + 1)) and step = 2^(2 C) - 1, small and exact where rows are many. It starts
 anew after `run` rows, over which e changes by 32 powers of two, so that neither its start is lost below the
 smallest float, nor its precision. Where runs would be too short for it (needles), e is computed for each row.
 """
@@ -16,13 +16,39 @@ from __future__ import annotations
 import numpy as np
 
 from .. import rendering
-from .binning import END_ROW, ENTRY, FIRST_ROW, GAUSSIAN, TILE_HEIGHT, TILE_WIDTH
 from .compilation import inlined, kernel
-from .projection import ALPHA_MIN, BLUE, DEPTH, GREEN, K_REST, OPACITY, RECORD, RED, RUN, STEP, A, D, K, X, Y
+from .layout import (
+    ALPHA_MIN,
+    BLUE,
+    DEPTH,
+    END_ROW,
+    ENTRY,
+    FIRST_ROW,
+    GAUSSIAN,
+    GREEN,
+    HALF,
+    K_REST,
+    ONE,
+    OPACITY,
+    RECORD,
+    RED,
+    RUN,
+    STEP,
+    T_MIN,
+    TILE_HEIGHT,
+    TILE_WIDTH,
+    TWO,
+    ZERO,
+    A,
+    D,
+    K,
+    X,
+    Y,
+)
 from .vector import (
-    LANES,
     any_of,
     exp2,
+    exp2_inside,
     fma,
     get,
     interleave,
@@ -37,19 +63,17 @@ from .vector import (
     where,
 )
 
-T_MIN = np.float32(rendering.TRANSMITTANCE_MIN)
 SHORT = 4
 """Rows below which a run is not worth its start."""
 PAUSE = 32
 """Entries between two looks at whether all pixels of the tile are done."""
 AHEAD = 6
 """Entries ahead of which records are asked for."""
-E_MAX = np.float32(126)
-ZERO, HALF, ONE, TWO = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
+POWER_MIN = np.float32(-126)
 DEPTH_ALPHA_MIN = np.float32(rendering.ALPHA_MIN / 2)
 # The state of a tile, row by row: the vectors of a row.
-T_PLANE, RED_PLANE, GREEN_PLANE, BLUE_PLANE, DEPTH_PLANE, MEDIAN_PLANE = (i * LANES for i in range(6))
-ROW = 6 * LANES
+T_PLANE, RED_PLANE, GREEN_PLANE, BLUE_PLANE, DEPTH_PLANE, MEDIAN_PLANE = (i * TILE_WIDTH for i in range(6))
+ROW = 6 * TILE_WIDTH
 STATE = ROW * TILE_HEIGHT
 
 
@@ -71,9 +95,9 @@ def needle_offsets(records, at, left, y):
 
 @inlined
 def falloff(records, at, u, dy):
-    """2^-(A u² + D d_y²); 0 instead of what is below 2^-126."""
+    """2^(A u² + D d_y²); 0 instead of what is below 2^-126."""
     power = fma(u * get(records, at + A), u, get(records, at + D) * dy * dy)
-    return where(power < E_MAX, exp2(-power), ZERO)
+    return where(power > POWER_MIN, exp2_inside(power), ZERO)
 
 
 @inlined
@@ -81,7 +105,7 @@ def ratio(records, at, u, dy):
     """The factor from this row to the next. Its limit only meets rows of zeros."""
     k, slope = get(records, at + K), get(records, at + A) * get(records, at + K)
     constant = slope * k + get(records, at + D) * (TWO * dy + ONE)
-    return exp2(fma(u, -TWO * slope, -constant))
+    return exp2(fma(u, TWO * slope, constant))
 
 
 @inlined
@@ -99,7 +123,7 @@ def is_needle(records, at, rows):
 @inlined
 def start_tile(state, row_length, left, top, width, height):
     """Transmittance 1 in the picture and 0 outside, where nothing needs to be done."""
-    at, line = 0, opaque(LANES)
+    at, line = 0, opaque(TILE_WIDTH)
     while at < row_length * TILE_HEIGHT:
         store(state, at, splat(ZERO))
         at += line
@@ -140,6 +164,24 @@ def blend_row(state, at, e, records, record, with_depth):
 
 
 @inlined
+def start_run(records, at, left, y):
+    """e and r in pixel row y of the tile, and d_y."""
+    u, dy = offsets(records, at, left, y)
+    return falloff(records, at, u, dy) * get(records, at + OPACITY), ratio(records, at, u, dy), dy
+
+
+@inlined
+def next_entry(entries, e, end, records, left, top):
+    """Entry e of the tile: place of its record, rows, and the start of its run. Taken before the one in front of
+    it is drawn, so that the latency of the exponentials passes meanwhile. After the last: the last again."""
+    at_entry = min(e, end - 1) * ENTRY
+    prefetch(records, get(entries, min(e + AHEAD, end - 1) * ENTRY + GAUSSIAN) * RECORD)
+    at = get(entries, at_entry + GAUSSIAN) * RECORD
+    first = get(entries, at_entry + FIRST_ROW)
+    return at, first, get(entries, at_entry + END_ROW), start_run(records, at, left, top + first)
+
+
+@inlined
 def _blend_needle(state, records, at, left, top, first, end, with_depth):
     """One Gaussian over rows first .. end of the tile, an exponential each."""
     row, one = first, opaque(1)
@@ -151,26 +193,27 @@ def _blend_needle(state, records, at, left, top, first, end, with_depth):
 
 
 @inlined
-def _blend(state, records, at, left, top, first, end, with_depth):
+def _blend(state, records, at, left, top, first, end, start, with_depth):
     """The same by the recurrence."""
     step, one, run = get(records, at + STEP), opaque(1), run_length(records, at)
-    row = first
-    while row < end:
-        u, dy = offsets(records, at, left, top + row)
-        e = falloff(records, at, u, dy) * get(records, at + OPACITY)
-        r = ratio(records, at, u, dy)
-        stop = min(row + run, end)
+    e, r, _ = start
+    row, stop = first, min(first + run, end)
+    while True:
         while row < stop:
             blend_row(state, row * ROW, e, records, at, with_depth)
             e = e * r
             r = fma(r, step, r)
             row += one
+        if row >= end:
+            break
+        e, r, _ = start_run(records, at, left, top + row)
+        stop = min(row + run, end)
 
 
 @inlined
 def _copy(source, at, target, to, count):
     """The first `count` of a vector's numbers, or all."""
-    if count >= LANES:
+    if count >= TILE_WIDTH:
         store(target, to, load(source, at))
         return
     lane, one = 0, opaque(1)
@@ -192,12 +235,12 @@ def write_tile(image, alphas, depths, medians, state, left, top, width, height, 
         green = fma(t, get(background, 1), load(state, at + GREEN_PLANE))
         blue = fma(t, get(background, 2), load(state, at + BLUE_PLANE))
         store(state, at + T_PLANE, alpha)
-        store_rows(state, at + RED_PLANE, LANES, interleave((red, green, blue)))
+        store_rows(state, at + RED_PLANE, TILE_WIDTH, interleave((red, green, blue)))
         _copy(state, at + T_PLANE, alphas, pixel, seen)
         third = 0
-        while third < 3 * LANES:
+        while third < 3 * TILE_WIDTH:
             _copy(state, at + RED_PLANE + third, image, 3 * pixel + third, 3 * seen - third)
-            third += one * LANES
+            third += one * TILE_WIDTH
         if with_depth:
             depth = load(state, at + DEPTH_PLANE) / where(alpha > DEPTH_ALPHA_MIN, alpha, DEPTH_ALPHA_MIN)
             store(state, at + DEPTH_PLANE, depth)
@@ -209,16 +252,18 @@ def write_tile(image, alphas, depths, medians, state, left, top, width, height, 
 @inlined
 def _raster_tile(entries, begin, end, records, left, top, state, with_depth):
     """Draws a tile; returns the end of the entries it needed."""
+    if begin == end:
+        return end
+    coming = next_entry(entries, begin, end, records, left, top)
     for e in range(begin, end):
         if (e - begin) & (PAUSE - 1) == PAUSE - 1 and finished(state):
             return e
-        prefetch(records, get(entries, min(e + AHEAD, end - 1) * ENTRY + GAUSSIAN) * RECORD)
-        at = get(entries, e * ENTRY + GAUSSIAN) * RECORD
-        first, last = get(entries, e * ENTRY + FIRST_ROW), get(entries, e * ENTRY + END_ROW)
+        at, first, last, start = coming
+        coming = next_entry(entries, e + 1, end, records, left, top)
         if is_needle(records, at, last - first):
             _blend_needle(state, records, at, left, top, first, last, with_depth)
         else:
-            _blend(state, records, at, left, top, first, last, with_depth)
+            _blend(state, records, at, left, top, first, last, start, with_depth)
     return end
 
 

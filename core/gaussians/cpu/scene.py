@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ..projection import FRUSTUM_MARGIN
 from ..rendering import Rendering
-from . import buffers, projection, raster_backward, raster_forward
+from . import buffers, layout, projection, raster_backward, raster_forward
 from .buffers import Array
 from .threads import parallel
 from .tiles import EMPTY, Grid, bin_gaussians, flat
@@ -53,7 +53,7 @@ class _Rasterize(torch.autograd.Function):
         inputs = [flat(t) for t in (means, quats, scales, opacities, sh)]
         sh_width = sh.shape[1] * 3
         camera = camera_numbers(world_to_camera, intrinsics, frame)
-        records, bounds = buffers.empty((n, projection.RECORD)), buffers.empty(n, np.int32)
+        records, bounds = buffers.empty((n, layout.RECORD)), buffers.empty(n, np.int32)
         centres, radii = buffers.empty_tensor((n, 2)), buffers.empty_tensor((n,))
         blocks = -(-n // LANES) if any(ctx.needs_input_grad) else 0
         slopes = buffers.empty(blocks * LANES * projection.SLOPES)
@@ -91,7 +91,7 @@ class _Rasterize(torch.autograd.Function):
         v_image = buffers.zeros(h * w * 3) if d_image is None else flat(d_image)
         v_alpha = buffers.zeros(h * w) if d_alpha is None else flat(d_alpha)
         v_depth = EMPTY if d_depth is None else flat(d_depth)
-        rows = buffers.empty((bins.slots, projection.RECORD))
+        rows = buffers.empty((bins.slots, layout.RECORD))
         parallel(
             raster_backward.raster_backward, bins.entries, bins.starts, ctx.ends, records.reshape(-1), ctx.behind, w, h,
             frame.tiles_x, flat(image), flat(alpha), flat(depth), v_image, v_alpha, v_depth, rows.reshape(-1),

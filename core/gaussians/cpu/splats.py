@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ..rendering import Splats
-from . import buffers, flare, projection, raster_backward, raster_forward
+from . import buffers, flare, layout, projection, raster_backward, raster_forward
 from .buffers import Array
 from .threads import parallel
 from .tiles import EMPTY, Bins, Grid, bin_gaussians, flat
@@ -33,7 +33,7 @@ class _Splat(torch.autograd.Function):
         shaped = rings is not None or arcs is not None
         inputs = [flat(t) for t in (centres, covariances, opacities, colours)]
         shape_inputs = [EMPTY if t is None else flat(t) for t in (rings, arcs)]
-        records, shapes = buffers.empty((n, projection.RECORD)), buffers.empty(n * flare.SHAPE)
+        records, shapes = buffers.empty((n, layout.RECORD)), buffers.empty(n * flare.SHAPE)
         bounds = buffers.empty(n, np.int32)
         flare.prepare(*inputs, *shape_inputs, w, h, add, records.reshape(-1), shapes, bounds)
         bins = _bin(records, bounds, grid)
@@ -64,7 +64,7 @@ class _Splat(torch.autograd.Function):
         h, w = grid.height, grid.width
         v_image = buffers.zeros(h * w * 3) if d_image is None else flat(d_image)
         v_alpha = buffers.zeros(h * w) if d_alpha is None else flat(d_alpha)
-        rows = buffers.empty(bins.slots * projection.RECORD)
+        rows = buffers.empty(bins.slots * layout.RECORD)
         tiles = (bins.entries, bins.starts, ends, records.reshape(-1))
         pictures = (flat(image), flat(alpha))
         shaped = rings is not None or arcs is not None
@@ -80,7 +80,7 @@ class _Splat(torch.autograd.Function):
             )  # fmt: skip
         gradients = [None if t is None else torch.empty(t.shape) for t in inputs]
         flare.finish(
-            np.empty(projection.RECORD, np.float32), flat(covariances), flat(opacities), flat(colours), rows,
+            np.empty(layout.RECORD, np.float32), flat(covariances), flat(opacities), flat(colours), rows,
             bins.firsts, bins.counts, add,
             *(EMPTY if t is None else flat(t) for t in gradients),
         )  # fmt: skip

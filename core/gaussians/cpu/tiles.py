@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from . import binning, buffers
+from . import binning, buffers, layout
 from .buffers import Array
 from .threads import parallel
 
@@ -24,11 +24,11 @@ class Grid:
 
     @property
     def tiles_x(self) -> int:
-        return -(-self.width // binning.TILE_WIDTH)
+        return -(-self.width // layout.TILE_WIDTH)
 
     @property
     def tiles(self) -> int:
-        return self.tiles_x * -(-self.height // binning.TILE_HEIGHT)
+        return self.tiles_x * -(-self.height // layout.TILE_HEIGHT)
 
 
 @dataclass(frozen=True)
@@ -70,6 +70,6 @@ def bin_gaussians(
     starts = np.empty(grid.tiles + 1, np.int64)
     parallel(binning.count, order, m, slots, firsts, counts, numbers)
     binning.deal(numbers, starts)
-    entries = buffers.empty(int(starts[-1]) * binning.ENTRY, np.int32)
+    entries = buffers.empty(int(starts[-1]) * layout.ENTRY, np.int32)
     parallel(binning.scatter, order, m, slots, firsts, counts, numbers, entries)
     return Bins(entries, starts, firsts, counts, room)

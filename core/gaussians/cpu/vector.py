@@ -552,17 +552,20 @@ _EXP2_MAX = np.float32(126.5)
 
 
 @inlined
-def exp2(x):
-    """2^x; below -126 as at -126 (1e-38, not zero), from 126.5 on as there."""
-    x = minimum(maximum(x, _EXP2_MIN), _EXP2_MAX)
+def exp2_inside(x):
+    """2^x for x within -126 .. 126; anything at all outside."""
     rounded = x + _ROUND
     f = x - (rounded - _ROUND)
-    p = fma(f, _EXP2[5], _EXP2[4])
-    p = fma(f, p, _EXP2[3])
-    p = fma(f, p, _EXP2[2])
-    p = fma(f, p, _EXP2[1])
-    p = fma(f, p, _EXP2[0])
+    ff = f * f
+    p = fma(ff, fma(f, _EXP2[5], _EXP2[4]), fma(f, _EXP2[3], _EXP2[2]))
+    p = fma(ff, p, fma(f, _EXP2[1], _EXP2[0]))
     return as_floats(as_ints(p) + (as_ints(rounded) << 23))
+
+
+@inlined
+def exp2(x):
+    """2^x; below -126 as at -126 (1e-38, not zero), from 126.5 on as there."""
+    return exp2_inside(minimum(maximum(x, _EXP2_MIN), _EXP2_MAX))
 
 
 # (2^f - 1) / f on [-1/2, 1/2].

@@ -1,0 +1,27 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Where things lie: what the kernels hand on to each other."""
+from __future__ import annotations
+
+import numpy as np
+
+from .. import rendering
+
+# A tile is one vector wide.
+TILE_SHIFT_X, TILE_SHIFT_Y = 4, 5
+TILE_WIDTH, TILE_HEIGHT = 1 << TILE_SHIFT_X, 1 << TILE_SHIFT_Y
+
+# A record of 16 float32, a cache line, for each Gaussian; `projection` says what its fields are.
+X, Y, A, K, D, OPACITY, STEP, RUN, RED, GREEN, BLUE, DEPTH, REACH, HALF_X, HALF_Y, K_REST = range(16)
+RECORD = 16
+
+# A row of gradients for each pair of Gaussian and tile: sums of g u, g d_y, g u², g u d_y, g d_y², g; then those of
+# colour and depth, or of ring and arc (`flare`).
+G_U, G_Y, G_UU, G_UY, G_YY, G, G_RED, G_GREEN, G_BLUE, G_DEPTH = range(10)
+G_R0, G_WIDTH, G_ARC_X, G_ARC_Y, G_THETA0, G_COS_DELTA, G_ARC = range(9, 16)
+
+# An entry of a tile, int32: which Gaussian, first row and end row within the tile, slot of its row of gradients.
+GAUSSIAN, FIRST_ROW, END_ROW, SLOT, ENTRY = 0, 1, 2, 3, 4
+
+OPACITY_MAX, ALPHA_MIN = np.float32(rendering.OPACITY_MAX), np.float32(rendering.ALPHA_MIN)
+T_MIN = np.float32(rendering.TRANSMITTANCE_MIN)
+ZERO, HALF, ONE, TWO = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)

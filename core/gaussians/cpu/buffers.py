@@ -8,7 +8,7 @@ that looks at it is gone, and the next request of about its size gets it.
 from __future__ import annotations
 
 import weakref
-from collections import defaultdict
+from collections import OrderedDict
 from typing import Any
 
 import numpy as np
@@ -20,53 +20,89 @@ Array = npt.NDArray[Any]
 
 LINE = 64
 """Bytes of a cache line; where arrays start."""
-KEPT = 6
-"""Blocks of one size kept on the shelf."""
+SMALL = 1 << 15
+"""Bytes below which the system's own memory is as good."""
+KEPT = 1 << 30
+"""Bytes kept on the shelves at most; those unused for longest go first."""
 
-_shelves: dict[int, list[Array]] = defaultdict(list)
-
-
-def _size_class(size: int) -> int:
-    """The next of 8 steps to each power of two, at least 4096."""
-    step = 1 << max(size.bit_length() - 4, 9)
-    return max(-(-size // step) * step, 4096)
+_shelf: OrderedDict[int, list[Array]] = OrderedDict()
+_loans: dict[int, _Loan] = {}
+_stored = 0
 
 
-def _give_back(block: Array) -> None:
-    shelf = _shelves[block.size]
-    if len(shelf) < KEPT:
-        shelf.append(block)
+class _Loan(weakref.ref[Array]):
+    """Watches an array; its block returns to the shelf with it."""
+
+    __slots__ = ("block",)
+    block: Array
 
 
-def empty(shape: tuple[int, ...] | int, dtype: Any = np.float32) -> Array:
-    """An array of undefined contents that starts at a cache line."""
-    shape = (shape,) if isinstance(shape, int) else shape
+def _give_back(loan: weakref.ref[Array]) -> None:
+    global _stored
+    assert isinstance(loan, _Loan)
+    del _loans[id(loan)]
+    size = loan.block.size
+    _shelf.setdefault(size, []).append(loan.block)
+    _shelf.move_to_end(size)
+    _stored += size
+    while _stored > KEPT:
+        oldest, blocks = next(iter(_shelf.items()))
+        blocks.pop()
+        _stored -= oldest
+        if not blocks:
+            del _shelf[oldest]
+
+
+def _capacity(size: int) -> int:
+    """The next of 8 steps to each power of two."""
+    step = 1 << (size.bit_length() - 4)
+    return -(-size // step) * step
+
+
+def _at_line(size: int) -> Array:
+    array = np.empty(size + LINE, np.uint8)
+    first = -array.__array_interface__["data"][0] % LINE
+    return array[first : first + size]
+
+
+def _block(capacity: int) -> Array:
+    global _stored
+    blocks = _shelf.get(capacity)
+    if not blocks:
+        return _at_line(capacity)
+    _stored -= capacity
+    block = blocks.pop()
+    if not blocks:
+        del _shelf[capacity]
+    return block
+
+
+def empty(count: int, dtype: npt.DTypeLike = np.float32) -> Array:
+    """A flat array of undefined contents that starts at a cache line."""
     dtype = np.dtype(dtype)
-    size = dtype.itemsize
-    for extent in shape:
-        size *= extent
-    capacity = _size_class(size + LINE)
-    try:
-        block = _shelves[capacity].pop()
-    except IndexError:
-        block = np.empty(capacity, np.uint8)
-    offset = -block.ctypes.data % LINE
+    size = count * dtype.itemsize
+    if size < SMALL:
+        return _at_line(size).view(dtype)
+    block = _block(_capacity(size))
     # frombuffer: an array that others refer to as their base, so that the block is free after all of them
-    array = np.frombuffer(block.data[offset : offset + size], dtype).reshape(shape)
-    owner = array
-    while isinstance(owner.base, np.ndarray):
-        owner = owner.base
-    weakref.finalize(owner, _give_back, block).atexit = False
+    array = np.frombuffer(block.data, dtype, count)
+    loan = _Loan(array, _give_back)
+    loan.block = block
+    _loans[id(loan)] = loan
     return array
 
 
-def zeros(shape: tuple[int, ...] | int, dtype: Any = np.float32) -> Array:
+def zeros(count: int) -> Array:
     """The same, filled with zeros."""
-    array = empty(shape, dtype)
+    array = empty(count)
     array.fill(0)
     return array
 
 
-def empty_tensor(shape: tuple[int, ...]) -> Tensor:
-    """The same as a float32 tensor."""
-    return torch.from_numpy(empty(shape))
+def pair(*shape: int) -> tuple[Tensor, Array]:
+    """A float32 tensor of undefined contents, and the same memory as a flat array."""
+    count = 1
+    for extent in shape:
+        count *= extent
+    array = empty(count)
+    return torch.from_numpy(array).view(shape), array

@@ -47,19 +47,14 @@ def _fingerprint() -> str:
 
 
 def _cache_folder() -> Path:
-    """A folder that can be written to; the last resort lasts until the system clears its temporary files."""
-    named = os.environ.get("FIT_FLARE_CACHE")
-    user = [] if named else [_user_folder()]
-    temporary = Path(tempfile.gettempdir()) / "fit_flare"
-    for base in [Path(named)] if named else [*user, temporary]:
-        folder = base / "kernels" / _fingerprint()
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-        except OSError:
-            continue
-        if os.access(folder, os.W_OK):
-            return folder
-    return temporary
+    """A folder that can be written to, by this user only: machine code is loaded from it. Where there is none,
+    one for this process alone."""
+    folder = Path(os.environ.get("FIT_FLARE_CACHE") or _user_folder()) / "kernels" / _fingerprint()
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    except OSError:
+        return Path(tempfile.mkdtemp(prefix="fit_flare_"))
+    return folder if os.access(folder, os.W_OK) else Path(tempfile.mkdtemp(prefix="fit_flare_"))
 
 
 CACHE_FOLDER = _cache_folder()

@@ -210,13 +210,13 @@ class _L1Ssim(torch.autograd.Function):
         height, width, _ = image.shape
         mu_y, s_y = _described(target)
         x, y = flat(image), flat(target)
-        maps, sums = buffers.empty((3, x.size)), np.empty((height, 2))
+        maps, sums = buffers.empty(3 * x.size).reshape(3, x.size), np.empty((height, 2))
         parallel(compare, x, y, mu_y, s_y, width, height, maps, sums, scratch=_scratch_size(width))
         l1, similarity = sums.sum(0) / x.size
         if ctx.needs_input_grad[0]:
-            d_image = buffers.empty_tensor(tuple(image.shape))
+            d_image, d_image_flat = buffers.pair(height, width, 3)
             scales = np.float32(lam / x.size), np.float32((lam - 1) / x.size)
-            parallel(gradient, x, y, maps, width, height, *scales, flat(d_image), scratch=_scratch_size(width))
+            parallel(gradient, x, y, maps, width, height, *scales, d_image_flat, scratch=_scratch_size(width))
             ctx.save_for_backward(d_image)
         return image.new_tensor(lam * l1 + (1 - lam) * (1 - similarity))
 

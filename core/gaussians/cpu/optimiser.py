@@ -14,6 +14,7 @@ from .vector import LANES, fma, load, sqrt, store, take_number
 
 PIECE = 1 << 13
 """Least number of values to a piece of work."""
+ROW = np.ones(LANES, np.float32)
 
 
 @kernel
@@ -50,10 +51,14 @@ def adam_step(
     *, step: int, rate: float | Tensor, beta1: float, beta2: float, epsilon: float,
 ) -> None:  # fmt: skip
     """See `..optimiser`; parameter and moments are contiguous float32, changed in place."""
-    row = flat(rate) if isinstance(rate, Tensor) else np.array([rate], np.float32)
-    rates = np.tile(row, math.lcm(row.size, LANES) // row.size) / np.float32(1 - beta1**step)
+    row = flat(rate) if isinstance(rate, Tensor) else ROW * np.float32(rate)
+    if row.size % LANES:
+        row = np.tile(row, math.lcm(row.size, LANES) // row.size)
+    rates = row / np.float32(1 - beta1**step)
     piece = -(-PIECE // rates.size) * rates.size
     root = 1 / math.sqrt(1 - beta2**step)
-    numbers = (np.float32(number) for number in (beta1, 1 - beta1, beta2, 1 - beta2, root, epsilon))
-    arrays = (flat(t) for t in (parameter, gradient, first, second))
-    parallel(advance, *arrays, rates, piece, *numbers, limit=-(-parameter.numel() // piece))
+    parallel(
+        advance, flat(parameter), flat(gradient), flat(first), flat(second), rates, piece,
+        np.float32(beta1), np.float32(1 - beta1), np.float32(beta2), np.float32(1 - beta2), np.float32(root),
+        np.float32(epsilon), limit=-(-parameter.numel() // piece),
+    )  # fmt: skip

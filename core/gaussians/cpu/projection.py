@@ -26,6 +26,7 @@ import math
 import numpy as np
 
 from .. import rendering
+from ..projection import FRUSTUM_MARGIN
 from . import spherical_harmonics as harmonics
 from .compilation import inlined, kernel
 from .layout import (
@@ -101,6 +102,26 @@ TINY = np.float32(1e-24)
 LARGEST = np.float32(1e30)
 RUN_POWERS, RUN_MAX = np.float32(32), np.float32(32)
 """Powers of two, and rows, over which a recurrence runs (see `raster_forward`): rounding adds up."""
+
+
+@kernel
+def describe_camera(world_to_camera, intrinsics, width, height, near, dilation, camera):
+    """The camera's numbers from the flat matrices (4, 4) and (3, 3)."""
+    for i in range(3):
+        position = 0.0
+        for j in range(3):
+            camera[3 * i + j] = world_to_camera[4 * i + j]
+            position -= np.float64(world_to_camera[4 * j + i]) * np.float64(world_to_camera[4 * j + 3])
+        camera[9 + i] = world_to_camera[4 * i + 3]
+        camera[POSITION + i] = position
+    camera[NEAR], camera[DILATION] = near, dilation
+    for axis in range(2):
+        focal, principal = np.float64(intrinsics[4 * axis]), np.float64(intrinsics[3 * axis + 2])
+        size = height if axis else width
+        margin = FRUSTUM_MARGIN * size / (2 * focal)
+        camera[FX + axis], camera[CX + axis] = focal, principal
+        camera[LOW_X + 2 * axis] = -principal / focal - margin
+        camera[HIGH_X + 2 * axis] = (size - principal) / focal + margin
 
 
 @inlined

@@ -9,7 +9,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..projection import FRUSTUM_MARGIN
 from ..rendering import Rendering
 from . import buffers, layout, projection, raster_backward, raster_forward
 from .buffers import Array
@@ -28,57 +27,42 @@ class _Frame(Grid):
     depth: bool
 
 
-def camera_numbers(world_to_camera: Tensor, intrinsics: Tensor, frame: _Frame) -> Array:
-    """The camera as `projection` wants it."""
-    matrix, k = world_to_camera.detach().double().numpy(), intrinsics.detach().double().numpy()
-    rotation, translation = matrix[:3, :3], matrix[:3, 3]
-    focal, principal, size = k.diagonal()[:2], k[:2, 2], np.array([frame.width, frame.height])
-    margin = FRUSTUM_MARGIN * size / (2 * focal)
-    low, high = -principal / focal - margin, (size - principal) / focal + margin
-    return np.concatenate(
-        [
-            rotation.reshape(-1), translation, focal, principal, [low[0], high[0], low[1], high[1]],
-            -rotation.T @ translation, [frame.near, frame.dilation],
-        ]
-    ).astype(np.float32)  # fmt: skip
-
-
 class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, sh: Tensor,
         world_to_camera: Tensor, intrinsics: Tensor, background: Tensor, frame: _Frame, centre_gradients: Tensor,
     ) -> tuple[Tensor, ...]:  # fmt: skip
-        n = len(means)
-        inputs = [flat(t) for t in (means, quats, scales, opacities, sh)]
-        sh_width = sh.shape[1] * 3
-        camera = camera_numbers(world_to_camera, intrinsics, frame)
-        records, bounds = buffers.empty((n, layout.RECORD)), buffers.empty(n, np.int32)
-        centres, radii = buffers.empty_tensor((n, 2)), buffers.empty_tensor((n,))
+        n, w, h = len(means), frame.width, frame.height
+        camera = np.empty(projection.CAMERA, np.float32)
+        projection.describe_camera(
+            flat(world_to_camera), flat(intrinsics), w, h, frame.near, frame.dilation, camera
+        )
+        records, bounds = buffers.empty(n * layout.RECORD), buffers.empty(n, np.int32)
+        centres, centres_flat = buffers.pair(n, 2)
+        radii, radii_flat = buffers.pair(n)
         blocks = -(-n // LANES) if any(ctx.needs_input_grad) else 0
         slopes = buffers.empty(blocks * LANES * projection.SLOPES)
         chunk_bounds = np.zeros(-(-n // projection.CHUNK), np.int64)
         parallel(
-            projection.project, *inputs, sh_width, frame.sh_degree, camera, frame.width, frame.height,
-            records.reshape(-1), flat(centres), flat(radii), bounds, chunk_bounds, slopes,
+            projection.project, *(flat(t) for t in (means, quats, scales, opacities, sh)), sh.shape[1] * 3,
+            frame.sh_degree, camera, w, h, records, centres_flat, radii_flat, bounds, chunk_bounds, slopes,
             scratch=projection.SCRATCH,
         )  # fmt: skip
         bins = bin_gaussians(records, bounds, chunk_bounds, frame)
 
-        h, w = frame.height, frame.width
-        image, alpha = buffers.empty_tensor((h, w, 3)), buffers.empty_tensor((h, w))
-        shape = (h, w) if frame.depth else (0, 0)
-        depth, median = buffers.empty_tensor(shape), buffers.empty_tensor(shape)
-        ends = np.empty(frame.tiles, np.int64)
-        behind = flat(background)
+        image, image_flat = buffers.pair(h, w, 3)
+        alpha, alpha_flat = buffers.pair(h, w)
+        depth, depth_flat = buffers.pair(*((h, w) if frame.depth else (0, 0)))
+        median, median_flat = buffers.pair(*depth.shape)
+        ends, behind = np.empty(frame.tiles, np.int64), flat(background)
         parallel(
-            raster_forward.raster, bins.entries, bins.starts, records.reshape(-1), behind, w, h, frame.tiles_x,
-            flat(image), flat(alpha), flat(depth), flat(median), ends, scratch=raster_forward.STATE,
+            raster_forward.raster, bins.entries, bins.starts, records, behind, w, h, frame.tiles_x,
+            image_flat, alpha_flat, depth_flat, median_flat, ends, scratch=raster_forward.STATE,
         )  # fmt: skip
         ctx.save_for_backward(means, quats, scales, opacities, sh, image, alpha, depth)
-        ctx.slopes = slopes
-        ctx.frame, ctx.bins, ctx.ends, ctx.records, ctx.camera, ctx.behind = frame, bins, ends, records, camera, behind
-        ctx.centre_gradients = centre_gradients
+        ctx.frame, ctx.bins, ctx.centre_gradients = frame, bins, centre_gradients
+        ctx.arrays = records, camera, slopes, ends, behind
         ctx.mark_non_differentiable(median, centres, radii)
         ctx.set_materialize_grads(False)
         return image, alpha, depth, median, centres, radii
@@ -86,29 +70,30 @@ class _Rasterize(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, d_image: Tensor | None, d_alpha: Tensor | None, d_depth: Tensor | None, *_: Any) -> Any:
         means, quats, scales, opacities, sh, image, alpha, depth = ctx.saved_tensors
-        frame, bins, records = ctx.frame, ctx.bins, ctx.records
-        n, h, w = len(means), frame.height, frame.width
+        frame, bins = ctx.frame, ctx.bins
+        records, camera, slopes, ends, behind = ctx.arrays
+        n, w, h = len(means), frame.width, frame.height
         v_image = buffers.zeros(h * w * 3) if d_image is None else flat(d_image)
         v_alpha = buffers.zeros(h * w) if d_alpha is None else flat(d_alpha)
         v_depth = EMPTY if d_depth is None else flat(d_depth)
-        rows = buffers.empty((bins.slots, layout.RECORD))
+        rows = buffers.empty(bins.slots * layout.RECORD)
         parallel(
-            raster_backward.raster_backward, bins.entries, bins.starts, ctx.ends, records.reshape(-1), ctx.behind, w, h,
-            frame.tiles_x, flat(image), flat(alpha), flat(depth), v_image, v_alpha, v_depth, rows.reshape(-1),
-            scratch=raster_backward.SCRATCH,
+            raster_backward.raster_backward, bins.entries, bins.starts, ends, records, behind, w, h, frame.tiles_x,
+            flat(image), flat(alpha), flat(depth), v_image, v_alpha, v_depth, rows, scratch=raster_backward.SCRATCH,
         )  # fmt: skip
-        inputs = (means, quats, scales, opacities, sh)
-        gradients = [buffers.empty_tensor(tuple(t.shape)) for t in inputs]
-        d_centres = buffers.empty_tensor((n, 2))
+        gradients, gradients_flat = zip(
+            *(buffers.pair(*t.shape) for t in (means, quats, scales, opacities, sh)), strict=True
+        )
+        d_centres, d_centres_flat = buffers.pair(n, 2)
         with_camera = ctx.needs_input_grad[5] or ctx.needs_input_grad[6]
         sums = np.zeros((-(-n // projection.CHUNK), projection.CAMERA_SUMS), np.float32)
         parallel(
-            projection.project_backward, *(flat(t) for t in inputs[:4]), sh.shape[1] * 3, frame.sh_degree, ctx.camera,
-            records.reshape(-1), ctx.slopes, rows.reshape(-1), bins.firsts, bins.counts, *(flat(t) for t in gradients),
-            flat(d_centres), sums, with_camera, scratch=projection.SCRATCH,
+            projection.project_backward, *(flat(t) for t in (means, quats, scales, opacities)), sh.shape[1] * 3,
+            frame.sh_degree, camera, records, slopes, rows, bins.firsts, bins.counts,
+            *gradients_flat, d_centres_flat, sums, with_camera, scratch=projection.SCRATCH,
         )  # fmt: skip
         ctx.centre_gradients.add_(d_centres)
-        d_world_to_camera, d_intrinsics = _camera_gradients(sums, ctx.camera) if with_camera else (None, None)
+        d_world_to_camera, d_intrinsics = _camera_gradients(sums, camera) if with_camera else (None, None)
         d_background = None
         if ctx.needs_input_grad[7] and d_image is not None:
             d_background = (d_image * (1 - alpha)[..., None]).sum((0, 1))
@@ -137,6 +122,7 @@ def rasterize_scene(
     """See `rasterization`. depth=False leaves depth and median_depth empty (0, 0), and is faster."""
     n = len(means)
     inputs = [t.to(torch.float32) for t in (means, quats, scales, opacities, sh)]
+    camera = [t.to(torch.float32) for t in (world_to_camera, intrinsics)]
     if n < LANES:  # the kernels work on 16 at a time; opacity 0 is never seen
         inputs = [torch.cat([t, t.new_zeros(LANES - n, *t.shape[1:])]) for t in inputs]
     if background is None:
@@ -144,6 +130,6 @@ def rasterize_scene(
     centre_gradients = torch.zeros(len(inputs[0]), 2)
     frame = _Frame(width, height, sh_degree, near, dilation, depth)
     image, alpha, depths, median, centres, radii = _Rasterize.apply(
-        *inputs, world_to_camera, intrinsics, background, frame, centre_gradients
+        *inputs, *camera, background, frame, centre_gradients
     )
     return Rendering(image, alpha, depths, median, centres[:n], radii[:n], centre_gradients[:n])

@@ -33,22 +33,23 @@ class _Splat(torch.autograd.Function):
         shaped = rings is not None or arcs is not None
         inputs = [flat(t) for t in (centres, covariances, opacities, colours)]
         shape_inputs = [EMPTY if t is None else flat(t) for t in (rings, arcs)]
-        records, shapes = buffers.empty((n, layout.RECORD)), buffers.empty(n * flare.SHAPE)
+        records, shapes = buffers.empty(n * layout.RECORD), buffers.empty(n * flare.SHAPE)
         bounds = buffers.empty(n, np.int32)
-        flare.prepare(*inputs, *shape_inputs, w, h, add, records.reshape(-1), shapes, bounds)
+        flare.prepare(*inputs, *shape_inputs, w, h, add, records, shapes, bounds)
         bins = _bin(records, bounds, grid)
 
-        image, alpha = buffers.empty_tensor((h, w, 3)), buffers.empty_tensor((h, w))
+        image, image_flat = buffers.pair(h, w, 3)
+        alpha, alpha_flat = buffers.pair(h, w)
         ends = np.empty(grid.tiles, np.int64)
-        tiles = (bins.entries, bins.starts, records.reshape(-1))
+        tiles = (bins.entries, bins.starts, records)
         if shaped or add:
             parallel(
                 flare.raster, *tiles, shapes, BLACK, w, h, grid.tiles_x, shaped, arcs is not None, add,
-                flat(image), flat(alpha), ends, scratch=raster_forward.STATE,
+                image_flat, alpha_flat, ends, scratch=raster_forward.STATE,
             )  # fmt: skip
         else:
             parallel(
-                raster_forward.raster, *tiles, BLACK, w, h, grid.tiles_x, flat(image), flat(alpha), EMPTY, EMPTY, ends,
+                raster_forward.raster, *tiles, BLACK, w, h, grid.tiles_x, image_flat, alpha_flat, EMPTY, EMPTY, ends,
                 scratch=raster_forward.STATE,
             )  # fmt: skip
         ctx.save_for_backward(centres, covariances, opacities, colours, rings, arcs, image, alpha)
@@ -65,7 +66,7 @@ class _Splat(torch.autograd.Function):
         v_image = buffers.zeros(h * w * 3) if d_image is None else flat(d_image)
         v_alpha = buffers.zeros(h * w) if d_alpha is None else flat(d_alpha)
         rows = buffers.empty(bins.slots * layout.RECORD)
-        tiles = (bins.entries, bins.starts, ends, records.reshape(-1))
+        tiles = (bins.entries, bins.starts, ends, records)
         pictures = (flat(image), flat(alpha))
         shaped = rings is not None or arcs is not None
         if shaped or add:
@@ -78,7 +79,7 @@ class _Splat(torch.autograd.Function):
                 raster_backward.raster_backward, *tiles, BLACK, w, h, grid.tiles_x, *pictures, EMPTY,
                 v_image, v_alpha, EMPTY, rows, scratch=raster_backward.SCRATCH,
             )  # fmt: skip
-        gradients = [None if t is None else torch.empty(t.shape) for t in inputs]
+        gradients = [None if t is None else torch.empty_like(t, memory_format=torch.contiguous_format) for t in inputs]
         flare.finish(
             np.empty(layout.RECORD, np.float32), flat(covariances), flat(opacities), flat(colours), rows,
             bins.firsts, bins.counts, add,

@@ -77,7 +77,7 @@ def parallel(function: Callable[..., Any], *arguments: Any, scratch: int = 0, li
     of its own a thread needs; passed after the counter, unless 0.
     """
     count = torch.get_num_threads() if limit is None else max(1, min(limit, torch.get_num_threads()))
-    if not getattr(function, "signatures", True):  # compile here, not on all threads at once
+    if not getattr(function, "overloads", True):  # compile here, not on all threads at once
         count = 1
     workers = []
     for number in range(1, count):

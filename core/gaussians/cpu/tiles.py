@@ -43,30 +43,29 @@ class Bins:
 
 
 def flat(tensor: Tensor) -> Array:
-    """The numbers of a tensor, as one contiguous row of float32."""
-    return tensor.detach().to(torch.float32).contiguous().reshape(-1).numpy()
+    """The numbers of a float32 tensor, as one contiguous row; the same memory if they are."""
+    return np.ravel(tensor.detach().numpy())
 
 
 def bin_gaussians(
     records: Array, bounds: Array, chunk_bounds: Array, grid: Grid, *, by_depth: bool = True
 ) -> Bins:
-    """Sorts the records (n, 16) into tiles; by depth or in the order given."""
+    """Sorts the n records into tiles; by depth or in the order given."""
     n = len(bounds)
     starts_of_chunks = np.cumsum(chunk_bounds) - chunk_bounds
     room = int(chunk_bounds.sum())
     slots = buffers.empty(room, np.int32)
     firsts, counts = buffers.empty(n, np.int32), buffers.empty(n, np.int32)
-    flat_records = records.reshape(-1)
     keys, spare_keys = buffers.empty(n, np.uint32), buffers.empty(n, np.uint32)
-    places = buffers.empty((binning.DIGITS, 1 << 11), np.int32)
     order, spare_order = buffers.empty(n, np.int32), buffers.empty(n, np.int32)
+    places = np.empty((binning.DIGITS, 1 << 11), np.int32)
     parallel(
-        binning.list_and_sort, flat_records, flat_records.view(np.uint32), bounds, starts_of_chunks,
+        binning.list_and_sort, records, records.view(np.uint32), bounds, starts_of_chunks,
         grid.width, grid.height, grid.tiles_x, by_depth, slots, firsts, counts,
         places, keys, spare_keys, order, spare_order,
     )  # fmt: skip
     m = int(np.count_nonzero(bounds))
-    numbers = buffers.empty((torch.get_num_threads(), grid.tiles), np.int32)
+    numbers = np.empty((torch.get_num_threads(), grid.tiles), np.int32)
     starts = np.empty(grid.tiles + 1, np.int64)
     parallel(binning.count, order, m, slots, firsts, counts, numbers)
     binning.deal(numbers, starts)

@@ -1,0 +1,292 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The CPU kernels as a piece of machinery: the same result on every machine, thread count and start."""
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import textwrap
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+pytest.importorskip("numba")
+
+from core.gaussians import loss as definition
+from core.gaussians import optimiser as plain_optimiser
+from core.gaussians import rasterization, splat
+from core.gaussians.cpu import adam_step, buffers, compilation, l1_ssim, threads
+
+ROOT = Path(__file__).parents[2]
+SIZE = (70, 45)
+
+SCENE = """
+    import math, sys
+    import numpy as np, torch
+    from core.gaussians import rasterization
+
+    def scene(n=2500, seed=0, size=(70, 45)):
+        g = torch.Generator().manual_seed(seed)
+        u = lambda *shape: torch.rand(*shape, generator=g)
+        z = 2 + 6 * u(n)
+        means = torch.stack([(u(n) - 0.5) * 1.3 * z, (u(n) - 0.5) * z, z], 1)
+        w, h = size
+        return dict(
+            means=means, quats=u(n, 4) - 0.5, scales=torch.exp(u(n, 3) * 2.5 - 4.5), opacities=u(n),
+            sh=(u(n, 16, 3) - 0.5) * 0.7, world_to_camera=torch.eye(4),
+            intrinsics=torch.tensor([[w * 0.8, 0, w / 2], [0, w * 0.8, h / 2], [0, 0, 1]]),
+            width=w, height=h, kernels="cpu", depth=False,
+        )
+"""
+_namespace: dict[str, object] = {}
+exec(textwrap.dedent(SCENE), _namespace)
+scene = _namespace["scene"]
+
+
+@pytest.fixture(autouse=True)
+def _threads() -> Iterator[None]:
+    before = torch.get_num_threads()
+    yield
+    torch.set_num_threads(before)
+
+
+def gradients(count: int, **changes: object) -> list[Tensor]:
+    """Picture, alpha and the gradients of all inputs, on this many threads."""
+    torch.set_num_threads(count)
+    arguments = {**scene(), **changes}  # type: ignore[operator]
+    inputs = {k: v.requires_grad_() for k, v in arguments.items() if isinstance(v, Tensor)}
+    result = rasterization(**arguments)
+    weights = torch.linspace(-1, 1, result.colour.numel()).reshape(result.colour.shape)
+    ((result.colour * weights).sum() + result.alpha.square().sum()).backward()
+    return [result.colour.detach(), result.alpha.detach(), *(v.grad for v in inputs.values() if v.grad is not None)]
+
+
+def test_every_run_and_every_thread_count_gives_the_same_bits() -> None:
+    first = gradients(1)
+    assert len(first) == 2 + 7
+    for count in (1, 2, 3):
+        for a, b in zip(first, gradients(count), strict=True):
+            assert torch.equal(a, b), count
+
+
+def test_splats_give_the_same_bits_on_all_thread_counts() -> None:
+    def draw(count: int) -> list[Tensor]:
+        torch.set_num_threads(count)
+        g = torch.Generator().manual_seed(2)
+        inputs = [
+            torch.rand(60, 2, generator=g) * 70, torch.tensor([90.0, 20, 60]).repeat(60, 1),
+            torch.rand(60, generator=g), torch.rand(60, 3, generator=g), torch.rand(60, 2, generator=g) + 0.1,
+        ]  # fmt: skip
+        for tensor in inputs:
+            tensor.requires_grad_()
+        found = splat(*inputs[:4], *SIZE, rings=inputs[4], blend="add", kernels="cpu")
+        found.colour.square().sum().backward()
+        return [found.colour.detach(), *(t.grad for t in inputs if t.grad is not None)]
+
+    for a, b in zip(draw(1), draw(2), strict=True):
+        assert torch.equal(a, b)
+
+
+def test_two_renderings_may_wait_for_their_gradients() -> None:
+    alone = gradients(2)
+    torch.set_num_threads(2)
+    pairs = []
+    for seed in (0, 1):
+        arguments = scene(seed=seed)  # type: ignore[operator]
+        arguments["means"].requires_grad_()
+        pairs.append((arguments["means"], rasterization(**arguments)))
+    for means, result in pairs:
+        weights = torch.linspace(-1, 1, result.colour.numel()).reshape(result.colour.shape)
+        ((result.colour * weights).sum() + result.alpha.square().sum()).backward()
+        assert means.grad.isfinite().all()
+    assert torch.equal(pairs[0][0].grad, alone[2])
+
+
+def test_without_gradients_the_picture_is_the_same() -> None:
+    with torch.no_grad():
+        result = rasterization(**scene())  # type: ignore[operator]
+    assert torch.equal(result.colour, gradients(1)[0])
+
+
+def test_nothing_to_see() -> None:
+    arguments = scene(n=20)  # type: ignore[operator]
+    arguments["means"] = arguments["means"] * torch.tensor([1.0, 1.0, -1.0])
+    arguments["means"].requires_grad_()
+    background = torch.tensor([0.1, 0.2, 0.3])
+    result = rasterization(**arguments, background=background)
+    result.colour.sum().backward()
+    assert torch.equal(result.colour, background.expand(45, 70, 3))
+    assert not result.alpha.any() and not arguments["means"].grad.any()
+
+
+RENDER = SCENE + """
+    with torch.no_grad():
+        picture = rasterization(**scene(n=400, size=(40, 36))).colour.numpy()
+    np.save(sys.argv[1], picture)
+"""
+
+
+@pytest.mark.skipif(sys.platform == "darwin" or os.uname().machine != "x86_64", reason="instruction sets of x86-64")
+def test_all_instruction_sets_give_the_same_picture(tmp_path: Path) -> None:
+    pictures = []
+    for name in ("", "haswell", "nehalem"):  # this machine's own; AVX2; SSE 4.2
+        where = tmp_path / f"{name}.npy"
+        environment = {**os.environ, **({"NUMBA_CPU_NAME": name, "NUMBA_CPU_FEATURES": ""} if name else {})}
+        subprocess.run(
+            [sys.executable, "-c", textwrap.dedent(RENDER), str(where)], cwd=ROOT, env=environment, check=True
+        )
+        pictures.append(np.load(where))
+    assert pictures[0].std() > 0.05
+    for picture in pictures[1:]:
+        assert np.abs(picture - pictures[0]).max() < 1e-5
+
+
+@pytest.mark.parametrize("kernel", ["raster_forward", "raster_backward"])
+def test_arm_gets_vectors_and_no_calls(kernel: str) -> None:
+    import importlib
+    import re
+
+    import llvmlite.binding as llvm
+    import numba
+
+    gradients(1)  # so that its signature is known
+    module = importlib.import_module(f"core.gaussians.cpu.{kernel}")
+    kept = module.raster if kernel == "raster_forward" else module.raster_backward
+    options = {**compilation.OPTIONS, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+    function = numba.njit(**options)(kept.py_func)  # not from the cache, which has no code to show
+    function.compile(kept.signatures[0])
+    library = next(iter(function.overloads.values())).library
+    code = library.get_llvm_str()
+    assert "llvm.x86" not in code
+    llvm.initialize_all_targets()
+    llvm.initialize_all_asmprinters()
+    parsed = llvm.parse_assembly(re.sub(r"target (triple|datalayout) = .*", "", code))
+    machine = llvm.Target.from_triple("aarch64-unknown-linux-gnu").create_target_machine(opt=2)
+    parsed.triple, parsed.data_layout = machine.triple, str(machine.target_data)
+    assembly = machine.emit_assembly(parsed)
+    assert len(re.findall(r"\bfmla\b.*\.4s", assembly)) > 20
+    called = set(re.findall(r"\bbl\s+(\S+)", assembly))
+    assert called <= {"memset", "memcpy", "numba_attempt_nocopy_reshape"}, called
+
+
+COMPILE = """
+    import numpy as np
+    from core.gaussians.cpu import binning, compilation
+    binning.deal(np.ones((2, 3), np.int32), np.zeros(4, np.int64))
+    print(compilation.CACHE_FOLDER)
+    print(sum(binning.deal.stats.cache_hits.values()))
+"""
+
+
+def _compile_elsewhere(environment: dict[str, str]) -> tuple[Path, int]:
+    done = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(COMPILE)], cwd=ROOT, env={**os.environ, **environment},
+        check=True, capture_output=True, text=True,
+    )  # fmt: skip
+    folder, hits = done.stdout.split()
+    return Path(folder), int(hits)
+
+
+def test_kernels_are_kept_where_they_are_told_to_be(tmp_path: Path) -> None:
+    environment = {"FIT_FLARE_CACHE": str(tmp_path)}
+    folder, hits = _compile_elsewhere(environment)
+    assert folder.is_relative_to(tmp_path) and hits == 0
+    assert list(folder.rglob("*.nbc"))
+    assert _compile_elsewhere(environment) == (folder, 1)
+
+
+def test_a_folder_that_cannot_be_used_is_no_obstacle(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("FIT_FLARE_CACHE", str(tmp_path / "file"))
+    folder = compilation._cache_folder()
+    assert not folder.is_relative_to(tmp_path) and os.access(folder, os.W_OK)
+
+
+def test_an_error_in_any_thread_reaches_the_caller() -> None:
+    calls = []
+
+    def fail(_: np.ndarray, number: int) -> None:
+        calls.append(number)
+        raise ValueError(str(number))
+
+    torch.set_num_threads(3)
+    with pytest.raises(ValueError, match="7"):
+        threads.parallel(fail, 7)
+    assert calls == [7, 7, 7]
+    gradients(2)  # the threads are still there
+
+
+def test_memory_is_used_again_but_never_while_in_use() -> None:
+    size = buffers.SMALL  # numbers of 4 bytes: a block of its own
+    first = buffers.empty(size)
+    place = first.ctypes.data
+    assert place % buffers.LINE == 0
+    view = torch.from_numpy(first)[3:].view(-1, 1)
+    del first
+    other = buffers.empty(size)
+    assert other.ctypes.data != place
+    del view
+    assert buffers.empty(size - 1).ctypes.data == place
+
+
+def test_memory_kept_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(buffers, "KEPT", 8 * buffers.SMALL)
+    for _ in range(3):
+        held = [buffers.empty(buffers.SMALL * step // 4) for step in (1, 2, 3)] + [buffers.empty(buffers.SMALL)]
+        del held
+    kept = sum(size * len(blocks) for size, blocks in buffers._shelf.items())
+    assert kept == buffers._stored <= 8 * buffers.SMALL
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.int32, np.int64])
+def test_small_memory_is_aligned_too(dtype: type) -> None:
+    for count in (1, 100, 5000):
+        array = buffers.empty(count, dtype)
+        assert array.size == count and array.dtype == dtype and array.ctypes.data % buffers.LINE == 0
+
+
+@pytest.mark.parametrize("size", [(5, 6), (37, 53), (64, 48), (11, 2)])
+def test_loss_and_its_gradient(size: tuple[int, int]) -> None:
+    g = torch.Generator().manual_seed(0)
+    image = torch.rand(*size, 3, generator=g).requires_grad_()
+    target = (image.detach() + 0.2 * torch.randn(*size, 3, generator=g)).clamp(0, 1)
+    exact = image.detach().double().requires_grad_()
+    expected = definition.l1_ssim(exact, target.double(), 0.8, kernels="torch")
+    (3 * expected).backward()
+    for _ in range(2):  # the second time what is known of the target is used again
+        image.grad = None
+        found = l1_ssim(image, target, 0.8)
+        (3 * found).backward()
+        assert abs(found.item() - expected.item()) < 1e-6
+        assert torch.linalg.vector_norm(image.grad - exact.grad) < 1e-5 * torch.linalg.vector_norm(exact.grad)
+
+
+def test_loss_notices_a_target_that_changes() -> None:
+    image, target = torch.rand(20, 30, 3), torch.rand(20, 30, 3)
+    before = l1_ssim(image, target, 0.5)
+    target.copy_(image)
+    assert l1_ssim(image, target, 0.5).item() == pytest.approx(0, abs=1e-6) != before.item()
+
+
+@pytest.mark.parametrize(
+    ("shape", "rate"),
+    [((1001, 3), 0.01), ((1001, 16, 3), torch.linspace(0.1, 1, 48).reshape(16, 3)), ((7,), 0.1),
+     ((50, 3), torch.tensor([1.0, 2, 3]))],
+)  # fmt: skip
+def test_adam(shape: tuple[int, ...], rate: float | Tensor) -> None:
+    g = torch.Generator().manual_seed(0)
+    values = torch.rand(shape, generator=g)
+    moments = [torch.zeros(shape) for _ in range(2)]
+    exact, exact_moments = values.double(), [m.double() for m in moments]
+    exact_rate = rate.double() if isinstance(rate, Tensor) else rate
+    for step in range(1, 5):
+        gradient = torch.randn(shape, generator=g)
+        constants = {"step": step, "beta1": 0.9, "beta2": 0.999, "epsilon": 1e-15}
+        adam_step(values, gradient, *moments, rate=rate, **constants)
+        plain_optimiser.adam_step(exact, gradient.double(), *exact_moments, rate=exact_rate, **constants)
+    assert (values - exact).abs().max() < 3e-6
+    assert (moments[0] - exact_moments[0]).abs().max() < 1e-6

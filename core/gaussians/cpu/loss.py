@@ -35,8 +35,8 @@ from .vector import LANES, absolute, fma, lanes, load, splat, store, take_number
 HALO = definition.WINDOW // 2
 PAD = 16  # at least 3 HALO zeros on both sides of a scratch row
 STEP = 3
-BAND = 4
-"""Rows to a piece of work."""
+BAND, STRIP = 8, 8 * LANES
+"""Rows to a piece of work, and numbers of a row that are blurred down the columns at a time."""
 WEIGHTS = definition.window(torch.zeros(1)).numpy().astype(np.float32)
 W0, W1, W2, W3, W4, W5 = (WEIGHTS[HALO + i] for i in range(HALO + 1))
 C1, C2 = np.float32(definition.C1), np.float32(definition.C2)
@@ -44,36 +44,76 @@ ZERO, ONE, TWO = np.float32(0), np.float32(1), np.float32(2)
 
 
 @inlined
-def _along(row, at):
-    """The window along a scratch row."""
-    s = load(row, at) * W0
-    s = fma(load(row, at - STEP) + load(row, at + STEP), W1, s)
-    s = fma(load(row, at - 2 * STEP) + load(row, at + 2 * STEP), W2, s)
-    s = fma(load(row, at - 3 * STEP) + load(row, at + 3 * STEP), W3, s)
-    s = fma(load(row, at - 4 * STEP) + load(row, at + 4 * STEP), W4, s)
-    return fma(load(row, at - 5 * STEP) + load(row, at + 5 * STEP), W5, s)
+def _window(a, at, step):
+    """The window over values that lie `step` apart."""
+    s = load(a, at) * W0
+    s = fma(load(a, at - step) + load(a, at + step), W1, s)
+    s = fma(load(a, at - 2 * step) + load(a, at + 2 * step), W2, s)
+    s = fma(load(a, at - 3 * step) + load(a, at + 3 * step), W3, s)
+    s = fma(load(a, at - 4 * step) + load(a, at + 4 * step), W4, s)
+    return fma(load(a, at - 5 * step) + load(a, at + 5 * step), W5, s)
 
 
 @inlined
-def _rows_around(y, height):
-    """The rows under the window of row y: first and end."""
-    return max(y - HALO, 0), min(y + HALO + 1, height)
+def _down(plane, row, at, length, height):
+    """The window down the columns, 16 of them, with zeros above and below the picture."""
+    i = row * length + at
+    if HALO <= row < height - HALO:
+        return _window(plane, i, length)
+    s = splat(ZERO)
+    for k in range(max(-HALO, -row), min(HALO + 1, height - row)):
+        s = fma(load(plane, i + k * length), WEIGHTS[k + HALO], s)
+    return s
 
 
 @inlined
-def _down_moments(x, y, row, at, length, height, rows, out):
-    """E[x], E[xx] and E[xy] down the columns, 16 of them, into the three scratch rows."""
-    first, end = _rows_around(row, height)
-    m, xx, xy = splat(ZERO), splat(ZERO), splat(ZERO)
-    for r in range(first, end):
-        a = load(x, r * length + at)
-        w = a * WEIGHTS[r - row + HALO]
-        m = m + w
-        xx = fma(w, a, xx)
-        xy = fma(w, load(y, r * length + at), xy)
-    store(rows[0], out, m)
-    store(rows[1], out, xx)
-    store(rows[2], out, xy)
+def _tap(x, y, i, weight, sums):
+    a = load(x, i)
+    w = a * weight
+    return sums[0] + w, fma(w, a, sums[1]), fma(w, load(y, i), sums[2])
+
+
+@inlined
+def _down_moments(x, y, row, at, length, height):
+    """E[x], E[xx] and E[xy] down the columns."""
+    i, zero = row * length + at, splat(ZERO)
+    sums = (zero, zero, zero)
+    if HALO <= row < height - HALO:
+        sums = _tap(x, y, i - 5 * length, W5, _tap(x, y, i + 5 * length, W5, sums))
+        sums = _tap(x, y, i - 4 * length, W4, _tap(x, y, i + 4 * length, W4, sums))
+        sums = _tap(x, y, i - 3 * length, W3, _tap(x, y, i + 3 * length, W3, sums))
+        sums = _tap(x, y, i - 2 * length, W2, _tap(x, y, i + 2 * length, W2, sums))
+        sums = _tap(x, y, i - length, W1, _tap(x, y, i + length, W1, sums))
+        return _tap(x, y, i, W0, sums)
+    for k in range(max(-HALO, -row), min(HALO + 1, height - row)):
+        sums = _tap(x, y, i + k * length, WEIGHTS[k + HALO], sums)
+    return sums
+
+
+@inlined
+def _columns_of_moments(x, y, band, end, length, height, rows):
+    """The same for the rows of a band, into scratch; by strips of columns, so that the nearest cache holds the rows."""
+    for strip in range(0, length, STRIP):
+        for row in range(band, end):
+            for block in range(strip, min(strip + STRIP, length), LANES):
+                at = min(block, length - LANES)
+                m, xx, xy = _down_moments(x, y, row, at, length, height)
+                place = row - band
+                store(rows[0, place], PAD + at, m)
+                store(rows[1, place], PAD + at, xx)
+                store(rows[2, place], PAD + at, xy)
+
+
+@inlined
+def _columns_of_maps(maps, band, end, length, height, rows):
+    for strip in range(0, length, STRIP):
+        for row in range(band, end):
+            for block in range(strip, min(strip + STRIP, length), LANES):
+                at = min(block, length - LANES)
+                place = row - band
+                store(rows[0, place], PAD + at, _down(maps[0], row, at, length, height))
+                store(rows[1, place], PAD + at, _down(maps[1], row, at, length, height))
+                store(rows[2, place], PAD + at, _down(maps[2], row, at, length, height))
 
 
 @inlined
@@ -93,22 +133,23 @@ def _similarity(mu, xx, xy, mu_y, s_y):
 def compare(counter, scratch, x, y, mu_y, s_y, width, height, maps, sums):
     """maps (3, h, 3w): derivatives of S by the means; sums (h, 2): of |x - y| and of S, by row."""
     length = STEP * width
-    rows = scratch[: 3 * (length + 2 * PAD)].reshape(3, length + 2 * PAD)
-    rows[:, :] = ZERO
+    rows = scratch[: 3 * BAND * (length + 2 * PAD)].reshape(3, BAND, length + 2 * PAD)
+    rows[:, :, :] = ZERO
     while True:
         band = take_number(counter) * BAND
+        end = min(band + BAND, height)
         if band >= height:
             break
-        for row in range(band, min(band + BAND, height)):
-            for block in range(0, length, LANES):
-                at = min(block, length - LANES)
-                _down_moments(x, y, row, at, length, height, rows, PAD + at)
+        _columns_of_moments(x, y, band, end, length, height, rows)
+        for row in range(band, end):
+            place = row - band
             l1, similar = splat(ZERO), splat(ZERO)
             for block in range(0, length, LANES):
                 at = min(block, length - LANES)
                 fresh = lanes() >= np.float32(block - at)  # the last block overlaps the one before
                 i = row * length + at
-                mu, xx, xy = _along(rows[0], PAD + at), _along(rows[1], PAD + at), _along(rows[2], PAD + at)
+                mu, xx = _window(rows[0, place], PAD + at, STEP), _window(rows[1, place], PAD + at, STEP)
+                xy = _window(rows[2, place], PAD + at, STEP)
                 s, by_mu, by_xx, by_xy = _similarity(mu, xx, xy, load(mu_y, i), load(s_y, i))
                 store(maps[0], i, by_mu)
                 store(maps[1], i, by_xx)
@@ -122,31 +163,22 @@ def compare(counter, scratch, x, y, mu_y, s_y, width, height, maps, sums):
 def gradient(counter, scratch, x, y, maps, width, height, by_l1, by_similarity, out):
     """out = by_l1 sign(x - y) + by_similarity dS/dx."""
     length = STEP * width
-    rows = scratch[: 3 * (length + 2 * PAD)].reshape(3, length + 2 * PAD)
-    rows[:, :] = ZERO
+    rows = scratch[: 3 * BAND * (length + 2 * PAD)].reshape(3, BAND, length + 2 * PAD)
+    rows[:, :, :] = ZERO
     while True:
         band = take_number(counter) * BAND
+        end = min(band + BAND, height)
         if band >= height:
             break
-        for row in range(band, min(band + BAND, height)):
-            first, end = _rows_around(row, height)
-            for block in range(0, length, LANES):
-                at = min(block, length - LANES)
-                a, b, c = splat(ZERO), splat(ZERO), splat(ZERO)
-                for r in range(first, end):
-                    weight = WEIGHTS[r - row + HALO]
-                    a = fma(load(maps[0], r * length + at), weight, a)
-                    b = fma(load(maps[1], r * length + at), weight, b)
-                    c = fma(load(maps[2], r * length + at), weight, c)
-                store(rows[0], PAD + at, a)
-                store(rows[1], PAD + at, b)
-                store(rows[2], PAD + at, c)
+        _columns_of_maps(maps, band, end, length, height, rows)
+        for row in range(band, end):
+            place = row - band
             for block in range(0, length, LANES):
                 at = min(block, length - LANES)
                 i = row * length + at
                 vx, vy = load(x, i), load(y, i)
-                g = fma(vx * TWO, _along(rows[1], PAD + at), _along(rows[0], PAD + at))
-                g = fma(vy, _along(rows[2], PAD + at), g) * by_similarity
+                g = fma(vx * TWO, _window(rows[1, place], PAD + at, STEP), _window(rows[0, place], PAD + at, STEP))
+                g = fma(vy, _window(rows[2, place], PAD + at, STEP), g) * by_similarity
                 sign = where(vx > vy, splat(by_l1), where(vx < vy, splat(-by_l1), ZERO))
                 store(out, i, g + sign)
 
@@ -155,25 +187,25 @@ def gradient(counter, scratch, x, y, maps, width, height, by_l1, by_similarity, 
 def describe(counter, scratch, y, width, height, mu_y, s_y):
     """The target's part: means and variances."""
     length = STEP * width
-    rows = scratch[: 3 * (length + 2 * PAD)].reshape(3, length + 2 * PAD)
-    rows[:, :] = ZERO
+    rows = scratch[: 3 * BAND * (length + 2 * PAD)].reshape(3, BAND, length + 2 * PAD)
+    rows[:, :, :] = ZERO
     while True:
         band = take_number(counter) * BAND
+        end = min(band + BAND, height)
         if band >= height:
             break
-        for row in range(band, min(band + BAND, height)):
+        _columns_of_moments(y, y, band, end, length, height, rows)
+        for row in range(band, end):
+            place = row - band
             for block in range(0, length, LANES):
                 at = min(block, length - LANES)
-                _down_moments(y, y, row, at, length, height, rows, PAD + at)
-            for block in range(0, length, LANES):
-                at = min(block, length - LANES)
-                mu = _along(rows[0], PAD + at)
+                mu = _window(rows[0, place], PAD + at, STEP)
                 store(mu_y, row * length + at, mu)
-                store(s_y, row * length + at, _along(rows[1], PAD + at) - mu * mu)
+                store(s_y, row * length + at, _window(rows[1, place], PAD + at, STEP) - mu * mu)
 
 
 def _scratch_size(width: int) -> int:
-    return 3 * (STEP * width + 2 * PAD)
+    return 3 * BAND * (STEP * width + 2 * PAD)
 
 
 class _Described:

@@ -10,7 +10,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 # What Blender's own Python, which has numpy and nothing else of ours, must be able to import.
 LIGHT = ("core.errors", "core.files", "core.progress", "core.pictures", "core.capture",
-         "core.bake.bake", "core.metrics.evaluation")
+         "core.bake.bake", "core.metrics.evaluation", "core.look")
 
 
 # Kernel sets that refuse to be imported on a machine without their device.

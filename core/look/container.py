@@ -1,0 +1,56 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""safetensors files, read with numpy and json: eight bytes of length, a JSON header, raw little-endian tensors.
+
+The header is bounded and every tensor is checked against the file's length before it is touched; nothing
+is executed or unpickled.
+"""
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import FlareFileError
+
+Arrays = dict[str, NDArray[Any]]
+
+LONGEST_HEADER = 100_000_000  # bytes, the format's own limit
+_KINDS = {"F64": "<f8", "F32": "<f4", "F16": "<f2", "I64": "<i8", "I32": "<i4", "I16": "<i2", "I8": "i1", "U8": "u1",
+          "BOOL": "?"}
+
+
+def read_tensors(path: Path | str) -> tuple[Arrays, dict[str, str]]:
+    """Tensors by name, and the metadata. Raises FlareFileError where the file is missing or damaged."""
+    path = Path(path)
+    if not path.is_file():
+        raise FlareFileError(f"{path} is missing; choose a .flare file that a fit has written.")
+    try:
+        data = path.read_bytes()
+        return _parsed(data)
+    except OSError as problem:
+        raise FlareFileError(f"{path} cannot be read ({problem.strerror or problem}).") from problem
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as problem:
+        raise FlareFileError(f"{path} is damaged or not a flare ({problem}); save it again.") from problem
+
+
+def _parsed(data: bytes) -> tuple[Arrays, dict[str, str]]:
+    length = int.from_bytes(data[:8], "little")
+    if len(data) < 8 or length > min(len(data) - 8, LONGEST_HEADER):
+        raise ValueError("it ends inside its header")
+    header = json.loads(data[8:8 + length].decode("utf-8"))
+    metadata = header.pop("__metadata__", {}) or {}
+    body = memoryview(data)[8 + length:]
+    arrays: Arrays = {}
+    for name, entry in header.items():
+        shape = [int(size) for size in entry["shape"]]
+        begin, end = (int(at) for at in entry["data_offsets"])
+        kind = np.dtype(_KINDS[entry["dtype"]])
+        count = math.prod(shape)
+        if min([0, *shape]) < 0 or not 0 <= begin <= end <= len(body) or end - begin != count * kind.itemsize:
+            raise ValueError(f"the tensor {name} does not fit the file")
+        arrays[name] = np.frombuffer(body[begin:end], kind).reshape(shape)
+    return arrays, {str(key): str(value) for key, value in metadata.items()}

@@ -1,0 +1,69 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Edits that change from frame to frame, in a small JSON file.
+
+    {"set": ["lamp.tint=1,0.8,0.6"], "frames": {"1": ["lamp.intensity=0"], "25": ["lamp.intensity=1"]}}
+
+"set" holds for every frame; "frames" gives more for some of them. Between two frames that are given,
+numbers run in straight lines; before the first and after the last they stay.
+"""
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from ..errors import SettingsError
+from ..files import read_json, write_json
+from .edits import LookEdits
+
+
+@dataclass(frozen=True)
+class KeyedEdits:
+    """always: words that hold for every frame. frames: by frame number, words added to them there."""
+
+    always: tuple[str, ...] = ()
+    frames: Mapping[int, tuple[str, ...]] = field(default_factory=dict)
+
+    @classmethod
+    def read(cls, path: Path | str) -> KeyedEdits:
+        """Raises SettingsError where the file is missing, damaged or of another form."""
+        data = read_json(path, SettingsError)
+        try:
+            frames = {int(number): _words(words) for number, words in data.get("frames", {}).items()}
+            return cls(_words(data.get("set", [])), dict(sorted(frames.items())))
+        except (AttributeError, TypeError, ValueError) as problem:
+            raise SettingsError(f'{path} should read {{"set": ["lamp.intensity=2"], "frames": {{"1": [...]}}}} '
+                                f"({problem}).") from problem
+
+    def write(self, path: Path | str) -> None:
+        """Write what `read` reads."""
+        write_json(path, self.described())
+
+    def described(self) -> dict[str, Any]:
+        """JSON-able."""
+        return {"set": list(self.always), "frames": {str(number): list(words) for number, words in self.frames.items()}}
+
+    def and_always(self, words: Sequence[str]) -> KeyedEdits:
+        """These and words that hold for every frame."""
+        return KeyedEdits((*self.always, *words), self.frames)
+
+    def at(self, frame: int, lights: Sequence[str], elements: Mapping[str, Sequence[str]] | None = None) -> LookEdits:
+        """The edits of a frame; see `LookEdits.parse` for the rest."""
+        def parsed(number: int) -> LookEdits:
+            return LookEdits.parse((*self.always, *self.frames[number]), lights, elements)
+
+        if not self.frames:
+            return LookEdits.parse(self.always, lights, elements)
+        numbers = sorted(self.frames)
+        before = max((number for number in numbers if number <= frame), default=numbers[0])
+        after = min((number for number in numbers if number >= frame), default=numbers[-1])
+        if before >= after:
+            return parsed(before if before in (frame, numbers[-1]) else after)
+        return parsed(before).towards(parsed(after), (frame - before) / (after - before))
+
+
+def _words(words: Any) -> tuple[str, ...]:
+    if not isinstance(words, list) or not all(isinstance(word, str) for word in words):
+        raise ValueError("edits are a list of texts")
+    return tuple(words)

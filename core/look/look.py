@@ -1,0 +1,301 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""A .flare as a look: what it shows for a camera and lights, with an artist's edits."""
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..errors import FlareFileError
+from . import container, elements
+from .edits import LookEdits, edited
+from .elements import Element
+from .network import Floats, Network, QueryRange, frequency_encoding
+from .plane import PlaneGaussians, colours, covariance_of_ellipse, covariance_of_solid
+
+VERSION = 1
+_KEY = "fit_flare"
+_MOST_GAUSSIANS = 1_000_000  # a file that claims more is damaged or hostile
+
+Query = Literal["target", "source", "trained"]
+
+
+@dataclass(frozen=True)
+class Form:
+    """What the model is made of (core.flare.model.FlareForm)."""
+
+    line: bool = True
+    light_correction: bool = True
+    plane_offset: bool = True
+    solid: bool = True
+    sh_degree: int = 3
+    static_offset: bool = False
+    rings: bool = False
+    latent: int = 0
+    levels: int = 16
+
+
+@dataclass(frozen=True)
+class TrainedCamera:
+    """Intrinsics of the footage, pixels."""
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+    @property
+    def intrinsics(self) -> NDArray[np.float64]:
+        """(3, 3)."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+
+@dataclass(frozen=True, eq=False)
+class ViewOfLight:
+    """One light seen from one camera. camera (3,) in the world, rotation (3, 3) world to camera, light (2,)
+    normalised coordinates, depth along the axis in world units: not positive means behind the camera."""
+
+    camera: Floats
+    rotation: Floats
+    light: Floats
+    depth: float
+
+    @classmethod
+    def of(cls, world_to_camera: ArrayLike, xyz: ArrayLike) -> ViewOfLight:
+        """From a pose (4, 4) and the light's position (3,)."""
+        pose = np.asarray(world_to_camera, np.float64)
+        x, y, z = (pose[:3, :3] @ np.asarray(xyz, np.float64) + pose[:3, 3]).tolist()
+        camera = -pose[:3, :3].T @ pose[:3, 3]
+        light = [x / z, y / z] if z > 0 else [math.inf, math.inf]
+        return cls(camera.astype(np.float32), pose[:3, :3].astype(np.float32), np.array(light, np.float32), z)
+
+
+class LightLook:
+    """The flare of one light; made by `read`."""
+
+    def __init__(self, name: str, xyz: NDArray[np.float64], form: Form, query_range: QueryRange,
+                 rows: Mapping[str, Floats], tensors: Mapping[str, NDArray[Any]], blend: str,
+                 listed: list[Element]) -> None:
+        """rows: canonical Gaussians by name; tensors: the network's; listed: elements the file has, [] for none."""
+        self.name, self.xyz, self.form, self.query_range, self.blend = name, xyz, form, query_range, blend
+        self._rows, self._listed = rows, listed
+        encoded = frequency_encoding(rows["positions"])
+        if form.latent:
+            encoded = np.concatenate([encoded, rows["latent"]], -1)
+        self._network = Network(tensors, _heads(form, rows), form.levels, query_range, encoded)
+
+    @property
+    def count(self) -> int:
+        """Gaussians."""
+        return len(self._rows["positions"])
+
+    @cached_property
+    def elements(self) -> list[Element]:
+        """Its elements: the file's own, or else found from the canonical Gaussians."""
+        if self._listed:
+            return self._listed
+        along = self.query_range.light_high[2] * np.array([0.55, 0.35], np.float32)
+        middle = (self.query_range.camera_low + self.query_range.camera_high) / 2
+        seen, _ = self._gaussians(ViewOfLight(middle, np.eye(3, dtype=np.float32), np.asarray(along, np.float32), 1.0),
+                                  None)
+        return elements.group(seen, self._rows["positions"][:, 0] if self.form.line else None)
+
+    def evaluate(self, view: ViewOfLight, *, query: ViewOfLight | None = None, edits: LookEdits | None = None,
+                 share: float = 1.0) -> PlaneGaussians | None:
+        """The Gaussians this light shows in `view`; None for a light behind the camera, which has no flare.
+
+        query: the camera and light the network is asked for, if not the view's own: appearance follows it,
+        placement follows the view. share: how much of the light is visible, 0..1; scales the opacities.
+        """
+        if view.depth <= 0:
+            return None
+        gaussians, light = self._gaussians(view, query)
+        if edits is not None:
+            gaussians = edited(gaussians, self.name, light, self.elements, edits, self.blend)
+        if share != 1.0:
+            gaussians = replace(gaussians, opacities=np.asarray(gaussians.opacities * share, np.float32))
+        return gaussians
+
+    def _gaussians(self, view: ViewOfLight, query: ViewOfLight | None) -> tuple[PlaneGaussians, Floats]:
+        """Gaussians on the plane (paper, eq. 1 to 3), and the light with delta_l."""
+        form, rows, asked = self.form, self._rows, query or view
+        features = self._network.view_features(asked.camera, asked.light)
+        change = self._network.offsets(features)
+        light = view.light
+        if form.light_correction:
+            light = light + self._network.light_correction(features)
+        positions = rows["positions"] + change["positions"]
+        means = positions * light if form.line else positions
+        if "plane_offset" in change:
+            means = means + change["plane_offset"]
+        if form.static_offset:
+            means = means + rows["offsets"]
+        scales, rotations = rows["log_scales"] + change["log_scales"], rows["rotations"] + change["rotations"]
+        covariances = (covariance_of_solid(means, scales, rotations) if form.solid
+                       else covariance_of_ellipse(scales, rotations))
+        with np.errstate(over="ignore"):
+            opacities = 1 / (1 + np.exp(-(rows["opacity_logits"] + change["opacity_logits"])[:, 0]))
+        rays = np.concatenate([means, np.ones_like(means[:, :1])], -1) @ view.rotation
+        sh = (rows["sh"] + change["sh"]).reshape(len(means), -1, 3)
+        rings = None
+        if form.rings:
+            raw = rows["rings"] + change["rings"]
+            rings = np.stack([raw[:, 0], np.exp(np.clip(raw[:, 1], -3, 3))], -1)
+        return PlaneGaussians(means, covariances, opacities, colours(rays, sh, form.sh_degree), rings), light
+
+
+class Look:
+    """All lights of a .flare; made by `read`."""
+
+    def __init__(self, path: Path, lights: tuple[LightLook, ...], blend: Literal["over", "add"], camera: TrainedCamera,
+                 licence: str = "", notes: str = "") -> None:
+        self.path, self.lights, self.blend, self.camera = path, lights, blend, camera
+        self.licence, self.notes = licence, notes
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the lights, in their order."""
+        return tuple(light.name for light in self.lights)
+
+    @property
+    def element_names(self) -> dict[str, list[str]]:
+        """Names of the elements by light, as `LookEdits.parse` takes them."""
+        return {light.name: [element.name for element in light.elements] for light in self.lights}
+
+    @property
+    def count(self) -> int:
+        """Gaussians of all lights."""
+        return sum(light.count for light in self.lights)
+
+    def evaluate(self, world_to_camera: ArrayLike, *, lights: Mapping[str, ArrayLike] | None = None,
+                 edits: LookEdits | None = None, shares: Mapping[str, float] | None = None,
+                 query: Query = "target") -> dict[str, PlaneGaussians]:
+        """The Gaussians of each light in front of the camera, by the light's name, in the file's order.
+
+        world_to_camera: (4, 4), x right, y down, z forward. lights: positions (3,) by name where they differ
+        from the file's; with it, lights it does not name are left out. edits: mute and solo leave lights out.
+        shares: how much of a light is visible, 0..1, by name (1 where not named).
+        query: what appearance follows: "target" the view as it is; "trained" the view, kept inside what training
+        saw; "source" the middle of what training saw. Placement follows the view always.
+        """
+        placed = {light.name: light.xyz for light in self.lights} if lights is None else dict(lights)
+        shown: dict[str, PlaneGaussians] = {}
+        for light in self.lights:
+            if light.name not in placed or (edits is not None and not edits.shows(light.name, placed)):
+                continue
+            view = ViewOfLight.of(world_to_camera, placed[light.name])
+            if view.depth <= 0:
+                continue
+            found = light.evaluate(view, query=asked(light, view, query), edits=edits,
+                                   share=(shares or {}).get(light.name, 1.0))
+            if found is not None:
+                shown[light.name] = found
+        return shown
+
+
+def asked(light: LightLook, view: ViewOfLight, query: Query) -> ViewOfLight | None:
+    """What the network is asked for, by name; see `Look.evaluate`. None: the view itself."""
+    if query == "target":
+        return None
+    reach = light.query_range
+    if query == "trained":
+        camera, place = reach.clipped(view.camera, view.light)
+    else:
+        camera = (reach.camera_low + reach.camera_high) / 2
+        _, place = reach.clipped(camera, view.light)
+    return replace(view, camera=camera, light=place)
+
+
+# ---- the file -------------------------------------------------------------------------------------
+
+
+def describe(path: Path | str) -> dict[str, Any]:
+    """The description of a .flare (lights, blend, camera, licence, notes), without its tensors' meaning.
+
+    Raises FlareFileError where the file is missing, damaged, newer, or not a flare.
+    """
+    return _described(Path(path), container.read_tensors(path)[1])
+
+
+def _described(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
+    if _KEY not in metadata:
+        raise FlareFileError(f"{path} is a safetensors file, but not a flare; choose another.")
+    try:
+        description = json.loads(metadata[_KEY])
+    except (ValueError, RecursionError) as problem:
+        raise FlareFileError(f"{path} is damaged or not a flare ({problem}); save it again.") from problem
+    version = description.get("version") if isinstance(description, dict) else None
+    if not isinstance(version, int) or version > VERSION:
+        raise FlareFileError(f"{path} was written by a newer Fit Flare (format {version}); update to open it.")
+    return description
+
+
+def read(path: Path | str) -> Look:
+    """Read a .flare. Raises FlareFileError where it is missing, damaged, newer, or not a flare."""
+    path = Path(path)
+    tensors, metadata = container.read_tensors(path)
+    description = _described(path, metadata)
+    for name, tensor in tensors.items():
+        if tensor.dtype.kind == "f" and not np.isfinite(tensor).all():
+            raise FlareFileError(f"{path} is damaged: {name} holds values that are not finite; save it again.")
+    try:
+        blend = description["blend"]
+        if blend not in ("over", "add"):
+            raise ValueError(f"blend {blend!r}")
+        listed = description.get("elements", [])
+        lights = tuple(_light(path, number, entry, tensors, blend, listed)
+                       for number, entry in enumerate(description["lights"]))
+        camera = TrainedCamera(**description["camera"])
+        if len({light.name for light in lights}) < len(lights):
+            raise ValueError("two lights have one name")
+    except (KeyError, TypeError, ValueError, IndexError, AttributeError) as problem:
+        raise FlareFileError(f"{path} is damaged: its tensors do not fit its description ({problem}).") from problem
+    return Look(path, lights, blend, camera, str(description.get("licence", "")), str(description.get("notes", "")))
+
+
+def _light(path: Path, number: int, entry: Mapping[str, Any], tensors: Mapping[str, NDArray[Any]], blend: str,
+           listed: Any) -> LightLook:
+    strange = set(entry["form"]) - {one.name for one in fields(Form)}
+    if strange:
+        raise FlareFileError(f"{path} was written by a newer Fit Flare (its form has {', '.join(sorted(strange))}); "
+                             "update to open it.")
+    form, name, count = Form(**entry["form"]), str(entry["name"]), int(entry["count"])
+    xyz = np.array([float(value) for value in entry["xyz"]], np.float64)
+    if not 0 <= count <= _MOST_GAUSSIANS or xyz.shape != (3,) or not np.isfinite(xyz).all():
+        raise ValueError("a light's description makes no sense")
+    if form.sh_degree not in range(4) or not 1 <= form.levels <= 16 or not 0 <= form.latent <= 64:
+        raise ValueError("a light's form makes no sense")
+    own = {key[len(f"{number}."):]: value for key, value in tensors.items() if key.startswith(f"{number}.")}
+    rows = {key[len("gaussians."):]: np.asarray(value, np.float32) for key, value in own.items()
+            if key.startswith("gaussians.")}
+    for key, width in _widths(form).items():
+        if rows[key].shape != (count, width):
+            raise ValueError(f"{key} has the shape {rows[key].shape}")
+    return LightLook(name, xyz, form, QueryRange.read(entry["range"]), rows, own, blend,
+                     elements.read(listed, name, count))
+
+
+def _widths(form: Form) -> dict[str, int]:
+    """Columns of the canonical Gaussians by name (core.flare.model.LightFlare)."""
+    widths = {"positions": 1 if form.line else 2, "log_scales": 3 if form.solid else 2,
+              "rotations": 4 if form.solid else 2, "opacity_logits": 1, "sh": 3 * (form.sh_degree + 1) ** 2}
+    extra = {"offsets": (form.static_offset, 2), "rings": (form.rings, 2), "latent": (form.latent, form.latent)}
+    return {**widths, **{name: width for name, (there, width) in extra.items() if there}}
+
+
+def _heads(form: Form, rows: Mapping[str, Floats]) -> dict[str, int]:
+    """Offsets by name, in the order of the network's one head matrix (core.flare.model.LightFlare)."""
+    known = sorted(name for name in _widths(form) if name not in ("offsets", "latent"))  # as torch sorts parameters
+    heads = {name: rows[name].shape[1] for name in known}
+    if form.line and form.plane_offset:
+        heads["plane_offset"] = 2
+    return heads

@@ -1,0 +1,150 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The deformation network and its encodings in numpy: what core.flare has in torch, without gradients.
+
+Hash tables stay as the rows that training touched (sorted), since one view asks for 128 rows of millions.
+"""
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float32]
+
+BANDS = 3
+BASE, LIGHT_BITS, LIGHT_GROWTH, CAMERA_BITS, CAMERA_GROWTH = 16, 17, 1.8, 15, 1.6
+_PRIMES = np.array([1, 2654435761, 805459861], np.int64)  # Müller et al. 2022, eq. 4
+_CORNERS = np.array([[(corner >> axis) & 1 for axis in range(3)] for corner in range(8)], np.int64)
+
+
+class HashGrid:
+    """Multiresolution hash grid over the unit cube (Müller et al. 2022, section 3); see core/flare/encoding.py."""
+
+    def __init__(self, bits: int, growth: float, levels: int, rows: NDArray[Any], values: NDArray[Any]) -> None:
+        """rows: ascending numbers of the table rows that are not zero, (k,); values: their content, (k, features)."""
+        size = 1 << bits
+        self._resolutions = np.array([math.floor(BASE * growth**level) for level in range(levels)], np.int64)
+        self._sizes = np.minimum((self._resolutions + 1) ** 3, size)
+        self._starts = np.concatenate([[0], np.cumsum(self._sizes)[:-1]]).astype(np.int64)
+        self._kept, self._values = np.asarray(rows, np.int64), np.asarray(values, np.float32)
+        if (self._values.ndim != 2 or self._kept.shape != self._values.shape[:1] or (np.diff(self._kept) <= 0).any()
+                or (len(self._kept) and not 0 <= self._kept[0] <= self._kept[-1] < self._sizes.sum())):
+            raise ValueError("a hash table's rows make no sense")
+
+    def __call__(self, point: Floats) -> Floats:
+        """Features (levels * features,) of a point (3,), clamped to 0..1."""
+        resolutions = self._resolutions[:, None]
+        scaled = (np.clip(point, 0, 1).astype(np.float32)[None] * resolutions.astype(np.float32))
+        low = np.minimum(np.floor(scaled), resolutions.astype(np.float32) - 1)
+        fraction = (scaled - low)[:, None]
+        corner = low.astype(np.int64)[:, None] + _CORNERS
+        weights = np.where(_CORNERS.astype(bool), fraction, 1 - fraction).prod(-1)
+        side = resolutions + 1
+        dense = corner[..., 0] + side * (corner[..., 1] + side * corner[..., 2])
+        mixed = corner * _PRIMES
+        hashed = (mixed[..., 0] ^ mixed[..., 1] ^ mixed[..., 2]) % self._sizes[:, None]
+        rows = np.where(side**3 <= self._sizes[:, None], dense, hashed) + self._starts[:, None]
+        return np.asarray((self._row_values(rows) * weights[..., None]).sum(1).reshape(-1), np.float32)
+
+    def _row_values(self, rows: NDArray[np.int64]) -> Floats:
+        found = np.zeros((*rows.shape, self._values.shape[1]), np.float32)
+        if len(self._kept):
+            at = np.minimum(np.searchsorted(self._kept, rows), len(self._kept) - 1)
+            known = self._kept[at] == rows
+            found[known] = self._values[at[known]]
+        return found
+
+
+def frequency_encoding(values: Floats, bands: int = BANDS) -> Floats:
+    """sin and cos of 2^k pi x for k < bands (Mildenhall et al. 2020, eq. 4): (n, d) to (n, 2 * bands * d)."""
+    octaves = (math.pi * 2.0 ** np.arange(bands)).astype(np.float32)
+    angles = (values[..., None] * octaves).reshape(len(values), -1)
+    return np.concatenate([np.sin(angles), np.cos(angles)], -1)
+
+
+@dataclass(frozen=True)
+class QueryRange:
+    """The boxes that map camera and light to the unit cube: what the network was trained on.
+
+    camera_low, camera_high: world units. light_high: largest |x|, |y|, norm of the light's offset from the
+    principal point, normalised image coordinates.
+    """
+
+    camera_low: Floats
+    camera_high: Floats
+    light_high: Floats
+
+    @classmethod
+    def read(cls, entry: Mapping[str, Sequence[float]]) -> QueryRange:
+        """From the .flare's description; ValueError where it makes no sense."""
+        parts = [np.asarray(entry[name], np.float32) for name in ("camera_low", "camera_high", "light_high")]
+        if any(part.shape != (3,) or not np.isfinite(part).all() for part in parts):
+            raise ValueError("a light's range makes no sense")
+        return cls(*parts)
+
+    def clipped(self, camera: Floats, light: Floats) -> tuple[Floats, Floats]:
+        """Camera (3,) and light (2,) moved to the nearest that training saw."""
+        camera = np.clip(camera, self.camera_low, self.camera_high)
+        reach = float(np.linalg.norm(light))
+        sizes = np.append(np.abs(light), reach)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            shrink = np.min(np.where(sizes > self.light_high, self.light_high / sizes, 1.0))
+        return camera, np.asarray(light * shrink, np.float32)
+
+
+class Network:
+    """Offsets of `heads` (name: width) for the canonical Gaussians, and delta_l, from one camera and light."""
+
+    def __init__(self, tensors: Mapping[str, NDArray[Any]], heads: Mapping[str, int], levels: int,
+                 query_range: QueryRange, encoded: Floats) -> None:
+        """tensors: by their names in the file, without the light's number. encoded: (n, d) canonical positions,
+        frequency encoded, with latent codes after them."""
+        self._t = {name: np.asarray(value, np.float32) for name, value in tensors.items()
+                   if not name.endswith(".rows")}
+        self._heads, self._range = dict(heads), query_range
+
+        def grid(name: str, bits: int, growth: float) -> HashGrid:
+            table = f"network.{name}.table.weight"
+            return HashGrid(bits, growth, levels, tensors[f"{table}.rows"], tensors[f"{table}.values"])
+
+        self._light_grid = grid("light_grid", LIGHT_BITS, LIGHT_GROWTH)
+        self._camera_grid = grid("camera_grid", CAMERA_BITS, CAMERA_GROWTH)
+        self._hidden = sorted(name[:-len(".weight")] for name in self._t
+                              if name.startswith("network.layers.") and name.endswith(".weight"))
+        self._encoded = encoded
+        if self._t["network.head.weight"].shape[0] != sum(self._heads.values()):
+            raise ValueError("the network's heads do not fit the form")
+
+    @cached_property
+    def _gaussian_share(self) -> Floats:
+        """The Gaussians' part of the first layer, which no view changes."""
+        return np.asarray(self._encoded @ self._t["network.gaussian_layer.weight"].T, np.float32)
+
+    def view_features(self, camera: Floats, light: Floats) -> Floats:
+        """Features of a camera position (3,), world units, and a light (2,), normalised coordinates."""
+        extent = self._range.camera_high - self._range.camera_low
+        folded = np.append(np.abs(light), np.linalg.norm(light)).astype(np.float32)
+        where = (camera.astype(np.float32) - self._range.camera_low) / extent
+        return np.concatenate([self._light_grid(folded / self._range.light_high), self._camera_grid(where)])
+
+    def offsets(self, features: Floats) -> dict[str, Floats]:
+        """Offsets by name, (n, width) each."""
+        x = np.maximum(self._gaussian_share + self._linear("network.view_layer", features[None]), 0)
+        for name in self._hidden:
+            x = np.maximum(self._linear(name, x), 0)
+        every = self._linear("network.head", x)
+        edges = np.cumsum([0, *self._heads.values()])
+        return {name: every[:, a:b] for name, a, b in zip(self._heads, edges[:-1], edges[1:], strict=True)}
+
+    def light_correction(self, features: Floats) -> Floats:
+        """delta_l (2,), normalised coordinates."""
+        hidden = np.maximum(self._linear("network.correction.0", features[None]), 0)
+        return self._linear("network.correction.2", hidden)[0]
+
+    def _linear(self, name: str, x: Floats) -> Floats:
+        return np.asarray(x @ self._t[f"{name}.weight"].T + self._t[f"{name}.bias"], np.float32)

@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Gaussians on the normalised plane: covariances, colours, pixels. The formulas of core/flare/placement.py in numpy.
+
+Everything is in normalised image coordinates (x/z, y/z, origin at the principal point, y down).
+"""
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Floats = NDArray[np.float32]
+
+PLANE_DEPTH = 0.21  # where solid Gaussians lie (core/flare/placement.py)
+DILATION = 0.3  # px², the low-pass of 3DGS
+
+C0 = 0.28209479177387814  # spherical harmonics with the signs and order of 3DGS
+C1 = 0.4886025119029199
+C2 = (1.0925484305920792, 0.31539156525252005, 0.5462742152960396)
+C3 = (0.5900435899266435, 2.890611442640554, 0.4570457994644658, 0.3731763325901154, 1.445305721320277)
+
+
+@dataclass(frozen=True, eq=False)
+class PlaneGaussians:
+    """Gaussians on the normalised plane, ready to be drawn.
+
+    means (n, 2), covariances (n, 3) as xx, xy, yy, opacities (n,) in 0..1 (any gain where light adds), colours
+    (n, 3) (linear where light adds, display values where it covers), rings (n, 2) as r0 and w or None.
+    """
+
+    means: Floats
+    covariances: Floats
+    opacities: Floats
+    colours: Floats
+    rings: Floats | None = None
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    def kept(self, rows: Any) -> PlaneGaussians:
+        """The Gaussians of these rows (a mask or numbers)."""
+        rings = None if self.rings is None else self.rings[rows]
+        return PlaneGaussians(self.means[rows], self.covariances[rows], self.opacities[rows], self.colours[rows], rings)
+
+    @property
+    def energy(self) -> Floats:
+        """(n,) luminance each adds to the plane: opacity times the profile's area times luminance."""
+        luminance = np.maximum(self.colours, 0) @ np.array([0.2126, 0.7152, 0.0722], np.float32)
+        xx, xy, yy = self.covariances.T
+        area = 2 * np.pi * np.sqrt(np.maximum(xx * yy - xy * xy, 0))
+        if self.rings is not None:  # a ring's area: radius times width, that of the plain profile for r0 = 0
+            r0, w = self.rings.T
+            area = area * (w * w + np.sqrt(np.pi / 2) * np.maximum(r0, 0) * w)
+        return np.asarray(self.opacities * area * luminance, np.float32)
+
+
+def covariance_of_solid(means: Floats, log_scales: Floats, quaternions: Floats) -> Floats:
+    """(n, 3) on the plane of 3D Gaussians at depth PLANE_DEPTH (Zwicker et al. 2002)."""
+    q = quaternions / np.maximum(np.linalg.norm(quaternions, axis=-1, keepdims=True), 1e-12)
+    w, x, y, z = q.T
+    rotation = np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+                         2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+                         2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], -1).reshape(-1, 3, 3)
+    scales = np.exp(log_scales) / PLANE_DEPTH
+    first = (rotation[:, 0] - means[:, :1] * rotation[:, 2]) * scales
+    second = (rotation[:, 1] - means[:, 1:] * rotation[:, 2]) * scales
+    return np.stack([(first * first).sum(-1), (first * second).sum(-1), (second * second).sum(-1)], -1)
+
+
+def covariance_of_ellipse(log_scales: Floats, directions: Floats) -> Floats:
+    """(n, 3) of ellipses: log_scales (n, 2), directions (n, 2) of the first axis, any length."""
+    c, s = (directions / np.maximum(np.linalg.norm(directions, axis=-1, keepdims=True), 1e-12)).T
+    a, b = np.exp(2 * log_scales).T
+    return np.stack([a * c * c + b * s * s, (a - b) * c * s, a * s * s + b * c * c], -1)
+
+
+def colours(rays: Floats, sh: Floats, degree: int) -> Floats:
+    """(n, 3) >= 0: spherical harmonics (n, k, 3) seen along rays (n, 3) of any length."""
+    x, y, z = (rays / np.maximum(np.linalg.norm(rays, axis=-1, keepdims=True), 1e-12)).T
+    functions = [np.full_like(x, C0)]
+    if degree >= 1:
+        functions += [-C1 * y, C1 * z, -C1 * x]
+    if degree >= 2:
+        functions += [C2[0] * x * y, -C2[0] * y * z, C2[1] * (2 * z * z - x * x - y * y), -C2[0] * x * z,
+                      C2[2] * (x * x - y * y)]
+    if degree >= 3:
+        functions += [-C3[0] * y * (3 * x * x - y * y), C3[1] * x * y * z, -C3[2] * y * (4 * z * z - x * x - y * y),
+                      C3[3] * z * (2 * z * z - 3 * x * x - 3 * y * y), -C3[2] * x * (4 * z * z - x * x - y * y),
+                      C3[4] * z * (x * x - y * y), -C3[0] * x * (x * x - 3 * y * y)]
+    shown = np.einsum("nk,nkc->nc", np.stack(functions, -1), sh[:, :len(functions)])
+    return np.maximum(shown + np.float32(0.5), 0)
+
+
+def pixels(gaussians: PlaneGaussians, intrinsics: ArrayLike, dilation: float = DILATION) -> tuple[Floats, Floats]:
+    """Centres (n, 2) px and covariances (n, 3) px² under intrinsics (3, 3), with 3DGS's low-pass added."""
+    k = np.asarray(intrinsics, np.float32)
+    focal, centre = k.diagonal()[:2], k[:2, 2]
+    stretch = np.array([focal[0] ** 2, focal[0] * focal[1], focal[1] ** 2], np.float32)
+    low_pass = np.array([dilation, 0, dilation], np.float32)
+    return gaussians.means * focal + centre, gaussians.covariances * stretch + low_pass
+
+
+def joined(sets: Sequence[PlaneGaussians]) -> PlaneGaussians | None:
+    """Several sets as one; None where there are none. Sets without rings get plain ones beside sets with."""
+    if not sets:
+        return None
+    rings = None
+    if any(one.rings is not None for one in sets):
+        rings = np.concatenate([np.tile(np.array([0, 1], np.float32), (len(one), 1)) if one.rings is None else one.rings
+                                for one in sets])
+    means, covariances, opacities, shown = (
+        np.concatenate([getattr(one, name) for one in sets])
+        for name in ("means", "covariances", "opacities", "colours"))
+    return PlaneGaussians(means, covariances, opacities, shown, rings)

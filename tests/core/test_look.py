@@ -1,0 +1,323 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The look in numpy against the flare in torch, and what edits do to it."""
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from core.errors import FlareFileError, SettingsError
+from core.flare import file as flare_file
+from core.flare.compositing import splat_flare
+from core.flare.file import FlareFile, TrainingCamera
+from core.flare.model import OURS, PAPER, FlareForm, FlareModel
+from core.look import Edit, KeyedEdits, LookEdits, PlaneGaussians, draw, read
+from core.look import elements as grouping
+from core.look.container import read_tensors
+from core.look.edits import edited
+from tests.core.flared import cameras
+from tests.core.test_flare import pose, some_flare
+
+FORMS = {"paper": PAPER, "ours": OURS, "plane": replace(PAPER, line=False, plane_offset=False),
+         "bare": replace(PAPER, light_correction=False, plane_offset=False, sh_degree=1),
+         "small": replace(OURS, levels=6)}
+SMALL = FORMS["small"]
+CAMERA = TrainingCamera(64, 40, 70.0, 70.0, 33.0, 19.5)
+
+
+def saved(path: Path, form: FlareForm = SMALL, lights: int = 2, blend: str = "add", count: int = 40) -> FlareModel:
+    model = some_flare(form, count, lights)
+    flare_file.save(path, FlareFile(model, blend, CAMERA, "CC0", "some notes"))  # type: ignore[arg-type]
+    return model
+
+
+@pytest.mark.parametrize("name", FORMS)
+def test_it_evaluates_as_torch_does(name: str, tmp_path: Path) -> None:
+    model = saved(tmp_path / "a.flare", FORMS[name])
+    look = read(tmp_path / "a.flare")
+    assert look.names == model.names
+    for number in range(3):
+        with torch.no_grad():
+            expected = model(pose(number))
+        shown = look.evaluate(cameras(3)[number].world_to_camera)
+        assert list(shown) == list(expected)
+        for light, gaussians in expected.items():
+            for field in ("means", "covariances", "opacities", "colours", "rings"):
+                theirs = getattr(gaussians, field)
+                if theirs is not None:
+                    np.testing.assert_allclose(getattr(shown[light], field), theirs.numpy(), rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("blend", ["add", "over"])
+def test_it_draws_as_the_rasterizer_does(blend: str, tmp_path: Path) -> None:
+    model = saved(tmp_path / "a.flare", SMALL, 1, blend)
+    camera = cameras(3)[1]
+    with torch.no_grad():
+        expected = splat_flare(next(iter(model(pose(1)).values())), torch.from_numpy(camera.intrinsics).float(), 64, 40,
+                               blend, kernels="torch").colour.numpy()  # type: ignore[arg-type]
+    look = read(tmp_path / "a.flare")
+    picture = draw(look.evaluate(camera.world_to_camera).values(), camera.intrinsics, 64, 40, look.blend)
+    assert expected.max() > 0.05
+    np.testing.assert_allclose(picture, expected, atol=2e-5)
+
+
+def test_a_light_behind_the_camera_has_no_flare(tmp_path: Path) -> None:
+    saved(tmp_path / "a.flare")
+    behind = np.diag([1.0, -1.0, -1.0, 1.0])
+    assert read(tmp_path / "a.flare").evaluate(behind) == {}
+
+
+def test_lights_can_be_placed_left_out_and_hidden(tmp_path: Path) -> None:
+    saved(tmp_path / "a.flare")
+    look, view = read(tmp_path / "a.flare"), cameras(3)[0].world_to_camera
+    moved = look.evaluate(view, lights={"lamp 1": look.lights[0].xyz})
+    assert list(moved) == ["lamp 1"]
+    half = look.evaluate(view, shares={"lamp 0": 0.25})
+    np.testing.assert_allclose(half["lamp 0"].opacities, 0.25 * look.evaluate(view)["lamp 0"].opacities, rtol=1e-6)
+
+
+def test_a_query_can_stay_in_the_trained_range(tmp_path: Path) -> None:
+    saved(tmp_path / "a.flare", replace(PAPER, levels=6), 1)
+    look = read(tmp_path / "a.flare")
+    inside, far = cameras(3)[1].world_to_camera, cameras(3)[1].world_to_camera.copy()
+    far[0, 3] += 3
+    for view, same in ((inside, True), (far, False)):
+        free, kept = (look.evaluate(view, query=query)["lamp 0"] for query in ("target", "trained"))
+        assert np.allclose(free.colours, kept.colours) == same
+    low, high = look.lights[0].query_range.camera_low, look.lights[0].query_range.camera_high
+    camera, light = look.lights[0].query_range.clipped(np.array([9, 0, -4], np.float32), np.array([3, 4], np.float32))
+    assert (camera >= low).all()
+    assert (camera <= high).all()
+    np.testing.assert_allclose(light[1] / light[0], 4 / 3, rtol=1e-5)
+    assert np.linalg.norm(light) <= 0.7 + 1e-5
+
+
+# ---- files ----------------------------------------------------------------------------------------
+
+
+def test_notes_and_licence_come_along(tmp_path: Path) -> None:
+    saved(tmp_path / "a.flare")
+    look = read(tmp_path / "a.flare")
+    assert (look.licence, look.notes, look.camera.width, look.count) == ("CC0", "some notes", 64, 80)
+
+
+def test_bad_files_are_one_sentence(tmp_path: Path) -> None:
+    good = tmp_path / "good.flare"
+    saved(good, replace(OURS, levels=2))
+    data = good.read_bytes()
+    length = int.from_bytes(data[:8], "little")
+    header = json.loads(data[8:8 + length])
+
+    def with_description(**changes: object) -> bytes:
+        description = {**json.loads(header["__metadata__"]["fit_flare"]), **changes}
+        text = json.dumps({**header, "__metadata__": {"fit_flare": json.dumps(description)}}).encode()
+        return len(text).to_bytes(8, "little") + text + data[8 + length:]
+
+    first = json.loads(header["__metadata__"]["fit_flare"])["lights"][0]
+    bad = {
+        "empty": b"", "short": data[:20], "cut": data[:-10], "noise": bytes(range(256)) * 8,
+        "huge": (1 << 60).to_bytes(8, "little") + data[8:], "list": (2).to_bytes(8, "little") + b"[]",
+        "newer": with_description(version=99), "form": with_description(lights=[{**first, "form": {"spiral": True}}]),
+        "count": with_description(lights=[{**first, "count": 7}]), "blend": with_description(blend="paint"),
+        "xyz": with_description(lights=[{**first, "xyz": [1, 2]}]), "twice": with_description(lights=[first, first]),
+        "members": with_description(elements=[{"light": first["name"], "name": "a", "members": [4000]}]),
+    }
+    for name, content in bad.items():
+        (tmp_path / f"{name}.flare").write_bytes(content)
+        with pytest.raises(FlareFileError, match=name):
+            read(tmp_path / f"{name}.flare")
+    for name in ("newer", "form"):
+        with pytest.raises(FlareFileError, match="newer Fit Flare"):
+            read(tmp_path / f"{name}.flare")
+    with pytest.raises(FlareFileError, match="missing"):
+        read(tmp_path / "absent.flare")
+
+
+def test_the_container_is_safetensors(tmp_path: Path) -> None:
+    from safetensors.numpy import save_file
+
+    arrays = {"a": np.arange(6, dtype=np.float32).reshape(2, 3), "b": np.array([], np.int32), "c": np.array([True])}
+    save_file(arrays, str(tmp_path / "a"), {"key": "value"})
+    tensors, metadata = read_tensors(tmp_path / "a")
+    assert metadata == {"key": "value"}
+    for name, array in arrays.items():
+        np.testing.assert_array_equal(tensors[name], array)
+
+
+# ---- elements -------------------------------------------------------------------------------------
+
+
+def plane(places: list[float], *, size: float = 0.02, long: float = 1.0, ring: float = 0.0) -> PlaneGaussians:
+    """Gaussians on the line towards (0.3, 0)."""
+    n = len(places)
+    means = np.stack([0.3 * np.array(places), np.zeros(n)], -1).astype(np.float32)
+    covariances = np.tile(np.array([(size * long) ** 2, 0, size**2], np.float32), (n, 1))
+    rings = np.tile(np.array([ring, 1], np.float32), (n, 1))
+    return PlaneGaussians(means, covariances, np.full(n, 0.5, np.float32), np.ones((n, 3), np.float32), rings)
+
+
+def test_gaussians_are_grouped_by_kind_and_place() -> None:
+    from core.look.plane import joined
+
+    mu = [1.0, 1.02, 0.98, 0.4, 0.42, -0.5, 1.0, 0.4]
+    gaussians = joined([plane(mu[:6]), plane(mu[6:7], long=9), plane(mu[7:], ring=3)])
+    assert gaussians is not None
+    found = {element.name: element for element in grouping.group(gaussians, np.array(mu, np.float32))}
+    assert {name: sorted(element.members.tolist()) for name, element in found.items()} == {
+        "glare": [0, 1, 2], "ghost": [3, 4], "ghost 2": [5], "streak": [6], "ring": [7]}
+    assert abs(found["ghost 2"].mu + 0.5) < 1e-5
+    assert sum(element.energy for element in found.values()) == pytest.approx(1, abs=1e-5)
+
+
+def test_every_gaussian_has_one_element_whatever_they_are() -> None:
+    random = np.random.default_rng(2)
+    for count in (0, 1, 2, 400):
+        gaussians = plane(random.uniform(-2, 2, count).tolist())
+        for mu in (gaussians.means[:, 0] / np.float32(0.3), None):
+            found = grouping.group(gaussians, mu)
+            assert len(found) <= grouping.MOST
+            assert len({element.name for element in found}) == len(found)
+            members = np.concatenate([np.zeros(0, np.int64), *(element.members for element in found)])
+            assert sorted(members.tolist()) == list(range(count))
+
+
+def test_elements_of_the_file_come_first(tmp_path: Path) -> None:
+    model = some_flare(SMALL, 6, 1)
+    listed = [{"light": "lamp 0", "name": "iris", "kind": "ring", "members": [0, 2], "mu": 0.5, "energy": 0.7}]
+    flare_file.save(tmp_path / "a.flare", FlareFile(model, "add", CAMERA, elements=listed))
+    elements = read(tmp_path / "a.flare").lights[0].elements
+    assert [(element.name, element.members.tolist()) for element in elements] == [
+        ("iris", [0, 2]), ("rest", [1, 3, 4, 5])]
+
+
+# ---- edits ----------------------------------------------------------------------------------------
+
+LIGHT = np.array([0.3, 0.0])
+
+
+def ghosts() -> tuple[PlaneGaussians, list[grouping.Element]]:
+    gaussians = plane([1.0, 0.4, 0.44])
+    return gaussians, grouping.group(gaussians, gaussians.means[:, 0] / np.float32(0.3))
+
+
+def after(*words: str, blend: str = "add") -> PlaneGaussians:
+    gaussians, elements = ghosts()
+    names = {"lamp": [element.name for element in elements]}
+    return edited(gaussians, "lamp", LIGHT, elements, LookEdits.parse(words, ["lamp"], names), blend)
+
+
+def test_no_edit_changes_nothing() -> None:
+    gaussians, elements = ghosts()
+    assert edited(gaussians, "lamp", LIGHT, elements, LookEdits(), "add") is gaussians
+
+
+def test_scale_grows_each_element_about_its_own_centre() -> None:
+    before, _ = ghosts()
+    scaled = after("lamp.scale=2")
+    np.testing.assert_allclose(scaled.covariances, 4 * before.covariances, rtol=1e-6)
+    np.testing.assert_allclose(scaled.means[0], before.means[0], atol=1e-7)
+    np.testing.assert_allclose(scaled.means[2] - scaled.means[1], 2 * (before.means[2] - before.means[1]), atol=1e-6)
+    np.testing.assert_allclose(scaled.means[1:].mean(0), before.means[1:].mean(0), atol=1e-6)
+
+
+def test_spread_moves_ghosts_and_leaves_the_source() -> None:
+    before, _ = ghosts()
+    spread = after("lamp.spread=0.5")
+    np.testing.assert_allclose(spread.means[0], before.means[0], atol=1e-6)
+    np.testing.assert_allclose(LIGHT - spread.means[1:].mean(0), 0.5 * (LIGHT - before.means[1:].mean(0)), atol=1e-6)
+    np.testing.assert_allclose(spread.covariances, before.covariances, rtol=1e-6)
+
+
+def test_rotation_turns_an_element_about_its_centre() -> None:
+    before, _ = ghosts()
+    turned = after("lamp/ghost.rotation=90")
+    np.testing.assert_array_equal(turned.means[0], before.means[0])
+    apart = turned.means[2] - turned.means[1]
+    np.testing.assert_allclose(apart, [0, 0.012], atol=1e-6)  # x towards y: clockwise, since y runs down
+
+
+def test_streaks_alone_are_lengthened() -> None:
+    gaussians = plane([1.0], long=8.0)
+    elements = grouping.group(gaussians, np.ones(1, np.float32))
+    assert elements[0].kind == "streak"
+    longer = edited(gaussians, "lamp", LIGHT, elements, LookEdits(Edit(streak=3.0)), "add")
+    np.testing.assert_allclose(longer.covariances[0] / [gaussians.covariances[0, 0], 1, gaussians.covariances[0, 2]],
+                               [9, 0, 1], atol=1e-4)
+    np.testing.assert_array_equal(after("*.streak=3").covariances, ghosts()[0].covariances)
+
+
+def test_mute_and_solo_of_elements_and_lights() -> None:
+    assert len(after("lamp/ghost.mute=1")) == 1
+    assert len(after("lamp/ghost.solo=1")) == 2
+    assert len(after("lamp/ghost.solo=1", "lamp/ghost.mute=1")) == 0
+    edits = LookEdits.parse(["a.solo=1", "c.mute=1"], ["a", "b", "c"])
+    assert [edits.shows(name, ["a", "b", "c"]) for name in "abc"] == [True, False, False]
+    assert not LookEdits.parse(["*.mute=1"], ["a"]).shows("a", ["a"])
+
+
+def test_colour_on_gaussians_is_colour_on_the_layer() -> None:
+    """Where light adds: drawn and then changed is changed and then drawn, saturation past 1 included."""
+    intrinsics = np.array([[50.0, 0, 10], [0, 50, 10], [0, 0, 1]])
+    gaussians, elements = ghosts()
+    gaussians = replace(gaussians, colours=np.array([[1, 0.2, 0], [0.1, 0.9, 0.3], [0, 0, 1]], np.float32))
+    edits = LookEdits.parse(["lamp.intensity=2", "lamp.tint=1,0.5,0.25", "*.saturation=1.6"], ["lamp"])
+    gaussians_first = draw([edited(gaussians, "lamp", LIGHT, elements, edits, "add")], intrinsics, 40, 20)
+    layer_first = draw([gaussians], intrinsics, 40, 20) @ edits.matrices(["lamp"])["lamp"].T
+    np.testing.assert_allclose(gaussians_first, layer_first, atol=1e-5)
+
+
+def test_colour_of_what_covers_fades_and_brightens() -> None:
+    before, _ = ghosts()
+    np.testing.assert_allclose(after("lamp.intensity=0.5", blend="over").opacities, 0.5 * before.opacities)
+    np.testing.assert_allclose(after("lamp.tint=0.5,1,1", blend="over").colours[:, 0], 0.735357, atol=1e-5)
+
+
+def test_edits_go_to_words_and_back() -> None:
+    names = {"lamp": ["ghost", "streak 2"], "key/1": []}
+    words = ["*.intensity=0.5", "lamp.tint=1,0.8,0.6", "lamp/streak 2.streak=2.5", "key/1.solo=1", "key/1.rotation=-30"]
+    edits = LookEdits.parse(words, ["lamp", "key/1"], names)
+    assert LookEdits.parse(edits.words(), ["lamp", "key/1"], names) == edits
+    assert set(edits.words()) == set(words)
+    assert LookEdits().words() == []
+    assert edits.elements["lamp", "streak 2"].streak == 2.5
+    both = LookEdits.parse(["*/ghost.scale=2", "lamp/*.scale=3"], ["lamp"], names)
+    assert both.elements == {("lamp", "ghost"): Edit(scale=6.0), ("lamp", "streak 2"): Edit(scale=3.0)}
+
+
+@pytest.mark.parametrize("edit", ["lamp/iris.scale=2", "lamp.scale=-1", "lamp.mute=2", "lamp.rotation=a", "lamp.solo=",
+                                  "sun/ghost.scale=1", "lamp.sizes=1", "lamp.scale=1e9", "lamp.rotation=inf"])
+def test_edits_that_make_no_sense_are_refused(edit: str) -> None:
+    with pytest.raises(SettingsError, match="edit"):
+        LookEdits.parse([edit], ["lamp"], {"lamp": ["ghost"]})
+
+
+def test_keyed_edits_run_between_frames(tmp_path: Path) -> None:
+    keyed = KeyedEdits(("lamp.scale=2",), {10: ("lamp.intensity=0",), 20: ("lamp.intensity=1", "lamp.mute=1")})
+    keyed.write(tmp_path / "edits.json")
+    again = KeyedEdits.read(tmp_path / "edits.json")
+    assert again == keyed
+    strength = [again.at(frame, ["lamp"]).light("lamp").intensity for frame in (1, 10, 15, 20, 99)]
+    np.testing.assert_allclose(strength, [0, 0, 0.5, 1, 1])
+    assert [again.at(frame, ["lamp"]).light("lamp").mute for frame in (10, 19, 20)] == [False, False, True]
+    assert again.at(15, ["lamp"]).light("lamp").scale == 2
+    for text in ("[]", '{"set": "a"}', '{"frames": {"x": []}}', "{"):
+        (tmp_path / "edits.json").write_text(text)
+        with pytest.raises(SettingsError, match=r"edits\.json"):
+            KeyedEdits.read(tmp_path / "edits.json")
+
+
+def test_a_rotated_light_flare_is_finite_everywhere(tmp_path: Path) -> None:
+    saved(tmp_path / "a.flare", SMALL, 1)
+    look = read(tmp_path / "a.flare")
+    edits = LookEdits(Edit(scale=0.0, spread=0.0, rotation=720.0, streak=0.0, intensity=0.0))
+    for gaussians in look.evaluate(cameras(3)[0].world_to_camera, edits=edits).values():
+        assert np.isfinite(gaussians.means).all()
+        assert math.isfinite(float(draw([gaussians], CAMERA_K, 64, 40).sum()))
+
+
+CAMERA_K = np.array([[70.0, 0, 33], [0, 70, 19.5], [0, 0, 1]])

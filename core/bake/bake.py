@@ -7,31 +7,33 @@ after each frame. A frame is made again unless it is listed there under the same
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
 from ..capture.camera import Camera
 from ..errors import RunError
 from ..files import inside, read_json, write_json
+from ..look import KeyedEdits, LookEdits
 from ..progress import Progress
-from .edits import gains
 from .exr import write_layers
 from .frames import Frame
-from .layers import Rendering, layer_names, layers_of
+from .layers import FrameLayers, Rendering, layer_names, layers_of
 
 RECORD = "bake.json"
 VERSION = 1
 
 
 class Renderer(Protocol):
-    """A fitted run, as `bake` uses it. `fingerprint` changes whenever its pictures would."""
+    """A fitted run, as `bake` uses it. `fingerprint` changes whenever its pictures would; elements: names by light."""
 
     @property
     def fingerprint(self) -> str: ...
     @property
     def lights(self) -> Sequence[str]: ...
-    def render(self, camera: Camera) -> Rendering: ...
+    @property
+    def elements(self) -> Mapping[str, Sequence[str]]: ...
+    def render(self, camera: Camera, edits: LookEdits | None = None) -> Rendering: ...
 
 
 @dataclass(frozen=True)
@@ -39,13 +41,14 @@ class BakeSettings:
     """What the layers are to be.
 
     width, height: in pixels; without a height the frame's proportions are kept, without either its size.
-    half: 16 bit floats. edits: see `edits`.
+    half: 16 bit floats. edits: words for `LookEdits.parse`. keyed: more of them, by frame number.
     """
 
     width: int | None = None
     height: int | None = None
     half: bool = True
     edits: tuple[str, ...] = ()
+    keyed: KeyedEdits = field(default_factory=KeyedEdits)
 
     def scaled(self, camera: Camera) -> Camera:
         """A frame's camera at the size asked for."""
@@ -64,9 +67,12 @@ def bake(renderer: Renderer, frames: Sequence[Frame], cameras: Mapping[str, Came
     edits that make no sense; Cancelled when asked to stop.
     """
     settings, progress, out = settings or BakeSettings(), progress or Progress(), Path(out)
-    factors = gains(settings.edits, renderer.lights)
-    made_from = {"renderer": renderer.fingerprint, "half": settings.half, "edits": list(settings.edits),
+    keyed = settings.keyed.and_always(settings.edits)
+    edits = {frame.number: keyed.at(frame.number, renderer.lights, renderer.elements) for frame in frames}
+    made_from = {"renderer": renderer.fingerprint, "half": settings.half, "edits": list(keyed.always),
                  "size": [settings.width, settings.height]}
+    if keyed.frames:
+        made_from["keyed"] = keyed.described()["frames"]
     record = _earlier(out, made_from, overwrite)
     record["layers"] = layer_names(renderer.lights)
     done = {entry["file"] for entry in record["frames"] if (out / entry["file"]).is_file()}
@@ -75,7 +81,7 @@ def bake(renderer: Renderer, frames: Sequence[Frame], cameras: Mapping[str, Came
     progress.stage("bake", len(frames), len(frames) - len(left))
     for frame in left:
         camera = settings.scaled(cameras[frame.view])
-        layers = layers_of(renderer.render(camera), factors)
+        layers = _layers(renderer, camera, edits[frame.number])
         write_layers(out / frame.file, layers, half=settings.half,
                      notes={"view": frame.view, "frame": frame.number, **made_from})
         record["frames"].append({"file": frame.file, "frame": frame.number, "view": frame.view,
@@ -84,6 +90,14 @@ def bake(renderer: Renderer, frames: Sequence[Frame], cameras: Mapping[str, Came
         write_json(out / RECORD, record)
         progress.advance()
     return record
+
+
+def _layers(renderer: Renderer, camera: Camera, edits: LookEdits) -> FrameLayers:
+    """One frame. The colour of whole lights is applied to the finished layers, which is exact for any blend."""
+    colours = edits.matrices(renderer.lights)
+    if edits.colour_of_lights_only:
+        return layers_of(renderer.render(camera), colours)
+    return layers_of(renderer.render(camera, edits.without_colour_of_lights()), colours)
 
 
 def _earlier(out: Path, made_from: dict[str, Any], overwrite: bool) -> dict[str, Any]:

@@ -84,6 +84,14 @@ def _add(channels: dict[str, Pixels], prefix: str, colour: Pixels, alpha: Pixels
         channels[prefix + "A"] = alpha
 
 
+def _coloured(layer: Pixels, matrix: Any) -> Pixels:
+    matrix = np.asarray(matrix, np.float32)
+    factors = matrix.diagonal()
+    if np.array_equal(matrix, np.diag(factors)):  # what is negative, as differences of layers are, stays so
+        return np.asarray(layer * factors, np.float32)
+    return np.asarray(np.maximum(layer @ matrix.T, 0), np.float32)
+
+
 def matte(flare: Pixels) -> Pixels:
     """The alpha of premultiplied light on black: its brightest channel, in 0..1."""
     return np.clip(flare.max(-1), 0, 1)
@@ -105,9 +113,12 @@ def layer_names(lights: Iterable[str]) -> dict[str, str]:
     return names
 
 
-def layers_of(rendering: Rendering, gains: Mapping[str, Any] | None = None) -> FrameLayers:
-    """The layers of a rendering, each light's flare multiplied by its gain (a number or R, G, B)."""
-    gains = gains or {}
-    flares = {light: np.asarray(layer * np.asarray(gains.get(light, 1.0), np.float32), np.float32)
+def layers_of(rendering: Rendering, colours: Mapping[str, Any] | None = None) -> FrameLayers:
+    """The layers of a rendering, each light's flare under its colour matrix (3, 3) (`LookEdits.matrices`).
+
+    Light that saturation would make negative is none.
+    """
+    colours = colours or {}
+    flares = {light: _coloured(layer, colours[light]) if light in colours else np.asarray(layer, np.float32)
               for light, layer in rendering.flare_by_light.items()}
     return FrameLayers(np.asarray(rendering.scene, np.float32), flares, np.asarray(rendering.depth, np.float32))

@@ -10,10 +10,13 @@ from torch import Tensor
 from ..capture import Camera
 from ..flare.compositing import Blend, Layers, encode, joined, layers, splat_flare
 from ..flare.model import FlareModel
+from ..flare.placement import PlaneGaussians
 from ..flare.visibility import VisibilitySettings, visible_shares
 from ..gaussians import Rendering, Splats
 from ..gaussians.rasterizer import Kernels
 from ..gaussians.scene import SceneGaussians
+from ..look import Look, LookEdits
+from ..look import PlaneGaussians as LookGaussians
 
 
 class RenderedView(NamedTuple):
@@ -57,14 +60,31 @@ def _shares(flare: FlareModel, pose: Tensor, scene: SceneGaussians | None, visib
 
 @torch.no_grad()
 def render(scene: SceneGaussians, flare: FlareModel | None, blend: Blend, camera: Camera,
-           kernels: Kernels = "auto", *, visibility: VisibilitySettings | None = None) -> RenderedView:
-    """Everything a view has to give, without gradients."""
+           kernels: Kernels = "auto", *, visibility: VisibilitySettings | None = None,
+           look: Look | None = None, edits: LookEdits | None = None) -> RenderedView:
+    """Everything a view has to give, without gradients. edits: changes of the flare, of which `look` is the reader."""
     rendering = scene.render(camera, kernels=kernels)
     flares: dict[str, Splats] = {}
     if flare is not None:
         pose, intrinsics = pose_and_intrinsics(camera)
-        gaussians = flare(pose, _shares(flare, pose, scene, visibility, kernels))
+        shares = _shares(flare, pose, scene, visibility, kernels)
+        gaussians = flare(pose, shares) if look is None or edits is None else _edited(look, edits, camera, shares)
         flares = {name: splat_flare(one, intrinsics, camera.width, camera.height, blend, kernels=kernels)
                   for name, one in gaussians.items()}
     parts = layers(rendering.colour.clamp(0, 1), flares, blend)
     return RenderedView(rendering, flares, encode(parts.composite.clamp_min(0)).clamp(0, 1), parts)
+
+
+def _edited(look: Look, edits: LookEdits, camera: Camera,
+            shares: dict[str, Tensor] | None) -> dict[str, PlaneGaussians]:
+    """Each light's Gaussians as an artist has changed them."""
+    visible = {name: float(share) for name, share in (shares or {}).items()}
+    shown = look.evaluate(camera.world_to_camera, edits=edits, shares=visible)
+    return {name: _as_tensors(one) for name, one in shown.items()}
+
+
+def _as_tensors(one: LookGaussians) -> PlaneGaussians:
+    means, covariances, opacities, colours = (
+        torch.from_numpy(part).float() for part in (one.means, one.covariances, one.opacities, one.colours))
+    return PlaneGaussians(means, covariances, opacities, colours,
+                          None if one.rings is None else torch.from_numpy(one.rings).float())

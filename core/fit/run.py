@@ -25,6 +25,8 @@ from ..flare import file as flare_file
 from ..flare.file import FlareFile
 from ..gaussians.ply import read_ply
 from ..gaussians.scene import SceneGaussians
+from ..look import Look, LookEdits
+from ..look import read as read_look
 from .rendering import RenderedView, render
 from .settings import FitSettings, read_config, write_config
 
@@ -100,10 +102,20 @@ class Run:
         """The fitted scene."""
         return read_ply(self._needed(SCENE))
 
+    @cached_property
+    def look(self) -> Look | None:
+        """The fitted flare as edits see it; None for plain 3DGS."""
+        return None if self.settings.mode == "3dgs" else read_look(self._needed(FLARE))
+
     @property
     def lights(self) -> tuple[str, ...]:
         """Names of the lights, in their order."""
         return self.flare.model.names if self.flare else ()
+
+    @property
+    def elements(self) -> dict[str, list[str]]:
+        """Names of each light's elements."""
+        return self.look.element_names if self.look else {}
 
     @cached_property
     def fingerprint(self) -> str:
@@ -114,15 +126,16 @@ class Run:
                 digest.update((self.folder / name).read_bytes())
         return digest.hexdigest()[:16]
 
-    def view(self, camera: Camera) -> RenderedView:
+    def view(self, camera: Camera, edits: LookEdits | None = None) -> RenderedView:
         """Scene, flares and composite as tensors."""
         model = self.flare.model if self.flare else None
         return render(self.scene, model, self.settings.blend, camera, self.settings.kernels,
-                      visibility=self.settings.flare.occluded_by_scene)
+                      visibility=self.settings.flare.occluded_by_scene, look=None if edits is None else self.look,
+                      edits=edits)
 
-    def render(self, camera: Camera) -> ViewLayers:
-        """The layers of a view at the camera's size."""
-        view = self.view(camera)
+    def render(self, camera: Camera, edits: LookEdits | None = None) -> ViewLayers:
+        """The layers of a view at the camera's size, the flare as `edits` change it."""
+        view = self.view(camera, edits)
         flares = {name: layer.numpy() for name, layer in view.layers.flares.items()}
         dark = np.zeros_like(view.layers.scene.numpy())
         return ViewLayers(view.layers.scene.numpy(), {name: flares.get(name, dark) for name in self.lights},

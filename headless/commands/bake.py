@@ -18,7 +18,11 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--frames", metavar="A-B", help="frame numbers, such as 1-20,31; all where not given")
     parser.add_argument("--size", metavar="WIDTH[xHEIGHT]", help="pixels (default: the frames')")
     parser.add_argument("--set", action="append", default=[], metavar="LIGHT.WHAT=VALUE", dest="edits",
-                        help="lamp.intensity=2, lamp.tint=1,0.8,0.6, lamp.tint=#ffcc88; * for all lights; repeatable")
+                        help="lamp.intensity=2, lamp.tint=1,0.8,0.6, lamp.tint=#ffcc88, lamp.scale=1.5; * for all "
+                             "lights, lamp/ghost for one element; also saturation, spread, rotation (degrees), streak, "
+                             "mute, solo; repeatable")
+    parser.add_argument("--edits", type=Path, metavar="FILE", dest="keyed",
+                        help='edits by frame: {"frames": {"1": ["lamp.intensity=0"], "25": ["lamp.intensity=1"]}}')
     parser.add_argument("--float", action="store_true", help="32 bit floats (default: 16 bit, depth always 32)")
     parser.add_argument("--overwrite", action="store_true", help="replace layers of another bake in DIR")
     parser.add_argument("--capture", type=Path, metavar="CAPTURE", help="where the capture is, if it was moved")
@@ -29,6 +33,7 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     from ...core.bake.frames import chosen, numbered
     from ...core.capture import Capture
     from ...core.fit.run import Run
+    from ...core.look import KeyedEdits
 
     made = Run.open(words.run)
     if not made.finished:
@@ -36,7 +41,8 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     capture = Capture.open(words.capture or made.capture_folder, need_frames=False)
     cameras = {view.name: view.camera for view in capture.views}
     frames = chosen(numbered(cameras), words.frames)
-    settings = BakeSettings(*size(words.size), half=not words.float, edits=tuple(words.edits))
+    settings = BakeSettings(*size(words.size), half=not words.float, edits=tuple(words.edits),
+                            keyed=KeyedEdits.read(words.keyed) if words.keyed else KeyedEdits())
     record = bake(made, frames, cameras, words.out, settings, progress, overwrite=words.overwrite)
     progress.say(f"{len(record['frames'])} frames of layers are in {words.out}.")
     return {"layers": str(words.out), "frames": len(record["frames"])}

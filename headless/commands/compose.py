@@ -6,8 +6,8 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from ...core.bake.edits import gains
 from ...core.errors import SettingsError
+from ...core.look import LookEdits
 from ...core.progress import Progress
 from ..command import Command, Step
 
@@ -42,7 +42,7 @@ def frames_of(folder: Path, out: Path, progress: Progress, *, wanted: str | None
     layers = LayerFolder.open(folder)
     if not 0 <= intensity < float("inf"):
         raise SettingsError(f"The intensity {intensity} is not a number of 0 or more.")
-    colour = gains([f"flare.tint={tint}"], ["flare"])["flare"]
+    colour = LookEdits.parse([f"flare.tint={tint}"], ["flare"]).light("flare").tint
     known = [Frame("", number, str(path)) for number, path in layers.files.items()]
     frames = [frame.number for frame in chosen(known, wanted)]
 

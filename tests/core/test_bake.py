@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from core.bake.bake import RECORD, BakeSettings, bake, read_record
-from core.bake.edits import gains
 from core.bake.exr import read_description, read_layers, write_layers
 from core.bake.frames import chosen, numbered
 from core.bake.layers import FARTHEST, FrameLayers, layer_names, layers_of
 from core.capture.camera import Camera
 from core.errors import Cancelled, FrameError, RunError, SettingsError
 from core.files import write_json
+from core.look import KeyedEdits, LookEdits
 from core.pictures import read_exr, write_exr
 from core.progress import Progress
 
@@ -36,10 +36,13 @@ class FakeRenderer:
     lights = ("lamp", "key light")
 
     def __init__(self) -> None:
+        self.elements = {"lamp": ("ghost",), "key light": ()}
         self.rendered: list[int] = []
+        self.edits: list[LookEdits | None] = []
 
-    def render(self, camera: Camera) -> FakeRendering:
+    def render(self, camera: Camera, edits: LookEdits | None = None) -> FakeRendering:
         self.rendered.append(round(camera.fx))
+        self.edits.append(edits)
         random = np.random.default_rng(round(camera.fx))
         size = camera.height, camera.width
         flares = {light: random.random((*size, 3), np.float32) ** 4 * 3 for light in self.lights}
@@ -133,10 +136,17 @@ def test_a_flare_without_lights_is_black() -> None:
 # ---- edits and frames -----------------------------------------------------------------------------
 
 
+def gains(edits: list[str], lights: list[str]) -> dict[str, list[float]]:
+    """The factors that edits put on lights; matrices without saturation are plain factors."""
+    return {name: matrix.diagonal().tolist()
+            for name, matrix in LookEdits.parse(edits, lights).matrices(lights).items()}
+
+
 def test_edits_multiply() -> None:
-    assert gains(["lamp.intensity=2", "lamp.tint=1,0.5,0"], ["lamp", "key"]) == {"lamp": (2, 1, 0)}
-    assert gains(["*.intensity=0.5"], ["lamp", "key"]) == {"lamp": (0.5,) * 3, "key": (0.5,) * 3}
-    assert gains(["a.b.intensity=3"], ["a.b"]) == {"a.b": (3, 3, 3)}
+    assert gains(["lamp.intensity=2", "lamp.tint=1,0.5,0"], ["lamp", "key"]) == {"lamp": [2, 1, 0]}
+    assert gains(["*.intensity=0.5"], ["lamp", "key"]) == {"lamp": [0.5] * 3, "key": [0.5] * 3}
+    assert gains(["a.b.intensity=3"], ["a.b"]) == {"a.b": [3, 3, 3]}
+    assert gains(["lamp.mute=1"], ["lamp", "key"]) == {"lamp": [0, 0, 0]}
     red = gains(["lamp.tint=#ff8000"], ["lamp"])["lamp"]
     np.testing.assert_allclose(red, (1, 0.21586, 0), atol=1e-5)
 
@@ -181,6 +191,22 @@ def test_bake_writes_every_frame_at_the_size_asked_for(tmp_path: Path) -> None:
     rendering = FakeRenderer().render(camera(1).scaled(24, 16))
     np.testing.assert_allclose(again.flares["lamp"], 2 * rendering.flare_by_light["lamp"], rtol=HALF, atol=1e-6)
     np.testing.assert_allclose(again.flares["key light"], rendering.flare_by_light["key light"], rtol=HALF, atol=1e-6)
+
+
+def test_edits_by_frame_reach_the_renderer_or_the_layers(tmp_path: Path) -> None:
+    renderer = FakeRenderer()
+    keyed = KeyedEdits((), {3: ("lamp.intensity=0",), 4: ("lamp.intensity=1",), 10: ("lamp/ghost.scale=2",)})
+    bake(renderer, FRAMES, CAMERAS, tmp_path, BakeSettings(edits=("key light.saturation=0",), keyed=keyed))
+    assert renderer.edits[:2] == [None, None]
+    assert renderer.edits[2] is not None
+    assert renderer.edits[2].elements["lamp", "ghost"].scale == 2
+    first, second = (read_layers(tmp_path / frame.file) for frame in FRAMES[:2])
+    assert not first.flares["lamp"].any()
+    np.testing.assert_allclose(second.flares["lamp"], FakeRenderer().render(camera(2)).flare_by_light["lamp"],
+                               rtol=HALF, atol=1e-6)
+    np.testing.assert_allclose(np.ptp(second.flares["key light"], axis=-1), 0, atol=2e-3)
+    with pytest.raises(RunError, match="other settings"):
+        bake(renderer, FRAMES, CAMERAS, tmp_path, BakeSettings(edits=("key light.saturation=0",)))
 
 
 class StopAfter(Progress):

@@ -321,3 +321,20 @@ def test_a_rotated_light_flare_is_finite_everywhere(tmp_path: Path) -> None:
 
 
 CAMERA_K = np.array([[70.0, 0, 33], [0, 70, 19.5], [0, 0, 1]])
+
+
+def test_the_engine_draws_edits_as_the_look_does(tmp_path: Path) -> None:
+    """What bake renders under edits of shape and element is what the overlay evaluates."""
+    from core.fit.rendering import render
+    from core.gaussians.scene import SceneGaussians
+
+    model = saved(tmp_path / "a.flare")
+    look, camera = read(tmp_path / "a.flare"), cameras(3)[1]
+    part = look.lights[1].elements[0].name
+    edits = LookEdits.parse(["*.scale=1.4", "lamp 0.spread=0.7", f"lamp 1/{part}.intensity=3", "lamp 1.rotation=40"],
+                            look.names, look.element_names)
+    empty = SceneGaussians(*(torch.zeros(0, *width) for width in ((3,), (3,), (4,), (), (16, 3))))
+    baked = render(empty, model, "add", camera, "torch", look=look, edits=edits)
+    for name, gaussians in look.evaluate(camera.world_to_camera, edits=edits).items():
+        picture = draw([gaussians], camera.intrinsics, *camera.size)
+        np.testing.assert_allclose(picture, baked.layers.flares[name].numpy(), atol=5e-5)

@@ -5,10 +5,11 @@
     python benchmarks/raster.py --quick         fewer rounds
     python benchmarks/raster.py --only raster curve
     python benchmarks/raster.py --engine mine=package.module:render
+    python benchmarks/raster.py --only peer --opensplat FOLDER
 
 An `--engine` is any other rasterizer for a column of its own: a function of (means, quats, scales, opacities,
 sh, world_to_camera, intrinsics, width, height) that returns the colour (h, w, 3), differentiable. gsplat has its
-column wherever it is installed and there is a GPU.
+column wherever it is installed and there is a GPU. OpenSplat is built from a checkout (`opensplat.py`).
 
 Everything timed is the whole of what a user calls: projection, spherical harmonics of degree 3, sorting and
 rasterization; an iteration adds L1 + SSIM, the backward pass and Adam.
@@ -25,7 +26,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 START = time.perf_counter()
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
@@ -33,11 +34,12 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import torch  # noqa: E402
 from torch import Tensor  # noqa: E402
 
-from benchmarks import report, workload  # noqa: E402
+from benchmarks import opensplat, report, workload  # noqa: E402
 from benchmarks.report import milliseconds, table  # noqa: E402
 from benchmarks.timing import medians, on_threads  # noqa: E402
 from core.gaussians import Adam, SceneGaussians, kernels, l1_ssim, rasterization, splat  # noqa: E402
 from core.gaussians.scene import learning_rates  # noqa: E402
+from core.gaussians.spherical_harmonics import colours  # noqa: E402
 
 Engine = Callable[..., Tensor]
 DOCUMENT = report.ROOT / "docs" / "engine.md"
@@ -50,9 +52,11 @@ class Job(NamedTuple):
     width: int
     height: int
     flares: int = 0
+    resolution: Literal["full", "mixed"] = "full"
 
     def __str__(self) -> str:
         flares = f" + {self.flares} flares" if self.flares else ""
+        flares += f" ({self.resolution})" if self.resolution != "full" else ""
         return f"{self.gaussians // 1000}k{flares}, {self.width}x{self.height}"
 
 
@@ -60,7 +64,10 @@ RASTER_JOBS = (
     Job(10_000, 480, 270), Job(50_000, 480, 270), Job(150_000, 480, 270), Job(50_000, 960, 540),
     Job(150_000, 960, 540), Job(50_000, 480, 270, 2000),
 )  # fmt: skip
-ITERATION_JOBS = (Job(50_000, 480, 270), Job(50_000, 480, 270, 2000), Job(150_000, 960, 540))
+ITERATION_JOBS = (
+    Job(50_000, 480, 270), Job(50_000, 480, 270, 2000), Job(50_000, 480, 270, 2000, "mixed"), Job(150_000, 960, 540),
+)  # fmt: skip
+PEER_JOBS = RASTER_JOBS[:5]
 CURVE = (10_000, 20_000, 50_000, 100_000, 200_000, 350_000, 500_000)
 SLOW = 150_000
 """From this many Gaussians or pixels on the torch path is left out of the tables: it takes too long."""
@@ -145,7 +152,9 @@ class Iteration:
             kernels=self.kernel_set, depth=False,  # type: ignore[arg-type]
         ).colour  # fmt: skip
         if self.job.flares:
-            laid = splat(*self.flares, *size, kernels=self.kernel_set)  # type: ignore[arg-type]
+            laid = splat(
+                *self.flares, *size, kernels=self.kernel_set, resolution=self.job.resolution,  # type: ignore[arg-type]
+            )  # fmt: skip
             picture = laid.colour + laid.transmittance[..., None] * picture
         self.optimiser.zero_grad()
         l1_ssim(picture, self.target, 0.8, kernels=self.fused).backward()  # type: ignore[arg-type]
@@ -289,6 +298,29 @@ def _plot(lines: dict[str, dict[str, float]], picture: Path) -> None:
     pyplot.close(figure)
 
 
+def peer_section(checkout: Path, rounds: int) -> str:
+    """OpenSplat's rasterizer beside ours."""
+    module, rows = opensplat.build(checkout), []
+    threads = torch.get_num_threads()
+    for job in PEER_JOBS:
+        ours = Raster(job, our_engine("cpu"), "cpu", "cpu")
+        means, quats, scales, opacities, sh = (value.detach() for value in ours.inputs)
+        seen_colours = colours(means, sh, 3)
+        camera = (ours.camera[0], ours.camera[1])
+        theirs = opensplat.Rasterizer(
+            module, means, quats, scales, opacities, seen_colours, camera, job.width, job.height, ours.upstream
+        )
+        with torch.no_grad():
+            apart = float((theirs.picture() - ours.picture()).abs().mean())
+        cases = {"peer": theirs.both, "1": on_threads(1, ours.both), "all": on_threads(threads, ours.both)}
+        times = medians(cases, rounds)
+        ratios = [_ratio(times["peer"], times[key]) for key in ("1", "all")]
+        rows.append([str(job), *[milliseconds(times[key]) for key in cases], *ratios, f"{apart:.1e}"])
+    head = ["Forward + backward, ms", "OpenSplat, 1 thread", "cpu, 1 thread", f"cpu, {_count(threads)}"]
+    head += [f"OpenSplat / cpu, {_count(count)}" for count in (1, threads)] + ["pictures apart, mean"]
+    return table(head, rows)
+
+
 def process_section(sets: list[str]) -> str:
     """Memory and the first call, each in a process of its own; other instruction sets."""
     rows = []
@@ -373,6 +405,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Times the kernel sets side by side.")
     parser.add_argument("--kernels", nargs="+", default=[n for n in ("cpu", "tiles") if kernels.available(n)])
     parser.add_argument("--engine", action="append", default=[], metavar="NAME=MODULE:FUNCTION")
+    parser.add_argument("--opensplat", type=Path, metavar="FOLDER", help="a checkout of OpenSplat, for --only peer")
     parser.add_argument("--threads", nargs="+", type=int, default=[1, torch.get_num_threads()])
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     parser.add_argument("--only", nargs="+", choices=SECTIONS, default=list(SECTIONS))
@@ -399,8 +432,11 @@ def main() -> None:
         "flares": lambda: flare_section(arguments.kernels, rounds),
         "curve": lambda: curve_section(engines, rounds, arguments.device, arguments.out.parent / "engine-curve.png"),
         "process": lambda: process_section(arguments.kernels),
+        "peer": lambda: peer_section(arguments.opensplat, rounds),
     }
     for section in arguments.only:
+        if section == "peer" and arguments.opensplat is None:
+            continue
         conditions = report.conditions()
         text = f"## {SECTIONS[section]}\n\n{write[section]()}\n\n{conditions}"
         report.write_section(arguments.out, section, text)
@@ -414,6 +450,7 @@ SECTIONS = {
     "flares": "Flares",
     "curve": "Against the number of Gaussians",
     "process": "Memory, first calls, instruction sets",
+    "peer": "Beside a C++ rasterizer",
 }
 
 if __name__ == "__main__":

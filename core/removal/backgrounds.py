@@ -1,0 +1,139 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Clean pictures to lay flares over: photographs, and views into environment maps in true linear light."""
+from __future__ import annotations
+
+import math
+import zlib
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import SettingsError
+from .formation import Pixels
+
+Part = Literal["train", "test", "all"]
+Random = np.random.Generator
+
+PHOTOS = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff"})
+MAPS = frozenset({".hdr", ".exr"})
+HELD_OUT = 10  # one in so many, by name, is kept for tests
+
+
+def kept_for_test(name: str) -> bool:
+    """Whether a picture or lens of this name is kept out of training: by its name alone, on every machine."""
+    return zlib.crc32(name.encode()) % HELD_OUT == 0
+
+
+@dataclass(frozen=True)
+class Backgrounds:
+    """Decoded pictures: photos as uint8 (h, w, 3) display values, maps as float16 equirectangular light."""
+
+    photos: Sequence[NDArray[np.uint8]]
+    maps: Sequence[NDArray[np.float16]]
+
+    def draw(self, random: Random, width: int, height: int, gamma: float) -> Pixels:
+        """(height, width, 3) linear light: a random window of a random picture, at a random scale."""
+        photos = len(self.photos)
+        share = len(self.maps) * 3 / (photos + len(self.maps) * 3)
+        if random.random() < share:
+            return _view(random, self.maps[int(random.integers(len(self.maps)))], width, height)
+        return _window(random, self.photos[int(random.integers(photos))], width, height, gamma)
+
+
+def read_backgrounds(folders: Iterable[Path | str], part: Part = "all", longest: int = 720) -> Backgrounds:
+    """Read every photograph and environment map below the folders, photographs reduced to `longest` pixels.
+
+    Environment maps are .hdr, or .exr twice as wide as high. Raises SettingsError where nothing is found.
+    """
+    import cv2
+
+    photos, maps, looked = [], [], []
+    for folder in folders:
+        looked.append(str(folder))
+        for path in sorted(Path(folder).rglob("*")):
+            suffix = path.suffix.lower()
+            if suffix not in PHOTOS | MAPS or (part != "all" and kept_for_test(path.name) != (part == "test")):
+                continue
+            if suffix in PHOTOS:
+                picture = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_COLOR)
+                if picture is None or min(picture.shape[:2]) < 64:
+                    continue
+                scale = longest / max(picture.shape[:2])
+                if scale < 1:
+                    picture = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+                photos.append(np.ascontiguousarray(picture[..., ::-1]))
+            else:
+                light = _environment(path)
+                if light is not None:
+                    maps.append(light)
+    if not photos and not maps:
+        raise SettingsError(f"There are no pictures in {', '.join(looked) or 'no folder'}; name a folder of clean "
+                            "photographs or environment maps.")
+    return Backgrounds(photos, maps)
+
+
+def _environment(path: Path) -> NDArray[np.float16] | None:
+    import cv2
+
+    if path.suffix.lower() == ".exr":
+        from ..errors import FrameError
+        from ..pictures import read_exr
+
+        try:
+            channels = read_exr(path)
+        except FrameError:
+            return None
+        if not all(name in channels for name in "RGB"):
+            return None
+        light: NDArray[Any] = np.stack([channels[name] for name in "RGB"], -1)
+    else:
+        found = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        if found is None:
+            return None
+        light = found[..., ::-1]
+    if light.shape[1] != 2 * light.shape[0]:
+        return None
+    if light.shape[1] > 1024:
+        light = cv2.resize(light, (1024, 512), interpolation=cv2.INTER_AREA)
+    light = np.clip(light / max(float(np.median(light.mean(-1))) / 0.18, 1e-6), 0, 6e4)
+    return light.astype(np.float16)
+
+
+def _window(random: Random, photo: NDArray[np.uint8], width: int, height: int, gamma: float) -> Pixels:
+    import cv2
+
+    h, w = photo.shape[:2]
+    fit = min(w / width, h / height)
+    scale = fit * random.uniform(0.5, 1.0) if fit > 0.7 else fit
+    cw, ch = min(int(width * scale), w), min(int(height * scale), h)
+    x, y = int(random.integers(w - cw + 1)), int(random.integers(h - ch + 1))
+    how = cv2.INTER_AREA if scale > 1 else cv2.INTER_LINEAR
+    window = cv2.resize(photo[y:y + ch, x:x + cw], (width, height), interpolation=how)
+    if random.random() < 0.5:
+        window = window[:, ::-1]
+    table = np.power(np.arange(256, dtype=np.float32) / 255, np.float32(gamma))
+    return table[window]
+
+
+def _view(random: Random, light: NDArray[np.float16], width: int, height: int) -> Pixels:
+    """A perspective view of 35 to 100 degrees, level but for a few degrees, exposed to a random grey."""
+    import cv2
+
+    field = math.tan(math.radians(random.uniform(35, 100)) / 2)
+    x = (np.arange(width, dtype=np.float32) + 0.5 - width / 2) / (width / 2) * field
+    y = (np.arange(height, dtype=np.float32) + 0.5 - height / 2) / (width / 2) * field
+    turn, tilt = random.uniform(0, 2 * math.pi), math.radians(random.normal(0, 15))
+    dx, dy = np.meshgrid(x, y)
+    up = dy * math.cos(tilt) + math.sin(tilt)
+    ahead = math.cos(tilt) - dy * math.sin(tilt)
+    rows, columns = light.shape[:2]
+    u = ((np.arctan2(dx, ahead) + turn) / (2 * math.pi) % 1) * columns
+    v = (np.arctan2(up, np.hypot(dx, ahead)) / math.pi + 0.5) * rows
+    seen = cv2.remap(light.astype(np.float32), u.astype(np.float32) - 0.5, v.astype(np.float32) - 0.5,
+                     cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
+    exposure = math.exp(random.normal(math.log(0.18), 0.5)) / max(float(np.median(seen)), 1e-4)
+    return np.asarray(seen * min(exposure, 20.0), np.float32)

@@ -1,0 +1,140 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Flares for training: a bank of synthesised ones that is renewed as training goes, and the user's own.
+
+The user's folders follow the layout that Flare7K++ made common:
+
+    Scattering_Flare/Compound_Flare/   flares on black, the light in them
+    Scattering_Flare/Light_Source/     the same names: the light alone (optional)
+    Reflective_Flare/                  ghosts on black
+
+or are any folder of pictures on black, image sequences, or video clips (stock flares).
+"""
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import FrameError, SettingsError
+from ..pictures import SUFFIXES, read_picture
+from .pairs import Bank, Layers
+from .synthesis.layers import flare
+from .synthesis.prescription import Prescription
+
+Random = np.random.Generator
+VIDEOS = frozenset({".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v"})
+
+
+class SynthesisBank:
+    """`count` flares of the seed; `renew_to` replaces the oldest, so that none is seen for ever.
+
+    What a bank holds is a function of the seed and of how often it was renewed: a resumed training sees the
+    same flares.
+    """
+
+    def __init__(self, seed: int, count: int, size: int, lenses: Sequence[Prescription]) -> None:
+        self._seed, self._size, self._lenses = seed, size, lenses
+        self._slots: list[Layers | None] = [None] * count
+        self._serials = [-1] * count
+
+    def __len__(self) -> int:
+        return len(self._slots)
+
+    def renew_to(self, serial: int) -> int:
+        """Hold the flares of the `count` serial numbers below `serial`; gives how many were made for it."""
+        made = 0
+        for number in range(max(serial - len(self._slots), 0), serial):
+            slot = number % len(self._slots)
+            if self._serials[slot] != number:
+                self._slots[slot], self._serials[slot] = self._make(number), number
+                made += 1
+        return made
+
+    def draw(self, random: Random) -> Layers:
+        """One of the flares that are there."""
+        layers = self._slots[int(random.integers(len(self._slots)))]
+        if layers is None:
+            raise SettingsError("The bank of flares is empty; renew it before it is drawn from.")
+        return layers
+
+    def _make(self, number: int) -> Layers:
+        one = flare((self._seed, number), self._size, self._lenses)
+        rest, glare, light = (np.minimum(layer, 6e4).astype(np.float16) for layer in (one.rest, one.glare, one.light))
+        return Layers(rest, glare, light, one.lights)
+
+
+class OwnFlares:
+    """Flare layers that the user has, as pictures or video frames, read when they are drawn."""
+
+    def __init__(self, folder: Path | str, size: int) -> None:
+        """Raises SettingsError where the folder holds neither pictures nor clips."""
+        folder = Path(folder)
+        lights = {path.stem: path for path in folder.glob("**/Light_Source/*") if path.suffix.lower() in SUFFIXES}
+        self._size = size
+        self._files: list[tuple[Path, Path | None]] = []
+        for path in sorted(folder.rglob("*")):
+            if "Light_Source" in path.parts or path.suffix.lower() not in SUFFIXES | VIDEOS:
+                continue
+            self._files.append((path, lights.get(path.stem)))
+        if not self._files:
+            raise SettingsError(f"{folder} holds no flare layers; give pictures or clips of flares on black.")
+
+    def __len__(self) -> int:
+        return len(self._files)
+
+    def draw(self, random: Random) -> Layers:
+        """A random layer; the middle of the picture is taken for the principal point."""
+        path, light_path = self._files[int(random.integers(len(self._files)))]
+        flare = self._square(_frame_of(path, random))
+        light = np.zeros_like(flare)
+        if light_path is not None:
+            light = np.minimum(self._square(read_picture(light_path).linear()), flare)
+        lights: tuple[tuple[float, float], ...] = ()
+        if float(light.max()) > 0.3:
+            y, x = np.unravel_index(int(light.sum(-1).argmax()), light.shape[:2])
+            lights = (((float(x) + 0.5) / self._size * 2 - 1, (float(y) + 0.5) / self._size * 2 - 1),)
+        return Layers(flare - light, np.zeros_like(flare), light * 4, lights)
+
+    def _square(self, pixels: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Reduced so that the diagonal is the canvas' side, and set in its middle."""
+        import cv2
+
+        height, width = pixels.shape[:2]
+        scale = self._size / float(np.hypot(height, width))
+        size = (max(round(width * scale), 1), max(round(height * scale), 1))
+        small = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
+        canvas = np.zeros((self._size, self._size, 3), np.float32)
+        y, x = (self._size - size[1]) // 2, (self._size - size[0]) // 2
+        canvas[y:y + size[1], x:x + size[0]] = np.maximum(small, 0)
+        return canvas
+
+
+def _frame_of(path: Path, random: Random) -> NDArray[np.float32]:
+    """A picture's linear light, or that of a random frame of a clip."""
+    if path.suffix.lower() not in VIDEOS:
+        return read_picture(path).linear()
+    import cv2
+
+    clip = cv2.VideoCapture(str(path))
+    try:
+        count = int(clip.get(cv2.CAP_PROP_FRAME_COUNT))
+        clip.set(cv2.CAP_PROP_POS_FRAMES, int(random.integers(max(count, 1))))
+        done, frame = clip.read()
+    finally:
+        clip.release()
+    if not done:
+        raise FrameError(f"{path} is no clip that can be read; convert it to pictures.")
+    return np.power(frame[..., ::-1].astype(np.float32) / 255, np.float32(2.2))
+
+
+class Mixed:
+    """A share of the user's flares among the synthesised ones."""
+
+    def __init__(self, made: Bank, own: Bank, share: float) -> None:
+        self._made, self._own, self._share = made, own, share
+
+    def draw(self, random: Random) -> Layers:
+        """From the one or the other."""
+        return (self._own if random.random() < self._share else self._made).draw(random)

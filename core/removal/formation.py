@@ -1,0 +1,40 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Image formation: how flare comes into a picture, and how much of the frame a flare covers.
+
+A flare adds in light. A plate in scene-linear light is I = S + F; a display picture is formed with a gamma
+between 1.8 and 2.2 (Yenamandra et al., "Lens Flare Removal"): I = (S^g + F^g)^(1/g), clipped as the camera
+clips. Layers here are linear light, float32 (height, width, 3), so that g enters where display pictures
+become light and where light becomes display.
+"""
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Pixels = NDArray[np.float32]
+
+GAMMAS = (1.8, 2.2)
+
+
+def light(display: Pixels, gamma: float) -> Pixels:
+    """Display values 0..1 as linear light."""
+    return np.power(np.maximum(display, 0), np.float32(gamma)).astype(np.float32)
+
+
+def display(linear: Pixels, gamma: float) -> Pixels:
+    """Linear light as display values, clipped to 0..1."""
+    return np.power(np.clip(linear, 0, 1), np.float32(1 / gamma)).astype(np.float32)
+
+
+def form(scene: Pixels, flare: Pixels, gamma: float) -> Pixels:
+    """The picture that a camera makes of display values `scene` under a flare of display values `flare`."""
+    return display(light(scene, gamma) + light(flare, gamma), gamma)
+
+
+def coverage(flare: Pixels, share: float = 0.9) -> float:
+    """Fraction of the frame that holds `share` of a flare layer's energy; 0 for an empty layer."""
+    energy = np.sort(np.asarray(flare, np.float64).sum(-1).ravel())[::-1]
+    total = float(energy.sum())
+    if total <= 0:
+        return 0.0
+    return float(np.searchsorted(np.cumsum(energy), share * total) + 1) / energy.size

@@ -1,0 +1,139 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Training pairs: a flare laid over a clean picture, as cameras would have filmed it with and without.
+
+Every pair is a function of its random generator, the flares and the backgrounds alone.
+"""
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .backgrounds import Backgrounds
+from .formation import GAMMAS, Pixels
+
+Random = np.random.Generator
+
+
+class Layers(NamedTuple):
+    """A flare on the square canvas, as `synthesis.layers.Flare` has it, in any float type."""
+
+    rest: NDArray[Any]
+    glare: NDArray[Any]
+    light: NDArray[Any]
+    lights: tuple[tuple[float, float], ...]
+
+
+class Bank(Protocol):
+    """Where flares come from."""
+
+    def draw(self, random: Random) -> Layers: ...
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Display values 0..1, each (height, width, 3): the frame as filmed, without any flare (`scene`), and
+    without flare but with the glow round its lights (`gentle`)."""
+
+    frame: Pixels
+    scene: Pixels
+    gentle: Pixels
+
+
+def pair(random: Random, bank: Bank, backgrounds: Backgrounds, width: int, height: int, *,
+         clean: float = 0.08) -> Pair:
+    """One frame of that size; a share `clean` of all has no flare."""
+    gamma = float(random.uniform(*GAMMAS))
+    scene = _exposed(random, backgrounds.draw(random, width, height, gamma))
+    rest, glare, light = (np.zeros_like(scene) for _ in range(3))
+    bare = random.random() < clean
+    for number in range(1 if random.random() < 0.85 else 2):
+        layers = bank.draw(random)
+        r, g, li = _placed(random, layers, width, height, 1.0 if number == 0 else random.uniform(0.1, 1))
+        rest, glare, light = rest + r, glare + g, np.maximum(light, li)
+    if bare:
+        rest, glare, light = rest * 0, glare * 0, light * float(random.random() < 0.5)
+    scene = scene + light
+    if random.random() < 0.5:  # of the sensor; the same in both pictures, since removal is no denoising
+        grain = np.sqrt(np.maximum(scene, 0) * 0.002 + 1e-5).astype(np.float32) * random.chisquare(1) * 0.3
+        scene = np.maximum(scene + grain * random.standard_normal(scene.shape, np.float32), 0)
+    shown = [np.power(np.clip(linear, 0, 1), np.float32(1 / gamma))
+             for linear in (scene + rest + glare, scene, scene + glare)]
+    if random.random() < 0.35:
+        shown = _developed(random, shown)
+    frame, clear, gentle = shown
+    if bare:
+        return Pair(frame, clear, gentle)
+    return Pair(_stored(random, frame), clear, gentle)
+
+
+def _exposed(random: Random, scene: Pixels) -> Pixels:
+    """Day and night: gain, balance and contrast of the scene alone."""
+    gain = random.uniform(0.5, 1.2) if random.random() < 0.65 else math.exp(random.uniform(math.log(0.03), 0))
+    balance = np.exp(random.normal(0, 0.06, 3))
+    return scene * (gain * balance).astype(np.float32)
+
+
+def _placed(random: Random, layers: Layers, width: int, height: int,
+            strength: float) -> tuple[Pixels, Pixels, Pixels]:
+    """The canvas turned, scaled, mirrored, sheared a little and cut to the frame, its middle at the frame's
+    middle in four of five; then coloured, and what the glow saturates near a light given to the light."""
+    import cv2
+
+    size = layers.rest.shape[0]
+    half = math.hypot(width, height) / 2
+    zoom = half / (size / 2) * random.uniform(0.85, 1.5)
+    turn = random.uniform(0, 2 * math.pi)
+    flip = random.choice([-1.0, 1.0])
+    stretch = np.array([[math.exp(random.normal(0, 0.05)), random.normal(0, 0.05)], [0, 1.0]])
+    spin = np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]])
+    linear = zoom * (spin * np.array([flip, 1.0])) @ stretch
+    shift = random.normal(0, 0.01 if random.random() < 0.8 else 0.25, 2) * half
+    offset = np.array([width / 2, height / 2]) + shift - linear @ np.array([size / 2, size / 2])
+    matrix = np.concatenate([linear, offset[:, None]], 1)
+    rest, glare, light = (cv2.warpAffine(np.asarray(layer, np.float32), matrix, (width, height),
+                                         flags=cv2.INTER_LINEAR)
+                          for layer in (layers.rest, layers.glare, layers.light))
+    if random.random() < 0.25:
+        blur = random.uniform(0.3, 2.0)
+        rest = cv2.GaussianBlur(rest, (0, 0), blur)
+    colour = np.exp(random.normal(0, 0.12, 3)).astype(np.float32)
+    gain = np.float32(math.exp(random.normal(0, 0.6)) * strength)
+    rest, glare = rest * (colour * gain), glare * (colour * gain)
+    near = np.zeros((height, width), np.float32)
+    x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
+    for place in layers.lights:
+        at = linear @ ((np.array(place) + 1) * size / 2) + offset
+        near = np.maximum(near, np.exp(-((x - at[0]) ** 2 + (y - at[1]) ** 2) / np.float32((0.35 * half) ** 2)))
+    least = (rest + glare).min(-1)
+    kept = np.clip((least * near - 0.7) / 0.8, 0, 1)[..., None]
+    kept = kept * kept * (3 - 2 * kept)
+    kept_light: Pixels = np.maximum(light, (rest + glare) * kept)
+    return rest * (1 - kept), glare * (1 - kept), kept_light
+
+
+def _developed(random: Random, shown: Sequence[Pixels]) -> list[Pixels]:
+    """A camera's curve and saturation, the same for all pictures."""
+    contrast, saturation = random.uniform(0, 0.7), random.uniform(0.8, 1.3)
+    lift = random.uniform(0, 0.04) if random.random() < 0.3 else 0.0
+    result = []
+    for picture in shown:
+        curve = picture + contrast * (picture * picture * (3 - 2 * picture) - picture)
+        grey = curve.mean(-1, keepdims=True)
+        result.append(np.clip(lift + (1 - lift) * (grey + saturation * (curve - grey)), 0, 1).astype(np.float32))
+    return result
+
+
+def _stored(random: Random, frame: Pixels) -> Pixels:
+    """8 bit, by JPEG in four of ten."""
+    import cv2
+
+    codes: NDArray[Any] = (frame * 255 + random.uniform(0.3, 0.7)).astype(np.uint8)
+    if random.random() < 0.4:
+        _, data = cv2.imencode(".jpg", codes, [cv2.IMWRITE_JPEG_QUALITY, int(random.integers(60, 99))])
+        codes = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
+    return codes.astype(np.float32) / np.float32(255)

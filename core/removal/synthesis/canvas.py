@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The canvas that flares are drawn on: its coordinates, light by wavelength, and shapes of stops."""
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+Array = NDArray[np.float32]
+Point = tuple[float, float]
+Random = np.random.Generator
+
+
+def grid(size: int) -> tuple[Array, Array]:
+    """x, y of the pixel centres of a square canvas, each (size, size), -1..1, x to the right, y down."""
+    at = ((np.arange(size) + 0.5) / size * 2 - 1).astype(np.float32)
+    x, y = np.meshgrid(at, at)
+    return x, y
+
+
+def colour_of(wavelength: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(n, 3) linear RGB of spectral light, 0.4..0.7 micrometres, smooth and never negative; a mixture of
+    bells in place of the eye's curves, red with its second bump in the violet."""
+    def bell(centre: float, below: float, above: float) -> NDArray[np.float64]:
+        width = np.where(wavelength < centre, below, above)
+        return np.exp(-0.5 * ((wavelength - centre) / width) ** 2)
+
+    red = bell(0.605, 0.032, 0.045) + 0.16 * bell(0.425, 0.015, 0.02)
+    return np.stack([red, bell(0.545, 0.036, 0.034), bell(0.455, 0.024, 0.028)], -1)
+
+
+def tint(random: Random, strength: float = 0.5) -> Array:
+    """(3,) a random colour of mean 1: warm, cool, or anything, the further from white the greater `strength`."""
+    colour = np.exp(random.normal(0, strength, 3))
+    if random.random() < 0.5:  # along the axis of colour temperature, where lamps are
+        warm = random.normal(0, strength)
+        colour = np.array([math.exp(warm), 1.0, math.exp(-warm)])
+    return (colour / colour.mean()).astype(np.float32)
+
+
+def uniform_log(random: Random, low: float, high: float) -> float:
+    """A number whose logarithm is evenly spread."""
+    return float(math.exp(random.uniform(math.log(low), math.log(high))))
+
+
+@njit(cache=True, fastmath=True)
+def draw_ghost(layer: Array, centre: Array, radius: Array, clip_centre: Array, clip_radius: Array,
+               second_centre: Array, second_radius: Array, weight: Array, blades: int, turn: float, roundness: float,
+               soft: float, rim: float, rim_width: float, hollow: float, slope: float) -> None:
+    """Add a ghost, channel by channel, to `layer` (n, n, 3), coordinates of the canvas.
+
+    centre, clip_centre, second_centre: (3, 2), of the stop's shadow, of the entrance's, and of the stop's as
+    the light met it the last time; the radii (3,). weight: (3,). blades: of the stop, turned by `turn`
+    radians, from straight (roundness 0) to a circle (1). soft: width of the edge; rim: brightness added
+    within rim_width of the edge; hollow: share taken from the middle; slope: one side brighter than the other.
+    """
+    n = layer.shape[0]
+    sector = 2 * math.pi / blades
+    flat = math.cos(sector / 2)
+    for channel in range(3):
+        r = radius[channel]
+        cx, cy = centre[channel, 0], centre[channel, 1]
+        reach = r * 1.02 + soft
+        x0 = max(int((cx - reach + 1) * n / 2), 0)
+        x1 = min(int((cx + reach + 1) * n / 2) + 2, n)
+        y0 = max(int((cy - reach + 1) * n / 2), 0)
+        y1 = min(int((cy + reach + 1) * n / 2) + 2, n)
+        edge = max(soft / r, 2.5 / (n * r))
+        away = math.sqrt(cx * cx + cy * cy) + 1e-6
+        ux, uy = cx / away, cy / away
+        for row in range(y0, y1):
+            y = (row + 0.5) * 2 / n - 1
+            for column in range(x0, x1):
+                x = (column + 0.5) * 2 / n - 1
+                dx, dy = (x - cx) / r, (y - cy) / r
+                d = math.sqrt(dx * dx + dy * dy)
+                if d > 1 + edge:
+                    continue
+                far = d
+                if roundness < 1:
+                    angle = math.atan2(dy, dx) - turn
+                    angle -= sector * math.floor(angle / sector + 0.5)
+                    far = roundness * d + (1 - roundness) * d * math.cos(angle) / flat
+                qx, qy = (x - second_centre[channel, 0]) / second_radius[channel], \
+                    (y - second_centre[channel, 1]) / second_radius[channel]
+                far = max(far, math.sqrt(qx * qx + qy * qy))
+                kx, ky = (x - clip_centre[channel, 0]) / clip_radius[channel], \
+                    (y - clip_centre[channel, 1]) / clip_radius[channel]
+                outside = math.sqrt(kx * kx + ky * ky)
+                cover = min(max((1 - far) / edge + 0.5, 0.0), 1.0)
+                cover *= min(max((1 - outside) * clip_radius[channel] / (edge * r) + 0.5, 0.0), 1.0)
+                if cover <= 0:
+                    continue
+                cover = cover * cover * (3 - 2 * cover)
+                value = 1 - hollow * (1 - min(far * far, 1.0))
+                value += rim * math.exp(-((1 - far) / rim_width) ** 2)
+                value *= max(1 + slope * (dx * ux + dy * uy), 0.0)
+                layer[row, column, channel] += weight[channel] * cover * value

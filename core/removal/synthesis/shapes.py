@@ -1,0 +1,103 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Streaks, halos and rings, and the light sources themselves."""
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from .canvas import Array, Point, Random, colour_of, tint, uniform_log
+
+
+def streak(random: Random, light: Point, x: Array, y: Array) -> Array:
+    """Lines of light through the source: the long horizontal one of an anamorphic lens, or what a wiped
+    lens shows in any direction, one-sided or fanned."""
+    layer = np.zeros((*x.shape, 3), np.float32)
+    anamorphic = random.random() < 0.5
+    base = 0.0 if anamorphic else random.uniform(0, math.pi)
+    blue = np.array([0.25, 0.6, 1.6], np.float32)
+    for number in range(1 if random.random() < 0.6 else int(random.integers(2, 7))):
+        angle = base + (random.normal(0, 0.02) if anamorphic else number * random.uniform(0.2, 1.6))
+        aside = random.normal(0, 0.01) if anamorphic and number else 0.0
+        dx, dy = x - light[0], y - light[1]
+        along = dx * math.cos(angle) + dy * math.sin(angle)
+        across = dy * math.cos(angle) - dx * math.sin(angle) - aside
+        reach, width = uniform_log(random, 0.1, 2.5), uniform_log(random, 0.003, 0.05)
+        fan = random.uniform(0, 0.15) if not anamorphic and random.random() < 0.5 else 0.0
+        spread = width * (1 + fan * np.abs(along) / width)
+        form = random.random()
+        cross = np.exp(-(across / spread) ** 2) if form < 0.5 else 1 / (1 + (across / spread) ** 2) ** 1.5
+        fall = np.exp(-np.abs(along) / reach) if random.random() < 0.5 else 1 / (1 + (along / reach * 2) ** 2)
+        if random.random() < 0.2:
+            fall *= 1 / (1 + np.exp(np.clip(-along * random.uniform(3, 40), -50, 50)))
+        if anamorphic and random.random() < 0.3:  # uneven along its length
+            fall *= 1 + 0.4 * np.sin(along * random.uniform(4, 60) + random.uniform(0, 7))
+        colour = blue * tint(random, 0.2) if anamorphic and random.random() < 0.6 else tint(random, 0.6)
+        core = np.exp(-np.abs(along) / (0.3 * reach))[..., None]
+        layer += (cross * fall * width ** -0.2 * random.uniform(0.3, 1))[..., None] * (
+            colour * (1 - 0.6 * core) + 0.6 * core).astype(np.float32)
+    return layer / max(float(layer.max()), 1e-9)
+
+
+def halo(random: Random, light: Point, x: Array, y: Array) -> Array:
+    """Rings about the light (or about the middle), bare or with the colours of diffraction, whole or in part."""
+    about = np.array(light) * (random.uniform(-0.5, 1) if random.random() < 0.3 else 1)
+    dx, dy = x - about[0], y - about[1]
+    r, angle = np.hypot(dx, dy), np.arctan2(dy, dx)
+    layer = np.zeros((*x.shape, 3), np.float32)
+    for _ in range(1 if random.random() < 0.7 else 2):
+        radius, width = uniform_log(random, 0.08, 1.4), uniform_log(random, 0.005, 0.2)
+        level = uniform_log(random, 0.2, 1)
+        waves = np.linspace(0.42, 0.68, 9)
+        colours = colour_of(waves)
+        colours = colours / colours.sum(0)
+        spread = random.uniform(-1, 1) if random.random() < 0.7 else 0.0
+        ring = np.zeros_like(layer)
+        for wave, colour in zip(waves, colours.astype(np.float32), strict=True):
+            at = radius * (1 + spread * (wave - 0.55))
+            side = np.where(r < at, random.uniform(0.7, 1.3), 1.0)
+            ring += np.exp(-((r - at) / (width * side)) ** 2)[..., None] * colour
+        if random.random() < 0.4:
+            towards, open_by = random.uniform(-math.pi, math.pi), random.uniform(0.3, 2)
+            ring *= np.exp(-((np.arctan2(np.sin(angle - towards), np.cos(angle - towards)) / open_by) ** 2))[..., None]
+        if random.random() < 0.3:
+            fine = sum(random.normal(0, 0.3) * np.cos(k * angle + random.uniform(0, 7))
+                       for k in random.integers(8, 120, 6))
+            ring *= np.exp(np.asarray(fine, np.float32))[..., None]
+        layer += level * ring * (tint(random, 0.5) if spread == 0 else tint(random, 0.15))
+    return layer / max(float(layer.max()), 1e-9)
+
+
+def rings(random: Random, x: Array, y: Array) -> Array:
+    """The method's procedural rings: any centre, any radius, any colour, opacity below 0.7, times a mask that
+    is 0 at the middle of the frame."""
+    layer = np.zeros((*x.shape, 3), np.float32)
+    for _ in range(int(random.integers(1, 4))):
+        centre, radius = random.uniform(-1, 1, 2), random.uniform(0.1, 1.2)
+        width = uniform_log(random, 0.004, 0.12)
+        r = np.hypot(x - centre[0], y - centre[1])
+        ring = np.exp(-((r - radius) / width) ** 2)
+        layer += (random.uniform(0.05, 0.7) * ring)[..., None] * (random.random(3) ** 0.7).astype(np.float32)
+    fade = np.clip(np.hypot(x, y) / random.uniform(0.3, 1.2), 0, 1)
+    return layer * fade[..., None].astype(np.float32)
+
+
+def source(random: Random, light: Point, x: Array, y: Array) -> Array:
+    """The light itself, which belongs to the scene: a disc, tube, window or cluster, brighter than white."""
+    layer = np.zeros((*x.shape, 3), np.float32)
+    kind, colour = random.random(), tint(random, 0.15)
+    level = uniform_log(random, 1.2, 12)
+    edge = 2.0 / x.shape[0]
+    for _ in range(1 if random.random() < 0.85 else int(random.integers(2, 6))):
+        dx, dy = x - light[0], y - light[1]
+        if kind > 0.85:
+            dx, dy = dx + random.normal(0, 0.03), dy + random.normal(0, 0.03)
+        radius = uniform_log(random, 0.006, 0.07)
+        if kind < 0.65:
+            far = np.hypot(dx, dy) - radius
+        else:
+            angle, ratio = random.choice([0.0, random.uniform(0, math.pi)]), uniform_log(random, 1, 6)
+            along = np.abs(dx * math.cos(angle) + dy * math.sin(angle)) - radius * ratio ** 0.5
+            far = np.maximum(along, np.abs(dy * math.cos(angle) - dx * math.sin(angle)) - radius / ratio ** 0.5)
+        layer += np.clip(0.5 - far / (2 * edge), 0, 1)[..., None] * colour * level
+    return layer

@@ -1,0 +1,54 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Weights on disk: safetensors with their recipe in the header, and the network that comes of them."""
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from functools import lru_cache
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from ..errors import RunError
+from ..files import atomic_path
+from .network import RemovalNetwork
+from .recipe import from_dict
+
+IN_THE_BOX = Path(__file__).parent / "box" / "removal.safetensors"
+
+
+def write(path: Path | str, tensors: Mapping[str, Tensor], about: Mapping[str, str]) -> None:
+    """Tensors and text about them, whole or not at all."""
+    from safetensors.torch import save_file
+
+    with atomic_path(path) as temporary:
+        save_file({name: value.cpu().contiguous() for name, value in tensors.items()}, str(temporary), dict(about))
+
+
+def read(path: Path | str) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """(tensors, what is said about them). Raises RunError where the file is missing or damaged."""
+    from safetensors import SafetensorError, safe_open
+
+    path = Path(path)
+    if not path.is_file():
+        raise RunError(f"{path} is missing; train it with train-removal, or install the program again.")
+    try:
+        with safe_open(str(path), "pt") as file:
+            return {name: file.get_tensor(name) for name in file.keys()}, dict(file.metadata() or {})  # noqa: SIM118
+    except (SafetensorError, OSError, ValueError) as problem:
+        raise RunError(f"{path} is damaged ({problem}); get it again.") from problem
+
+
+@lru_cache(maxsize=2)
+def load(path: Path = IN_THE_BOX) -> RemovalNetwork:
+    """The network of a weights file, on the processor, ready to tell flares. Raises RunError."""
+    tensors, about = read(path)
+    try:
+        recipe = from_dict(json.loads(about["recipe"]))
+        network = RemovalNetwork(recipe.widths, recipe.depths)
+        network.load_state_dict({name: value.float() for name, value in tensors.items()})
+    except (KeyError, ValueError, RuntimeError) as problem:
+        raise RunError(f"{path} holds no weights of the removal network; train it with train-removal.") from problem
+    network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    return network.eval()

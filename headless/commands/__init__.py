@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from ..command import Command
-from . import bake, compose, demo, evaluate, fit, lights, solve
+from . import bake, compose, demo, engine, evaluate, fit, lights, solve
 
-_MODULES = (demo, solve, lights, fit, evaluate, bake, compose)
+_MODULES = (demo, solve, lights, fit, evaluate, bake, compose, engine)
 
 COMMANDS: dict[str, Command] = {module.COMMAND.name: module.COMMAND for module in _MODULES}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,9 @@ from ..command import Command, Step
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("run", type=Path, metavar="RUN", help="folder that `fit` has written")
+    parser.add_argument("run", type=Path, metavar="RUN",
+                        help="folder that `fit` has written, or a shot: a JSON file of cameras and lights by frame, as "
+                             "the add-on writes it (core/look/shot.py)")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for layers.####.exr")
     parser.add_argument("--frames", metavar="A-B", help="frame numbers, such as 1-20,31; all where not given")
     parser.add_argument("--size", metavar="WIDTH[xHEIGHT]", help="pixels (default: the frames')")
@@ -35,6 +38,8 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     from ...core.fit.run import Run
     from ...core.look import KeyedEdits
 
+    if words.run.suffix.lower() == ".json":
+        return run_shot(words, progress)
     made = Run.open(words.run)
     if not made.finished:
         raise RunError(f"{words.run} is not finished; go on with it by `fit --resume` first.")
@@ -44,6 +49,23 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     settings = BakeSettings(*size(words.size), half=not words.float, edits=tuple(words.edits),
                             keyed=KeyedEdits.read(words.keyed) if words.keyed else KeyedEdits())
     record = bake(made, frames, cameras, words.out, settings, progress, overwrite=words.overwrite)
+    progress.say(f"{len(record['frames'])} frames of layers are in {words.out}.")
+    return {"layers": str(words.out), "frames": len(record["frames"])}
+
+
+def run_shot(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
+    """A shot's layers; its edits are in the file."""
+    from ...core.bake.frames import Frame, chosen
+    from ...core.bake.shot import bake_shot
+    from ...core.look.shot import Shot
+
+    if words.edits or words.keyed:
+        raise SettingsError("The edits of a shot stand in its file; --set and --edits are for runs.")
+    shot = Shot.read(words.run).sized(*size(words.size))
+    if words.frames is not None:
+        wanted = {one.number for one in chosen([Frame("", one.frame, "") for one in shot.frames], words.frames)}
+        shot = replace(shot, frames=tuple(one for one in shot.frames if one.frame in wanted))
+    record = bake_shot(shot, words.out, half=not words.float, overwrite=words.overwrite, progress=progress)
     progress.say(f"{len(record['frames'])} frames of layers are in {words.out}.")
     return {"layers": str(words.out), "frames": len(record["frames"])}
 

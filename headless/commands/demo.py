@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import argparse
+import shutil
 import time
 from pathlib import Path
 from typing import Any
 
 from ...core.errors import CaptureError, RunError
+from ...core.files import atomic_folder
 from ...core.progress import Progress
 from ..command import Command, Step
 from . import compose, evaluate, fit
+from .lights import LIGHTS, with_lights
 
 ROOT = Path(__file__).resolve().parents[2]
 SAMPLE = ROOT / "sample_scenes" / "desk"
@@ -21,8 +24,8 @@ ROWS = 6
 def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, default=ROOT / "build" / "demo", metavar="DIR",
                         help="folder for everything (default build/demo in the repository)")
-    parser.add_argument("--capture", type=Path, default=SAMPLE, metavar="CAPTURE",
-                        help="another capture than the sample")
+    parser.add_argument("--capture", type=Path, metavar="CAPTURE",
+                        help="another capture than the sample, which is worked on in a copy, DIR/capture")
     parser.add_argument("--model", choices=fit.MODELS, help="the flare's form, as of `fit`")
     parser.add_argument("--iterations", type=int, metavar="N", help="length of the fit (default: the preset's)")
     parser.add_argument("--preset", choices=("draft", "standard", "high"), default="draft",
@@ -37,13 +40,13 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     from ...core.fit import fit as fit_capture
     from ...core.fit import preset
 
-    if not words.capture.is_dir():
-        raise CaptureError(f"There is no capture in {words.capture}; the sample comes with the repository, "
+    source, out = words.capture or SAMPLE, words.out
+    if not source.is_dir():
+        raise CaptureError(f"There is no capture in {source}; the sample comes with the repository, "
                            "or name another with --capture.")
     began = time.monotonic()
-    capture, out = Capture.open(words.capture), words.out
-    progress.say(f"{words.capture.name}: {len(capture.views)} frames, {len(capture.lights)} lights. "
-                 f"{_supervision(capture)}")
+    capture = with_lights(Capture.open(words.capture or _copy_of_sample(out)), progress)
+    progress.say(f"{source.name}: {len(capture.views)} frames, {len(capture.lights)} lights. {_supervision(capture)}")
     given = {"model": words.model} if words.model else {}
     settings = preset(words.preset, iterations=words.iterations, **given)
     _check_earlier(out / "run", settings, capture)
@@ -55,6 +58,16 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     progress.say(f"In {out} there are now the run, the layers of {len(cameras)} frames (EXR), and {SHEET}; "
                  f"{time.monotonic() - began:.0f} s.")
     return {**result, "run": str(made.folder), "layers": str(out / "layers"), "sheet": str(out / SHEET)}
+
+
+def _copy_of_sample(out: Path) -> Path:
+    """The sample's frames and cameras in DIR/capture, where what is found in them can be written; without its
+    lights, which are to be found."""
+    copy = out / "capture"
+    if not copy.exists():
+        with atomic_folder(copy) as temporary:
+            shutil.copytree(SAMPLE, temporary, ignore=shutil.ignore_patterns(LIGHTS), dirs_exist_ok=True)
+    return copy
 
 
 def _check_earlier(folder: Path, settings: Any, capture: Any) -> None:
@@ -98,9 +111,10 @@ def frames(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
 
 
 COMMAND = Command(
-    "demo", "Runs the whole chain on the sample capture: fit, eval, bake, composited frames.",
-    f"""Writes DIR/run, DIR/layers (EXR), DIR/frames (through Blender's compositor), DIR/{SHEET}
-(frame | composite | scene | flare), and shows the table of scores. Given again, it goes on where it was.
+    "demo", "Runs the whole chain on the sample capture: lights, fit, eval, bake, composited frames.",
+    f"""Writes DIR/capture (a copy of the sample), DIR/run, DIR/layers (EXR), DIR/frames (through Blender's
+compositor), DIR/{SHEET} (frame | composite | scene | flare), and shows the table of scores. Given again,
+it goes on where it was.
 
   run.py demo
   blender -b -P headless/run.py -- demo""",

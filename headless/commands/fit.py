@@ -9,6 +9,7 @@ from typing import Any
 from ...core.errors import SettingsError
 from ...core.progress import Progress
 from ..command import Command, Step
+from .lights import with_lights
 
 # Spelled out here, since the settings themselves can only be imported where torch is.
 PRESETS = ("draft", "standard", "high", "paper")
@@ -19,8 +20,8 @@ BLENDS = ("over", "add")
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("capture", type=Path, metavar="CAPTURE",
-                        help="folder with images/, sparse/0/ (or transforms.json), lights.json, and removed/ or "
-                             "truth/scene/")
+                        help="folder with images/, sparse/0/ (or transforms.json), removed/ or truth/scene/, and "
+                             "lights.json; lights are found and written there if it is missing")
     parser.add_argument("--out", type=Path, required=True, metavar="RUN", help="folder for the run")
     parser.add_argument("--resume", action="store_true",
                         help="go on with the run in --out, with the settings it was begun with; begin it if there is "
@@ -53,7 +54,10 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     changes = {"width": words.size, "seed": words.seed, "holdout": holdout(words.holdout)}
     changes = {name: value for name, value in changes.items() if value is not None}
     settings = changed(settings, {**changes, **dict(map(change, words.changes))})
-    done = fit(Capture.open(words.capture), settings, words.out, progress, resume=words.resume)
+    capture = Capture.open(words.capture)
+    if settings.mode != "3dgs":
+        capture = with_lights(capture, progress)
+    done = fit(capture, settings, words.out, progress, resume=words.resume)
     progress.say(f"The run is in {done.folder}: see preview.png there, then `eval` and `bake` it.")
     return {"run": str(done.folder)}
 

@@ -4,12 +4,18 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ...core.progress import Progress
 from ..command import Command, Step
 
+if TYPE_CHECKING:
+    from ...core.capture import Capture
+    from ...core.lights import GatherSettings
+    from ...core.lights.detection import Detector
+
 METHODS = ("exposure", "grounded")
+LIGHTS = "lights.json"
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -33,25 +39,47 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     from ...core.capture import Capture
-    from ...core.lights import GatherSettings, detector_for, find_lights, record
-    from ...core.lights.find import REPORT, SHEETS
+    from ...core.lights import GatherSettings, detector_for
 
     capture = Capture.open(words.capture)
     detector = detector_for(words.method, words.threshold, words.boxes, words.masks)
     settings = GatherSettings(min_views=words.min_views, seed=words.seed)
     gaussians = _gaussians(words.scene) if words.scene else None
+    report = _find(capture, detector, progress, settings, gaussians=gaussians, keep=words.keep)
+    return {"lights": report["lights"], "file": str(capture.folder / LIGHTS),
+            "sheets": [str(capture.folder / sheet) for sheet in report["sheets"]]}
+
+
+def with_lights(capture: Capture, progress: Progress) -> Capture:
+    """The capture with its lights, which are found and written into its folder if no lights.json is there."""
+    from ...core.capture import Capture
+    from ...core.lights import detector_for
+
+    if capture.lights or (capture.folder / LIGHTS).exists():
+        return capture
+    progress.say(f"{capture.folder} has no {LIGHTS}: its lights are looked for.")
+    _find(capture, detector_for("exposure"), progress)
+    return Capture.open(capture.folder)
+
+
+def _find(capture: Capture, detector: Detector, progress: Progress, settings: GatherSettings | None = None, *,
+          gaussians: tuple[Any, Any] | None = None, keep: bool = False) -> dict[str, Any]:
+    """Finds, writes down, and says what was found; returns the report."""
+    from ...core.lights import find_lights, record
+    from ...core.lights.find import REPORT, SHEETS
+
     findings = find_lights(capture, detector, progress, settings, gaussians=gaussians)
-    report = record(capture, findings, keep=words.keep)
+    report = record(capture, findings, keep=keep)
     for sentence in findings.says:
         progress.say(sentence)
     for light in report["lights"]:
         progress.say(_sentence(light))
     if findings.doubtful:
         progress.say(f"{len(findings.doubtful)} more are doubtful, in too few of the views that should show them, and "
-                     f"left out: {words.capture / SHEETS / REPORT} lists them.")
-    progress.say(f"Look at {words.capture / report['sheets'][0]}; lights.json can be edited, and `--keep` respects it.")
-    return {"lights": report["lights"], "file": str(words.capture / "lights.json"),
-            "sheets": [str(words.capture / sheet) for sheet in report["sheets"]]}
+                     f"left out: {capture.folder / SHEETS / REPORT} lists them.")
+    progress.say(f"Look at {capture.folder / report['sheets'][0]}; {LIGHTS} can be edited, and `lights --keep` "
+                 "respects it.")
+    return report
 
 
 def _sentence(light: dict[str, Any]) -> str:

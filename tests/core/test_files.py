@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from core.errors import CaptureError
-from core.files import atomic_path, inside, read_json, write_json, write_text
+from core.files import atomic_folder, atomic_path, inside, read_json, write_json, write_text
 
 
 def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
@@ -58,3 +58,14 @@ def test_links_that_lead_out_are_refused(tmp_path: Path) -> None:
         inside(folder, "a.png", CaptureError)
     assert inside(folder, "b.png", CaptureError) == folder / "b.png"
     assert inside(folder, "sub/c.png", CaptureError) == folder / "sub/c.png"
+
+
+def test_a_folder_is_there_whole_or_not_at_all(tmp_path: Path) -> None:
+    with pytest.raises(RuntimeError), atomic_folder(tmp_path / "made") as folder:
+        (folder / "a").write_text("half")
+        raise RuntimeError
+    assert not list(tmp_path.iterdir())
+    with atomic_folder(tmp_path / "made") as folder:
+        (folder / "a").write_text("whole")
+    assert (tmp_path / "made" / "a").read_text() == "whole"
+    assert [path.name for path in tmp_path.iterdir()] == ["made"]

@@ -80,10 +80,11 @@ def _edited(look: Look, edits: LookEdits, camera: Camera,
     """Each light's Gaussians as an artist has changed them."""
     visible = {name: float(share) for name, share in (shares or {}).items()}
     shown = look.evaluate(camera.world_to_camera, edits=edits, shares=visible)
-    return {name: _as_tensors(one) for name, one in shown.items()}
+    return {name: as_tensors(one) for name, one in shown.items()}
 
 
-def _as_tensors(one: LookGaussians) -> PlaneGaussians:
+def as_tensors(one: LookGaussians) -> PlaneGaussians:
+    """A look's Gaussians as the rasterizer takes them."""
     means, covariances, opacities, colours = (
         torch.from_numpy(part).float() for part in (one.means, one.covariances, one.opacities, one.colours))
     return PlaneGaussians(means, covariances, opacities, colours,

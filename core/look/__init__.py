@@ -12,6 +12,7 @@
     edits.py       what an artist changes: the one definition, which bake and transfer use too
     keyed.py       edits that differ from frame to frame
     look.py        all of it together
+    shot.py        cameras and placed lights frame by frame, written down for the engine to render
     drawing.py     Gaussians to pixels, for thumbnails and checks
 """
 from __future__ import annotations

@@ -110,17 +110,18 @@ class LightLook:
         return elements.group(seen, self._rows["positions"][:, 0] if self.form.line else None)
 
     def evaluate(self, view: ViewOfLight, *, query: ViewOfLight | None = None, edits: LookEdits | None = None,
-                 share: float = 1.0) -> PlaneGaussians | None:
+                 share: float = 1.0, name: str | None = None) -> PlaneGaussians | None:
         """The Gaussians this light shows in `view`; None for a light behind the camera, which has no flare.
 
         query: the camera and light the network is asked for, if not the view's own: appearance follows it,
-        placement follows the view. share: how much of the light is visible, 0..1; scales the opacities.
+        placement follows the view. share: how much of the light is visible, 0..1; scales the opacities. name:
+        whose edits are applied, if not this light's.
         """
         if view.depth <= 0:
             return None
         gaussians, light = self._gaussians(view, query)
         if edits is not None:
-            gaussians = edited(gaussians, self.name, light, self.elements, edits, self.blend)
+            gaussians = edited(gaussians, name or self.name, light, self.elements, edits, self.blend)
         if share != 1.0:
             gaussians = replace(gaussians, opacities=np.asarray(gaussians.opacities * share, np.float32))
         return gaussians

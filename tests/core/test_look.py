@@ -20,6 +20,7 @@ from core.look import Edit, KeyedEdits, LookEdits, PlaneGaussians, draw, read
 from core.look import elements as grouping
 from core.look.container import read_tensors
 from core.look.edits import edited
+from core.look.shot import PlacedLight, Shot, ShotFrame, evaluate
 from tests.core.flared import cameras
 from tests.core.test_flare import pose, some_flare
 
@@ -338,3 +339,50 @@ def test_the_engine_draws_edits_as_the_look_does(tmp_path: Path) -> None:
     for name, gaussians in look.evaluate(camera.world_to_camera, edits=edits).items():
         picture = draw([gaussians], camera.intrinsics, *camera.size)
         np.testing.assert_allclose(picture, baked.layers.flares[name].numpy(), atol=5e-5)
+
+
+# ---- shots ----------------------------------------------------------------------------------------
+
+
+def a_shot(tmp_path: Path, *words: str) -> Shot:
+    """One camera, three frames, the look of lamp 0 twice: as it was, and elsewhere and half hidden."""
+    saved(tmp_path / "a.flare")
+    lights = (PlacedLight("lamp 0", "lamp 0", np.array([-0.2, -0.4, 1.0])),
+              PlacedLight("second", "lamp 0", np.array([0.5, 0.2, 1.5]), 0.5))
+    return Shot(tmp_path / "a.flare", tuple(
+        ShotFrame(number + 1, "Camera", camera, lights, words) for number, camera in enumerate(cameras(3))))
+
+
+def test_a_shot_is_read_as_it_was_written(tmp_path: Path) -> None:
+    shot = a_shot(tmp_path, "second.tint=1,0.5,0.5")
+    shot.write(tmp_path / "shot.json")
+    again = Shot.read(tmp_path / "shot.json")
+    assert again.lights == ("lamp 0", "second")
+    assert again.frames[2].edits == ("second.tint=1,0.5,0.5",)
+    np.testing.assert_array_equal(again.frames[1].camera.world_to_camera, shot.frames[1].camera.world_to_camera)
+    assert again.sized(128, None).frames[0].camera.size == (128, 80)
+    text = (tmp_path / "shot.json").read_text()
+    for old, new in (('"version": 1', '"version": 2'), ('"share": 1.0', '"share": "x"'), ('"frames"', '"frame"'),
+                     ('"width": 64', '"width": -1'), ('"query": "target"', '"query": "moon"')):
+        (tmp_path / "bad.json").write_text(text.replace(old, new))
+        with pytest.raises(SettingsError, match=r"bad\.json"):
+            Shot.read(tmp_path / "bad.json")
+
+
+def test_a_shot_is_baked_as_the_overlay_shows_it(tmp_path: Path) -> None:
+    from core.bake.exr import read_layers
+    from core.bake.shot import bake_shot
+
+    shot = a_shot(tmp_path, "second.intensity=2", "*.scale=1.2")
+    record = bake_shot(shot, tmp_path / "layers", half=False)
+    assert [entry["file"] for entry in record["frames"]] == [f"layers.000{number}.exr" for number in (1, 2, 3)]
+    look, frame = read(shot.flare), shot.frames[2]
+    edits = LookEdits.parse(frame.edits, shot.lights)
+    shown = evaluate(look, frame.camera.world_to_camera, frame.lights, edits)
+    layers = read_layers(tmp_path / "layers" / "layers.0003.exr")
+    for name, gaussians in shown.items():
+        picture = draw([gaussians], frame.camera.intrinsics, *frame.camera.size)
+        np.testing.assert_allclose(layers.flares[name], picture, atol=5e-5)
+    assert not layers.scene.any()
+    np.testing.assert_allclose(shown["second"].opacities.max(), 0.5 * look.evaluate(
+        frame.camera.world_to_camera, lights={"lamp 0": frame.lights[1].xyz})["lamp 0"].opacities.max(), rtol=1e-5)

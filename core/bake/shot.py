@@ -1,0 +1,119 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""A shot (core/look/shot.py) rendered to layers: a flare over any camera's frames, in a folder that can be
+gone on with after any stop.
+
+Layers of the flare alone have a black scene; with the run of a fit, the scene it learned and how that scene
+hides the lights come along.
+"""
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..capture.camera import Camera
+from ..fit.rendering import as_tensors, pose_and_intrinsics
+from ..fit.run import Run
+from ..flare.compositing import layers as linear_layers
+from ..flare.compositing import splat_flare
+from ..flare.visibility import visible_share
+from ..look import LookEdits, read
+from ..look.shot import PlacedLight, Shot, ShotFrame, evaluate
+from ..progress import Progress
+from .bake import BakeSettings, bake
+from .frames import Frame
+from .layers import Pixels
+
+
+@dataclass(frozen=True)
+class _Rendering:
+    scene: Pixels
+    flare_by_light: Mapping[str, Pixels]
+    depth: Pixels
+
+
+class ShotRenderer:
+    """Renders the frames of a shot, each by the camera that belongs to it; what `bake` wants."""
+
+    def __init__(self, shot: Shot) -> None:
+        self.shot, self.look = shot, read(shot.flare)
+        self.run = Run.open(shot.run) if shot.run else None
+        self.lights = shot.lights
+        self._by_camera = {id(one.camera): one for one in shot.frames}
+
+    @property
+    def elements(self) -> Mapping[str, list[str]]:
+        """Names of each placed light's elements."""
+        of_source = self.look.element_names
+        return {light.name: of_source.get(light.source, []) for one in self.shot.frames for light in one.lights}
+
+    @property
+    def fingerprint(self) -> str:
+        """Changes whenever a picture would."""
+        digest = hashlib.sha256(self.shot.flare.read_bytes())
+        for one in self.shot.frames:
+            camera = one.camera
+            digest.update(repr((one.frame, one.name, camera.size, camera.intrinsics.tolist(),
+                                camera.world_to_camera.tolist(), one.edits, self.shot.query,
+                                [(light.name, light.source, light.xyz.tolist(), light.share) for light in one.lights]),
+                               ).encode())
+        if self.run is not None:
+            digest.update(self.run.fingerprint.encode())
+        return digest.hexdigest()[:16]
+
+    def render(self, camera: Camera, edits: LookEdits | None = None) -> _Rendering:  # noqa: ARG002 - see the frame
+        """The layers of the frame whose camera this is."""
+        import torch
+
+        one = self._by_camera[id(camera)]
+        words = LookEdits.parse(one.edits, self.lights, self.elements)
+        placed = [self._behind_the_scene(light, camera) for light in one.lights]
+        with torch.no_grad():
+            _, intrinsics = pose_and_intrinsics(camera)
+            flares = {name: splat_flare(as_tensors(found), intrinsics, *camera.size, self.look.blend)
+                      for name, found in evaluate(self.look, camera.world_to_camera, placed, words,
+                                                  self.shot.query).items()}
+            dark = torch.zeros(camera.height, camera.width, 3)
+            scene = self.run.scene.render(camera) if self.run is not None else None
+            parts = linear_layers(dark if scene is None else scene.colour.clamp(0, 1), flares, self.look.blend)
+        found = {name: np.maximum(layer.numpy(), 0) if scene is None else layer.numpy()
+                 for name, layer in parts.flares.items()}
+        depth = dark[..., 0] if scene is None else scene.depth
+        return _Rendering(parts.scene.numpy(), {name: found.get(name, dark.numpy()) for name in self.lights},
+                          depth.detach().numpy())
+
+    def _behind_the_scene(self, light: PlacedLight, camera: Camera) -> PlacedLight:
+        """The light with what the fitted scene hides of it."""
+        import torch
+
+        settings = self.run.settings.flare.occluded_by_scene if self.run is not None else None
+        if self.run is None or settings is None:
+            return light
+        with torch.no_grad():
+            share = visible_share(self.run.scene, torch.from_numpy(camera.position), torch.from_numpy(light.xyz),
+                                  settings)
+        return PlacedLight(light.name, light.source, light.xyz, light.share * float(share))
+
+
+def bake_shot(shot: Shot, out: Path | str, *, half: bool = True, overwrite: bool = False,
+              progress: Progress | None = None) -> dict[str, Any]:
+    """Write the layers of a shot's frames under `out`: `layers.0001.exr` for one camera, in a folder for each of
+    several. Returns the content of bake.json. Raises what `bake` raises, and FlareFileError."""
+    several = len({one.name for one in shot.frames}) > 1
+    frames: list[Frame] = []
+    cameras: dict[str, Camera] = {}
+    for one in shot.frames:
+        view = f"{one.name}/{one.frame}"
+        frames.append(Frame(view, one.frame, _file(one, several)))
+        cameras[view] = one.camera
+    return bake(ShotRenderer(shot), frames, cameras, out, BakeSettings(half=half), progress, overwrite=overwrite)
+
+
+def _file(one: ShotFrame, several: bool) -> str:
+    folder = re.sub(r"[^A-Za-z0-9_-]+", "_", one.name).strip("_") or "camera"
+    return f"{folder}/layers.{one.frame:04d}.exr" if several else f"layers.{one.frame:04d}.exr"

@@ -25,7 +25,7 @@ setup: .venv/.ready .venv-bpy45/.ready
 .venv/.ready: constraints.txt pyproject.toml
 	$(PYTHON) -m venv .venv
 	.venv/bin/python $(PIP) install --upgrade pip
-	.venv/bin/python $(PIP) install --group engine --group blender --group test -c constraints.txt
+	.venv/bin/python $(PIP) install --group engine --group blender --group colour --group test -c constraints.txt
 	touch $@
 
 # An older Blender without an engine, for the tests of Blender's side.

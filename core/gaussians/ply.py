@@ -3,7 +3,8 @@
 
 One binary element `vertex` of float32: x y z, nx ny nz (unused), f_dc_0..2 (degree 0, by channel),
 f_rest_0..44 (the 15 others, all of one channel before the next), opacity (logit), scale_0..2 (log),
-rot_0..3 (w x y z). Fewer f_rest (0, 9, 24) mean a lower degree.
+rot_0..3 (w x y z). Fewer f_rest (0, 9, 24) mean a lower degree. Compressed forms are read too: see
+`compressed`.
 """
 from __future__ import annotations
 
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 
 from ..errors import FlareFileError
 from ..files import atomic_path
+from .compressed import is_compressed, read_compressed
 from .scene import COEFFICIENTS, SceneGaussians
 
 HEADER_MAX = 1 << 16
@@ -63,6 +65,8 @@ def read_ply(path: Path | str) -> SceneGaussians:
     """
     path = Path(path)
     try:
+        if is_compressed(path):
+            return read_compressed(path)
         with open(path, "rb") as file:
             order, n, layout, start = _header(path, file.read(HEADER_MAX))
             kind = np.dtype([(name, order + code) for name, code in layout])

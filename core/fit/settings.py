@@ -85,9 +85,12 @@ class SceneSettings:
     """The scene: 3DGS from the capture's points, with one of two strategies of densification.
 
     `sh_every`: iterations between degrees of spherical harmonics. `reorder_every`: iterations between sorts
-    along the Morton curve, which keeps neighbours together in memory.
+    along the Morton curve, which keeps neighbours together in memory. `start`: a 3DGS PLY in the capture's world
+    to begin with, instead of the points; `frozen`: it stays as it is, and only the flare is fitted.
     """
 
+    start: str = ""
+    frozen: bool = False
     strategy: Literal["classic", "mcmc"] = "classic"
     classic: ClassicSettings = field(default_factory=ClassicSettings)
     mcmc: McmcSettings = field(default_factory=McmcSettings)
@@ -126,6 +129,7 @@ class FitSettings:
             (self.flare.count >= 1, "a flare starts with at least one Gaussian"),
             (0 < self.flare.opacity < 1, "a flare's opacity must lie between 0 and 1"),
             (self.seed >= 0, "seed must not be negative"),
+            (not self.scene.frozen or bool(self.scene.start), "a frozen scene needs a PLY to start from"),
             (self.mode != "2d" or not self.flare.form.line, "mode 2d needs a form without the line"),
         )
         for good, sentence in checks:

@@ -26,6 +26,7 @@ from ..gaussians.densification import Classic, Mcmc, Strategy
 from ..gaussians.loss import l1_ssim
 from ..gaussians.optimiser import Adam
 from ..gaussians.ordering import morton_order
+from ..gaussians.ply import read_ply
 from ..gaussians.scene import SceneGaussians
 from .checkpoint import State
 from .frames import Frames, Targets
@@ -48,12 +49,11 @@ class Trainer:
         self.frames = Frames(capture, settings.width)
         self.views, _ = capture.split(settings.holdout)
         self.iteration = 0
-        if settings.mode in ("default", "2d") and not self.frames.reference:
+        self.scene_is_fitted = not settings.scene.frozen
+        if settings.mode in ("default", "2d") and not self.frames.reference and self.scene_is_fitted:
             raise CaptureError(f"{capture.folder} has no flare-free frames (removed/); run remove on it first, "
                                "or fit with --mode unsup.")
-        if not len(capture.points):
-            raise CaptureError(f"{capture.folder} has no 3D points to start from; solve it again.")
-        self.scene = SceneGaussians.from_points(capture.points)
+        self.scene = _first_scene(capture, settings)
         self.flare = None if settings.mode == "3dgs" else _new_flare(capture, self.views, settings)
         self.extent = capture.extent
         self.scene_adam = Adam(dict(self.scene.named_parameters()), self._scene_rates())
@@ -76,20 +76,25 @@ class Trainer:
         loss = l1_ssim(picture, targets.frame, weight)
         figures = {"loss": float(loss.detach())}
         clean = self._scene_target(targets, picture, scene.colour)
-        if clean is not None:
+        if clean is not None and self.scene_is_fitted:
             scene_loss = l1_ssim(scene.colour, clean, weight)
             figures["scene_loss"] = float(scene_loss.detach())
             loss = loss + scene_loss
         if not all(map(math.isfinite, figures.values())):
             raise RunError(f"The fit diverged at iteration {self.iteration}; start it anew with lower learning rates.")
-        (loss + self.strategy.regulariser()).backward()
-        self.strategy.observe(scene)
-        for optimiser in (self.scene_adam, self.flare_adam, self.grid_adam):
+        if self.scene_is_fitted:
+            loss = loss + self.strategy.regulariser()
+        if loss.requires_grad:  # a frozen scene without a light in front of the camera teaches nothing
+            loss.backward()
+        if self.scene_is_fitted:
+            self.strategy.observe(scene)
+        for optimiser in (self.scene_adam if self.scene_is_fitted else None, self.flare_adam, self.grid_adam):
             if optimiser is not None:
                 optimiser.step()
                 optimiser.zero_grad()
-        self.strategy.update(self.iteration)
-        self._keep_neighbours_together()
+        if self.scene_is_fitted:
+            self.strategy.update(self.iteration)
+            self._keep_neighbours_together()
         self._change_flare_density()
         return figures
 
@@ -108,6 +113,8 @@ class Trainer:
         return None
 
     def _sh_degree(self) -> int:
+        if self.settings.scene.start:
+            return 3  # it was trained before
         return min(3, self.iteration // self.settings.scene.sh_every)
 
     def _generator(self, number: int, purpose: int) -> torch.Generator:
@@ -208,6 +215,20 @@ def _load_parameters(parameters: dict[str, Parameter], state: State) -> None:
 def _decayed(first: float, last: float, progress: float) -> float:
     """Exponential decay from `first` to `last` as progress goes from 0 to 1."""
     return first * (last / first) ** min(max(progress, 0.0), 1.0)
+
+
+def _first_scene(capture: Capture, settings: FitSettings) -> SceneGaussians:
+    """The scene a fit begins with: one that was trained elsewhere, or a Gaussian at each point."""
+    if settings.scene.start:
+        scene = read_ply(settings.scene.start)
+        if not len(scene):
+            raise CaptureError(f"{settings.scene.start} holds no Gaussians; export it again.")
+        for parameter in scene.parameters():
+            parameter.requires_grad_(not settings.scene.frozen)
+        return scene
+    if not len(capture.points):
+        raise CaptureError(f"{capture.folder} has no 3D points to start from; solve it again.")
+    return SceneGaussians.from_points(capture.points)
 
 
 def _new_flare(capture: Capture, views: tuple[View, ...], settings: FitSettings) -> FlareModel:

@@ -40,6 +40,11 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--size", type=int, metavar="WIDTH", help="work at this width in pixels (default: the frames')")
     parser.add_argument("--iterations", type=int, metavar="N", help="length, with every schedule stretched to it")
     parser.add_argument("--seed", type=int, metavar="N", help="of all randomness (default 0)")
+    parser.add_argument("--scene", type=Path, metavar="PLY",
+                        help="begin with this 3DGS scene, trained elsewhere in the capture's world (INRIA's layout, as "
+                             "gsplat, nerfstudio, Brush and Postshot write it, or PlayCanvas's compressed one)")
+    parser.add_argument("--freeze-scene", action="store_true",
+                        help="leave the scene of --scene as it is and fit the flare alone; needs no flare-free frames")
     parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", dest="changes",
                         help="any other setting by its name in config.toml, e.g. flare.count=400; repeatable")
 
@@ -52,6 +57,11 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     given = {"model": words.model} if words.model else {}
     settings = preset(words.preset, mode=words.mode, blend=words.blend, iterations=words.iterations, **given)
     changes = {"width": words.size, "seed": words.seed, "holdout": holdout(words.holdout)}
+    if words.scene:
+        if not words.scene.is_file():
+            raise SettingsError(f"--scene {words.scene} is missing.")
+        changes["scene.start"] = str(words.scene.resolve())
+    changes["scene.frozen"] = words.freeze_scene or None
     changes = {name: value for name, value in changes.items() if value is not None}
     settings = changed(settings, {**changes, **dict(map(change, words.changes))})
     capture = Capture.open(words.capture)

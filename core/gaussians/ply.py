@@ -8,6 +8,7 @@ rot_0..3 (w x y z). Fewer f_rest (0, 9, 24) mean a lower degree. Compressed form
 """
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -37,9 +38,15 @@ def _rest(number: int) -> tuple[str, ...]:
     return tuple(f"f_rest_{i}" for i in range(number))
 
 
-def write_ply(path: Path | str, scene: SceneGaussians) -> None:
-    """Writes a scene; every parameter comes back bit by bit."""
-    names = POSITION + NORMAL + DC + _rest(3 * (COEFFICIENTS - 1)) + ("opacity",) + SCALE + ROTATION
+def write_ply(path: Path | str, scene: SceneGaussians, *, extra: Mapping[str, NDArray[np.float32]] | None = None,
+              comments: Sequence[str] = ()) -> None:
+    """Writes a scene; every parameter comes back bit by bit.
+
+    extra: further properties by name, (n,) each, which readers that do not know them leave alone. comments:
+    lines of ASCII for the header.
+    """
+    extra = extra or {}
+    names = POSITION + NORMAL + DC + _rest(3 * (COEFFICIENTS - 1)) + ("opacity",) + SCALE + ROTATION + tuple(extra)
     n = len(scene)
     means, log_scales, quaternions, opacities, sh = (
         parameter.detach().cpu().numpy().astype("<f4")
@@ -49,12 +56,14 @@ def write_ply(path: Path | str, scene: SceneGaussians) -> None:
     )  # fmt: skip
     rest = sh[:, 1:].transpose(0, 2, 1).reshape(n, 3 * (COEFFICIENTS - 1))
     table = np.concatenate(
-        [means, np.zeros((n, 3), "<f4"), sh[:, 0], rest, opacities[:, None], log_scales, quaternions], 1
+        [means, np.zeros((n, 3), "<f4"), sh[:, 0], rest, opacities[:, None], log_scales, quaternions,
+         *(np.asarray(column, "<f4")[:, None] for column in extra.values())], 1
     )
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {n}"]
+    lines = ["ply", "format binary_little_endian 1.0", *(f"comment {line}" for line in comments),
+             f"element vertex {n}"]
     lines += [f"property float {name}" for name in names] + ["end_header"]
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
-        file.write(("\n".join(lines) + "\n").encode("ascii"))
+        file.write(("\n".join(lines) + "\n").encode("ascii", "replace"))
         file.write(np.ascontiguousarray(table, "<f4").tobytes())
 
 

@@ -1,0 +1,133 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""A look as other tools take it: one frame's Gaussians as a 3DGS PLY, or a flat preset of elements as JSON."""
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ..capture.camera import Camera, quaternion_from_rotation
+from ..files import write_json
+from ..gaussians.ply import write_ply
+from ..gaussians.scene import COEFFICIENTS, SceneGaussians
+from ..gaussians.spherical_harmonics import dc_from_colour
+from ..look import Look, LookEdits, PlaneGaussians, ViewOfLight
+from ..look.plane import PLANE_DEPTH, joined
+
+PRESET_VERSION = 1
+_APART = 1e-5  # share of the depth between one Gaussian and the next, so that a sort by depth keeps their order
+_FLAT = 1e-4  # thickness along the axis, share of the depth: next to nothing in any view near the camera's
+_MOST_OPAQUE = 0.99
+
+
+def flare_scene(flares: Mapping[str, PlaneGaussians], camera: Camera) -> tuple[SceneGaussians, NDArray[np.float32]]:
+    """One frame's flare as 3D Gaussians of the world, just before the camera (paper, "Flare Representation").
+
+    They are flat, face the camera at depth 0.21, and project to what the look shows. Returned beside them:
+    rings (n, 2) as r0 and w, (0, 1) for a plain Gaussian, which 3DGS itself has no word for.
+    """
+    whole = joined(list(flares.values())) or _nothing()
+    n = len(whole)
+    depth = PLANE_DEPTH * (1 + _APART * np.arange(n))
+    local = np.concatenate([whole.means, np.ones((n, 1))], 1) * depth[:, None]
+    to_world = camera.world_to_camera[:3, :3].T
+    means = local @ to_world.T + camera.position
+    xx, xy, yy = whole.covariances.T.astype(np.float64)
+    variances, axes = np.linalg.eigh(np.stack([xx, xy, xy, yy], -1).reshape(-1, 2, 2))
+    deviations = np.sqrt(np.maximum(variances, 1e-14)) * depth[:, None]
+    scales = np.concatenate([deviations, _FLAT * depth[:, None]], 1)
+    turned = np.zeros((n, 3, 3))
+    turned[:, :2, :2] = axes
+    turned[:, 2, 2] = np.linalg.det(axes)  # a rotation, not a mirror image
+    quaternions = np.array([quaternion_from_rotation(to_world @ one) for one in turned]).reshape(n, 4)
+    # More opaque than 3DGS allows: the rest of the light goes into the colour.
+    gain = np.maximum(whole.opacities / _MOST_OPAQUE, 1)
+    opacities = np.clip(whole.opacities / gain, 1e-6, _MOST_OPAQUE)
+    sh = torch.zeros(n, COEFFICIENTS, 3)
+    sh[:, 0] = dc_from_colour(torch.from_numpy(np.asarray(whole.colours * gain[:, None], np.float32)))
+
+    def tensor(values: NDArray[Any]) -> torch.Tensor:
+        return torch.from_numpy(np.ascontiguousarray(values, np.float32))
+
+    scene = SceneGaussians(tensor(means), tensor(np.log(scales)), tensor(quaternions),
+                           tensor(np.log(opacities / (1 - opacities))), sh)
+    rings = np.tile(np.array([0.0, 1.0], np.float32), (n, 1)) if whole.rings is None else whole.rings
+    return scene, np.asarray(rings, np.float32)
+
+
+def _nothing() -> PlaneGaussians:
+    return PlaneGaussians(*(np.zeros(shape, np.float32) for shape in ((0, 2), (0, 3), (0,), (0, 3))))
+
+
+def write_flare_ply(path: Path | str, flares: Mapping[str, PlaneGaussians], camera: Camera, blend: str) -> None:
+    """One frame's flare as a 3DGS PLY; `ring_r0` and `ring_w` besides, and what they mean in the header."""
+    scene, rings = flare_scene(flares, camera)
+    write_ply(path, scene, extra={"ring_r0": rings[:, 0], "ring_w": rings[:, 1]}, comments=(
+        "Fit Flare: the flare of one frame, as its camera sees it",
+        "light adds, colours are scene-linear" if blend == "add" else "light covers, colours are display values",
+        "profile exp(-(r - ring_r0)^2 / (2 ring_w^2)), r the Mahalanobis distance",
+        f"lights {' '.join(flares)}"))
+
+
+def preset(look: Look, view: Mapping[str, ViewOfLight], edits: LookEdits | None = None) -> dict[str, Any]:
+    """The look as a list of elements such as procedural flare tools have them, for one place of each light.
+
+    view: where each light stands, by name. An element: `offset` along the axis (0 at the light, 1 at the
+    centre, 2 at the mirror image: 1 - mu), `aside` across it, `size` (standard deviations along its long and
+    short axis, as shares of the picture's width), `rotation` of the long axis (degrees from the axis through
+    the light, clockwise), `colour` (linear Rec. 709, brightest channel 1), `intensity` (linear light at its
+    brightest), `shape` (glow, disc, ring or streak), and for a ring its `radius` and `thickness` in the same unit.
+    """
+    width = look.camera.width / look.camera.fx  # of the picture, on the normalised plane
+    lights = []
+    for light in look.lights:
+        if light.name not in view:
+            continue
+        seen = light.evaluate(view[light.name], edits=edits)
+        if seen is None:
+            continue
+        at = view[light.name].light.astype(np.float64)
+        elements = [{"name": element.name, "kind": element.kind,
+                     "parts": [_part(seen, row, at, width) for row in element.members]}
+                    for element in light.elements]
+        lights.append({"name": light.name, "at": (at / width).tolist(), "elements": elements})
+    return {"version": PRESET_VERSION, "made_by": "Fit Flare", "blend": look.blend, "unit": "picture width",
+            "offset": "0 at the light, 1 at the principal point", "licence": look.licence, "notes": look.notes,
+            "lights": lights}
+
+
+def write_preset(path: Path | str, look: Look, view: Mapping[str, ViewOfLight], edits: LookEdits | None = None) -> None:
+    """Write `preset` as JSON."""
+    write_json(path, preset(look, view, edits))
+
+
+def _part(seen: PlaneGaussians, row: int, light: NDArray[np.float64], width: float) -> dict[str, Any]:
+    """One Gaussian of a preset."""
+    reach = max(float(np.linalg.norm(light)), 1e-6)
+    axis = light / reach
+    mean = seen.means[row].astype(np.float64)
+    xx, xy, yy = (float(value) for value in seen.covariances[row])
+    variances, axes = np.linalg.eigh(np.array([[xx, xy], [xy, yy]]))
+    short, long = np.sqrt(np.maximum(variances, 0)) / width
+    x, y = axes[:, 1]
+    turn = math.degrees(math.atan2(axis[0] * y - axis[1] * x, axis[0] * x + axis[1] * y))
+    light_here = np.maximum(seen.colours[row].astype(np.float64), 0) * float(seen.opacities[row])
+    peak = float(light_here.max())
+    part: dict[str, Any] = {
+        "offset": 1 - float(mean @ axis) / reach, "aside": float(axis[0] * mean[1] - axis[1] * mean[0]) / width,
+        "size": [float(long), float(short)], "rotation": (turn + 90) % 180 - 90, "intensity": peak,
+        "colour": (light_here / peak).tolist() if peak > 0 else [1.0, 1.0, 1.0],
+        "shape": "streak" if long > 4 * short else "glow"}
+    if seen.rings is not None:
+        r0, w = (float(value) for value in seen.rings[row])
+        if r0 > w:
+            part |= {"shape": "ring" if r0 > 3 * w else "disc", "radius": [r0 * float(long), r0 * float(short)],
+                     "thickness": [w * float(long), w * float(short)]}
+        elif r0 != 0 or w != 1:  # its own profile, as a plain one of about its width
+            part["size"] = [(max(r0, 0) + w) * float(long), (max(r0, 0) + w) * float(short)]
+    return part

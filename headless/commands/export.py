@@ -1,0 +1,70 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""export: a flare as files that other tools take."""
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from ...core.errors import RunError, SettingsError
+from ...core.progress import Progress
+from ..command import Command, Step
+
+KINDS = ("preset", "ply")
+
+
+def arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("flare", type=Path, metavar="RUN_OR_FLARE", help="folder that `fit` has written, or a .flare")
+    parser.add_argument("--as", choices=KINDS, required=True, dest="kind",
+                        help="preset: elements with offset, size, colour, shape, in JSON; ply: the flare's Gaussians "
+                             "of each frame, 3DGS layout")
+    parser.add_argument("--out", type=Path, required=True, metavar="PATH",
+                        help="preset: the JSON file; ply: a folder for flare.####.ply")
+    parser.add_argument("--capture", type=Path, metavar="CAPTURE", help="whose cameras to use (default: the run's own)")
+    parser.add_argument("--frames", metavar="A-B", help="frame numbers; all for ply, the first for a preset")
+    parser.add_argument("--set", action="append", default=[], metavar="LIGHT.WHAT=VALUE", dest="edits",
+                        help="edits, as of `bake`; repeatable")
+
+
+def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
+    from ...core.bake.frames import chosen, numbered
+    from ...core.capture import Capture
+    from ...core.fit.run import FLARE, Run
+    from ...core.look import LookEdits, ViewOfLight, read
+    from ...core.transfer.export import write_flare_ply, write_preset
+
+    folder = words.capture
+    if words.flare.is_dir():
+        folder = folder or Run.open(words.flare).capture_folder
+        if not (words.flare / FLARE).is_file():
+            raise RunError(f"{words.flare} has no {FLARE} yet; finish the fit with --resume first.")
+    if folder is None:
+        raise SettingsError(f"{words.flare} says nothing of cameras; name a capture with --capture.")
+    look = read(words.flare / FLARE if words.flare.is_dir() else words.flare)
+    edits = LookEdits.parse(words.edits, look.names, look.element_names)
+    cameras = {view.name: view.camera for view in Capture.open(folder, need_frames=False).views}
+    frames = chosen(numbered(cameras), words.frames)
+    if words.kind == "preset":
+        pose = cameras[frames[0].view].world_to_camera
+        write_preset(words.out, look, {light.name: ViewOfLight.of(pose, light.xyz) for light in look.lights}, edits)
+        progress.say(f"The preset is {words.out}.")
+        return {"preset": str(words.out)}
+    progress.stage("export", len(frames))
+    for frame in frames:
+        camera = cameras[frame.view]
+        write_flare_ply(words.out / frame.file.replace("layers.", "flare.").replace(".exr", ".ply"),
+                        look.evaluate(camera.world_to_camera, edits=edits), camera, look.blend)
+        progress.advance()
+    progress.say(f"{len(frames)} frames of Gaussians are in {words.out}.")
+    return {"ply": str(words.out), "frames": len(frames)}
+
+
+COMMAND = Command(
+    "export", "Writes a flare as a preset (JSON) or as Gaussians (PLY), for other tools.",
+    """A preset is a flat list of elements for one frame: offset (0 at the light, 1 at the centre), size, colour,
+shape; procedural flare tools can be fed from it. The PLY has a frame's flare as 3D Gaussians before the
+camera, in 3DGS's layout, with ring_r0 and ring_w besides. docs/interop.md has both.
+
+  run.py export build/demo/run --as preset --out lamp.json --frames 20
+  run.py export lamp.flare --capture my_capture --as ply --out build/flares""",
+    arguments, (Step("export", "engine", run),))

@@ -1,0 +1,88 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""A flare as a PLY renders as the flare does; a preset says where its elements are."""
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from core.flare.model import OURS, PAPER
+from core.gaussians import rasterization
+from core.gaussians.ply import read_ply
+from core.look import PlaneGaussians, ViewOfLight, draw, read
+from core.transfer.export import preset, write_flare_ply, write_preset
+from tests.core.flared import cameras
+from tests.core.test_look import saved
+
+
+@pytest.mark.parametrize("blend", ["over", "add"])
+def test_the_ply_of_a_frame_renders_as_the_flare(blend: str, tmp_path: Path) -> None:
+    """Without rings, which 3DGS has no word for; "over", which is what a 3DGS renderer does."""
+    form = replace(PAPER if blend == "over" else OURS, rings=False)
+    saved(tmp_path / "a.flare", form, 2, blend)
+    look, camera = read(tmp_path / "a.flare"), cameras(3)[0]
+    seen = look.evaluate(camera.world_to_camera)
+    write_flare_ply(tmp_path / "flare.ply", seen, camera, blend)
+    scene = read_ply(tmp_path / "flare.ply")
+    assert len(scene) == look.count
+    with torch.no_grad():
+        shown = rasterization(
+            scene.means, scene.quaternions, scene.scales, scene.opacities, scene.sh,
+            torch.from_numpy(camera.world_to_camera).float(), torch.from_numpy(camera.intrinsics).float(),
+            camera.width, camera.height, kernels="torch").colour.numpy()
+    expected = draw(seen.values(), camera.intrinsics, camera.width, camera.height, "over")
+    assert expected.max() > 0.05
+    np.testing.assert_allclose(shown, expected, atol=2e-3)
+
+
+def test_rings_stand_beside_the_gaussians(tmp_path: Path) -> None:
+    saved(tmp_path / "a.flare", OURS, 1)
+    look, camera = read(tmp_path / "a.flare"), cameras(3)[1]
+    seen = look.evaluate(camera.world_to_camera)
+    write_flare_ply(tmp_path / "flare.ply", seen, camera, look.blend)
+    head, body = (tmp_path / "flare.ply").read_bytes().split(b"end_header\n")
+    assert b"property float ring_r0\nproperty float ring_w\n" in head
+    assert b"comment light adds" in head
+    table = np.frombuffer(body, "<f4").reshape(look.count, 64)
+    np.testing.assert_array_equal(table[:, 62:], next(iter(seen.values())).rings)
+
+
+def test_a_flare_out_of_sight_is_an_empty_ply(tmp_path: Path) -> None:
+    write_flare_ply(tmp_path / "flare.ply", {}, cameras(1)[0], "add")
+    assert len(read_ply(tmp_path / "flare.ply")) == 0
+
+
+def test_a_preset_says_where_and_how_bright(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One Gaussian of each kind at a known place."""
+    saved(tmp_path / "a.flare", OURS, 1, count=4)
+    look = read(tmp_path / "a.flare")
+    light = np.array([0.3, 0.4], np.float32)
+    along = np.array([0.6, 0.8])
+    means = np.stack([light, 0 * light, -light, light / 2]).astype(np.float32)
+    sides = np.array([[0.04, 0.04], [0.02, 0.02], [0.02, 0.02], [0.2, 0.01]])
+    turn = np.stack([along, [-along[1], along[0]]], 1)
+    covariances = [turn @ np.diag(side**2) @ turn.T for side in sides]
+    seen = PlaneGaussians(means, np.array([[c[0, 0], c[0, 1], c[1, 1]] for c in covariances], np.float32),
+                          np.full(4, 0.5, np.float32), np.tile(np.array([2, 1, 0.5], np.float32), (4, 1)),
+                          np.array([[0, 1], [0, 1], [4, 0.5], [0, 1]], np.float32))
+    monkeypatch.setattr(type(look.lights[0]), "evaluate", lambda *_arguments, **_options: seen)
+    view = {look.names[0]: ViewOfLight(np.zeros(3, np.float32), np.eye(3, dtype=np.float32), light, 1.0)}
+    write_preset(tmp_path / "a.json", look, view)
+    made = json.loads((tmp_path / "a.json").read_text())
+    assert made == preset(look, view)
+    rows = [row for element in look.lights[0].elements for row in element.members]
+    listed = [part for element in made["lights"][0]["elements"] for part in element["parts"]]
+    parts = [part for _, part in sorted(zip(rows, listed, strict=True), key=lambda pair: pair[0])]
+    width = look.camera.width / look.camera.fx
+    np.testing.assert_allclose([part["offset"] for part in parts], [0, 1, 2, 0.5], atol=1e-6)
+    np.testing.assert_allclose([part["aside"] for part in parts], 0, atol=1e-6)
+    assert [part["shape"] for part in parts] == ["glow", "glow", "ring", "streak"]
+    np.testing.assert_allclose(parts[3]["size"], np.array([0.2, 0.01]) / width, rtol=1e-3)
+    assert abs(parts[3]["rotation"]) < 0.1
+    np.testing.assert_allclose(parts[2]["radius"], np.array([0.08, 0.08]) / width, rtol=1e-3)
+    np.testing.assert_allclose(parts[0]["colour"], [1, 0.5, 0.25])
+    assert parts[0]["intensity"] == pytest.approx(1.0)

@@ -7,8 +7,8 @@ in `encoded` light (a root, so that faint flares count), of which `gentle` is th
 round the lights. The clean picture is frame less flare in linear light: what the network does not call
 flare, the source of light among it, is the frame's own.
 
-Plain convolutions on half, quarter, ... resolution were chosen over depthwise ones because matrix units of
-processors and graphics cards alike are several times faster on them.
+Plain convolutions on a quarter, an eighth, ... of the resolution were chosen over depthwise ones because the
+matrix units of processors and graphics cards alike are several times faster on them.
 """
 from __future__ import annotations
 
@@ -20,6 +20,9 @@ import torch.nn.functional as F  # noqa: N812 - its name everywhere
 from torch import Tensor, nn
 
 INPUTS = 10
+FOLD = 4
+"""Pixels a side that become the channels of one: most of the cost of a network lies at its finest resolution, and
+what it tells is smooth, and carried up by a guided filter."""
 MULTIPLE = 32
 """Height and width that the network takes are multiples of this."""
 GAMMA = 2.2
@@ -82,13 +85,12 @@ class Everywhere(nn.Module):
 
 
 class RemovalNetwork(nn.Module):
-    """widths: channels at 1/2, 1/4, ... of the resolution; depths: blocks on the way down, and up again."""
+    """widths: channels at 1/4, 1/8, ... of the resolution; depths: blocks on the way down, and up again."""
 
-    def __init__(self, widths: tuple[int, ...] = (32, 64, 96, 128, 192),
-                 depths: tuple[int, ...] = (1, 2, 2, 3, 4)) -> None:
+    def __init__(self, widths: tuple[int, ...] = (64, 96, 128, 192), depths: tuple[int, ...] = (1, 2, 2, 4)) -> None:
         super().__init__()
         self.widths, self.depths = tuple(widths), tuple(depths)
-        self.stem = nn.Conv2d(INPUTS * 4, widths[0], 3, padding=1)
+        self.stem = nn.Conv2d(INPUTS * FOLD**2, widths[0], 3, padding=1)
         self.down = nn.ModuleList(nn.Sequential(*(Block(width) for _ in range(depth)))
                                   for width, depth in zip(widths, depths, strict=True))
         self.reduce = nn.ModuleList(nn.Conv2d(a, b, 2, stride=2) for a, b in pairwise(widths))
@@ -97,13 +99,13 @@ class RemovalNetwork(nn.Module):
                                   for a, b in pairwise(widths))
         self.up = nn.ModuleList(nn.Sequential(*(Block(width) for _ in range(depth)))
                                 for width, depth in zip(widths[:-1], depths[:-1], strict=True))
-        self.head = nn.Conv2d(widths[0], 6 * 4, 3, padding=1)
+        self.head = nn.Conv2d(widths[0], 6 * FOLD**2, 3, padding=1)
         nn.init.normal_(self.head.weight, std=1e-3)
         nn.init.constant_(self.head.bias, -0.05)  # type: ignore[arg-type]
 
     def forward(self, x: Tensor) -> Prediction:
         """x: (n, 10, h, w) as `inputs` makes it, h and w multiples of MULTIPLE."""
-        x = self.stem(F.pixel_unshuffle(x, 2))
+        x = self.stem(F.pixel_unshuffle(x, FOLD))
         kept = []
         for level, blocks in enumerate(self.down):
             x = blocks(x)
@@ -113,7 +115,7 @@ class RemovalNetwork(nn.Module):
         x = self.everywhere(x)
         for level in reversed(range(len(self.grow))):
             x = self.up[level](self.grow[level](F.relu(x)) + kept[level])
-        out = F.pixel_shuffle(self.head(F.relu(x)), 2).float()
+        out = F.pixel_shuffle(self.head(F.relu(x)), FOLD).float()
         flare = F.softplus(out[:, :3], beta=40)
         return Prediction(flare, flare * torch.sigmoid(8 * out[:, 3:] + 1))
 

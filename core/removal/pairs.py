@@ -109,7 +109,8 @@ def _placed(random: Random, layers: Layers, width: int, height: int,
     for place in layers.lights:
         at = linear @ ((np.array(place) + 1) * size / 2) + offset
         near = np.maximum(near, np.exp(-((x - at[0]) ** 2 + (y - at[1]) ** 2) / np.float32((0.35 * half) ** 2)))
-    least = (rest + glare).min(-1)
+    red, green, blue = np.moveaxis(rest + glare, -1, 0)
+    least = np.minimum(np.minimum(red, green), blue)
     kept = np.clip((least * near - 0.7) / 0.8, 0, 1)[..., None]
     kept = kept * kept * (3 - 2 * kept)
     kept_light: Pixels = np.maximum(light, (rest + glare) * kept)
@@ -123,7 +124,7 @@ def _developed(random: Random, shown: Sequence[Pixels]) -> list[Pixels]:
     result = []
     for picture in shown:
         curve = picture + contrast * (picture * picture * (3 - 2 * picture) - picture)
-        grey = curve.mean(-1, keepdims=True)
+        grey = ((curve[..., 0] + curve[..., 1] + curve[..., 2]) / 3)[..., None]
         result.append(np.clip(lift + (1 - lift) * (grey + saturation * (curve - grey)), 0, 1).astype(np.float32))
     return result
 

@@ -20,18 +20,18 @@ class Recipe:
 
     seed: int = 1
     iterations: int = 8000
-    pixels: int = 450_000          # of a batch; frames of one size a batch
-    learning_rate: float = 6e-4
+    pixels: int = 400_000          # of a batch; frames of one size a batch
+    learning_rate: float = 8e-4
     warmup: int = 200
     cooldown: float = 0.3
     weight_decay: float = 1e-4
     average: float = 0.998         # of the weights that are kept, over iterations
-    widths: tuple[int, ...] = (32, 64, 96, 128, 192)
-    depths: tuple[int, ...] = (1, 2, 2, 3, 4)
+    widths: tuple[int, ...] = (64, 96, 128, 192)
+    depths: tuple[int, ...] = (1, 2, 2, 4)
     small_until: int = 2000        # iterations with small frames, which are cheaper
     canvas: int = 448              # pixels a side of the flares' canvas
     bank: int = 400                # flares at hand at a time
-    renew_every: int = 4           # iterations for each new flare
+    renew_every: int = 6           # iterations for each new flare
     own_share: float = 0.3         # of the user's own flares, where there are any
     clean: float = 0.08            # of the frames have no flare
     half: bool = True              # bfloat16 in the convolutions

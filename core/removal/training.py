@@ -106,7 +106,8 @@ class Trainer:
         distance = (clean - clean_goal).abs().mean()
         loss = (distance + 0.5 * (mild - mild_goal).abs().mean() + 0.3 * (told.flare - flare_goal).abs().mean()
                 + 0.01 * torch.log(squared + 1e-5).mean())
-        return loss, {"l1": float(distance), "psnr": float(-10 * torch.log10(squared + 1e-6).mean())}
+        return loss, {"l1": float(distance.detach()),
+                      "psnr": float(-10 * torch.log10(squared.detach() + 1e-6).mean())}
 
     def _stack(self, pictures: Sequence[Any]) -> Tensor:
         stacked = torch.from_numpy(np.stack(pictures)).permute(0, 3, 1, 2)

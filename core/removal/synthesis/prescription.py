@@ -152,7 +152,7 @@ def reflectance(n0: Array, n2: Array, wavelengths: Array, coating: float) -> Arr
     coating: the wavelength (micrometres) for which a layer of magnesium fluoride is a quarter wave thick,
     0 for bare glass; cemented surfaces have none.
     """
-    bare: Array = ((n0 - n2) / (n0 + n2)) ** 2
+    bare: Array = np.square((n0 - n2) / (n0 + n2))
     if coating <= 0 or min(float(np.min(n0)), float(np.min(n2))) > 1.01:
         return bare
     n1 = 1.38

@@ -148,12 +148,12 @@ def glare(random: Random, light: Point, x: Array, y: Array) -> Array:
     layer = np.zeros((*r.shape, 3), np.float32)
     for _ in range(int(random.integers(1, 4))):
         width, power = uniform_log(random, 0.015, 0.5), random.uniform(1.6, 4)
-        lobe = 1 / (1 + (r / width) ** power) if random.random() < 0.7 else np.exp(-((r / width) ** 2))
+        lobe: Array = 1 / (1 + (r / width) ** power) if random.random() < 0.7 else np.exp(-((r / width) ** 2))
         layer += (lobe * uniform_log(random, 0.05, 1) * (0.05 / width) ** 0.5)[..., None] * _along(random, r)
     if random.random() < 0.3:  # uneven round the circle
-        angle = np.arctan2(dy, dx)
-        wave = sum(random.normal(0, 0.3) * np.cos(k * angle + random.uniform(0, 7)) for k in range(1, 5))
-        layer *= np.exp(np.asarray(wave, np.float32))[..., None]
+        about = np.arctan2(dy, dx)
+        waves = [random.normal(0, 0.3) * np.cos(k * about + random.uniform(0, 7)) for k in range(1, 5)]
+        layer *= np.exp(np.sum(waves, axis=0, dtype=np.float32))[..., None]
     return layer / max(float(layer.max()), 1e-9)
 
 

@@ -1,0 +1,74 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""LPIPS (Zhang et al. 2018, "The Unreasonable Effectiveness of Deep Features as a Perceptual Metric"), AlexNet, v0.1.
+
+The weights are not part of this program: a folder holds those of AlexNet's features, as torchvision names
+them (features.0.weight, ...), and the five linear layers of the metric (lin0.model.1.weight, ...), in
+.safetensors or .pth files of any name.
+"""
+from __future__ import annotations
+
+import pickle
+from pathlib import Path
+
+import numpy as np
+import torch
+import torch.nn.functional as F  # noqa: N812 - its name everywhere
+from torch import Tensor
+
+from ..errors import SettingsError
+from ..pictures import Pixels
+
+_LAYERS = ((0, 4, 2, False), (3, 1, 2, True), (6, 1, 1, True), (8, 1, 1, False), (10, 1, 1, False))
+"""Index in AlexNet's features, stride, padding, whether a 3x3 maximum of stride 2 comes first."""
+_SHIFT, _SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
+
+
+class Lpips:
+    """Distance of two pictures of display values 0..1; 0 is equal."""
+
+    def __init__(self, folder: Path | str) -> None:
+        """Raises SettingsError where the folder lacks weights or holds others."""
+        self._weights: dict[str, Tensor] = {}
+        for path in sorted(Path(folder).glob("*")):
+            self._weights.update(_read(path))
+        wanted = [f"features.{layer[0]}.{kind}" for layer in _LAYERS for kind in ("weight", "bias")]
+        wanted += [f"lin{k}.model.1.weight" for k in range(5)]
+        lacking = [name for name in wanted if name not in self._weights]
+        if lacking:
+            raise SettingsError(f"{folder} lacks weights of LPIPS, first {lacking[0]}; put AlexNet's features and the "
+                                "metric's five layers there.")
+
+    @torch.inference_mode()
+    def __call__(self, image: Pixels, target: Pixels) -> float:
+        """Pictures (height, width, 3), 32 pixels a side at least."""
+        total = 0.0
+        for level, (a, b) in enumerate(zip(self._features(image), self._features(target), strict=True)):
+            weight = self._weights[f"lin{level}.model.1.weight"].reshape(1, -1, 1, 1)
+            total += float((((a - b) ** 2) * weight).sum(1).mean())
+        return total
+
+    def _features(self, picture: Pixels) -> list[Tensor]:
+        x = torch.from_numpy(np.ascontiguousarray(picture.transpose(2, 0, 1), np.float32))[None] * 2 - 1
+        x = (x - torch.tensor(_SHIFT).reshape(1, 3, 1, 1)) / torch.tensor(_SCALE).reshape(1, 3, 1, 1)
+        found = []
+        for index, stride, padding, pooled in _LAYERS:
+            if pooled:
+                x = F.max_pool2d(x, 3, 2)
+            x = F.relu(F.conv2d(x, self._weights[f"features.{index}.weight"], self._weights[f"features.{index}.bias"],
+                                stride, padding))
+            found.append(x / (x.square().sum(1, keepdim=True).sqrt() + 1e-10))
+        return found
+
+
+def _read(path: Path) -> dict[str, Tensor]:
+    if path.suffix == ".safetensors":
+        from safetensors.torch import load_file
+
+        return load_file(str(path))
+    if path.suffix in (".pth", ".pt"):
+        try:
+            stored = torch.load(path, map_location="cpu", weights_only=True)
+        except (pickle.UnpicklingError, RuntimeError, EOFError) as problem:
+            raise SettingsError(f"{path} is no file of plain weights; remove it from the folder.") from problem
+        return {str(name): value for name, value in stored.items() if isinstance(value, Tensor)}
+    return {}

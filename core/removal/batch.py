@@ -1,0 +1,85 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Removal of many plates: one after the other, past those that cannot be read, resumable."""
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import FrameError, SettingsError
+from ..pictures import SUFFIXES, write_exr
+from ..progress import Progress
+from .inference import Remover
+from .plates import read_plate, write_plate
+
+TOLD = 20  # failures that are spelled out in the last sentence
+
+
+def plates_of(inputs: Iterable[Path]) -> list[tuple[Path, Path]]:
+    """(file, name below the output folder) of pictures, and of the pictures in folders.
+
+    Raises SettingsError where there are none, or where two would be written to one name.
+    """
+    found: dict[Path, Path] = {}
+    for given in inputs:
+        if given.is_dir():
+            files = [(path, path.relative_to(given)) for path in sorted(given.rglob("*"))
+                     if path.suffix.lower() in SUFFIXES and path.is_file() and not path.name.startswith(".")]
+            if not files:
+                raise SettingsError(f"{given} holds no pictures; give a folder with PNG, JPEG, TIFF or EXR files.")
+        else:
+            files = [(given, Path(given.name))]
+        for path, name in files:
+            if name in found:
+                raise SettingsError(f"{found[name]} and {path} would be written to the same file; remove them apart.")
+            found[name] = path
+    return [(path, name) for name, path in found.items()]
+
+
+def remove_all(inputs: Sequence[Path], folder: Path, remover: Remover, progress: Progress, *,
+               flare_folder: Path | None = None, overwrite: bool = False) -> dict[str, Any]:
+    """Clean every plate into `folder`; a plate whose result is there and newer is left as it is.
+
+    Raises SettingsError before anything is written, and FrameError after everything was tried, with a list of
+    the plates that failed.
+    """
+    plates = plates_of(inputs)
+    for path, name in plates:
+        if (folder / name).resolve() == path.resolve():
+            raise SettingsError(f"{path} would be overwritten by its own result; choose another folder with --out.")
+    progress.stage("remove", len(plates))
+    failed: list[str] = []
+    made = kept = 0
+    for path, name in plates:
+        flare = flare_folder / name.with_suffix(".exr") if flare_folder else None
+        if not overwrite and _is_newer(folder / name, path) and (flare is None or _is_newer(flare, path)):
+            kept += 1
+        else:
+            try:
+                _remove(path, folder / name, flare, remover)
+                made += 1
+            except (FrameError, OSError, MemoryError) as problem:
+                failed.append(str(problem) or f"{path} does not fit into memory.")
+                progress.say(f"Left out: {failed[-1]}")
+        progress.advance()
+    if kept:
+        progress.say(f"{kept} plates were in {folder} already; --overwrite makes them again.")
+    if failed:
+        more = f" And {len(failed) - TOLD} more." if len(failed) > TOLD else ""
+        raise FrameError(f"{len(failed)} of {len(plates)} plates could not be cleaned: {' '.join(failed[:TOLD])}{more}")
+    progress.say(f"{made} clean plates are in {folder}.")
+    return {"plates": str(folder), "made": made, "kept": kept}
+
+
+def _remove(path: Path, target: Path, flare_target: Path | None, remover: Remover) -> None:
+    plate = read_plate(path)
+    codes, flare = remover.remove(plate)
+    write_plate(target, plate, codes)
+    if flare_target is not None:
+        write_exr(flare_target, {name: np.ascontiguousarray(flare[..., k]) for k, name in enumerate("RGB")})
+
+
+def _is_newer(result: Path, source: Path) -> bool:
+    return result.is_file() and source.is_file() and result.stat().st_mtime >= source.stat().st_mtime

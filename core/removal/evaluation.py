@@ -1,0 +1,202 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""How good a removal is: scores of cleaned pictures against flare-free ones, beside the untouched input.
+
+Paired folders are read as the field keeps them: input/ and gt/ (also target/, clean/ or scene/ for the
+latter, flare/ or blend/ for the former), pictures matched by name, or by the number in it, as Flare7K++'s
+real and synthetic test sets have input_000001.png beside gt_000001.png; mask/ if there is one. A folder of
+such folders is a set of categories.
+"""
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import FrameError, SettingsError
+from ..metrics.pictures import flip, psnr, ssim
+from ..pictures import SUFFIXES, Pixels, read_picture
+from ..progress import Progress
+
+INPUTS = ("input", "flare", "blend")
+TRUTHS = ("gt", "target", "clean", "scene")
+WORST = 10
+Scores = dict[str, float | None]
+
+
+@dataclass(frozen=True)
+class Case:
+    """A picture with flare and the same without: display values 0..1 (height, width, 3), read when asked for."""
+
+    name: str
+    category: str
+    read: Callable[[], tuple[Pixels, Pixels, Pixels | None]]
+
+
+def paired(folder: Path | str) -> list[Case]:
+    """The cases of a folder, see the module's head. Raises SettingsError where it holds none, or some without
+    their counterpart."""
+    folder = Path(folder)
+    cases: list[Case] = []
+    for inputs in sorted(path for path in [folder, *folder.rglob("*")] if path.is_dir()):
+        root = inputs.parent
+        truth = next((root / name for name in TRUTHS if (root / name).is_dir()), None)
+        if inputs.name.lower() not in INPUTS or truth is None:
+            continue
+        category = root.relative_to(folder).as_posix() if root != folder else root.name
+        truths, masks = _by_key(truth), _by_key(root / "mask") if (root / "mask").is_dir() else {}
+        for key, path in _by_key(inputs).items():
+            if key not in truths:
+                raise SettingsError(f"{path} has no counterpart in {truth}; add it, or remove the picture.")
+            cases.append(Case(path.stem, category, _reader(path, truths[key], masks.get(key))))
+    if not cases:
+        raise SettingsError(f"{folder} holds no pairs; give a folder with input/ and gt/, or a folder of such folders.")
+    return cases
+
+
+def _by_key(folder: Path) -> dict[str, Path]:
+    paths = [path for path in sorted(folder.iterdir()) if path.suffix.lower() in SUFFIXES]
+    plain = {re.sub(r"^(input|gt|target|clean|scene|flare|blend|mask)_?", "", path.stem): path for path in paths}
+    return plain if len(plain) == len(paths) else {path.stem: path for path in paths}
+
+
+def _reader(path: Path, truth: Path, mask: Path | None) -> Callable[[], tuple[Pixels, Pixels, Pixels | None]]:
+    def read() -> tuple[Pixels, Pixels, Pixels | None]:
+        frame, clean = read_picture(path), read_picture(truth)
+        if frame.size != clean.size:
+            raise FrameError(f"{path} is {frame.size[0]} x {frame.size[1]} pixels and {truth} {clean.size[0]} x "
+                             f"{clean.size[1]}; make them one size.")
+        marked = read_picture(mask).resized(*frame.size).display() if mask else None
+        return frame.display(), clean.display(), marked
+
+    return read
+
+
+def evaluate(cases: Sequence[Case], clean: Callable[[Pixels], Pixels], progress: Progress | None = None, *,
+             lpips: Callable[[Pixels, Pixels], float] | None = None) -> dict[str, Any]:
+    """Scores of every case, means by category and of all; JSON-able.
+
+    clean: display values (height, width, 3) to the same without flare. `gain_db` is the PSNR above the
+    untouched input's, `made_worse` the share of pictures with a gain below -0.5 dB; `masked_psnr` counts
+    the pixels of the mask alone. lpips is null where no weights for it were given, FLIP where its package is
+    not installed.
+    """
+    progress = progress or Progress()
+    progress.stage("eval-removal", len(cases))
+    rows: list[dict[str, Any]] = []
+    for case in cases:
+        frame, truth, mask = case.read()
+        result = clean(frame)
+        row: dict[str, Any] = {"name": case.name, "category": case.category,
+                               "result": _scores(result, truth, mask, lpips),
+                               "input": _scores(frame, truth, mask, lpips)}
+        before, after = row["input"]["psnr"], row["result"]["psnr"]
+        row["gain_db"] = None if before is None or after is None else round(after - before, 4)
+        rows.append(row)
+        progress.advance()
+    categories = sorted({row["category"] for row in rows})
+    return {"mean": _summary(rows), "categories": {name: _summary([row for row in rows if row["category"] == name])
+                                                   for name in categories}, "pictures": rows}
+
+
+def _scores(picture: Pixels, truth: Pixels, mask: Pixels | None,
+            lpips: Callable[[Pixels, Pixels], float] | None) -> Scores:
+    small = min(picture.shape[:2]) < 11
+    scores: Scores = {"psnr": psnr(picture, truth), "ssim": None if small else ssim(picture, truth),
+                      "lpips": lpips(picture, truth) if lpips else None, "flip": flip(picture, truth)}
+    if mask is not None:
+        scores["masked_psnr"] = psnr(picture, truth, mask.max(-1) > 0.5)
+    return {name: round(value, 5) if value is not None and math.isfinite(value) else None
+            for name, value in scores.items()}
+
+
+def _summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    gains = [row["gain_db"] for row in rows if row["gain_db"] is not None]
+    summary: dict[str, Any] = {"count": len(rows), "gain_db": _mean(gains),
+                               "made_worse": round(sum(gain < -0.5 for gain in gains) / max(len(gains), 1), 4)}
+    for side in ("result", "input"):
+        names = sorted({name for row in rows for name in row[side]})
+        summary[side] = {name: _mean([row[side].get(name) for row in rows]) for name in names}
+    return summary
+
+
+def _mean(values: Iterable[float | None]) -> float | None:
+    numbers = [value for value in values if value is not None]
+    return round(sum(numbers) / len(numbers), 4) if numbers else None
+
+
+def table(scores: dict[str, Any]) -> str:
+    """The means as text: result, input in brackets."""
+    lines = [f"{'category':24}{'n':>5}{'PSNR':>16}{'gain':>7}{'SSIM':>18}{'LPIPS':>8}{'FLIP':>8}{'worse':>7}"]
+    for name, part in [*scores["categories"].items(), ("all", scores["mean"])]:
+        after, before = part["result"], part["input"]
+        levels = f"{_cell(after['psnr'], 2)} ({_cell(before['psnr'], 2)})"
+        likeness = f"{_cell(after['ssim'], 4)} ({_cell(before['ssim'], 4)})"
+        lines.append(f"{name:24.24}{part['count']:>5}{levels:>16}{_cell(part['gain_db'], 2):>7}{likeness:>18}"
+                     f"{_cell(after['lpips'], 4):>8}{_cell(after['flip'], 4):>8}{part['made_worse']:>7.1%}")
+    return "\n".join(lines)
+
+
+def _cell(value: float | None, decimals: int) -> str:
+    return "-" if value is None else f"{value:.{decimals}f}"
+
+
+def worst_sheet(cases: Sequence[Case], clean: Callable[[Pixels], Pixels], scores: dict[str, Any],
+                width: int = 400) -> Pixels:
+    """The pictures with the lowest gain, worst first: input | result | truth | flare taken, display values."""
+    import cv2
+
+    ranked = sorted((row["gain_db"], k) for k, row in enumerate(scores["pictures"]) if row["gain_db"] is not None)
+    strips = []
+    for gain, k in ranked[:WORST]:
+        frame, truth, _ = cases[k].read()
+        result = clean(frame)
+        taken = np.clip((frame - result) * 2, 0, 1)
+        height = round(width * frame.shape[0] / frame.shape[1])
+        parts = [np.asarray(cv2.resize(part, (width, height), interpolation=cv2.INTER_AREA), np.float32)
+                 for part in (frame, result, truth, taken)]
+        head = np.zeros((20, 4 * width, 3), np.float32)
+        text = f"{cases[k].category} / {cases[k].name}: {gain:+.2f} dB   input | result | truth | taken away x2"
+        cv2.putText(head, text, (4, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (0.9, 0.9, 0.9), 1, cv2.LINE_AA)
+        strips += [head, np.concatenate(parts, 1)]
+    return np.concatenate(strips, 0) if strips else np.zeros((20, 4 * width, 3), np.float32)
+
+
+def synthetic(seed: int, count: int, backgrounds: Any, lenses: Sequence[Any], size: tuple[int, int]) -> list[Case]:
+    """`count` cases of every class of flare, a function of the seed: the test set that needs no data but clean
+    pictures. Frames are 8 bit codes."""
+    from .pairs import Layers, pair
+    from .synthesis.layers import CLASSES, flare
+
+    class One:
+        """A bank of a single flare, of the class that is due."""
+
+        def __init__(self, index: int, number: int) -> None:
+            self._index, self._number = index, number
+
+        def draw(self, random: np.random.Generator) -> Layers:
+            again = int(random.integers(1 << 30))
+            made = flare((seed, self._index, self._number, again), 640, lenses, CLASSES[self._index])
+            return Layers(made.rest, made.glare, made.light, made.lights)
+
+    def reader(index: int, number: int) -> Callable[[], tuple[Pixels, Pixels, None]]:
+        def read() -> tuple[Pixels, Pixels, None]:
+            random = np.random.default_rng((seed, index, number))
+            made = pair(random, One(index, number), backgrounds, *size, clean=0)
+            return np.round(made.frame * 255).astype(np.float32) / 255, made.scene, None
+
+        return read
+
+    return [Case(f"{number:04d}", kind, reader(index, number))
+            for index, kind in enumerate(CLASSES) for number in range(count)]
+
+
+def pairs_of_pictures(cases: Iterable[Case]) -> Iterator[tuple[str, Pixels, Pixels]]:
+    """(category/name, frame, scene) of cases, for who wants them as files."""
+    for case in cases:
+        frame, truth, _ = case.read()
+        yield f"{case.category}/{case.name}", frame, truth

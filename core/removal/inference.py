@@ -1,0 +1,199 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Flare removal of plates of any size and depth.
+
+The network sees the plate at a bounded working size. The flare that it tells is carried up by a guided
+filter (He et al. 2013, in the fast form of He and Sun 2015): flare = a * plate + b, with a and b found at
+the working size, smooth, and applied to the plate's own pixels, so that the edges of a light or of what
+stands before it stay sharp. What was carried up is taken from the plate in linear light. Where the network
+tells less than a threshold the flare is exactly zero, and the plate's own codes are kept.
+"""
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ..errors import SettingsError
+from ..pictures import Encoding
+from .network import GAMMA, MULTIPLE, RemovalNetwork, decoded, inputs
+from .plates import Plate
+from .weights import IN_THE_BOX, load
+
+Pixels = NDArray[np.float32]
+
+WORKING_SIZE = 512
+"""Long side that the network sees: about the largest that it was trained at."""
+LEAST = 0.012
+"""Encoded flare below this is none: about 0.0006 of white."""
+RADIUS, SMOOTHNESS = 2, 1e-3
+"""Of the guided filter, at the working size."""
+ROWS = 256
+"""Rows of the plate that are worked on at a time, which bounds the memory."""
+
+
+@dataclass(frozen=True)
+class FlareMap:
+    """A flare at the working size, as what carries it up: flare = gain * display + offset, (h, w, 3) each."""
+
+    gain: Pixels
+    offset: Pixels
+
+    @property
+    def empty(self) -> bool:
+        """Whether there is no flare at all."""
+        return not (self.gain.any() or self.offset.any())
+
+
+class Remover:
+    """The network of a weights file, ready for plates."""
+
+    def __init__(self, weights: Path | None = None, *, working_size: int = WORKING_SIZE,
+                 keep_glare: bool = False) -> None:
+        """keep_glare: leave the glow round the lights. Raises RunError, SettingsError."""
+        if not 64 <= working_size <= 8192:
+            raise SettingsError(f"A working size of {working_size} pixels is outside 64 to 8192.")
+        self.network: RemovalNetwork = load(weights or IN_THE_BOX)
+        self.working_size, self.keep_glare = working_size, keep_glare
+
+    def remove(self, plate: Plate) -> tuple[NDArray[Any], NDArray[np.float16]]:
+        """(codes without flare, in the plate's own type; the flare in linear light (height, width, 3))."""
+        found = self.find(plate.codes, plate.encoding, plate.top)
+        codes = plate.codes.copy()
+        flare = np.zeros(plate.codes.shape, np.float16)
+        if not found.empty:
+            for rows, light in carried_up(found, plate.codes, plate.encoding, plate.top):
+                codes[rows] = _less(plate.codes[rows], light, plate.encoding, plate.top)
+                flare[rows] = np.minimum(light, 65504)
+        return codes, flare
+
+    def clean_display(self, display: Pixels) -> Pixels:
+        """Display values 0..1 (height, width, 3) without flare, as 16 bit codes would give them."""
+        codes = (np.clip(display, 0, 1) * 65535 + 0.5).astype(np.uint16)
+        clean = self.remove(Plate(Path("display.png"), codes, "srgb"))[0]
+        return np.where(clean == codes, display, clean.astype(np.float32) / 65535)
+
+    def find(self, codes: NDArray[Any], encoding: Encoding, top: float = 1.0) -> FlareMap:
+        """The flare of a picture's codes (height, width, 3), at the working size."""
+        small = self._seen(codes, encoding, top)
+        return _guided(small, self.flare(small))
+
+    @torch.inference_mode()
+    def flare(self, display: Pixels) -> Pixels:
+        """Linear flare of a picture of display values 0..1 at the network's size; exactly 0 where it is none."""
+        frame = torch.from_numpy(np.ascontiguousarray(display.transpose(2, 0, 1)))[None]
+        told = self.network(inputs(frame).to(memory_format=torch.channels_last))
+        code = told.gentle if self.keep_glare else told.flare
+        # A ramp from nothing to the whole, so that a faint flare has no rim.
+        code = code * ((code - LEAST) / LEAST).clamp(0, 1)
+        light = torch.where(code > 0, decoded(code), 0.0).minimum(frame**GAMMA)
+        return np.ascontiguousarray(light[0].permute(1, 2, 0).numpy())
+
+    def _seen(self, codes: NDArray[Any], encoding: Encoding, top: float) -> Pixels:
+        """The plate as the network sees it: display values, reduced, sides multiples of what it takes."""
+        import cv2
+
+        height, width = codes.shape[:2]
+        scale = self.working_size / max(height, width)
+        fit = [int(np.clip(round(side * scale / MULTIPLE), 2, max(self.working_size // MULTIPLE, 2))) * MULTIPLE
+               for side in (width, height)]
+        # In strips, whose floats would not fit memory all at once; reduced in light, as a lens would.
+        grow = fit[0] > width or fit[1] > height
+        if grow:
+            light = np.clip(_light(codes, encoding, top), 0, 1)
+            small = cv2.resize(light, (fit[0], fit[1]), interpolation=cv2.INTER_LINEAR)
+        else:
+            small = _reduced(codes, encoding, top, fit[0], fit[1])
+        return _display(np.asarray(small, np.float32))
+
+
+def _reduced(codes: NDArray[Any], encoding: Encoding, top: float, width: int, height: int) -> Pixels:
+    """Clipped linear light by area, (height, width, 3), read in strips of whole working rows."""
+    import cv2
+
+    rows = codes.shape[0]
+    small = np.zeros((height, width, 3), np.float32)
+    step = max(height * ROWS // rows, 1)
+    for top_row in range(0, height, step):
+        end_row = min(top_row + step, height)
+        first, last = top_row * rows // height, max(-(-end_row * rows // height), top_row * rows // height + 1)
+        strip = np.clip(_light(codes[first:last], encoding, top), 0, 1)
+        small[top_row:end_row] = cv2.resize(strip, (width, end_row - top_row), interpolation=cv2.INTER_AREA)
+    return small
+
+
+def _light(codes: NDArray[Any], encoding: Encoding, top: float) -> Pixels:
+    """Linear light; what is not a finite number counts as black here."""
+    if encoding == "srgb":
+        if codes.dtype == np.uint8:
+            return _TABLE[codes]
+        return np.power(codes.astype(np.float32) / np.float32(top), np.float32(GAMMA))
+    return np.nan_to_num(codes.astype(np.float32), nan=0.0, posinf=65504.0, neginf=0.0)
+
+
+def _display(light: Pixels) -> Pixels:
+    """What the network was trained on: light to the power of 1 / 2.2, for files of either encoding, since the
+    sum of scene and flare is one of light as `network.GAMMA` has it."""
+    return np.power(np.clip(light, 0, 1), np.float32(1 / GAMMA)).astype(np.float32)
+
+
+_TABLE = np.power(np.arange(256, dtype=np.float32) / 255, np.float32(GAMMA)).astype(np.float32)
+
+
+def _guided(display: Pixels, flare: Pixels) -> FlareMap:
+    """The guided filter's two maps, channel by channel: box means over a window, then their own means."""
+    import cv2
+
+    if not flare.any():
+        return FlareMap(np.zeros_like(flare), np.zeros_like(flare))
+    window = (2 * RADIUS + 1, 2 * RADIUS + 1)
+
+    def mean(values: Pixels) -> Pixels:
+        return np.asarray(cv2.blur(values, window, borderType=cv2.BORDER_REFLECT), np.float32)
+
+    mean_i, mean_f = mean(display), mean(flare)
+    covariance = mean(display * flare) - mean_i * mean_f
+    variance = np.maximum(mean(display * display) - mean_i**2, 0)
+    gain = np.clip(covariance / (variance + np.float32(SMOOTHNESS)), -4, 4)
+    # Running sums leave crumbs where there is nothing at all.
+    anything = cv2.dilate((flare > 0).any(-1).astype(np.uint8), np.ones(window, np.uint8))[..., None]
+    offset = mean_f - gain * mean_i
+    wide = cv2.dilate(anything, np.ones(window, np.uint8))[..., None]
+    return FlareMap(mean(gain * anything) * wide, mean(offset * anything) * wide)
+
+
+def carried_up(found: FlareMap, codes: NDArray[Any], encoding: Encoding,
+               top: float) -> Iterator[tuple[slice, Pixels]]:
+    """(rows, linear flare of those rows (n, width, 3)), from the top of the picture to its bottom."""
+    import cv2
+
+    height, width = codes.shape[:2]
+    low_height, low_width = found.gain.shape[:2]
+    x = ((np.arange(width, dtype=np.float32) + 0.5) * (low_width / width) - 0.5)[None, :]
+    for first in range(0, height, ROWS):
+        rows = slice(first, min(first + ROWS, height))
+        y = ((np.arange(first, rows.stop, dtype=np.float32) + 0.5) * (low_height / height) - 0.5)[:, None]
+        low = max(int(y[0, 0]) - 2, 0)
+        high = min(int(y[-1, 0]) + 4, low_height)
+        at = (np.broadcast_to(x, (len(y), width)), np.broadcast_to(y - low, (len(y), width)))
+        gain, offset = (cv2.remap(np.ascontiguousarray(part[low:high]), np.ascontiguousarray(at[0]),
+                                  np.ascontiguousarray(at[1]), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+                        for part in (found.gain, found.offset))
+        light = _light(codes[rows], encoding, top)
+        display = codes[rows].astype(np.float32) / np.float32(top) if encoding == "srgb" else _display(light)
+        flare = gain * display + offset
+        yield rows, np.minimum(np.maximum(flare, 0), np.maximum(light, 0))
+
+
+def _less(codes: NDArray[Any], flare: Pixels, encoding: Encoding, top: float) -> NDArray[Any]:
+    """The codes with the flare taken from their light; kept as they are where it is zero, or they no numbers."""
+    light = _light(codes, encoding, top) - flare
+    if encoding == "srgb":
+        new = (_display(light) * np.float32(top) + np.float32(0.5)).astype(codes.dtype)
+    else:
+        new = light.astype(codes.dtype)
+    return np.where((flare > 0) & np.isfinite(codes), new, codes)

@@ -1,0 +1,83 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""eval-removal: how good the removal of flares is, in figures."""
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from ...core.errors import SettingsError
+from ...core.progress import Progress
+from ..command import Command, Step
+
+SHEET, SCORES = "worst.png", "eval.json"
+
+
+def arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("pairs", type=Path, nargs="?", metavar="PAIRS",
+                        help="folder with input/ and gt/ (and mask/), or a folder of such folders")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help=f"folder for {SCORES} and {SHEET}")
+    parser.add_argument("--synthetic", type=int, metavar="N",
+                        help="in place of PAIRS: N synthesised pictures of every class of flare")
+    parser.add_argument("--backgrounds", type=Path, nargs="+", default=[], metavar="DIR",
+                        help="clean pictures for --synthetic; one in ten, by name, is kept from training for this")
+    parser.add_argument("--lenses", type=Path, metavar="DIR",
+                        help="lens prescriptions for --synthetic, of which one in ten, by name, is kept from training")
+    parser.add_argument("--all-backgrounds", action="store_true", help="use every clean picture, not one in ten")
+    parser.add_argument("--seed", type=int, default=7, metavar="N", help="of --synthetic (default 7)")
+    parser.add_argument("--size", type=int, nargs=2, default=(960, 640), metavar=("W", "H"),
+                        help="of --synthetic's pictures (default 960 640)")
+    parser.add_argument("--keep-glare", action="store_true", help="leave the glow round the lights")
+    parser.add_argument("--working-size", type=int, metavar="PIXELS", help="as of `remove`")
+    parser.add_argument("--weights", type=Path, metavar="FILE", help="as of `remove`")
+    parser.add_argument("--lpips", type=Path, metavar="DIR", help="folder with the weights of LPIPS (AlexNet, v0.1)")
+
+
+def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
+    from ...core.files import write_json
+    from ...core.pictures import write_png
+    from ...core.removal import evaluation
+    from ...core.removal.inference import WORKING_SIZE, Remover
+
+    size = WORKING_SIZE if words.working_size is None else words.working_size
+    remover = Remover(words.weights, working_size=size, keep_glare=words.keep_glare)
+    cases = _cases(words)
+    perceptual = None
+    if words.lpips:
+        from ...core.metrics.lpips import Lpips
+
+        perceptual = Lpips(words.lpips)
+    else:
+        progress.say("LPIPS is left out: no folder with its weights was given (--lpips).")
+    scores = evaluation.evaluate(cases, remover.clean_display, progress, lpips=perceptual)
+    write_json(words.out / SCORES, scores)
+    write_png(words.out / SHEET, evaluation.worst_sheet(cases, remover.clean_display, scores))
+    progress.say(evaluation.table(scores))
+    return {"eval": str(words.out / SCORES), "sheet": str(words.out / SHEET), "mean": scores["mean"],
+            "categories": scores["categories"]}
+
+
+def _cases(words: argparse.Namespace) -> Any:
+    from ...core.removal import evaluation
+    from ...core.removal.backgrounds import kept_for_test, read_backgrounds
+    from ...core.removal.synthesis.prescription import built_in, read_lenses
+
+    if (words.pairs is None) == (words.synthetic is None):
+        raise SettingsError("Give either a folder of pairs, or --synthetic with --backgrounds.")
+    if words.pairs is not None:
+        return evaluation.paired(words.pairs)
+    if words.synthetic < 1 or min(words.size) < 64:
+        raise SettingsError("--synthetic wants one picture a class at least, of 64 pixels a side at least.")
+    backgrounds = read_backgrounds(words.backgrounds, "all" if words.all_backgrounds else "test", max(words.size))
+    lenses = [lens for lens in read_lenses(words.lenses) if kept_for_test(lens.name)] if words.lenses else built_in()
+    return evaluation.synthetic(words.seed, words.synthetic, backgrounds, lenses or built_in(), tuple(words.size))
+
+
+COMMAND = Command(
+    "eval-removal", "Scores the removal of flares on pairs of pictures.",
+    f"""Writes DIR/{SCORES} and DIR/{SHEET} (the ten pictures that gain least) and shows, by category, PSNR, SSIM,
+LPIPS and FLIP against the flare-free pictures, with those of the untouched input in brackets.
+
+  run.py eval-removal Flare7Kpp/test_data/real --out build/eval
+  run.py eval-removal --synthetic 25 --backgrounds photos hdri --lenses lenses --out build/eval""",
+    arguments, (Step("eval-removal", "engine", run),))

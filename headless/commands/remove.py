@@ -1,0 +1,44 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""remove: plates without their flares."""
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from ...core.progress import Progress
+from ..command import Command, Step
+
+
+def arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("plates", type=Path, nargs="+", metavar="PLATE",
+                        help="pictures (PNG, JPEG, TIFF, EXR), or folders of them")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR",
+                        help="folder for the clean plates, under the names that the plates have")
+    parser.add_argument("--flare", type=Path, metavar="DIR", help="write the flares too, as EXR in linear light")
+    parser.add_argument("--keep-glare", action="store_true", help="leave the glow round the lights")
+    parser.add_argument("--working-size", type=int, metavar="PIXELS",
+                        help="long side that the network sees (default 512)")
+    parser.add_argument("--weights", type=Path, metavar="FILE",
+                        help="weights of train-removal's (default: those that come with the program)")
+    parser.add_argument("--overwrite", action="store_true", help="make again what is there")
+
+
+def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
+    from ...core.removal.batch import remove_all
+    from ...core.removal.inference import WORKING_SIZE, Remover
+
+    size = WORKING_SIZE if words.working_size is None else words.working_size
+    remover = Remover(words.weights, working_size=size, keep_glare=words.keep_glare)
+    return remove_all(words.plates, words.out, remover, progress, flare_folder=words.flare, overwrite=words.overwrite)
+
+
+COMMAND = Command(
+    "remove", "Takes the flares out of plates.",
+    """Writes each plate without its flare to DIR, in the kind and depth it came in. The network sees a reduced
+plate; the flare is carried up to full size and taken away in linear light, and where there is none the plate
+is kept to the last bit. A plate that cannot be read is told at the end, and does not stop the others.
+
+  run.py remove plate.exr --out clean
+  run.py remove shots/sh010 --out clean/sh010 --flare flares/sh010 --keep-glare""",
+    arguments, (Step("remove", "engine", run),))

@@ -1,0 +1,78 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""train-removal: the network that takes flares out, trained on synthesised flares over clean pictures."""
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from ...core.errors import SettingsError
+from ...core.progress import Progress
+from ..command import Command, Step
+from .fit import change
+
+
+def arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--backgrounds", type=Path, nargs="+", required=True, metavar="DIR",
+                        help="clean photographs and environment maps (.hdr, or .exr twice as wide as high)")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR",
+                        help="folder for the weights, the checkpoint and the log")
+    parser.add_argument("--lenses", type=Path, metavar="DIR",
+                        help="lens prescriptions (.lens) for the ghosts (default: a few that come with the program)")
+    parser.add_argument("--flares", type=Path, metavar="DIR",
+                        help="your own flares on black, mixed in: pictures, clips, or Flare7K++'s folders")
+    parser.add_argument("--iterations", type=int, metavar="N", help="length (default: the recipe's)")
+    parser.add_argument("--resume", action="store_true", help="go on with the training in --out, to --iterations")
+    parser.add_argument("--start", type=Path, metavar="FILE",
+                        help='weights to begin with; "box" for those that come with the program')
+    parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", dest="changes",
+                        help="any other number of the recipe, e.g. learning_rate=3e-4; repeatable")
+    parser.add_argument("--most-lenses", type=int, default=180, metavar="N",
+                        help="so many of the lenses, evenly spread; each is traced once (default 180)")
+    parser.add_argument("--threads", type=int, metavar="N", help="processor threads (default: all)")
+
+
+def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
+    import torch
+
+    from ...core.removal import recipe as recipes
+    from ...core.removal import weights
+    from ...core.removal.backgrounds import kept_for_test, read_backgrounds
+    from ...core.removal.bank import OwnFlares
+    from ...core.removal.synthesis.prescription import built_in, read_lenses
+    from ...core.removal.training import train
+
+    if words.threads:
+        torch.set_num_threads(words.threads)
+    changes = dict(map(change, words.changes))
+    if words.iterations is not None:
+        changes["iterations"] = words.iterations
+    recipe = recipes.from_dict({**recipes.as_dict(recipes.Recipe()), **changes})
+    lenses = read_lenses(words.lenses, words.most_lenses) if words.lenses else []
+    train_on = [lens for lens in lenses if not kept_for_test(lens.name)] + built_in()
+    test_on = [lens for lens in lenses if kept_for_test(lens.name)] or built_in()
+    backgrounds = read_backgrounds(words.backgrounds, "train")
+    try:
+        tests = read_backgrounds(words.backgrounds, "test"), test_on
+    except SettingsError:
+        tests = None
+        progress.say("There are too few clean pictures to keep some for checks; the log will have none.")
+    own = OwnFlares(words.flares, recipe.canvas) if words.flares else None
+    start = weights.IN_THE_BOX if str(words.start) == "box" else words.start
+    progress.say(f"{len(backgrounds.photos)} photographs, {len(backgrounds.maps)} environment maps, {len(train_on)} "
+                 f"lenses, {len(own) if own else 'no'} flares of your own.")
+    path = train(recipe, words.out, backgrounds, train_on, tests=tests, own=own, resume=words.resume, start=start,
+                 progress=progress)
+    progress.say(f"The weights are in {path}; use them with `remove --weights`.")
+    return {"weights": str(path)}
+
+
+COMMAND = Command(
+    "train-removal", "Trains the network that takes flares out.",
+    """Flares are synthesised as the training goes (dirty apertures, ghosts through lens prescriptions, streaks,
+halos, glare, rings) and laid over the clean pictures. One picture and one lens in ten, by name, are kept out
+for checks. Stopped, it goes on with --resume; --start box begins with the weights that come with the program.
+
+  run.py train-removal --backgrounds photos hdri --lenses lenses --out build/removal
+  run.py train-removal --backgrounds photos --flares my_flares --start box --out build/mine --iterations 4000""",
+    arguments, (Step("train-removal", "engine", run),))

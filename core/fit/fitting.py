@@ -16,9 +16,9 @@ from ..flare.file import FlareFile, TrainingCamera
 from ..gaussians.ply import write_ply
 from ..progress import Progress
 from . import checkpoint
-from .preview import row, spread, write_preview
+from .preview import row, spread, write_preview, write_small
 from .rendering import render
-from .run import CHECKPOINT, FLARE, LOG, METRICS, PREVIEW, SCENE, Run
+from .run import CHECKPOINT, FLARE, LOG, METRICS, PREVIEW, SCENE, SMALL_PREVIEW, Run
 from .settings import FitSettings
 from .trainer import Trainer
 
@@ -111,6 +111,8 @@ def _preview(trainer: Trainer, run: Run) -> None:
                       visibility=run.settings.flare.occluded_by_scene)
         rows.append(row(trainer.frames.frame(views[index]), view))
     write_preview(run.folder / PREVIEW, rows)
+    if rows:
+        write_small(run.folder / SMALL_PREVIEW, rows[len(rows) // 2])
 
 
 def _forget_after(path: Path, iteration: int) -> None:

@@ -10,10 +10,11 @@ import torch
 from numpy.typing import NDArray
 
 from ..flare.compositing import encode
-from ..pictures import write_png
+from ..pictures import Picture, write_png
 from .rendering import RenderedView
 
 GAP = 4
+SMALL = 512  # pixels of the longer side of a small preview
 
 
 def row(frame: torch.Tensor, view: RenderedView) -> NDArray[np.float32]:
@@ -33,6 +34,17 @@ def write_preview(path: Path, rows: Sequence[NDArray[np.float32]]) -> None:
     gap = np.full((GAP, width, 3), 0.5, np.float32)
     strips = [part for one in rows for part in (one[:, :width], gap)]
     write_png(path, np.concatenate(strips[:-1], axis=0))
+
+
+def write_small(path: Path, strip: NDArray[np.float32]) -> None:
+    """One view, frame | composite over scene | flare, small enough to be read again and again by a panel."""
+    width = (strip.shape[1] - 3 * GAP) // 4
+    frame, composite, scene, flare = (strip[:, at * (width + GAP):at * (width + GAP) + width] for at in range(4))
+    square = np.concatenate([np.concatenate([frame, composite], 1), np.concatenate([scene, flare], 1)])
+    step = max(SMALL / max(square.shape[:2]), 1e-9)
+    size = max(round(square.shape[1] * step), 1), max(round(square.shape[0] * step), 1)
+    picture = Picture(np.ascontiguousarray(square, np.float32), "srgb")
+    write_png(path, (picture.resized(*size) if step < 1 else picture).pixels)
 
 
 def spread(count: int, wanted: int) -> list[int]:

@@ -5,7 +5,7 @@
     capture.txt   the capture's folder
     flare.flare   the flare            scene.ply   the scene, standard 3DGS
     checkpoint/   state.safetensors    what a resumed fit needs
-    metrics.jsonl one line of figures now and then; preview.png; eval.json; log.txt
+    metrics.jsonl one line of figures now and then; preview.png, preview_small.png; eval.json; log.txt
 """
 from __future__ import annotations
 
@@ -37,6 +37,7 @@ SCENE = "scene.ply"
 CHECKPOINT = "checkpoint/state.safetensors"
 METRICS = "metrics.jsonl"
 PREVIEW = "preview.png"
+SMALL_PREVIEW = "preview_small.png"
 EVALUATION = "eval.json"
 LOG = "log.txt"
 

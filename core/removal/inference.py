@@ -136,7 +136,7 @@ def _light(codes: NDArray[Any], encoding: Encoding, top: float) -> Pixels:
 
 
 def _display(light: Pixels) -> Pixels:
-    """What the network was trained on: light to the power of 1 / 2.2, for files of either encoding, since the
+    """What the network was trained on: light to the power of 1 / GAMMA, for files of either encoding, since the
     sum of scene and flare is one of light as `network.GAMMA` has it."""
     return np.power(np.clip(light, 0, 1), np.float32(1 / GAMMA)).astype(np.float32)
 

@@ -25,7 +25,8 @@ FOLD = 4
 what it tells is smooth, and carried up by a guided filter."""
 MULTIPLE = 32
 """Height and width that the network takes are multiples of this."""
-GAMMA = 2.2
+GAMMA = 2
+"""Of the light that flares are taken from display values in: the middle of what pictures are formed with, and cheap."""
 _EPSILON = 1e-3
 
 
@@ -38,12 +39,12 @@ class Prediction(NamedTuple):
 
 def encoded(light: Tensor) -> Tensor:
     """Linear light >= 0 as the network's own display-like values, finite slope at 0."""
-    return (light.clamp(min=0) + _EPSILON) ** (1 / GAMMA) - _EPSILON ** (1 / GAMMA)
+    return torch.sqrt(light.clamp(min=0) + _EPSILON) - _EPSILON**0.5
 
 
 def decoded(code: Tensor) -> Tensor:
     """The inverse of `encoded`, for code >= 0."""
-    return (code.clamp(min=0) + _EPSILON ** (1 / GAMMA)) ** GAMMA - _EPSILON
+    return torch.square(code.clamp(min=0) + _EPSILON**0.5) - _EPSILON
 
 
 def inputs(display: Tensor) -> Tensor:
@@ -122,4 +123,4 @@ class RemovalNetwork(nn.Module):
 
 def cleaned(display: Tensor, flare: Tensor) -> Tensor:
     """Encoded light of the frame less its encoded flare; display (n, 3, h, w) 0..1."""
-    return encoded(display.clamp(min=0) ** GAMMA - decoded(flare))
+    return encoded(torch.square(display) - decoded(flare))

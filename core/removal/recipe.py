@@ -30,8 +30,8 @@ class Recipe:
     depths: tuple[int, ...] = (1, 2, 2, 4)
     small_until: int = 2000        # iterations with small frames, which are cheaper
     canvas: int = 448              # pixels a side of the flares' canvas
-    bank: int = 400                # flares at hand at a time
-    renew_every: int = 6           # iterations for each new flare
+    bank: int = 250                # flares at hand at a time
+    renew_every: int = 4           # iterations for each new flare
     own_share: float = 0.3         # of the user's own flares, where there are any
     clean: float = 0.08            # of the frames have no flare
     half: bool = True              # bfloat16 in the convolutions

@@ -18,7 +18,7 @@ from ..progress import Progress
 from . import weights
 from .backgrounds import Backgrounds
 from .bank import Mixed, OwnFlares, SynthesisBank
-from .network import GAMMA, RemovalNetwork, cleaned, encoded, inputs
+from .network import RemovalNetwork, cleaned, encoded, inputs
 from .pairs import Bank, Pair, pair
 from .recipe import Recipe, as_dict, from_dict
 from .synthesis.layers import flare
@@ -49,7 +49,7 @@ class Trainer:
         torch.manual_seed(recipe.seed)
         self.network = self._placed(RemovalNetwork(recipe.widths, recipe.depths))
         self.optimiser = torch.optim.AdamW(self.network.parameters(), recipe.learning_rate, betas=(0.9, 0.99),
-                                           weight_decay=recipe.weight_decay)
+                                           weight_decay=recipe.weight_decay, fused=True)
         self.averaged = {name: value.detach().clone() for name, value in self.network.state_dict().items()}
 
     def _placed(self, network: RemovalNetwork) -> RemovalNetwork:
@@ -87,8 +87,7 @@ class Trainer:
         self.iteration += 1
         keep = min(recipe.average, (1 + self.iteration) / (10 + self.iteration))
         with torch.no_grad():
-            for name, value in self.network.state_dict().items():
-                self.averaged[name].lerp_(value, 1 - keep)
+            torch._foreach_lerp_(list(self.averaged.values()), list(self.network.state_dict().values()), 1 - keep)
         return figures
 
     def _loss(self, pairs: Sequence[Pair]) -> tuple[Tensor, dict[str, float]]:
@@ -100,8 +99,8 @@ class Trainer:
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.recipe.half):
             told = self.network(seen)
         clean, mild = cleaned(frame, told.flare), cleaned(frame, told.gentle)
-        clean_goal, mild_goal = encoded(scene**GAMMA), encoded(gentle**GAMMA)
-        flare_goal = encoded(frame**GAMMA - scene**GAMMA)
+        clean_goal, mild_goal = encoded(torch.square(scene)), encoded(torch.square(gentle))
+        flare_goal = encoded(torch.square(frame) - torch.square(scene))
         squared = (clean - clean_goal).square().mean((1, 2, 3))
         distance = (clean - clean_goal).abs().mean()
         loss = (distance + 0.5 * (mild - mild_goal).abs().mean() + 0.3 * (told.flare - flare_goal).abs().mean()
@@ -127,8 +126,8 @@ class Trainer:
                 with torch.autocast(self.device.type, torch.bfloat16, enabled=self.recipe.half):
                     told = network(inputs(frame).to(memory_format=torch.channels_last))
                 clean = cleaned(frame, told.flare)
-                after = (clean - encoded(scene**GAMMA)).square().mean()
-                before = (encoded(frame**GAMMA) - encoded(scene**GAMMA)).square().mean()
+                after = (clean - encoded(torch.square(scene))).square().mean()
+                before = (encoded(torch.square(frame)) - encoded(torch.square(scene))).square().mean()
                 values.append(float(10 * torch.log10((before + 1e-8) / (after + 1e-8))))
             gains[kind] = round(float(np.mean(values)), 3)
         gains["mean"] = round(float(np.mean(list(gains.values()))), 3)

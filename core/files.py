@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import glob
 import json
 import os
 import shutil
 import tempfile
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -24,7 +26,7 @@ def atomic_path(target: Path | str) -> Iterator[Path]:
     """
     target = Path(target)
     target.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(prefix=_PARTIAL, suffix=target.suffix, dir=target.parent)
+    handle, name = tempfile.mkstemp(prefix=_partial_of(target), suffix=target.suffix, dir=target.parent)
     os.close(handle)
     temporary = Path(name)
     try:
@@ -34,6 +36,42 @@ def atomic_path(target: Path | str) -> Iterator[Path]:
         temporary.replace(target)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def _partial_of(target: Path) -> str:
+    return f"{_PARTIAL}{target.name[:80]}-"
+
+
+def remove_partial_of(target: Path | str) -> None:
+    """Remove what a killed process left of `target` half written; only for whom that file is to write."""
+    target = Path(target)
+    for path in target.parent.glob(f"{glob.escape(_partial_of(target))}*"):
+        path.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def locked(lock: Path | str, stale_s: float = 10.0) -> Iterator[None]:
+    """Hold a lock file while a short block runs, so that processes of one folder take turns, on shared disks too.
+
+    A lock older than `stale_s` belonged to a process that was killed, and is taken over.
+    """
+    lock = Path(lock)
+    lock.parent.mkdir(parents=True, exist_ok=True)
+    while True:
+        try:
+            os.close(os.open(lock, os.O_CREAT | os.O_EXCL | os.O_WRONLY))
+            break
+        except (FileExistsError, PermissionError):  # Windows refuses while another one is removing it
+            try:
+                if time.time() - lock.stat().st_mtime > stale_s:
+                    lock.unlink(missing_ok=True)
+            except FileNotFoundError:
+                continue
+            time.sleep(0.01)
+    try:
+        yield
+    finally:
+        lock.unlink(missing_ok=True)
 
 
 @contextlib.contextmanager

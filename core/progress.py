@@ -2,7 +2,8 @@
 """How long work tells where it stands, and how it is asked to stop.
 
 Core code takes a `Progress` and calls `stage`, `advance`, `say`, `result`. The base class is silent;
-`TerminalProgress` draws a bar; `JsonProgress` writes one JSON object a line for the add-on and farms:
+`TerminalProgress` draws a bar; `OpenJdProgress` speaks to farms of the Open Job Description; `JsonProgress`
+writes one JSON object a line for the add-on and other programs:
 
     {"type": "stage", "name": "fit", "total": 3000, "done": 0}
     {"type": "progress", "stage": "fit", "done": 120, "total": 3000, "left_s": 61.2, "figures": {…}}
@@ -188,6 +189,41 @@ class JsonProgress(Progress):
 
     def error(self, text: str) -> None:
         self._send(type="error", text=text)
+
+
+class OpenJdProgress(Progress):
+    """Lines of the Open Job Description on stdout: openjd_progress (per cent), openjd_status, openjd_fail.
+
+    At most one progress line a second, and each per cent once.
+    """
+
+    def __init__(self, stream: TextIO | None = None) -> None:
+        super().__init__()
+        self._stream = stream or sys.stdout
+        self._shown = -1
+        self._last = 0.0
+
+    def _line(self, kind: str, text: str) -> None:
+        print(f"openjd_{kind}: {' '.join(text.split())}", file=self._stream, flush=True)
+
+    def _show_stage(self) -> None:
+        self._shown, self._last = -1, 0.0
+        self._line("status", f"{self._stage} {self._done}/{self._total}")
+        self._show_progress({})
+
+    def _show_progress(self, figures: dict[str, float]) -> None:  # noqa: ARG002 - the base's signature
+        share = int(100 * min(max(self._done / self._total, 0), 1)) if self._total > 0 else 100
+        now = time.monotonic()
+        if share == self._shown or (share < 100 and now - self._last < 1):
+            return
+        self._shown, self._last = share, now
+        self._line("progress", f"{share}")
+
+    def say(self, text: str) -> None:
+        self._line("status", text)
+
+    def error(self, text: str) -> None:
+        self._line("fail", text)
 
 
 @contextlib.contextmanager

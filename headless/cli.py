@@ -14,7 +14,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any, NoReturn, TextIO
 
 from ..core.errors import Cancelled, EngineError, FitFlareError
-from ..core.progress import JsonProgress, Progress, TerminalProgress, stoppable
+from ..core.progress import JsonProgress, OpenJdProgress, Progress, TerminalProgress, stoppable
 from . import hand_off
 from .command import Command, Step
 from .commands import COMMANDS
@@ -44,8 +44,9 @@ def parser() -> argparse.ArgumentParser:
     """The parser of all commands, their options and the options that all share."""
     shared = _Parser(add_help=False)
     options = shared.add_argument_group("how it runs")
-    options.add_argument("--progress", choices=("terminal", "json"), default="terminal",
-                         help="json: one JSON object a line on standard output, for programs that watch")
+    options.add_argument("--progress", choices=("terminal", "json", "openjd"), default="terminal",
+                         help="json: one JSON object a line on standard output, for programs that watch; openjd: "
+                              "lines of the Open Job Description, for farms")
     options.add_argument("--engine", metavar="PYTHON",
                          help="the Python with torch, or the folder of its virtual environment, for a Blender that "
                               "has none (else FIT_FLARE_ENGINE, the add-on's preferences, .venv in the repository)")
@@ -78,7 +79,7 @@ def main(words: Sequence[str]) -> int:
 
 def _status(words: Sequence[str], progress: Progress) -> int:
     try:
-        arguments = parser().parse_args(words)
+        arguments = parser().parse_args(words, argparse.Namespace(words=list(words)))
         with stoppable(progress):
             result = _run(COMMANDS[arguments.command], arguments, words, progress)
         progress.close()
@@ -111,8 +112,9 @@ def _status(words: Sequence[str], progress: Progress) -> int:
 def _progress(words: Sequence[str]) -> Iterator[Progress]:
     """By --progress alone, read before the rest so that misuse is told in the same manner."""
     told = " ".join(words).replace("--progress=", "--progress ").split("--progress ")[1:]
-    if not told or told[-1].split(" ")[0] != "json" or "--help" in words:
-        progress: Progress = TerminalProgress()
+    kind = told[-1].split(" ")[0] if told else ""
+    if kind != "json" or "--help" in words:
+        progress: Progress = OpenJdProgress() if kind == "openjd" else TerminalProgress()
         try:
             yield progress
         finally:
@@ -152,7 +154,7 @@ def _quiet() -> Iterator[None]:
 def _run(command: Command, arguments: argparse.Namespace, words: Sequence[str], progress: Progress) -> dict[str, Any]:
     result: dict[str, Any] = {}
     for step in command.steps:
-        if arguments.step in (None, step.name):
+        if arguments.step in (None, step.name) and step.wanted(arguments):
             result.update(_run_step(step, arguments, words, progress))
     return result
 

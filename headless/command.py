@@ -20,12 +20,13 @@ Run = Callable[[argparse.Namespace, Progress], dict[str, Any]]
 
 @dataclass(frozen=True)
 class Step:
-    """optional: left out, with a sentence, on a machine that lacks its side."""
+    """optional: left out, with a sentence, on a machine that lacks its side. wanted: whether these words ask for it."""
 
     name: str
     side: Side
     run: Run
     optional: bool = False
+    wanted: Callable[[argparse.Namespace], bool] = lambda _words: True
 
 
 @dataclass(frozen=True)

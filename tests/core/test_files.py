@@ -2,12 +2,13 @@
 """Files are whole or absent, and names stay inside their folder."""
 from __future__ import annotations
 
+import time
 from pathlib import Path
 
 import pytest
 
 from core.errors import CaptureError
-from core.files import atomic_folder, atomic_path, inside, read_json, write_json, write_text
+from core.files import atomic_folder, atomic_path, inside, locked, read_json, remove_partial_of, write_json, write_text
 
 
 def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
@@ -69,3 +70,23 @@ def test_a_folder_is_there_whole_or_not_at_all(tmp_path: Path) -> None:
         (folder / "a").write_text("whole")
     assert (tmp_path / "made" / "a").read_text() == "whole"
     assert [path.name for path in tmp_path.iterdir()] == ["made"]
+
+
+def test_what_a_killed_process_left_of_a_file_can_be_removed(tmp_path: Path) -> None:
+    target, other = tmp_path / "layers.0001.exr", tmp_path / "layers.0002.exr"
+    with atomic_path(target) as mine, atomic_path(other) as theirs:
+        assert mine.suffix == ".exr"
+        remove_partial_of(target)
+        assert not mine.exists()
+        assert theirs.exists()
+        mine.touch()
+
+
+def test_a_lock_is_held_by_one_and_outlives_no_one(tmp_path: Path) -> None:
+    lock = tmp_path / ".lock"
+    with locked(lock):
+        assert lock.exists()
+        started = time.monotonic()
+        with locked(lock, stale_s=0.05):  # as if the holder had been killed
+            assert time.monotonic() - started >= 0.04
+    assert not lock.exists()

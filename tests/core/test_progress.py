@@ -10,7 +10,7 @@ import signal
 import pytest
 
 from core.errors import Cancelled
-from core.progress import JsonProgress, Progress, TerminalProgress, stoppable
+from core.progress import JsonProgress, OpenJdProgress, Progress, TerminalProgress, stoppable
 
 
 def test_json_lines_are_whole_and_in_order() -> None:
@@ -58,3 +58,16 @@ def test_signals_ask_for_a_stop_and_handlers_come_back(number: int) -> None:
         with pytest.raises(Cancelled):
             progress.advance()
     assert signal.getsignal(number) is before
+
+
+def test_openjd_lines_are_a_farm_s() -> None:
+    stream = io.StringIO()
+    progress = OpenJdProgress(stream)
+    progress.stage("bake", 4)
+    progress.advance(4)
+    progress.say("two\nlines")
+    progress.result(layers="a")
+    progress.error("It failed.")
+    assert stream.getvalue().splitlines() == [
+        "openjd_status: bake 0/4", "openjd_progress: 0", "openjd_progress: 100", "openjd_status: two lines",
+        "openjd_fail: It failed."]

@@ -128,19 +128,23 @@ def _environment() -> dict[str, str]:
 # ---- how ------------------------------------------------------------------------------------------
 
 
+def own_group() -> dict[str, Any]:
+    """Options of Popen that keep a terminal's Ctrl-C from a child, so that it is stopped by its parent alone."""
+    if WINDOWS:
+        return {"creationflags": getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0)}
+    return {"start_new_session": True}
+
+
 def run_there(command: Sequence[str], words: Sequence[str], step: str, progress: Progress) -> dict[str, Any]:
     """Run one step of the command `words` in another process and return its result.
 
     Raises Cancelled when that process was stopped, and FitFlareError with its own sentence when it failed.
     """
     whole = [*command, *words, "--step", step, "--progress", "json"]
-    groups: dict[str, Any] = {"start_new_session": True}
-    if WINDOWS:
-        groups = {"creationflags": getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0)}
     with tempfile.TemporaryFile() as noise:
         try:
             child = subprocess.Popen(whole, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=noise,
-                                     env=_environment(), encoding="utf-8", errors="replace", **groups)
+                                     env=_environment(), encoding="utf-8", errors="replace", **own_group())
         except OSError as problem:
             raise EngineError(f"{whole[0]} cannot be started ({problem.strerror or problem}).") from problem
         try:

@@ -1,26 +1,29 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """A run rendered from its views, one EXR a frame, in a folder that can be gone on with after any stop.
 
-`bake.json` in the folder says what the layers were made from and which frames are whole; it is written
-after each frame. A frame is made again unless it is listed there under the same settings.
+A frame is made again unless its file is there and its header names the same settings, so any number of
+processes may make frames of one folder. `bake.json` lists what is whole; it is written after each frame.
 """
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
 from ..capture.camera import Camera
-from ..errors import RunError
-from ..files import inside, read_json, write_json
+from ..errors import FrameError, RunError
+from ..files import inside, locked, read_json, remove_partial_of, write_json
 from ..look import KeyedEdits, LookEdits
+from ..pictures import picture_size
 from ..progress import Progress
-from .exr import write_layers
+from .exr import read_description, write_layers
 from .frames import Frame
 from .layers import FrameLayers, Rendering, layer_names, layers_of
 
 RECORD = "bake.json"
+LOCK = ".bake.lock"
 VERSION = 1
 
 
@@ -73,21 +76,19 @@ def bake(renderer: Renderer, frames: Sequence[Frame], cameras: Mapping[str, Came
                  "size": [settings.width, settings.height]}
     if keyed.frames:
         made_from["keyed"] = keyed.described()["frames"]
-    record = _earlier(out, made_from, overwrite)
-    record["layers"] = layer_names(renderer.lights)
-    done = {entry["file"] for entry in record["frames"] if (out / entry["file"]).is_file()}
-    record["frames"] = [entry for entry in record["frames"] if entry["file"] in done]
-    left = [frame for frame in frames if frame.file not in done]
-    progress.stage("bake", len(frames), len(frames) - len(left))
-    for frame in left:
-        camera = settings.scaled(cameras[frame.view])
-        layers = _layers(renderer, camera, edits[frame.number])
-        write_layers(out / frame.file, layers, half=settings.half,
-                     notes={"view": frame.view, "frame": frame.number, **made_from})
-        record["frames"].append({"file": frame.file, "frame": frame.number, "view": frame.view,
-                                 "width": camera.width, "height": camera.height})
-        record["frames"].sort(key=lambda entry: (Path(entry["file"]).parent.as_posix(), entry["frame"]))
-        write_json(out / RECORD, record)
+    _begin(out, made_from, overwrite)
+    names = layer_names(renderer.lights)
+    done = [frame for frame in frames if _is_made(out / frame.file, frame, made_from)]
+    record = _add_to_record(out, made_from, names, [_entry(out, frame) for frame in done])
+    progress.stage("bake", len(frames), len(done))
+    for frame in frames:
+        if frame in done:
+            continue
+        path = out / frame.file
+        remove_partial_of(path)
+        layers = _layers(renderer, settings.scaled(cameras[frame.view]), edits[frame.number])
+        write_layers(path, layers, half=settings.half, notes={"view": frame.view, "frame": frame.number, **made_from})
+        record = _add_to_record(out, made_from, names, [_entry(out, frame)])
         progress.advance()
     return record
 
@@ -100,20 +101,54 @@ def _layers(renderer: Renderer, camera: Camera, edits: LookEdits) -> FrameLayers
     return layers_of(renderer.render(camera, edits.without_colour_of_lights()), colours)
 
 
-def _earlier(out: Path, made_from: dict[str, Any], overwrite: bool) -> dict[str, Any]:
-    """The record of an earlier bake with the same settings, or a new one."""
-    fresh: dict[str, Any] = {"version": VERSION, "made_from": made_from, "layers": {}, "frames": []}
+def _begin(out: Path, made_from: dict[str, Any], overwrite: bool) -> None:
+    """Refuse, or clear away, what was made otherwise."""
     if not (out / RECORD).exists():
-        return fresh
-    record = read_record(out)
-    if record["made_from"] == made_from:
-        return record
-    if not overwrite:
-        raise RunError(f"{out} holds layers that were baked from another fit or with other settings; "
-                       f"choose another folder, or ask for overwriting.")
-    for entry in record["frames"]:  # a mixture of two bakes would pass for one sequence
-        (out / entry["file"]).unlink(missing_ok=True)
-    return fresh
+        return
+    with locked(out / LOCK):
+        record = read_record(out)
+        if record["made_from"] == made_from:
+            return
+        if not overwrite:
+            raise RunError(f"{out} holds layers that were baked from another fit or with other settings; "
+                           f"choose another folder, or ask for overwriting.")
+        for entry in record["frames"]:  # a mixture of two bakes would pass for one sequence
+            (out / entry["file"]).unlink(missing_ok=True)
+        (out / RECORD).unlink()
+
+
+def _is_made(path: Path, frame: Frame, made_from: Mapping[str, Any]) -> bool:
+    """Whether the file is this frame under these settings, by its own header: other tasks of a farm write here too."""
+    if not path.is_file():
+        return False
+    try:
+        notes = read_description(path)
+    except FrameError:
+        return False
+    wanted = json.loads(json.dumps({"view": frame.view, "frame": frame.number, **made_from}))
+    return all(notes.get(name) == value for name, value in wanted.items())
+
+
+def _entry(out: Path, frame: Frame) -> dict[str, Any]:
+    width, height = picture_size(out / frame.file)
+    return {"file": frame.file, "frame": frame.number, "view": frame.view, "width": width, "height": height}
+
+
+def _add_to_record(out: Path, made_from: dict[str, Any], names: dict[str, str],
+                   entries: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """bake.json with these entries beside those of others who write to this folder."""
+    with locked(out / LOCK):
+        found = read_record(out) if (out / RECORD).exists() else {}
+        if found.get("made_from") != json.loads(json.dumps(made_from)):
+            found = {}
+        known = {entry["file"]: entry for entry in found.get("frames", []) if (out / entry["file"]).is_file()}
+        known.update({entry["file"]: entry for entry in entries})
+        frames = sorted(known.values(), key=lambda entry: (Path(entry["file"]).parent.as_posix(), entry["frame"]))
+        record = {"version": VERSION, "made_from": made_from, "layers": names, "frames": frames}
+        if record != found:
+            remove_partial_of(out / RECORD)
+            write_json(out / RECORD, record)
+    return record
 
 
 def read_record(out: Path | str) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -101,13 +101,16 @@ class ShotRenderer:
 
 
 def bake_shot(shot: Shot, out: Path | str, *, half: bool = True, overwrite: bool = False,
-              progress: Progress | None = None) -> dict[str, Any]:
+              progress: Progress | None = None, wanted: Container[int] | None = None) -> dict[str, Any]:
     """Write the layers of a shot's frames under `out`: `layers.0001.exr` for one camera, in a folder for each of
-    several. Returns the content of bake.json. Raises what `bake` raises, and FlareFileError."""
+    several. wanted: frame numbers, None for all. Returns the content of bake.json. Raises what `bake` raises, and
+    FlareFileError."""
     several = len({one.name for one in shot.frames}) > 1
     frames: list[Frame] = []
     cameras: dict[str, Camera] = {}
     for one in shot.frames:
+        if wanted is not None and one.frame not in wanted:
+            continue
         view = f"{one.name}/{one.frame}"
         frames.append(Frame(view, one.frame, _file(one, several)))
         cameras[view] = one.camera

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import argparse
 import re
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from ...core.errors import RunError, SettingsError
 from ...core.progress import Progress
+from .. import jobs
 from ..command import Command, Step
 
 
@@ -29,6 +29,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--float", action="store_true", help="32 bit floats (default: 16 bit, depth always 32)")
     parser.add_argument("--overwrite", action="store_true", help="replace layers of another bake in DIR")
     parser.add_argument("--capture", type=Path, metavar="CAPTURE", help="where the capture is, if it was moved")
+    jobs.add_option(parser)
 
 
 def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
@@ -46,6 +47,8 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     capture = Capture.open(words.capture or made.capture_folder, need_frames=False)
     cameras = {view.name: view.camera for view in capture.views}
     frames = chosen(numbered(cameras), words.frames)
+    if words.jobs != 1:
+        jobs.run_jobs(words, "bake", [frame.number for frame in frames], progress)
     settings = BakeSettings(*size(words.size), half=not words.float, edits=tuple(words.edits),
                             keyed=KeyedEdits.read(words.keyed) if words.keyed else KeyedEdits())
     record = bake(made, frames, cameras, words.out, settings, progress, overwrite=words.overwrite)
@@ -62,10 +65,12 @@ def run_shot(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     if words.edits or words.keyed:
         raise SettingsError("The edits of a shot stand in its file; --set and --edits are for runs.")
     shot = Shot.read(words.run).sized(*size(words.size))
-    if words.frames is not None:
-        wanted = {one.number for one in chosen([Frame("", one.frame, "") for one in shot.frames], words.frames)}
-        shot = replace(shot, frames=tuple(one for one in shot.frames if one.frame in wanted))
-    record = bake_shot(shot, words.out, half=not words.float, overwrite=words.overwrite, progress=progress)
+    known = chosen([Frame("", one.frame, "") for one in shot.frames], words.frames)
+    if words.jobs != 1:
+        jobs.run_jobs(words, "bake", [frame.number for frame in known], progress)
+    wanted = {one.number for one in known}
+    record = bake_shot(shot, words.out, half=not words.float, overwrite=words.overwrite, progress=progress,
+                       wanted=wanted)
     progress.say(f"{len(record['frames'])} frames of layers are in {words.out}.")
     return {"layers": str(words.out), "frames": len(record["frames"])}
 

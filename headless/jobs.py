@@ -1,0 +1,141 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Several processes of one command on this machine, each with a share of the frames: --jobs.
+
+Each is the command itself with `--frames` and `--progress json`, as a farm would start it; the frames are
+theirs alone, so nothing is shared but the folder they write to.
+"""
+from __future__ import annotations
+
+import argparse
+import contextlib
+import itertools
+import json
+import os
+import queue
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+from collections.abc import Sequence
+from typing import IO, Any
+
+from ..core.errors import EngineError, FitFlareError, SettingsError
+from ..core.progress import Progress
+from . import hand_off
+
+POLL_S = 0.2
+
+
+def add_option(parser: argparse.ArgumentParser) -> None:
+    """--jobs N."""
+    parser.add_argument("--jobs", type=int, default=1, metavar="N",
+                        help="processes at once on this machine, each with a share of the frames (default 1)")
+
+
+def shares(numbers: Sequence[int], jobs: int) -> list[str]:
+    """Frame numbers as `jobs` lists for --frames, contiguous and of about one length; fewer where there are few.
+
+    Raises SettingsError for less than one job.
+    """
+    if jobs < 1:
+        raise SettingsError(f"--jobs {jobs} makes no sense; give a number from 1.")
+    ordered = sorted(set(numbers))
+    count = min(jobs, len(ordered))
+    cuts = [round(len(ordered) * part / count) for part in range(count + 1)] if count else [0]
+    return [_ranges(ordered[low:high]) for low, high in itertools.pairwise(cuts)]
+
+
+def _ranges(numbers: Sequence[int]) -> str:
+    """[1, 2, 3, 7] as "1-3,7"."""
+    runs: list[list[int]] = []
+    for number in numbers:
+        if runs and number == runs[-1][1] + 1:
+            runs[-1][1] = number
+        else:
+            runs.append([number, number])
+    return ",".join(f"{low}-{high}" if high > low else f"{low}" for low, high in runs)
+
+
+def run_jobs(words: argparse.Namespace, step: str, numbers: Sequence[int], progress: Progress) -> None:
+    """Run a step of the command once for each share of the frames, at once; returns when all are done.
+
+    Raises Cancelled when asked to stop, after the processes have stopped; FitFlareError with the sentence of the
+    first that failed, after the others have been stopped.
+    """
+    events: queue.Queue[tuple[int, dict[str, Any] | None]] = queue.Queue()
+    parts = shares(numbers, words.jobs)
+    threads = str(max((os.cpu_count() or 1) // max(len(parts), 1), 1))
+    environment = {**os.environ, "OMP_NUM_THREADS": threads, "NUMBA_NUM_THREADS": threads}
+    children: list[subprocess.Popen[str]] = []
+    noises: list[IO[bytes]] = []
+    progress.stage(step, len(numbers))
+    counted = [0] * len(parts)
+    errors: dict[int, str] = {}
+    try:
+        for number, frames in enumerate(parts):
+            noises.append(tempfile.TemporaryFile())  # noqa: SIM115 - closed below, when its process has ended
+            whole = [sys.executable, str(hand_off.RUN), *words.words, "--step", step, "--jobs", "1", "--frames", frames,
+                     "--progress", "json"]
+            children.append(subprocess.Popen(whole, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
+                                             stderr=noises[-1], encoding="utf-8", errors="replace",
+                                             env=environment, **hand_off.own_group()))
+            threading.Thread(target=_listen, args=(number, children[-1], events), daemon=True).start()
+        left = len(children)
+        while left and not errors:
+            progress.check()
+            try:
+                number, event = events.get(timeout=POLL_S)
+            except queue.Empty:
+                continue
+            if event is None:
+                left -= 1
+                if children[number].wait() != 0:
+                    errors.setdefault(number, "")
+            elif event.get("type") in ("stage", "progress"):
+                made, counted[number] = event["done"] - counted[number], event["done"]
+                if made:
+                    progress.advance(made)
+            elif event.get("type") == "error":
+                errors[number] = event["text"]
+    finally:
+        _end(children)
+        said = _last_words(noises[next(iter(errors))]) if errors and len(noises) > next(iter(errors)) else ""
+        for noise in noises:
+            noise.close()
+    if errors:
+        text = next((text for text in errors.values() if text), "")
+        if not text:
+            sys.stderr.write(said)
+            raise EngineError(f"One of {len(children)} processes of {step} failed; its last words stand above.")
+        raise FitFlareError(text)
+
+
+def _listen(number: int, child: subprocess.Popen[str], events: queue.Queue[tuple[int, dict[str, Any] | None]]) -> None:
+    assert child.stdout is not None
+    for line in child.stdout:
+        with contextlib.suppress(ValueError):
+            event = json.loads(line)
+            if isinstance(event, dict):
+                events.put((number, event))
+    events.put((number, None))
+
+
+def _end(children: Sequence[subprocess.Popen[str]]) -> None:
+    """Ask those that run to stop, and wait for them."""
+    running = [child for child in children if child.poll() is None]
+    for child in running:
+        with contextlib.suppress(OSError):
+            child.send_signal(getattr(signal, "CTRL_BREAK_EVENT", signal.SIGINT))
+    for child in running:
+        try:
+            child.wait(timeout=hand_off.PATIENCE_S)
+        except subprocess.TimeoutExpired:
+            child.kill()
+            child.wait()
+
+
+def _last_words(noise: IO[bytes]) -> str:
+    noise.seek(0)
+    return "".join(noise.read().decode("utf-8", "replace").splitlines(keepends=True)[-40:])
+

@@ -1,17 +1,38 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Blender's side of Fit Flare. Each module registers its own classes; the last registered goes first."""
+"""Blender's side of Fit Flare. Each module registers its own classes; the last registered goes first.
+
+    properties.py       what a .blend remembers           preferences.py   engine and library
+    capture_import.py   captures in                       capture_export.py   Blender's cameras as captures
+    cameras.py          Blender's cameras and the core's  lights.py        light objects
+    engine.py, jobs.py  the process with torch            fits.py          fits
+    looks.py            .flare, flares, occlusion         overlay.py       the flare in the camera view
+    shots.py            what is baked                     compositor.py, layer_folder.py   layers back together
+    library.py          flares for other shots            operators/, panels.py   buttons and panels
+"""
 from __future__ import annotations
 
-from . import operators, panels, preferences
+import bpy
 
-_MODULES = (preferences, operators, panels)
+from . import fits, jobs, looks, operators, overlay, panels, preferences, properties
+
+_MODULES = (properties, preferences, operators, panels, overlay)
+
+
+@bpy.app.handlers.persistent
+def _loaded(_path: str) -> None:
+    """Another file: nothing that was read for the last one stays."""
+    looks.forget()
 
 
 def register() -> None:
     for module in _MODULES:
         module.register()
+    bpy.app.handlers.load_post.append(_loaded)
 
 
 def unregister() -> None:
+    bpy.app.handlers.load_post.remove(_loaded)
+    jobs.unregister()
+    fits.unregister()
     for module in reversed(_MODULES):
         module.unregister()

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Baked layers put together in Blender's compositor, by the reusable node group "Fit Flare".
 
-    Flare = Intensity * Tint * (sum of the flare layers),   Image = Scene + Flare
+    Flare = Intensity * Tint * (sum of the flare layers, each by its Gain),   Image = Scene + Flare
 
-in scene-linear light, so that the picture is the bake's composite at Intensity 1 and white Tint.
+in scene-linear light, so that the picture is the bake's composite at Intensity 1 and white Tint and Gains.
+What was there before is noted on the scene, so that it can all be taken away again.
 Written for the compositors of 4.2 to 5.2: up to 4.5 a scene owns a node tree that ends in a Composite
 node, from 5.0 it points at a node group that ends in a Group Output; the mix and math nodes changed
 family with it.
@@ -24,8 +25,14 @@ from .layer_folder import LayerFolder
 
 GROUP = "Fit Flare"
 LAYERS = "Fit Flare Layers"
+PLATE = "Fit Flare Footage"
+VIEWER = "Fit Flare Viewer"
+RENDER = "Fit Flare Render"
+NOTE = "fit_flare_compositor"  # a property of the scene: what was there before
+_GAIN = " Gain"
 
 _GROUPS_ARE_TREES = bpy.app.version >= (5, 0, 0)
+_END = "NodeGroupOutput" if _GROUPS_ARE_TREES else "CompositorNodeComposite"
 _MIX, _MATH = (("ShaderNodeMix", "ShaderNodeMath") if _GROUPS_ARE_TREES
                else ("CompositorNodeMixRGB", "CompositorNodeMath"))
 
@@ -38,7 +45,7 @@ def node_group(layers: Sequence[str]) -> Any:
 
     layers: names of the inputs, such as "flare_lamp".
     """
-    wanted = ["Scene", *layers, "Intensity", "Tint"]
+    wanted = ["Scene", *layers, "Intensity", "Tint", *(gain_of(layer) for layer in layers)]
     for group in bpy.data.node_groups:
         if group.bl_idname == "CompositorNodeTree" and group.name.split(".")[0] == GROUP:
             inputs = [item.name for item in group.interface.items_tree if getattr(item, "in_out", "") == "INPUT"]
@@ -50,6 +57,11 @@ def node_group(layers: Sequence[str]) -> Any:
     return group
 
 
+def gain_of(layer: str) -> str:
+    """The input that holds a layer's factors on linear R, G, B."""
+    return f"{layer}{_GAIN}"
+
+
 def _declare(group: Any, inputs: Iterable[str]) -> None:
     for name in ("Image", "Flare"):
         group.interface.new_socket(name, in_out="OUTPUT", socket_type="NodeSocketColor")
@@ -59,16 +71,18 @@ def _declare(group: Any, inputs: Iterable[str]) -> None:
         if name == "Intensity":
             socket.default_value, socket.min_value, socket.max_value = 1.0, 0.0, 1000.0
         else:
-            grey = 1.0 if name == "Tint" else 0.0
+            grey = 1.0 if name == "Tint" or name.endswith(_GAIN) else 0.0
             socket.default_value = (grey, grey, grey, 1.0)
 
 
 def _fill(group: Any, layers: Sequence[str]) -> None:
     entry = _node(group, "NodeGroupInput", 0, 0)
-    total = entry.outputs[layers[0]]
-    for column, name in enumerate(layers[1:], 1):
-        total = _mix(group, "ADD", total, entry.outputs[name], column, -1)
-    column = len(layers)
+    gained = [_mix(group, "MULTIPLY", entry.outputs[name], entry.outputs[gain_of(name)], 1, -row)
+              for row, name in enumerate(layers, 1)]
+    total = gained[0]
+    for column, one in enumerate(gained[1:], 2):
+        total = _mix(group, "ADD", total, one, column, -1)
+    column = len(layers) + 1
     tinted = _mix(group, "MULTIPLY", total, entry.outputs["Tint"], column, -1)
     scaled = _mix(group, "MULTIPLY", tinted, entry.outputs["Intensity"], column + 1, -1)
     image = _mix(group, "ADD", entry.outputs["Scene"], scaled, column + 2, 0)
@@ -137,13 +151,15 @@ def find_node(scene: Any) -> Any:
     return tree.nodes.get(GROUP) if tree else None
 
 
-def set_up(scene: Any, layers: LayerFolder, *, keep_image: bool = False) -> Any:
+def set_up(scene: Any, layers: LayerFolder, *, keep_image: bool = False, plate: Any = None) -> Any:
     """Build the graph that puts `layers` together, or point the one that is there at them.
 
     keep_image: the scene is what fed the output until now (a render, a plate), and the flare goes over
-    it; otherwise it is the baked scene. Other nodes stay as they are. Returns the "Fit Flare" node.
+    it; otherwise it is the baked scene. plate: (image, frame_start, frame_offset, frame_duration) of footage
+    that is the scene instead. Other nodes stay as they are. Returns the "Fit Flare" node.
     Raises FrameError where the files hold no flare layers.
     """
+    note = _note(scene)
     tree = tree_of(scene) or _new_tree(scene, keep_image)
     source = tree.nodes.get(LAYERS)
     if source is None:
@@ -153,26 +169,174 @@ def set_up(scene: Any, layers: LayerFolder, *, keep_image: bool = False) -> Any:
     names = [name for name in sockets if name.startswith("flare_")] or [name for name in sockets if name == "flare"]
     if not names or "scene" not in sockets:
         raise FrameError(f"{layers.files[layers.first]} holds no scene and flare layers; choose a folder of a bake.")
+    if NOTE not in scene:
+        scene[NOTE] = {**note, **_before(tree)}
     node = tree.nodes.get(GROUP)
     if node is None:
         node = _named(_node(tree, "CompositorNodeGroup", -2, 0), GROUP)
-    sliders = {name: _value(node, name) for name in ("Intensity", "Tint") if name in node.inputs}
+    sliders = {socket.name: _value(node, socket.name) for socket in node.inputs
+               if socket.name in ("Intensity", "Tint") or socket.name.endswith(_GAIN)}
+    _undriven(tree)
     node.node_tree = node_group(names)
     for name, value in sliders.items():
-        node.inputs[name].default_value = value
+        if name in node.inputs:
+            node.inputs[name].default_value = value
     for name in names:
         tree.links.new(sockets[name], node.inputs[name])
     end = _output(tree)
     before = end.links[0].from_socket if end.is_linked else None
     if before is not None and before.node == node:  # set up earlier: what the scene is was chosen then
         before = node.inputs["Scene"].links[0].from_socket if node.inputs["Scene"].is_linked else None
-    keep = keep_image and before is not None and before.node != source
-    tree.links.new(before if keep else sockets["scene"], node.inputs["Scene"])
+    keep = keep_image and before is not None and before.node != source and before.node.name != PLATE
+    scene_socket = before if keep else sockets["scene"]
+    if plate is not None:
+        scene_socket = _footage(tree, plate).outputs["Image"]
+    elif keep_image and not keep:
+        scene_socket = _render(tree).outputs["Image"]
+    tree.links.new(scene_socket, node.inputs["Scene"])
     tree.links.new(node.outputs["Image"], end)
     if not any(other.bl_idname == "CompositorNodeViewer" for other in tree.nodes):
-        viewer = _node(tree, "CompositorNodeViewer", 1, -1)  # what the backdrop shows
+        viewer = _named(_node(tree, "CompositorNodeViewer", 1, -1), VIEWER)  # what the backdrop shows
         tree.links.new(node.outputs["Image"], viewer.inputs["Image"])
     return node
+
+
+def _render(tree: Any) -> Any:
+    """A Render Layers node, the first there is."""
+    found = next((node for node in tree.nodes if node.bl_idname == "CompositorNodeRLayers"), None)
+    return found or _named(_node(tree, "CompositorNodeRLayers", -4, 1), RENDER)
+
+
+def _footage(tree: Any, plate: tuple[Any, int, int, int]) -> Any:
+    node = tree.nodes.get(PLATE) or _named(_node(tree, "CompositorNodeImage", -4, 1), PLATE)
+    image, start, offset, duration = plate
+    node.image = image
+    if image.source == "SEQUENCE":
+        node.frame_start, node.frame_offset, node.frame_duration = start, offset, duration
+        node.use_auto_refresh = True
+    return node
+
+
+# ---- wired to the panel ---------------------------------------------------------------------------
+
+
+def wire(scene: Any, gains: dict[str, str]) -> None:
+    """Drive the node's sliders from the panel's: gains by layer, the name of the light whose sliders they are.
+
+    Intensity, Tint, Mute and Solo of all lights and of each are live then; the layers must hold none of them.
+    """
+    tree, node = tree_of(scene), find_node(scene)
+    _undriven(tree)
+    names = list(dict.fromkeys(gains.values()))
+    _drive(scene, node, "Intensity", -1, "i*(1-m)", {"i": "master.intensity", "m": "master.mute"})
+    for channel in range(3):
+        _drive(scene, node, "Tint", channel, "t", {"t": f"master.tint[{channel}]"})
+    solos = {f"s{number}": f'lights["{_quoted(name)}"].solo' for number, name in enumerate(names)}
+    for layer, name in gains.items():
+        if gain_of(layer) not in node.inputs:
+            continue
+        path = f'lights["{_quoted(name)}"]'
+        own = f"s{names.index(name)}"
+        most = f"max({','.join(solos)})" if len(solos) > 1 else own
+        for channel in range(3):
+            _drive(scene, node, gain_of(layer), channel, f"i*t*(1-m)*({own} if {most} else 1)",
+                   {"i": f"{path}.intensity", "t": f"{path}.tint[{channel}]", "m": f"{path}.mute", **solos})
+
+
+def _quoted(name: str) -> str:
+    """A name inside the quotes of an RNA path."""
+    return str(bpy.utils.escape_identifier(name))
+
+
+def _drive(scene: Any, node: Any, name: str, index: int, expression: str, variables: dict[str, str]) -> None:
+    curve = node.inputs[name].driver_add("default_value", index)
+    driver = curve.driver
+    driver.type = "SCRIPTED"
+    for short, path in variables.items():
+        variable = driver.variables.new()
+        variable.name, variable.type = short, "SINGLE_PROP"
+        target = variable.targets[0]
+        target.id_type, target.id, target.data_path = "SCENE", scene, f"fit_flare.{path}"
+    driver.expression = expression  # of the plain kind that needs no permission to run
+
+
+def _undriven(tree: Any) -> None:
+    """Take our drivers out of a tree."""
+    if tree.animation_data is not None:
+        for curve in list(tree.animation_data.drivers):
+            if curve.data_path.startswith(f'nodes["{GROUP}"]'):
+                tree.animation_data.drivers.remove(curve)
+
+
+# ---- and away again -------------------------------------------------------------------------------
+
+
+def _note(scene: Any) -> dict[str, Any]:
+    """What the scene had before any of this."""
+    if _GROUPS_ARE_TREES:
+        return {"tree": scene.compositing_node_group is not None, "use_nodes": True}
+    return {"tree": scene.node_tree is not None, "use_nodes": bool(scene.use_nodes)}
+
+
+def _before(tree: Any) -> dict[str, Any]:
+    """The names of a tree's nodes, and what fed its output."""
+    end = _output(tree, make=False)
+    fed = end.links[0].from_socket if end is not None and end.is_linked else None
+    return {"nodes": "\n".join(node.name for node in tree.nodes if node.name not in (GROUP, LAYERS)),
+            "drivers": tree.animation_data is not None,
+            "from": fed.node.name if fed else "", "socket": fed.identifier if fed else ""}
+
+
+def remove(scene: Any) -> None:
+    """Take the graph away: what was there before `set_up` is there again, and nothing else.
+
+    Raises FrameError where it is not set up.
+    """
+    tree, node = tree_of(scene), find_node(scene)
+    if node is None:
+        raise FrameError(f"The scene {scene.name!r} has no compositor of Fit Flare to remove.")
+    note = dict(scene[NOTE]) if NOTE in scene else {**_note(scene), **_before(tree), "nodes": None}
+    group, images = node.node_tree, [tree.nodes[name].image for name in (LAYERS, PLATE) if tree.nodes.get(name)]
+    entry = node.inputs["Scene"]
+    inner = entry.links[0].from_socket if entry.is_linked else None  # what someone may have put there since
+    _undriven(tree)
+    if not note.get("drivers", True) and tree.animation_data is not None and not tree.animation_data.drivers:
+        tree.animation_data_clear()
+    for name in (GROUP, LAYERS, PLATE, VIEWER, RENDER):
+        if (ours := tree.nodes.get(name)) is not None:
+            inner = None if inner is not None and inner.node == ours else inner
+            tree.nodes.remove(ours)
+    if not note["tree"]:
+        _discard_tree(scene, tree, bool(note["use_nodes"]))
+    else:
+        had = tree.nodes.get(note["from"]) if note["from"] else None
+        fed = next((one for one in had.outputs if one.identifier == note["socket"]), None) if had else inner
+        end = _output(tree, make=False)
+        if fed is not None and end is not None:
+            tree.links.new(fed, end)
+        if note.get("nodes") is not None:
+            known = note["nodes"].split("\n")
+            for extra in [one for one in tree.nodes if one.name not in known and one.bl_idname == _END]:
+                tree.nodes.remove(extra)
+        if not _GROUPS_ARE_TREES:
+            scene.use_nodes = bool(note["use_nodes"])
+    if NOTE in scene:
+        del scene[NOTE]
+    if group is not None and not group.users:
+        bpy.data.node_groups.remove(group)
+    for image in images:
+        if image is not None and not image.users:
+            bpy.data.images.remove(image)
+
+
+def _discard_tree(scene: Any, tree: Any, use_nodes: bool) -> None:
+    if _GROUPS_ARE_TREES:
+        scene.compositing_node_group = None
+        if not tree.users:
+            bpy.data.node_groups.remove(tree)
+    else:
+        tree.nodes.clear()
+        scene.use_nodes = use_nodes
 
 
 def _value(node: Any, name: str) -> Any:
@@ -199,18 +363,19 @@ def _new_tree(scene: Any, keep_image: bool) -> Any:
     if fresh:
         tree.nodes.clear()
         if keep_image:
-            render = _node(tree, "CompositorNodeRLayers", -4, 1)
+            render = _named(_node(tree, "CompositorNodeRLayers", -4, 1), RENDER)
             tree.links.new(render.outputs["Image"], _output(tree))
     return tree
 
 
-def _output(tree: Any) -> Any:
-    """The input socket that the final picture goes into."""
-    kind = "NodeGroupOutput" if _GROUPS_ARE_TREES else "CompositorNodeComposite"
-    found = [node for node in tree.nodes if node.bl_idname == kind]
+def _output(tree: Any, make: bool = True) -> Any:
+    """The input socket that the final picture goes into; where there is none it is made, or None."""
+    found = [node for node in tree.nodes if node.bl_idname == _END]
+    if not make:
+        return found[0].inputs[0] if found and len(found[0].inputs) else None
     if _GROUPS_ARE_TREES and not any(getattr(item, "in_out", "") == "OUTPUT" for item in tree.interface.items_tree):
         tree.interface.new_socket("Image", in_out="OUTPUT", socket_type="NodeSocketColor")
-    node = found[0] if found else _node(tree, kind, 1, 0)
+    node = found[0] if found else _node(tree, _END, 1, 0)
     return node.inputs[0]
 
 

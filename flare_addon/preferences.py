@@ -1,8 +1,12 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What the user sets once: where the Python with the engine is."""
+"""What the user sets once: the engine, and the library of flares."""
 from __future__ import annotations
 
+from typing import Any
+
 import bpy
+
+from . import engine, jobs
 
 # The extension's full name ("bl_ext.user_default.fit_flare"), by which Blender knows its preferences.
 PACKAGE = __package__.rpartition(".")[0]
@@ -13,25 +17,192 @@ class FITFLARE_AP_preferences(bpy.types.AddonPreferences):
 
     engine: bpy.props.StringProperty(  # type: ignore[valid-type]
         name="Engine",
-        description="The Python that has torch, or the folder of its virtual environment",
+        description="The Python that has torch, or the folder of its virtual environment. Empty: the one that Set Up "
+        "Engine has made",
         subtype="FILE_PATH",
+    )
+    library: bpy.props.StringProperty(  # type: ignore[valid-type]
+        name="Flare Library",
+        description="Folder of .flare files to choose from. Empty: a folder of the extension's own",
+        subtype="DIR_PATH",
     )
 
     def draw(self, _context: bpy.types.Context) -> None:
-        self.layout.prop(self, "engine")
+        layout = self.layout
+        column = layout.column()
+        column.use_property_split = True
+        column.prop(self, "engine")
+        column.prop(self, "library")
+        _draw_engine(layout)
+
+
+def _draw_engine(layout: Any) -> None:
+    box = layout.box().column()
+    python, test, making = engine.find(), engine.tested(), engine.setting_up()
+    if making is not None and making.running:
+        draw_progress(box, making, "Setting up the engine")
+        return
+    if python is None:
+        named = bool(engine_path())
+        box.label(text="The engine that is named is not there" if named else "No engine yet", icon="ERROR")
+        lines(box, "Set it up here (about 1 GB to download, once), or name a Python above that has torch.")
+    else:
+        box.label(text=f"Engine: {python}", icon="CHECKMARK")
+    if making is not None and making.state in ("failed", "stopped"):
+        lines(box, making.error, "ERROR")
+    if test is not None and test.running:
+        box.label(text="Testing …", icon="SORTTIME")
+    elif test is not None and test.state == "done":
+        result = test.result
+        box.label(text=f"Fit Flare {result.get('version')}, torch {result.get('torch')}, {result.get('device')}",
+                  icon="INFO")
+    elif test is not None and test.error:
+        lines(box, test.error, "ERROR")
+    row = box.row()
+    row.operator("fit_flare.test_engine", icon="PLAY")
+    row.operator("fit_flare.set_up_engine", icon="IMPORT")
+    row.operator("fit_flare.remove_engine", icon="TRASH")
+
+
+def draw_progress(layout: Any, job: jobs.Job, text: str) -> None:
+    """A bar with what is done and the time left, and Cancel."""
+    row = layout.row(align=True)
+    row.progress(factor=job.share, text=f"{text}: {job.share:.0%}{time_left(job)}")
+    row.operator("fit_flare.cancel", text="", icon="X").folder = str(job.folder)
+    if job.said:
+        lines(layout, job.said[-1])
+
+
+def time_left(job: jobs.Job) -> str:
+    """", 3 min left"; nothing where it is not known."""
+    if job.stage == "stopping":
+        return ", stopping …"
+    if not job.left_s:
+        return ""
+    left = job.left_s
+    return f", {left / 60:.0f} min left" if left >= 90 else f", {left:.0f} s left"
+
+
+def lines(layout: Any, text: str, icon: str = "NONE", width: int = 44) -> None:
+    """A sentence broken into labels, since a label is cut off at the panel's edge."""
+    region = bpy.context.region
+    if region is not None and region.width > 1:
+        scale = bpy.context.preferences.system.ui_scale
+        width = max(int((region.width - 50 * scale) / (6.4 * scale)), 16)
+    column = layout.column(align=True)
+    column.scale_y = 0.85
+    words, line, first = text.split(), "", True
+    for word in [*words, ""]:
+        if not word or len(line) + len(word) + 1 > width:
+            while len(line) > width + 4:  # a path without blanks
+                column.label(text=line[:width], icon=icon if first else "BLANK1" if icon != "NONE" else "NONE")
+                line, first = line[width:], False
+            if line:
+                column.label(text=line, icon=icon if first else "BLANK1" if icon != "NONE" else "NONE")
+                first = False
+            line = word
+        else:
+            line = f"{line} {word}".strip()
+
+
+def own() -> Any:
+    """The preferences; None where the extension is not enabled (loaded from source)."""
+    for name, addon in bpy.context.preferences.addons.items():
+        if name.rpartition(".")[2] == "fit_flare" and addon.preferences is not None:
+            return addon.preferences
+    return None
 
 
 def engine_path() -> str:
     """The engine set in the preferences; "" where none is, or the extension is not enabled."""
-    for name, addon in bpy.context.preferences.addons.items():
-        if name.rpartition(".")[2] == "fit_flare" and addon.preferences is not None:
-            return bpy.path.abspath(addon.preferences.engine)
-    return ""
+    preferences = own()
+    return bpy.path.abspath(preferences.engine) if preferences is not None and preferences.engine else ""
+
+
+def library_path() -> str:
+    """The library's folder as set; "" where none is."""
+    preferences = own()
+    return bpy.path.abspath(preferences.library) if preferences is not None and preferences.library else ""
+
+
+class FITFLARE_OT_test_engine(bpy.types.Operator):
+    """Start the engine and ask for its version and device"""
+
+    bl_idname = "fit_flare.test_engine"
+    bl_label = "Test"
+
+    @classmethod
+    def poll(cls, _context: bpy.types.Context) -> bool:
+        if engine.find() is None:
+            cls.poll_message_set("No engine is set up or named")
+            return False
+        return True
+
+    def execute(self, _context: bpy.types.Context) -> set[str]:
+        from .reports import reported
+
+        with reported(self) as outcome:
+            engine.test()
+        return outcome.status
+
+
+class FITFLARE_OT_set_up_engine(bpy.types.Operator):
+    """Install the engine (torch and its libraries, about 1 GB to download) into the extension's own folder"""
+
+    bl_idname = "fit_flare.set_up_engine"
+    bl_label = "Set Up Engine"
+
+    @classmethod
+    def poll(cls, _context: bpy.types.Context) -> bool:
+        if not bpy.app.online_access:
+            cls.poll_message_set("Allow Online Access in Preferences > System > Network first")
+            return False
+        making = engine.setting_up()
+        if making is not None and making.running:
+            cls.poll_message_set("The engine is being set up")
+            return False
+        return True
+
+    def execute(self, _context: bpy.types.Context) -> set[str]:
+        from .reports import reported
+
+        with reported(self) as outcome:
+            engine.set_up()
+        return outcome.status
+
+
+class FITFLARE_OT_remove_engine(bpy.types.Operator):
+    """Delete the engine that Set Up Engine has installed, and free its disk space"""
+
+    bl_idname = "fit_flare.remove_engine"
+    bl_label = "Remove"
+
+    @classmethod
+    def poll(cls, _context: bpy.types.Context) -> bool:
+        if not (engine.user_folder(engine.FOLDER) / "python").is_dir():
+            cls.poll_message_set("No engine was set up here; one that is named by its path is not touched")
+            return False
+        return True
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        return context.window_manager.invoke_confirm(self, event)
+
+    def execute(self, _context: bpy.types.Context) -> set[str]:
+        from .reports import reported
+
+        with reported(self) as outcome:
+            engine.remove()
+        return outcome.status
+
+
+_CLASSES = (FITFLARE_AP_preferences, FITFLARE_OT_test_engine, FITFLARE_OT_set_up_engine, FITFLARE_OT_remove_engine)
 
 
 def register() -> None:
-    bpy.utils.register_class(FITFLARE_AP_preferences)
+    for cls in _CLASSES:
+        bpy.utils.register_class(cls)
 
 
 def unregister() -> None:
-    bpy.utils.unregister_class(FITFLARE_AP_preferences)
+    for cls in reversed(_CLASSES):
+        bpy.utils.unregister_class(cls)

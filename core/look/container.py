@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FlareFileError
+from ..files import atomic_path
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -54,3 +55,15 @@ def _parsed(data: bytes) -> tuple[Arrays, dict[str, str]]:
             raise ValueError(f"the tensor {name} does not fit the file")
         arrays[name] = np.frombuffer(body[begin:end], kind).reshape(shape)
     return arrays, {str(key): str(value) for key, value in metadata.items()}
+
+
+def rewritten(source: Path | str, target: Path | str, metadata: dict[str, str]) -> None:
+    """A copy of a safetensors file with other metadata, its tensors byte for byte. Raises FlareFileError."""
+    read_tensors(source)  # checks it
+    data = Path(source).read_bytes()
+    length = int.from_bytes(data[:8], "little")
+    header = json.loads(data[8:8 + length].decode("utf-8"))
+    text = json.dumps({**header, "__metadata__": metadata}).encode("utf-8")
+    text += b" " * (-len(text) % 8)  # the tensors stay aligned
+    with atomic_path(target) as temporary:
+        temporary.write_bytes(len(text).to_bytes(8, "little") + text + data[8 + length:])

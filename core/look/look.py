@@ -227,6 +227,13 @@ def describe(path: Path | str) -> dict[str, Any]:
     return _described(Path(path), container.read_tensors(path)[1])
 
 
+def annotated(source: Path | str, target: Path | str, *, notes: str, licence: str) -> None:
+    """A copy of a .flare with other notes and licence. Raises FlareFileError where `source` is not a flare."""
+    _, metadata = container.read_tensors(source)
+    description = {**_described(Path(source), metadata), "notes": notes, "licence": licence}
+    container.rewritten(source, target, {**metadata, _KEY: json.dumps(description)})
+
+
 def _described(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
     if _KEY not in metadata:
         raise FlareFileError(f"{path} is a safetensors file, but not a flare; choose another.")

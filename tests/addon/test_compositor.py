@@ -85,7 +85,8 @@ def test_the_flare_output_is_premultiplied_with_its_matte(made: Made) -> None:
 
 
 def test_the_group_has_its_sockets(made: Made) -> None:
-    assert made.facts["inputs"] == ["Scene", "flare_key_light", "flare_lamp", "Intensity", "Tint"]
+    assert made.facts["inputs"] == ["Scene", "flare_key_light", "flare_lamp", "Intensity", "Tint",
+                                    "flare_key_light Gain", "flare_lamp Gain"]
     assert made.facts["outputs"] == ["Image", "Flare"]
 
 

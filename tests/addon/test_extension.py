@@ -54,7 +54,7 @@ def test_the_package_holds_the_program_and_nothing_else(package: Path) -> None:
 
 def test_it_installs_and_registers(facts: Any) -> None:
     assert facts["enabled"]
-    classes = {"FITFLARE_OT_set_up_compositor", "FITFLARE_PT_compositor", "FITFLARE_AP_preferences"}
+    classes = {"FITFLARE_OT_set_up_compositor", "FITFLARE_PT_bake", "FITFLARE_PT_look", "FITFLARE_AP_preferences"}
     assert classes <= set(facts["classes"])
 
 

@@ -386,3 +386,15 @@ def test_a_shot_is_baked_as_the_overlay_shows_it(tmp_path: Path) -> None:
     assert not layers.scene.any()
     np.testing.assert_allclose(shown["second"].opacities.max(), 0.5 * look.evaluate(
         frame.camera.world_to_camera, lights={"lamp 0": frame.lights[1].xyz})["lamp 0"].opacities.max(), rtol=1e-5)
+
+
+def test_notes_can_be_changed_and_the_engine_reads_it(tmp_path: Path) -> None:
+    from core.look.look import annotated
+
+    saved(tmp_path / "a.flare")
+    annotated(tmp_path / "a.flare", tmp_path / "b.flare", notes="Zeiss, wide open: ö", licence="CC BY 4.0")
+    look, engine = read(tmp_path / "b.flare"), flare_file.load(tmp_path / "b.flare")
+    assert (look.notes, look.licence) == (engine.notes, engine.licence) == ("Zeiss, wide open: ö", "CC BY 4.0")
+    view = cameras(3)[0].world_to_camera
+    before, after_ = (read(tmp_path / name).evaluate(view) for name in ("a.flare", "b.flare"))
+    np.testing.assert_array_equal(before["lamp 1"].means, after_["lamp 1"].means)

@@ -1,0 +1,137 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""A capture made of Blender's own camera: solved by the motion tracker, or animated in any other way.
+
+transforms.json with the camera of every frame, images/ with the frames, points.ply with the tracker's
+bundles and the vertices of the scene's meshes, which the fit begins from.
+"""
+from __future__ import annotations
+
+import os
+import re
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import bpy
+import numpy as np
+
+from ..core.errors import CaptureError
+from ..core.files import atomic_path, write_json
+from . import cameras
+from .capture_import import stored
+
+MOST_POINTS = 100_000
+_NUMBER = re.compile(r"(\d+)(?=\D*$)")
+
+
+@dataclass(frozen=True)
+class Footage:
+    """A numbered sequence of pictures: the first one's path, and the scene's frame that shows it."""
+
+    first: Path
+    frame: int
+
+    def path(self, frame: int) -> Path:
+        """The picture that the scene's frame shows."""
+        match = _NUMBER.search(self.first.stem)
+        if match is None:
+            return self.first
+        number = f"{int(match[1]) + frame - self.frame:0{len(match[1])}d}"
+        return self.first.with_name(self.first.stem[:match.start()] + number + self.first.stem[match.end():]
+                                    + self.first.suffix)
+
+
+def footage_of(camera: Any) -> Footage | None:
+    """The image sequence behind a camera: of its background images, or of the movie clip there."""
+    for back in camera.data.background_images if camera.type == "CAMERA" else ():
+        if back.source == "IMAGE" and back.image is not None and back.image.source == "SEQUENCE":
+            user, path = back.image_user, Path(bpy.path.abspath(back.image.filepath))
+            match = _NUMBER.search(path.stem)
+            shown = user.frame_start - user.frame_offset - 1 + int(match[1]) if match else user.frame_start
+            # The sequence shows file number `frame - frame_start + 1 + frame_offset`.
+            return Footage(path, shown)
+        if back.source == "MOVIE_CLIP" and back.clip is not None and back.clip.source == "SEQUENCE":
+            return Footage(Path(bpy.path.abspath(back.clip.filepath)), back.clip.frame_start)
+    return None
+
+
+def export(scene: Any, folder: Path) -> int:
+    """Write a capture of the scene's camera over the scene's frames, and make it the scene's; how many frames.
+
+    Raises CaptureError where a frame's picture is missing or there is nothing to start a fit from.
+    """
+    camera = scene.camera
+    footage = footage_of(camera) if camera is not None else None
+    if footage is None:
+        raise CaptureError("The camera has no background image sequence or movie clip to take the frames from.")
+    pictures = {frame: footage.path(frame) for frame in range(scene.frame_start, scene.frame_end + 1)}
+    pictures = {frame: path for frame, path in pictures.items() if path.is_file()}
+    if len(pictures) < 3:
+        raise CaptureError(f"Of the frames that the camera shows, {len(pictures)} are there as pictures beside "
+                           f"{footage.first}; set the scene's frame range to the footage.")
+    points = _points(scene, camera)
+    if not len(points):
+        raise CaptureError("There are no points to begin a fit from; solve the camera with the motion tracker, or "
+                           "model the rough scene as a mesh.")
+    before, entries = scene.frame_current, []
+    try:
+        for frame, path in pictures.items():
+            scene.frame_set(frame)
+            entries.append(_entry(scene, camera, frame, path, folder))
+    finally:
+        scene.frame_set(before)
+    _write_points(folder / "points.ply", points)
+    write_json(folder / "transforms.json",
+               {"camera_model": "PINHOLE", "ply_file_path": "points.ply", "frames": entries})
+    state = scene.fit_flare
+    state.capture, state.root, state.mode = stored(folder), None, "unsup"
+    return len(entries)
+
+
+def _entry(scene: Any, camera: Any, frame: int, path: Path, folder: Path) -> dict[str, Any]:
+    depsgraph = bpy.context.evaluated_depsgraph_get()
+    evaluated = camera.evaluated_get(depsgraph)
+    core = cameras.core_camera(evaluated.data, evaluated.matrix_world, scene.render)
+    name = f"images/{frame:06d}{path.suffix.lower()}"
+    target = folder / name
+    target.parent.mkdir(parents=True, exist_ok=True)
+    if not target.exists():
+        try:
+            os.link(path, target)
+        except OSError:  # another disk, or a file system without links
+            shutil.copy2(path, target)
+    pose = cameras.camera_to_world(evaluated.matrix_world) @ cameras.FLIP
+    return {"file_path": name, "w": core.width, "h": core.height, "fl_x": core.fx, "fl_y": core.fy, "cx": core.cx,
+            "cy": core.cy, "transform_matrix": pose.tolist()}
+
+
+def _points(scene: Any, camera: Any) -> np.ndarray[Any, Any]:
+    """(n, 3) of the clip's solved tracks and of the scene's meshes, in Blender's world."""
+    found: list[np.ndarray[Any, Any]] = []
+    for back in camera.data.background_images:
+        if back.source == "MOVIE_CLIP" and back.clip is not None:
+            bundles = [list(track.bundle) for track in back.clip.tracking.tracks if track.has_bundle]
+            if bundles:  # in the space of the camera's parent, or the world
+                found.append(_moved(np.array(bundles), camera.parent.matrix_world if camera.parent else None))
+    for item in scene.objects:
+        if item.type == "MESH" and len(item.data.vertices):
+            flat = np.empty(3 * len(item.data.vertices), np.float32)
+            item.data.vertices.foreach_get("co", flat)
+            found.append(_moved(flat.reshape(-1, 3), item.matrix_world))
+    every = np.concatenate(found) if found else np.zeros((0, 3))
+    return every[:: max(len(every) // MOST_POINTS, 1)]
+
+
+def _moved(points: np.ndarray[Any, Any], matrix: Any) -> np.ndarray[Any, Any]:
+    if matrix is None:
+        return points
+    values = np.array([list(row) for row in matrix])
+    return np.asarray(points @ values[:3, :3].T + values[:3, 3])
+
+
+def _write_points(path: Path, points: np.ndarray[Any, Any]) -> None:
+    head = (f"ply\nformat binary_little_endian 1.0\nelement vertex {len(points)}\n"
+            "property float x\nproperty float y\nproperty float z\nend_header\n")
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(head.encode() + np.ascontiguousarray(points, "<f4").tobytes())

@@ -1,0 +1,264 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""A capture as a collection: cameras with their frames behind them, the point cloud, the lights.
+
+Everything is parented to one empty that carries up axis and scale, so keys and positions are the capture's
+own numbers, and turning or scaling the empty turns and scales all.
+"""
+from __future__ import annotations
+
+import math
+import os
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import bpy
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.bake.frames import numbered
+from ..core.capture import Capture, PointCloud, View
+from ..core.capture.camera import quaternion_from_rotation
+from ..core.errors import CaptureError
+from . import cameras
+from .cameras import FLIP
+
+SENSOR = 36.0  # mm
+UP = {"Z": (0.0, 0.0, 0.0), "-Y": (-math.pi / 2, 0.0, 0.0), "Y": (math.pi / 2, 0.0, 0.0)}
+"""Rotation of the root by the axis that is up in the capture."""
+
+Placement = Literal["animated", "each"]
+_NUMBER = re.compile(r"(\d+)(?=\D*$)")
+
+
+@dataclass(frozen=True)
+class ImportSettings:
+    """cameras: one animated camera (for each folder of frames), or one for each frame. up: "Z", "Y" or "-Y"."""
+
+    cameras: Placement = "animated"
+    up: str = "Z"
+    scale: float = 1.0
+    frames: bool = True
+    points: bool = True
+    match_scene: bool = True
+
+
+@dataclass(frozen=True)
+class Imported:
+    """What an import made. notes: sentences on what could not be done as asked."""
+
+    root: Any
+    cameras: tuple[Any, ...]
+    lights: tuple[Any, ...]
+    notes: tuple[str, ...]
+
+
+def find_capture(path: Path | str) -> Path:
+    """The capture's folder, from itself or anything in it: a COLMAP model's file or folder, images/, lights.json.
+
+    Raises CaptureError where there is none.
+    """
+    path = Path(path)
+    start = path if path.is_dir() else path.parent
+    for folder in (start, *start.parents[:3]):
+        if (folder / "images").is_dir() or (folder / "transforms.json").is_file():
+            return folder
+    raise CaptureError(f"{path} is not in a capture: no folder images/ beside sparse/0/, and no transforms.json; "
+                       "choose the capture's folder.")
+
+
+def import_capture(scene: Any, folder: Path | str, settings: ImportSettings | None = None) -> Imported:
+    """Read the capture in `folder` and build it in `scene`. Raises CaptureError or FrameError."""
+    settings = settings or ImportSettings()
+    folder = find_capture(folder)
+    capture = Capture.open(folder, need_frames=settings.frames)
+    notes: list[str] = []
+    collection = bpy.data.collections.new(folder.resolve().name)
+    scene.collection.children.link(collection)
+    root = _object(collection, f"{collection.name} Root", None, None)
+    root.empty_display_type, root.empty_display_size = "ARROWS", 0.2 * capture.extent
+    root.rotation_euler, root.scale = UP[settings.up], (settings.scale,) * 3
+    made = _cameras(collection, root, capture, settings, scene, notes)
+    if settings.points and len(capture.points):
+        _points(collection, root, capture.points)
+    lights = tuple(add_light(collection, root, light.name, light.xyz, 0.04 * capture.extent)
+                   for light in capture.lights)
+    state = scene.fit_flare
+    state.capture, state.root = stored(folder), root
+    state.mode = "default" if capture.has_removed or capture.has_truth else "unsup"
+    scene.camera = made[0]
+    if settings.match_scene:
+        view = scene.view_settings  # footage is shown as it is, not through AgX
+        view.view_transform, view.look, view.exposure, view.gamma = "Standard", "None", 0.0, 1.0
+    if not lights:
+        notes.append("The capture has no lights yet; find or add them in the panel Lights.")
+    if any(view.lens for view in capture.views) and settings.frames:
+        notes.append("The frames behind the camera show the lens's distortion; the cameras have none.")
+    return Imported(root, made, lights, tuple(notes))
+
+
+def stored(path: Path) -> str:
+    """A path as a .blend keeps it: relative to the file where it can be."""
+    text = os.fspath(path.resolve())
+    if bpy.data.filepath:
+        try:
+            return str(bpy.path.relpath(text))
+        except ValueError:  # another drive
+            return text
+    return text
+
+
+def add_light(collection: Any, root: Any, name: str, xyz: Any, size: float) -> Any:
+    """An empty that stands for a light of the capture, at `xyz` in the root's coordinates."""
+    light = _object(collection, name, None, root)
+    light.empty_display_type, light.empty_display_size = "SPHERE", size
+    light.location = [float(value) for value in xyz]
+    light.show_name = True
+    light.fit_flare.is_light, light.fit_flare.light = True, name
+    return light
+
+
+# ---- cameras --------------------------------------------------------------------------------------
+
+
+def _cameras(collection: Any, root: Any, capture: Capture, settings: ImportSettings, scene: Any,
+             notes: list[str]) -> tuple[Any, ...]:
+    frames = numbered(view.name for view in capture.views)
+    number = {frame.view: frame.number for frame in frames}
+    folders: dict[str, list[View]] = {}
+    for frame in frames:
+        folders.setdefault(Path(frame.view).parent.as_posix(), []).append(capture.view(frame.view))
+    first = capture.views[0].camera
+    aspect = cameras.pixel_aspect(first.fx, first.fy)
+    if settings.match_scene:
+        render = scene.render
+        render.resolution_x, render.resolution_y = first.size
+        render.resolution_percentage = 100
+        render.pixel_aspect_x, render.pixel_aspect_y = aspect
+        scene.frame_start, scene.frame_end = min(number.values()), max(number.values())
+        scene.frame_set(scene.frame_start)
+    if len({view.camera.size for view in capture.views}) > 1:
+        notes.append("The frames differ in size, and a scene has one: it is that of the first frame.")
+    made: list[Any] = []
+    for folder, views in folders.items():
+        label = "Camera" if folder == "." else f"Camera {folder}"
+        if settings.cameras == "animated":
+            camera = _camera(collection, root, label, views[0], aspect, 0.15 * capture.extent)
+            _animate(camera, views, [number[view.name] for view in views], aspect)
+            if settings.frames and not _footage(camera, capture, views, [number[view.name] for view in views]):
+                notes.append(f"The frames of {label} have no common numbering, so only the first is shown behind it; "
+                             "import with one camera for each frame to see all.")
+            made.append(camera)
+        else:
+            for view in views:
+                camera = _camera(collection, root, Path(view.name).stem, view, aspect, 0.08 * capture.extent)
+                if settings.frames:
+                    _backdrop(camera, bpy.data.images.load(str(capture.frame_path(view)), check_existing=True))
+                made.append(camera)
+    return tuple(made)
+
+
+def _camera(collection: Any, root: Any, name: str, view: View, aspect: tuple[float, float], size: float) -> Any:
+    data = bpy.data.cameras.new(name)
+    data.sensor_fit, data.sensor_width = "HORIZONTAL", SENSOR
+    data.lens, data.shift_x, data.shift_y = cameras.lens_of(view.camera, SENSOR, aspect)
+    data.display_size, data.passepartout_alpha = size, 0.8
+    data.clip_end = 1e4
+    camera = _object(collection, name, data, root)
+    camera.rotation_mode = "QUATERNION"
+    matrix = view.camera.camera_to_world @ FLIP
+    camera.location = matrix[:3, 3].tolist()
+    camera.rotation_quaternion = quaternion_from_rotation(matrix[:3, :3]).tolist()
+    return camera
+
+
+def _animate(camera: Any, views: Sequence[View], numbers: Sequence[int], aspect: tuple[float, float]) -> None:
+    """Keys of place and rotation at the frames' numbers; of focal length and shift where they change."""
+    matrices = [view.camera.camera_to_world @ FLIP for view in views]
+    places = np.array([matrix[:3, 3] for matrix in matrices])
+    turns = np.array([quaternion_from_rotation(matrix[:3, :3]) for matrix in matrices])
+    for index in range(1, len(turns)):  # q and -q are one rotation; the nearer keeps what lies between sensible
+        if turns[index] @ turns[index - 1] < 0:
+            turns[index] *= -1
+    keys(camera, {"location": places, "rotation_quaternion": turns}, numbers)
+    lenses = np.array([cameras.lens_of(view.camera, SENSOR, aspect) for view in views])
+    if np.ptp(lenses, axis=0).max() > 1e-6:
+        keys(camera.data, {"lens": lenses[:, :1], "shift_x": lenses[:, 1:2], "shift_y": lenses[:, 2:]}, numbers)
+
+
+def keys(block: Any, channels: dict[str, NDArray[Any]], frames: Sequence[int]) -> None:
+    """Linear keys on a data block, in bulk: by RNA path, (frames, width) values."""
+    action = bpy.data.actions.new(f"{block.name} Action")
+    block.animation_data_create().action = action
+    curves: Any
+    if bpy.app.version >= (4, 4, 0):
+        slot = action.slots.new(id_type=block.id_type, name=block.name)
+        block.animation_data.action_slot = slot
+        strip = action.layers.new("Layer").strips.new(type="KEYFRAME")
+        curves = strip.channelbag(slot, ensure=True).fcurves
+    else:
+        curves = action.fcurves
+    for path, values in channels.items():
+        for index in range(values.shape[1]):
+            curve = curves.new(path, index=index)
+            curve.keyframe_points.add(len(frames))
+            flat = np.stack([np.asarray(frames, np.float32), values[:, index].astype(np.float32)], -1).ravel()
+            curve.keyframe_points.foreach_set("co", flat)
+            curve.keyframe_points.foreach_set("interpolation", [1] * len(frames))  # LINEAR
+            curve.update()
+
+
+def _footage(camera: Any, capture: Capture, views: Sequence[View], numbers: Sequence[int]) -> bool:
+    """The frames as one sequence behind the camera; False where their names are no sequence."""
+    paths = [capture.frame_path(view) for view in views]
+    image = bpy.data.images.load(str(paths[0]), check_existing=True)
+    back = _backdrop(camera, image)
+    camera.fit_flare.frame_names = "\n".join(path.name for path in paths)
+    if len(paths) == 1:
+        return True
+    patterns = {(path.parent, _NUMBER.sub("#" * 1, path.name)) for path in paths}
+    found = [_NUMBER.search(path.stem) for path in paths]
+    if len(patterns) > 1 or any(match is None or int(match[1]) != number
+                                for match, number in zip(found, numbers, strict=True)):
+        return False
+    image.source = "SEQUENCE"
+    user = back.image_user
+    user.frame_start, user.frame_offset = numbers[0], numbers[0] - 1
+    user.frame_duration = numbers[-1] - numbers[0] + 1
+    user.use_auto_refresh = True
+    return True
+
+
+def _backdrop(camera: Any, image: Any) -> Any:
+    camera.data.show_background_images = True
+    back = camera.data.background_images.new()
+    back.image, back.alpha, back.frame_method, back.display_depth = image, 1.0, "STRETCH", "BACK"
+    return back
+
+
+# ---- the rest -------------------------------------------------------------------------------------
+
+
+def _points(collection: Any, root: Any, cloud: PointCloud) -> Any:
+    """A mesh of vertices with the colour attribute "Col"; it is not rendered."""
+    mesh = bpy.data.meshes.new("Points")
+    mesh.vertices.add(len(cloud))
+    mesh.vertices.foreach_set("co", np.ascontiguousarray(cloud.xyz, np.float32).ravel())
+    colours = mesh.color_attributes.new("Col", "BYTE_COLOR", "POINT")
+    rgba = np.ones((len(cloud), 4), np.float32)
+    rgba[:, :3] = cloud.rgb / np.float32(255)
+    colours.data.foreach_set("color_srgb", rgba.ravel())
+    mesh.update()
+    points = _object(collection, "Points", mesh, root)
+    points.hide_render = True
+    points.hide_select = True
+    return points
+
+
+def _object(collection: Any, name: str, data: Any, parent: Any) -> Any:
+    made = bpy.data.objects.new(name, data)
+    collection.objects.link(made)
+    made.parent = parent
+    return made

@@ -1,0 +1,114 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Where the engine is, and how its commands are started: a Python with torch, never Blender's own process."""
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import bpy
+
+from ..core.errors import EngineError, FitFlareError
+from . import jobs
+from .jobs import Job
+
+ROOT = Path(__file__).resolve().parents[1]
+RUN = ROOT / "headless" / "run.py"
+PACKAGE = (__package__ or "").rpartition(".")[0]
+FOLDER = "engine"
+MISSING = "No engine is set up. Open the preferences of Fit Flare and set one up, or name a Python that has it"
+
+
+def user_folder(name: str, create: bool = False) -> Path:
+    """A folder of the extension's own, in Blender's user folder."""
+    try:
+        return Path(bpy.utils.extension_path_user(PACKAGE, path=name, create=create))
+    except (ValueError, AttributeError):  # loaded from source, not installed as an extension
+        folder = Path(bpy.utils.user_resource("CONFIG", path="fit_flare", create=create)) / name
+        if create:
+            folder.mkdir(parents=True, exist_ok=True)
+        return folder
+
+
+def python_at(place: Path) -> Path | None:
+    """The interpreter that `place` is, or that the virtual environment in it has."""
+    for path in (place, place / "Scripts" / "python.exe", place / "bin" / "python"):
+        if path.is_file():
+            return path.absolute()  # not resolved: a virtual environment's python is a link
+    return None
+
+
+def find() -> Path | None:
+    """The engine's Python: the preferences' own, FIT_FLARE_ENGINE, the one that was set up by a click, .venv
+    beside the extension's source. None where there is none; a look at the disk, cheap enough for a panel."""
+    from .preferences import engine_path
+
+    for place in (engine_path(), os.environ.get("FIT_FLARE_ENGINE", "")):
+        if place:
+            return python_at(Path(place).expanduser())
+    for folder in (user_folder(FOLDER) / "python", ROOT / ".venv"):
+        python = python_at(folder)
+        if python is not None:
+            return python
+    return None
+
+
+def command(*words: object) -> list[str]:
+    """A command of run.py as the engine runs it. Raises EngineError where no engine is set up."""
+    python = find()
+    if python is None:
+        raise EngineError(f"{MISSING}.")
+    return [str(python), str(RUN), *map(str, words), "--progress", "json"]
+
+
+def environment() -> dict[str, str]:
+    """This environment, less what would lead another Python to Blender's modules."""
+    return {name: value for name, value in os.environ.items() if name not in ("PYTHONHOME", "PYTHONPATH")}
+
+
+def run(kind: str, folder: Path, words: Sequence[object], finished: Any = None) -> Job:
+    """Start a command of run.py whose events go to `folder`; see `jobs.start`."""
+    return jobs.start(kind, folder, command(*words), environment(), finished)
+
+
+# ---- its state ------------------------------------------------------------------------------------
+
+
+def test() -> Job:
+    """Ask the engine what it is; the answer is the job's result (version, torch, device, kernels)."""
+    return run("test", user_folder("test", create=True), ["engine"])
+
+
+def tested() -> Job | None:
+    """The last test, if there was one."""
+    return jobs.find(user_folder("test"))
+
+
+def set_up() -> Job:
+    """Make a virtual environment in the extension's own folder and install the engine into it.
+
+    Raises EngineError where Blender's online access is not granted.
+    """
+    if not bpy.app.online_access:
+        raise EngineError("Blender's online access is off; allow it in Preferences > System > Network, then set up.")
+    script = ROOT / "headless" / "set_up.py"
+    words = [sys.executable, *bpy.app.python_args, str(script), str(user_folder(FOLDER, create=True) / "python")]
+    return jobs.start("set up", user_folder(FOLDER), words, environment())
+
+
+def setting_up() -> Job | None:
+    """The set-up that runs or ran."""
+    return jobs.find(user_folder(FOLDER))
+
+
+def remove() -> None:
+    """Remove the engine that a click set up. Raises FitFlareError while it works."""
+    import shutil
+
+    if any(job.running for job in jobs.running()):
+        raise FitFlareError("The engine is at work; wait for it or cancel it before removing it.")
+    folder = user_folder(FOLDER)
+    jobs.forget(folder)
+    shutil.rmtree(folder, ignore_errors=True)

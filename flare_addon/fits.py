@@ -1,0 +1,169 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Fits: started, found again, and what they leave taken into the scene."""
+from __future__ import annotations
+
+import contextlib
+from pathlib import Path
+from typing import Any
+
+import bpy
+
+from ..core.errors import CaptureError, FitFlareError, RunError
+from . import engine, jobs, lights, looks
+from .capture_import import stored
+from .jobs import Job
+
+FLARE, PREVIEW, CHECKPOINT, CONFIG = "flare.flare", "preview_small.png", "checkpoint/state.safetensors", "config.toml"
+
+
+def folder_of(scene: Any) -> Path | None:
+    """The run's folder; None where none is chosen."""
+    return Path(bpy.path.abspath(scene.fit_flare.run)) if scene.fit_flare.run else None
+
+
+def capture_of(scene: Any) -> Path | None:
+    """The capture's folder; None where none is chosen."""
+    return Path(bpy.path.abspath(scene.fit_flare.capture)) if scene.fit_flare.capture else None
+
+
+def job_of(scene: Any) -> Job | None:
+    """The fit that runs or ran in the scene's run folder."""
+    return jobs.find(folder_of(scene))
+
+
+def state_of(scene: Any) -> str:
+    """"none", "running", "resumable" (broken off), "finished" or "lost" (its folder is gone)."""
+    folder = folder_of(scene)
+    if folder is None:
+        return "none"
+    job = jobs.find(folder)
+    if job is not None and job.running:
+        return "running"
+    if (folder / FLARE).is_file():
+        return "finished"
+    if (folder / CONFIG).is_file():
+        return "resumable"
+    return "none" if not scene.fit_flare.run or folder.is_dir() else "lost"
+
+
+def new_folder(scene: Any) -> Path:
+    """A free folder for a run: beside the .blend where it is saved, else in the capture's own fits/."""
+    capture = capture_of(scene)
+    if capture is None:
+        raise CaptureError("There is no capture yet; import one first.")
+    base = Path(bpy.data.filepath).parent / "fits" if bpy.data.filepath else capture / "fits"
+    number = 1
+    while (folder := base / f"{capture.name}_{scene.fit_flare.preset}_{number}").exists():
+        number += 1
+    return folder
+
+
+def start(scene: Any) -> Job:
+    """Begin a fit in a new folder, with the lights as they are in the scene.
+
+    Raises EngineError without an engine, CaptureError without a capture or lights, RunError for the folder.
+    """
+    capture = capture_of(scene)
+    if capture is None or not capture.is_dir():
+        raise CaptureError(f"The capture {capture} is not there any more; import it from where it is now."
+                           if capture else "There is no capture yet; import one first.")
+    engine.command()  # says so before anything is written
+    lights.write(scene, capture)
+    folder = new_folder(scene)
+    scene.fit_flare.run = stored(folder)
+    return _run(scene, capture, folder)
+
+
+def resume(scene: Any) -> Job:
+    """Go on with the run of the scene. Raises as `start` does."""
+    capture, folder = capture_of(scene), folder_of(scene)
+    if folder is None or not (folder / CONFIG).is_file():
+        raise RunError(f"There is no fit to go on with in {folder}; start a new one.")
+    with contextlib.suppress(OSError):
+        capture = Path((folder / "capture.txt").read_text(encoding="utf-8").strip())
+    if capture is None or not capture.is_dir():
+        raise CaptureError(f"The capture {capture} that this fit was begun with is not there; put it back, or start a "
+                           "new fit.")
+    return _run(scene, capture, folder)
+
+
+def _run(scene: Any, capture: Path, folder: Path) -> Job:
+    state = scene.fit_flare
+    words: list[object] = ["fit", capture.resolve(), "--out", folder, "--resume", "--preset", state.preset, "--mode",
+                           state.mode, "--holdout", 0]
+    if state.width:
+        words += ["--size", state.width]
+    return engine.run("fit", folder, words, finished)
+
+
+def finished(job: Job) -> None:
+    """Show the flare of a fit that ended well, in every scene that has this run."""
+    if job.state != "done":
+        return
+    for scene in bpy.data.scenes:
+        folder = folder_of(scene)
+        if folder is not None and folder == job.folder:
+            try:
+                looks.use(scene, folder / FLARE)
+            except FitFlareError as problem:
+                job.error = str(problem)
+
+
+def find_lights(scene: Any) -> Job:
+    """Have the engine look for lights in the frames; those of the scene stay. Raises EngineError, CaptureError."""
+    capture = capture_of(scene)
+    if capture is None or not capture.is_dir():
+        raise CaptureError("There is no capture yet; import one first.")
+    if lights.of_scene(scene):
+        lights.write(scene, capture)
+    return engine.run("lights", capture / "lights", ["lights", capture, "--keep"], lights_found)
+
+
+def lights_found(job: Job) -> None:
+    """Bring found lights into every scene with this capture."""
+    if job.state != "done":
+        return
+    for scene in bpy.data.scenes:
+        capture = capture_of(scene)
+        if capture is not None and capture / "lights" == job.folder:
+            try:
+                lights.reload(scene, capture)
+            except FitFlareError as problem:
+                job.error = str(problem)
+
+
+# ---- the preview ----------------------------------------------------------------------------------
+
+_previews: Any = None
+_shown: dict[str, float] = {}
+
+
+def preview_icon(folder: Path) -> int:
+    """An icon of the run's newest preview picture; 0 where there is none yet."""
+    global _previews
+    path = folder / PREVIEW
+    try:
+        changed = path.stat().st_mtime
+    except OSError:
+        return 0
+    if _previews is None:
+        from bpy.utils import previews
+
+        _previews = previews.new()
+    key = str(path)
+    if _shown.get(key) != changed:
+        if key in _previews:
+            del _previews[key]
+        _previews.load(key, key, "IMAGE")
+        _shown[key] = changed
+    return int(_previews[key].icon_id)
+
+
+def unregister() -> None:
+    global _previews
+    if _previews is not None:
+        from bpy.utils import previews
+
+        previews.remove(_previews)
+        _previews = None
+    _shown.clear()

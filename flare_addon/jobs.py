@@ -1,0 +1,271 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Work of the engine, watched from Blender: a process of its own whose events land in a file.
+
+    FOLDER/job.json       what was started, and the process's number
+    FOLDER/events.jsonl   its events, one JSON object a line (core/progress.py)
+    FOLDER/engine.log     what else it said
+
+A file, not a pipe: the process needs nobody to read it, so Blender can be saved, closed and opened again
+meanwhile, and finds the work by its folder. A timer looks at what is new in the file, a few kilobytes at a
+time, so the window never waits. Without a window the same calls wait for the end.
+"""
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import bpy
+
+from ..core.errors import EngineError, FitFlareError, RunError
+from ..core.files import write_json
+from .properties import redraw
+
+State = Literal["running", "done", "failed", "stopped"]
+
+RECORD, EVENTS, LOG = "job.json", "events.jsonl", "engine.log"
+WINDOWS = os.name == "nt"
+STOPPED = 130  # the status of a command that was stopped (headless/cli.py)
+EVERY_S = 0.2
+AT_ONCE = 1 << 16  # bytes of events read at a time
+
+_jobs: dict[str, Job] = {}
+
+
+class Job:
+    """One command of the engine. done, total: steps of `stage`; left_s: seconds left, None where unknown."""
+
+    def __init__(self, kind: str, folder: Path, pid: int, process: subprocess.Popen[bytes] | None,
+                 finished: Callable[[Job], None] | None = None) -> None:
+        self.kind, self.folder, self.pid = kind, folder, pid
+        self.state: State = "running"
+        self.stage, self.done, self.total, self.left_s = "starting", 0, 0, None
+        self.figures: dict[str, float] = {}
+        self.said: list[str] = []
+        self.result: dict[str, Any] = {}
+        self.error = ""
+        self._process, self._finished = process, finished
+        self._at, self._rest = 0, b""
+
+    @property
+    def running(self) -> bool:
+        return self.state == "running"
+
+    @property
+    def share(self) -> float:
+        """How much of the stage is done, 0..1."""
+        return min(self.done / self.total, 1.0) if self.total else 0.0
+
+    @property
+    def log(self) -> Path:
+        return self.folder / LOG
+
+    def poll(self) -> bool:
+        """Take in what is new; whether anything was."""
+        alive = self._alive()  # asked first: what was written before the end is then read below
+        news = self._read()
+        if alive or not self.running:
+            return news
+        while self._read():
+            pass
+        if self.running:
+            self._end()
+        if self._finished is not None:
+            self._finished(self)
+        return True
+
+    def stop(self) -> None:
+        """Ask it to stop; it keeps what it has, and ends by itself."""
+        self.stage = "stopping"
+        with contextlib.suppress(OSError):
+            if self._process is not None and self._process.poll() is None:
+                self._process.send_signal(getattr(signal, "CTRL_BREAK_EVENT", signal.SIGINT))
+            elif self._process is None:
+                os.kill(self.pid, getattr(signal, "CTRL_BREAK_EVENT", signal.SIGINT))
+
+    def _read(self) -> bool:
+        try:
+            with open(self.folder / EVENTS, "rb") as stream:
+                stream.seek(self._at)
+                data = stream.read(AT_ONCE)
+        except OSError:  # the folder was removed, or is not there yet
+            return False
+        self._at += len(data)
+        *lines, self._rest = (self._rest + data).split(b"\n")
+        for line in lines:
+            self._take(line)
+        return bool(data)
+
+    def _take(self, line: bytes) -> None:
+        try:
+            event = json.loads(line)
+            kind = event["type"]
+        except (ValueError, KeyError, TypeError):
+            return
+        if kind == "stage":
+            self.stage, self.done, self.total, self.left_s = event["name"], event["done"], event["total"], None
+        elif kind == "progress":
+            self.done, self.total, self.left_s = event["done"], event["total"], event["left_s"]
+            self.figures = event["figures"]
+        elif kind == "say":
+            self.said.append(str(event["text"]))
+        elif kind == "result":
+            self.result.update(event["data"])
+            self.state = "done"
+        elif kind == "error":
+            self.error = str(event["text"])
+
+    def _alive(self) -> bool:
+        if self._process is not None:
+            return self._process.poll() is None
+        return _is_ours(self.pid)
+
+    def _end(self) -> None:
+        """The process is gone without a result."""
+        status = self._process.returncode if self._process is not None else None
+        if self.error and (status == STOPPED or self.error.startswith("Stopped")):
+            self.state = "stopped"
+        elif self.error:
+            self.state = "failed"
+        elif not self.folder.is_dir():
+            self.state, self.error = "failed", f"The folder {self.folder} was removed while the engine worked in it."
+        else:
+            self.state = "failed"
+            self.error = f"The engine ended without a result{_last_words(self.log)}; {LOG} in {self.folder} has it all."
+
+
+def _last_words(log: Path) -> str:
+    try:
+        text = log.read_text(encoding="utf-8", errors="replace")
+    except OSError:
+        return ""
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
+    return f' ("{lines[-1][:160]}")' if lines else ""
+
+
+def _is_ours(pid: int) -> bool:
+    """Whether a process that an earlier Blender started still runs."""
+    if WINDOWS:
+        import ctypes
+
+        kernel = ctypes.windll.kernel32  # type: ignore[attr-defined,unused-ignore]
+        handle = kernel.OpenProcess(0x1000, False, pid)
+        if not handle:
+            return False
+        code = ctypes.c_ulong()
+        kernel.GetExitCodeProcess(handle, ctypes.byref(code))
+        kernel.CloseHandle(handle)
+        return code.value == 259  # STILL_ACTIVE
+    try:
+        os.kill(pid, 0)
+    except OSError:
+        return False
+    command = Path(f"/proc/{pid}/cmdline")
+    try:  # the number may have gone to another program
+        return b"run.py" in command.read_bytes() if command.parent.parent.is_dir() and command.exists() else True
+    except OSError:
+        return True
+
+
+# ---- starting and finding -------------------------------------------------------------------------
+
+
+def start(kind: str, folder: Path, command: Sequence[str], environment: Mapping[str, str] | None = None,
+          finished: Callable[[Job], None] | None = None) -> Job:
+    """Start a command whose events go to `folder`, and watch it.
+
+    Without a window this returns when it has ended. Raises EngineError where it cannot be started, RunError
+    where the folder cannot be written or has work running in it.
+    """
+    before = find(folder)
+    if before is not None and before.running:
+        raise RunError(f"The engine works in {folder} already; wait for it or cancel it first.")
+    apart: dict[str, Any] = {"start_new_session": True}
+    if WINDOWS:
+        apart = {"creationflags": getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0)}
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with open(folder / EVENTS, "wb") as events, open(folder / LOG, "ab") as log:
+            process = subprocess.Popen(list(command), stdin=subprocess.DEVNULL, stdout=events, stderr=log,
+                                       env=dict(environment) if environment is not None else None, **apart)
+        write_json(folder / RECORD, {"kind": kind, "pid": process.pid, "started": time.time()})
+    except FileNotFoundError as problem:
+        raise EngineError(f"{command[0]} cannot be started; set up the engine in the preferences.") from problem
+    except OSError as problem:
+        raise RunError(f"{folder} cannot be used ({problem.strerror or problem}); choose another folder.") from problem
+    job = Job(kind, folder, process.pid, process, finished)
+    _jobs[_key(folder)] = job
+    if bpy.app.background:
+        _wait(job)
+    else:
+        _watch()
+    return job
+
+
+def find(folder: Path | str | None) -> Job | None:
+    """The work in a folder: watched already, or left running by an earlier Blender; None where there is none."""
+    if not folder:
+        return None
+    folder = Path(folder)
+    known = _jobs.get(_key(folder))
+    if known is not None:
+        return known
+    try:
+        record = json.loads((folder / RECORD).read_text(encoding="utf-8"))
+        job = Job(str(record["kind"]), folder, int(record["pid"]), None)
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    _jobs[_key(folder)] = job
+    job.poll()
+    if job.running:
+        _watch()
+    return job
+
+
+def forget(folder: Path | str) -> None:
+    """Stop watching a folder; what runs there goes on."""
+    _jobs.pop(_key(Path(folder)), None)
+
+
+def running() -> list[Job]:
+    """All work that goes on now."""
+    return [job for job in _jobs.values() if job.running]
+
+
+def _key(folder: Path) -> str:
+    return os.path.normcase(folder.absolute())
+
+
+def _wait(job: Job) -> None:
+    while job.running:
+        job.poll()
+        time.sleep(0.05)
+    if job.state == "failed":
+        raise FitFlareError(job.error)
+
+
+def _watch() -> None:
+    if not bpy.app.background and not bpy.app.timers.is_registered(_tick):
+        bpy.app.timers.register(_tick, first_interval=EVERY_S, persistent=True)
+
+
+def _tick() -> float | None:
+    news = [job.poll() for job in running()]
+    if any(news):
+        redraw()
+        for area in (area for window in bpy.context.window_manager.windows for area in window.screen.areas):
+            if area.type in ("IMAGE_EDITOR", "PREFERENCES"):
+                area.tag_redraw()
+    return EVERY_S if running() else None
+
+
+def unregister() -> None:
+    if bpy.app.timers.is_registered(_tick):
+        bpy.app.timers.unregister(_tick)
+    _jobs.clear()

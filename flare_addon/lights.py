@@ -1,0 +1,107 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Light objects: which there are, and how they become the lights.json of a fit."""
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..core.capture import read_lights
+from ..core.errors import CaptureError
+from ..core.files import read_json, write_json
+from . import cameras
+from .capture_import import add_light
+
+
+def of_scene(scene: Any) -> list[Any]:
+    """The objects of the scene that stand for lights, by name of the light."""
+    found = [item for item in scene.objects if item.fit_flare.is_light]
+    return sorted(found, key=lambda item: name_of(item).casefold())
+
+
+def name_of(light: Any) -> str:
+    """The light's name in lights.json."""
+    return light.fit_flare.light or light.name
+
+
+def place_of(light: Any, root: Any, matrix: Any = None) -> Any:
+    """(3,) position in the capture's coordinates. matrix: the light's matrix_world, if not the present one."""
+    world = np.array([*(matrix or light.matrix_world).translation, 1.0])
+    return (cameras.to_capture(root) @ world)[:3]
+
+
+def add(scene: Any, where: Any, name: str = "") -> Any:
+    """A new light at a point (3,) of Blender's world."""
+    state = scene.fit_flare
+    root = state.root
+    taken = {name_of(item) for item in of_scene(scene)}
+    name = free_name(name or "light1", taken)
+    collection = root.users_collection[0] if root is not None and root.users_collection else scene.collection
+    size = max((item.empty_display_size for item in of_scene(scene) if item.type == "EMPTY"), default=0.2)
+    local = (cameras.to_capture(root) @ np.array([*where, 1.0]))[:3]
+    return add_light(collection, root, name, local, size)
+
+
+def take(objects: Iterable[Any], taken: set[str]) -> int:
+    """Make objects lights of the capture; how many were not before."""
+    made = 0
+    for item in objects:
+        if item.type != "CAMERA" and not item.fit_flare.is_light:
+            name = free_name(item.name, taken)
+            taken.add(name)
+            item.fit_flare.is_light, item.fit_flare.light = True, name
+            made += 1
+    return made
+
+
+def free_name(name: str, taken: set[str]) -> str:
+    """`name`, with another number where it is taken."""
+    stem = name.rstrip("0123456789") or "light"
+    number = 1
+    while name in taken:
+        number += 1
+        name = f"{stem}{number}"
+    return name
+
+
+def write(scene: Any, folder: Path) -> int:
+    """Write the scene's lights to the capture's lights.json; how many. Entries keep what else was said of them.
+
+    Raises CaptureError where there are none or two have one name.
+    """
+    objects = of_scene(scene)
+    if not objects:
+        raise CaptureError("There are no lights to fit a flare to; add one, or find them in the frames.")
+    names = [name_of(item) for item in objects]
+    if len(set(names)) < len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        raise CaptureError(f"Two lights have the name {twice!r}; rename one in the panel Lights.")
+    path = folder / "lights.json"
+    data: dict[str, Any] = read_json(path, CaptureError) if path.is_file() else {}
+    known = {entry.get("name"): entry for entry in data.get("lights", []) if isinstance(entry, dict)}
+    lights = []
+    for item, name in zip(objects, names, strict=True):
+        xyz = [round(float(value), 6) for value in place_of(item, scene.fit_flare.root)]
+        lights.append({**known.get(name, {}), "name": name, "xyz": xyz})
+    if lights != data.get("lights"):
+        write_json(path, {**data, "lights": lights})
+    return len(lights)
+
+
+def reload(scene: Any, folder: Path) -> int:
+    """Bring the lights of lights.json into the scene, those by name that are there moved; how many."""
+    there = {name_of(item): item for item in of_scene(scene)}
+    found = read_lights(folder / "lights.json")
+    root = scene.fit_flare.root
+    for light in found:
+        if light.name in there:
+            item = there[light.name]
+            if item.parent == root:
+                item.location = light.xyz.tolist()
+        else:
+            collection = root.users_collection[0] if root is not None and root.users_collection else scene.collection
+            size = max((item.empty_display_size for item in there.values() if item.type == "EMPTY"), default=0.2)
+            there[light.name] = add_light(collection, root, light.name, light.xyz, size)
+    return len(found)

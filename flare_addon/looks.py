@@ -1,0 +1,225 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The look of a scene: its .flare, which object each flare comes from, what it shows in a camera, occlusion."""
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import bpy
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.errors import FlareFileError
+from ..core.look import Edit, Look, LookEdits, PlaneGaussians, read
+from ..core.look.look import Query
+from ..core.look.shot import PlacedLight, evaluate
+from . import cameras
+from .lights import name_of, of_scene, place_of
+from .properties import edit_of
+
+LIGHT_SHARE = 0.01  # of a light's distance: its radius where none is given (core/flare/visibility.py)
+MARGIN = 0.06  # what stands nearer to the light than this share of its distance is the lamp itself
+RAYS = 25
+
+_cache: dict[str, tuple[tuple[float, int], Look | str]] = {}
+
+
+def path_of(scene: Any) -> Path | None:
+    """The .flare of the scene; None where none is chosen."""
+    return Path(bpy.path.abspath(scene.fit_flare.flare)) if scene.fit_flare.flare else None
+
+
+def look_of(scene: Any) -> Look:
+    """The scene's look, read again when the file changes. Raises FlareFileError."""
+    path = path_of(scene)
+    if path is None:
+        raise FlareFileError("No flare is chosen; fit one, or open a .flare.")
+    try:
+        status = path.stat()
+        stamp = (status.st_mtime, status.st_size)
+    except OSError as problem:
+        raise FlareFileError(f"{path} is missing; choose a .flare file that a fit has written.") from problem
+    known = _cache.get(str(path))
+    if known is None or known[0] != stamp:
+        try:
+            found: Look | str = read(path)
+        except FlareFileError as problem:
+            found = str(problem)
+        known = _cache[str(path)] = (stamp, found)
+    if isinstance(known[1], str):
+        raise FlareFileError(known[1])
+    return known[1]
+
+
+def use(scene: Any, path: Path | str, targets: dict[str, Any] | None = None) -> Look:
+    """Show a .flare in the scene: one flare for each of its lights, at the light object of that name.
+
+    targets: objects by the .flare's light, where the names do not say it. Edits of flares that stay are kept.
+    Raises FlareFileError.
+    """
+    path = Path(path)
+    look = read(path)
+    state = scene.fit_flare
+    before = state.flare
+    state.flare = str(path)
+    if bpy.data.filepath:
+        import contextlib
+
+        with contextlib.suppress(ValueError):
+            state.flare = bpy.path.relpath(str(path))
+    objects = {name_of(item): item for item in of_scene(scene)}
+    if targets is None:
+        targets = {name: objects[name] for name in look.names if name in objects}
+    if before != state.flare:
+        for index in reversed(range(len(state.lights))):
+            if state.lights[index].source not in look.names:
+                state.lights.remove(index)
+    for light in look.lights:
+        item = next((one for one in state.lights if one.source == light.name), None)
+        if item is None:
+            item = state.lights.add()
+            item.name = item.source = light.name
+        if item.target is None and light.name in targets:
+            item.target = targets[light.name]
+        _elements(item, light)
+    state.light = min(state.light, max(len(state.lights) - 1, 0))
+    state.native = _is_of(look, state.root, objects)
+    return look
+
+
+def _is_of(look: Look, root: Any, objects: dict[str, Any]) -> bool:
+    """Whether the look was learned in the capture that `root` carries: its lights are where they were then."""
+    shared = [light for light in look.lights if light.name in objects]
+    if root is None or not shared:
+        return False
+    extent = max(float(np.linalg.norm(light.query_range.camera_high - light.query_range.camera_low))
+                 for light in shared)
+    return all(np.linalg.norm(place_of(objects[light.name], root) - light.xyz) < 0.05 * extent for light in shared)
+
+
+def add_instance(scene: Any, target: Any, source: str) -> Any:
+    """One more flare: the look of the .flare's light `source`, coming from `target`. Raises FlareFileError."""
+    look = look_of(scene)
+    light = next((one for one in look.lights if one.name == source), None)
+    if light is None:
+        raise FlareFileError(f"{look.path} has no light {source!r}; it has {', '.join(look.names)}.")
+    state = scene.fit_flare
+    taken = {item.name for item in state.lights}
+    name, number = target.name, 2
+    while name in taken:
+        name, number = f"{target.name} {number}", number + 1
+    item = state.lights.add()
+    item.name, item.source, item.target = name, source, target
+    _elements(item, light)
+    state.light = len(state.lights) - 1
+    return item
+
+
+def _elements(item: Any, light: Any) -> None:
+    """Give a flare the elements of its look, keeping the sliders of those that stay."""
+    wanted = {element.name: element.kind for element in light.elements}
+    for index in reversed(range(len(item.elements))):
+        if item.elements[index].name not in wanted:
+            item.elements.remove(index)
+    there = {element.name for element in item.elements}
+    for name, kind in wanted.items():
+        if name not in there:
+            item.elements.add().name = name
+        next(element for element in item.elements if element.name == name).kind = kind
+
+
+def edits_of(state: Any) -> LookEdits:
+    """All sliders of a scene."""
+    neutral = Edit()
+    lights = {item.name: edit for item in state.lights if (edit := edit_of(item)) != neutral}
+    elements = {(item.name, element.name): edit for item in state.lights for element in item.elements
+                if (edit := edit_of(element)) != neutral}
+    return LookEdits(edit_of(state.master), lights, elements)
+
+
+def query_of(state: Any) -> Query:
+    """What appearance follows: the view itself in the capture's own scene, else the middle of what was trained."""
+    return "target" if state.root is not None and state.native else "source"
+
+
+def placed(scene: Any, depsgraph: Any, camera: Any) -> tuple[NDArray[np.float64], list[PlacedLight]]:
+    """world_to_camera (4, 4) of a camera object and the lights with their visible shares, in the coordinates
+    that the look is asked in: the capture's, or Blender's where there is no capture."""
+    state = scene.fit_flare
+    root = state.root.evaluated_get(depsgraph) if state.root is not None else None
+    matrix = camera.evaluated_get(depsgraph).matrix_world
+    into = cameras.to_capture(root)
+    lights = []
+    for item in state.lights:
+        if item.target is None or item.target.name not in scene.objects:
+            continue
+        where = item.target.evaluated_get(depsgraph).matrix_world.translation
+        share = visible_share(scene, depsgraph, matrix.translation, item) if state.occlusion else 1.0
+        xyz = (into @ np.array([*where, 1.0]))[:3]
+        lights.append(PlacedLight(item.name, item.source, xyz, share))
+    return cameras.pose_in_capture(matrix, root), lights
+
+
+def seen(scene: Any, depsgraph: Any, camera: Any) -> dict[str, PlaneGaussians]:
+    """What every flare of the scene shows in a camera at the present frame. Raises FlareFileError."""
+    look = look_of(scene)
+    pose, lights = placed(scene, depsgraph, camera)
+    return evaluate(look, pose, lights, edits_of(scene.fit_flare), query_of(scene.fit_flare))
+
+
+# ---- occlusion ------------------------------------------------------------------------------------
+
+
+def _disk() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Points of a sunflower on the unit disk (n, 2), and weights that fall off to the rim."""
+    index = np.arange(RAYS) + 0.5
+    radius, angle = np.sqrt(index / RAYS), index * math.pi * (3 - math.sqrt(5))
+    weights = np.exp(-2.0 * radius**2)
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle)], -1), weights / weights.sum()
+
+
+_POINTS, _WEIGHTS = _disk()
+
+
+def visible_share(scene: Any, depsgraph: Any, eye: Any, item: Any) -> float:
+    """How much of a light's disk the eye sees past the scene's objects, 0..1, by rays to points of the disk.
+
+    What stands right at the light (within 6% of the distance) is the lamp itself and hides nothing.
+    """
+    from mathutils import Vector
+
+    light = item.target.evaluated_get(depsgraph).matrix_world.translation
+    away = light - eye
+    distance = away.length
+    if distance < 1e-6:
+        return 1.0
+    radius = item.radius or LIGHT_SHARE * distance
+    forward = away / distance
+    right = forward.orthogonal().normalized()
+    up = forward.cross(right)
+    share = 0.0
+    own = {item.target.name, *(child.name for child in item.target.children_recursive)}
+    reach = (1 - MARGIN) * distance
+    for (x, y), weight in zip(_POINTS.tolist(), _WEIGHTS.tolist(), strict=True):
+        target = light + radius * (x * right + y * up)
+        direction = (target - eye).normalized()
+        start, left, clear = Vector(eye), reach, True
+        for _ in range(4):  # past the lamp's own meshes
+            hit, where, _normal, _index, thing, _matrix = scene.ray_cast(depsgraph, start, direction, distance=left)
+            if not hit:
+                break
+            if thing is None or thing.original.name not in own:
+                clear = False
+                break
+            step = (where - start).length + 1e-4 * distance
+            start, left = start + direction * step, left - step
+            if left <= 0:
+                break
+        share += weight * clear
+    return share
+
+
+def forget() -> None:
+    """Let go of all files that were read."""
+    _cache.clear()

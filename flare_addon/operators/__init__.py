@@ -1,0 +1,18 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What the buttons do: read the properties, call the module that does it, report what went wrong."""
+from __future__ import annotations
+
+from . import bake, capture, fit, library, lights
+from . import look as look_
+
+_MODULES = (capture, lights, fit, look_, bake, library)
+
+
+def register() -> None:
+    for module in _MODULES:
+        module.register()
+
+
+def unregister() -> None:
+    for module in reversed(_MODULES):
+        module.unregister()

@@ -1,0 +1,132 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Import of a capture, and a capture made of a camera that Blender has solved or animated."""
+from __future__ import annotations
+
+from pathlib import Path
+
+import bpy
+
+from .. import capture_export
+from ..capture_import import ImportSettings, import_capture
+from ..reports import reported
+
+
+class FITFLARE_OT_import_capture(bpy.types.Operator):
+    """Import a capture: its cameras with the frames behind them, its points and its lights"""
+
+    bl_idname = "fit_flare.import_capture"
+    bl_label = "Import Capture"
+    bl_options = {"REGISTER", "UNDO"}
+
+    directory: bpy.props.StringProperty(name="Folder", description="The capture's folder, or one inside it",  # type: ignore[valid-type]
+                                        subtype="DIR_PATH")
+    filepath: bpy.props.StringProperty(name="File", description="A file of the capture", subtype="FILE_PATH")  # type: ignore[valid-type]
+    filter_folder: bpy.props.BoolProperty(default=True, options={"HIDDEN"})  # type: ignore[valid-type]
+    filter_glob: bpy.props.StringProperty(default="*.json;*.bin;*.txt", options={"HIDDEN"})  # type: ignore[valid-type]
+    cameras: bpy.props.EnumProperty(  # type: ignore[valid-type]
+        name="Cameras", description="How the frames' cameras come in",
+        items=(("animated", "One, Animated", "One camera with a key for each frame; frames follow the timeline"),
+               ("each", "One for Each Frame", "A camera object for each frame, each with its picture")))
+    up: bpy.props.EnumProperty(  # type: ignore[valid-type]
+        name="Up Axis", description="The axis that points up in the capture",
+        items=(("Z", "+Z", "As Blender; what Fit Flare's own solve writes"),
+               ("-Y", "-Y", "As COLMAP often leaves it: y points down"), ("Y", "+Y", "As many game engines")))
+    scale: bpy.props.FloatProperty(  # type: ignore[valid-type]
+        name="Scale", description="Scene units for each unit of the capture", default=1.0, min=1e-6, soft_max=100.0)
+    frames: bpy.props.BoolProperty(  # type: ignore[valid-type]
+        name="Frames behind Cameras", description="Show the frames as background images", default=True)
+    points: bpy.props.BoolProperty(  # type: ignore[valid-type]
+        name="Points", description="Bring the point cloud in as a mesh with colours", default=True)
+    match_scene: bpy.props.BoolProperty(  # type: ignore[valid-type]
+        name="Match Scene", description="Give the scene the frames' size, number and plain colours", default=True)
+
+    def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
+        if self.filepath or self.directory:  # dropped into the window
+            return self.execute(context)
+        self.filepath = ""
+        context.window_manager.fileselect_add(self)
+        return {"RUNNING_MODAL"}
+
+    def draw(self, _context: bpy.types.Context) -> None:
+        layout = self.layout
+        layout.use_property_split = True
+        for name in ("cameras", "up", "scale", "frames", "points", "match_scene"):
+            layout.prop(self, name)
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        chosen = Path(bpy.path.abspath(self.filepath or self.directory))
+        if not chosen.exists() and self.directory:
+            chosen = Path(bpy.path.abspath(self.directory))
+        settings = ImportSettings(self.cameras, self.up, self.scale, self.frames, self.points, self.match_scene)
+        with reported(self) as outcome:
+            made = import_capture(context.scene, chosen, settings)
+            for note in made.notes:
+                self.report({"WARNING"}, note)
+            self.report({"INFO"}, f"{chosen.name}: cameras {len(made.cameras)}, lights {len(made.lights)}")
+            _look_through_camera(context)
+        return outcome.status
+
+
+def _look_through_camera(context: bpy.types.Context) -> None:
+    """Turn the largest 3D view to the camera, so that the footage is seen at once."""
+    screen = context.screen
+    views = [area for area in screen.areas if area.type == "VIEW_3D"] if screen is not None else []
+    if views:
+        space = max(views, key=lambda area: area.width * area.height).spaces.active
+        space.region_3d.view_perspective = "CAMERA"
+
+
+class FITFLARE_OT_capture_from_camera(bpy.types.Operator):
+    """Make a capture of the scene's camera as it is animated, with the pictures of its background or clip"""
+
+    bl_idname = "fit_flare.capture_from_camera"
+    bl_label = "Capture from This Camera"
+    bl_options = {"REGISTER", "UNDO"}
+
+    directory: bpy.props.StringProperty(name="Folder", description="Folder for the capture", subtype="DIR_PATH")  # type: ignore[valid-type]
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        if context.scene.camera is None:
+            cls.poll_message_set("The scene has no camera")
+            return False
+        if capture_export.footage_of(context.scene.camera) is None:
+            cls.poll_message_set("The camera has no background image sequence or movie clip to take the frames from")
+            return False
+        return True
+
+    def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
+        context.window_manager.fileselect_add(self)
+        return {"RUNNING_MODAL"}
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        with reported(self) as outcome:
+            count = capture_export.export(context.scene, Path(bpy.path.abspath(self.directory)))
+            self.report({"INFO"}, f"{count} frames are now a capture in {self.directory}")
+        return outcome.status
+
+
+class FITFLARE_FH_capture(bpy.types.FileHandler):
+    """A capture's file dropped into the 3D viewport imports the capture."""
+
+    bl_idname = "FITFLARE_FH_capture"
+    bl_label = "Fit Flare Capture"
+    bl_import_operator = "fit_flare.import_capture"
+    bl_file_extensions = ".json;.bin"
+
+    @classmethod
+    def poll_drop(cls, context: bpy.types.Context) -> bool:
+        return bool(context.area and context.area.type == "VIEW_3D")
+
+
+_CLASSES = (FITFLARE_OT_import_capture, FITFLARE_OT_capture_from_camera, FITFLARE_FH_capture)
+
+
+def register() -> None:
+    for cls in _CLASSES:
+        bpy.utils.register_class(cls)
+
+
+def unregister() -> None:
+    for cls in reversed(_CLASSES):
+        bpy.utils.unregister_class(cls)

@@ -1,0 +1,194 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The fit: started, gone on with, cancelled, its log and preview shown."""
+from __future__ import annotations
+
+from pathlib import Path
+
+import bpy
+
+from .. import engine, fits, jobs, lights, looks
+from ..reports import reported
+
+_keymaps: list[tuple[object, object]] = []
+
+
+class FITFLARE_OT_fit(bpy.types.Operator):
+    """Learn the flare of every light from the footage, in the engine; Blender stays free meanwhile"""
+
+    bl_idname = "fit_flare.fit"
+    bl_label = "Fit"
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        scene = context.scene
+        capture = fits.capture_of(scene)
+        if capture is None:
+            cls.poll_message_set("Import a capture first")
+        elif not capture.is_dir():
+            cls.poll_message_set(f"The capture {capture} is not there any more")
+        elif not lights.of_scene(scene):
+            cls.poll_message_set("Add a light first, or find the lights in the frames")
+        elif engine.find() is None:
+            cls.poll_message_set(engine.MISSING)
+        elif fits.state_of(scene) == "running":
+            cls.poll_message_set("A fit is running")
+        else:
+            return True
+        return False
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        with reported(self) as outcome:
+            fits.start(context.scene)
+        return outcome.status
+
+
+class FITFLARE_OT_resume(bpy.types.Operator):
+    """Go on with the fit where it was stopped"""
+
+    bl_idname = "fit_flare.resume"
+    bl_label = "Resume"
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        if engine.find() is None:
+            cls.poll_message_set(engine.MISSING)
+            return False
+        if fits.state_of(context.scene) != "resumable":
+            cls.poll_message_set("There is no broken-off fit to go on with")
+            return False
+        return True
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        with reported(self) as outcome:
+            fits.resume(context.scene)
+        return outcome.status
+
+
+class FITFLARE_OT_cancel(bpy.types.Operator):
+    """Stop this; what is done is kept, and it can be gone on with (ESC with the mouse over this panel)"""
+
+    bl_idname = "fit_flare.cancel"
+    bl_label = "Cancel"
+
+    folder: bpy.props.StringProperty(options={"HIDDEN", "SKIP_SAVE"})  # type: ignore[valid-type]
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        region = context.region
+        over_panel = region is None or region.type != "WINDOW" or context.area is None or context.area.type != "VIEW_3D"
+        if region is not None and region.type == "UI" and hasattr(region, "active_panel_category"):
+            over_panel = region.active_panel_category in ("Fit Flare", "UNSUPPORTED")
+        return over_panel and bool(jobs.running())
+
+    def execute(self, _context: bpy.types.Context) -> set[str]:
+        stopped = [job for job in jobs.running() if not self.folder or job.folder == Path(self.folder)]
+        for job in stopped:
+            job.stop()
+        if not stopped:
+            self.report({"INFO"}, "It has ended already")
+            return {"CANCELLED"}
+        self.report({"INFO"}, "Stopping; what is done is kept")
+        return {"FINISHED"}
+
+
+class FITFLARE_OT_show_log(bpy.types.Operator):
+    """Open what the engine wrote in a text editor"""
+
+    bl_idname = "fit_flare.show_log"
+    bl_label = "Show Log"
+    bl_options = {"REGISTER", "UNDO"}
+
+    folder: bpy.props.StringProperty(options={"HIDDEN"})  # type: ignore[valid-type]
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        parts = []
+        for name in ("log.txt", jobs.EVENTS, jobs.LOG):
+            path = Path(self.folder, name)
+            if path.is_file():
+                parts.append(f"==== {path}\n{path.read_text(encoding='utf-8', errors='replace')[-200_000:]}")
+        if not parts:
+            self.report({"ERROR"}, f"There is no log in {self.folder}.")
+            return {"CANCELLED"}
+        text = bpy.data.texts.get("Fit Flare Log") or bpy.data.texts.new("Fit Flare Log")
+        text.from_string("\n".join(parts))
+        _show(context, "TEXT_EDITOR", lambda space: setattr(space, "text", text))
+        return {"FINISHED"}
+
+
+class FITFLARE_OT_show_preview(bpy.types.Operator):
+    """Open the fit's preview picture: frame, composite, scene, flare"""
+
+    bl_idname = "fit_flare.show_preview"
+    bl_label = "Show Preview"
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        folder = fits.folder_of(context.scene)
+        if folder is None or not (folder / "preview.png").is_file():
+            cls.poll_message_set("The fit has not made a preview yet")
+            return False
+        return True
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        folder = fits.folder_of(context.scene)
+        assert folder is not None
+        image = bpy.data.images.load(str(folder / "preview.png"), check_existing=True)
+        image.reload()
+        _show(context, "IMAGE_EDITOR", lambda space: setattr(space, "image", image))
+        return {"FINISHED"}
+
+
+class FITFLARE_OT_use_result(bpy.types.Operator):
+    """Show the flare that this fit has learned"""
+
+    bl_idname = "fit_flare.use_result"
+    bl_label = "Use Result"
+    bl_options = {"REGISTER", "UNDO"}
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        if fits.state_of(context.scene) != "finished":
+            cls.poll_message_set("The fit is not finished")
+            return False
+        return True
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        folder = fits.folder_of(context.scene)
+        assert folder is not None
+        with reported(self) as outcome:
+            looks.use(context.scene, folder / fits.FLARE)
+        return outcome.status
+
+
+def _show(context: bpy.types.Context, kind: str, give: object) -> None:
+    """Give something to an editor of that kind: one that is open, or a new window's."""
+    assert callable(give)
+    if context.window is None:
+        return
+    area = next((area for area in context.screen.areas if area.type == kind), None)
+    if area is None:
+        bpy.ops.wm.window_new()
+        area = context.window_manager.windows[-1].screen.areas[0]
+        area.type = kind
+    give(area.spaces.active)
+
+
+_CLASSES = (FITFLARE_OT_fit, FITFLARE_OT_resume, FITFLARE_OT_cancel, FITFLARE_OT_show_log, FITFLARE_OT_show_preview,
+            FITFLARE_OT_use_result)
+
+
+def register() -> None:
+    for cls in _CLASSES:
+        bpy.utils.register_class(cls)
+    keyconfig = bpy.context.window_manager.keyconfigs.addon
+    if keyconfig is not None:  # None in the background
+        keymap = keyconfig.keymaps.new("3D View Generic", space_type="VIEW_3D")
+        _keymaps.append((keymap, keymap.keymap_items.new(FITFLARE_OT_cancel.bl_idname, "ESC", "PRESS")))
+
+
+def unregister() -> None:
+    for keymap, item in _keymaps:
+        keymap.keymap_items.remove(item)  # type: ignore[attr-defined]
+    _keymaps.clear()
+    for cls in reversed(_CLASSES):
+        bpy.utils.unregister_class(cls)

@@ -1,0 +1,213 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Flares to the library and from it, on to other cameras, lights and single pictures."""
+from __future__ import annotations
+
+from pathlib import Path
+
+import bpy
+from mathutils import Vector
+
+from ...core.errors import FlareFileError
+from .. import cameras, library, lights, looks, overlay
+from ..reports import reported
+
+
+class FITFLARE_OT_save_flare(bpy.types.Operator):
+    """Keep this scene's flare in the library, with a thumbnail and notes"""
+
+    bl_idname = "fit_flare.save_flare"
+    bl_label = "Save to Library"
+
+    name: bpy.props.StringProperty(name="Name", description="What it is called in the library")  # type: ignore[valid-type]
+    notes: bpy.props.StringProperty(name="Notes", description="Lens, aperture, camera, what it is good for")  # type: ignore[valid-type]
+    licence: bpy.props.StringProperty(name="Licence", description="Under which terms others may use it")  # type: ignore[valid-type]
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        if not context.scene.fit_flare.flare:
+            cls.poll_message_set("Fit or open a flare first")
+            return False
+        return True
+
+    def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
+        path = looks.path_of(context.scene)
+        self.name = self.name or (path.parent.name if path and path.stem == "flare" else path.stem if path else "")
+        return context.window_manager.invoke_props_dialog(self, width=360)
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        with reported(self) as outcome:
+            look = looks.look_of(context.scene)
+            path = library.save(look, self.name, self.notes or look.notes, self.licence or look.licence)
+            self.report({"INFO"}, f"{path.stem} is in the library")
+        return outcome.status
+
+
+class FITFLARE_OT_apply_flare(bpy.types.Operator):
+    """Show the chosen flare of the library in this scene, at the selected objects or the lights of the same names"""
+
+    bl_idname = "fit_flare.apply_flare"
+    bl_label = "Apply"
+    bl_options = {"REGISTER", "UNDO"}
+
+    filepath: bpy.props.StringProperty(options={"HIDDEN", "SKIP_SAVE"})  # type: ignore[valid-type]
+
+    @classmethod
+    def poll(cls, _context: bpy.types.Context) -> bool:
+        if not library.files():
+            cls.poll_message_set("The library is empty: save a flare into it first")
+            return False
+        return True
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        path = self.filepath or context.window_manager.fit_flare_library
+        with reported(self) as outcome:
+            if not path:
+                raise FlareFileError("Choose a flare of the library first.")
+            look = looks.use(context.scene, Path(path))
+            free = [item for item in context.scene.fit_flare.lights if item.target is None]
+            chosen = [item for item in context.selected_objects if item.type != "CAMERA"]
+            for item, target in zip(free, chosen, strict=False):
+                item.target = target
+            for target in chosen[len(free):]:
+                if all(item.target != target for item in context.scene.fit_flare.lights):
+                    looks.add_instance(context.scene, target, look.names[0])
+            missing = [item.name for item in context.scene.fit_flare.lights if item.target is None]
+            if missing:
+                self.report({"WARNING"}, f"{', '.join(missing)}: choose the object it comes from in the panel Look")
+        return outcome.status
+
+
+class FITFLARE_OT_pick_light(bpy.types.Operator):
+    """Click on the light in the camera view: the flare comes from there"""
+
+    bl_idname = "fit_flare.pick_light"
+    bl_label = "Pick Light in Picture"
+    bl_options = {"REGISTER", "UNDO"}
+
+    x: bpy.props.FloatProperty(name="X", description="Across the picture, 0 left to 1 right", default=-1.0)  # type: ignore[valid-type]
+    y: bpy.props.FloatProperty(name="Y", description="Down the picture, 0 top to 1 bottom", default=-1.0)  # type: ignore[valid-type]
+    distance: bpy.props.FloatProperty(  # type: ignore[valid-type]
+        name="Distance", description="From the camera, where no object is hit; 0 takes ten units", default=0.0,
+        min=0.0, subtype="DISTANCE")
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        if context.scene.camera is None:
+            cls.poll_message_set("The scene has no camera")
+            return False
+        if not context.scene.fit_flare.flare:
+            cls.poll_message_set("Open a flare, or apply one of the library, first")
+            return False
+        return True
+
+    def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
+        areas = [area for area in context.screen.areas if area.type == "VIEW_3D"]
+        if not areas:
+            self.report({"ERROR"}, "There is no 3D viewport to pick in.")
+            return {"CANCELLED"}
+        self._area = max(areas, key=lambda area: area.width * area.height)
+        self._area.spaces.active.region_3d.view_perspective = "CAMERA"
+        context.window_manager.modal_handler_add(self)
+        context.window.cursor_modal_set("EYEDROPPER")
+        context.workspace.status_text_set("Click on the light in the picture; ESC or right click to leave it")
+        return {"RUNNING_MODAL"}
+
+    def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        if event.type in {"ESC", "RIGHTMOUSE"}:
+            return self._end(context, {"CANCELLED"})
+        if event.type != "LEFTMOUSE" or event.value != "PRESS":
+            return {"PASS_THROUGH"}
+        region = next(region for region in self._area.regions if region.type == "WINDOW")
+        space = self._area.spaces.active
+        with context.temp_override(area=self._area, region=region, space_data=space, region_data=space.region_3d):
+            frame = overlay.frame_in(bpy.context, context.scene, context.scene.camera)
+        if frame is None:
+            return self._end(context, {"CANCELLED"})
+        self.x = (event.mouse_x - region.x - frame.left) / frame.width
+        self.y = 1 - (event.mouse_y - region.y - frame.bottom) / frame.height
+        return self._end(context, self.execute(context))
+
+    def _end(self, context: bpy.types.Context, status: set[str]) -> set[str]:
+        context.window.cursor_modal_restore()
+        context.workspace.status_text_set(None)
+        return status
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        scene = context.scene
+        with reported(self) as outcome:
+            depsgraph = context.evaluated_depsgraph_get()
+            camera = scene.camera.evaluated_get(depsgraph)
+            core = cameras.core_camera(camera.data, camera.matrix_world, scene.render)
+            ray = Vector(core.rays([[self.x * core.width, self.y * core.height]])[0].tolist())
+            eye = camera.matrix_world.translation
+            hit, where, *_ = scene.ray_cast(depsgraph, eye, ray)
+            if not hit:
+                where = eye + ray * (self.distance or 10.0 * max(camera.matrix_world.to_scale()))
+            look, state = looks.look_of(scene), scene.fit_flare
+            item = next((one for one in state.lights if one.target is None), None)
+            light = lights.add(scene, where, item.name if item is not None else "light1")
+            light.fit_flare.is_light = state.root is not None
+            light.empty_display_size = 0.02 * (where - eye).length
+            if item is None:
+                item = looks.add_instance(scene, light, state.lights[state.light].source if state.lights
+                                          else look.names[0])
+            item.target = light
+        return outcome.status
+
+
+class FITFLARE_OT_shot_from_picture(bpy.types.Operator):
+    """Set the scene up for a single picture: a camera of its size with the picture behind it"""
+
+    bl_idname = "fit_flare.shot_from_picture"
+    bl_label = "Single Picture"
+    bl_options = {"REGISTER", "UNDO"}
+
+    filepath: bpy.props.StringProperty(name="Picture", description="The picture to lay the flare over",  # type: ignore[valid-type]
+                                       subtype="FILE_PATH")
+    filter_image: bpy.props.BoolProperty(default=True, options={"HIDDEN"})  # type: ignore[valid-type]
+
+    def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
+        context.window_manager.fileselect_add(self)
+        return {"RUNNING_MODAL"}
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        scene = context.scene
+        with reported(self) as outcome:
+            try:
+                image = bpy.data.images.load(bpy.path.abspath(self.filepath), check_existing=True)
+            except RuntimeError as problem:
+                raise FlareFileError(f"{self.filepath} is not a picture that Blender can open.") from problem
+            if 0 in image.size:
+                raise FlareFileError(f"{self.filepath} is not a picture that Blender can open.")
+            data = bpy.data.cameras.new(Path(self.filepath).stem)
+            data.sensor_fit, data.sensor_width = "HORIZONTAL", 36.0
+            data.lens = 36.0
+            if scene.fit_flare.flare:  # the flare's own lens, which its shapes belong to
+                filmed = looks.look_of(scene).camera
+                data.lens = 36.0 * filmed.fx / filmed.width
+            camera = bpy.data.objects.new(data.name, data)
+            scene.collection.objects.link(camera)
+            camera.rotation_euler = (1.5707963, 0, 0)
+            data.show_background_images = True
+            back = data.background_images.new()
+            back.image, back.alpha, back.frame_method = image, 1.0, "STRETCH"
+            scene.camera = camera
+            scene.render.resolution_x, scene.render.resolution_y = image.size
+            scene.render.resolution_percentage = 100
+            scene.render.pixel_aspect_x = scene.render.pixel_aspect_y = 1.0
+        return outcome.status
+
+
+_CLASSES = (FITFLARE_OT_save_flare, FITFLARE_OT_apply_flare, FITFLARE_OT_pick_light, FITFLARE_OT_shot_from_picture)
+
+
+def register() -> None:
+    library.register()
+    for cls in _CLASSES:
+        bpy.utils.register_class(cls)
+
+
+def unregister() -> None:
+    for cls in reversed(_CLASSES):
+        bpy.utils.unregister_class(cls)
+    library.unregister()

@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Lights of the capture: added, taken from objects, removed, found."""
+from __future__ import annotations
+
+import bpy
+
+from .. import engine, fits, lights
+from ..reports import reported
+
+
+class FITFLARE_OT_add_light(bpy.types.Operator):
+    """Add a light at the 3D cursor; move it on to the lamp in the footage"""
+
+    bl_idname = "fit_flare.add_light"
+    bl_label = "Add at Cursor"
+    bl_options = {"REGISTER", "UNDO"}
+
+    name: bpy.props.StringProperty(name="Name", description="Name of the light and of its flare's layer",  # type: ignore[valid-type]
+                                   default="light1")
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        with reported(self) as outcome:
+            light = lights.add(context.scene, context.scene.cursor.location, self.name)
+            for item in context.selected_objects:
+                item.select_set(False)
+            light.select_set(True)
+            context.view_layer.objects.active = light
+        return outcome.status
+
+
+class FITFLARE_OT_lights_from_selected(bpy.types.Operator):
+    """Make the selected objects lights: the fit learns a flare for each"""
+
+    bl_idname = "fit_flare.lights_from_selected"
+    bl_label = "From Selected"
+    bl_options = {"REGISTER", "UNDO"}
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        if not context.selected_objects:
+            cls.poll_message_set("Select the objects that are lights first")
+            return False
+        return True
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        taken = {lights.name_of(item) for item in lights.of_scene(context.scene)}
+        made = lights.take(context.selected_objects, taken)
+        self.report({"INFO"}, f"{made} objects are lights now")
+        return {"FINISHED"}
+
+
+class FITFLARE_OT_remove_light(bpy.types.Operator):
+    """Take this light out; an empty that stood for nothing else is deleted"""
+
+    bl_idname = "fit_flare.remove_light"
+    bl_label = "Remove Light"
+    bl_options = {"REGISTER", "UNDO"}
+
+    object: bpy.props.StringProperty(options={"HIDDEN"})  # type: ignore[valid-type]
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        light = context.scene.objects.get(self.object)
+        if light is None:
+            self.report({"ERROR"}, f"The light {self.object!r} is not in this scene any more.")
+            return {"CANCELLED"}
+        light.fit_flare.is_light = False
+        if light.type == "EMPTY" and not light.children:
+            bpy.data.objects.remove(light)
+        return {"FINISHED"}
+
+
+class FITFLARE_OT_find_lights(bpy.types.Operator):
+    """Have the engine look for light sources in the frames; lights that are there already stay"""
+
+    bl_idname = "fit_flare.find_lights"
+    bl_label = "Find in Frames"
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        capture = fits.capture_of(context.scene)
+        if capture is None or not capture.is_dir():
+            cls.poll_message_set("Import a capture first")
+            return False
+        if engine.find() is None:
+            cls.poll_message_set(engine.MISSING)
+            return False
+        return True
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        with reported(self) as outcome:
+            fits.find_lights(context.scene)
+        return outcome.status
+
+
+_CLASSES = (FITFLARE_OT_add_light, FITFLARE_OT_lights_from_selected, FITFLARE_OT_remove_light, FITFLARE_OT_find_lights)
+
+
+def register() -> None:
+    for cls in _CLASSES:
+        bpy.utils.register_class(cls)
+
+
+def unregister() -> None:
+    for cls in reversed(_CLASSES):
+        bpy.utils.unregister_class(cls)

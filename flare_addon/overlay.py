@@ -1,0 +1,406 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The flare over the camera view, drawn by the GPU from what numpy evaluates.
+
+Each Gaussian is a quad. Where light adds, what is soft is drawn small: a Gaussian goes to the coarsest of five
+pictures (full size to 1/16) in which its narrow side is still four texels, so cost is bounded whatever the
+size of a glare. What covers is drawn back to front at full size, over black, as it is baked. The pictures are
+half float and linear; a last pass adds them to the viewport's overlay, which Blender blends in display-linear
+light, so light adds as it does in the baked layers.
+
+Only what the region shows of the frame is drawn, at the region's own pixels, so zoom costs nothing.
+"""
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import bpy
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.errors import FitFlareError
+from ..core.look import PlaneGaussians, pixels
+from ..core.look.drawing import OPACITY_MAX, reach
+from ..core.look.plane import joined
+from . import cameras, looks
+
+LEVELS = (1, 2, 4, 8, 16)
+TEXELS = 4.0  # deviations of a Gaussian's narrow side at the level it is drawn in
+MOST_TEXELS = 1 << 14
+
+Floats = NDArray[np.float32]
+
+problem = ""
+"""What kept the overlay from being drawn last time, for the panel; "" where nothing did."""
+
+_handle: Any = None
+_shaders: dict[str, Any] = {}
+_offscreens: dict[tuple[int, int, int], Any] = {}
+
+
+@dataclass(frozen=True)
+class Frame:
+    """Where the camera's frame lies in a region, in region pixels from its lower left corner."""
+
+    left: float
+    bottom: float
+    width: float
+    height: float
+
+
+@dataclass(frozen=True)
+class Window:
+    """The part of a frame that is drawn: its corner and size in region pixels, and the intrinsics (3, 3) of its
+    pixels, row 0 on top."""
+
+    x: int
+    y: int
+    width: int
+    height: int
+    intrinsics: NDArray[np.float64]
+
+
+def window_of(frame: Frame, region: tuple[int, int], camera: Any) -> Window | None:
+    """What a region of (width, height) pixels shows of a frame; None where it shows nothing.
+
+    camera: the core's camera of the render. The frame is the render's picture, so its pixels are scaled ones.
+    """
+    left, bottom = max(int(np.floor(frame.left)), 0), max(int(np.floor(frame.bottom)), 0)
+    right = min(int(np.ceil(frame.left + frame.width)), region[0])
+    top = min(int(np.ceil(frame.bottom + frame.height)), region[1])
+    if right <= left or top <= bottom or frame.width < 1 or frame.height < 1:
+        return None
+    x, y = frame.width / camera.width, frame.height / camera.height
+    above = frame.bottom + frame.height - top  # from the frame's upper edge down to the window's
+    k = np.array([[camera.fx * x, 0, camera.cx * x + frame.left - left],
+                  [0, camera.fy * y, camera.cy * y + above], [0, 0, 1.0]])
+    return Window(left, bottom, right - left, top - bottom, k)
+
+
+def frame_in(context: Any, scene: Any, camera: Any) -> Frame | None:
+    """The camera's frame in the region of a 3D view that looks through it."""
+    from bpy_extras.view3d_utils import location_3d_to_region_2d
+
+    corners = [location_3d_to_region_2d(context.region, context.region_data, camera.matrix_world.normalized() @ corner)
+               for corner in camera.data.view_frame(scene=scene)]
+    if any(corner is None for corner in corners):
+        return None
+    across, up = [corner.x for corner in corners], [corner.y for corner in corners]
+    return Frame(min(across), min(up), max(across) - min(across), max(up) - min(up))
+
+
+# ---- quads ----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Quads:
+    """Vertices of n quads: place (4n, 2) in the window's pixels, local (4n, 2) in Mahalanobis radii, light
+    (4n, 3) at the peak, ring (4n, 3) r0, w and opacity, and the triangles (2n, 3)."""
+
+    place: Floats
+    local: Floats
+    light: Floats
+    ring: Floats
+    triangles: NDArray[np.uint32]
+
+
+_CORNERS = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], np.float32)
+
+
+def quads(centres: Floats, covariances: Floats, radii: Floats, light: Floats, ring: Floats) -> Quads:
+    """Quads round ellipses: centres (n, 2), covariances (n, 3) px², radii (n,) Mahalanobis, light (n, 3), ring
+    (n, 3); in their order."""
+    xx, xy, yy = covariances.T
+    half, root = (xx + yy) / 2, np.sqrt(((xx - yy) / 2) ** 2 + xy * xy)
+    long, short = np.sqrt(np.maximum(half + root, 0)), np.sqrt(np.maximum(half - root, 0))
+    angle = 0.5 * np.arctan2(2 * xy, xx - yy)
+    axis = np.stack([np.cos(angle), np.sin(angle)], -1)
+    local = _CORNERS[None] * radii[:, None, None]
+    side = np.stack([-axis[:, 1], axis[:, 0]], -1)
+    place = (centres[:, None] + local[..., :1] * (long[:, None] * axis)[:, None]
+             + local[..., 1:] * (short[:, None] * side)[:, None])
+    count = len(centres)
+    index = 4 * np.arange(count, dtype=np.uint32)[:, None, None]
+    triangles = (index + np.array([[0, 1, 2], [0, 2, 3]], np.uint32)).reshape(-1, 3)
+    return Quads(place.reshape(-1, 2).astype(np.float32), local.reshape(-1, 2).astype(np.float32),
+                 np.repeat(light, 4, 0).astype(np.float32), np.repeat(ring, 4, 0).astype(np.float32),
+                 np.ascontiguousarray(triangles, np.uint32))
+
+
+def level_of(covariances: Floats, rings: Floats | None) -> NDArray[np.int64]:
+    """(n,) number of the level in LEVELS that each Gaussian is drawn in, by its narrow side in pixels."""
+    xx, xy, yy = covariances.T
+    half, root = (xx + yy) / 2, np.sqrt(((xx - yy) / 2) ** 2 + xy * xy)
+    narrow = np.sqrt(np.maximum(half - root, 0))
+    if rings is not None:
+        narrow = narrow * np.minimum(rings[:, 1], 1)
+    return np.clip(np.searchsorted(np.array(LEVELS), narrow / TEXELS, side="right") - 1, 0, len(LEVELS) - 1)
+
+
+def inside(centres: Floats, covariances: Floats, radii: Floats, width: int, height: int) -> NDArray[np.bool_]:
+    """(n,) which ellipses touch the picture and are ellipses at all."""
+    xx, xy, yy = covariances.T
+    reach_x, reach_y = radii * np.sqrt(np.maximum(xx, 0)), radii * np.sqrt(np.maximum(yy, 0))
+    x, y = centres.T
+    with np.errstate(invalid="ignore"):
+        return np.asarray((x + reach_x > 0) & (y + reach_y > 0) & (x - reach_x < width) & (y - reach_y < height)
+                          & (xx * yy - xy * xy > 0) & (radii > 0) & np.isfinite(x + y))
+
+
+def levels(gaussians: PlaneGaussians, window: Window, blend: str) -> dict[int, Quads]:
+    """Quads by level (a divisor of the size), those of the level in its own pixels; in drawing order."""
+    centres, covariances = pixels(gaussians, window.intrinsics)
+    radii = reach(gaussians, blend)
+    rows = np.flatnonzero(inside(centres, covariances, radii, window.width, window.height))
+    opacities = gaussians.opacities if blend == "add" else np.minimum(gaussians.opacities, OPACITY_MAX)
+    rings = gaussians.rings
+    if rings is None:
+        rings = np.tile(np.array([0, 1], np.float32), (len(gaussians), 1))
+    light, ring = gaussians.colours * opacities[:, None], np.concatenate([rings, opacities[:, None]], -1)
+    if blend == "over":  # the first lies in front, so it is drawn last
+        rows = rows[::-1]
+        chosen = np.zeros(len(gaussians), np.int64)
+    else:
+        chosen = level_of(covariances, gaussians.rings)
+    made: dict[int, Quads] = {}
+    for number, divisor in enumerate(LEVELS):
+        own = rows[chosen[rows] == number]
+        if len(own):
+            made[divisor] = quads(centres[own] / divisor, covariances[own] / divisor**2, radii[own], light[own],
+                                  ring[own])
+    return made
+
+
+# ---- the GPU --------------------------------------------------------------------------------------
+
+
+def _shader(name: str) -> Any:
+    if name not in _shaders:
+        _shaders[name] = _gaussian_shader() if name == "gaussian" else _sum_shader()
+    return _shaders[name]
+
+
+def _gaussian_shader() -> Any:
+    import gpu
+
+    flow = gpu.types.GPUStageInterfaceInfo("fit_flare_gaussian")
+    flow.smooth("VEC2", "at")
+    flow.flat("VEC3", "shine")
+    flow.flat("VEC3", "hollow")
+    info = gpu.types.GPUShaderCreateInfo()
+    info.push_constant("VEC2", "size")
+    info.push_constant("FLOAT", "covers")
+    info.vertex_in(0, "VEC2", "place")
+    info.vertex_in(1, "VEC2", "local")
+    info.vertex_in(2, "VEC3", "light")
+    info.vertex_in(3, "VEC3", "ring")
+    info.vertex_out(flow)
+    info.fragment_out(0, "VEC4", "result")
+    info.vertex_source("void main() {\n"
+                       "  at = local; shine = light; hollow = ring;\n"
+                       "  vec2 ndc = place / size * 2.0 - 1.0;\n"
+                       "  gl_Position = vec4(ndc.x, -ndc.y, 0.0, 1.0);\n"
+                       "}\n")
+    info.fragment_source("void main() {\n"
+                         "  float away = (sqrt(max(dot(at, at), 1e-12)) - hollow.x) / hollow.y;\n"
+                         "  float profile = exp(-0.5 * away * away);\n"
+                         "  float alpha = covers > 0.5 ? profile * hollow.z : 1.0;\n"
+                         "  if (covers > 0.5 ? alpha < 1.0 / 255.0 : profile < 1.0 / 4096.0) { discard; }\n"
+                         "  result = vec4(shine * profile, alpha);\n"
+                         "}\n")
+    return gpu.shader.create_from_info(info)
+
+
+def _sum_shader() -> Any:
+    import gpu
+
+    flow = gpu.types.GPUStageInterfaceInfo("fit_flare_sum")
+    flow.smooth("VEC2", "at")
+    info = gpu.types.GPUShaderCreateInfo()
+    info.push_constant("VEC4", "box")
+    info.push_constant("VEC2", "extent")
+    info.push_constant("FLOAT", "covers")
+    for number in range(len(LEVELS)):
+        info.sampler(number, "FLOAT_2D", f"level{number}")
+    info.vertex_in(0, "VEC2", "corner")
+    info.vertex_out(flow)
+    info.fragment_out(0, "VEC4", "result")
+    info.vertex_source("void main() {\n"
+                       "  at = corner;\n"
+                       "  gl_Position = vec4(mix(box.xy, box.zw, corner) * 2.0 - 1.0, 0.0, 1.0);\n"
+                       "}\n")
+    # Texels are filtered here, so that it does not depend on how a texture was made. A level rounds its size
+    # up, so its rows are counted from the top, where the picture begins.
+    picked = "".join(f"  sum += pick(level{number}, extent / {divisor}.0);\n" for number, divisor in enumerate(LEVELS))
+    info.fragment_source("vec3 pick(sampler2D picture, vec2 covered) {\n"
+                         "  ivec2 size = textureSize(picture, 0);\n"
+                         "  vec2 where = vec2(at.x * covered.x, float(size.y) - (1.0 - at.y) * covered.y) - 0.5;\n"
+                         "  ivec2 low = ivec2(floor(where));\n"
+                         "  vec2 share = where - vec2(low);\n"
+                         "  ivec2 most = size - 1;\n"
+                         "  vec3 a = texelFetch(picture, clamp(low, ivec2(0), most), 0).rgb;\n"
+                         "  vec3 b = texelFetch(picture, clamp(low + ivec2(1, 0), ivec2(0), most), 0).rgb;\n"
+                         "  vec3 c = texelFetch(picture, clamp(low + ivec2(0, 1), ivec2(0), most), 0).rgb;\n"
+                         "  vec3 d = texelFetch(picture, clamp(low + ivec2(1, 1), ivec2(0), most), 0).rgb;\n"
+                         "  return mix(mix(a, b, share.x), mix(c, d, share.x), share.y);\n"
+                         "}\n"
+                         "void main() {\n"
+                         "  vec3 sum = vec3(0.0);\n" + picked +
+                         "  sum = max(sum, vec3(0.0));\n"
+                         "  if (covers > 0.5) {\n"  # display values to linear light
+                         "    sum = mix(sum / 12.92, pow((sum + 0.055) / 1.055, vec3(2.4)), "
+                         "step(vec3(0.04045), sum));\n"
+                         "  }\n"
+                         "  result = vec4(sum, 1.0);\n"
+                         "}\n")
+    return gpu.shader.create_from_info(info)
+
+
+def _offscreen(divisor: int, width: int, height: int) -> Any:
+    import gpu
+
+    size = max(-(-width // divisor), 1), max(-(-height // divisor), 1)
+    key = (divisor, *size)
+    if key not in _offscreens:
+        for old in [other for other in _offscreens if other[0] == divisor]:
+            _offscreens.pop(old).free()
+        _offscreens[key] = gpu.types.GPUOffScreen(*size, format="RGBA16F")
+    return _offscreens[key]
+
+
+def _batch(made: Quads) -> Any:
+    import gpu
+
+    form = gpu.types.GPUVertFormat()
+    for name, size in (("place", 2), ("local", 2), ("light", 3), ("ring", 3)):
+        form.attr_add(id=name, comp_type="F32", len=size, fetch_mode="FLOAT")
+    buffer = gpu.types.GPUVertBuf(form, len(made.place))
+    for name in ("place", "local", "light", "ring"):
+        buffer.attr_fill(name, np.ascontiguousarray(getattr(made, name)))
+    triangles = gpu.types.GPUIndexBuf(type="TRIS", seq=made.triangles)
+    return gpu.types.GPUBatch(type="TRIS", buf=buffer, elem=triangles)
+
+
+def render(gaussians: PlaneGaussians | None, window: Window, blend: str) -> list[Any]:
+    """Draw Gaussians into the offscreens; returns one for each level, the full size first. Needs a GPU context."""
+    import gpu
+
+    made = {} if gaussians is None else levels(gaussians, window, blend)
+    drawn = []
+    for divisor in LEVELS:
+        offscreen = _offscreen(divisor, window.width, window.height)
+        with offscreen.bind():
+            gpu.state.active_framebuffer_get().clear(color=(0.0, 0.0, 0.0, 0.0))
+            if divisor in made:
+                gpu.state.blend_set("ADDITIVE" if blend == "add" else "ALPHA_PREMULT")
+                gpu.state.depth_test_set("NONE")
+                shader = _shader("gaussian")
+                shader.bind()
+                shader.uniform_float("covers", 0.0 if blend == "add" else 1.0)
+                # The level's own pixels: its last ones may reach past the window's edge.
+                shader.uniform_float("size", (offscreen.width, offscreen.height))
+                _batch(made[divisor]).draw(shader)
+        drawn.append(offscreen)
+    return drawn
+
+
+def add(drawn: list[Any], box: tuple[float, float, float, float], blend: str, window: Window) -> None:
+    """Add rendered levels to the framebuffer that is bound, into box (left, bottom, right, top; 0..1 of it)."""
+    import gpu
+    from gpu_extras.batch import batch_for_shader
+
+    shader = _shader("sum")
+    shader.bind()
+    shader.uniform_float("box", box)
+    shader.uniform_float("extent", (window.width, window.height))
+    shader.uniform_float("covers", 1.0 if blend == "over" else 0.0)
+    for number, offscreen in enumerate(drawn):
+        shader.uniform_sampler(f"level{number}", offscreen.texture_color)
+    corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32)
+    gpu.state.blend_set("ADDITIVE")
+    gpu.state.depth_test_set("NONE")
+    batch_for_shader(shader, "TRI_FAN", {"corner": corners}).draw(shader)
+    gpu.state.blend_set("NONE")
+
+
+def _draw() -> None:
+    global problem
+    context = bpy.context
+    scene, space = context.scene, context.space_data
+    if scene is None or context.region_data is None or context.region_data.view_perspective != "CAMERA":
+        return
+    state = scene.fit_flare
+    camera = space.camera if space.use_local_camera and space.camera else scene.camera
+    wanted = state.show and state.flare and space.overlay.show_overlays
+    if not wanted or camera is None or camera.type != "CAMERA":
+        return
+    try:
+        draw_in(context, scene, camera)
+        problem = ""
+    except FitFlareError as what:
+        problem = str(what)
+
+
+def draw_in(context: Any, scene: Any, camera: Any) -> None:
+    """Draw the scene's flares over the region's camera view. Raises FitFlareError."""
+    import gpu
+
+    depsgraph = context.view_layer.depsgraph
+    evaluated = camera.evaluated_get(depsgraph)
+    core = cameras.core_camera(evaluated.data, evaluated.matrix_world, scene.render)
+    frame = frame_in(context, scene, evaluated)
+    region = context.region.width, context.region.height
+    window = window_of(frame, region, core) if frame is not None else None
+    if window is None:
+        return
+    look = looks.look_of(scene)
+    gaussians = joined(list(looks.seen(scene, depsgraph, camera).values()))
+    if gaussians is None:
+        return
+    drawn = render(gaussians, window, look.blend)
+    viewport = gpu.state.viewport_get()
+    add(drawn, (window.x / region[0], window.y / region[1], (window.x + window.width) / region[0],
+                (window.y + window.height) / region[1]), look.blend, window)
+    gpu.state.viewport_set(*viewport)
+
+
+def picture(scene: Any, depsgraph: Any, camera: Any, width: int, height: int) -> Floats:
+    """The overlay as numbers: (height, width, 3) scene-linear, row 0 on top. Needs a GPU context."""
+    import gpu
+
+    evaluated = camera.evaluated_get(depsgraph)
+    core = cameras.core_camera(evaluated.data, evaluated.matrix_world, scene.render)
+    window = window_of(Frame(0, 0, width, height), (width, height), core)
+    assert window is not None
+    look = looks.look_of(scene)
+    gaussians = joined(list(looks.seen(scene, depsgraph, camera).values()))
+    drawn = render(gaussians, window, look.blend)
+    target = gpu.types.GPUOffScreen(width, height, format="RGBA32F")
+    try:
+        with target.bind():
+            buffer = gpu.state.active_framebuffer_get()
+            buffer.clear(color=(0.0, 0.0, 0.0, 0.0))
+            add(drawn, (0, 0, 1, 1), look.blend, window)
+            pixels_ = buffer.read_color(0, 0, width, height, 4, 0, "FLOAT")
+    finally:
+        target.free()
+    pixels_.dimensions = width * height * 4
+    return np.array(pixels_, np.float32).reshape(height, width, 4)[::-1, :, :3]
+
+
+def register() -> None:
+    global _handle
+    if not bpy.app.background:
+        _handle = bpy.types.SpaceView3D.draw_handler_add(_draw, (), "WINDOW", "POST_VIEW")
+
+
+def unregister() -> None:
+    global _handle, problem
+    if _handle is not None:
+        bpy.types.SpaceView3D.draw_handler_remove(_handle, "WINDOW")
+        _handle = None
+    for offscreen in _offscreens.values():
+        offscreen.free()
+    _offscreens.clear()
+    _shaders.clear()
+    problem = ""

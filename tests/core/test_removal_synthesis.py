@@ -1,0 +1,191 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Image formation and synthesised flares: optics that can be checked by hand, and what a seed promises."""
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from core.errors import SettingsError
+from core.pictures import write_png
+from core.removal import formation, pairs
+from core.removal.backgrounds import Backgrounds, kept_for_test, read_backgrounds
+from core.removal.bank import Mixed, OwnFlares, SynthesisBank
+from core.removal.synthesis import prescription as lenses
+from core.removal.synthesis.layers import CLASSES, Flare, flare
+
+ROOT = Path(__file__).resolve().parents[2]
+SIZE = 96
+
+# A plano-convex lens behind a stop: f = r / (n - 1) = 60 mm.
+SIMPLE = """
+stop  2.0  1.0  0     10  0
+30    4.0  1.5  60    20  1
+0     58   1.0  0     20  0
+"""
+
+
+def test_flare_adds_in_light() -> None:
+    scene, glow = np.full((2, 2, 3), 0.5, np.float32), np.full((2, 2, 3), 0.4, np.float32)
+    assert formation.form(scene, glow, 2.0) == pytest.approx(np.sqrt(0.25 + 0.16), abs=1e-6)
+    assert formation.form(scene, np.ones_like(scene), 2.2) == pytest.approx(1.0)
+    assert formation.form(scene, np.zeros_like(scene), 1.8) == pytest.approx(0.5, abs=1e-6)
+
+
+def test_coverage_is_the_share_of_the_frame_that_holds_the_energy() -> None:
+    layer = np.zeros((10, 10, 3), np.float32)
+    assert formation.coverage(layer) == 0
+    layer[0, 0] = 1
+    assert formation.coverage(layer) == 0.01
+    assert formation.coverage(np.ones((10, 10, 3), np.float32)) == 0.9
+
+
+def test_a_lens_is_read_and_has_its_focal_length() -> None:
+    lens = lenses.parse_prescription(SIMPLE, "simple")
+    assert lens.focal_length() == pytest.approx(60)
+    assert lens.stop == 0
+    assert lens.indices(lenses.F)[1] > lens.indices(lenses.C)[1], "glass bends blue more"
+
+
+@pytest.mark.parametrize(("text", "says"), [("", "not a lens"), ("1 2 3\n", "line 1"), ("30 4 1.5 60 20\n" * 3, "stop"),
+                                            ("stop 1 nan 0 5\n", "line 1"), ("30 4 1.5 60 -2\n", "line 1")])
+def test_what_is_no_lens_is_told(text: str, says: str) -> None:
+    with pytest.raises(SettingsError, match=says):
+        lenses.parse_prescription(text, "bad")
+
+
+def test_the_one_ghost_of_a_single_lens() -> None:
+    """By hand: reflected at the plane and then at the sphere from inside, mirrors of power 0 and 2 n / r."""
+    lens = lenses.parse_prescription(SIMPLE, "simple")
+    (ghost,) = lenses.ghosts(lens)
+    assert ghost.surfaces == (1, 2)
+    n, r, thick = lens.indices(lenses.WAVELENGTHS[1])[1], 30.0, 4.0
+    height, slope = 1.0, 0.0
+    slope -= (n - 1) / r * height       # in, reduced slope
+    height += 2 * thick / n * slope     # to the plane and back
+    slope -= 2 * n / r * height         # the sphere, concave from inside
+    height += thick / n * slope
+    focus = 60 - thick / 1.5            # behind the plane, at the d line
+    assert ghost.sensor[1, 0] == pytest.approx(height + focus * slope, rel=1e-6)
+    assert ghost.stop[1] == pytest.approx([1, 0])
+
+
+def test_reflectance_of_glass_and_of_its_coating() -> None:
+    air, glass, waves = np.ones(1), np.full(1, 1.5), np.full(1, 0.55)
+    assert lenses.reflectance(air, glass, waves, 0)[0] == pytest.approx(0.04)
+    assert lenses.reflectance(air, glass, waves, 0.55)[0] < 0.015
+    assert lenses.reflectance(air, glass, np.full(1, 0.4), 0.55)[0] > lenses.reflectance(air, glass, waves, 0.55)[0]
+
+
+def test_the_lenses_in_the_project_are_photographic() -> None:
+    assert [round(lens.focal_length()) for lens in lenses.built_in()] == [50, 51, 20, 28, 100, 20]
+
+
+@pytest.mark.parametrize("kind", CLASSES)
+def test_a_flare_is_light_and_its_seed_alone(kind: str) -> None:
+    one, again = (flare((3, 5), SIZE, lenses.built_in(), kind) for _ in range(2))
+    assert one.kind == kind
+    for layer in (one.rest, one.glare, one.light):
+        assert layer.shape == (SIZE, SIZE, 3)
+        assert layer.dtype == np.float32
+        assert np.isfinite(layer).all()
+        assert layer.min() >= 0
+    assert one.whole.max() > 1e-3
+    assert np.array_equal(one.whole, again.whole)
+    assert not np.array_equal(one.whole, flare((3, 6), SIZE, lenses.built_in(), kind).whole)
+
+
+def test_flares_span_small_to_full_frame() -> None:
+    covered = [formation.coverage(flare((11, k), SIZE, lenses.built_in()).whole) for k in range(60)]
+    assert min(covered) < 0.02
+    assert max(covered) > 0.7
+
+
+def test_synthesis_shares_nothing_with_the_sample_scenes() -> None:
+    for path in (ROOT / "core" / "removal").rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            names = ([alias.name for alias in node.names] if isinstance(node, ast.Import)
+                     else [node.module or ""] if isinstance(node, ast.ImportFrom) else [])
+            assert not any("sample_scenes" in name for name in names), path
+
+
+class Single:
+    """A bank of one flare."""
+
+    def __init__(self, made: Flare) -> None:
+        self.made = made
+
+    def draw(self, random: np.random.Generator) -> pairs.Layers:
+        del random
+        return pairs.Layers(self.made.rest, self.made.glare, self.made.light, self.made.lights)
+
+
+def backgrounds() -> Backgrounds:
+    random = np.random.default_rng(0)
+    return Backgrounds([random.integers(0, 256, (80, 120, 3), np.uint8)], [])
+
+
+def test_pairs_are_brighter_with_flare_and_keep_the_light() -> None:
+    bank = Single(flare((2, 0), 128, lenses.built_in(), "scatter"))
+    made = [pairs.pair(np.random.default_rng(k), bank, backgrounds(), 96, 64, clean=0) for k in range(12)]
+    for one in made:
+        assert one.frame.shape == one.scene.shape == one.gentle.shape == (64, 96, 3)
+        assert one.frame.min() >= 0 and one.frame.max() <= 1
+        assert (one.gentle - one.scene).min() > -1e-4, "the glow only adds"
+        assert (one.frame - one.scene).mean() > -0.01
+    again = pairs.pair(np.random.default_rng(3), bank, backgrounds(), 96, 64, clean=0)
+    assert np.array_equal(again.frame, made[3].frame)
+
+
+def test_a_share_of_the_pairs_is_clean() -> None:
+    bank = Single(flare((2, 0), 128, lenses.built_in(), "glare"))
+    one = pairs.pair(np.random.default_rng(1), bank, backgrounds(), 96, 64, clean=1)
+    assert np.array_equal(one.frame, one.scene)
+
+
+def test_a_bank_is_renewed_as_if_never_stopped() -> None:
+    through, later = (SynthesisBank(4, 3, SIZE, lenses.built_in()) for _ in range(2))
+    for serial in range(3, 6):
+        through.renew_to(serial)
+    assert later.renew_to(5) == 3
+    for seed in range(6):
+        a, b = (bank.draw(np.random.default_rng(seed)) for bank in (through, later))
+        assert np.array_equal(a.rest, b.rest)
+    with pytest.raises(SettingsError, match="empty"):
+        SynthesisBank(4, 3, SIZE, []).draw(np.random.default_rng(0))
+
+
+def test_own_flares_with_their_lights(tmp_path: Path) -> None:
+    with pytest.raises(SettingsError, match="no flare layers"):
+        OwnFlares(tmp_path, SIZE)
+    picture = np.zeros((40, 60, 3))
+    picture[10:30, 20:40] = 0.5
+    light = np.zeros((40, 60, 3))
+    picture[18:22, 28:32] = light[18:22, 28:32] = 1
+    write_png(tmp_path / "Scattering_Flare" / "Compound_Flare" / "1.png", picture)
+    write_png(tmp_path / "Scattering_Flare" / "Light_Source" / "1.png", light)
+    own = OwnFlares(tmp_path, SIZE)
+    assert len(own) == 1
+    layers = own.draw(np.random.default_rng(0))
+    assert layers.light.max() > 1
+    assert layers.lights[0] == pytest.approx((0, 0), abs=0.06)
+    middle = SIZE // 2
+    assert layers.rest[middle, middle].max() < 0.05, "the light is not flare"
+    mixed = Mixed(Single(flare((2, 0), SIZE, lenses.built_in(), "rings")), own, 1.0)
+    assert np.array_equal(mixed.draw(np.random.default_rng(0)).light, layers.light)
+
+
+def test_backgrounds_of_folders(tmp_path: Path) -> None:
+    with pytest.raises(SettingsError, match="no pictures"):
+        read_backgrounds([tmp_path])
+    for k in range(30):
+        write_png(tmp_path / f"{k}.png", np.random.default_rng(k).random((64, 80, 3)))
+    names = [path.name for path in tmp_path.iterdir()]
+    both = [len(read_backgrounds([tmp_path], part).photos) for part in ("train", "test")]
+    assert sum(both) == 30
+    assert both[1] == sum(map(kept_for_test, names)) > 0
+    drawn = read_backgrounds([tmp_path]).draw(np.random.default_rng(0), 48, 32, 2.2)
+    assert drawn.shape == (32, 48, 3)
+    assert drawn.dtype == np.float32

@@ -19,7 +19,7 @@ import torch
 from numpy.typing import NDArray
 
 from ..errors import SettingsError
-from ..pictures import Encoding
+from ..pictures import Encoding, linear_from_srgb
 from .network import GAMMA, MULTIPLE, RemovalNetwork, decoded, inputs
 from .plates import Plate
 from .weights import IN_THE_BOX, load
@@ -68,7 +68,7 @@ class Remover:
         if not found.empty:
             for rows, light in carried_up(found, plate.codes, plate.encoding, plate.top):
                 codes[rows] = _less(plate.codes[rows], light, plate.encoding, plate.top)
-                flare[rows] = np.minimum(light, 65504)
+                flare[rows] = _taken(plate.codes[rows], codes[rows], light, plate.encoding, plate.top)
         return codes, flare
 
     def clean_display(self, display: Pixels) -> Pixels:
@@ -197,3 +197,11 @@ def _less(codes: NDArray[Any], flare: Pixels, encoding: Encoding, top: float) ->
     else:
         new = light.astype(codes.dtype)
     return np.where((flare > 0) & np.isfinite(codes), new, codes)
+
+
+def _taken(codes: NDArray[Any], less: NDArray[Any], flare: Pixels, encoding: Encoding, top: float) -> Pixels:
+    """Scene-linear light between the two: of integer codes by the curve that pictures are shown with."""
+    if encoding == "linear":
+        return np.minimum(flare, 65504)
+    before, after = (linear_from_srgb(part.astype(np.float32) / np.float32(top)) for part in (codes, less))
+    return np.where(flare > 0, before - after, 0)

@@ -102,7 +102,7 @@ def _read_exr(path: Path) -> Plate:
 def write_plate(path: Path | str, plate: Plate, codes: NDArray[Any], quality: int = 97) -> None:
     """Write `codes` in the kind and depth of `plate`, with all that belongs to it, to a path of its suffix."""
     path = Path(path)
-    if plate.path.suffix.lower() == ".exr":
+    if "channels" in plate.rest:
         _write_exr(path, plate, codes)
         return
     import cv2

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ...core.progress import Progress
 from ..command import Command, Step
+
+if TYPE_CHECKING:
+    from ...core.capture import Capture
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -31,6 +34,20 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     size = WORKING_SIZE if words.working_size is None else words.working_size
     remover = Remover(words.weights, working_size=size, keep_glare=words.keep_glare)
     return remove_all(words.plates, words.out, remover, progress, flare_folder=words.flare, overwrite=words.overwrite)
+
+
+def with_removed(capture: Capture, progress: Progress) -> Capture:
+    """The capture with its flare-free frames, which are made and written into its folder if it has none."""
+    from ...core.capture import Capture
+    from ...core.removal.captured import remove_from
+    from ...core.removal.inference import Remover
+
+    if capture.has_removed:
+        return capture
+    progress.say(f"{capture.folder} has no removed/: the flares are taken out of its frames, and what comes of that is "
+                 "kept there.")
+    remove_from(capture, Remover(), progress)
+    return Capture.open(capture.folder)
 
 
 COMMAND = Command(

@@ -19,10 +19,14 @@ BLENDS = ("over", "add")
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("capture", type=Path, metavar="CAPTURE",
+    parser.add_argument("capture", type=Path, metavar="CAPTURE", nargs="?",
                         help="folder with images/, sparse/0/ (or transforms.json), removed/ or truth/scene/, and "
                              "lights.json; lights are found and written there if it is missing")
     parser.add_argument("--out", type=Path, required=True, metavar="RUN", help="folder for the run")
+    parser.add_argument("--list", type=Path, metavar="FILE", dest="listed",
+                        help="a text file with a capture's folder on each line, instead of CAPTURE; with --entry, for "
+                             "farms: --out is then the folder of the runs, each under its capture's name")
+    parser.add_argument("--entry", type=int, metavar="N", help="which line of --list, from 1")
     parser.add_argument("--resume", action="store_true",
                         help="go on with the run in --out, with the settings it was begun with; begin it if there is "
                              "none")
@@ -54,6 +58,7 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     from ...core.fit import fit
     from ...core.fit.settings import changed, preset
 
+    folder, out = place(words)
     given = {"model": words.model} if words.model else {}
     settings = preset(words.preset, mode=words.mode, blend=words.blend, iterations=words.iterations, **given)
     changes = {"width": words.size, "seed": words.seed, "holdout": holdout(words.holdout)}
@@ -64,12 +69,31 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     changes["scene.frozen"] = words.freeze_scene or None
     changes = {name: value for name, value in changes.items() if value is not None}
     settings = changed(settings, {**changes, **dict(map(change, words.changes))})
-    capture = Capture.open(words.capture)
+    capture = Capture.open(folder)
     if settings.mode != "3dgs":
         capture = with_lights(capture, progress)
-    done = fit(capture, settings, words.out, progress, resume=words.resume)
+    done = fit(capture, settings, out, progress, resume=words.resume)
     progress.say(f"The run is in {done.folder}: see preview.png there, then `eval` and `bake` it.")
     return {"run": str(done.folder)}
+
+
+def place(words: argparse.Namespace) -> tuple[Path, Path]:
+    """The capture's folder, and the run's."""
+    if words.listed is None:
+        if words.capture is None:
+            raise SettingsError("fit needs a capture: name its folder, or a list of them with --list and --entry.")
+        return words.capture, words.out
+    try:
+        lines = words.listed.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as problem:
+        raise SettingsError(f"{words.listed} cannot be read ({problem}); it should list a folder a line.") from problem
+    folders = [words.listed.parent / line.strip() for line in lines if line.strip() and not line.startswith("#")]
+    if words.entry is None or not 1 <= words.entry <= len(folders):
+        raise SettingsError(f"{words.listed} lists {len(folders)} captures; --entry {words.entry} is none of them.")
+    names = [folder.name for folder in folders]
+    chosen = folders[words.entry - 1]
+    name = chosen.name if names.count(chosen.name) == 1 else f"{words.entry:03d}_{chosen.name}"
+    return chosen, words.out / name
 
 
 def holdout(text: str | None) -> str | int | None:

@@ -1,0 +1,141 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The farm's templates are valid, run chunk by chunk, and a task that was killed and run again leaves the same files.
+
+Checked and run by openjd-cli, which does what a farm's worker does.
+"""
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+
+from core.bake.bake import read_record
+from core.capture import Capture
+from core.fit import fit, preset
+from core.fit.settings import changed
+
+ROOT = Path(__file__).resolve().parents[2]
+RUN = ROOT / "headless" / "run.py"
+TEMPLATES = sorted((ROOT / "headless" / "farm").glob("*.yaml"))
+FRAMES = "0-8"
+
+openjd = pytest.importorskip("openjd.cli", reason="openjd-cli is not installed")
+
+
+@pytest.fixture(scope="module")
+def made(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run, hardly fitted, of the tiny capture."""
+    settings = changed(preset("draft", iterations=3), {"flare.count": 20, "holdout": 0})
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    folder = fit(Capture.open(capture), settings, tmp_path_factory.mktemp("run") / "run").folder
+    torch.set_num_threads(before)
+    return folder
+
+
+def job(template: str, step: str, *options: str, **parameters: object) -> str:
+    """Run a step as `openjd run` does; its log."""
+    words = [sys.executable, "-m", "openjd", "run", str(ROOT / "headless" / "farm" / template), "--step", step]
+    for name, value in {"RunScript": RUN, "Python": sys.executable, **parameters}.items():
+        words += ["-p", f"{name}={value}"]
+    ended = subprocess.run([*words, *options], capture_output=True, text=True, timeout=300, check=False,
+                           env={**os.environ, "OMP_NUM_THREADS": "1"})
+    assert ended.returncode == 0, ended.stdout[-3000:] + ended.stderr[-2000:]
+    return ended.stdout
+
+
+def contents(folder: Path) -> dict[str, str]:
+    """Every file below a folder, hidden ones too, and the hash of what is in it."""
+    return {path.relative_to(folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
+            for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+@pytest.fixture(scope="module")
+def whole(capture: Path, made: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """All frames by one command: what any number of tasks must come to."""
+    out = tmp_path_factory.mktemp("whole") / "layers"
+    subprocess.run([sys.executable, RUN, "bake", made, "--capture", capture, "--out", out, "--set", "*.intensity=1"],
+                   check=True, capture_output=True, timeout=300, env={**os.environ, "OMP_NUM_THREADS": "1"})
+    return out
+
+
+@pytest.mark.parametrize("template", TEMPLATES, ids=lambda path: path.stem)
+def test_templates_are_valid(template: Path) -> None:
+    ended = subprocess.run([sys.executable, "-m", "openjd", "check", template], capture_output=True, text=True,
+                           timeout=120, check=False)
+    assert ended.returncode == 0, ended.stdout + ended.stderr
+
+
+def test_there_is_a_template_for_each_job() -> None:
+    assert {path.stem for path in TEMPLATES} == {"bake", "fit", "remove", "transfer"}
+
+
+def test_three_chunks_make_what_one_command_makes(capture: Path, made: Path, whole: Path, tmp_path: Path) -> None:
+    """In any order, and one of them twice."""
+    parameters = {"Run": made, "Capture": capture, "Out": tmp_path / "out", "Frames": FRAMES, "FramesPerTask": 3}
+    chunks = json.dumps([{"Frame": text} for text in ("6-8", "0-2", "3-5", "0-2")])
+    log = job("bake.yaml", "Bake", "--tasks", chunks, **parameters)
+    assert re.findall(r"openjd_progress: (\d+)", log).count("100") == 4
+    assert "openjd_status: bake 0/3" in log
+    assert contents(tmp_path / "out") == contents(whole)
+
+
+def test_a_task_that_is_killed_and_run_again_leaves_the_same_files(capture: Path, made: Path, whole: Path,
+                                                                  tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    words = [sys.executable, RUN, "bake", made, "--capture", capture, "--out", out, "--set", "*.intensity=1",
+             "--frames", FRAMES, "--progress", "openjd"]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    task = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=environment)
+    begun = time.monotonic()
+    while len(list(out.glob("layers.*.exr"))) < 3 and time.monotonic() - begun < 120:
+        time.sleep(0.001)
+    task.send_signal(getattr(signal, "SIGKILL", signal.SIGTERM))
+    task.wait(timeout=60)
+    assert 3 <= len(list(out.glob("layers.*.exr"))) < 9, "it was not killed half way"
+    # What a kill in the middle of writing leaves: a file begun, a frame cut short, a list without it.
+    (out / ".partial-layers.0006.exr-x.exr").write_bytes(b"half")
+    (out / "layers.0007.exr").write_bytes((whole / "layers.0007.exr").read_bytes()[:500])
+    again = subprocess.run(words, capture_output=True, text=True, timeout=300, check=False, env=environment)
+    assert again.returncode == 0, again.stderr
+    found = contents(out)
+    assert found == contents(whole)
+
+
+def test_several_processes_share_the_frames(capture: Path, made: Path, whole: Path, tmp_path: Path) -> None:
+    ended = subprocess.run([sys.executable, RUN, "bake", made, "--capture", capture, "--out", tmp_path / "out", "--set",
+                            "*.intensity=1", "--jobs", "2", "--progress", "json"], capture_output=True, text=True,
+                           timeout=300, check=False)
+    assert ended.returncode == 0, ended.stderr
+    assert contents(tmp_path / "out") == contents(whole)
+    assert len(read_record(tmp_path / "out")["frames"]) == 9
+
+
+def test_a_job_that_fails_says_why_and_stops_the_others(capture: Path, made: Path, tmp_path: Path) -> None:
+    (tmp_path / "out").write_text("a file where the folder should be")
+    ended = subprocess.run([sys.executable, RUN, "bake", made, "--capture", capture, "--out", tmp_path / "out",
+                            "--jobs", "2", "--progress", "openjd"], capture_output=True, text=True, timeout=300,
+                           check=False)
+    assert ended.returncode == 1
+    assert "openjd_fail: The system refused" in ended.stdout
+
+
+def test_fits_over_a_list_of_captures(capture: Path, tmp_path: Path) -> None:
+    listed = tmp_path / "captures.txt"
+    listed.write_text(f"# the shoot\n{capture}\n{tmp_path / 'absent'}\n")
+    job("fit.yaml", "Fit", "--tasks", '[{"Entry": "1"}]', Captures=listed, Entries="1-2", Out=tmp_path / "runs",
+        Preset="draft", Set="iterations=3")
+    assert (tmp_path / "runs" / capture.name / "flare.flare").is_file()
+    ended = subprocess.run([sys.executable, RUN, "fit", "--list", listed, "--entry", "3", "--out", tmp_path / "runs"],
+                           capture_output=True, text=True, timeout=120, check=False)
+    assert ended.returncode == 1
+    assert "lists 2 captures; --entry 3 is none of them" in ended.stderr

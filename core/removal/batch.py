@@ -2,7 +2,7 @@
 """Removal of many plates: one after the other, past those that cannot be read, resumable."""
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Container, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -39,13 +39,18 @@ def plates_of(inputs: Iterable[Path]) -> list[tuple[Path, Path]]:
 
 
 def remove_all(inputs: Sequence[Path], folder: Path, remover: Remover, progress: Progress, *,
-               flare_folder: Path | None = None, overwrite: bool = False) -> dict[str, Any]:
+               flare_folder: Path | None = None, overwrite: bool = False,
+               wanted: Container[Path] | None = None) -> dict[str, Any]:
     """Clean every plate into `folder`; a plate whose result is there and newer is left as it is.
+
+    wanted: names below the output folder of those to be cleaned; None for all.
 
     Raises SettingsError before anything is written, and FrameError after everything was tried, with a list of
     the plates that failed.
     """
     plates = plates_of(inputs)
+    if wanted is not None:
+        plates = [(path, name) for path, name in plates if name in wanted]
     for path, name in plates:
         if (folder / name).resolve() == path.resolve():
             raise SettingsError(f"{path} would be overwritten by its own result; choose another folder with --out.")

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from ..command import Command
-from . import bake, compose, demo, engine, evaluate, fit, lights, solve
+from . import bake, compose, demo, engine, eval_removal, evaluate, export, fit, lights, remove, solve, train_removal
 
-_MODULES = (demo, solve, lights, fit, evaluate, bake, compose, engine)
+_MODULES = (demo, solve, lights, remove, fit, evaluate, bake, compose, export,
+            train_removal, eval_removal, engine)
 
 COMMANDS: dict[str, Command] = {module.COMMAND.name: module.COMMAND for module in _MODULES}

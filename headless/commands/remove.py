@@ -18,6 +18,8 @@ def arguments(parser: argparse.ArgumentParser) -> None:
                         help="pictures (PNG, JPEG, TIFF, EXR), or folders of them")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR",
                         help="folder for the clean plates, under the names that the plates have")
+    parser.add_argument("--frames", metavar="A-B",
+                        help="frame numbers, such as 1-20,31, of those in the plates' names; all where not given")
     parser.add_argument("--flare", type=Path, metavar="DIR", help="write the flares too, as EXR in linear light")
     parser.add_argument("--keep-glare", action="store_true", help="leave the glow round the lights")
     parser.add_argument("--working-size", type=int, metavar="PIXELS",
@@ -28,12 +30,18 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
-    from ...core.removal.batch import remove_all
+    from ...core.bake.frames import chosen, numbered
+    from ...core.removal.batch import plates_of, remove_all
     from ...core.removal.inference import WORKING_SIZE, Remover
 
     size = WORKING_SIZE if words.working_size is None else words.working_size
     remover = Remover(words.weights, working_size=size, keep_glare=words.keep_glare)
-    return remove_all(words.plates, words.out, remover, progress, flare_folder=words.flare, overwrite=words.overwrite)
+    wanted = None
+    if words.frames is not None:
+        names = [name.as_posix() for _, name in plates_of(words.plates)]
+        wanted = {Path(frame.view) for frame in chosen(numbered(names), words.frames)}
+    return remove_all(words.plates, words.out, remover, progress, flare_folder=words.flare, overwrite=words.overwrite,
+                      wanted=wanted)
 
 
 def with_removed(capture: Capture, progress: Progress) -> Capture:

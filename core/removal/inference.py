@@ -87,7 +87,7 @@ class Remover:
         """Linear flare of a picture of display values 0..1 at the network's size; exactly 0 where it is none."""
         frame = torch.from_numpy(np.ascontiguousarray(display.transpose(2, 0, 1)))[None]
         told = self.network(inputs(frame).to(memory_format=torch.channels_last))
-        code = told.gentle if self.keep_glare else told.flare
+        code = (told.gentle if self.keep_glare else told.flare).clamp(min=0)
         # A ramp from nothing to the whole, so that a faint flare has no rim.
         code = code * ((code - LEAST) / LEAST).clamp(0, 1)
         light = torch.where(code > 0, decoded(code), 0.0).minimum(frame**GAMMA)

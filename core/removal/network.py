@@ -31,7 +31,12 @@ _EPSILON = 1e-3
 
 
 class Prediction(NamedTuple):
-    """(n, 3, h, w) encoded flare, and the same without the glow round the lights; both >= 0."""
+    """(n, 3, h, w) encoded flare, and the same without the glow round the lights.
+
+    Below 0 where the network is in doubt the other way; who uses it counts that as none. An activation that
+    cannot go below 0 has no slope there, and a network that begins with "no flare", which is most often right,
+    would never leave it.
+    """
 
     flare: Tensor
     gentle: Tensor
@@ -43,8 +48,8 @@ def encoded(light: Tensor) -> Tensor:
 
 
 def decoded(code: Tensor) -> Tensor:
-    """The inverse of `encoded`, for code >= 0."""
-    return torch.square(code.clamp(min=0) + _EPSILON**0.5) - _EPSILON
+    """The inverse of `encoded`, continued below 0 as an odd function."""
+    return torch.sign(code) * (torch.square(code.abs() + _EPSILON**0.5) - _EPSILON)
 
 
 def inputs(display: Tensor) -> Tensor:
@@ -102,7 +107,7 @@ class RemovalNetwork(nn.Module):
                                 for width, depth in zip(widths[:-1], depths[:-1], strict=True))
         self.head = nn.Conv2d(widths[0], 6 * FOLD**2, 3, padding=1)
         nn.init.normal_(self.head.weight, std=1e-3)
-        nn.init.constant_(self.head.bias, -0.05)  # type: ignore[arg-type]
+        nn.init.zeros_(self.head.bias)  # type: ignore[arg-type]
 
     def forward(self, x: Tensor) -> Prediction:
         """x: (n, 10, h, w) as `inputs` makes it, h and w multiples of MULTIPLE."""
@@ -117,7 +122,7 @@ class RemovalNetwork(nn.Module):
         for level in reversed(range(len(self.grow))):
             x = self.up[level](self.grow[level](F.relu(x)) + kept[level])
         out = F.pixel_shuffle(self.head(F.relu(x)), FOLD).float()
-        flare = F.softplus(out[:, :3], beta=40)
+        flare = out[:, :3]
         return Prediction(flare, flare * torch.sigmoid(8 * out[:, 3:] + 1))
 
 

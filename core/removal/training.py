@@ -125,7 +125,7 @@ class Trainer:
                 frame, scene = self._stack([one.frame]), self._stack([one.scene])
                 with torch.autocast(self.device.type, torch.bfloat16, enabled=self.recipe.half):
                     told = network(inputs(frame).to(memory_format=torch.channels_last))
-                clean = cleaned(frame, told.flare)
+                clean = cleaned(frame, told.flare.clamp(min=0))
                 after = (clean - encoded(torch.square(scene))).square().mean()
                 before = (encoded(torch.square(frame)) - encoded(torch.square(scene))).square().mean()
                 values.append(float(10 * torch.log10((before + 1e-8) / (after + 1e-8))))

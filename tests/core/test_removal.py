@@ -1,0 +1,321 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Removal of flares from plates: what is kept, what is taken, and what cannot be read."""
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import cv2
+import numpy as np
+import OpenEXR
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from core.errors import FrameError, RunError, SettingsError
+from core.pictures import read_exr, read_picture, write_exr, write_png
+from core.progress import Progress
+from core.removal import inference, weights
+from core.removal.batch import plates_of, remove_all
+from core.removal.inference import FlareMap, Remover, carried_up
+from core.removal.network import RemovalNetwork, cleaned, decoded, encoded, inputs
+from core.removal.plates import read_plate, write_plate
+from core.removal.recipe import Recipe, as_dict
+
+TINY = Recipe(widths=(8, 8, 8, 8), depths=(1, 1, 1, 1))
+
+
+def network_file(path: Path, seed: int = 0, bias: float = 0.0) -> Path:
+    """A small network of random weights; `bias` makes it see flare everywhere (> 0) or nowhere (< 0)."""
+    torch.manual_seed(seed)
+    network = RemovalNetwork(TINY.widths, TINY.depths)
+    with torch.no_grad():
+        network.head.weight.mul_(30)
+        network.head.bias[:48] = bias
+    weights.write(path, {name: value.half() for name, value in network.state_dict().items()},
+                  {"recipe": json.dumps(as_dict(TINY)), "iteration": "0"})
+    return path
+
+
+@pytest.fixture(scope="module")
+def everywhere(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Weights that see a flare in every pixel."""
+    return network_file(tmp_path_factory.mktemp("weights") / "everywhere.safetensors", bias=0.2)
+
+
+@pytest.fixture(scope="module")
+def nowhere(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Weights that never see one."""
+    return network_file(tmp_path_factory.mktemp("weights") / "nowhere.safetensors", bias=-1.0)
+
+
+def picture(height: int = 60, width: int = 90, top: int = 255, dtype: type = np.uint8) -> NDArray[np.generic]:
+    random = np.random.default_rng(height)
+    smooth = cv2.resize(random.random((6, 9, 3)), (width, height), interpolation=cv2.INTER_CUBIC).clip(0, 1)
+    return (smooth * top).astype(dtype)
+
+
+def write_codes(path: Path, codes: NDArray[np.generic]) -> Path:
+    assert cv2.imwrite(str(path), codes[..., ::-1] if codes.ndim == 3 and codes.shape[2] == 3 else codes)
+    return path
+
+
+# The network.
+
+
+def test_encoded_light_and_back() -> None:
+    light = torch.tensor([0.0, 1e-4, 0.3, 1.0, 7.0])
+    torch.testing.assert_close(decoded(encoded(light)), light, atol=1e-5, rtol=1e-5)
+    assert abs(float(encoded(torch.zeros(1)))) < 1e-7
+
+
+def test_the_network_sees_the_frame_turned_about_its_middle() -> None:
+    frame = torch.rand(1, 3, 32, 64)
+    seen = inputs(frame)
+    assert seen.shape == (1, 10, 32, 64)
+    assert torch.equal(seen[:, 4:7, 3, 5], frame[:, :, 28, 58])
+    assert seen[0, 8].abs().max() < 1 and seen[0, 8, 0, 0] == -seen[0, 8, 0, -1]
+
+
+def test_no_flare_leaves_the_frame() -> None:
+    frame = torch.rand(1, 3, 8, 8)
+    torch.testing.assert_close(cleaned(frame, torch.zeros_like(frame)), encoded(frame**2))
+
+
+@pytest.mark.parametrize("size", [(32, 32), (64, 128)])
+def test_the_network_is_fully_convolutional(size: tuple[int, int]) -> None:
+    told = RemovalNetwork(TINY.widths, TINY.depths)(inputs(torch.rand(2, 3, *size)))
+    assert told.flare.shape == told.gentle.shape == (2, 3, *size)
+
+
+def test_weights_keep_their_recipe_and_damage_is_told(tmp_path: Path, everywhere: Path) -> None:
+    assert weights.load(everywhere).widths == TINY.widths
+    with pytest.raises(RunError, match="missing"):
+        weights.read(tmp_path / "none.safetensors")
+    (tmp_path / "bad.safetensors").write_bytes(b"no weights")
+    with pytest.raises(RunError, match="damaged"):
+        weights.read(tmp_path / "bad.safetensors")
+    weights.write(tmp_path / "other.safetensors", {"a": torch.zeros(2)}, {})
+    with pytest.raises(RunError, match="no weights of the removal network"):
+        weights.load(tmp_path / "other.safetensors")
+
+
+# Carried up.
+
+
+def test_a_flat_flare_is_taken_in_light(everywhere: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    remover = Remover(everywhere, working_size=64)
+    monkeypatch.setattr(remover, "flare", lambda display: np.full_like(display, 0.1))
+    codes = np.full((300, 200, 3), 180, np.uint8)
+    clean = np.asarray(_remove(remover, codes))
+    expected = np.sqrt((180 / 255) ** 2 - 0.1) * 255
+    assert np.abs(clean.astype(float) - expected).max() < 1
+
+
+def test_edges_of_the_plate_stay_sharp(everywhere: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A flare that the frame clips has the light's edge in it; it must come up as sharp as the plate has it."""
+    remover = Remover(everywhere, working_size=64)
+    codes = np.full((512, 512, 3), 80, np.uint8)
+    codes[:, 256:] = 255
+    monkeypatch.setattr(remover, "flare", lambda display: 0.1 * (display > 0.6).astype(np.float32))
+    clean = np.asarray(_remove(remover, codes)).astype(int)
+    assert np.abs(clean[200:300, 240:256] - 80).max() <= 5, "what is beside the flare keeps its level up to the edge"
+    assert (codes[200:300, 258:270].astype(int) - clean[200:300, 258:270]).min() >= 8
+
+
+def _remove(remover: Remover, codes: NDArray[np.generic]) -> NDArray[np.generic]:
+    from core.removal.plates import Plate
+
+    return remover.remove(Plate(Path("plate.png"), codes, "srgb"))[0]
+
+
+def test_where_the_flare_is_zero_the_plate_is_kept_to_the_last_bit(everywhere: Path,
+                                                                   monkeypatch: pytest.MonkeyPatch) -> None:
+    remover = Remover(everywhere, working_size=128)
+
+    def corner(display: NDArray[np.float32]) -> NDArray[np.float32]:
+        flare = np.zeros_like(display)
+        flare[:20, :20] = 0.05
+        return flare
+
+    monkeypatch.setattr(remover, "flare", corner)
+    random = np.random.default_rng(0)
+    for dtype in (np.uint8, np.uint16):
+        codes = random.integers(0, np.iinfo(dtype).max, (400, 400, 3), dtype)
+        clean = np.asarray(_remove(remover, codes))
+        assert clean.dtype == codes.dtype
+        assert np.array_equal(clean[120:], codes[120:])
+        assert np.array_equal(clean[:, 120:], codes[:, 120:])
+        assert (clean[:50, :50].astype(int) < codes[:50, :50]).mean() > 0.5
+
+
+def test_a_network_that_sees_nothing_changes_nothing(nowhere: Path) -> None:
+    codes = picture()
+    assert np.array_equal(_remove(Remover(nowhere, working_size=64), codes), codes)
+
+
+def test_rows_are_worked_on_apart_without_a_seam(monkeypatch: pytest.MonkeyPatch) -> None:
+    random = np.random.default_rng(1)
+    found = FlareMap(random.random((32, 64, 3), np.float32) * 0.1, random.random((32, 64, 3), np.float32) * 0.2)
+    codes = picture(301, 500)
+    whole, parts = np.zeros(codes.shape, np.float32), np.zeros(codes.shape, np.float32)
+    for rows, light in carried_up(found, codes, "srgb", 255):
+        whole[rows] = light
+    monkeypatch.setattr(inference, "ROWS", 7)
+    for rows, light in carried_up(found, codes, "srgb", 255):
+        parts[rows] = light
+    np.testing.assert_allclose(parts, whole, atol=2e-4)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 700), (700, 1), (33, 47), (64, 64), (31, 2000)])
+def test_any_shape(everywhere: Path, shape: tuple[int, int]) -> None:
+    codes = np.random.default_rng(0).integers(0, 256, (*shape, 3), np.uint8)
+    assert np.asarray(_remove(Remover(everywhere, working_size=96), codes)).shape == codes.shape
+
+
+def test_keep_glare_takes_no_more(everywhere: Path) -> None:
+    codes = picture()
+    gentle, all_of_it = (np.asarray(_remove(Remover(everywhere, working_size=96, keep_glare=keep), codes)).astype(int)
+                         for keep in (True, False))
+    assert (gentle >= all_of_it - 1).mean() > 0.98
+    assert gentle.mean() > all_of_it.mean()
+
+
+@pytest.mark.parametrize("size", [0, 63, 10_000])
+def test_a_working_size_that_makes_no_sense(everywhere: Path, size: int) -> None:
+    with pytest.raises(SettingsError, match="working size"):
+        Remover(everywhere, working_size=size)
+
+
+# Files.
+
+
+@pytest.mark.parametrize(("suffix", "dtype"), [(".png", np.uint8), (".png", np.uint16), (".tif", np.uint8),
+                                               (".tif", np.uint16), (".tiff", np.float32), (".jpg", np.uint8)])
+def test_kind_and_depth_stay(tmp_path: Path, everywhere: Path, suffix: str, dtype: type) -> None:
+    codes = picture(top=1 if dtype is np.float32 else np.iinfo(dtype).max, dtype=dtype)
+    source = write_codes(tmp_path / f"plate{suffix}", codes)
+    remove_all([source], tmp_path / "out", Remover(everywhere, working_size=64), Progress())
+    result = cv2.imread(str(tmp_path / "out" / source.name), cv2.IMREAD_UNCHANGED)
+    assert result.dtype == dtype
+    assert result.shape == codes.shape
+    assert result.mean() < codes.mean()
+
+
+def test_grey_and_alpha_stay(tmp_path: Path, everywhere: Path) -> None:
+    grey, alpha = picture()[..., 0], np.random.default_rng(0).integers(0, 256, (60, 90, 4), np.uint8)
+    (tmp_path / "in").mkdir()
+    write_codes(tmp_path / "in" / "grey.png", grey)
+    write_codes(tmp_path / "in" / "alpha.png", alpha)
+    remove_all([tmp_path / "in"], tmp_path / "out", Remover(everywhere, working_size=64), Progress())
+    assert cv2.imread(str(tmp_path / "out" / "grey.png"), cv2.IMREAD_UNCHANGED).shape == (60, 90)
+    result = cv2.imread(str(tmp_path / "out" / "alpha.png"), cv2.IMREAD_UNCHANGED)
+    assert np.array_equal(result[..., 3], alpha[..., 3])
+    assert not np.array_equal(result[..., :3], alpha[..., :3])
+
+
+@pytest.mark.parametrize("half", [True, False])
+def test_exr_keeps_values_above_one_other_channels_and_what_is_no_number(tmp_path: Path, everywhere: Path,
+                                                                        half: bool) -> None:
+    colour = np.random.default_rng(0).uniform(0, 0.6, (48, 64, 3)).astype(np.float32)
+    colour[10:14, 10:14] = 40.0
+    colour[30, 30] = np.nan
+    colour[31, 31, 0] = np.inf
+    channels = {name: colour[..., k].copy() for k, name in enumerate("RGB")}
+    write_exr(tmp_path / "plate.exr", {**channels, "A": np.full((48, 64), 0.5), "depth.Z": np.full((48, 64), 7.25)},
+              half=half, header={"comments": "shot 10"})
+    stored = read_plate(tmp_path / "plate.exr")
+    remove_all([tmp_path / "plate.exr"], tmp_path / "out", Remover(everywhere, working_size=64), Progress())
+    clean = read_plate(tmp_path / "out" / "plate.exr")
+    assert clean.codes.dtype == stored.codes.dtype == (np.float16 if half else np.float32)
+    assert clean.codes[11, 11].min() > 38
+    assert np.isnan(clean.codes[30, 30]).all()
+    assert half or np.isinf(clean.codes[31, 31, 0])
+    assert clean.rest["channels"]["depth.Z"].dtype == np.float32
+    assert np.array_equal(clean.rest["channels"]["A"], stored.rest["channels"]["A"])
+    assert clean.rest["header"]["comments"] == "shot 10"
+    assert np.nanmean(clean.codes.astype(np.float32)[20:30]) < np.nanmean(stored.codes.astype(np.float32)[20:30])
+
+
+def test_colour_tags_are_carried_over(tmp_path: Path) -> None:
+    codes = picture()
+    write_codes(tmp_path / "a.jpg", codes)
+    data = (tmp_path / "a.jpg").read_bytes()
+    profile = b"ICC_PROFILE\0\x01\x01" + b"profile" * 3
+    segment = b"\xff\xe2" + (len(profile) + 2).to_bytes(2, "big") + profile
+    (tmp_path / "a.jpg").write_bytes(data[:2] + segment + data[2:])
+    plate = read_plate(tmp_path / "a.jpg")
+    write_plate(tmp_path / "b.jpg", plate, plate.codes)
+    assert segment in (tmp_path / "b.jpg").read_bytes()
+    write_plate(tmp_path / "b.png", plate, plate.codes)
+    assert np.array_equal(read_plate(tmp_path / "b.png").codes, plate.codes)
+
+
+def test_the_flare_taken_is_what_plate_and_clean_plate_differ_by(tmp_path: Path, everywhere: Path) -> None:
+    write_codes(tmp_path / "plate.png", picture())
+    remove_all([tmp_path / "plate.png"], tmp_path / "out", Remover(everywhere, working_size=64), Progress(),
+               flare_folder=tmp_path / "flare")
+    flare = read_exr(tmp_path / "flare" / "plate.exr")
+    before, after = (read_picture(path).linear() for path in (tmp_path / "plate.png", tmp_path / "out" / "plate.png"))
+    np.testing.assert_allclose(np.stack([flare[name] for name in "RGB"], -1), before - after, atol=1e-3)
+
+
+def bad_files(folder: Path) -> list[Path]:
+    folder.mkdir(parents=True)
+    (folder / "text.png").write_text("not a picture")
+    (folder / "empty.jpg").write_bytes(b"")
+    whole = write_codes(folder / "cut.png", picture())
+    whole.write_bytes(whole.read_bytes()[:400])
+    (folder / "bad.exr").write_bytes(b"\x76\x2f\x31\x01 and no more")
+    write_exr(folder / "no_colour.exr", {"Z": np.ones((4, 4))})
+    return sorted(folder.iterdir())
+
+
+def test_bad_plates_do_not_stop_the_others(tmp_path: Path, everywhere: Path) -> None:
+    bad = bad_files(tmp_path / "in")
+    write_codes(tmp_path / "in" / "good.png", picture())
+    with pytest.raises(FrameError) as told:
+        remove_all([tmp_path / "in"], tmp_path / "out", Remover(everywhere, working_size=64), Progress())
+    assert f"{len(bad)} of {len(bad) + 1} plates" in str(told.value)
+    assert all(path.name in str(told.value) for path in bad)
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["good.png"]
+
+
+def test_what_is_there_is_kept(tmp_path: Path, everywhere: Path) -> None:
+    source = write_codes(tmp_path / "plate.png", picture())
+    remover = Remover(everywhere, working_size=64)
+    assert remove_all([source], tmp_path / "out", remover, Progress())["made"] == 1
+    assert remove_all([source], tmp_path / "out", remover, Progress())["kept"] == 1
+    assert remove_all([source], tmp_path / "out", remover, Progress(), overwrite=True)["made"] == 1
+    os.utime(tmp_path / "out" / "plate.png", (1, 1))
+    assert remove_all([source], tmp_path / "out", remover, Progress())["made"] == 1, "the plate is newer"
+
+
+def test_inputs_that_make_no_sense(tmp_path: Path, everywhere: Path) -> None:
+    source = write_codes(tmp_path / "plate.png", picture())
+    remover = Remover(everywhere, working_size=64)
+    with pytest.raises(SettingsError, match="overwritten"):
+        remove_all([source], tmp_path, remover, Progress())
+    (tmp_path / "other").mkdir()
+    with pytest.raises(SettingsError, match="no pictures"):
+        plates_of([tmp_path / "other"])
+    twin = write_codes(tmp_path / "other" / "plate.png", picture())
+    with pytest.raises(SettingsError, match="same file"):
+        plates_of([source, twin])
+
+
+def test_multipart_exr_is_told(tmp_path: Path) -> None:
+    pixels = np.zeros((4, 4), np.float32)
+    parts = [OpenEXR.Part({"name": name, "type": OpenEXR.scanlineimage}, dict.fromkeys("RGB", pixels)) for name in "ab"]
+    with OpenEXR.File(parts) as file:
+        file.write(str(tmp_path / "two.exr"))
+    with pytest.raises(FrameError, match="2 parts"):
+        read_plate(tmp_path / "two.exr")
+
+
+def test_write_png_is_read_as_a_plate(tmp_path: Path) -> None:
+    write_png(tmp_path / "a.png", np.full((3, 4, 3), 0.5), bits=16)
+    plate = read_plate(tmp_path / "a.png")
+    assert plate.top == 65535
+    assert plate.codes[0, 0, 0] == 32768

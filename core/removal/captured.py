@@ -1,0 +1,43 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The flare-free frames of a capture, made once and kept in its folder removed/."""
+from __future__ import annotations
+
+from pathlib import Path
+
+from ..capture import Capture
+from ..errors import CaptureError
+from ..files import inside
+from ..progress import Progress
+from .inference import Remover
+from .plates import read_plate, write_plate
+
+REMOVED = "removed"
+UNFINISHED = "removed.unfinished"
+"""Where they are until they are all there: half a removed/ would be taken for a whole one."""
+_LOSSY = frozenset({".jpg", ".jpeg"})
+
+
+def remove_from(capture: Capture, remover: Remover, progress: Progress) -> Path:
+    """Clean every frame into the capture's removed/, JPEG frames as PNG; what an earlier call has made is kept.
+
+    Raises CaptureError where there is a removed/ already or the folder cannot be written, FrameError for a
+    frame that cannot be read, and Cancelled when asked to stop.
+    """
+    target, work = capture.folder / REMOVED, capture.folder / UNFINISHED
+    if target.exists():
+        raise CaptureError(f"{target} is there already; remove it, and the frames are cleaned again.")
+    progress.stage("remove", len(capture.views))
+    try:
+        for view in capture.views:
+            name = Path(view.name)
+            result = inside(work, str(name.with_suffix(".png") if name.suffix.lower() in _LOSSY else name),
+                            CaptureError)
+            if not result.is_file():
+                plate = read_plate(capture.frame_path(view))
+                write_plate(result, plate, remover.remove(plate)[0])
+            progress.advance()
+        work.rename(target)
+    except OSError as problem:
+        raise CaptureError(f"{work} cannot be written ({problem.strerror or problem}); copy the capture to where it "
+                           "can, or make removed/ there with `remove`.") from problem
+    return target

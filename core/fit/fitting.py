@@ -95,7 +95,9 @@ def _finish(trainer: Trainer, run: Run) -> None:
     if trainer.flare is not None:
         camera = trainer.views[0].camera
         lens = TrainingCamera(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
-        flare_file.save(run.folder / FLARE, FlareFile(trainer.flare, run.settings.blend, lens))
+        flare_file.save(run.folder / FLARE, FlareFile(
+            trainer.flare, run.settings.blend, lens,
+            seen=trainer.flare.seen_from([torch.from_numpy(view.camera.world_to_camera) for view in trainer.views])))
     (run.folder / CHECKPOINT).unlink(missing_ok=True)
 
 

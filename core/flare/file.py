@@ -42,7 +42,10 @@ class TrainingCamera:
 
 @dataclass
 class FlareFile:
-    """A flare model and what an artist needs to know of it."""
+    """A flare model and what an artist needs to know of it.
+
+    seen: by light, camera x, y, z (world) and light x, y (normalised) of each training view that had it in front.
+    """
 
     model: FlareModel
     blend: Blend
@@ -50,6 +53,7 @@ class FlareFile:
     licence: str = ""
     notes: str = ""
     elements: list[dict[str, Any]] = field(default_factory=list)
+    seen: dict[str, list[list[float]]] = field(default_factory=dict)
 
 
 def save(path: Path | str, flare: FlareFile) -> None:
@@ -63,7 +67,7 @@ def save(path: Path | str, flare: FlareFile) -> None:
                                           flare.model.lights, strict=True)
     ]
     description = {"version": VERSION, "blend": flare.blend, "lights": lights, "camera": asdict(flare.camera),
-                   "elements": flare.elements, "licence": flare.licence, "notes": flare.notes}
+                   "elements": flare.elements, "seen": flare.seen, "licence": flare.licence, "notes": flare.notes}
     with atomic_path(path) as temporary:
         save_file(_packed(flare.model), str(temporary), {_KEY: json.dumps(description)})
 
@@ -142,4 +146,5 @@ def _unpacked(description: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> 
     if blend not in ("over", "add"):
         raise ValueError(f"blend {blend!r}")
     return FlareFile(model, blend, TrainingCamera(**description["camera"]), str(description.get("licence", "")),
-                     str(description.get("notes", "")), list(description.get("elements", [])))
+                     str(description.get("notes", "")), list(description.get("elements", [])),
+                     dict(description.get("seen", {})))

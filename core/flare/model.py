@@ -196,6 +196,15 @@ class FlareModel(nn.Module):
         """Every light seen from one pose (4, 4)."""
         return [ViewOfLight.of(world_to_camera, xyz) for xyz in self.positions]
 
+    def seen_from(self, poses: Sequence[Tensor]) -> dict[str, list[list[float]]]:
+        """By light, camera x, y, z and normalised light x, y in each of these poses (4, 4) that has it in front."""
+        seen: dict[str, list[list[float]]] = {name: [] for name in self.names}
+        for pose in poses:
+            for name, view in zip(self.names, self.views(pose), strict=True):
+                if view.depth > 0:
+                    seen[name].append([round(value, 5) for value in (*view.camera.tolist(), *view.light.tolist())])
+        return seen
+
     def forward(self, world_to_camera: Tensor, shares: Mapping[str, Tensor] | None = None) -> dict[str, PlaneGaussians]:
         """The Gaussians of every light in front of the camera, by the light's name.
 

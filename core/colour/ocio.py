@@ -1,0 +1,116 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Any space of an OpenColorIO configuration, by PyOpenColorIO: the package `opencolorio`, or Blender's own."""
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import os
+import sys
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import EngineError, SettingsError
+from .spaces import REC_709, ColourSpace, colour_space, linear_space
+from .spaces import names as built_in_names
+
+_REC_709_LINEAR = ("lin_rec709_scene", "lin_rec709", "Linear Rec.709 (sRGB)", "Linear Rec.709",
+                   "Utility - Linear - sRGB", "Utility - Linear - Rec.709", "Linear")
+_BUILT_IN = "ocio://default"
+
+
+def configured() -> bool:
+    """Whether the variable OCIO names a configuration."""
+    return bool(os.environ.get("OCIO"))
+
+
+def ocio_space(name: str, config: Path | str | None) -> ColourSpace:
+    """The space `name` of a configuration: a file, "ocio://…" for one of the library's own, None for the variable OCIO.
+
+    A space that OpenColorIO calls linear comes as a matrix. Raises SettingsError for a configuration that cannot
+    be read or lacks the space, EngineError where the library is not installed.
+    """
+    library = _library()
+    where = str(config or os.environ.get("OCIO") or _BUILT_IN)
+    try:
+        opened = library.Config.CreateFromFile(where)
+    except Exception as problem:  # its own class, which exists only where it is installed
+        raise SettingsError(f"The OpenColorIO configuration {where} cannot be read ({_short(problem)}).") from problem
+    found = opened.getColorSpace(name)
+    if found is None:
+        if name.lower() in built_in_names():
+            return colour_space(name)
+        raise SettingsError(f"The OpenColorIO configuration {where} has no colour space {name!r}; it has "
+                            f"{', '.join(list(opened.getColorSpaceNames())[:12])}, …")
+    if opened.isColorSpaceLinear(name, library.REFERENCE_SPACE_SCENE):
+        there = _processor(library, opened, name, forward=True)
+        matrix = _apply(there, np.eye(3, dtype=np.float32)).T.astype(np.float64)
+        known = _known(found)
+        return linear_space(name, matrix, known.chromaticities if known else _chromaticities(matrix))
+    there, back = (_processor(library, opened, name, forward=forward) for forward in (True, False))
+    return ColourSpace(name, lambda pixels: _apply(there, pixels), lambda pixels: _apply(back, pixels))
+
+
+def _library() -> ModuleType:
+    """PyOpenColorIO; Blender as a Python module keeps its own where only Blender looks."""
+    if importlib.util.find_spec("PyOpenColorIO"):
+        return importlib.import_module("PyOpenColorIO")
+    blender = sys.modules.get("bpy")
+    if blender is not None:
+        root = Path(str(blender.utils.system_resource("PYTHON")))
+        for path in sorted(root.glob("lib/**/PyOpenColorIO/PyOpenColorIO*")):
+            spec = importlib.util.spec_from_file_location("PyOpenColorIO.PyOpenColorIO", path)
+            if spec is not None and spec.loader is not None and path.suffix in (".so", ".pyd"):
+                module = importlib.util.module_from_spec(spec)
+                spec.loader.exec_module(module)
+                return module
+    raise EngineError("This colour space needs OpenColorIO: install the Python package opencolorio in the engine's "
+                      "environment.")
+
+
+def _processor(library: ModuleType, config: Any, name: str, *, forward: bool) -> Any:
+    """From the space to linear Rec. 709, or back."""
+    own = next((one for one in _REC_709_LINEAR if config.getColorSpace(one) is not None), None)
+    try:
+        if own is not None:
+            made = config.getProcessor(name, own) if forward else config.getProcessor(own, name)
+        elif forward:
+            made = library.Config.GetProcessorToBuiltinColorSpace(config, name, "lin_rec709_scene")
+        else:
+            made = library.Config.GetProcessorFromBuiltinColorSpace("lin_rec709_scene", config, name)
+        return made.getDefaultCPUProcessor()
+    except Exception as problem:
+        raise SettingsError(f"OpenColorIO knows no way between {name!r} and linear Rec. 709 in this configuration "
+                            f"({_short(problem)}).") from problem
+
+
+def _apply(processor: Any, pixels: NDArray[Any]) -> NDArray[np.float32]:
+    values = np.array(pixels, np.float32, order="C")
+    processor.applyRGB(values.reshape(-1, 3))
+    return values
+
+
+def _known(space: Any) -> ColourSpace | None:
+    """The space of ours that it is, by one of its names."""
+    for name in (space.getName(), *space.getAliases()):
+        plain = name.lower().replace("aces - ", "").strip()
+        if plain in ("acescg", "aces2065-1"):
+            return colour_space(plain)
+    return None
+
+
+def _chromaticities(matrix: NDArray[np.float64]) -> tuple[float, float, float, float, float, float, float, float]:
+    """Primaries as Rec. 709's white sees them, where nothing better is known."""
+    from .spaces import matrix_to_xyz
+
+    xyz = matrix_to_xyz(REC_709) @ matrix
+    points = [*xyz.T, xyz.sum(1)]
+    flat = [float(value) for point in points for value in point[:2] / point.sum()]
+    return (flat[0], flat[1], flat[2], flat[3], flat[4], flat[5], flat[6], flat[7])
+
+
+def _short(problem: Exception) -> str:
+    return " ".join(str(problem).split())[:200].rstrip(".")

@@ -1,0 +1,161 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Colour spaces by name, as primaries and a curve.
+
+White points are adapted by Bradford's matrix, as ACES and ICC do. Curves go on above 1 and are mirrored below
+0, so that no light is lost on the way.
+"""
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import SettingsError
+from ..pictures import linear_from_srgb, srgb_from_linear
+
+Chromaticities = tuple[float, float, float, float, float, float, float, float]
+"""x and y of red, green, blue and white, as OpenEXR's attribute has them."""
+Pixels = NDArray[np.float32]
+Curve = Callable[[NDArray[Any]], Pixels]
+
+REC_709: Chromaticities = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
+AP1: Chromaticities = (0.713, 0.293, 0.165, 0.830, 0.128, 0.044, 0.32168, 0.33767)
+AP0: Chromaticities = (0.7347, 0.2653, 0.0, 1.0, 0.0001, -0.077, 0.32168, 0.33767)
+REC_2020: Chromaticities = (0.708, 0.292, 0.170, 0.797, 0.131, 0.046, 0.3127, 0.3290)
+P3_D65: Chromaticities = (0.680, 0.320, 0.265, 0.690, 0.150, 0.060, 0.3127, 0.3290)
+
+_BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
+_SAME = 2e-3  # primaries this near are one space: headers round them
+
+
+@dataclass(frozen=True, eq=False)
+class ColourSpace:
+    """to_linear, from_linear: pixels (…, 3) to and from scene-linear Rec. 709, float32.
+
+    matrix: (3, 3) to linear Rec. 709, of a space that is linear; None for one with a curve. chromaticities: for the
+    header of a file, where they are known.
+    """
+
+    name: str
+    to_linear: Curve
+    from_linear: Curve
+    matrix: NDArray[np.float64] | None = None
+    chromaticities: Chromaticities | None = None
+
+    @property
+    def is_linear(self) -> bool:
+        """Whether light adds in it."""
+        return self.matrix is not None
+
+
+def matrix_to_xyz(chromaticities: Chromaticities) -> NDArray[np.float64]:
+    """(3, 3) from linear R, G, B to CIE X, Y, Z, white at Y = 1 (SMPTE RP 177)."""
+    x, y = np.array(chromaticities[0::2]), np.array(chromaticities[1::2])
+    columns = np.stack([x / y, np.ones(4), (1 - x - y) / y])
+    return np.asarray(columns[:, :3] * np.linalg.solve(columns[:, :3], columns[:, 3]))
+
+
+def matrix_between(source: Chromaticities, target: Chromaticities) -> NDArray[np.float64]:
+    """(3, 3) from one linear R, G, B to another, the white adapted."""
+    first, second = (_BRADFORD @ _white(space) for space in (source, target))
+    adapted = np.linalg.inv(_BRADFORD) @ np.diag(second / first) @ _BRADFORD
+    return np.asarray(np.linalg.inv(matrix_to_xyz(target)) @ adapted @ matrix_to_xyz(source))
+
+
+def _white(chromaticities: Chromaticities) -> NDArray[np.float64]:
+    x, y = chromaticities[6:]
+    return np.array([x / y, 1.0, (1 - x - y) / y])
+
+
+def linear_space(name: str, matrix: NDArray[np.float64], chromaticities: Chromaticities | None) -> ColourSpace:
+    """A linear space from its matrix to linear Rec. 709."""
+    if np.allclose(matrix, np.eye(3), atol=1e-12):
+        return ColourSpace(name, _same, _same, np.eye(3), chromaticities)
+    there, back = matrix.T.astype(np.float32), np.linalg.inv(matrix).T.astype(np.float32)
+    return ColourSpace(name, lambda pixels: np.asarray(pixels, np.float32) @ there,
+                       lambda pixels: np.asarray(pixels, np.float32) @ back, matrix, chromaticities)
+
+
+def space_of_chromaticities(chromaticities: Chromaticities) -> ColourSpace:
+    """The linear space with these primaries: one of the named ones, or of its own.
+
+    Raises SettingsError where they span no space.
+    """
+    for name, known in _LINEAR.items():
+        if np.abs(np.subtract(chromaticities, known)).max() < _SAME:
+            return colour_space(name)
+    try:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            matrix = matrix_between(chromaticities, REC_709)
+            np.linalg.inv(matrix)
+    except np.linalg.LinAlgError:
+        matrix = np.full((3, 3), np.nan)
+    if not np.isfinite(matrix).all():
+        raise SettingsError(f"The chromaticities {chromaticities} span no colour space; name the plate's with "
+                            "--plate-space.")
+    return linear_space("by its chromaticities", matrix, chromaticities)
+
+
+def colour_space(name: str, config: Path | str | None = None) -> ColourSpace:
+    """A space by name: one of `names()`, or of an OpenColorIO configuration (`config`, else the variable OCIO).
+
+    With `config` its own names come first. Raises SettingsError for a name that is not known, EngineError where
+    OpenColorIO is wanted and not installed.
+    """
+    if config is not None:
+        from .ocio import ocio_space
+
+        return ocio_space(name, config)
+    plain = name.strip().lower().replace(" ", "").replace("_", "")
+    if plain in _ALIASES:
+        return _BUILT_IN[_ALIASES[plain]]()
+    from .ocio import configured, ocio_space
+
+    if not configured():
+        raise SettingsError(f"The colour space {name!r} is not one of {', '.join(_BUILT_IN)}; for another, name an "
+                            "OpenColorIO configuration with --ocio or the variable OCIO.")
+    return ocio_space(name, None)
+
+
+def names() -> list[str]:
+    """The spaces that need no configuration."""
+    return list(_BUILT_IN)
+
+
+def _same(pixels: NDArray[Any]) -> Pixels:
+    return np.asarray(pixels, np.float32)
+
+
+def _rec709_from_linear(linear: NDArray[Any]) -> Pixels:
+    """The camera's curve of ITU-R BT.709, as compositors mean it."""
+    size = np.abs(np.asarray(linear, np.float32))
+    curve = 1.099 * np.power(np.maximum(size, 0.018), np.float32(0.45)) - 0.099
+    return np.copysign(np.where(size < 0.018, 4.5 * size, curve), linear).astype(np.float32)
+
+
+def _linear_from_rec709(display: NDArray[Any]) -> Pixels:
+    size = np.abs(np.asarray(display, np.float32))
+    curve = np.power((np.maximum(size, 0.081) + 0.099) / 1.099, np.float32(1 / 0.45))
+    return np.copysign(np.where(size < 0.081, size / 4.5, curve), display).astype(np.float32)
+
+
+_LINEAR: dict[str, Chromaticities] = {"linear": REC_709, "acescg": AP1, "aces2065-1": AP0, "rec2020": REC_2020,
+                                      "p3-d65": P3_D65}
+
+
+def _linear(name: str) -> Callable[[], ColourSpace]:
+    return lambda: linear_space(name, matrix_between(_LINEAR[name], REC_709), _LINEAR[name])
+
+
+_BUILT_IN: dict[str, Callable[[], ColourSpace]] = {
+    "srgb": lambda: ColourSpace("srgb", linear_from_srgb, srgb_from_linear),
+    "rec709": lambda: ColourSpace("rec709", _linear_from_rec709, _rec709_from_linear),
+    **{name: _linear(name) for name in _LINEAR},
+}
+_ALIASES = {**{name.replace("_", ""): name for name in _BUILT_IN}, "rec.709": "rec709", "bt709": "rec709",
+            "linearrec.709": "linear", "linrec709": "linear", "linearrec709": "linear", "ap1": "acescg",
+            "ap0": "aces2065-1", "linearrec2020": "rec2020", "lin_rec2020": "rec2020"}

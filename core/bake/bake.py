@@ -7,12 +7,13 @@ processes may make frames of one folder. `bake.json` lists what is whole; it is 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
 from ..capture.camera import Camera
+from ..colour import colour_space
 from ..errors import FrameError, RunError
 from ..files import inside, locked, read_json, remove_partial_of, write_json
 from ..look import KeyedEdits, LookEdits
@@ -27,7 +28,19 @@ LOCK = ".bake.lock"
 VERSION = 1
 
 
-class Renderer(Protocol):
+class OfCamera(Protocol):
+    """What renders a camera's view, with edits."""
+
+    def render(self, camera: Camera, edits: LookEdits | None = None) -> Rendering: ...
+
+
+class FrameRenderer(OfCamera, Protocol):
+    """What renders one frame. finished: its layers, already in the space asked for, as they are to be written."""
+
+    def finished(self, layers: FrameLayers, camera: Camera) -> FrameLayers: ...
+
+
+class Renderer(OfCamera, Protocol):
     """A fitted run, as `bake` uses it. `fingerprint` changes whenever its pictures would; elements: names by light."""
 
     @property
@@ -36,7 +49,6 @@ class Renderer(Protocol):
     def lights(self) -> Sequence[str]: ...
     @property
     def elements(self) -> Mapping[str, Sequence[str]]: ...
-    def render(self, camera: Camera, edits: LookEdits | None = None) -> Rendering: ...
 
 
 @dataclass(frozen=True)
@@ -44,7 +56,8 @@ class BakeSettings:
     """What the layers are to be.
 
     width, height: in pixels; without a height the frame's proportions are kept, without either its size.
-    half: 16 bit floats. edits: words for `LookEdits.parse`. keyed: more of them, by frame number.
+    half: 16 bit floats. edits: words for `LookEdits.parse`. keyed: more of them, by frame number. space: linear
+    colour space of the layers, by name; config: OpenColorIO configuration it is looked up in, if any.
     """
 
     width: int | None = None
@@ -52,6 +65,8 @@ class BakeSettings:
     half: bool = True
     edits: tuple[str, ...] = ()
     keyed: KeyedEdits = field(default_factory=KeyedEdits)
+    space: str = "linear"
+    config: str | None = None
 
     def scaled(self, camera: Camera) -> Camera:
         """A frame's camera at the size asked for."""
@@ -62,8 +77,10 @@ class BakeSettings:
 
 def bake(renderer: Renderer, frames: Sequence[Frame], cameras: Mapping[str, Camera], out: Path | str,
          settings: BakeSettings | None = None, progress: Progress | None = None, *,
-         overwrite: bool = False) -> dict[str, Any]:
+         overwrite: bool = False, of_frame: Callable[[Frame], FrameRenderer] | None = None) -> dict[str, Any]:
     """Write the layers of `frames` (cameras by the view's name) under `out`; returns the content of bake.json.
+
+    of_frame: what renders a frame, where that is more than a matter of its camera.
 
     Frames that an earlier bake with the same settings finished are left as they are, and stay in the record.
     Raises RunError where `out` holds layers made with other settings, unless `overwrite`; SettingsError for
@@ -74,6 +91,9 @@ def bake(renderer: Renderer, frames: Sequence[Frame], cameras: Mapping[str, Came
     edits = {frame.number: keyed.at(frame.number, renderer.lights, renderer.elements) for frame in frames}
     made_from = {"renderer": renderer.fingerprint, "half": settings.half, "edits": list(keyed.always),
                  "size": [settings.width, settings.height]}
+    space = colour_space(settings.space, settings.config)
+    if settings.space != "linear" or settings.config is not None:
+        made_from["space"] = [settings.space, settings.config]
     if keyed.frames:
         made_from["keyed"] = keyed.described()["frames"]
     _begin(out, made_from, overwrite)
@@ -86,16 +106,23 @@ def bake(renderer: Renderer, frames: Sequence[Frame], cameras: Mapping[str, Came
             continue
         path = out / frame.file
         remove_partial_of(path)
-        layers = _layers(renderer, settings.scaled(cameras[frame.view]), edits[frame.number])
-        write_layers(path, layers, half=settings.half, notes={"view": frame.view, "frame": frame.number, **made_from})
+        camera = settings.scaled(cameras[frame.view])
+        if of_frame is None:
+            layers = _layers(renderer, camera, edits[frame.number], renderer.lights).in_space(space)
+        else:
+            one = of_frame(frame)
+            layers = _layers(one, camera, edits[frame.number], renderer.lights).in_space(space)
+            layers = one.finished(layers, camera)
+        write_layers(path, layers, half=settings.half, chromaticities=space.chromaticities,
+                     notes={"view": frame.view, "frame": frame.number, **made_from})
         record = _add_to_record(out, made_from, names, [_entry(out, frame)])
         progress.advance()
     return record
 
 
-def _layers(renderer: Renderer, camera: Camera, edits: LookEdits) -> FrameLayers:
+def _layers(renderer: OfCamera, camera: Camera, edits: LookEdits, lights: Sequence[str]) -> FrameLayers:
     """One frame. The colour of whole lights is applied to the finished layers, which is exact for any blend."""
-    colours = edits.matrices(renderer.lights)
+    colours = edits.matrices(lights)
     if edits.colour_of_lights_only:
         return layers_of(renderer.render(camera), colours)
     return layers_of(renderer.render(camera, edits.without_colour_of_lights()), colours)

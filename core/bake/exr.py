@@ -2,7 +2,7 @@
 """One frame as one multilayer EXR file, and back.
 
 One part; root R G B A = composite, then scene.*, flare.*, flare_<light>.*, depth.Z (see `layers`).
-The header says what the file is: `software`, the Rec. 709 `chromaticities`, and `fitFlare`, a JSON text
+The header says what the file is: `software`, the `chromaticities` of its linear space, and `fitFlare`, a JSON text
 with the version, the view, the frame number, and the light that each flare layer belongs to.
 """
 from __future__ import annotations
@@ -12,24 +12,26 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from ..colour import REC_709, Chromaticities
 from ..errors import FrameError
 from ..pictures import read_exr, write_exr
 from .layers import FrameLayers, Pixels, layer_names
 
 ATTRIBUTE = "fitFlare"
 VERSION = 1
-_REC_709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
 
 
 def write_layers(path: Path | str, layers: FrameLayers, *, half: bool = True,
-                 notes: Mapping[str, Any] | None = None) -> None:
+                 notes: Mapping[str, Any] | None = None, chromaticities: Chromaticities | None = REC_709) -> None:
     """Write a frame's layers atomically, ZIP compressed; depth stays 32 bit when the rest is `half`.
 
-    notes: JSON-able entries for the header (view, frame, …).
+    notes: JSON-able entries for the header (view, frame, …). chromaticities: of the layers' linear space.
     """
     lights = {layer: light for light, layer in layer_names(layers.flares).items()}
     description = json.dumps({"version": VERSION, "lights": lights, **(notes or {})})
-    header = {"software": "Fit Flare", "chromaticities": _REC_709, ATTRIBUTE: description}
+    header: dict[str, Any] = {"software": "Fit Flare", ATTRIBUTE: description}
+    if chromaticities is not None:
+        header["chromaticities"] = chromaticities
     write_exr(path, layers.channels(), half=half, header=header)
 
 

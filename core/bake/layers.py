@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The layers of one frame and the channels that hold them.
 
-All light is scene-linear Rec. 709, and scene + flare = composite in every pixel, whatever blend was
-fitted: for a flare that was fitted "over" the scene in display space, the flare's layer is the linear
-composite less the linear scene. The layers of the lights sum to the flare. So the way to put them
-together is plain addition (Add in Blender, plus in Nuke), of as many of them as wanted.
+All light is scene-linear (Rec. 709 where no other space is asked for), and scene + flare = composite in
+every pixel, whatever blend was fitted: for a flare that was fitted "over" the scene in display space, the
+flare's layer is the linear composite less the linear scene. The layers of the lights sum to the flare. So
+the way to put them together is plain addition (Add in Blender, plus in Nuke), of as many of them as wanted.
 
 A flare layer is premultiplied, with alpha = max(R, G, B) in 0..1: laid over black it is the flare, and
 the alpha serves as its matte. The root's alpha is 1.
@@ -19,6 +19,9 @@ from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+
+from ..colour import ColourSpace
+from ..errors import SettingsError
 
 Pixels = NDArray[np.float32]
 
@@ -59,6 +62,14 @@ class FrameLayers:
     def composite(self) -> Pixels:
         """Scene and flare together."""
         return self.scene + self.flare
+
+    def in_space(self, space: ColourSpace) -> FrameLayers:
+        """The same light in another linear space."""
+        if space.matrix is None:
+            raise SettingsError(f"Layers add in linear light, and {space.name} is not linear; choose linear, acescg, "
+                                "or another linear space.")
+        flares = {light: space.from_linear(layer) for light, layer in self.flares.items()}
+        return FrameLayers(space.from_linear(self.scene), flares, self.depth)
 
     def channels(self) -> dict[str, Pixels]:
         """Channel name to (h, w), for one EXR part. One dot in a name at most.

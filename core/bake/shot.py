@@ -101,10 +101,11 @@ class ShotRenderer:
 
 
 def bake_shot(shot: Shot, out: Path | str, *, half: bool = True, overwrite: bool = False,
-              progress: Progress | None = None, wanted: Container[int] | None = None) -> dict[str, Any]:
+              progress: Progress | None = None, wanted: Container[int] | None = None, space: str = "linear",
+              config: str | None = None) -> dict[str, Any]:
     """Write the layers of a shot's frames under `out`: `layers.0001.exr` for one camera, in a folder for each of
-    several. wanted: frame numbers, None for all. Returns the content of bake.json. Raises what `bake` raises, and
-    FlareFileError."""
+    several. wanted: frame numbers, None for all. space, config: see `BakeSettings`. Returns the content of bake.json.
+    Raises what `bake` raises, and FlareFileError."""
     several = len({one.name for one in shot.frames}) > 1
     frames: list[Frame] = []
     cameras: dict[str, Camera] = {}
@@ -114,7 +115,8 @@ def bake_shot(shot: Shot, out: Path | str, *, half: bool = True, overwrite: bool
         view = f"{one.name}/{one.frame}"
         frames.append(Frame(view, one.frame, _file(one, several)))
         cameras[view] = one.camera
-    return bake(ShotRenderer(shot), frames, cameras, out, BakeSettings(half=half), progress, overwrite=overwrite)
+    settings = BakeSettings(half=half, space=space, config=config)
+    return bake(ShotRenderer(shot), frames, cameras, out, settings, progress, overwrite=overwrite)
 
 
 def _file(one: ShotFrame, several: bool) -> str:

@@ -29,7 +29,17 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--float", action="store_true", help="32 bit floats (default: 16 bit, depth always 32)")
     parser.add_argument("--overwrite", action="store_true", help="replace layers of another bake in DIR")
     parser.add_argument("--capture", type=Path, metavar="CAPTURE", help="where the capture is, if it was moved")
+    space_options(parser)
     jobs.add_option(parser)
+
+
+def space_options(parser: argparse.ArgumentParser) -> None:
+    """--space and --ocio."""
+    parser.add_argument("--space", default="linear", metavar="NAME",
+                        help="linear colour space of the layers: linear (Rec. 709, the default), acescg, aces2065-1, "
+                             "rec2020, p3-d65, or one of an OpenColorIO configuration")
+    parser.add_argument("--ocio", metavar="CONFIG",
+                        help="OpenColorIO configuration to look names up in (else the variable OCIO, for other names)")
 
 
 def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
@@ -50,7 +60,8 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     if words.jobs != 1:
         jobs.run_jobs(words, "bake", [frame.number for frame in frames], progress)
     settings = BakeSettings(*size(words.size), half=not words.float, edits=tuple(words.edits),
-                            keyed=KeyedEdits.read(words.keyed) if words.keyed else KeyedEdits())
+                            keyed=KeyedEdits.read(words.keyed) if words.keyed else KeyedEdits(), space=words.space,
+                            config=words.ocio)
     record = bake(made, frames, cameras, words.out, settings, progress, overwrite=words.overwrite)
     progress.say(f"{len(record['frames'])} frames of layers are in {words.out}.")
     return {"layers": str(words.out), "frames": len(record["frames"])}
@@ -70,7 +81,7 @@ def run_shot(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
         jobs.run_jobs(words, "bake", [frame.number for frame in known], progress)
     wanted = {one.number for one in known}
     record = bake_shot(shot, words.out, half=not words.float, overwrite=words.overwrite, progress=progress,
-                       wanted=wanted)
+                       wanted=wanted, space=words.space, config=words.ocio)
     progress.say(f"{len(record['frames'])} frames of layers are in {words.out}.")
     return {"layers": str(words.out), "frames": len(record["frames"])}
 

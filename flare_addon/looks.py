@@ -187,19 +187,25 @@ def visible_share(scene: Any, depsgraph: Any, eye: Any, item: Any) -> float:
 
     What stands right at the light (within 6% of the distance) is the lamp itself and hides nothing.
     """
+    where = item.target.evaluated_get(depsgraph).matrix_world.translation
+    own = {item.target.name, *(child.name for child in item.target.children_recursive)}
+    return share_seen(scene, depsgraph, eye, where, own, item.radius)
+
+
+def share_seen(scene: Any, depsgraph: Any, eye: Any, light: Any, own: set[str], disk: float = 0.0) -> float:
+    """How much of a disk about the point `light` the eye sees past all objects but `own`, 0..1; its radius in world
+    units, 0 for a share of the distance."""
     from mathutils import Vector
 
-    light = item.target.evaluated_get(depsgraph).matrix_world.translation
     away = light - eye
     distance = away.length
     if distance < 1e-6:
         return 1.0
-    radius = item.radius or LIGHT_SHARE * distance
+    radius = disk or LIGHT_SHARE * distance
     forward = away / distance
     right = forward.orthogonal().normalized()
     up = forward.cross(right)
     share = 0.0
-    own = {item.target.name, *(child.name for child in item.target.children_recursive)}
     reach = (1 - MARGIN) * distance
     for (x, y), weight in zip(_POINTS.tolist(), _WEIGHTS.tolist(), strict=True):
         target = light + radius * (x * right + y * up)

@@ -57,8 +57,11 @@ def _ranges(numbers: Sequence[int]) -> str:
     return ",".join(f"{low}-{high}" if high > low else f"{low}" for low, high in runs)
 
 
-def run_jobs(words: argparse.Namespace, step: str, numbers: Sequence[int], progress: Progress) -> None:
+def run_jobs(words: argparse.Namespace, step: str, numbers: Sequence[int], progress: Progress,
+             extra: Sequence[str] = ()) -> None:
     """Run a step of the command once for each share of the frames, at once; returns when all are done.
+
+    extra: words that the processes are given besides.
 
     Raises Cancelled when asked to stop, after the processes have stopped; FitFlareError with the sentence of the
     first that failed, after the others have been stopped.
@@ -75,8 +78,8 @@ def run_jobs(words: argparse.Namespace, step: str, numbers: Sequence[int], progr
     try:
         for number, frames in enumerate(parts):
             noises.append(tempfile.TemporaryFile())  # noqa: SIM115 - closed below, when its process has ended
-            whole = [sys.executable, str(hand_off.RUN), *words.words, "--step", step, "--jobs", "1", "--frames", frames,
-                     "--progress", "json"]
+            whole = [sys.executable, str(hand_off.RUN), *words.words, *extra, "--step", step, "--jobs", "1",
+                     "--frames", frames, "--progress", "json"]
             children.append(subprocess.Popen(whole, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
                                              stderr=noises[-1], encoding="utf-8", errors="replace",
                                              env=environment, **hand_off.own_group()))

@@ -35,8 +35,11 @@ class OfCamera(Protocol):
 
 
 class FrameRenderer(OfCamera, Protocol):
-    """What renders one frame. finished: its layers, already in the space asked for, as they are to be written."""
+    """What renders one frame. fingerprint: changes whenever this frame's picture would, beyond the whole's.
+    finished: its layers, already in the space asked for, as they are to be written."""
 
+    @property
+    def fingerprint(self) -> str: ...
     def finished(self, layers: FrameLayers, camera: Camera) -> FrameLayers: ...
 
 
@@ -98,7 +101,13 @@ def bake(renderer: Renderer, frames: Sequence[Frame], cameras: Mapping[str, Came
         made_from["keyed"] = keyed.described()["frames"]
     _begin(out, made_from, overwrite)
     names = layer_names(renderer.lights)
-    done = [frame for frame in frames if _is_made(out / frame.file, frame, made_from)]
+
+    def notes(frame: Frame) -> dict[str, Any]:
+        """What the frame's header is to say."""
+        own = {"inputs": of_frame(frame).fingerprint} if of_frame is not None else {}
+        return {"view": frame.view, "frame": frame.number, **own, **made_from}
+
+    done = [frame for frame in frames if _is_made(out / frame.file, notes(frame))]
     record = _add_to_record(out, made_from, names, [_entry(out, frame) for frame in done])
     progress.stage("bake", len(frames), len(done))
     for frame in frames:
@@ -113,8 +122,7 @@ def bake(renderer: Renderer, frames: Sequence[Frame], cameras: Mapping[str, Came
             one = of_frame(frame)
             layers = _layers(one, camera, edits[frame.number], renderer.lights).in_space(space)
             layers = one.finished(layers, camera)
-        write_layers(path, layers, half=settings.half, chromaticities=space.chromaticities,
-                     notes={"view": frame.view, "frame": frame.number, **made_from})
+        write_layers(path, layers, half=settings.half, chromaticities=space.chromaticities, notes=notes(frame))
         record = _add_to_record(out, made_from, names, [_entry(out, frame)])
         progress.advance()
     return record
@@ -144,7 +152,7 @@ def _begin(out: Path, made_from: dict[str, Any], overwrite: bool) -> None:
         (out / RECORD).unlink()
 
 
-def _is_made(path: Path, frame: Frame, made_from: Mapping[str, Any]) -> bool:
+def _is_made(path: Path, wanted: Mapping[str, Any]) -> bool:
     """Whether the file is this frame under these settings, by its own header: other tasks of a farm write here too."""
     if not path.is_file():
         return False
@@ -152,8 +160,7 @@ def _is_made(path: Path, frame: Frame, made_from: Mapping[str, Any]) -> bool:
         notes = read_description(path)
     except FrameError:
         return False
-    wanted = json.loads(json.dumps({"view": frame.view, "frame": frame.number, **made_from}))
-    return all(notes.get(name) == value for name, value in wanted.items())
+    return all(notes.get(name) == value for name, value in json.loads(json.dumps(wanted)).items())
 
 
 def _entry(out: Path, frame: Frame) -> dict[str, Any]:

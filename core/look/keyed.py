@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Edits that change from frame to frame, in a small JSON file.
+"""Edits that change from frame to frame, in a small JSON or TOML file.
 
     {"set": ["lamp.tint=1,0.8,0.6"], "frames": {"1": ["lamp.intensity=0"], "25": ["lamp.intensity=1"]}}
 
@@ -8,6 +8,7 @@ numbers run in straight lines; before the first and after the last they stay.
 """
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -28,7 +29,7 @@ class KeyedEdits:
     @classmethod
     def read(cls, path: Path | str) -> KeyedEdits:
         """Raises SettingsError where the file is missing, damaged or of another form."""
-        data = read_json(path, SettingsError)
+        data = _toml(Path(path)) if Path(path).suffix.lower() == ".toml" else read_json(path, SettingsError)
         try:
             frames = {int(number): _words(words) for number, words in data.get("frames", {}).items()}
             return cls(_words(data.get("set", [])), dict(sorted(frames.items())))
@@ -61,6 +62,15 @@ class KeyedEdits:
         if before >= after:
             return parsed(before if before in (frame, numbers[-1]) else after)
         return parsed(before).towards(parsed(after), (frame - before) / (after - before))
+
+
+def _toml(path: Path) -> Any:
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as problem:
+        raise SettingsError(f"{path} cannot be read: {problem.strerror or problem}.") from problem
+    except ValueError as problem:
+        raise SettingsError(f"{path} is not valid TOML ({problem}); mend it.") from problem
 
 
 def _words(words: Any) -> tuple[str, ...]:

@@ -14,9 +14,9 @@ from ..command import Command, Step
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("run", type=Path, metavar="RUN",
-                        help="folder that `fit` has written, or a shot: a JSON file of cameras and lights by frame, as "
-                             "the add-on writes it (core/look/shot.py)")
+    parser.add_argument("run", type=Path, metavar="RUN_OR_FLARE",
+                        help="folder that `fit` has written; or a .flare, with --capture or --blend; or a shot: a JSON "
+                             "file of cameras and lights by frame, as the add-on writes it (core/look/shot.py)")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for layers.####.exr")
     parser.add_argument("--frames", metavar="A-B", help="frame numbers, such as 1-20,31; all where not given")
     parser.add_argument("--size", metavar="WIDTH[xHEIGHT]", help="pixels (default: the frames')")
@@ -28,7 +28,13 @@ def arguments(parser: argparse.ArgumentParser) -> None:
                         help='edits by frame: {"frames": {"1": ["lamp.intensity=0"], "25": ["lamp.intensity=1"]}}')
     parser.add_argument("--float", action="store_true", help="32 bit floats (default: 16 bit, depth always 32)")
     parser.add_argument("--overwrite", action="store_true", help="replace layers of another bake in DIR")
-    parser.add_argument("--capture", type=Path, metavar="CAPTURE", help="where the capture is, if it was moved")
+    parser.add_argument("--capture", type=Path, metavar="CAPTURE",
+                        help="where the capture is, if it was moved; of a .flare: whose cameras see it, the lights "
+                             "where it was learned")
+    parser.add_argument("--blend", type=Path, metavar="FILE",
+                        help="of a .flare: a .blend, whose camera and lights it is shown for, behind what hides them")
+    parser.add_argument("--lights", metavar="NAMES", help="objects of the .blend that are lights (default: its lamps)")
+    parser.add_argument("--shot", type=Path, help=argparse.SUPPRESS)
     space_options(parser)
     jobs.add_option(parser)
 
@@ -51,6 +57,10 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
 
     if words.run.suffix.lower() == ".json":
         return run_shot(words, progress)
+    if words.run.suffix.lower() == ".flare":
+        from .transfer import bake_flare
+
+        return bake_flare(words, progress)
     made = Run.open(words.run)
     if not made.finished:
         raise RunError(f"{words.run} is not finished; go on with it by `fit --resume` first.")
@@ -65,6 +75,15 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     record = bake(made, frames, cameras, words.out, settings, progress, overwrite=words.overwrite)
     progress.say(f"{len(record['frames'])} frames of layers are in {words.out}.")
     return {"layers": str(words.out), "frames": len(record["frames"])}
+
+
+def look(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
+    """Blender's part of a bake for a .blend."""
+    from .transfer import look_at_blend, words_of_bake
+
+    if words.run.suffix.lower() != ".flare":
+        raise SettingsError("--blend is for a .flare: name the run's flare.flare.")
+    return look_at_blend(words_of_bake(words), progress)
 
 
 def run_shot(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
@@ -103,4 +122,5 @@ flare_<light>, depth. scene + flare = composite, and the lights sum to the flare
 compositor. Frames already made with the same settings are kept.
 
   run.py bake build/desk --out build/layers --frames 1-20 --set lamp.intensity=2""",
-    arguments, (Step("bake", "engine", run),))
+    arguments, (Step("look", "blender", look, wanted=lambda words: words.blend is not None),
+                Step("bake", "engine", run)))

@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""A plate in its own colour space, and the same plate with a flare over it.
+
+What the flare does not reach keeps its file's own numbers, to the last bit.
+"""
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..colour import ColourSpace, colour_space, space_of_chromaticities
+from ..removal.plates import Plate, read_plate, write_plate
+
+AUTO = "auto"
+
+Pixels = NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class ColouredPlate:
+    """A plate and the space its numbers are in."""
+
+    plate: Plate
+    space: ColourSpace
+
+    @classmethod
+    def read(cls, path: Path, space: str = AUTO, config: str | None = None) -> ColouredPlate:
+        """`space` by name; "auto": an EXR's by its chromaticities, linear Rec. 709 without, sRGB for other files.
+
+        Raises FrameError for a file that cannot be read, SettingsError for a space that is not known.
+        """
+        plate = read_plate(path)
+        if space != AUTO:
+            return cls(plate, colour_space(space, config))
+        if plate.encoding == "srgb":
+            return cls(plate, colour_space("srgb"))
+        told = plate.rest.get("header", {}).get("chromaticities")
+        return cls(plate, space_of_chromaticities(tuple(told)) if told is not None else colour_space("linear"))
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(width, height) in pixels."""
+        return self.plate.codes.shape[1], self.plate.codes.shape[0]
+
+    @property
+    def values(self) -> Pixels:
+        """(height, width, 3) in its own space, codes as 0..1."""
+        return self.plate.codes.astype(np.float32) / np.float32(self.plate.top)
+
+    @property
+    def linear(self) -> Pixels:
+        """Scene-linear Rec. 709."""
+        return self.space.to_linear(self.values)
+
+    @property
+    def is_full_float(self) -> bool:
+        """Whether its file has 32 bit floats, which 16 bit layers would round."""
+        return bool(self.plate.codes.dtype == np.float32)
+
+    def with_light(self, light: Pixels) -> NDArray[Any]:
+        """Codes of the plate with light (height, width, 3), scene-linear Rec. 709, added."""
+        if self.space.is_linear:
+            values = self.values + self.space.from_linear(light)
+        else:
+            values = self.space.from_linear(self.linear + light)
+        codes = self.plate.codes
+        if codes.dtype.kind == "u":
+            stored = np.clip(np.round(values * self.plate.top), 0, self.plate.top).astype(codes.dtype)
+        else:
+            most = 65504 if codes.dtype == np.float16 else np.finfo(np.float32).max
+            stored = np.clip(values, -most, most).astype(codes.dtype)
+        reached = (light != 0).any(-1, keepdims=True)
+        return np.where(reached, stored, codes)
+
+    def write(self, path: Path, light: Pixels) -> None:
+        """Write `with_light` in the plate's own kind, depth and space."""
+        write_plate(path, self.plate, self.with_light(light))

@@ -1,0 +1,210 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What a flare goes on to: pictures, a capture, a run, splats with cameras, or a shot that Blender wrote down.
+
+All become frames with a camera and placed lights, each perhaps with a plate, and perhaps one scene of Gaussians
+that hides lights and can be shown.
+"""
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..bake.frames import Frame, numbered
+from ..capture import Camera, Capture, Light, View, read_lights
+from ..errors import CaptureError, SettingsError
+from ..gaussians.ply import read_ply
+from ..gaussians.scene import SceneGaussians
+from ..lights.detection import Detector
+from ..look import Look
+from ..look.shot import PlacedLight, Shot, ShotFrame
+from ..pictures import SUFFIXES, Picture, picture_size, read_picture
+from .sources import assigned
+
+Mapped = Mapping[str, str]
+
+
+@dataclass(frozen=True, eq=False)
+class TargetFrame:
+    """frame: its number and the file of its layers. shot: camera and lights. plate: its picture, if it has one.
+
+    undistorted: gives the plate's picture where the file itself is a distorted one.
+    """
+
+    frame: Frame
+    shot: ShotFrame
+    plate: Path | None = None
+    undistorted: Callable[[], Picture] | None = None
+
+    def described(self) -> str:
+        """Changes whenever the frame would; its plate counts by name and length, so that mirrored disks agree."""
+        camera = self.shot.camera
+        plate = (self.plate.name, self.plate.stat().st_size) if self.plate else None
+        return repr((self.frame, self.shot.name, self.shot.edits, camera.size, camera.intrinsics.tolist(),
+                     camera.world_to_camera.tolist(), plate,
+                     [(light.name, light.source, light.xyz.tolist(), light.share) for light in self.shot.lights]))
+
+
+@dataclass(frozen=True, eq=False)
+class Target:
+    """frames: of the whole shot, in order. scene: hides lights; shown: it is the picture too, where no plate is."""
+
+    frames: tuple[TargetFrame, ...]
+    scene: SceneGaussians | None = None
+    shown: bool = False
+
+    @property
+    def lights(self) -> tuple[str, ...]:
+        """Names of the target's lights, in order of appearance."""
+        return tuple(dict.fromkeys(light.name for one in self.frames for light in one.shot.lights))
+
+    def fingerprint(self) -> str:
+        """Changes whenever the scene does; "" without one."""
+        digest = hashlib.sha256()
+        for parameter in self.scene.parameters() if self.scene is not None else ():
+            digest.update(parameter.detach().numpy().tobytes())
+        return digest.hexdigest()[:16] if self.scene is not None else ""
+
+
+# ---- pictures -------------------------------------------------------------------------------------
+
+
+def of_pictures(paths: Sequence[Path], look: Look, lights: Mapping[str, tuple[float, float]], wanted: Mapped,
+                distances: Mapping[str, float], *, detector: Detector | None = None, focal: float | None = None,
+                centre: tuple[float, float] | None = None) -> Target:
+    """Pictures with a light each in 2D: `lights` in pixels by name, else what `detector` finds.
+
+    focal: in pixels (default: the training camera's field of view); centre: principal point in pixels (default: the
+    middle). distances: of each source, at which its flare is as bright as it was learned. Raises SettingsError where
+    a picture has no light.
+    """
+    frames = []
+    for frame in numbered(path.name for path in paths):
+        path = next(one for one in paths if one.name == frame.view)
+        width, height = picture_size(path)
+        fx = focal or look.camera.fx * width / look.camera.width
+        fy = focal or look.camera.fy * width / look.camera.width
+        cx, cy = centre or (width / 2, height / 2)
+        camera = Camera(width, height, fx, fy, cx, cy, np.eye(4))
+        found = dict(lights) or _detected(path, detector)
+        if not found:
+            raise SettingsError(f"No light was found in {path}; say where it is with --light X,Y.")
+        sources = assigned(list(found), look.names, {name: source for name, source in wanted.items() if name in found})
+        placed = []
+        for name, (x, y) in found.items():
+            ray = np.array([(x - cx) / fx, (y - cy) / fy, 1.0])
+            placed.append(PlacedLight(name, sources[name], ray / np.linalg.norm(ray) * distances[sources[name]]))
+        frames.append(TargetFrame(frame, ShotFrame(frame.number, frame.view, camera, tuple(placed)), path))
+    return Target(tuple(frames))
+
+
+def _detected(path: Path, detector: Detector | None) -> dict[str, tuple[float, float]]:
+    if detector is None:
+        return {}
+    found = detector.detect(read_picture(path))
+    return {f"light{number + 1}": (float(one.xy[0]), float(one.xy[1])) for number, one in enumerate(found)}
+
+
+# ---- captures and splats --------------------------------------------------------------------------
+
+
+def of_capture(capture: Capture, look: Look, wanted: Mapped, *, lights: Path | None = None, scene: Path | None = None,
+               shown: bool = False) -> Target:
+    """A capture's views. lights: a lights.json instead of the capture's. scene: a 3DGS PLY in its world, which hides
+    lights; shown: it is the picture too, and the frames are left alone.
+
+    Raises CaptureError where there are no lights.
+    """
+    known = read_lights(lights) if lights else capture.lights
+    if lights and not lights.is_file():
+        raise CaptureError(f"{lights} is missing.")
+    if not known:
+        raise CaptureError(f"{capture.folder} has no lights; run lights on it, or name a lights.json with --lights.")
+    placed = _placed(known, look, wanted)
+    views = {view.name: view for view in capture.views}
+    frames = []
+    for frame in numbered(views):
+        view = views[frame.view]
+        path = None if shown else capture.frame_path(view)
+        straight = view.lens is None or path is None
+        shot = ShotFrame(frame.number, str(Path(frame.view).parent), view.camera, placed)
+        frames.append(TargetFrame(frame, shot, path, None if straight else _undistorted(capture, view)))
+    return Target(tuple(frames), read_ply(scene) if scene else None, shown)
+
+
+def _placed(lights: Sequence[Light], look: Look, wanted: Mapped) -> tuple[PlacedLight, ...]:
+    sources = assigned([light.name for light in lights], look.names, wanted)
+    return tuple(PlacedLight(light.name, sources[light.name], light.xyz) for light in lights)
+
+
+def _undistorted(capture: Capture, view: View) -> Callable[[], Picture]:
+    return lambda: capture.frame(view)
+
+
+def of_cameras(capture: Capture, look: Look) -> Target:
+    """A capture's cameras without its pictures, and the lights where the flare was learned: for a flare that is shown
+    in the scene it comes from."""
+    placed = tuple(PlacedLight(light.name, light.name, light.xyz) for light in look.lights)
+    views = {view.name: view for view in capture.views}
+    return Target(tuple(TargetFrame(frame, ShotFrame(frame.number, str(Path(frame.view).parent),
+                                                     views[frame.view].camera, placed)) for frame in numbered(views)))
+
+
+# ---- shots ----------------------------------------------------------------------------------------
+
+
+def of_shot(shot: Shot, look: Look, wanted: Mapped, *, plates: Path | None = None, scene: Path | None = None,
+            shown: bool = False) -> Target:
+    """A shot's frames. plates: a folder of pictures whose names end with the frames' numbers.
+
+    Raises SettingsError where a frame has no plate there.
+    """
+    given = _by_number(plates) if plates else {}
+    several = len({one.name for one in shot.frames}) > 1
+    # Sources that the shot names itself hold, unless others are wanted or this look has none such.
+    told = {light.name: light.source for one in shot.frames for light in one.lights}
+    sources = assigned(list(told), look.names,
+                       {**{name: source for name, source in told.items() if source in look.names}, **wanted})
+    frames = []
+    for one in sorted(shot.frames, key=lambda each: (each.name, each.frame)):
+        if plates and one.frame not in given:
+            raise SettingsError(f"{plates} has no picture for frame {one.frame}.")
+        lights = tuple(replace(light, source=sources[light.name]) for light in one.lights)
+        name = f"{one.name}/" if several else ""
+        frame = Frame(f"{one.name}/{one.frame}", one.frame, f"{name}layers.{one.frame:04d}.exr")
+        frames.append(TargetFrame(frame, replace(one, lights=lights), given.get(one.frame)))
+    if not frames:
+        raise SettingsError("The shot has no frames; export it again.")
+    return Target(tuple(frames), read_ply(scene) if scene else None, shown)
+
+
+def _by_number(folder: Path) -> dict[int, Path]:
+    """Pictures of a folder by the number that each name ends with."""
+    files = {path.name: path for path in sorted(folder.glob("*"))
+             if path.suffix.lower() in SUFFIXES and not path.name.startswith(".")}
+    if not files:
+        raise SettingsError(f"{folder} holds no pictures.")
+    return {frame.number: files[frame.view] for frame in numbered(files)}
+
+
+def sized(target: Target, width: int | None, height: int | None) -> Target:
+    """The same at another size in pixels; without a height the proportions stay."""
+    if not width:
+        return target
+
+    def smaller(camera: Camera) -> Camera:
+        return camera.scaled(width, height or max(round(width * camera.height / camera.width), 1))
+
+    return replace(target, frames=tuple(replace(one, shot=replace(one.shot, camera=smaller(one.shot.camera)))
+                                        for one in target.frames))
+
+
+def background(one: TargetFrame, size: tuple[int, int]) -> NDArray[np.float32] | None:
+    """The undistorted plate in linear Rec. 709 at `size`, where the plate's own file cannot be used; else None."""
+    if one.undistorted is None:
+        return None
+    return np.asarray(one.undistorted().resized(*size).linear(), np.float32)

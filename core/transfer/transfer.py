@@ -1,0 +1,256 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""A captured flare on other frames: one instance for each light that the target shows, merged and composited.
+
+Everything is in normalised image coordinates, so the target's focal length, principal point, aspect and
+resolution may be any. Lights behind the camera, and lights that are hidden, give no flare.
+"""
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ..bake.bake import BakeSettings, bake
+from ..bake.frames import Frame
+from ..bake.layers import FrameLayers
+from ..capture import Camera
+from ..colour import ColourSpace, colour_space
+from ..fit.rendering import as_tensors, pose_and_intrinsics
+from ..flare.compositing import decode, encode, splat_flare
+from ..flare.compositing import layers as linear_layers
+from ..flare.visibility import VisibilitySettings, visible_share
+from ..gaussians import Splats
+from ..look import LookEdits, ViewOfLight, read
+from ..look.shot import PlacedLight
+from ..pictures import Picture
+from ..progress import Progress
+from . import query as queries
+from .plates import AUTO, ColouredPlate
+from .query import Query
+from .target import Target, TargetFrame, background
+from .visibility import smoothed
+
+Pixels = NDArray[np.float32]
+
+FRAMES = "frames"
+"""Folder of the plates with their flares, beside the layers."""
+
+
+@dataclass(frozen=True)
+class TransferSettings:
+    """query: what appearance follows (see `query`). scale: units of the target's world to one of the source's.
+    smooth: frames over which a light's visibility is smoothed on either side, 0 for none. plate_space: of the
+    plates, "auto" by their files. visibility: how the target's scene hides lights."""
+
+    query: Query = "blend"
+    scale: float = 1.0
+    smooth: int = 1
+    plate_space: str = AUTO
+    visibility: VisibilitySettings = field(default_factory=VisibilitySettings)
+
+
+@dataclass(frozen=True)
+class _Rendering:
+    scene: Pixels
+    flare_by_light: Mapping[str, Pixels]
+    depth: Pixels
+
+
+class Transfer:
+    """A flare on a target; `of_frame` renders, `bake` writes.
+
+    training: poses (4, 4) of the views the flare was learned from, for a .flare that does not tell.
+    """
+
+    def __init__(self, flare: Path, target: Target, settings: TransferSettings | None = None,
+                 training: Sequence[Any] | None = None, config: str | None = None) -> None:
+        self.flare, self.target, self.settings, self.config = flare, target, settings or TransferSettings(), config
+        self.look = read(flare)
+        self.sources = {light.name: light for light in self.look.lights}
+        self.seen = queries.seen_by(flare, self.look.lights, training)
+        self._shares: dict[tuple[int, str], float] = {}
+        self._fixed = self._fixed_views() if self.settings.query == "source" else {}
+        self._index = {one.frame.view: index for index, one in enumerate(target.frames)}
+
+    # ---- what `bake` asks for ---------------------------------------------------------------------
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """Changes whenever all pictures would; what is a frame's alone, its renderer's fingerprint tells."""
+        digest = hashlib.sha256(self.flare.read_bytes())
+        digest.update(self.target.fingerprint().encode())
+        digest.update(repr((self.settings, self.config, sorted(self.seen))).encode())
+        return digest.hexdigest()[:16]
+
+    def fingerprint_of(self, index: int) -> str:
+        """Of a frame, and of the neighbours that its lights' visibility depends on."""
+        reach = 2 * self.settings.smooth
+        near = self.target.frames[max(index - reach, 0):index + reach + 1]
+        fixed = [(name, view.camera.tolist(), view.light.tolist()) for name, view in self._fixed.items()]
+        told = "".join(one.described() for one in near) + repr(fixed)
+        return hashlib.sha256(told.encode()).hexdigest()[:16]
+
+    @property
+    def lights(self) -> tuple[str, ...]:
+        """Names of the target's lights."""
+        return self.target.lights
+
+    @property
+    def elements(self) -> dict[str, list[str]]:
+        """Names of each light's elements, which are its source's."""
+        names = self.look.element_names
+        return {light.name: names.get(light.source, []) for one in self.target.frames for light in one.shot.lights}
+
+    def render(self, camera: Camera, edits: LookEdits | None = None) -> _Rendering:
+        """Not for a camera alone: see `of_frame`."""
+        raise NotImplementedError("a transfer renders frames")
+
+    # ---- flares -----------------------------------------------------------------------------------
+
+    def flares(self, index: int, camera: Camera, edits: LookEdits | None = None) -> dict[str, Splats]:
+        """Each light's splats in a frame, under `camera`; of the lights that show something."""
+        shot = self.target.frames[index].shot
+        if shot.edits:
+            own = LookEdits.parse(shot.edits, self.lights, self.elements)
+            edits = own if edits is None or edits.neutral else edits
+        names = [light.name for light in shot.lights]
+        _, intrinsics = pose_and_intrinsics(camera)
+        shown: dict[str, Splats] = {}
+        for light in shot.lights:
+            if edits is not None and not edits.shows(light.name, names):
+                continue
+            view = ViewOfLight.of(camera.world_to_camera, light.xyz)
+            found = queries.evaluate(
+                self.sources[light.source], view, light.xyz, self.settings.query, self.seen.get(light.source),
+                share=self.share(index, light.name) if view.depth > 0 else 0.0, edits=edits, name=light.name,
+                scale=self.settings.scale, fixed=self._fixed.get(light.name))
+            if found is not None:
+                shown[light.name] = splat_flare(as_tensors(found), intrinsics, *camera.size, self.look.blend)
+        return shown
+
+    def share(self, index: int, light: str) -> float:
+        """How much of a light is to be seen in a frame, 0..1, smooth along the path."""
+        frames = [one.shot for one in self.target.frames]
+        return smoothed(frames, index, light, self.settings.smooth, lambda at: self._share(at, light))
+
+    def _share(self, index: int, light: str) -> float:
+        """As the frame alone has it: the shot's own figure, and what the target's scene hides."""
+        key = (index, light)
+        if key not in self._shares:
+            shot = self.target.frames[index].shot
+            placed = next((one for one in shot.lights if one.name == light), None)
+            share = placed.share if placed is not None else 0.0
+            if placed is not None and share > 0 and self.target.scene is not None:
+                with torch.no_grad():
+                    share *= float(visible_share(self.target.scene, torch.from_numpy(shot.camera.position),
+                                                 torch.from_numpy(placed.xyz), self.settings.visibility))
+            self._shares[key] = share
+        return self._shares[key]
+
+    def _fixed_views(self) -> dict[str, ViewOfLight]:
+        """What each light asks for throughout the shot, by its name."""
+        fixed = {}
+        for name in self.lights:
+            placed: list[tuple[ViewOfLight, float, PlacedLight]] = []
+            for one in self.target.frames:
+                for light in one.shot.lights:
+                    if light.name == name:
+                        far = float(np.linalg.norm(one.shot.camera.position - light.xyz)) / self.settings.scale
+                        placed.append((ViewOfLight.of(one.shot.camera.world_to_camera, light.xyz), far, light))
+            source = placed[0][2].source
+            view = queries.fixed_view(self.sources[source], [each[0] for each in placed],
+                                      [each[1] for each in placed], self.seen.get(source))
+            if view is not None:
+                fixed[name] = view
+        return fixed
+
+    # ---- frames -----------------------------------------------------------------------------------
+
+    def of_frame(self, frame: Frame, space: ColourSpace | None = None, out: Path | None = None) -> _OfFrame:
+        """What renders one frame; with `out` it writes the plate with its flare there too."""
+        return _OfFrame(self, self._index[frame.view], space or colour_space("linear"), out)
+
+    def bake(self, out: Path | str, wanted: Sequence[Frame] | None = None, settings: BakeSettings | None = None,
+             progress: Progress | None = None, *, overwrite: bool = False) -> dict[str, Any]:
+        """Write layers of the frames (`wanted`, else all) under `out`, and plates with their flares to `out`/frames.
+
+        Layers are 32 bit where a plate is. Returns the content of bake.json; raises what `bake` raises.
+        """
+        settings = settings or BakeSettings()
+        space = colour_space(settings.space, settings.config)
+        frames = list(wanted) if wanted is not None else [one.frame for one in self.target.frames]
+        cameras = {one.frame.view: one.shot.camera for one in self.target.frames}
+        if settings.half and self._has_full_float():
+            settings = replace(settings, half=False)
+        return bake(self, frames, cameras, out, settings, progress, overwrite=overwrite,
+                    of_frame=lambda frame: self.of_frame(frame, space, Path(out) / FRAMES))
+
+    def _has_full_float(self) -> bool:
+        first = next((one for one in self.target.frames if one.plate is not None), None)
+        return first is not None and self.plate(first).is_full_float
+
+    def plate(self, one: TargetFrame) -> ColouredPlate:
+        """The frame's plate in its own space."""
+        assert one.plate is not None
+        return ColouredPlate.read(one.plate, self.settings.plate_space, self.config)
+
+
+class _OfFrame:
+    """One frame of a transfer."""
+
+    def __init__(self, transfer: Transfer, index: int, space: ColourSpace, out: Path | None) -> None:
+        self._transfer, self._index, self._space, self._out = transfer, index, space, out
+        self._one = transfer.target.frames[index]
+        self._plate: ColouredPlate | None = None
+
+    @property
+    def fingerprint(self) -> str:
+        """See `Transfer.fingerprint_of`."""
+        return self._transfer.fingerprint_of(self._index)
+
+    def render(self, camera: Camera, edits: LookEdits | None = None) -> _Rendering:
+        """Scene, flare of each light, depth; scene-linear Rec. 709."""
+        with torch.no_grad():
+            scene, depth = self._background(camera)
+            flares = self._transfer.flares(self._index, camera, edits)
+            # What covers does so in display space, over what a screen shows of the scene; the scene stays unclipped.
+            display = encode(torch.from_numpy(np.clip(scene, 0, 1)))
+            parts = linear_layers(display, flares, self._transfer.look.blend)
+        dark = np.zeros_like(scene)
+        return _Rendering(scene, {name: parts.flares[name].numpy() if name in parts.flares else dark
+                                  for name in self._transfer.lights}, depth)
+
+    def _background(self, camera: Camera) -> tuple[Pixels, Pixels]:
+        target, one = self._transfer.target, self._one
+        nothing = np.zeros((camera.height, camera.width), np.float32)
+        if one.plate is not None:
+            straight = background(one, camera.size)
+            if straight is not None:
+                return straight, nothing
+            plate = self._transfer.plate(one)
+            if plate.size == camera.size:
+                self._plate = plate
+                return plate.linear, nothing
+            return np.asarray(Picture(plate.linear, "linear").resized(*camera.size).pixels, np.float32), nothing
+        if target.scene is not None and target.shown:
+            rendering = target.scene.render(camera)
+            return decode(rendering.colour.clamp(0, 1)).numpy(), rendering.depth.numpy()
+        return np.zeros((camera.height, camera.width, 3), np.float32), nothing
+
+    def finished(self, layers: FrameLayers, camera: Camera) -> FrameLayers:
+        """The layers, with the plate's own numbers where the spaces are one; writes the plate with its flare."""
+        if self._plate is None or self._plate.size != camera.size:
+            return layers
+        if self._out is not None and self._one.plate is not None:
+            self._plate.write(self._out / self._one.plate.name, self._space.to_linear(layers.flare))
+        own = self._plate.space.matrix
+        if own is not None and self._space.matrix is not None and np.allclose(own, self._space.matrix, atol=1e-9):
+            return FrameLayers(self._plate.values, layers.flares, layers.depth)
+        return layers

@@ -1,0 +1,78 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""A .blend as a shot: its camera, its lights or named objects, and what its objects hide of them, frame by frame.
+
+For the commands, which find no look set up in the scene; the panel's own way is `shots`.
+"""
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from ..core.errors import CaptureError
+from ..core.look.shot import PlacedLight, Shot, ShotFrame
+from . import cameras, looks
+
+KINDS = ("POINT", "SPOT", "AREA", "SUN")
+SUN_DISTANCE = 1e4
+"""Scene units at which a sun is placed, against its direction, from the camera."""
+
+
+def shot_of(scene: Any, flare: Path, names: Sequence[str], frames: Sequence[int], *, radius: float = 0.0,
+            occlusion: bool = True, done: Callable[[], None] = lambda: None) -> Shot:
+    """The scene's active camera at these frames. names: of objects that are lights; none: the scene's lamps.
+
+    radius: of the lights' discs for the soft edge of shadows, world units; 0: a share of the distance. The shot's
+    coordinates are Blender's world. Raises CaptureError for a scene without a camera, light, or named object.
+    """
+    import bpy
+
+    things = _lights(scene, names)
+    made = []
+    for frame in frames:
+        scene.frame_set(frame)
+        depsgraph = bpy.context.evaluated_depsgraph_get()
+        if scene.camera is None:
+            raise CaptureError(f"The scene {scene.name!r} has no active camera; set one.")
+        camera = scene.camera.evaluated_get(depsgraph)
+        core = cameras.core_camera(camera.data, camera.matrix_world, scene.render)
+        eye = camera.matrix_world.translation
+        lights = [_placed(scene, depsgraph, thing, eye, radius, occlusion) for thing in things]
+        made.append(ShotFrame(frame, scene.camera.name, core, tuple(lights)))
+        done()
+    return Shot(flare, tuple(made))
+
+
+def _lights(scene: Any, names: Sequence[str]) -> list[Any]:
+    if names:
+        missing = [name for name in names if name not in scene.objects]
+        if missing:
+            raise CaptureError(f"The scene {scene.name!r} has no object {missing[0]!r}; name lights as it does.")
+        return [scene.objects[name] for name in names]
+    found = [thing for thing in scene.objects if thing.type == "LIGHT" and thing.data.type in KINDS
+             and not thing.hide_render]
+    if not found:
+        raise CaptureError(f"The scene {scene.name!r} has no lights; name objects with --lights.")
+    return found
+
+
+def _placed(scene: Any, depsgraph: Any, thing: Any, eye: Any, radius: float, occlusion: bool) -> PlacedLight:
+    here = thing.evaluated_get(depsgraph)
+    where = here.matrix_world.translation.copy()
+    if thing.type == "LIGHT" and thing.data.type == "SUN":
+        from mathutils import Vector
+
+        where = eye + (here.matrix_world.to_3x3() @ Vector((0.0, 0.0, 1.0))).normalized() * SUN_DISTANCE
+        share = looks.share_seen(scene, depsgraph, eye, where, {thing.name}, radius) if occlusion else 1.0
+    else:
+        item = SimpleNamespace(target=thing, radius=radius or _radius(thing))
+        share = looks.visible_share(scene, depsgraph, eye, item) if occlusion else 1.0
+    return PlacedLight(thing.name, thing.name, np.array(where, np.float64), float(share))
+
+
+def _radius(thing: Any) -> float:
+    """Of a lamp that has one; 0 where it is a point or a mesh."""
+    return float(getattr(thing.data, "shadow_soft_size", 0.0)) if thing.type == "LIGHT" else 0.0

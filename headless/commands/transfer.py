@@ -1,0 +1,263 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""transfer: a flare on to other footage."""
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from ...core.errors import CaptureError, RunError, SettingsError
+from ...core.progress import Progress
+from .. import jobs
+from ..command import Command, Step
+from .bake import size, space_options
+
+QUERIES = ("source", "target", "blend")
+PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".exr")
+
+
+def arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("flare", type=Path, metavar="FLARE", help="a .flare, or the folder of a run")
+    parser.add_argument("--to", type=Path, nargs="+", required=True, metavar="TARGET",
+                        help="pictures; or a capture; a run (its scene is shown); a 3DGS PLY with --cameras; a .blend; "
+                             "a shot (JSON)")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR",
+                        help="folder for layers.####.exr, and frames/ with the plates under their own names")
+    parser.add_argument("--query", choices=QUERIES, default="blend",
+                        help="what the flare's appearance follows: one training view (source), the target's view "
+                             "(target), or the target's view kept inside what was trained (blend, the default)")
+    parser.add_argument("--frames", metavar="A-B", help="frame numbers, such as 1-20,31; all where not given")
+    parser.add_argument("--size", metavar="WIDTH[xHEIGHT]", help="pixels (default: the target's)")
+    looks = parser.add_argument_group("lights")
+    looks.add_argument("--light", action="append", default=[], metavar="[NAME=]X,Y",
+                       help="on to a picture: a light in pixels, in the frame or not; repeatable (default: found by "
+                            "exposure)")
+    looks.add_argument("--lights", metavar="FILE|NAMES",
+                       help="a lights.json instead of the capture's; or names of objects of the .blend, with commas "
+                            "between (default: its lamps)")
+    looks.add_argument("--use", action="append", default=[], metavar="LIGHT=SOURCE",
+                       help="the light of the target that shows the look of this light of the flare; repeatable "
+                            "(default: by name, else in turn)")
+    looks.add_argument("--smooth", type=int, default=1, metavar="FRAMES",
+                       help="frames over which a light fades where it is hidden, on paths (default 1, 0 for none)")
+    looks.add_argument("--radius", type=float, default=0.0, metavar="UNITS",
+                       help="of the lights of a .blend, for the soft edge (default: the lamp's, else 1%% of the "
+                            "distance)")
+    looks.add_argument("--scale", type=float, default=1.0, metavar="X",
+                       help="units of the target's world to one of the source's (default 1)")
+    cameras = parser.add_argument_group("cameras and scenes")
+    cameras.add_argument("--cameras", type=Path, metavar="CAPTURE", help="whose cameras see the 3DGS PLY")
+    cameras.add_argument("--scene", type=Path, metavar="PLY", help="3DGS scene in the target's world that hides lights")
+    cameras.add_argument("--focal", type=float, metavar="PIXELS",
+                         help="of a picture (default: the field of view of the source's camera)")
+    cameras.add_argument("--centre", metavar="X,Y", help="principal point of a picture, pixels (default: the middle)")
+    cameras.add_argument("--capture", type=Path, metavar="CAPTURE",
+                         help="what the flare was fitted to, for a .flare that does not tell what it was trained on")
+    plates = parser.add_argument_group("plates and layers")
+    plates.add_argument("--plates", type=Path, metavar="DIR", help="pictures for the frames of a .blend or a shot")
+    plates.add_argument("--plate-space", default="auto", metavar="NAME",
+                        help="colour space of the plates: srgb, rec709, linear, acescg, … or one of an OpenColorIO "
+                             "configuration (default: an EXR's by its chromaticities, sRGB for other files)")
+    space_options(parser)
+    plates.add_argument("--set", action="append", default=[], metavar="LIGHT.WHAT=VALUE", dest="edits",
+                        help="edits of the look, as of `bake`, by the target's lights; repeatable")
+    plates.add_argument("--edits", type=Path, metavar="FILE", dest="keyed", help="edits by frame (JSON or TOML)")
+    plates.add_argument("--float", action="store_true", help="32 bit floats (default: 16 bit, if no plate has more)")
+    plates.add_argument("--overwrite", action="store_true", help="replace layers of another transfer in DIR")
+    parser.add_argument("--shot", type=Path, help=argparse.SUPPRESS)
+    jobs.add_option(parser)
+
+
+def is_blend(words: argparse.Namespace) -> bool:
+    """Whether Blender has to be asked."""
+    return bool(words.to[0] is not None and words.to[0].suffix.lower() == ".blend")
+
+
+def look_at_blend(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
+    """Blender's part: the .blend's camera, lights and what hides them, written down for the engine."""
+    import bpy
+
+    from ...core.bake.frames import Frame, chosen
+    from ...flare_addon.blend_shot import shot_of
+
+    if len(words.to) > 1:
+        raise SettingsError("One .blend at a time can be the target.")
+    path = words.to[0].resolve()
+    if not path.is_file():
+        raise CaptureError(f"{path} is missing.")
+    try:
+        bpy.ops.wm.open_mainfile(filepath=str(path), load_ui=False, use_scripts=False)
+    except RuntimeError as problem:
+        raise CaptureError(f"{path} cannot be opened by Blender {bpy.app.version_string} ({problem}).") from problem
+    scene = bpy.context.scene
+    every = range(scene.frame_start, scene.frame_end + 1)
+    # Neighbours too: the share of a light is smoothed over them, and a chunk must come out as the whole does.
+    wanted = {frame.number for frame in chosen([Frame("", number, "") for number in every], words.frames)}
+    around = range(-2 * words.smooth, 2 * words.smooth + 1)
+    frames = [number for number in every if any(number + step in wanted for step in around)]
+    if words.query == "source":
+        frames = list(every)  # whose middle chooses the training view
+    names = [name.strip() for name in (words.lights or "").split(",") if name.strip()]
+    progress.stage("look at the .blend", len(frames))
+    shot = shot_of(scene, words.flare.resolve(), names, frames, radius=words.radius, done=progress.advance)
+    shot.write(shot_path(words))
+    return {"shot": str(shot_path(words))}
+
+
+def shot_path(words: argparse.Namespace) -> Path:
+    """Where Blender's part leaves the shot; chunks of one shot each have their own."""
+    if words.shot:
+        return Path(words.shot)
+    part = f".{words.frames.replace(',', '_')}" if words.frames else ""
+    return Path(words.out) / f"shot{part}.json"
+
+
+def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
+    if words.smooth < 0 or not words.scale > 0:
+        raise SettingsError("--smooth is 0 or more, and --scale more than 0.")
+    flare, training = source(words)
+    return _made(words, "transfer", target_of(words, flare), flare, training, progress)
+
+
+def _made(words: argparse.Namespace, step: str, target: Any, flare: Path, training: list[Any] | None,
+          progress: Progress) -> dict[str, Any]:
+    """The layers of a target."""
+    from ...core.bake.bake import BakeSettings
+    from ...core.bake.frames import chosen
+    from ...core.look import KeyedEdits
+    from ...core.transfer.target import sized
+    from ...core.transfer.transfer import Transfer, TransferSettings
+
+    target = sized(target, *size(words.size))
+    settings = TransferSettings(words.query, words.scale, words.smooth, words.plate_space)
+    transfer = Transfer(flare, target, settings, training, words.ocio)
+    frames = chosen([one.frame for one in target.frames], words.frames)
+    if words.jobs != 1:
+        extra = ["--shot", str(shot_path(words))] if is_blend(words) else []
+        jobs.run_jobs(words, step, [frame.number for frame in frames], progress, extra)
+    baked = BakeSettings(half=not words.float, edits=tuple(words.edits), space=words.space, config=words.ocio,
+                         keyed=KeyedEdits.read(words.keyed) if words.keyed else KeyedEdits())
+    record = transfer.bake(words.out, frames, baked, progress, overwrite=words.overwrite)
+    progress.say(f"{len(record['frames'])} frames of layers are in {words.out}.")
+    return {"layers": str(words.out), "frames": len(record["frames"])}
+
+
+def words_of_bake(words: argparse.Namespace) -> argparse.Namespace:
+    """What `bake FLARE` was asked, as transfer's own words."""
+    given = vars(words) | {"flare": words.run, "to": [words.blend or words.capture]}
+    plain = {"query": "blend", "smooth": 1, "radius": 0.0, "scale": 1.0, "use": [], "light": [], "plates": None,
+             "scene": None, "cameras": None, "focal": None, "centre": None, "plate_space": "auto"}
+    return argparse.Namespace(**{**plain, **given})
+
+
+def bake_flare(bake_words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
+    """`bake FLARE`: with the cameras of a capture, the lights where it was learned; or for a .blend."""
+    from ...core.capture import Capture
+    from ...core.look import read
+    from ...core.transfer.target import of_cameras
+
+    if bake_words.blend is None and bake_words.capture is None:
+        raise SettingsError(f"{bake_words.run} has no cameras of its own; name a capture with --capture, or a .blend "
+                            "with --blend.")
+    words = words_of_bake(bake_words)
+    if words.blend is not None:
+        words.capture = None
+        return _made(words, "bake", target_of(words, words.flare), words.flare, None, progress)
+    views = Capture.open(words.capture, need_frames=False)
+    return _made(words, "bake", of_cameras(views, read(words.flare)), words.flare, None, progress)
+
+
+def source(words: argparse.Namespace) -> tuple[Path, list[Any] | None]:
+    """The .flare, and the poses of its training views where they can be had."""
+    from ...core.capture import Capture
+    from ...core.fit.run import FLARE, Run
+
+    capture, holdout = words.capture, None
+    flare = words.flare
+    if flare.is_dir():
+        made = Run.open(flare)
+        if not (flare / FLARE).is_file():
+            raise RunError(f"{flare} has no {FLARE} yet; finish the fit with --resume first.")
+        flare, holdout = flare / FLARE, made.settings.holdout
+        capture = capture or (made.capture_folder if made.capture_folder.is_dir() else None)
+    if capture is None:
+        return flare, None
+    views, _ = Capture.open(capture, need_frames=False).split(holdout)
+    return flare, [view.camera.world_to_camera for view in views]
+
+
+def target_of(words: argparse.Namespace, flare: Path) -> Any:
+    """The target, by what --to names."""
+    from ...core.capture import Capture
+    from ...core.fit.run import CONFIG, SCENE, Run
+    from ...core.lights.detection import Detector
+    from ...core.lights.exposure import Exposure
+    from ...core.look import read
+    from ...core.look.shot import Shot
+    from ...core.transfer import target as targets
+    from ...core.transfer.query import seen_by
+    from ...core.transfer.sources import parsed
+
+    look, to, wanted = read(flare), words.to, parsed(words.use)
+    if len(to) > 1 and not all(path.suffix.lower() in PICTURES for path in to):
+        raise SettingsError("Several targets at once have to be pictures.")
+    kind = to[0].suffix.lower()
+    if kind in PICTURES:
+        seen = seen_by(flare, look.lights)
+        distances = {light.name: _usual_distance(light, seen.get(light.name)) for light in look.lights}
+        detector: Detector | None = None if words.light else Exposure()
+        return targets.of_pictures(to, look, _points(words.light), wanted, distances, detector=detector,
+                                   focal=words.focal, centre=_point(words.centre) if words.centre else None)
+    if kind in (".blend", ".json"):
+        path = shot_path(words) if kind == ".blend" else to[0]
+        return targets.of_shot(Shot.read(path), look, wanted, plates=words.plates, scene=words.scene)
+    lights = Path(words.lights) if words.lights else None
+    if kind == ".ply":
+        if words.cameras is None:
+            raise SettingsError(f"{to[0]} is a scene without cameras; name a capture that has them with --cameras.")
+        return targets.of_capture(Capture.open(words.cameras, need_frames=False), look, wanted, lights=lights,
+                                  scene=to[0], shown=True)
+    if (to[0] / CONFIG).is_file():
+        capture = Capture.open(words.cameras or Run.open(to[0]).capture_folder, need_frames=False)
+        return targets.of_capture(capture, look, wanted, lights=lights, scene=words.scene or to[0] / SCENE, shown=True)
+    return targets.of_capture(Capture.open(to[0]), look, wanted, lights=lights, scene=words.scene)
+
+
+def _usual_distance(light: Any, seen: Any) -> float:
+    """From which training saw a light, in the middle."""
+    import numpy as np
+
+    if seen is not None:
+        return float(np.median(seen.distances))
+    reach = light.query_range
+    return float(np.linalg.norm((reach.camera_low + reach.camera_high) / 2 - light.xyz)) or 1.0
+
+
+def _points(words: list[str]) -> dict[str, tuple[float, float]]:
+    """"[name=]x,y" by name."""
+    found: dict[str, tuple[float, float]] = {}
+    for number, word in enumerate(words, 1):
+        name, equals, place = word.rpartition("=")
+        found[name.strip() if equals else f"light{number}"] = _point(place)
+    return found
+
+
+def _point(text: str) -> tuple[float, float]:
+    try:
+        x, y = (float(part) for part in text.split(","))
+    except ValueError:
+        raise SettingsError(f"{text!r} is not a place in pixels such as 640,360.") from None
+    return x, y
+
+
+COMMAND = Command(
+    "transfer", "Puts a flare on to other footage: pictures, captures, splats, Blender scenes.",
+    """Writes EXR layers as `bake` does, and DIR/frames with the plates as they are, flare added; where the flare does
+not reach, a plate keeps its own numbers to the last bit. Hidden lights, and lights behind the camera, give no
+flare. A run as the target, or a PLY with --cameras, is rendered; a .blend is looked at by Blender, for its
+camera, its lights, and what hides them.
+
+  run.py transfer lamp.flare --to plate.exr --light 1210,340 --out build/plate
+  run.py transfer lamp.flare --to shots/sh010 --scene sh010.ply --out build/sh010 --use sun=lamp
+  run.py transfer lamp.flare --to shot.blend --plates renders --out build/shot --jobs 2""",
+    arguments, (Step("look", "blender", look_at_blend, wanted=is_blend), Step("transfer", "engine", run)))

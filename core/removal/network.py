@@ -64,18 +64,31 @@ def inputs(display: Tensor) -> Tensor:
     return torch.cat([display, over, turned, place], 1)
 
 
+class Norm(nn.Module):
+    """Layer normalisation over the channels of each pixel."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.weight, self.bias = nn.Parameter(torch.ones(width)), nn.Parameter(torch.zeros(width))
+
+    def forward(self, x: Tensor) -> Tensor:
+        last = x.permute(0, 2, 3, 1)  # the memory's own order
+        return F.layer_norm(last, last.shape[-1:], self.weight, self.bias).permute(0, 3, 1, 2)
+
+
 class Block(nn.Module):
     """x + convolutions(x); its last layer starts at zero, so that a deep network starts as a shallow one."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
+        self.norm = Norm(width)
         self.first = nn.Conv2d(width, width, 3, padding=1)
         self.second = nn.Conv2d(width, width, 3, padding=1)
         nn.init.zeros_(self.second.weight)
         nn.init.zeros_(self.second.bias)  # type: ignore[arg-type]
 
     def forward(self, x: Tensor) -> Tensor:
-        return x + self.second(F.relu(self.first(F.relu(x))))
+        return x + self.second(F.leaky_relu(self.first(self.norm(x)), 0.1))
 
 
 class Everywhere(nn.Module):
@@ -105,6 +118,7 @@ class RemovalNetwork(nn.Module):
                                   for a, b in pairwise(widths))
         self.up = nn.ModuleList(nn.Sequential(*(Block(width) for _ in range(depth)))
                                 for width, depth in zip(widths[:-1], depths[:-1], strict=True))
+        self.last = Norm(widths[0])
         self.head = nn.Conv2d(widths[0], 6 * FOLD**2, 3, padding=1)
         nn.init.normal_(self.head.weight, std=1e-3)
         nn.init.zeros_(self.head.bias)  # type: ignore[arg-type]
@@ -117,11 +131,11 @@ class RemovalNetwork(nn.Module):
             x = blocks(x)
             if level < len(self.reduce):
                 kept.append(x)
-                x = self.reduce[level](F.relu(x))
+                x = self.reduce[level](x)
         x = self.everywhere(x)
         for level in reversed(range(len(self.grow))):
-            x = self.up[level](self.grow[level](F.relu(x)) + kept[level])
-        out = F.pixel_shuffle(self.head(F.relu(x)), FOLD).float()
+            x = self.up[level](self.grow[level](x) + kept[level])
+        out = F.pixel_shuffle(self.head(self.last(x)), FOLD).float()
         flare = out[:, :3]
         return Prediction(flare, flare * torch.sigmoid(8 * out[:, 3:] + 1))
 

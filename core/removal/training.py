@@ -156,9 +156,10 @@ class Trainer:
             self.averaged[name] = state[f"averaged.{name}"].float().to(self.device)
         for name, parameter in self.network.named_parameters():
             if f"moment.step.{name}" in state:
-                self.optimiser.state[parameter] = {
-                    key: state[f"moment.{key}.{name}"].to(self.device if key != "step" else "cpu")
-                    for key in ("exp_avg", "exp_avg_sq", "step")}
+                # In the parameter's own order of memory, which the fused step takes for granted.
+                moments = {key: torch.empty_like(parameter).copy_(state[f"moment.{key}.{name}"])
+                           for key in ("exp_avg", "exp_avg_sq")}
+                self.optimiser.state[parameter] = {**moments, "step": state[f"moment.step.{name}"].to(self.device)}
 
 
 def checks(backgrounds: Backgrounds, lenses: Sequence[Prescription], count: int = CHECKS) -> dict[str, list[Pair]]:

@@ -1,0 +1,190 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Training and scoring of the removal network: it learns, it can be stopped, its scores are right."""
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from core.errors import Cancelled, RunError, SettingsError
+from core.metrics.lpips import Lpips
+from core.pictures import Pixels, write_png
+from core.progress import Progress
+from core.removal import evaluation, training, weights
+from core.removal.backgrounds import Backgrounds
+from core.removal.recipe import Recipe, as_dict, from_dict
+from core.removal.synthesis.prescription import built_in
+
+torch.set_num_threads(1)  # small tensors, on which threads only wait for each other
+
+RECIPE = Recipe(iterations=4, pixels=1, widths=(8, 8, 8, 8), depths=(1, 1, 1, 1), bank=2, canvas=64, warmup=2,
+                half=False)
+
+
+def backgrounds() -> Backgrounds:
+    x, y = np.meshgrid(np.linspace(0, 150, 300), np.linspace(20, 100, 200))
+    return Backgrounds([np.stack([x, y, 120 - y], -1).astype(np.uint8)], [])
+
+
+class StopAfter(Progress):
+    """Asks for a stop at a step of the training."""
+
+    def __init__(self, steps: int) -> None:
+        super().__init__()
+        self._steps = steps
+
+    def advance(self, steps: int = 1, **figures: float) -> None:
+        if self._stage == "train":
+            self._steps -= 1
+            if self._steps == 0:
+                self.request_stop()
+        super().advance(steps, **figures)
+
+
+def test_a_training_that_was_stopped_goes_on_as_if_it_was_not(tmp_path: Path) -> None:
+    whole = training.train(RECIPE, tmp_path / "whole", backgrounds(), built_in())
+    with pytest.raises(Cancelled):
+        training.train(RECIPE, tmp_path / "parts", backgrounds(), built_in(), progress=StopAfter(2))
+    with pytest.raises(RunError, match="--resume"):
+        training.train(RECIPE, tmp_path / "parts", backgrounds(), built_in())
+    parts = training.train(RECIPE, tmp_path / "parts", backgrounds(), built_in(), resume=True)
+    a, b = weights.read(whole)[0], weights.read(parts)[0]
+    assert a.keys() == b.keys()
+    for name in a:
+        assert a[name].dtype == torch.float16
+        torch.testing.assert_close(a[name], b[name], atol=1e-3, rtol=1e-2)
+    assert weights.load(whole).widths == RECIPE.widths
+
+
+def test_a_handful_of_pairs_is_learned(tmp_path: Path) -> None:
+    del tmp_path
+    trainer = training.Trainer(Recipe(iterations=400, pixels=1, widths=(16, 16, 16, 16), depths=(1, 1, 1, 1), bank=2,
+                                      canvas=64, warmup=5, learning_rate=3e-3, half=False), backgrounds(), built_in())
+    trainer.fill(Progress())
+    from core.removal.pairs import pair
+
+    pairs = [pair(np.random.default_rng(k), trainer._bank, backgrounds(), 64, 64, clean=0) for k in (1, 2)]
+    losses = []
+    for _ in range(80):
+        loss, figures = trainer._loss(pairs)
+        trainer.optimiser.zero_grad()
+        loss.backward()
+        trainer.optimiser.step()
+        losses.append(figures["l1"])
+    assert losses[-1] < 0.6 * losses[0]
+
+
+def test_going_on_from_weights(tmp_path: Path) -> None:
+    first = training.train(RECIPE, tmp_path / "first", backgrounds(), built_in())
+    second = training.train(RECIPE, tmp_path / "second", backgrounds(), built_in(), start=first)
+    assert weights.read(second)[1]["iteration"] == "4"
+    other = Recipe(**{**RECIPE.__dict__, "widths": (16, 8, 8, 8)})
+    third = training.train(other, tmp_path / "third", backgrounds(), built_in(), start=first)
+    assert weights.load(third).widths == RECIPE.widths, "the network is that of the weights"
+
+
+def test_the_log_has_figures_and_checks(tmp_path: Path) -> None:
+    training.train(RECIPE, tmp_path, backgrounds(), built_in(), tests=(backgrounds(), built_in()))
+    (line,) = [json.loads(text) for text in (tmp_path / training.LOG).read_text(encoding="utf-8").splitlines()]
+    assert line["iteration"] == 4
+    assert {"l1", "psnr", "gain_db"} <= line.keys()
+
+
+def test_recipes(tmp_path: Path) -> None:
+    del tmp_path
+    recipe = Recipe(iterations=1000, warmup=10, cooldown=0.2)
+    assert recipe.rate(0) == pytest.approx(recipe.learning_rate / 10)
+    assert recipe.rate(500) == recipe.learning_rate
+    assert recipe.rate(900) == pytest.approx(recipe.learning_rate / 2)
+    assert from_dict(as_dict(recipe)) == recipe
+    with pytest.raises(SettingsError, match="has no speed"):
+        from_dict({"speed": 1})
+    with pytest.raises(SettingsError, match="as many"):
+        Recipe(widths=(8, 8), depths=(1,))
+    sizes = [recipe.frame_size(np.random.default_rng(k), 5000) for k in range(50)]
+    assert all(side % 32 == 0 for size in sizes for side in size)
+
+
+# Scores.
+
+
+def pair_folder(folder: Path, names: tuple[str, ...] = ("input_0.png", "gt_0.png")) -> Path:
+    random = np.random.default_rng(0)
+    for kind, level in (("input", 0.1), ("gt", 0.0)):
+        for k in range(2):
+            name = (names[0] if kind == "input" else names[1]).replace("0", str(k))
+            write_png(folder / kind / name, np.clip(random.random((24, 30, 3)) * 0 + 0.5 + level, 0, 1))
+    return folder
+
+
+def test_scores_beside_the_untouched_input(tmp_path: Path) -> None:
+    pair_folder(tmp_path / "real")
+    pair_folder(tmp_path / "synthetic", ("a0.png", "a0.png"))
+    cases = evaluation.paired(tmp_path)
+    assert sorted({case.category for case in cases}) == ["real", "synthetic"]
+    scores = evaluation.evaluate(cases, lambda frame: frame - np.float32(0.05))
+    assert scores["mean"]["count"] == 4
+    assert scores["mean"]["gain_db"] == pytest.approx(20 * np.log10(2), abs=0.4)
+    assert scores["mean"]["made_worse"] == 0
+    assert scores["mean"]["result"]["lpips"] is None
+    worse = evaluation.evaluate(cases, lambda frame: frame + np.float32(0.05))
+    assert worse["mean"]["made_worse"] == 1
+    assert "real" in evaluation.table(worse)
+    sheet = evaluation.worst_sheet(cases, lambda frame: frame, worse, 40)
+    assert sheet.shape == (4 * (20 + 32), 160, 3)
+
+
+def test_masks_count_alone(tmp_path: Path) -> None:
+    pair_folder(tmp_path)
+    mask = np.zeros((24, 30, 3))
+    mask[:4] = 1
+    for k in range(2):
+        write_png(tmp_path / "mask" / f"mask_{k}.png", mask)
+
+    def half(frame: Pixels) -> Pixels:
+        result = frame.copy()
+        result[:4] -= np.float32(0.1)
+        return result
+
+    result = evaluation.evaluate(evaluation.paired(tmp_path), half)["mean"]["result"]
+    assert result["masked_psnr"] > 45 > result["psnr"]
+
+
+def test_pairs_that_are_none(tmp_path: Path) -> None:
+    with pytest.raises(SettingsError, match="no pairs"):
+        evaluation.paired(tmp_path)
+    pair_folder(tmp_path)
+    (tmp_path / "gt" / "gt_1.png").unlink()
+    with pytest.raises(SettingsError, match="counterpart"):
+        evaluation.paired(tmp_path)
+
+
+def test_the_synthetic_test_set_is_its_seed() -> None:
+    one, again = (evaluation.synthetic(5, 1, backgrounds(), built_in(), (96, 64)) for _ in range(2))
+    assert len(one) == 8
+    for a, b in zip(one[:3], again[:3], strict=True):
+        (frame, scene, _), (frame2, _, _) = a.read(), b.read()
+        assert frame.shape == scene.shape == (64, 96, 3)
+        assert np.array_equal(frame, frame2)
+        assert np.array_equal(np.round(frame * 255) / 255, frame.astype(np.float64)) or frame.dtype == np.float32
+
+
+def test_lpips_with_weights_of_the_user(tmp_path: Path) -> None:
+    with pytest.raises(SettingsError, match="lacks weights"):
+        Lpips(tmp_path)
+    shapes = {0: (64, 3, 11, 11), 3: (192, 64, 5, 5), 6: (384, 192, 3, 3), 8: (256, 384, 3, 3), 10: (256, 256, 3, 3)}
+    torch.manual_seed(0)
+    features = {f"features.{index}.weight": torch.randn(shape) / np.prod(shape[1:]) ** 0.5
+                for index, shape in shapes.items()}
+    features |= {f"features.{index}.bias": torch.zeros(shape[0]) for index, shape in shapes.items()}
+    torch.save(features, tmp_path / "alexnet.pth")
+    lines = {f"lin{k}.model.1.weight": torch.rand(1, shape[0], 1, 1) for k, shape in enumerate(shapes.values())}
+    weights.write(tmp_path / "alex.safetensors", lines, {})
+    measure = Lpips(tmp_path)
+    a = np.random.default_rng(0).random((64, 64, 3)).astype(np.float32)
+    assert measure(a, a) == 0
+    near, far = (np.clip(a + amount, 0, 1).astype(np.float32) for amount in (0.02, 0.4))
+    assert 0 < measure(a, near) < measure(a, far)

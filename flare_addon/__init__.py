@@ -5,7 +5,7 @@
     capture_import.py   captures in                       capture_export.py   Blender's cameras as captures
     cameras.py          Blender's cameras and the core's  lights.py        light objects
     engine.py, jobs.py  the process with torch            fits.py          fits
-    looks.py            .flare, flares, occlusion         overlay.py       the flare in the camera view
+    looks.py            .flare, flares, occlusion         overlay.py, points.py   what is drawn in the viewport
     shots.py            what is baked                     compositor.py, layer_folder.py   layers back together
     library.py          flares for other shots            operators/, panels.py   buttons and panels
 """
@@ -13,9 +13,9 @@ from __future__ import annotations
 
 import bpy
 
-from . import fits, jobs, looks, operators, overlay, panels, preferences, properties
+from . import fits, jobs, looks, operators, overlay, panels, points, preferences, properties
 
-_MODULES = (properties, preferences, operators, panels, overlay)
+_MODULES = (properties, preferences, operators, panels, points, overlay)
 
 
 @bpy.app.handlers.persistent

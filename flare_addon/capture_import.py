@@ -215,7 +215,6 @@ def _footage(camera: Any, capture: Capture, views: Sequence[View], numbers: Sequ
     paths = [capture.frame_path(view) for view in views]
     image = bpy.data.images.load(str(paths[0]), check_existing=True)
     back = _backdrop(camera, image)
-    camera.fit_flare.frame_names = "\n".join(path.name for path in paths)
     if len(paths) == 1:
         return True
     patterns = {(path.parent, _NUMBER.sub("#" * 1, path.name)) for path in paths}
@@ -229,6 +228,34 @@ def _footage(camera: Any, capture: Capture, views: Sequence[View], numbers: Sequ
     user.frame_duration = numbers[-1] - numbers[0] + 1
     user.use_auto_refresh = True
     return True
+
+
+def show_footage(scene: Any, which: str) -> int:
+    """Show the frames of the capture's folder images/ or removed/ behind its cameras; how many images changed.
+
+    A frame that has no twin there stays as it is. Twins may have another suffix.
+    """
+    root, folder = scene.fit_flare.root, scene.fit_flare.capture
+    if root is None or not folder:
+        return 0
+    base = Path(bpy.path.abspath(folder))
+    changed = 0
+    for camera in (item for item in root.children if item.type == "CAMERA"):
+        for back in camera.data.background_images:
+            if back.image is None:
+                continue
+            path = Path(bpy.path.abspath(back.image.filepath)).resolve()
+            inner = next((path.relative_to((base / name).resolve()) for name in ("images", "removed")
+                          if path.is_relative_to((base / name).resolve())), None)
+            if inner is None:
+                continue
+            twin = base / which / inner
+            choices = [twin, *(twin.with_suffix(suffix) for suffix in (".png", ".jpg", ".exr", ".tif"))]
+            found = next((one for one in choices if one.is_file()), None)
+            if found is not None and found.resolve() != path:
+                back.image.filepath = stored(found)
+                changed += 1
+    return changed
 
 
 def _backdrop(camera: Any, image: Any) -> Any:
@@ -252,8 +279,8 @@ def _points(collection: Any, root: Any, cloud: PointCloud) -> Any:
     colours.data.foreach_set("color_srgb", rgba.ravel())
     mesh.update()
     points = _object(collection, "Points", mesh, root)
-    points.hide_render = True
-    points.hide_select = True
+    points.hide_render = points.hide_select = True
+    points.display_type, points.fit_flare.is_points = "BOUNDS", True  # points.py draws them in their colours
     return points
 
 

@@ -37,6 +37,8 @@ class FITFLARE_PT_capture(_Part, bpy.types.Panel):
         row.operator("fit_flare.import_capture", icon="IMPORT")
         if folder is not None:
             layout.prop(state, "capture", text="")
+            if state.root is not None and (folder / "removed").is_dir():
+                layout.row().prop(state, "footage", expand=True)
         column = layout.column()
         column.operator("fit_flare.capture_from_camera", icon="CAMERA_DATA")
 

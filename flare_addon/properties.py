@@ -42,6 +42,13 @@ def redraw(_self: Any = None, _context: Any = None) -> None:
                 area.tag_redraw()
 
 
+def _footage(self: Any, _context: Any) -> None:
+    """Show the frames as filmed or without flare behind the cameras."""
+    from .capture_import import show_footage
+
+    show_footage(self.id_data, self.footage)
+
+
 class Edits:
     """The sliders of a look, for all lights, one light, or one element (core.look.Edit)."""
 
@@ -119,6 +126,12 @@ class FITFLARE_PG_scene(bpy.types.PropertyGroup):
         name="Root", description="The empty that carries the imported capture: move, turn or scale it as you like",
         type=bpy.types.Object, update=redraw)
 
+    footage: EnumProperty(  # type: ignore[valid-type]
+        name="Footage", description="Which frames are shown behind the cameras",
+        items=(("images", "As Filmed", "The frames with their own flare"),
+               ("removed", "Without Flare", "The frames of removed/, to see the flare over a clean plate")),
+        update=_footage)
+
     run: StringProperty(  # type: ignore[valid-type]
         name="Run", description="Folder of the fit: settings, checkpoint, preview and result", subtype="DIR_PATH")
     preset: EnumProperty(  # type: ignore[valid-type]
@@ -170,7 +183,7 @@ class FITFLARE_PG_object(bpy.types.PropertyGroup):
     is_light: BoolProperty(  # type: ignore[valid-type]
         name="Light of the Capture", description="The fit learns a flare for this object", default=False)
     light: StringProperty(name="Light Name", description="Name of the light in lights.json and the .flare")  # type: ignore[valid-type]
-    frame_names: StringProperty()  # type: ignore[valid-type]
+    is_points: BoolProperty()  # type: ignore[valid-type]
 
 
 _CLASSES = (FITFLARE_PG_master, FITFLARE_PG_element, FITFLARE_PG_light, FITFLARE_PG_scene, FITFLARE_PG_object)

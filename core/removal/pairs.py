@@ -103,6 +103,9 @@ def _placed(random: Random, layers: Layers, width: int, height: int,
         rest = cv2.GaussianBlur(rest, (0, 0), blur)
     colour = np.exp(random.normal(0, 0.12, 3)).astype(np.float32)
     gain = np.float32(math.exp(random.normal(0, 0.6)) * strength)
+    # Frames that are washed out altogether teach nothing: the flare's mean light is bounded.
+    mean = float(np.minimum((rest[::4, ::4] + glare[::4, ::4]) * gain, 1).mean())
+    gain *= np.float32(min(random.uniform(0.02, 0.18) / max(mean, 1e-6), 1))
     rest, glare = rest * (colour * gain), glare * (colour * gain)
     near = np.zeros((height, width), np.float32)
     x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))

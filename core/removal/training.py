@@ -104,7 +104,7 @@ class Trainer:
         squared = (clean - clean_goal).square().mean((1, 2, 3))
         distance = (clean - clean_goal).abs().mean()
         loss = (distance + 0.5 * (mild - mild_goal).abs().mean() + 0.3 * (told.flare - flare_goal).abs().mean()
-                + 0.01 * torch.log(squared + 1e-5).mean())
+                + 0.03 * torch.log(squared + 1e-5).mean())
         return loss, {"l1": float(distance.detach()),
                       "psnr": float(-10 * torch.log10(squared.detach() + 1e-6).mean())}
 

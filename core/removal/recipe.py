@@ -28,7 +28,7 @@ class Recipe:
     average: float = 0.998         # of the weights that are kept, over iterations
     widths: tuple[int, ...] = (64, 96, 128, 192)
     depths: tuple[int, ...] = (1, 2, 2, 4)
-    small_until: int = 2000        # iterations with small frames, which are cheaper
+    small_until: int = 2500        # iterations with small frames, which are cheaper
     canvas: int = 448              # pixels a side of the flares' canvas
     bank: int = 250                # flares at hand at a time
     renew_every: int = 4           # iterations for each new flare
@@ -50,8 +50,8 @@ class Recipe:
 
     def frame_size(self, random: np.random.Generator, iteration: int) -> tuple[int, int]:
         """(width, height), multiples of 32: small at first, then up to the size that plates are worked at."""
-        longest = int(random.integers(7, 10) if iteration < self.small_until else random.integers(9, 17)) * 32
-        width, height = longest, max(round(longest / random.uniform(1.0, 1.9) / 32) * 32, 128)
+        longest = int(random.integers(4, 8) if iteration < self.small_until else random.integers(7, 15)) * 32
+        width, height = longest, max(round(longest / random.uniform(1.0, 1.9) / 32) * 32, 96)
         return (width, height) if random.random() < 0.8 else (height, width)
 
 

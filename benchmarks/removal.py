@@ -1,0 +1,176 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What the removal of flares costs and what it is worth.
+
+    python benchmarks/removal.py speed                       # 1920x1080 and 4096x2160, time and memory
+    python benchmarks/removal.py sample [--capture CAPTURE]  # against the exact scene, and flicker
+    python benchmarks/removal.py clean PHOTOS...             # pictures without flare, against themselves
+    python benchmarks/removal.py coverage [--sheet FILE]     # what the synthesis spans, and a sheet of it
+
+Speed: each case in a process of its own, on the threads that torch takes; reading and writing included; the
+peak is the process's resident memory. `full` is the network at the plate's own size, the ratio its time over
+that of the working size. Sample: PSNR in display values; flicker is the mean change of the error from one
+frame to the next, |(result - truth) of a frame - the same of the frame before|, beside that of the untouched
+frames. Clean: PSNR of the result against its input, not of a number where they are equal to the last bit.
+"""
+from __future__ import annotations
+
+import argparse
+import json
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+
+from core.metrics.pictures import psnr  # noqa: E402
+from core.pictures import read_picture, write_exr, write_png  # noqa: E402
+from core.progress import Progress  # noqa: E402
+from core.removal.batch import remove_all  # noqa: E402
+from core.removal.inference import Remover  # noqa: E402
+from core.removal.plates import read_plate  # noqa: E402
+
+CASES = {"1920x1080 png": (1920, 1080), "4096x2160 exr": (4096, 2160)}
+
+
+def plate(path: Path, width: int, height: int) -> None:
+    """A smooth picture with a bright spot, so that there is a flare to take."""
+    x, y = np.meshgrid(np.linspace(-1, 1, width), np.linspace(-1, 1, height))
+    glow = 0.5 / (1 + 30 * ((x - 0.4) ** 2 + (y + 0.3) ** 2))
+    waves = 0.2 + 0.1 * np.sin(30 * x) * np.cos(23 * y)
+    pixels = np.stack([waves + glow, waves * 0.8 + glow, waves * 0.6 + glow], -1).astype(np.float32)
+    pixels[np.hypot(x - 0.4, y + 0.3) < 0.03] = 4.0
+    if path.suffix == ".exr":
+        write_exr(path, {name: pixels[..., k] for k, name in enumerate("RGB")})
+    else:
+        write_png(path, pixels)
+
+
+def one(path: Path, size: int, weights: Path | None) -> None:
+    """The measured process: says seconds and peak megabytes."""
+    began = time.perf_counter()
+    remover = Remover(weights, working_size=size)
+    loaded = time.perf_counter()
+    remove_all([path], path.parent / "out", remover, Progress(), overwrite=True)
+    first = time.perf_counter()
+    remove_all([path], path.parent / "out", remover, Progress(), overwrite=True)
+    print(json.dumps({"load_s": loaded - began, "first_s": first - loaded, "again_s": time.perf_counter() - first,
+                      "peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024}))
+
+
+def speed(weights: Path | None) -> None:
+    """Time and memory of each case, at the working size and at full size."""
+    for name, (width, height) in CASES.items():
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / f"plate.{name.split()[1]}"
+            plate(path, width, height)
+            figures: dict[str, dict[str, float]] = {}
+            for kind, size in (("working", 512), ("full", width)):
+                words = [sys.executable, __file__, "one", str(path), "--size", str(size)]
+                done = subprocess.run(words + (["--weights", str(weights)] if weights else []), capture_output=True,
+                                      text=True, check=False)
+                if done.returncode:
+                    print(f"{name}, {kind}: failed, {done.stderr.strip().splitlines()[-1:]}")
+                    continue
+                figures[kind] = json.loads(done.stdout)
+                told = figures[kind]
+                print(f"{name:16} {kind:8} load {told['load_s']:5.2f} s, plate {told['first_s']:6.2f} s, "
+                      f"the next {told['again_s']:6.2f} s, peak {told['peak_mb']:6.0f} MB")
+            if len(figures) == 2:
+                print(f"{name:16} ratio    {figures['full']['again_s'] / figures['working']['again_s']:.1f}")
+
+
+def sample(capture: Path, weights: Path | None) -> None:
+    """PSNR of every frame against the exact scene, and flicker."""
+    remover = Remover(weights)
+    before: Any = None
+    scores, flicker = [], []
+    for path in sorted((capture / "images").iterdir()):
+        truth = read_picture(capture / "truth" / "scene" / f"{path.stem}.exr").display()
+        found = read_plate(path)
+        frame = found.codes.astype(np.float32) / 255
+        clean = remover.remove(found)[0].astype(np.float32) / 255
+        scores.append((psnr(frame, truth), psnr(clean, truth)))
+        errors = (frame - truth, clean - truth)
+        if before is not None:
+            flicker.append([float(np.abs(now - then).mean()) for now, then in zip(errors, before, strict=True)])
+        before = errors
+    untouched, cleaned = np.mean(scores, 0)
+    gains = np.diff(scores, axis=1)[:, 0]
+    print(f"scene PSNR {cleaned:.2f} dB, untouched {untouched:.2f}, gain {gains.mean():+.2f} "
+          f"(lowest {gains.min():+.2f}, highest {gains.max():+.2f}) over {len(scores)} frames")
+    print(f"flicker {np.mean(flicker, 0)[1]:.5f}, untouched {np.mean(flicker, 0)[0]:.5f}")
+
+
+def clean_pictures(folders: list[Path], weights: Path | None) -> None:
+    """What happens to pictures without flare."""
+    remover = Remover(weights)
+    values, kept = [], 0
+    for path in sorted(path for folder in folders for path in folder.rglob("*")
+                       if path.suffix.lower() in (".png", ".jpg", ".jpeg", ".tif")):
+        found = read_plate(path)
+        clean = remover.remove(found)[0]
+        if np.array_equal(clean, found.codes):
+            kept += 1
+            values.append(100.0)
+            continue
+        values.append(psnr(clean / found.top, found.codes / found.top))
+    print(f"{len(values)} pictures, {kept} kept to the last bit; PSNR against the input: median "
+          f"{np.median(values):.2f}, mean with 100 for the kept {np.mean(values):.2f}, 5 % below "
+          f"{np.percentile(values, 5):.2f}, lowest {min(values):.2f} dB; {np.mean(np.array(values) >= 45):.0%} at 45 dB "
+          "or more")
+
+
+def coverage(sheet: Path | None, count: int) -> None:
+    """A histogram of the coverage of synthesised flares, as text, and a sheet of pictures."""
+    from core.removal.formation import coverage as covered
+    from core.removal.synthesis.layers import CLASSES, flare
+    from core.removal.synthesis.prescription import built_in
+
+    lenses, tiles = built_in(), []
+    shares = [covered(flare((1, number), 160, lenses).whole) for number in range(count)]
+    counts, edges = np.histogram(shares, [0, 0.005, 0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 1])
+    for k, value in enumerate(counts):
+        print(f"{edges[k]:5.1%} to {edges[k + 1]:6.1%}  {value / count:6.1%}  {'#' * round(100 * value / count)}")
+    print(f"median {np.median(shares):.1%}, below 2 %: {np.mean(np.array(shares) < 0.02):.0%}, above 70 %: "
+          f"{np.mean(np.array(shares) > 0.7):.0%} of {count}")
+    if sheet:
+        for kind in CLASSES:
+            row = [flare((5, number), 256, lenses, kind) for number in range(9)]
+            tiles.append(np.concatenate([np.clip(one.whole + one.light, 0, 1) ** (1 / 2.2) for one in row], 1))
+        import cv2
+
+        picture = (np.concatenate(tiles)[::2, ::2, ::-1] * 255).astype(np.uint8)
+        cv2.imwrite(str(sheet), picture, [cv2.IMWRITE_JPEG_QUALITY, 88])
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=("speed", "sample", "clean", "coverage", "one"))
+    parser.add_argument("paths", type=Path, nargs="*")
+    parser.add_argument("--capture", type=Path, default=ROOT / "sample_scenes" / "desk")
+    parser.add_argument("--weights", type=Path)
+    parser.add_argument("--size", type=int, default=512)
+    parser.add_argument("--sheet", type=Path)
+    parser.add_argument("--count", type=int, default=400)
+    words = parser.parse_args()
+    if words.what == "one":
+        one(words.paths[0], words.size, words.weights)
+    elif words.what == "speed":
+        speed(words.weights)
+    elif words.what == "sample":
+        sample(words.capture, words.weights)
+    elif words.what == "clean":
+        clean_pictures(words.paths, words.weights)
+    else:
+        coverage(words.sheet, words.count)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,170 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Transfer against exact flares: the sample's lens and lights on another path, through another scene.
+
+    python benchmarks/transfer.py RUN [--world moved] [--frames 40] [--query blend] [--out FOLDER]
+
+The target is made here: a camera path that the capture does not have, its focal length, principal point and
+aspect other than the capture's, a plain background, and lights that are hidden in known frames. Its flares come
+from the generator of the sample (traced ghosts, diffraction), at the target's own views. `--world moved` turns and
+shifts the whole target, so that nothing in its coordinates is the source's. Scored are views whose lights stand
+where training saw lights, in the frame's terms: inside the range of their place and distance.
+"""
+from __future__ import annotations
+
+import argparse
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from core.capture import Camera, Capture
+from core.files import write_json
+from core.fit.run import FLARE, Run
+from core.look import ViewOfLight, read
+from core.look.shot import PlacedLight, Shot, ShotFrame
+from core.pictures import srgb_from_linear, write_png
+from core.transfer.target import of_shot
+from core.transfer.transfer import Transfer, TransferSettings
+from sample_scenes.description import looking_at
+from sample_scenes.flares import LOOKS, render_flare
+from sample_scenes.scenes.desk import DESK
+
+Pixels = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Truth:
+    """A target's frame: what it is, and the exact flare by light."""
+
+    shot: ShotFrame
+    flares: dict[str, Pixels]
+
+
+def path(number: int, count: int) -> NDArray[np.float64]:
+    """A slow arc from left to right, rising and coming nearer, with a turn of the head; another than the capture's."""
+    t = number / max(count - 1, 1)
+    azimuth = np.radians(-32 + 64 * t)
+    distance = 5.9 - 0.5 * t
+    eye = np.array([distance * np.sin(azimuth), 0.7 - distance * np.cos(azimuth), 1.3 + 0.9 * t])
+    target = np.array([0.3 * np.cos(5 * t), 0.75, 1.0 + 0.25 * np.sin(4 * t)])
+    return looking_at(eye, target, np.radians(2) * np.sin(6 * t))
+
+
+def moved(pose: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """A rigid motion of the world (4, 4), and the pose in it."""
+    angle = np.radians(117.0)
+    motion = np.eye(4)
+    motion[:3, :3] = [[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]]
+    motion[:3, 3] = (40.0, -12.0, 3.0)
+    return motion, pose @ np.linalg.inv(motion)
+
+
+def target(count: int, world: str, size: tuple[int, int]) -> list[Truth]:
+    """Frames with exact flares. Each light is hidden for some frames, and behind an edge for two beside them."""
+    width, height = size
+    made = []
+    for number in range(count):
+        pose, motion = path(number, count), np.eye(4)
+        camera = Camera(width, height, 0.93 * width, 0.93 * width, 0.487 * width, 0.52 * height, pose)
+        if world == "moved":
+            motion, there = moved(pose)
+            camera = Camera(width, height, camera.fx, camera.fy, camera.cx, camera.cy, there)
+        lights, flares = [], {}
+        for index, light in enumerate(DESK.lights):
+            centre = count * (0.35 + 0.3 * index)
+            share = float(np.clip((abs(number - centre) - 2.5) / 3, 0, 1))
+            xyz = np.array(light.xyz)
+            local = pose[:3, :3] @ xyz + pose[:3, 3]
+            flares[light.name] = render_flare(
+                LOOKS[DESK.lens], camera, local, colour=light.colour, visible_share=share,
+                intensity=light.strength(float(np.linalg.norm(local))))
+            lights.append(PlacedLight(light.name, light.name, motion[:3, :3] @ xyz + motion[:3, 3], share))
+        made.append(Truth(ShotFrame(number + 1, "Camera", camera, tuple(lights)), flares))
+    return made
+
+
+def background(camera: Camera) -> Pixels:
+    """A plain scene: dim, brighter to one side, scene-linear."""
+    ramp = np.linspace(0.02, 0.12, camera.width, dtype=np.float32)
+    return np.broadcast_to(ramp[None, :, None] * np.array([1.0, 0.9, 0.8], np.float32),
+                           (camera.height, camera.width, 3)).copy()
+
+
+def psnr(first: Pixels, second: Pixels) -> float:
+    """Against 1, dB."""
+    return float(-10 * np.log10(max(float(((first - second) ** 2).mean()), 1e-12)))
+
+
+def shown(scene: Pixels, flare: Pixels) -> Pixels:
+    """What a flare adds to a picture in display space."""
+    return srgb_from_linear(np.clip(scene + flare, 0, 1)) - srgb_from_linear(np.clip(scene, 0, 1))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("run", type=Path)
+    parser.add_argument("--world", choices=("same", "moved"), default="same")
+    parser.add_argument("--query", choices=("source", "target", "blend"), default="blend")
+    parser.add_argument("--smooth", type=int, default=1)
+    parser.add_argument("--frames", type=int, default=40)
+    parser.add_argument("--width", type=int, default=480)
+    parser.add_argument("--out", type=Path)
+    words = parser.parse_args()
+
+    made = Run.open(words.run)
+    look = read(words.run / FLARE)
+    capture = Capture.open(made.capture_folder if made.capture_folder.is_dir() else "sample_scenes/desk",
+                           need_frames=False)
+    training = [view.camera.world_to_camera for view in capture.split(made.settings.holdout)[0]]
+    truths = target(words.frames, words.world, (words.width, words.width * 5 // 8))
+    shot = Shot(words.run / FLARE, tuple(truth.shot for truth in truths))
+    transfer = Transfer(words.run / FLARE, of_shot(shot, look, {}),
+                        TransferSettings(query=words.query, smooth=words.smooth), training)
+    ranges = {light.name: transfer.seen[light.name] for light in look.lights}
+
+    rows, hidden, pictures = [], 0.0, []
+    for index, truth in enumerate(truths):
+        camera = truth.shot.camera
+        exact = sum(truth.flares.values())
+        layers = transfer.of_frame(transfer.target.frames[index].frame).render(camera)
+        ours = sum(layers.flare_by_light.values())
+        for light in truth.shot.lights:
+            if light.share == 0:
+                hidden = max(hidden, float(np.abs(layers.flare_by_light[light.name]).max()))
+        inside = all(is_inside(ranges[light.source], ViewOfLight.of(camera.world_to_camera, light.xyz),
+                               float(np.linalg.norm(camera.position - light.xyz))) for light in truth.shot.lights)
+        scene = background(camera)
+        clipped = np.clip(scene + exact, 0, 1), np.clip(scene + ours, 0, 1)
+        rows.append({"frame": truth.shot.frame, "inside": inside, "shares": [one.share for one in truth.shot.lights],
+                     "flare": psnr(shown(scene, exact), shown(scene, ours)), "flare_linear": psnr(*clipped),
+                     "empty": psnr(shown(scene, exact), 0 * exact)})
+        if index % max(words.frames // 6, 1) == 0:
+            pictures.append(np.concatenate([srgb_from_linear(part) for part in clipped], 1))
+        print(f"frame {rows[-1]['frame']:3}  inside {inside!s:5}  shares "
+              + " ".join(f"{share:.2f}" for share in rows[-1]["shares"])
+              + "".join(f"  {name} {rows[-1][name]:.2f}" for name in ("flare", "flare_linear", "empty")),
+              flush=True)
+    scored = [row for row in rows if row["inside"]]
+    means = {name: float(np.mean([row[name] for row in scored])) for name in ("flare", "flare_linear", "empty")}
+    worst = min(scored, key=lambda row: row["flare"])
+    print(f"{len(scored)} of {len(rows)} views inside the trained range: flare {means['flare']:.2f} dB (worst "
+          f"{worst['flare']:.2f}, frame {worst['frame']}), in linear light {means['flare_linear']:.2f}, empty "
+          f"{means['empty']:.2f}; most light of a hidden light: {hidden:g}")
+    if words.out:
+        write_png(words.out / f"transfer_{words.world}_{words.query}.png", np.concatenate(pictures))
+        write_json(words.out / f"transfer_{words.world}_{words.query}.json", {"means": means, "views": rows})
+
+
+def is_inside(seen: object, view: ViewOfLight, distance: float) -> bool:
+    """Whether a light stands where training saw it: in the frame's quadrant-folded plane and at its distances."""
+    lights, distances = np.abs(seen.lights), seen.distances  # type: ignore[attr-defined]
+    place = np.abs(view.light)
+    return bool((place <= lights.max(0)).all() and distances.min() <= distance <= distances.max())
+
+
+if __name__ == "__main__":
+    main()

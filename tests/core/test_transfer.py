@@ -1,0 +1,322 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""A flare on other frames: where it stands, what it shows, when it is not there, and what it leaves alone."""
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import OpenEXR
+import pytest
+import torch
+
+from core.bake.bake import BakeSettings
+from core.bake.exr import read_layers
+from core.capture import Camera, Capture
+from core.colour import colour_space
+from core.errors import RunError, SettingsError
+from core.flare import file as flare_file
+from core.flare.file import FlareFile, TrainingCamera
+from core.gaussians import SceneGaussians
+from core.gaussians.ply import write_ply
+from core.look import Look, ViewOfLight, read
+from core.look.shot import PlacedLight, Shot, ShotFrame
+from core.pictures import read_exr, srgb_from_linear, write_exr, write_png
+from core.transfer import query as queries
+from core.transfer.sources import assigned, parsed
+from core.transfer.target import Target, of_capture, of_pictures, of_shot
+from core.transfer.transfer import Transfer, TransferSettings
+from tests.core.captures import make_capture
+from tests.core.flared import cameras
+from tests.core.test_look import saved
+
+LIGHT = np.array([0.3, -0.6, 1.5])
+
+
+@pytest.fixture(scope="module")
+def flare(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One light, small bright Gaussians, so that most of a picture is out of the flare's reach."""
+    path = tmp_path_factory.mktemp("flare") / "lamp.flare"
+    model = saved(path, lights=1, count=12)
+    with torch.no_grad():
+        light = model.lights[0]
+        light.gaussians["log_scales"] -= 1.2
+        for layer in (light.network.head, light.network.correction[2]):
+            layer.weight *= 0.02
+            layer.bias *= 0.02
+    poses = [torch.from_numpy(camera.world_to_camera) for camera in cameras(6)]
+    flare_file.save(path, FlareFile(model, "add", TrainingCamera(64, 40, 70.0, 70.0, 33.0, 19.5),
+                                    seen=model.seen_from(poses)))
+    return path
+
+
+@pytest.fixture(scope="module")
+def look(flare: Path) -> Look:
+    return read(flare)
+
+
+def name(look: Look) -> str:
+    return look.names[0]
+
+
+def shot(flare: Path, look: Look, views: list[Camera], xyz: Any = None, shares: list[float] | None = None) -> Shot:
+    xyz = look.lights[0].xyz if xyz is None else np.asarray(xyz)
+    shares = shares or [1.0] * len(views)
+    return Shot(flare, tuple(ShotFrame(number + 1, "Camera", camera, (PlacedLight("lamp", name(look), xyz, share),))
+                             for number, (camera, share) in enumerate(zip(views, shares, strict=True))))
+
+
+def light_of(transfer: Transfer, index: int = 0) -> np.ndarray[Any, Any]:
+    one = transfer.target.frames[index]
+    return sum(transfer.of_frame(one.frame).render(one.shot.camera).flare_by_light.values())  # type: ignore[return-value]
+
+
+# ---- placement ------------------------------------------------------------------------------------
+
+
+def test_it_follows_focal_length_aspect_principal_point_and_resolution(flare: Path, look: Look) -> None:
+    """The same pose through another camera: every Gaussian at the same place of the normalised plane."""
+    camera = cameras(3)[1]
+    other = Camera(150, 60, 120.0, 110.0, 80.0, 25.0, camera.world_to_camera)
+    transfer = Transfer(flare, of_shot(shot(flare, look, [camera, other]), look, {}))
+    first, second = light_of(transfer, 0), light_of(transfer, 1)
+    assert first.max() > 0.02
+
+    def centre(picture: np.ndarray[Any, Any], seen: Camera) -> np.ndarray[Any, Any]:
+        weight = picture.sum(-1)
+        rows, columns = np.mgrid[:seen.height, :seen.width] + 0.5
+        middle = np.array([(weight * columns).sum(), (weight * rows).sum()]) / weight.sum()
+        return (middle - (seen.cx, seen.cy)) / (seen.fx, seen.fy)
+
+    # Both frames hold the whole flare but for its faintest rims; a pixel is 0.014 of the plane.
+    np.testing.assert_allclose(centre(first, camera), centre(second, other), atol=0.02)
+
+
+def test_on_to_a_picture_the_flare_goes_to_the_light(look: Look, tmp_path: Path) -> None:
+    write_png(tmp_path / "plate.0007.png", np.full((80, 120, 3), 0.2))
+    there = of_pictures([tmp_path / "plate.0007.png"], look, {"sun": (90.0, 20.0)}, {}, {name(look): 4.0}, focal=131.25,
+                        centre=(60.0, 40.0))
+    one = there.frames[0]
+    assert (one.frame.number, one.frame.file) == (7, "layers.0007.exr")
+    pixels, depth = one.shot.camera.project(one.shot.lights[0].xyz)
+    np.testing.assert_allclose(pixels[0], (90.0, 20.0), atol=1e-9)
+    assert depth[0] > 0
+    assert np.linalg.norm(one.shot.lights[0].xyz) == pytest.approx(4.0)
+    with pytest.raises(SettingsError, match="No light was found"):
+        of_pictures([tmp_path / "plate.0007.png"], look, {}, {}, {name(look): 4.0})
+
+
+# ---- visibility -----------------------------------------------------------------------------------
+
+
+def test_hidden_lights_and_lights_behind_give_none(flare: Path, look: Look) -> None:
+    camera = cameras(3)[1]
+    turned = replace(camera, world_to_camera=np.diag([-1.0, 1.0, -1.0, 1.0]) @ camera.world_to_camera)
+    transfer = Transfer(flare, of_shot(shot(flare, look, [camera, camera, turned], shares=[1, 0, 1]), look, {}),
+                        TransferSettings(smooth=0))
+    assert light_of(transfer, 0).max() > 0
+    assert not light_of(transfer, 1).any()
+    assert not light_of(transfer, 2).any()
+
+
+def slow(count: int) -> list[Camera]:
+    """A path so slow that frames are neighbours."""
+    return [replace(cameras(1)[0], world_to_camera=np.array(
+        [[1, 0, 0, 0.01 * step], [0, 1, 0, 0], [0, 0, 1, 4], [0, 0, 0, 1.0]])) for step in range(count)]
+
+
+def test_visibility_is_a_ramp_that_reaches_nothing_where_it_is_hidden(flare: Path, look: Look) -> None:
+    shares = [1.0] * 6 + [0.0] * 3 + [1.0] * 6
+    there = of_shot(shot(flare, look, slow(15), shares=shares), look, {})
+    transfer = Transfer(flare, there, TransferSettings(smooth=2))
+    smooth = [transfer.share(index, "lamp") for index in range(15)]
+    assert smooth[0] == smooth[-1] == 1
+    assert smooth[6:9] == [0, 0, 0]
+    assert max(abs(np.diff(smooth))) < 0.5
+    assert all(value <= share for value, share in zip(smooth, shares, strict=True))
+
+
+def test_stills_are_not_mixed(flare: Path, look: Look) -> None:
+    """Frames far apart, or with a number left out, are no path."""
+    stills = of_shot(shot(flare, look, cameras(3), shares=[1, 0, 1]), look, {})
+    far = Transfer(flare, stills, TransferSettings(smooth=2))
+    assert [far.share(index, "lamp") for index in range(3)] == [1, 0, 1]
+    whole = shot(flare, look, slow(3), shares=[1, 0, 1])
+    gaps = replace(whole, frames=tuple(replace(one, frame=2 * one.frame) for one in whole.frames))
+    gapped = Transfer(flare, of_shot(gaps, look, {}), TransferSettings(smooth=2))
+    assert [gapped.share(index, "lamp") for index in range(3)] == [1, 0, 1]
+
+
+def test_the_target_s_splats_hide_its_lights(flare: Path, look: Look, tmp_path: Path) -> None:
+    """A wall between camera and light, in one of two views."""
+    camera = cameras(3)[1]
+    away = replace(camera, world_to_camera=np.array([[1, 0, 0, -3.0], [0, 1, 0, 0], [0, 0, 1, 4], [0, 0, 0, 1.0]]))
+    middle = camera.position + 0.5 * (look.lights[0].xyz - camera.position)
+    wall = SceneGaussians(torch.tensor(middle[None], dtype=torch.float32), torch.full((1, 3), -1.5),
+                          torch.tensor([[1.0, 0, 0, 0]]), torch.tensor([9.0]), torch.zeros(1, 16, 3))
+    write_ply(tmp_path / "wall.ply", wall)
+    there = of_shot(shot(flare, look, [camera, away]), look, {}, scene=tmp_path / "wall.ply")
+    transfer = Transfer(flare, there, TransferSettings(smooth=0))
+    assert transfer.share(0, "lamp") < 0.05
+    assert transfer.share(1, "lamp") > 0.95
+    shown = Transfer(flare, replace(there, shown=True), TransferSettings(smooth=0))
+    rendering = shown.of_frame(there.frames[0].frame).render(camera)
+    assert rendering.scene.max() > 0.1
+    assert rendering.depth.max() > 1
+
+
+def test_far_outside_of_what_was_trained_it_fades(look: Look) -> None:
+    light = look.lights[0]
+    reach = float(light.query_range.light_high[2])
+
+    def at(distance: float) -> float:
+        place = np.array([distance, 0.0], np.float32)
+        return queries.fade(light, ViewOfLight(np.zeros(3, np.float32), np.eye(3, dtype=np.float32), place, 1.0))
+
+    assert at(0.9 * reach) == 1
+    assert at(2.1 * reach) == 0
+    assert np.all(np.diff([at(reach * step) for step in np.linspace(0.9, 2.1, 30)]) <= 0)
+
+
+# ---- appearance -----------------------------------------------------------------------------------
+
+
+def test_in_its_own_world_target_and_blend_are_the_flare_itself(flare: Path, look: Look) -> None:
+    camera = cameras(6)[2]
+    expected = look.evaluate(camera.world_to_camera)[name(look)]
+    seen = queries.seen_by(flare, look.lights)
+    view = ViewOfLight.of(camera.world_to_camera, look.lights[0].xyz)
+    for query in ("target", "blend"):
+        found = queries.evaluate(look.lights[0], view, look.lights[0].xyz, query, seen[name(look)])  # type: ignore[arg-type]
+        assert found is not None
+        np.testing.assert_allclose(found.means, expected.means, atol=1e-6)
+        np.testing.assert_allclose(found.colours, expected.colours, atol=1e-6)
+
+
+def test_elsewhere_blend_is_a_mix_of_what_was_trained_and_changes_smoothly(flare: Path, look: Look) -> None:
+    light, seen = look.lights[0], queries.seen_by(flare, look.lights)[name(look)]
+    assert len(seen.cameras) == 6
+    xyz = light.xyz + np.array([100.0, 0, 0])
+    means = []
+    for step in np.linspace(0, 1, 60):
+        view = ViewOfLight(np.float32([100 + 1.2 * (2 * step - 1), 0, -4]), np.eye(3, dtype=np.float32),
+                           np.float32([0.05 + 0.1 * step, -0.1]), 5.0)
+        asked = queries._asked(light, view, xyz, "blend", seen, 1.0, None)
+        assert sum(weight for weight, _ in asked) == pytest.approx(1)
+        assert all(any(np.allclose(one.camera, known, atol=1e-4) for known in seen.cameras) for _, one in asked)
+        found = queries.evaluate(light, view, xyz, "blend", seen)
+        assert found is not None
+        means.append(found.opacities)
+    steps = np.abs(np.diff(means, axis=0)).max(1)
+    assert steps.max() < 8 * np.median(steps) + 1e-4
+
+
+def test_source_asks_for_one_view_throughout(flare: Path, look: Look) -> None:
+    views = cameras(5)
+    transfer = Transfer(flare, of_shot(shot(flare, look, views), look, {}), TransferSettings(query="source"))
+    fixed = transfer._fixed["lamp"]
+    assert any(np.allclose(fixed.camera, known, atol=1e-4) for known in transfer.seen[name(look)].cameras)
+    asked = [queries._asked(look.lights[0], ViewOfLight.of(view.world_to_camera, look.lights[0].xyz),
+                            look.lights[0].xyz, "source", None, 1.0, fixed) for view in views]
+    assert all(one == [(1.0, fixed)] for one in asked)
+
+
+def test_lights_find_their_sources() -> None:
+    assert assigned(["lamp", "sun", "moon"], ["lamp", "neon"]) == {"lamp": "lamp", "sun": "lamp", "moon": "neon"}
+    assert assigned(["sun"], ["lamp", "neon"], parsed(["sun=neon"])) == {"sun": "neon"}
+    with pytest.raises(SettingsError, match="no light 'moon'"):
+        assigned(["sun"], ["lamp"], {"moon": "lamp"})
+    with pytest.raises(SettingsError, match="not of the form"):
+        parsed(["sun"])
+
+
+# ---- plates ---------------------------------------------------------------------------------------
+
+
+def plate_target(path: Path, look: Look) -> Target:
+    return of_pictures([path], look, {"sun": (20.0, 12.0)}, {}, {name(look): 4.0})
+
+
+@pytest.mark.parametrize("half", [True, False])
+def test_an_acescg_plate_keeps_its_values_outside_the_flare(flare: Path, look: Look, tmp_path: Path,
+                                                            half: bool) -> None:
+    random = np.random.default_rng(3)
+    values = (random.standard_normal((90, 160, 3)) * 3).astype(np.float16 if half else np.float32)  # below 0, above 1
+    aces = colour_space("acescg")
+    write_exr(tmp_path / "plate.0001.exr", {channel: values[..., index] for index, channel in enumerate("RGB")},
+              half=half, header={"chromaticities": aces.chromaticities})
+    transfer = Transfer(flare, plate_target(tmp_path / "plate.0001.exr", look))
+    transfer.bake(tmp_path / "out", settings=BakeSettings(space="acescg"))
+    made = read_exr(tmp_path / "out" / "layers.0001.exr")
+    framed = read_exr(tmp_path / "out" / "frames" / "plate.0001.exr")
+    light = np.stack([made[f"flare.{channel}"] for channel in "RGB"], -1)
+    outside = ~(light != 0).any(-1)
+    assert 0.2 < outside.mean() < 0.99
+    for index, channel in enumerate("RGB"):
+        stored = values[..., index].astype(np.float32)
+        np.testing.assert_array_equal(made[f"scene.{channel}"], stored)
+        np.testing.assert_array_equal(made[channel][outside], stored[outside])
+        np.testing.assert_array_equal(framed[channel][outside], stored[outside])
+        assert (made[channel] != stored)[~outside].mean() > 0.3
+    for path in (tmp_path / "out" / "layers.0001.exr", tmp_path / "out" / "frames" / "plate.0001.exr"):
+        with OpenEXR.File(str(path), header_only=True) as file:
+            assert file.parts[0].header["chromaticities"] == pytest.approx(aces.chromaticities, abs=1e-6)
+    # The flare is the same light, in the plate's primaries.
+    plain = sum(transfer.of_frame(transfer.target.frames[0].frame).render(
+        transfer.target.frames[0].shot.camera).flare_by_light.values())
+    np.testing.assert_allclose(aces.to_linear(light), plain, atol=0.01 * plain.max())
+
+
+def test_a_png_plate_keeps_its_codes_and_gains_light(flare: Path, look: Look, tmp_path: Path) -> None:
+    codes = np.random.default_rng(0).integers(0, 65535, (60, 100, 3), np.uint16)
+    cv2.imwrite(str(tmp_path / "plate.png"), codes[..., ::-1])
+    transfer = Transfer(flare, plate_target(tmp_path / "plate.png", look))
+    transfer.bake(tmp_path / "out")
+    found = cv2.imread(str(tmp_path / "out" / "frames" / "plate.png"), cv2.IMREAD_UNCHANGED)[..., ::-1]
+    layers = read_layers(tmp_path / "out" / "layers.0001.exr")
+    outside = ~(layers.flare != 0).any(-1)
+    assert found.dtype == np.uint16
+    assert 0.1 < outside.mean() < 0.99
+    np.testing.assert_array_equal(found[outside], codes[outside])
+    expected = srgb_from_linear(np.clip(layers.composite, 0, 1))
+    np.testing.assert_allclose(found / 65535, expected, atol=2e-3)
+
+
+def test_layers_in_a_space_with_a_curve_are_refused(flare: Path, look: Look, tmp_path: Path) -> None:
+    write_png(tmp_path / "plate.png", np.full((40, 60, 3), 0.2))
+    with pytest.raises(SettingsError, match="srgb is not linear"):
+        Transfer(flare, plate_target(tmp_path / "plate.png", look)).bake(
+            tmp_path / "out", settings=BakeSettings(space="srgb"))
+
+
+# ---- captures, chunks -----------------------------------------------------------------------------
+
+
+def test_on_to_a_capture_and_in_chunks(flare: Path, look: Look, tmp_path: Path) -> None:
+    folder = make_capture(tmp_path / "capture", views=4)
+    (folder / "lights.json").write_text('{"lights": [{"name": "sun", "xyz": [0.2, -0.3, 0.5]}]}')
+    target = of_capture(Capture.open(folder), look, {})
+    assert [one.plate is not None for one in target.frames] == [True] * 4
+    Transfer(flare, target).bake(tmp_path / "whole")
+    for part in (slice(2, 4), slice(0, 2)):
+        again = Transfer(flare, of_capture(Capture.open(folder), look, {}))
+        again.bake(tmp_path / "parts", [one.frame for one in target.frames[part]])
+    for path in sorted((tmp_path / "whole").rglob("*.*")):
+        if path.is_file():
+            assert (tmp_path / "parts" / path.relative_to(tmp_path / "whole")).read_bytes() == path.read_bytes()
+    with pytest.raises(RunError, match="other settings"):
+        Transfer(flare, target, TransferSettings(query="source")).bake(tmp_path / "whole")
+
+
+def test_edits_go_by_the_target_s_lights(flare: Path, look: Look, tmp_path: Path) -> None:
+    target = of_shot(shot(flare, look, [cameras(3)[1]]), look, {})
+    Transfer(flare, target).bake(tmp_path / "one", settings=BakeSettings(half=False))
+    Transfer(flare, target).bake(tmp_path / "two", settings=BakeSettings(half=False, edits=("lamp.intensity=2",)))
+    Transfer(flare, target).bake(tmp_path / "big", settings=BakeSettings(half=False, edits=("lamp.scale=2",)))
+    one, two, big = (read_layers(tmp_path / folder / "layers.0001.exr").flare for folder in ("one", "two", "big"))
+    np.testing.assert_allclose(two, 2 * one, rtol=1e-5)
+    assert (big > 0).sum() > 1.2 * (one > 0).sum()
+    with pytest.raises(SettingsError, match="moon"):
+        Transfer(flare, target).bake(tmp_path / "bad", settings=BakeSettings(edits=("moon.intensity=2",)))

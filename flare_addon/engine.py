@@ -6,7 +6,6 @@ import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import bpy
 
@@ -68,9 +67,9 @@ def environment() -> dict[str, str]:
     return {name: value for name, value in os.environ.items() if name not in ("PYTHONHOME", "PYTHONPATH")}
 
 
-def run(kind: str, folder: Path, words: Sequence[object], finished: Any = None) -> Job:
+def run(kind: str, folder: Path, words: Sequence[object]) -> Job:
     """Start a command of run.py whose events go to `folder`; see `jobs.start`."""
-    return jobs.start(kind, folder, command(*words), environment(), finished)
+    return jobs.start(kind, folder, command(*words), environment())
 
 
 # ---- its state ------------------------------------------------------------------------------------

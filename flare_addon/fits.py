@@ -93,7 +93,7 @@ def _run(scene: Any, capture: Path, folder: Path) -> Job:
                            state.mode, "--holdout", 0]
     if state.width:
         words += ["--size", state.width]
-    return engine.run("fit", folder, words, finished)
+    return engine.run("fit", folder, words)
 
 
 def finished(job: Job) -> None:
@@ -116,7 +116,7 @@ def find_lights(scene: Any) -> Job:
         raise CaptureError("There is no capture yet; import one first.")
     if lights.of_scene(scene):
         lights.write(scene, capture)
-    return engine.run("lights", capture / "lights", ["lights", capture, "--keep"], lights_found)
+    return engine.run("lights", capture / "lights", ["lights", capture, "--keep"])
 
 
 def lights_found(job: Job) -> None:
@@ -130,6 +130,9 @@ def lights_found(job: Job) -> None:
                 lights.reload(scene, capture)
             except FitFlareError as problem:
                 job.error = str(problem)
+
+
+jobs.FINISHERS.update({"fit": finished, "lights": lights_found})
 
 
 # ---- the preview ----------------------------------------------------------------------------------

@@ -35,14 +35,16 @@ STOPPED = 130  # the status of a command that was stopped (headless/cli.py)
 EVERY_S = 0.2
 AT_ONCE = 1 << 16  # bytes of events read at a time
 
+FINISHERS: dict[str, Callable[[Job], None]] = {}
+"""By kind of work: what is to be done in the scenes when it has ended."""
+
 _jobs: dict[str, Job] = {}
 
 
 class Job:
     """One command of the engine. done, total: steps of `stage`; left_s: seconds left, None where unknown."""
 
-    def __init__(self, kind: str, folder: Path, pid: int, process: subprocess.Popen[bytes] | None,
-                 finished: Callable[[Job], None] | None = None) -> None:
+    def __init__(self, kind: str, folder: Path, pid: int, process: subprocess.Popen[bytes] | None) -> None:
         self.kind, self.folder, self.pid = kind, folder, pid
         self.state: State = "running"
         self.stage, self.done, self.total, self.left_s = "starting", 0, 0, None
@@ -50,7 +52,7 @@ class Job:
         self.said: list[str] = []
         self.result: dict[str, Any] = {}
         self.error = ""
-        self._process, self._finished = process, finished
+        self._process, self._watched, self._has_result = process, process is not None, False
         self._at, self._rest = 0, b""
 
     @property
@@ -68,16 +70,18 @@ class Job:
 
     def poll(self) -> bool:
         """Take in what is new; whether anything was."""
+        if not self.running:
+            return False
         alive = self._alive()  # asked first: what was written before the end is then read below
         news = self._read()
-        if alive or not self.running:
+        if alive:
+            self._watched = True
             return news
         while self._read():
             pass
-        if self.running:
-            self._end()
-        if self._finished is not None:
-            self._finished(self)
+        self._end()
+        if self._watched and self.kind in FINISHERS:  # what ended before this session was taken in then
+            FINISHERS[self.kind](self)
         return True
 
     def stop(self) -> None:
@@ -117,7 +121,7 @@ class Job:
             self.said.append(str(event["text"]))
         elif kind == "result":
             self.result.update(event["data"])
-            self.state = "done"
+            self._has_result = True
         elif kind == "error":
             self.error = str(event["text"])
 
@@ -127,9 +131,11 @@ class Job:
         return _is_ours(self.pid)
 
     def _end(self) -> None:
-        """The process is gone without a result."""
+        """The process is gone."""
         status = self._process.returncode if self._process is not None else None
-        if self.error and (status == STOPPED or self.error.startswith("Stopped")):
+        if self._has_result:
+            self.state = "done"
+        elif self.error and (status == STOPPED or self.error.startswith("Stopped")):
             self.state = "stopped"
         elif self.error:
             self.state = "failed"
@@ -176,8 +182,7 @@ def _is_ours(pid: int) -> bool:
 # ---- starting and finding -------------------------------------------------------------------------
 
 
-def start(kind: str, folder: Path, command: Sequence[str], environment: Mapping[str, str] | None = None,
-          finished: Callable[[Job], None] | None = None) -> Job:
+def start(kind: str, folder: Path, command: Sequence[str], environment: Mapping[str, str] | None = None) -> Job:
     """Start a command whose events go to `folder`, and watch it.
 
     Without a window this returns when it has ended. Raises EngineError where it cannot be started, RunError
@@ -199,7 +204,7 @@ def start(kind: str, folder: Path, command: Sequence[str], environment: Mapping[
         raise EngineError(f"{command[0]} cannot be started; set up the engine in the preferences.") from problem
     except OSError as problem:
         raise RunError(f"{folder} cannot be used ({problem.strerror or problem}); choose another folder.") from problem
-    job = Job(kind, folder, process.pid, process, finished)
+    job = Job(kind, folder, process.pid, process)
     _jobs[_key(folder)] = job
     if bpy.app.background:
         _wait(job)

@@ -73,7 +73,7 @@ def window_of(frame: Frame, region: tuple[int, int], camera: Any) -> Window | No
     x, y = frame.width / camera.width, frame.height / camera.height
     above = frame.bottom + frame.height - top  # from the frame's upper edge down to the window's
     k = np.array([[camera.fx * x, 0, camera.cx * x + frame.left - left],
-                  [0, camera.fy * y, camera.cy * y + above], [0, 0, 1.0]])
+                  [0, camera.fy * y, camera.cy * y - above], [0, 0, 1.0]])
     return Window(left, bottom, right - left, top - bottom, k)
 
 

@@ -6,6 +6,7 @@ keep two looks, and every number can be animated and driven (`fit_flare.lights[0
 """
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import bpy
@@ -86,7 +87,7 @@ def edit_of(sliders: Any) -> Edit:
     """The edit that sliders (an `Edits` group) stand for."""
     red, green, blue = sliders.tint
     return Edit(intensity=sliders.intensity, tint=(red, green, blue), saturation=sliders.saturation,
-                scale=sliders.scale, spread=sliders.spread, rotation=sliders.rotation * 57.29577951308232,
+                scale=sliders.scale, spread=sliders.spread, rotation=math.degrees(sliders.rotation),
                 streak=sliders.streak, mute=sliders.mute, solo=sliders.solo)
 
 

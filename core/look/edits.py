@@ -247,7 +247,8 @@ def _words(edit: Edit) -> list[str]:
         value, usual = getattr(edit, entry.name), getattr(NEUTRAL, entry.name)
         if value != usual:
             numbers = value if isinstance(value, tuple) else (int(value) if isinstance(value, bool) else value,)
-            words.append(f"{entry.name}={','.join(f'{number:.9g}' for number in numbers)}")
+            # Seven digits: all that a slider's 32 bits hold.
+            words.append(f"{entry.name}={','.join(f'{number:.7g}' for number in numbers)}")
     return words
 
 

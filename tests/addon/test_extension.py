@@ -2,8 +2,6 @@
 """The extension as a user gets it: packed by Blender's own packer, installed, used, disabled."""
 from __future__ import annotations
 
-import subprocess
-import sys
 import tomllib
 import zipfile
 from pathlib import Path
@@ -11,23 +9,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from blenders import ROOT, Blender, newer
+from blenders import ROOT, Blender
 
 from core.bake.exr import write_layers
 from core.bake.layers import FrameLayers
 
 SCRIPTS = Path(__file__).parent / "scripts"
-
-
-@pytest.fixture(scope="session")
-def package(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    if newer() is None:
-        pytest.skip("Blender's packer comes with the bpy package (`make setup`)")
-    out = tmp_path_factory.mktemp("package")
-    done = subprocess.run([sys.executable, str(ROOT / "headless" / "package.py"), str(out)], capture_output=True,
-                          text=True, check=False)
-    assert done.returncode == 0, done.stdout + done.stderr
-    return next(out.glob("*.zip"))
 
 
 @pytest.fixture(scope="session")

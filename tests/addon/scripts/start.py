@@ -1,0 +1,55 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What the scripts inside Blender share: the built extension installed, an empty scene, refusals as text."""
+from __future__ import annotations
+
+import contextlib
+import importlib
+import io
+import json
+import os
+import sys
+from collections.abc import Callable
+from typing import Any
+
+import bpy
+
+NAME = "bl_ext.user_default.fit_flare"
+
+
+def install(package: str) -> None:
+    """Into the (empty) profile of this process."""
+    bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+    bpy.ops.extensions.package_install_files(filepath=package, repo="user_default", enable_on_install=True,
+                                             overwrite=True)
+    assert NAME in bpy.context.preferences.addons
+
+
+def part(name: str) -> Any:
+    """A module of the installed extension."""
+    return importlib.import_module(f"{NAME}.{name}")
+
+
+def empty() -> Any:
+    """A new file; its scene."""
+    bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+    return bpy.context.scene
+
+
+def refusal(call: Callable[[], Any]) -> str:
+    """The error report of an operator that refuses; "" where it did not. A traceback fails the script."""
+    with contextlib.redirect_stderr(io.StringIO()) as noise:
+        try:
+            result = call()
+        except RuntimeError as problem:  # how Blender hands on an operator's error report, or a poll that fails
+            text = str(problem).removeprefix("Error: ").strip()
+            assert "Traceback" not in text + noise.getvalue(), text + noise.getvalue()
+            return text
+    assert "Traceback" not in noise.getvalue(), noise.getvalue()
+    return "" if result == {"FINISHED"} else str(result)
+
+
+def leave(facts: dict[str, Any]) -> None:
+    """Hand the facts to the test, and go."""
+    print(json.dumps(facts))
+    sys.stdout.flush()
+    os._exit(0)

@@ -1,0 +1,297 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Inside Blender: an artist's work, operator by operator. Words: the zip, a capture, a .flare of it, a folder."""
+from __future__ import annotations
+
+import math
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import bpy
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parent))
+from start import NAME, empty, install, leave, part, refusal
+
+package, capture, flare, out = sys.argv[1:5]
+install(package)
+sys.path.remove(str(Path(__file__).parent))
+ops = bpy.ops.fit_flare
+shots, looks, overlay, cameras = (part(f"flare_addon.{name}") for name in ("shots", "looks", "overlay", "cameras"))
+core_capture, core_look = part("core.capture"), part("core.look")
+drawing = part("core.look.drawing")
+facts: dict[str, object] = {}
+original = core_capture.Capture.open(capture)
+
+
+def blenders_own(scene, camera, points):
+    """Pixels of world points by the matrices that Blender renders with."""
+    render = scene.render
+    depsgraph = bpy.context.evaluated_depsgraph_get()
+    evaluated = camera.evaluated_get(depsgraph)
+    projection = evaluated.calc_matrix_camera(depsgraph, x=render.resolution_x, y=render.resolution_y,
+                                              scale_x=render.pixel_aspect_x, scale_y=render.pixel_aspect_y)
+    whole = np.array(projection) @ np.linalg.inv(np.array(evaluated.matrix_world.normalized()))
+    clip = np.concatenate([points, np.ones((len(points), 1))], 1) @ whole.T
+    ndc = clip[:, :2] / clip[:, 3:]
+    return np.stack([(ndc[:, 0] + 1) / 2 * render.resolution_x, (1 - ndc[:, 1]) / 2 * render.resolution_y], -1)
+
+
+# ---- import -----------------------------------------------------------------------------------------
+for kind, up, scale in (("animated", "Z", 1.0), ("each", "-Y", 2.5)):
+    scene = empty()
+    assert ops.import_capture(directory=capture, cameras=kind, up=up, scale=scale) == {"FINISHED"}
+    root = scene.fit_flare.root
+    bpy.context.view_layer.update()
+    to_world = np.array(root.matrix_world)
+    cloud = original.points.xyz.astype(np.float64)
+    worst = 0.0
+    frames = part("core.bake.frames").numbered(view.name for view in original.views)
+    for frame in frames:
+        view = original.view(frame.view)
+        scene.frame_set(frame.number)
+        camera = scene.camera if kind == "animated" else scene.objects[Path(frame.view).stem]
+        expected, depth = view.camera.project(cloud)
+        found = blenders_own(scene, camera, cloud @ to_world[:3, :3].T + to_world[:3, 3])
+        worst = max(worst, float(np.abs(expected - found)[depth > 0.3].max()))
+    facts[f"pixels off, {kind}"] = worst
+    facts[f"objects, {kind}"] = sorted(item.name for item in scene.objects)
+    back = scene.camera.data.background_images[0]
+    facts[f"background, {kind}"] = [back.image.source, back.frame_method, Path(back.image.filepath).name]
+    if kind == "animated":
+        facts["sequence"] = [back.image_user.frame_start, back.image_user.frame_offset, back.image_user.frame_duration]
+        facts["frames"] = [scene.frame_start, scene.frame_end, scene.render.resolution_x, scene.render.resolution_y]
+        mesh = scene.objects["Points"].data
+        colour = np.empty(4 * len(mesh.vertices), np.float32)
+        mesh.color_attributes["Col"].data.foreach_get("color_srgb", colour)
+        facts["colours off"] = float(np.abs(colour.reshape(-1, 4)[:, :3] * 255 - original.points.rgb).max())
+        facts["lights"] = {item.name: [round(value, 5) for value in item.location] for item in scene.objects
+                           if item.fit_flare.is_light}
+
+# ---- one undo step ----------------------------------------------------------------------------------
+scene = empty()
+bpy.ops.ed.undo_push(message="before")
+ops.import_capture(directory=capture)
+bpy.ops.ed.undo_push(message="after")
+count = len(bpy.data.objects)
+bpy.ops.ed.undo()
+facts["undo"] = [count, len(bpy.data.objects), bpy.context.scene.fit_flare.capture]
+
+# ---- lights -----------------------------------------------------------------------------------------
+scene = empty()
+ops.import_capture(directory=capture)
+lights = part("flare_addon.lights")
+scene.cursor.location = (0.5, -0.25, 1.0)
+ops.add_light(name="key")
+cube = bpy.data.objects.new("Bulb", bpy.data.meshes.new("Bulb"))
+scene.collection.objects.link(cube)
+for item in scene.objects:
+    item.select_set(item == cube)
+ops.lights_from_selected()
+facts["lights now"] = [lights.name_of(item) for item in lights.of_scene(scene)]
+ops.remove_light(object="Bulb")
+facts["bulb stays"] = "Bulb" in scene.objects
+lights.write(scene, Path(capture))
+written = core_capture.read_lights(Path(capture) / "lights.json")
+facts["lights.json"] = {light.name: light.xyz.tolist() for light in written}
+ops.remove_light(object="key")
+lights.write(scene, Path(capture))
+
+# ---- look -------------------------------------------------------------------------------------------
+facts["open"] = list(ops.open_flare(filepath=flare))
+state = scene.fit_flare
+facts["flares"] = [[item.name, item.source, item.target.name, len(item.elements) > 0] for item in state.lights]
+facts["native"] = state.native
+item = state.lights[0]
+item.intensity = 0.5
+item.keyframe_insert("intensity", frame=1)
+item.intensity = 1.5
+item.keyframe_insert("intensity", frame=3)
+scene.frame_set(3)
+facts["animated"] = looks.edits_of(state).light(item.name).intensity
+driver = state.master.driver_add("scale").driver
+driver.type = "SCRIPTED"
+driver.expression = "frame / 2"
+scene.frame_set(4)
+facts["driven"] = looks.edits_of(state).master.scale
+state.master.driver_remove("scale")
+state.master.scale = 1.0
+element = item.elements[0]
+element.rotation, element.tint = math.radians(30), (1.0, 0.5, 0.25)
+words = looks.edits_of(state).words()
+facts["words"] = words
+ops.reset_look()
+facts["reset"] = looks.edits_of(state).neutral or looks.edits_of(state).words()
+
+# The overlay's quads, drawn by numpy as the GPU draws them, against the definition.
+look = looks.look_of(scene)
+scene.frame_set(2)
+state.occlusion = False
+gaussians = overlay.joined(list(looks.seen(scene, bpy.context.evaluated_depsgraph_get(), scene.camera).values()))
+evaluated = scene.camera.evaluated_get(bpy.context.evaluated_depsgraph_get())
+core = cameras.core_camera(evaluated.data, evaluated.matrix_world, scene.render)
+
+
+def drawn(window):
+    """The sum of the levels, as the last shader makes it."""
+    total = np.zeros((window.height, window.width, 3), np.float32)
+    for divisor, quads in overlay.levels(gaussians, window, look.blend).items():
+        size = -(-window.height // divisor), -(-window.width // divisor)
+        level = np.zeros((*size, 3), np.float32)
+        x, y = np.arange(size[1]) + 0.5, np.arange(size[0])[:, None] + 0.5
+        for first in range(0, len(quads.place), 4):
+            corner, across, up = quads.place[first], quads.place[first + 1], quads.place[first + 3]
+            affine = np.linalg.inv(np.stack([across - corner, up - corner], -1).astype(np.float64))
+            u = affine[0, 0] * (x - corner[0]) + affine[0, 1] * (y - corner[1])
+            v = affine[1, 0] * (x - corner[0]) + affine[1, 1] * (y - corner[1])
+            reach = quads.local[first + 1, 0]
+            away = np.hypot((2 * u - 1) * reach, (2 * v - 1) * reach)
+            r0, w, _ = quads.ring[first]
+            profile = np.exp(-0.5 * ((np.maximum(away, 1e-6) - r0) / w) ** 2)
+            inside = (u >= 0) & (u <= 1) & (v >= 0) & (v <= 1) & (profile >= 1 / 4096)
+            level += np.where(inside, profile, 0)[..., None] * quads.light[first]
+        total += enlarged(level, divisor, window)
+    return np.maximum(total, 0)
+
+
+def enlarged(level, divisor, window):
+    """Bilinear, rows counted from the top."""
+    def places(length, most):
+        where = (np.arange(length) + 0.5) / divisor - 0.5
+        low = np.floor(where).astype(int)
+        return np.clip(low, 0, most - 1), np.clip(low + 1, 0, most - 1), where - low
+
+    top, bottom, down = places(window.height, level.shape[0])
+    left, right, across = places(window.width, level.shape[1])
+    down, across = down[:, None, None], across[None, :, None]
+    upper = level[top][:, left] * (1 - across) + level[top][:, right] * across
+    lower = level[bottom][:, left] * (1 - across) + level[bottom][:, right] * across
+    return upper * (1 - down) + lower * down
+
+
+def far_off(picture, expected):
+    return float(np.sqrt(((picture - expected) ** 2).sum() / (expected**2).sum()))
+
+
+whole = overlay.window_of(overlay.Frame(0, 0, 3 * core.width, 3 * core.height), (3 * core.width, 3 * core.height), core)
+large = core.scaled(3 * core.width, 3 * core.height)
+expected = drawing.draw([gaussians], large.intrinsics, *large.size, look.blend)
+facts["overlay off"] = far_off(drawn(whole), expected)
+# Zoomed in, the frame larger than the region and beyond its edges.
+cropped = overlay.window_of(overlay.Frame(-40, -30, 3 * core.width, 3 * core.height), (100, 80), core)
+rows = slice(3 * core.height - 30 - 80, 3 * core.height - 30)  # the frame reaches 10 pixels above the region
+facts["cropped off"] = far_off(drawn(cropped), expected[rows, 40:140])
+facts["outside"] = overlay.window_of(overlay.Frame(500, 0, 64, 40), (100, 80), core) is None
+
+# ---- a shot, and the same by hand ------------------------------------------------------------------
+state.occlusion = True
+shot = shots.of_scene(scene, [scene.camera], [1, 3], Path(flare), None)
+pose = original.views[1].camera.world_to_camera
+facts["pose off"] = float(np.abs(shot.frames[0].camera.world_to_camera - pose).max())
+facts["place off"] = float(np.abs(shot.frames[0].lights[0].xyz - original.lights[0].xyz).max())
+facts["shares"] = [light.share for light in shot.frames[0].lights]
+root = state.root
+root.rotation_euler, root.scale, root.location = (0.3, 0.2, 0.1), (2, 2, 2), (1, 2, 3)
+moved = shots.of_scene(scene, [scene.camera], [1, 3], Path(flare), None)
+facts["moved root off"] = float(np.abs(moved.frames[0].camera.world_to_camera - pose).max())
+root.rotation_euler, root.scale, root.location = (0, 0, 0), (1, 1, 1), (0, 0, 0)
+
+# ---- occlusion: a wall slides before the light ------------------------------------------------------
+scene.frame_set(1)
+depsgraph = bpy.context.evaluated_depsgraph_get()
+eye = scene.camera.evaluated_get(depsgraph).matrix_world.translation.copy()
+light = state.lights[0].target.evaluated_get(depsgraph).matrix_world.translation.copy()
+middle = (eye + light) / 2
+forward = (light - eye).normalized()
+right = forward.orthogonal().normalized()
+up = forward.cross(right)
+shares = []
+for edge in np.linspace(-0.03, 0.03, 13):
+    mesh = bpy.data.meshes.new("Wall")
+    mesh.from_pydata([middle + right * (edge - 2 * a) + up * b for a, b in ((0, -2), (0, 2), (1, 2), (1, -2))], [],
+                     [(0, 1, 2, 3)])
+    wall = bpy.data.objects.new("Wall", mesh)
+    scene.collection.objects.link(wall)
+    bpy.context.view_layer.update()
+    shares.append(looks.visible_share(scene, bpy.context.evaluated_depsgraph_get(), eye, state.lights[0]))
+    bpy.data.objects.remove(wall)
+facts["fades"] = shares
+bpy.context.view_layer.update()
+
+# ---- behind the camera -----------------------------------------------------------------------------
+behind = bpy.data.objects.new("Behind", bpy.data.cameras.new("Behind"))
+scene.collection.objects.link(behind)
+behind.location = light + 0.5 * forward
+behind.rotation_euler = forward.to_track_quat("-Z", "Y").to_euler()
+bpy.context.view_layer.update()
+seen = looks.seen(scene, bpy.context.evaluated_depsgraph_get(), behind)
+facts["behind"] = [name for name in seen if name == state.lights[0].name]
+
+# ---- save, reload ----------------------------------------------------------------------------------
+state.lights[0].tint = (1, 0.5, 0.25)
+bpy.ops.wm.save_as_mainfile(filepath=str(Path(out) / "work.blend"))
+empty()
+bpy.ops.wm.open_mainfile(filepath=str(Path(out) / "work.blend"))
+state = bpy.context.scene.fit_flare
+facts["reloaded"] = [Path(bpy.path.abspath(state.flare)).name, state.lights[0].target.name,
+                     [round(value, 3) for value in state.lights[0].tint], state.root.name]
+bpy.ops.preferences.addon_disable(module=NAME)
+bpy.ops.preferences.addon_enable(module=NAME)
+facts["enabled again"] = [round(value, 3) for value in bpy.context.scene.fit_flare.lights[0].tint]
+
+# ---- library and transfer --------------------------------------------------------------------------
+part("flare_addon.preferences").own().library = str(Path(out) / "library")
+facts["saved"] = [list(ops.save_flare(name="Desk: lamp", notes="35 mm")),
+                  refusal(lambda: ops.save_flare(name="Desk: lamp"))]
+library = part("flare_addon.library")
+facts["library"] = [path.name for path in library.files()]
+facts["thumbnail"] = (Path(out) / "library" / "Desk lamp.png").stat().st_size
+facts["items"] = [entry[1:3] for entry in library.items()]
+other = empty()
+camera = bpy.data.objects.new("Second", bpy.data.cameras.new("Second"))
+camera.rotation_euler = (math.pi / 2, 0, 0)
+lamp = bpy.data.objects.new("Spot", bpy.data.lights.new("Spot", "SPOT"))
+lamp.location = (-1.0, 6.0, 0.8)
+for thing in (camera, lamp):
+    other.collection.objects.link(thing)
+other.camera = camera
+bpy.context.view_layer.update()
+lamp.select_set(True)
+facts["applied"] = list(ops.apply_flare(filepath=str(library.files()[0])))
+state = other.fit_flare
+facts["applied to"] = [item.target.name if item.target else "" for item in state.lights]
+seen = looks.seen(other, bpy.context.evaluated_depsgraph_get(), camera)
+facts["transferred"] = [state.native, len(seen), float(drawing.draw(seen.values(), cameras.core_camera(
+    camera.data, camera.matrix_world, other.render).scaled(96, 54).intrinsics, 96, 54).sum()) > 0.1]
+
+# ---- a single picture, the light picked in it -------------------------------------------------------
+image = bpy.data.images.new("plate", 96, 64)
+image.filepath_raw, image.file_format = str(Path(out) / "plate.png"), "PNG"
+image.save()
+single = empty()
+state = single.fit_flare
+ops.open_flare(filepath=flare)
+facts["picture"] = [list(ops.shot_from_picture(filepath=str(Path(out) / "plate.png"))),
+                    single.render.resolution_x, single.render.resolution_y]
+bpy.context.view_layer.update()
+ops.pick_light(x=0.25, y=0.3)
+bpy.context.view_layer.update()
+core = cameras.core_camera(single.camera.data, single.camera.matrix_world, single.render)
+where, _ = core.project([list(state.lights[0].target.matrix_world.translation)])
+facts["picked"] = (where[0] / core.size).tolist()
+
+# ---- a capture of Blender's own camera --------------------------------------------------------------
+scene = empty()
+ops.import_capture(directory=capture)
+exported = Path(out) / "exported"
+facts["exported"] = list(ops.capture_from_camera(directory=str(exported)))
+again = core_capture.Capture.open(exported)
+facts["export off"] = max(float(np.abs(one.camera.world_to_camera - two.camera.world_to_camera).max())
+                          for one, two in zip(again.views, original.views, strict=True))
+facts["export lens off"] = float(np.abs(again.views[0].camera.intrinsics - original.views[0].camera.intrinsics).max())
+facts["export points"] = len(again.points)
+
+# ---- the engine's own bake of a shot, from the panel ------------------------------------------------
+replace(shot, frames=shot.frames[:1]).write(Path(out) / "shot.json")
+
+leave(facts)

@@ -1,0 +1,106 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Broken things end in one readable sentence, never in a traceback, and nothing is lost."""
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+from blenders import Blender
+from test_work import a_flare
+
+from tests.core.flared import flared_capture
+
+SCRIPTS = Path(__file__).parent / "scripts"
+
+pytestmark = pytest.mark.skipif(os.name == "nt", reason="the sham engine is a shell script")
+
+
+@pytest.fixture(scope="session")
+def said(blender: Blender, package: Path, tmp_path_factory: pytest.TempPathFactory) -> Any:
+    base = tmp_path_factory.mktemp("broken")
+    sham = base / "sham_engine.sh"
+    shutil.copy(SCRIPTS / "sham_engine.sh", sham)
+    capture, flare = flared_capture(base / "capture", 4), a_flare(base / "lamp.flare")
+    (base / "out").mkdir()
+    return blender.run(SCRIPTS / "broken.py", package, capture, flare, base / "out", sham, user=base / "user")
+
+
+def is_sentence(text: str) -> bool:
+    return len(text) > 20 and text[-1] == "." and "Traceback" not in text and "Error" not in text
+
+
+def test_an_empty_scene_offers_what_can_be_done_alone(said: Any) -> None:
+    possible = {name for name, can in said["polls of an empty scene"].items() if can}
+    assert possible == {"import_capture", "add_light", "open_flare"}
+
+
+@pytest.mark.parametrize("what", ["import of nothing", "import of a broken capture", "cut flare", "newer flare",
+                                  "absent flare", "flare deleted later", "save of a deleted flare", "orthographic",
+                                  "bake of a deleted flare", "log of nothing", "folder of nothing", "layers of nothing",
+                                  "library name"])
+def test_what_cannot_be_done_is_one_sentence(said: Any, what: str) -> None:
+    assert is_sentence(said[what]), said[what]
+
+
+def test_refusals_leave_nothing_behind(said: Any) -> None:
+    assert said["objects after refusals"] == 0
+    assert said["edits survive a refusal"] == 1
+
+
+def test_without_an_engine_the_button_says_so(said: Any) -> None:
+    assert said["no engine"]
+    assert said["engine named, not there"] == [False, False]
+
+
+def test_an_engine_that_dies_is_told(said: Any) -> None:
+    fits = said["fits"]
+    assert "out of memory" in fits["dies"]
+    assert fits["refuses"] == "The frames are not there; put them back."
+    assert is_sentence(fits["chatters"]) or fits["chatters"].endswith("has it all.")
+    assert "without a result" in fits["ends"]
+    assert {fits[f"{how}, state"] for how in ("dies", "refuses", "chatters", "ends")} == {"none"}
+
+
+def test_a_fit_that_ends_well_shows_its_flare(said: Any) -> None:
+    assert said["a fit that ends well"] == ["", "finished", True]
+
+
+def test_the_engine_says_what_it_is(said: Any) -> None:
+    assert said["test"] == ["", {"version": "1", "torch": "2", "device": "a sham"}]
+
+
+def test_work_is_found_again_and_can_be_cancelled(said: Any) -> None:
+    assert said["found again"] == ["running", "fit", 40, 100]
+    assert said["state of the found"] == "running"
+    assert said["cancelled"] == ["stopped", "Stopped during fit as asked; run it again to go on."]
+    assert said["another program has the number"] != "running"
+
+
+def test_folders_that_went_are_told(said: Any) -> None:
+    assert said["run folder deleted"] == ["lost", True, False]
+    assert said["capture moved"] == [False, False]
+
+
+def test_cameras_lights_and_scenes(said: Any) -> None:
+    assert said["camera deleted"] == [False, True]
+    assert said["light deleted"]
+    assert said["second scene is empty"] == ["", False, 0]
+    assert said["two scenes"] == [3.0, 1.0]
+
+
+def test_every_operator_is_one_undo_step(said: Any) -> None:
+    assert [name for name, good in said["undone"].items() if not good] == []
+
+
+def test_nothing_is_downloaded_without_leave(said: Any) -> None:
+    online, offered = said["online"]
+    assert offered == online
+
+
+def test_uninstalled_leaves_nothing(said: Any) -> None:
+    assert said["after disabling"] == [False, False]
+    assert said["left behind"] == []
+    assert not said["modules left"]

@@ -1,0 +1,171 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""An artist's work in Blender, against the core: import, lights, look, overlay, occlusion, transfer."""
+from __future__ import annotations
+
+import itertools
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from blenders import Blender
+
+from core.bake.exr import read_layers
+from core.bake.shot import bake_shot
+from core.flare import file as flare_file
+from core.flare.deformation import QueryRange
+from core.flare.file import FlareFile, TrainingCamera
+from core.flare.model import OURS, FlareModel, LightFlare
+from core.look import LookEdits, draw, read
+from core.look.shot import Shot, evaluate
+from tests.core.flared import HEIGHT, LIGHT, WIDTH, cameras, flared_capture
+
+SCRIPTS = Path(__file__).parent / "scripts"
+
+
+def a_flare(path: Path) -> Path:
+    """A flare of the light of `flared_capture`, its Gaussians spread and coloured at random."""
+    generator = torch.Generator().manual_seed(4)
+    place = cameras(5)
+    seen = torch.tensor(np.array([camera.normalised(LIGHT)[0][0] for camera in place])).float()
+    reach = QueryRange.of(torch.tensor(np.array([camera.position for camera in place])).float(), seen)
+    light = LightFlare(OURS, reach, 60, generator)
+    with torch.no_grad():
+        light.gaussians["opacity_logits"] += 2
+        light.gaussians["sh"] += torch.rand(light.gaussians["sh"].shape, generator=generator)
+        light.gaussians["log_scales"] += torch.randn(light.gaussians["log_scales"].shape, generator=generator)
+    model = FlareModel(["lamp"], torch.tensor(LIGHT[None]), [light])
+    flare_file.save(path, FlareFile(model, "add", TrainingCamera(WIDTH, HEIGHT, 70.0, 70.0, 33.0, 19.5)))
+    return path
+
+
+@pytest.fixture(scope="session")
+def made(blender: Blender, package: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Any, Path]:
+    base = tmp_path_factory.mktemp("work")
+    capture, flare = flared_capture(base / "capture", 5), a_flare(base / "lamp.flare")
+    facts = blender.run(SCRIPTS / "work.py", package, capture, flare, base, user=base / "user")
+    return facts, base
+
+
+@pytest.fixture(scope="session")
+def facts(made: tuple[Any, Path]) -> Any:
+    return made[0]
+
+
+@pytest.mark.parametrize("kind", ["animated", "each"])
+def test_cameras_see_points_where_the_footage_has_them(facts: Any, kind: str) -> None:
+    """Off-centre principal point, turned and scaled root; by the matrices Blender renders with."""
+    assert facts[f"pixels off, {kind}"] < 0.002
+
+
+def test_an_import_is_whole(facts: Any) -> None:
+    assert facts["objects, animated"] == ["Camera", "Points", "capture Root", "lamp"]
+    assert facts["objects, each"] == ["0000", "0001", "0002", "0003", "0004", "Points", "capture Root", "lamp"]
+    assert facts["background, animated"] == ["SEQUENCE", "STRETCH", "0000.png"]
+    assert facts["background, each"] == ["FILE", "STRETCH", "0000.png"]
+    assert facts["sequence"] == [0, -1, 5]
+    assert facts["frames"] == [0, 4, WIDTH, HEIGHT]
+    assert facts["colours off"] <= 0.51
+    np.testing.assert_allclose(facts["lights"]["lamp"], LIGHT, atol=1e-4)
+
+
+def test_an_import_is_one_undo_step(facts: Any) -> None:
+    count, after, capture = facts["undo"]
+    assert count > 3
+    assert (after, capture) == (0, "")
+
+
+def test_lights_of_the_scene_are_those_of_the_fit(facts: Any) -> None:
+    assert facts["lights now"] == ["Bulb", "key", "lamp"]
+    assert facts["bulb stays"]
+    assert list(facts["lights.json"]) == ["key", "lamp"]
+    np.testing.assert_allclose(facts["lights.json"]["key"], (0.5, -0.25, 1.0), atol=1e-5)
+    np.testing.assert_allclose(facts["lights.json"]["lamp"], LIGHT, atol=1e-5)
+
+
+def test_a_flare_finds_its_light(facts: Any) -> None:
+    assert facts["open"] == ["FINISHED"]
+    assert facts["flares"] == [["lamp", "lamp", "lamp", True]]
+    assert facts["native"]
+
+
+def test_sliders_can_be_animated_driven_and_reset(facts: Any) -> None:
+    assert facts["animated"] == pytest.approx(1.5)
+    assert facts["driven"] == pytest.approx(2.0)
+    assert "lamp.intensity=1.5" in facts["words"]
+    assert any(word.startswith("lamp/") and word.endswith("rotation=30") for word in facts["words"])
+    assert any(word.endswith("tint=1,0.5,0.25") for word in facts["words"])
+    # What is animated stays so: there the slider follows its curve.
+    assert facts["reset"] is True or all(word.startswith("lamp.intensity") for word in facts["reset"])
+
+
+def test_the_overlay_draws_what_the_look_defines(facts: Any) -> None:
+    """The GPU's quads and levels, drawn by numpy: what drawing small costs, whole and zoomed in."""
+    assert facts["overlay off"] < 0.015
+    assert facts["cropped off"] < 0.015
+    assert facts["outside"]
+
+
+def test_a_shot_has_the_captures_own_numbers(facts: Any) -> None:
+    assert facts["pose off"] < 1e-5
+    assert facts["place off"] < 1e-5
+    assert facts["moved root off"] < 1e-5
+    assert facts["shares"] == [pytest.approx(1.0)]
+
+
+def test_a_wall_hides_a_light_softly(facts: Any) -> None:
+    shares = facts["fades"]
+    assert shares[0] == pytest.approx(1)
+    assert shares[-1] == pytest.approx(0)
+    assert all(later <= before + 1e-6 for before, later in itertools.pairwise(shares))
+    assert sum(0.02 < share < 0.98 for share in shares) >= 3
+
+
+def test_a_light_behind_the_camera_gives_no_flare(facts: Any) -> None:
+    assert facts["behind"] == []
+
+
+def test_a_file_remembers_and_so_does_a_disabled_extension(facts: Any) -> None:
+    assert facts["reloaded"] == ["lamp.flare", "lamp", [1.0, 0.5, 0.25], "capture Root"]
+    assert facts["enabled again"] == [1.0, 0.5, 0.25]
+
+
+def test_the_library_keeps_flares(facts: Any) -> None:
+    saved, again = facts["saved"]
+    assert saved == ["FINISHED"]
+    assert "already" in again
+    assert facts["library"] == ["Desk lamp.flare"]
+    assert facts["thumbnail"] > 200
+    assert facts["items"] == [["Desk lamp", "1 lights, 60 Gaussians. 35 mm"]]
+
+
+def test_a_flare_goes_on_to_another_camera_and_light(facts: Any) -> None:
+    assert facts["applied"] == ["FINISHED"]
+    assert facts["applied to"] == ["Spot"]
+    assert facts["transferred"] == [False, 1, True]
+
+
+def test_a_light_is_picked_in_a_single_picture(facts: Any) -> None:
+    assert facts["picture"] == [["FINISHED"], 96, 64]
+    np.testing.assert_allclose(facts["picked"], [0.25, 0.3], atol=1e-4)
+
+
+def test_blenders_own_camera_becomes_a_capture(facts: Any) -> None:
+    assert facts["exported"] == ["FINISHED"]
+    assert facts["export off"] < 1e-5
+    assert facts["export lens off"] < 1e-3
+    assert facts["export points"] == 150
+
+
+def test_the_overlay_is_what_is_baked(made: tuple[Any, Path], tmp_path: Path) -> None:
+    """The shot that Blender wrote, through the engine, against what the overlay evaluates for that frame."""
+    _, base = made
+    shot = Shot.read(base / "shot.json")
+    bake_shot(shot, tmp_path, half=False)
+    frame = shot.frames[0]
+    shown = evaluate(read(shot.flare), frame.camera.world_to_camera, frame.lights,
+                     LookEdits.parse(frame.edits, shot.lights, None), shot.query)
+    picture = draw(shown.values(), frame.camera.intrinsics, *frame.camera.size)
+    assert picture.max() > 0.05
+    np.testing.assert_allclose(read_layers(tmp_path / "layers.0001.exr").flare, picture, atol=1e-4)

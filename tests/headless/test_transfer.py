@@ -1,0 +1,150 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""transfer, export and bake of a bare .flare as they are started, on to a picture, a capture and a .blend."""
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from core.bake.exr import read_description, read_layers
+from core.capture import Capture
+from core.fit import fit, preset
+from core.fit.settings import changed
+from core.gaussians.ply import read_ply
+from core.look import read
+from core.look.shot import Shot
+from core.pictures import read_picture, write_png
+
+ROOT = Path(__file__).resolve().parents[2]
+RUN = ROOT / "headless" / "run.py"
+
+
+@pytest.fixture(scope="module")
+def made(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run, hardly fitted: its flare is there, whatever it looks like."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    settings = changed(preset("draft", iterations=3), {"flare.count": 40, "holdout": 0})
+    folder = fit(Capture.open(capture), settings, tmp_path_factory.mktemp("run") / "run").folder
+    torch.set_num_threads(before)
+    return folder
+
+
+def run(*words: object, status: int = 0) -> list[dict[str, Any]]:
+    """The events of a command."""
+    ended = subprocess.run([sys.executable, str(RUN), *map(str, words), "--progress", "json"], capture_output=True,
+                           text=True, timeout=300, check=False, env={**os.environ, "OMP_NUM_THREADS": "1"})
+    assert ended.returncode == status, ended.stderr + ended.stdout
+    return [json.loads(line) for line in ended.stdout.splitlines()]
+
+
+def test_on_to_a_picture(made: Path, tmp_path: Path) -> None:
+    write_png(tmp_path / "plate.png", np.full((54, 96, 3), 0.3))
+    run("transfer", made, "--to", tmp_path / "plate.png", "--light", "sun=60,10", "--out", tmp_path / "out", "--set",
+        "sun.intensity=3")
+    layers = read_layers(tmp_path / "out" / "layers.0001.exr")
+    assert list(layers.flares) == ["sun"]
+    assert layers.flare.max() > 0
+    assert read_picture(tmp_path / "out" / "frames" / "plate.png").size == (96, 54)
+    problem = run("transfer", made, "--to", tmp_path / "plate.png", "--out", tmp_path / "none", status=1)[-1]
+    assert "No light was found in" in problem["text"]
+
+
+def test_a_bare_flare_is_baked_as_its_run_is(made: Path, capture: Path, tmp_path: Path) -> None:
+    """With the capture's cameras: the same light, less what the run's scene hides, over black."""
+    run("bake", made / "flare.flare", "--capture", capture, "--out", tmp_path / "flare", "--frames", "3-4", "--space",
+        "acescg", "--float")
+    layers = read_layers(tmp_path / "flare" / "layers.0003.exr")
+    assert not layers.scene.any()
+    assert layers.flare.max() > 0
+    assert read_description(tmp_path / "flare" / "layers.0003.exr")["space"] == ["acescg", None]
+    sentence = run("bake", made / "flare.flare", "--out", tmp_path / "none", status=1)[-1]["text"]
+    assert "--capture" in sentence
+    assert "--blend" in sentence
+
+
+def test_export(made: Path, tmp_path: Path) -> None:
+    run("export", made, "--as", "ply", "--out", tmp_path / "ply", "--frames", "2")
+    assert len(read_ply(tmp_path / "ply" / "flare.0002.ply")) == read(made / "flare.flare").count
+    run("export", made, "--as", "preset", "--out", tmp_path / "lamp.json", "--frames", "2")
+    preset_made = json.loads((tmp_path / "lamp.json").read_text())
+    parts = [part for element in preset_made["lights"][0]["elements"] for part in element["parts"]]
+    assert len(parts) == read(made / "flare.flare").count
+    assert {"offset", "size", "colour", "shape"} <= set(parts[0])
+
+
+BLEND = """
+import sys
+import bpy
+bpy.ops.wm.read_factory_settings(use_empty=True)
+scene = bpy.context.scene
+scene.frame_start, scene.frame_end = 1, 9
+scene.render.resolution_x, scene.render.resolution_y = 96, 54
+camera = bpy.data.objects.new("Camera", bpy.data.cameras.new("Camera"))
+scene.collection.objects.link(camera)
+scene.camera = camera
+camera.location, camera.rotation_euler = (0, -5, 1), (1.5707963, 0, 0)
+data = bpy.data.lights.new("sun", "POINT")
+data.shadow_soft_size = 0.05
+light = bpy.data.objects.new("sun", data)
+light.location = (0.5, 0, 1.6)
+scene.collection.objects.link(light)
+bpy.ops.mesh.primitive_cube_add(size=0.5, location=(0.3, -2, 1.3))
+wall = bpy.context.object
+for frame, x in ((1, 3.25), (5, 0.25), (9, -2.75)):
+    wall.location.x = x
+    wall.keyframe_insert("location", frame=frame)
+bpy.ops.wm.save_as_mainfile(filepath=sys.argv[1])
+sys.stdout.flush()
+import os
+os._exit(0)
+"""
+
+
+@pytest.fixture(scope="module")
+def blend(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A camera, a lamp, and a block that passes between them in frame 5."""
+    if importlib.util.find_spec("bpy") is None:
+        pytest.skip("there is no bpy (`make setup` brings it)")
+    path = tmp_path_factory.mktemp("blend") / "shot.blend"
+    subprocess.run([sys.executable, "-c", BLEND, str(path)], check=True, capture_output=True, timeout=120)
+    return path
+
+
+def test_on_to_a_blend_its_objects_hide_the_light(made: Path, blend: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    run("transfer", made, "--to", blend, "--out", out, "--frames", "1-9", "--jobs", "2", "--float")
+    shot = Shot.read(out / "shot.1-9.json")
+    assert [one.frame for one in shot.frames] == list(range(1, 10))
+    shares = [one.lights[0].share for one in shot.frames]
+    assert shares[4] == 0
+    assert shares[0] == shares[8] == 1
+    camera = shot.frames[0].camera
+    pixels, depth = camera.project(shot.frames[0].lights[0].xyz)
+    np.testing.assert_allclose(pixels[0], (48 + 96 * 50 / 36 * 0.1, 27 - 96 * 50 / 36 * 0.12), atol=1e-3)
+    assert depth[0] == pytest.approx(5)
+    most = [float(read_layers(out / f"layers.{frame:04d}.exr").flare.max()) for frame in range(1, 10)]
+    assert most[0] > 0
+    assert most[4] == 0
+    assert max(abs(np.diff(most))) < 0.9 * max(most)
+    # A chunk alone, as a farm makes it, is the same: its neighbours are looked at too.
+    run("transfer", made, "--to", blend, "--out", tmp_path / "part", "--frames", "4-4", "--float")
+    assert (tmp_path / "part" / "layers.0004.exr").read_bytes() == (out / "layers.0004.exr").read_bytes()
+
+
+def test_a_bare_flare_is_baked_for_a_blend(made: Path, blend: Path, tmp_path: Path) -> None:
+    run("bake", made / "flare.flare", "--blend", blend, "--out", tmp_path / "out", "--frames", "1", "--lights", "sun")
+    layers = read_layers(tmp_path / "out" / "layers.0001.exr")
+    assert list(layers.flares) == ["sun"]
+    assert layers.flare.max() > 0
+    problem = run("bake", made / "flare.flare", "--blend", blend, "--out", tmp_path / "none", "--lights", "moon",
+                  status=1)[-1]
+    assert "no object 'moon'" in problem["text"]

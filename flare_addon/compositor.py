@@ -272,10 +272,11 @@ def _undriven(tree: Any) -> None:
 
 
 def _note(scene: Any) -> dict[str, Any]:
-    """What the scene had before any of this."""
+    """What the scene and the file had before any of this."""
+    viewer = any(image.type == "COMPOSITING" for image in bpy.data.images)  # Blender makes it for a Viewer node
     if _GROUPS_ARE_TREES:
-        return {"tree": scene.compositing_node_group is not None, "use_nodes": True}
-    return {"tree": scene.node_tree is not None, "use_nodes": bool(scene.use_nodes)}
+        return {"tree": scene.compositing_node_group is not None, "use_nodes": True, "viewer": viewer}
+    return {"tree": scene.node_tree is not None, "use_nodes": bool(scene.use_nodes), "viewer": viewer}
 
 
 def _before(tree: Any) -> dict[str, Any]:
@@ -324,6 +325,7 @@ def remove(scene: Any) -> None:
         del scene[NOTE]
     if group is not None and not group.users:
         bpy.data.node_groups.remove(group)
+    images += [image for image in bpy.data.images if image.type == "COMPOSITING" and not note.get("viewer", True)]
     for image in images:
         if image is not None and not image.users:
             bpy.data.images.remove(image)

@@ -76,8 +76,8 @@ def drag(x0: float, y0: float, x1: float, y1: float, button: str = "LEFTMOUSE") 
         real.drag(x0, top - y0, x1, top - y1, button={"LEFTMOUSE": 1, "MIDDLEMOUSE": 2}[button])
         return
     _queue.extend([("MOUSEMOVE", "NOTHING", x0, y0), (button, "PRESS", x0, y0)])
-    for step in range(1, 7):
-        _queue.append(("MOUSEMOVE", "NOTHING", x0 + (x1 - x0) * step / 6, y0 + (y1 - y0) * step / 6))
+    _queue.extend(("MOUSEMOVE", "NOTHING", x0 + (x1 - x0) * step / 6, y0 + (y1 - y0) * step / 6)
+                  for step in range(1, 7))
     _queue.append((button, "RELEASE", x1, y1))
 
 

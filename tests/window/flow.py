@@ -19,7 +19,7 @@ import bpy
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent))
-import driver as ui  # noqa: E402
+import driver as ui
 
 ZIP, CAPTURE, ENGINE, OUT = (os.environ[f"FIT_FLARE_{name}"] for name in ("ZIP", "CAPTURE", "ENGINE", "OUT"))
 NAME = "bl_ext.user_default.fit_flare"
@@ -90,8 +90,21 @@ def steps():
     yield 1
     assert NAME in bpy.context.preferences.addons, "the extension did not install"
     done("install")
-    shot("01_preferences") if show_preferences() else None
     bpy.context.preferences.addons[NAME].preferences.engine = ENGINE
+    chosen = ui.area()
+    show_preferences(chosen)
+    yield 1
+    with bpy.context.temp_override(window=ui.window(), screen=ui.window().screen, area=chosen):
+        bpy.ops.fit_flare.test_engine()
+    test = module("engine").tested()
+    while test.running:
+        yield 0.3
+    assert test.state == "done", test.error
+    yield 0.5
+    shot("01_preferences")
+    done("engine", engine=test.result)
+    chosen.type = "VIEW_3D"
+    yield 0.5
     for item in list(bpy.data.objects):
         bpy.data.objects.remove(item)
     open_tab()
@@ -250,18 +263,16 @@ def steps():
     done("all")
 
 
-def show_preferences() -> bool:
-    """The preferences of the extension in a window of their own."""
-    try:
-        bpy.ops.preferences.addon_show(module=NAME)
-    except RuntimeError:
-        return False
-    for other in list(bpy.context.window_manager.windows)[1:]:
-        ui.redraw()
-        with bpy.context.temp_override(window=other):
-            bpy.ops.screen.screenshot(filepath=str(out / "01_preferences.png"))
-            bpy.ops.wm.window_close()
-    return False
+def show_preferences(area) -> None:
+    """The preferences of the extension in an area of the window."""
+    import addon_utils
+
+    area.type = "PREFERENCES"
+    bpy.context.preferences.active_section = "ADDONS"
+    bpy.context.window_manager.addon_search = "Fit Flare"
+    for other in addon_utils.modules(refresh=True):
+        if other.__name__ == NAME:
+            addon_utils.module_bl_info(other)["show_expanded"] = True
 
 
 def speed_of(overlay, scene) -> dict[str, float]:
@@ -280,13 +291,15 @@ def speed_of(overlay, scene) -> dict[str, float]:
         middle = time.perf_counter()
         drawn = overlay.render(gaussians, window, look.blend)
         with drawn[-1].bind():  # reading back waits for the drawing
-            overlay_read(drawn[-1])
+            wait_for_gpu()
         numpy_ms.append(middle - began)
         gpu_ms.append(time.perf_counter() - middle)
-    return {"gaussians": len(gaussians), "numpy_ms": round(1e3 * min(numpy_ms), 1), "draw_ms": round(1e3 * min(gpu_ms), 1)}
+    return {"gaussians": len(gaussians), "numpy_ms": round(1e3 * min(numpy_ms), 1),
+            "draw_ms": round(1e3 * min(gpu_ms), 1)}
 
 
-def overlay_read(offscreen) -> None:
+def wait_for_gpu() -> None:
+    """Reading a pixel of what is bound waits for all that was asked before."""
     import gpu
 
     gpu.state.active_framebuffer_get().read_color(0, 0, 1, 1, 4, 0, "FLOAT")

@@ -1,0 +1,45 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The compositor that the panel sets up: its drivers in rendered pixels, and that it goes without a trace."""
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from blenders import Blender
+from test_work import a_flare
+
+from core.bake.exr import write_layers
+from core.bake.layers import FrameLayers
+from core.files import write_json
+from core.pictures import read_picture
+
+SCRIPTS = Path(__file__).parent / "scripts"
+SCENE, FLARE = np.full((8, 16, 3), 0.125, np.float32), np.full((8, 16, 3), 0.25, np.float32)
+
+
+@pytest.fixture(scope="session")
+def facts(blender: Blender, package: Path, tmp_path_factory: pytest.TempPathFactory) -> Any:
+    base = tmp_path_factory.mktemp("wired")
+    layers = base / "layers"
+    for number in range(1, 6):
+        write_layers(layers / f"layers.{number:04d}.exr", FrameLayers(SCENE, {"lamp": FLARE}, SCENE[..., 0]))
+    write_json(layers / "live.json", {"lights": ["lamp"]})
+    return blender.run(SCRIPTS / "wired.py", package, a_flare(base / "lamp.flare"), layers, base, user=base / "user")
+
+
+@pytest.mark.parametrize("before", ["bare", "grey", "unused"])
+@pytest.mark.parametrize("over", ["present", "scene"])
+def test_it_goes_without_a_trace(facts: Any, before: str, over: str) -> None:
+    changed, same, difference = facts[f"{before}, {over}"]
+    assert changed
+    assert same, difference
+
+
+@pytest.mark.parametrize(("name", "gain"), [
+    ("plain", (1, 1, 1)), ("graded", (3, 1.5, 0.75)), ("muted", (0, 0, 0)), ("animated", (3, 1.5, 0.75))])
+def test_the_panels_sliders_act_on_the_render(facts: Any, name: str, gain: tuple[float, ...]) -> None:
+    assert facts["valid"]
+    picture = read_picture(facts["files"][name]).pixels
+    np.testing.assert_allclose(picture, SCENE + FLARE * np.array(gain, np.float32), rtol=1e-5)

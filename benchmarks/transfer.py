@@ -24,7 +24,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from core.capture import Camera, Capture
 from core.files import write_json
 from core.fit.run import FLARE, Run
-from core.look import ViewOfLight, read
+from core.look import Look, ViewOfLight, read
 from core.look.shot import PlacedLight, Shot, ShotFrame
 from core.pictures import srgb_from_linear, write_png
 from core.transfer.target import of_shot
@@ -63,8 +63,13 @@ def moved(pose: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.fl
     return motion, pose @ np.linalg.inv(motion)
 
 
-def target(count: int, world: str, size: tuple[int, int]) -> list[Truth]:
-    """Frames with exact flares. Each light is hidden for some frames, and behind an edge for two beside them."""
+def target(count: int, world: str, size: tuple[int, int], look: Look) -> list[Truth]:
+    """Frames with exact flares. Each light is hidden for some frames, and behind an edge for two beside them.
+
+    A light's source is the light of the look that was found nearest to where it is.
+    """
+    sources = {light.name: min(look.lights, key=lambda one: float(np.linalg.norm(one.xyz - light.xyz))).name
+               for light in DESK.lights}
     width, height = size
     made = []
     for number in range(count):
@@ -82,7 +87,7 @@ def target(count: int, world: str, size: tuple[int, int]) -> list[Truth]:
             flares[light.name] = render_flare(
                 LOOKS[DESK.lens], camera, local, colour=light.colour, visible_share=share,
                 intensity=light.strength(float(np.linalg.norm(local))))
-            lights.append(PlacedLight(light.name, light.name, motion[:3, :3] @ xyz + motion[:3, 3], share))
+            lights.append(PlacedLight(light.name, sources[light.name], motion[:3, :3] @ xyz + motion[:3, 3], share))
         made.append(Truth(ShotFrame(number + 1, "Camera", camera, tuple(lights)), flares))
     return made
 
@@ -120,7 +125,7 @@ def main() -> None:
     capture = Capture.open(made.capture_folder if made.capture_folder.is_dir() else "sample_scenes/desk",
                            need_frames=False)
     training = [view.camera.world_to_camera for view in capture.split(made.settings.holdout)[0]]
-    truths = target(words.frames, words.world, (words.width, words.width * 5 // 8))
+    truths = target(words.frames, words.world, (words.width, words.width * 5 // 8), look)
     shot = Shot(words.run / FLARE, tuple(truth.shot for truth in truths))
     transfer = Transfer(words.run / FLARE, of_shot(shot, look, {}),
                         TransferSettings(query=words.query, smooth=words.smooth), training)

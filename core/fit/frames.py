@@ -14,7 +14,7 @@ from ..capture import Camera, Capture, View
 from ..errors import CaptureError
 from ..pictures import Picture
 
-CACHE_BYTES = 1 << 30  # 400 frames of 960x540 with their flare-free pairs take 1.2 GB at 8 bit
+CACHE_BYTES = 1 << 29  # 80 frames of 960x540 with their flare-free pairs; others are decoded when they are looked at
 
 
 class Targets(NamedTuple):

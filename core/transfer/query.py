@@ -31,7 +31,7 @@ Query = Literal["source", "target", "blend"]
 NEIGHBOURS = 4
 PLACE = 0.1  # of the normalised plane: lights this far apart are as unlike
 DISTANCE = 0.2  # as distances whose logarithms differ by this
-SAME_WORLD = 1e-3  # of the distance, within which two lights are one
+SAME_WORLD = 0.02  # of the distance, within which two lights are one: as well as lights are found
 
 Floats = NDArray[np.float64]
 
@@ -125,7 +125,7 @@ def _asked(light: LightLook, view: ViewOfLight, xyz: Floats, query: Query, seen:
     """Views to ask the network for, with weights that sum to 1."""
     away = (view.camera - xyz) / scale
     distance = float(np.linalg.norm(away))
-    one_world = np.linalg.norm(xyz - light.xyz) <= SAME_WORLD * distance
+    one_world = scale == 1 and np.linalg.norm(xyz - light.xyz) <= SAME_WORLD * distance
     camera = view.camera if one_world else (light.xyz + away).astype(np.float32)
     if query == "target":
         return [(1.0, replace(view, camera=camera))]

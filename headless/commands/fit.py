@@ -16,6 +16,7 @@ PRESETS = ("draft", "standard", "high", "paper")
 MODES = ("default", "unsup", "in-flare", "2d", "3dgs")
 MODELS = ("paper", "ours")
 BLENDS = ("over", "add")
+DECODED_BYTES = 1 << 26
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -69,7 +70,8 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     changes["scene.frozen"] = words.freeze_scene or None
     changes = {name: value for name, value in changes.items() if value is not None}
     settings = changed(settings, {**changes, **dict(map(change, words.changes))})
-    capture = Capture.open(folder)
+    # The fit keeps pictures itself, and smaller.
+    capture = Capture.open(folder, cache_bytes=DECODED_BYTES)
     if settings.mode != "3dgs":
         capture = with_lights(capture, progress)
     done = fit(capture, settings, out, progress, resume=words.resume)

@@ -61,10 +61,10 @@ class DeformationNetwork(nn.Module):
     light_high: Tensor
 
     def __init__(self, heads: Mapping[str, int], query_range: QueryRange, *, positions: int = 1, latent: int = 0,
-                 width: int = 128, hidden: int = 3, levels: int = 16) -> None:
+                 width: int = 128, hidden: int = 3, levels: int = 16, base: int = 16) -> None:
         super().__init__()
-        self.light_grid = HashGrid(17, 1.8, levels)
-        self.camera_grid = HashGrid(15, 1.6, levels)
+        self.light_grid = HashGrid(17, 1.8, levels, base=base)
+        self.camera_grid = HashGrid(15, 1.6, levels, base=base)
         view = 2 * 2 * levels
         self.view_layer = nn.Linear(view, width)
         self.gaussian_layer = nn.Linear(2 * BANDS * positions + latent, width, bias=False)

@@ -128,7 +128,8 @@ def _unpacked(description: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> 
             raise ValueError("a light's description makes no sense")
         low, high, reach = (_triple(light["range"][key]) for key in ("camera_low", "camera_high", "light_high"))
         form = FlareForm(**light["form"])
-        if form.sh_degree not in range(4) or not 1 <= form.levels <= 16 or not 0 <= form.latent <= 64:
+        if not (form.sh_degree in range(4) and 1 <= form.levels <= 16 and 1 <= form.base <= 256
+                and 0 <= form.latent <= 64):
             raise ValueError("a light's form makes no sense")
         flares.append(LightFlare(form, QueryRange(low, high, reach), count, torch.Generator()))
         names.append(str(light["name"]))

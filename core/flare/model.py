@@ -32,7 +32,8 @@ class FlareForm:
     static_offset     a learned 2D offset of each Gaussian, the same in all views
     rings             the radial profile exp(-(r - r0)^2 / (2 w^2)) (METHOD, section 5)
     latent            width of a per-Gaussian code that the network sees
-    levels            of the hash grids
+    levels, base      of the hash grids: how many, and the resolution of the coarsest. Fine cells hold a view
+                      each, and learn nothing about the views between
     """
 
     line: bool = True
@@ -44,10 +45,11 @@ class FlareForm:
     rings: bool = False
     latent: int = 0
     levels: int = 16
+    base: int = 16
 
 
 PAPER = FlareForm()
-OURS = replace(PAPER, solid=False, sh_degree=0, static_offset=True, rings=True, latent=4)
+OURS = replace(PAPER, solid=False, sh_degree=0, static_offset=True, rings=True, latent=4, levels=3, base=4)
 
 
 class ViewOfLight(NamedTuple):
@@ -91,7 +93,7 @@ class LightFlare(nn.Module):
         if form.line and form.plane_offset:
             heads["plane_offset"] = 2
         self.network = DeformationNetwork(heads, query_range, positions=1 if form.line else 2,
-                                          latent=form.latent, levels=form.levels)
+                                          latent=form.latent, levels=form.levels, base=form.base)
 
     @property
     def count(self) -> int:

@@ -40,6 +40,7 @@ class Form:
     rings: bool = False
     latent: int = 0
     levels: int = 16
+    base: int = 16
 
 
 @dataclass(frozen=True)
@@ -91,7 +92,7 @@ class LightLook:
         encoded = frequency_encoding(rows["positions"])
         if form.latent:
             encoded = np.concatenate([encoded, rows["latent"]], -1)
-        self._network = Network(tensors, _heads(form, rows), form.levels, query_range, encoded)
+        self._network = Network(tensors, _heads(form, rows), form.levels, form.base, query_range, encoded)
 
     @property
     def count(self) -> int:
@@ -280,7 +281,8 @@ def _light(path: Path, number: int, entry: Mapping[str, Any], tensors: Mapping[s
     xyz = np.array([float(value) for value in entry["xyz"]], np.float64)
     if not 0 <= count <= _MOST_GAUSSIANS or xyz.shape != (3,) or not np.isfinite(xyz).all():
         raise ValueError("a light's description makes no sense")
-    if form.sh_degree not in range(4) or not 1 <= form.levels <= 16 or not 0 <= form.latent <= 64:
+    if not (form.sh_degree in range(4) and 1 <= form.levels <= 16 and 1 <= form.base <= 256
+            and 0 <= form.latent <= 64):
         raise ValueError("a light's form makes no sense")
     own = {key[len(f"{number}."):]: value for key, value in tensors.items() if key.startswith(f"{number}.")}
     rows = {key[len("gaussians."):]: np.asarray(value, np.float32) for key, value in own.items()

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float32]
 
 BANDS = 3
-BASE, LIGHT_BITS, LIGHT_GROWTH, CAMERA_BITS, CAMERA_GROWTH = 16, 17, 1.8, 15, 1.6
+LIGHT_BITS, LIGHT_GROWTH, CAMERA_BITS, CAMERA_GROWTH = 17, 1.8, 15, 1.6
 _PRIMES = np.array([1, 2654435761, 805459861], np.int64)  # Müller et al. 2022, eq. 4
 _CORNERS = np.array([[(corner >> axis) & 1 for axis in range(3)] for corner in range(8)], np.int64)
 
@@ -25,10 +25,11 @@ _CORNERS = np.array([[(corner >> axis) & 1 for axis in range(3)] for corner in r
 class HashGrid:
     """Multiresolution hash grid over the unit cube (Müller et al. 2022, section 3); see core/flare/encoding.py."""
 
-    def __init__(self, bits: int, growth: float, levels: int, rows: NDArray[Any], values: NDArray[Any]) -> None:
+    def __init__(self, bits: int, growth: float, levels: int, base: int, rows: NDArray[Any],
+                 values: NDArray[Any]) -> None:
         """rows: ascending numbers of the table rows that are not zero, (k,); values: their content, (k, features)."""
         size = 1 << bits
-        self._resolutions = np.array([math.floor(BASE * growth**level) for level in range(levels)], np.int64)
+        self._resolutions = np.array([math.floor(base * growth**level) for level in range(levels)], np.int64)
         self._sizes = np.minimum((self._resolutions + 1) ** 3, size)
         self._starts = np.concatenate([[0], np.cumsum(self._sizes)[:-1]]).astype(np.int64)
         self._kept, self._values = np.asarray(rows, np.int64), np.asarray(values, np.float32)
@@ -100,7 +101,7 @@ class QueryRange:
 class Network:
     """Offsets of `heads` (name: width) for the canonical Gaussians, and delta_l, from one camera and light."""
 
-    def __init__(self, tensors: Mapping[str, NDArray[Any]], heads: Mapping[str, int], levels: int,
+    def __init__(self, tensors: Mapping[str, NDArray[Any]], heads: Mapping[str, int], levels: int, base: int,
                  query_range: QueryRange, encoded: Floats) -> None:
         """tensors: by their names in the file, without the light's number. encoded: (n, d) canonical positions,
         frequency encoded, with latent codes after them."""
@@ -110,7 +111,7 @@ class Network:
 
         def grid(name: str, bits: int, growth: float) -> HashGrid:
             table = f"network.{name}.table.weight"
-            return HashGrid(bits, growth, levels, tensors[f"{table}.rows"], tensors[f"{table}.values"])
+            return HashGrid(bits, growth, levels, base, tensors[f"{table}.rows"], tensors[f"{table}.values"])
 
         self._light_grid = grid("light_grid", LIGHT_BITS, LIGHT_GROWTH)
         self._camera_grid = grid("camera_grid", CAMERA_BITS, CAMERA_GROWTH)

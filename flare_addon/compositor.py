@@ -327,7 +327,7 @@ def remove(scene: Any) -> None:
         bpy.data.node_groups.remove(group)
     images += [image for image in bpy.data.images if image.type == "COMPOSITING" and not note.get("viewer", True)]
     for image in images:
-        if image is not None and not image.users:
+        if image is not None and (not image.users or image.type == "COMPOSITING"):  # that one counts itself
             bpy.data.images.remove(image)
 
 

@@ -123,8 +123,8 @@ def clean_pictures(folders: list[Path], weights: Path | None) -> None:
         values.append(psnr(clean / found.top, found.codes / found.top))
     print(f"{len(values)} pictures, {kept} kept to the last bit; PSNR against the input: median "
           f"{np.median(values):.2f}, mean with 100 for the kept {np.mean(values):.2f}, 5 % below "
-          f"{np.percentile(values, 5):.2f}, lowest {min(values):.2f} dB; {np.mean(np.array(values) >= 45):.0%} at 45 dB "
-          "or more")
+          f"{np.percentile(values, 5):.2f}, lowest {min(values):.2f} dB; {np.mean(np.array(values) >= 45):.0%} at 45 "
+          "dB or more")
 
 
 def coverage(sheet: Path | None, count: int) -> None:

@@ -41,22 +41,28 @@ class Lpips:
     @torch.inference_mode()
     def __call__(self, image: Pixels, target: Pixels) -> float:
         """Pictures (height, width, 3), 32 pixels a side at least."""
-        total = 0.0
+        stacked = (torch.from_numpy(np.ascontiguousarray(picture.transpose(2, 0, 1), np.float32))[None]
+                   for picture in (image, target))
+        return float(self.distance(*stacked))
+
+    def distance(self, image: Tensor, target: Tensor) -> Tensor:
+        """The same of (n, 3, h, w), on average, with gradients."""
+        total = torch.zeros((), device=image.device)
         for level, (a, b) in enumerate(zip(self._features(image), self._features(target), strict=True)):
-            weight = self._weights[f"lin{level}.model.1.weight"].reshape(1, -1, 1, 1)
-            total += float((((a - b) ** 2) * weight).sum(1).mean())
+            weight = self._weights[f"lin{level}.model.1.weight"].reshape(1, -1, 1, 1).to(a)
+            total = total + (((a - b) ** 2) * weight).sum(1).mean()
         return total
 
-    def _features(self, picture: Pixels) -> list[Tensor]:
-        x = torch.from_numpy(np.ascontiguousarray(picture.transpose(2, 0, 1), np.float32))[None] * 2 - 1
-        x = (x - torch.tensor(_SHIFT).reshape(1, 3, 1, 1)) / torch.tensor(_SCALE).reshape(1, 3, 1, 1)
+    def _features(self, x: Tensor) -> list[Tensor]:
+        shift, scale = (torch.tensor(values, device=x.device).reshape(1, 3, 1, 1) for values in (_SHIFT, _SCALE))
+        x = (x * 2 - 1 - shift) / scale
         found = []
         for index, stride, padding, pooled in _LAYERS:
             if pooled:
                 x = F.max_pool2d(x, 3, 2)
-            x = F.relu(F.conv2d(x, self._weights[f"features.{index}.weight"], self._weights[f"features.{index}.bias"],
-                                stride, padding))
-            found.append(x / (x.square().sum(1, keepdim=True).sqrt() + 1e-10))
+            kernel, bias = (self._weights[f"features.{index}.{kind}"].to(x) for kind in ("weight", "bias"))
+            x = F.relu(F.conv2d(x, kernel, bias, stride, padding))
+            found.append(x / (x.square().sum(1, keepdim=True) + 1e-20).sqrt())
         return found
 
 

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from ..errors import SettingsError
 from ..pictures import Encoding, linear_from_srgb
-from .network import GAMMA, MULTIPLE, RemovalNetwork, decoded, inputs
+from .network import GAMMA, MULTIPLE, RemovalNetwork, flare_light, inputs
 from .plates import Plate
 from .weights import IN_THE_BOX, load
 
@@ -28,8 +28,8 @@ Pixels = NDArray[np.float32]
 
 WORKING_SIZE = 512
 """Long side that the network sees: about the largest that it was trained at."""
-LEAST = 0.012
-"""Encoded flare below this is none: about 0.0006 of white."""
+LEAST = 0.004
+"""What a flare adds to display values, below which there is none: a code of 8 bit."""
 RADIUS, SMOOTHNESS = 2, 1e-3
 """Of the guided filter, at the working size."""
 ROWS = 256
@@ -87,10 +87,10 @@ class Remover:
         """Linear flare of a picture of display values 0..1 at the network's size; exactly 0 where it is none."""
         frame = torch.from_numpy(np.ascontiguousarray(display.transpose(2, 0, 1)))[None]
         told = self.network(inputs(frame).to(memory_format=torch.channels_last))
-        code = (told.gentle if self.keep_glare else told.flare).clamp(min=0)
+        added = (told.gentle if self.keep_glare else told.flare).clamp(min=0)
         # A ramp from nothing to the whole, so that a faint flare has no rim.
-        code = code * ((code - LEAST) / LEAST).clamp(0, 1)
-        light = torch.where(code > 0, decoded(code), 0.0).minimum(frame**GAMMA)
+        added = added * ((added - LEAST) / LEAST).clamp(0, 1)
+        light = torch.where(added > 0, flare_light(frame, added), 0.0)
         return np.ascontiguousarray(light[0].permute(1, 2, 0).numpy())
 
     def _seen(self, codes: NDArray[Any], encoding: Encoding, top: float) -> Pixels:

@@ -2,10 +2,10 @@
 """The network in the box: a U-Net of plain 3x3 convolutions that sees a frame and tells its flare.
 
 It sees ten channels: the frame (display values), the frame turned by 180 degrees about the principal point,
-where a light's ghosts mirror it, how over-exposed both are, and where on the frame it is. It gives the flare
-in `encoded` light (a root, so that faint flares count), of which `gentle` is the part that is not the glow
-round the lights. The clean picture is frame less flare in linear light: what the network does not call
-flare, the source of light among it, is the frame's own.
+where a light's ghosts mirror it, how over-exposed both are, and where on the frame it is. It gives what the
+flare adds to the frame's display values, of which `gentle` is the part that is not the glow round the lights.
+The clean picture is the frame less that, and the flare the difference of the two in light: what the network
+does not call flare, the source of light among it, is the frame's own.
 
 Plain convolutions on a quarter, an eighth, ... of the resolution were chosen over depthwise ones because the
 matrix units of processors and graphics cards alike are several times faster on them.
@@ -27,11 +27,10 @@ MULTIPLE = 32
 """Height and width that the network takes are multiples of this."""
 GAMMA = 2
 """Of the light that flares are taken from display values in: the middle of what pictures are formed with, and cheap."""
-_EPSILON = 1e-3
 
 
 class Prediction(NamedTuple):
-    """(n, 3, h, w) encoded flare, and the same without the glow round the lights.
+    """(n, 3, h, w) what the flare adds to display values, and the same without the glow round the lights.
 
     Below 0 where the network is in doubt the other way; who uses it counts that as none. An activation that
     cannot go below 0 has no slope there, and a network that begins with "no flare", which is most often right,
@@ -40,16 +39,6 @@ class Prediction(NamedTuple):
 
     flare: Tensor
     gentle: Tensor
-
-
-def encoded(light: Tensor) -> Tensor:
-    """Linear light >= 0 as the network's own display-like values, finite slope at 0."""
-    return torch.sqrt(light.clamp(min=0) + _EPSILON) - _EPSILON**0.5
-
-
-def decoded(code: Tensor) -> Tensor:
-    """The inverse of `encoded`, continued below 0 as an odd function."""
-    return torch.sign(code) * (torch.square(code.abs() + _EPSILON**0.5) - _EPSILON)
 
 
 def inputs(display: Tensor) -> Tensor:
@@ -140,6 +129,6 @@ class RemovalNetwork(nn.Module):
         return Prediction(flare, flare * torch.sigmoid(8 * out[:, 3:] + 1))
 
 
-def cleaned(display: Tensor, flare: Tensor) -> Tensor:
-    """Encoded light of the frame less its encoded flare; display (n, 3, h, w) 0..1."""
-    return encoded(torch.square(display) - decoded(flare))
+def flare_light(display: Tensor, added: Tensor) -> Tensor:
+    """Linear flare (of GAMMA): what the frame's light has more than that of the clean display values."""
+    return display**GAMMA - (display - added).clamp(min=0) ** GAMMA

@@ -21,14 +21,14 @@ class Recipe:
     seed: int = 1
     iterations: int = 8000
     pixels: int = 400_000          # of a batch; frames of one size a batch
-    learning_rate: float = 8e-4
+    learning_rate: float = 1e-3
     warmup: int = 200
     cooldown: float = 0.3
     weight_decay: float = 1e-4
-    average: float = 0.998         # of the weights that are kept, over iterations
+    average: float = 0.996         # of the weights that are kept, over iterations
     widths: tuple[int, ...] = (64, 96, 128, 192)
     depths: tuple[int, ...] = (1, 2, 2, 4)
-    small_until: int = 2500        # iterations with small frames, which are cheaper
+    small_until: int = 1800        # iterations with small frames, which are cheaper
     canvas: int = 448              # pixels a side of the flares' canvas
     bank: int = 250                # flares at hand at a time
     renew_every: int = 4           # iterations for each new flare

@@ -18,7 +18,7 @@ from ..progress import Progress
 from . import weights
 from .backgrounds import Backgrounds
 from .bank import Mixed, OwnFlares, SynthesisBank
-from .network import RemovalNetwork, cleaned, encoded, inputs
+from .network import RemovalNetwork, inputs
 from .pairs import Bank, Pair, pair
 from .recipe import Recipe, as_dict, from_dict
 from .synthesis.layers import flare
@@ -91,19 +91,16 @@ class Trainer:
         return figures
 
     def _loss(self, pairs: Sequence[Pair]) -> tuple[Tensor, dict[str, float]]:
-        """L1 of the clean pictures, of the flare and of its gentle part, all encoded, and the logarithm of the
-        squared error of each picture, which asks as much of faint flares as of strong ones."""
+        """L1 of the two clean pictures, and the logarithm of the squared error of each, which asks as much of faint
+        flares as of strong ones; display values."""
         frame, scene, gentle = (self._stack([getattr(one, name) for one in pairs])
                                 for name in ("frame", "scene", "gentle"))
         seen = inputs(frame).to(memory_format=torch.channels_last)
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.recipe.half):
             told = self.network(seen)
-        clean, mild = cleaned(frame, told.flare), cleaned(frame, told.gentle)
-        clean_goal, mild_goal = encoded(torch.square(scene)), encoded(torch.square(gentle))
-        flare_goal = encoded(torch.square(frame) - torch.square(scene))
-        squared = (clean - clean_goal).square().mean((1, 2, 3))
-        distance = (clean - clean_goal).abs().mean()
-        loss = (distance + 0.5 * (mild - mild_goal).abs().mean() + 0.3 * (told.flare - flare_goal).abs().mean()
+        wrong = frame - told.flare - scene
+        squared, distance = wrong.square().mean((1, 2, 3)), wrong.abs().mean()
+        loss = (distance + 0.5 * (frame - told.gentle - gentle).abs().mean()
                 + 0.03 * torch.log(squared + 1e-5).mean())
         return loss, {"l1": float(distance.detach()),
                       "psnr": float(-10 * torch.log10(squared.detach() + 1e-6).mean())}
@@ -125,9 +122,8 @@ class Trainer:
                 frame, scene = self._stack([one.frame]), self._stack([one.scene])
                 with torch.autocast(self.device.type, torch.bfloat16, enabled=self.recipe.half):
                     told = network(inputs(frame).to(memory_format=torch.channels_last))
-                clean = cleaned(frame, told.flare.clamp(min=0))
-                after = (clean - encoded(torch.square(scene))).square().mean()
-                before = (encoded(torch.square(frame)) - encoded(torch.square(scene))).square().mean()
+                after = (frame - told.flare.clamp(min=0) - scene).clamp(min=-1).square().mean()
+                before = (frame - scene).square().mean()
                 values.append(float(10 * torch.log10((before + 1e-8) / (after + 1e-8))))
             gains[kind] = round(float(np.mean(values)), 3)
         gains["mean"] = round(float(np.mean(list(gains.values()))), 3)

@@ -6,11 +6,13 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ...core.errors import SettingsError
 from ...core.progress import Progress
 from ..command import Command, Step
 
 if TYPE_CHECKING:
     from ...core.capture import Capture
+    from ...core.removal.inference import Remover
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -26,22 +28,39 @@ def arguments(parser: argparse.ArgumentParser) -> None:
                         help="long side that the network sees (default 512)")
     parser.add_argument("--weights", type=Path, metavar="FILE",
                         help="weights of train-removal's (default: those that come with the program)")
+    parser.add_argument("--model", choices=("network", "diffusion"), default="network",
+                        help="network: the one that comes with the program; diffusion: a base model and a LoRA of "
+                             "train-removal's, if diffusers, transformers and peft are at hand")
+    parser.add_argument("--base", metavar="FOLDER_OR_NAME", help="the base model, for diffusion")
     parser.add_argument("--overwrite", action="store_true", help="make again what is there")
 
 
 def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     from ...core.bake.frames import chosen, numbered
     from ...core.removal.batch import plates_of, remove_all
-    from ...core.removal.inference import WORKING_SIZE, Remover
 
-    size = WORKING_SIZE if words.working_size is None else words.working_size
-    remover = Remover(words.weights, working_size=size, keep_glare=words.keep_glare)
+    remover = _remover(words)
     wanted = None
     if words.frames is not None:
         names = [name.as_posix() for _, name in plates_of(words.plates)]
         wanted = {Path(frame.view) for frame in chosen(numbered(names), words.frames)}
     return remove_all(words.plates, words.out, remover, progress, flare_folder=words.flare, overwrite=words.overwrite,
                       wanted=wanted)
+
+
+def _remover(words: argparse.Namespace) -> Remover:
+    from ...core.removal.inference import WORKING_SIZE, Remover
+
+    size = WORKING_SIZE if words.working_size is None else words.working_size
+    if words.model == "network":
+        return Remover(words.weights, working_size=size, keep_glare=words.keep_glare)
+    from ...core.removal.diffusion import DiffusionRemover, need
+
+    need()
+    if words.base is None or words.weights is None or words.keep_glare:
+        raise SettingsError("--model diffusion wants --base and --weights, and knows no --keep-glare: a LoRA is "
+                            "trained for the one or the other.")
+    return DiffusionRemover(words.base, words.weights, working_size=size)
 
 
 def with_removed(capture: Capture, progress: Progress) -> Capture:

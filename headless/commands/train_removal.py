@@ -29,6 +29,14 @@ def arguments(parser: argparse.ArgumentParser) -> None:
                         help="any other number of the recipe, e.g. learning_rate=3e-4; repeatable")
     parser.add_argument("--most-lenses", type=int, default=180, metavar="N",
                         help="so many of the lenses, evenly spread; each is traced once (default 180)")
+    parser.add_argument("--model", choices=("network", "diffusion"), default="network",
+                        help="network: the one that comes with the program; diffusion: a LoRA for one-step diffusion, "
+                             "if diffusers, transformers and peft are at hand")
+    parser.add_argument("--base", metavar="FOLDER_OR_NAME",
+                        help="for diffusion: a base model such as SD-Turbo, in the layout of diffusers")
+    parser.add_argument("--keep-glare", action="store_true", help="for diffusion: the glow round the lights is to stay")
+    parser.add_argument("--lpips", type=Path, metavar="DIR",
+                        help="for diffusion: weights of LPIPS, which then is a part of the loss")
     parser.add_argument("--threads", type=int, metavar="N", help="processor threads (default: all)")
 
 
@@ -58,12 +66,44 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
         tests = None
         progress.say("There are too few clean pictures to keep some for checks; the log will have none.")
     own = OwnFlares(words.flares, recipe.canvas) if words.flares else None
+    if words.model == "diffusion":
+        return _diffusion(words, recipe, backgrounds, train_on, own, progress)
     start = weights.IN_THE_BOX if str(words.start) == "box" else words.start
     progress.say(f"{len(backgrounds.photos)} photographs, {len(backgrounds.maps)} environment maps, {len(train_on)} "
                  f"lenses, {len(own) if own else 'no'} flares of your own.")
     path = train(recipe, words.out, backgrounds, train_on, tests=tests, own=own, resume=words.resume, start=start,
                  progress=progress)
     progress.say(f"The weights are in {path}; use them with `remove --weights`.")
+    return {"weights": str(path)}
+
+
+def _diffusion(words: argparse.Namespace, recipe: Any, backgrounds: Any, lenses: Any, own: Any,
+               progress: Progress) -> dict[str, Any]:
+    import numpy as np
+
+    from ...core.metrics.lpips import Lpips
+    from ...core.removal import diffusion
+    from ...core.removal.bank import Mixed, SynthesisBank
+    from ...core.removal.pairs import pair
+
+    diffusion.need()
+    if words.base is None:
+        raise SettingsError("--model diffusion wants a base model; name its folder with --base.")
+    perceptual = Lpips(words.lpips).distance if words.lpips else None
+    if perceptual is None:
+        progress.say("The loss is L2 alone: no folder with the weights of LPIPS was given (--lpips).")
+    made = SynthesisBank(recipe.seed, recipe.bank, recipe.canvas, lenses)
+    bank = Mixed(made, own, recipe.own_share) if own else made
+
+    def draw(number: int) -> Any:
+        made.renew_to(recipe.bank + number // recipe.renew_every)
+        one = pair(np.random.default_rng((recipe.seed, number)), bank, backgrounds, 512, 512, clean=recipe.clean)
+        return one.frame, one.gentle if words.keep_glare else one.scene
+
+    path = diffusion.train_diffusion(diffusion.DiffusionRemoval(words.base), words.out, draw,
+                                     words.iterations or diffusion.ITERATIONS, progress, resume=words.resume,
+                                     perceptual=perceptual)
+    progress.say(f"The LoRA is in {path}; use it with `remove --model diffusion --base {words.base} --weights {path}`.")
     return {"weights": str(path)}
 
 

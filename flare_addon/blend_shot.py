@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A .blend as a shot: its camera, its lights or named objects, and what its objects hide of them, frame by frame.
+"""A .blend as a shot: its camera, its lights or named objects, and what its objects hide of them, frame by frame;
+and its animated camera as a capture.
 
-For the commands, which find no look set up in the scene; the panel's own way is `shots`.
+For the commands, which find no look set up in the scene; the panel's own ways are `shots` and `capture_export`.
 """
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -13,8 +14,9 @@ from typing import Any
 import numpy as np
 
 from ..core.errors import CaptureError
+from ..core.files import write_json
 from ..core.look.shot import PlacedLight, Shot, ShotFrame
-from . import cameras, looks
+from . import cameras, capture_export, looks
 
 KINDS = ("POINT", "SPOT", "AREA", "SUN")
 SUN_DISTANCE = 1e4
@@ -76,3 +78,32 @@ def _placed(scene: Any, depsgraph: Any, thing: Any, eye: Any, radius: float, occ
 def _radius(thing: Any) -> float:
     """Of a lamp that has one; 0 where it is a point or a mesh."""
     return float(getattr(thing.data, "shadow_soft_size", 0.0)) if thing.type == "LIGHT" else 0.0
+
+
+def capture_of(scene: Any, plates: Mapping[int, Path], folder: Path, names: Sequence[str],
+               done: Callable[[], None] = lambda: None) -> int:
+    """Write a capture of the scene's camera: transforms.json, images/, points.ply, and lights.json where there are
+    lights (`names`, or the scene's lamps); how many frames it has.
+
+    plates: the picture of each frame. Raises CaptureError where the scene lacks a camera, or anything to begin a fit
+    from.
+    """
+    if scene.camera is None:
+        raise CaptureError(f"The scene {scene.name!r} has no active camera; set one.")
+    points = capture_export.points_of(scene, scene.camera)
+    if not len(points):
+        raise CaptureError("There are no points to begin a fit from; solve the camera with the motion tracker, or "
+                           "model the rough scene as a mesh.")
+    entries = []
+    for frame, path in sorted(plates.items()):
+        scene.frame_set(frame)
+        entries.append(capture_export.entry_of(scene, scene.camera, frame, path, folder))
+        done()
+    capture_export.write_points(folder / "points.ply", points)
+    things = _lights(scene, names) if names or any(thing.type == "LIGHT" for thing in scene.objects) else []
+    if things:
+        write_json(folder / "lights.json", {"lights": [
+            {"name": thing.name, "xyz": list(map(float, thing.matrix_world.translation))} for thing in things]})
+    write_json(folder / "transforms.json",
+               {"camera_model": "PINHOLE", "ply_file_path": "points.ply", "frames": entries})
+    return len(entries)

@@ -70,7 +70,7 @@ def export(scene: Any, folder: Path) -> int:
     if len(pictures) < 3:
         raise CaptureError(f"Of the frames that the camera shows, {len(pictures)} are there as pictures beside "
                            f"{footage.first}; set the scene's frame range to the footage.")
-    points = _points(scene, camera)
+    points = points_of(scene, camera)
     if not len(points):
         raise CaptureError("There are no points to begin a fit from; solve the camera with the motion tracker, or "
                            "model the rough scene as a mesh.")
@@ -78,10 +78,10 @@ def export(scene: Any, folder: Path) -> int:
     try:
         for frame, path in pictures.items():
             scene.frame_set(frame)
-            entries.append(_entry(scene, camera, frame, path, folder))
+            entries.append(entry_of(scene, camera, frame, path, folder))
     finally:
         scene.frame_set(before)
-    _write_points(folder / "points.ply", points)
+    write_points(folder / "points.ply", points)
     write_json(folder / "transforms.json",
                {"camera_model": "PINHOLE", "ply_file_path": "points.ply", "frames": entries})
     state = scene.fit_flare
@@ -89,7 +89,8 @@ def export(scene: Any, folder: Path) -> int:
     return len(entries)
 
 
-def _entry(scene: Any, camera: Any, frame: int, path: Path, folder: Path) -> dict[str, Any]:
+def entry_of(scene: Any, camera: Any, frame: int, path: Path, folder: Path) -> dict[str, Any]:
+    """A frame of transforms.json; its picture is linked or copied into the capture."""
     depsgraph = bpy.context.evaluated_depsgraph_get()
     evaluated = camera.evaluated_get(depsgraph)
     core = cameras.core_camera(evaluated.data, evaluated.matrix_world, scene.render)
@@ -106,7 +107,7 @@ def _entry(scene: Any, camera: Any, frame: int, path: Path, folder: Path) -> dic
             "cy": core.cy, "transform_matrix": pose.tolist()}
 
 
-def _points(scene: Any, camera: Any) -> np.ndarray[Any, Any]:
+def points_of(scene: Any, camera: Any) -> np.ndarray[Any, Any]:
     """(n, 3) of the clip's solved tracks and of the scene's meshes, in Blender's world."""
     found: list[np.ndarray[Any, Any]] = []
     for back in camera.data.background_images:
@@ -130,7 +131,8 @@ def _moved(points: np.ndarray[Any, Any], matrix: Any) -> np.ndarray[Any, Any]:
     return np.asarray(points @ values[:3, :3].T + values[:3, 3])
 
 
-def _write_points(path: Path, points: np.ndarray[Any, Any]) -> None:
+def write_points(path: Path, points: np.ndarray[Any, Any]) -> None:
+    """Points (n, 3) as a PLY."""
     head = (f"ply\nformat binary_little_endian 1.0\nelement vertex {len(points)}\n"
             "property float x\nproperty float y\nproperty float z\nend_header\n")
     with atomic_path(path) as temporary:

@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from ...core.errors import CaptureError, SettingsError
 from ...core.progress import Progress
 from ..command import Command, Step
 
@@ -14,7 +15,11 @@ MATCHING = ("auto", "exhaustive", "sequential", "similar")
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("source", type=Path, metavar="FRAMES_OR_VIDEO",
-                        help="folder of frames (PNG, JPEG, TIFF, EXR) or a video")
+                        help="folder of frames (PNG, JPEG, TIFF, EXR), a video, or a .blend with an animated camera, "
+                             "which is taken as it is")
+    parser.add_argument("--plates", type=Path, metavar="DIR",
+                        help="of a .blend: the frames as filmed or rendered, whose names end with their numbers")
+    parser.add_argument("--lights", metavar="NAMES", help="of a .blend: objects that are lights (default: its lamps)")
     parser.add_argument("--out", type=Path, required=True, metavar="CAPTURE", help="folder for the capture")
     parser.add_argument("--frames", type=int, default=0, metavar="N",
                         help="choose N frames, evenly, the sharpest of each stretch (default: all of a folder, 150 of "
@@ -46,6 +51,41 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
                                                "track_length")}}
 
 
+def is_blend(words: argparse.Namespace) -> bool:
+    """Whether the source has cameras already."""
+    return bool(words.source.suffix.lower() == ".blend")
+
+
+def of_blend(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
+    """Blender's part: the animated camera of a .blend as a capture."""
+    import bpy
+
+    from ...core.bake.frames import numbered
+    from ...core.pictures import SUFFIXES
+    from ...flare_addon.blend_shot import capture_of
+
+    if words.plates is None or not words.plates.is_dir():
+        raise SettingsError(f"{words.source} has cameras but no pictures; name the folder of its frames with --plates.")
+    if (words.out / "transforms.json").exists():
+        raise CaptureError(f"{words.out} holds a capture already; choose another folder.")
+    try:
+        bpy.ops.wm.open_mainfile(filepath=str(words.source.resolve()), load_ui=False, use_scripts=False)
+    except RuntimeError as problem:
+        raise CaptureError(f"{words.source} cannot be opened by Blender {bpy.app.version_string} "
+                           f"({problem}).") from problem
+    scene = bpy.context.scene
+    files = {path.name: path for path in sorted(words.plates.glob("*")) if path.suffix.lower() in SUFFIXES}
+    plates = {frame.number: files[frame.view] for frame in numbered(files)
+              if scene.frame_start <= frame.number <= scene.frame_end}
+    if not plates:
+        raise CaptureError(f"{words.plates} has no picture for the frames {scene.frame_start} to {scene.frame_end}.")
+    progress.stage("look at the .blend", len(plates))
+    names = [name.strip() for name in (words.lights or "").split(",") if name.strip()]
+    count = capture_of(scene, plates, words.out.resolve(), names, progress.advance)
+    progress.say(f"{count} frames with the cameras of {words.source} are in {words.out}; next: `fit {words.out}`.")
+    return {"capture": str(words.out), "frames": count}
+
+
 COMMAND = Command(
     "solve", "Finds the cameras of frames or a video, and makes a capture of them.",
     """Structure from motion by pycolmap: features (not from clipped pixels, nor where ghosts lie), matches,
@@ -54,4 +94,5 @@ picture of cameras and points. The world stands upright (+z up). Frames that fin
 named.
 
   run.py solve shot.mp4 --out captures/shot""",
-    arguments, (Step("solve", "engine", run),))
+    arguments, (Step("camera", "blender", of_blend, wanted=is_blend),
+                Step("solve", "engine", run, wanted=lambda words: not is_blend(words))))

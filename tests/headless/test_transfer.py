@@ -148,3 +148,16 @@ def test_a_bare_flare_is_baked_for_a_blend(made: Path, blend: Path, tmp_path: Pa
     problem = run("bake", made / "flare.flare", "--blend", blend, "--out", tmp_path / "none", "--lights", "moon",
                   status=1)[-1]
     assert "no object 'moon'" in problem["text"]
+
+
+def test_the_animated_camera_of_a_blend_is_a_capture(blend: Path, tmp_path: Path) -> None:
+    for frame in range(1, 5):
+        write_png(tmp_path / "renders" / f"render.{frame:04d}.png", np.full((54, 96, 3), 0.1 * frame))
+    run("solve", blend, "--plates", tmp_path / "renders", "--out", tmp_path / "capture")
+    found = Capture.open(tmp_path / "capture")
+    assert len(found.views) == 4
+    assert [light.name for light in found.lights] == ["sun"]
+    assert len(found.points) > 4
+    pixels, _ = found.views[0].camera.project(found.lights[0].xyz)
+    np.testing.assert_allclose(pixels[0], (48 + 96 * 50 / 36 * 0.1, 27 - 96 * 50 / 36 * 0.12), atol=1e-3)
+    assert found.frame(found.views[2]).display()[0, 0, 0] == pytest.approx(0.3, abs=0.01)

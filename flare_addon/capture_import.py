@@ -83,7 +83,7 @@ def import_capture(scene: Any, folder: Path | str, settings: ImportSettings | No
     made = _cameras(collection, root, capture, settings, scene, notes)
     if settings.points and len(capture.points):
         _points(collection, root, capture.points)
-    lights = tuple(add_light(collection, root, light.name, light.xyz, 0.04 * capture.extent)
+    lights = tuple(add_light(collection, root, light.name, light.xyz, 0.02 * capture.extent)
                    for light in capture.lights)
     state = scene.fit_flare
     state.capture, state.root = stored(folder), root

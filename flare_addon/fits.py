@@ -46,6 +46,22 @@ def state_of(scene: Any) -> str:
     return "none" if not scene.fit_flare.run or folder.is_dir() else "lost"
 
 
+def why_not(scene: Any) -> str:
+    """What keeps a fit from being started, and what to do; "" where nothing does. No full stop: for tooltips."""
+    capture = capture_of(scene)
+    if capture is None:
+        return "Import a capture first"
+    if not capture.is_dir():
+        return f"The capture {capture} is not there any more; choose where it is now"
+    if not lights.of_scene(scene):
+        return "Add a light first, or find the lights in the frames"
+    if engine.find() is None:
+        return engine.MISSING
+    if state_of(scene) == "running":
+        return "A fit is running"
+    return ""
+
+
 def new_folder(scene: Any) -> Path:
     """A free folder for a run: beside the .blend where it is saved, else in the capture's own fits/."""
     capture = capture_of(scene)

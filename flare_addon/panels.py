@@ -101,6 +101,9 @@ class FITFLARE_PT_fit(_Part, bpy.types.Panel):
             _finished(layout, scene, job)
         elif job is not None and job.state in ("failed", "stopped"):
             lines(layout, job.error, "ERROR" if job.state == "failed" else "INFO")
+        why = fits.why_not(scene)
+        if why and engine.find() is not None:
+            lines(layout, f"{why}.", "INFO")
         row = layout.row()
         row.scale_y = 1.3
         row.operator("fit_flare.fit", text="Fit" if stage in ("none", "lost") else "New Fit", icon="RENDER_ANIMATION")

@@ -46,6 +46,8 @@ def _draw_engine(layout: Any) -> None:
         named = bool(engine_path())
         box.label(text="The engine that is named is not there" if named else "No engine yet", icon="ERROR")
         lines(box, "Set it up here (about 1 GB to download, once), or name a Python above that has torch.")
+        if not bpy.app.online_access:
+            lines(box, "Set Up Engine needs online access: allow it in System > Network.", "INTERNET_OFFLINE")
     else:
         box.label(text=f"Engine: {python}", icon="CHECKMARK")
     if making is not None and making.state in ("failed", "stopped"):

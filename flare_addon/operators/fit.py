@@ -6,7 +6,7 @@ from pathlib import Path
 
 import bpy
 
-from .. import engine, fits, jobs, lights, looks
+from .. import engine, fits, jobs, looks
 from ..reports import reported
 
 _keymaps: list[tuple[object, object]] = []
@@ -20,21 +20,10 @@ class FITFLARE_OT_fit(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        scene = context.scene
-        capture = fits.capture_of(scene)
-        if capture is None:
-            cls.poll_message_set("Import a capture first")
-        elif not capture.is_dir():
-            cls.poll_message_set(f"The capture {capture} is not there any more")
-        elif not lights.of_scene(scene):
-            cls.poll_message_set("Add a light first, or find the lights in the frames")
-        elif engine.find() is None:
-            cls.poll_message_set(engine.MISSING)
-        elif fits.state_of(scene) == "running":
-            cls.poll_message_set("A fit is running")
-        else:
-            return True
-        return False
+        why = fits.why_not(context.scene)
+        if why:
+            cls.poll_message_set(why)
+        return not why
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         with reported(self) as outcome:

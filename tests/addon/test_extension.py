@@ -33,9 +33,10 @@ def test_the_versions_agree() -> None:
 
 def test_the_package_holds_the_program_and_nothing_else(package: Path) -> None:
     names = zipfile.ZipFile(package).namelist()
-    assert {"__init__.py", "blender_manifest.toml", "LICENSE", "core/errors.py", "headless/run.py"} <= set(names)
+    assert {"__init__.py", "blender_manifest.toml", "LICENSE", "core/errors.py", "headless/run.py",
+            "headless/set_up.py", "constraints.txt", "pyproject.toml"} <= set(names)
     strangers = [name for name in names if name.split("/")[0].startswith(".") or "__pycache__" in name
-                 or name.split("/")[0] in ("tests", "benchmarks", "sample_scenes", "build", "tmp")]
+                 or name.split("/")[0] in ("tests", "benchmarks", "sample_scenes", "build", "tmp", "docs")]
     assert strangers == []
 
 

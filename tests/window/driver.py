@@ -111,11 +111,17 @@ def quit_(status: int = 0) -> None:
 def run(steps) -> None:
     """Walk through the generator function `steps`; an exception ends Blender with status 1."""
     walk = steps()
+    sent = False
 
     def step():
+        nonlocal sent
         try:
             if real is not None and bpy.app.timers.is_registered(real._pump):
+                sent = True
                 return 0.05
+            if sent:  # let Blender handle what was sent
+                sent = False
+                return 0.3
             if _queue:
                 kind, value, x, y = _queue.pop(0)
                 window().event_simulate(type=kind, value=value, x=int(x), y=int(y))

@@ -2,6 +2,9 @@
 """Colour spaces against published matrices, against OpenColorIO, and there and back."""
 from __future__ import annotations
 
+import json
+import os
+import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -104,3 +107,23 @@ def test_a_bad_configuration_is_one_sentence(tmp_path: Path) -> None:
     (tmp_path / "bad.ocio").write_text("no configuration")
     with pytest.raises(SettingsError, match=r"bad\.ocio cannot be read"):
         colour_space("ACEScg", tmp_path / "bad.ocio")
+
+
+def test_blender_s_own_library_serves_inside_blender() -> None:
+    """In a Blender without the package, by the library and the configuration that ship with it."""
+    root = Path(__file__).resolve().parents[2]
+    older = root / ".venv-bpy45" / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
+    if not older.is_file():
+        pytest.skip(f"there is no {older} (`make setup` makes it)")
+    code = ("import os, sys, pathlib, bpy, numpy\n"
+            "assert 'PyOpenColorIO' not in sys.modules\n"
+            "sys.path.insert(0, sys.argv[1])\n"
+            "from core.colour import colour_space\n"
+            "config = next(pathlib.Path(bpy.utils.system_resource('DATAFILES')).rglob('config.ocio'))\n"
+            "print(colour_space('ACEScg', config).to_linear(numpy.float32([[0.1, 0.5, 1]])).tolist())\n"
+            "sys.stdout.flush()\n"
+            "os._exit(0)")
+    ended = subprocess.run([older, "-c", code, root], capture_output=True, text=True, timeout=120, check=False)
+    assert ended.returncode == 0, ended.stderr
+    expected = colour_space("acescg").to_linear(np.float32([[0.1, 0.5, 1]]))
+    np.testing.assert_allclose(json.loads(ended.stdout.splitlines()[-1]), expected, atol=2e-3)

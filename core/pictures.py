@@ -77,6 +77,8 @@ def linear_from_srgb(display: NDArray[Any]) -> Pixels:
 def read_picture(path: Path | str) -> Picture:
     """Decode PNG, JPEG, TIFF (8 or 16 bit, grey or colour, alpha dropped) or EXR.
 
+    An EXR whose `chromaticities` say another space than Rec. 709 (ACEScg, say) is converted.
+
     Raises FrameError where the file is missing, damaged or of another kind, or holds NaN or infinity.
     """
     path = Path(path)
@@ -85,7 +87,7 @@ def read_picture(path: Path | str) -> Picture:
     if not path.is_file():
         raise FrameError(f"{path} is missing.")
     if path.suffix.lower() == ".exr":
-        return Picture(_rgb_from_channels(path, read_exr(path)), "linear")
+        return Picture(_rec709(path, _rgb_from_channels(path, read_exr(path))), "linear")
     import cv2
 
     width, height = picture_size(path)
@@ -214,6 +216,23 @@ def _rgb_from_channels(path: Path, channels: Mapping[str, Pixels]) -> Pixels:
     if "Y" in channels:
         return np.repeat(channels["Y"][..., None], 3, axis=2)
     raise FrameError(f"{path} has no R, G, B channels at its root (it has {', '.join(sorted(channels))}).")
+
+
+def _rec709(path: Path, pixels: Pixels) -> Pixels:
+    """Linear Rec. 709 of an EXR's pixels, by its chromaticities; as they are where it has none."""
+    import OpenEXR
+
+    from .colour import space_of_chromaticities
+    from .errors import SettingsError
+
+    with OpenEXR.File(str(path), header_only=True) as file:
+        told = file.parts[0].header.get("chromaticities")
+    if told is None:
+        return pixels
+    try:
+        return space_of_chromaticities(tuple(told)).to_linear(pixels)
+    except SettingsError as problem:
+        raise FrameError(f"{path} has chromaticities that span no colour space; export it again.") from problem
 
 
 def write_exr(path: Path | str, channels: Mapping[str, NDArray[Any]], *, half: bool = True,

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
+from core.colour import colour_space
 from core.errors import FrameError
 from core.pictures import (
     Picture,
@@ -108,3 +109,16 @@ def test_nan_in_an_exr_is_refused(tmp_path: Path) -> None:
     write_exr(tmp_path / "nan.exr", {"R": pixels, "G": pixels, "B": pixels})
     with pytest.raises(FrameError, match=r"nan\.exr"):
         read_picture(tmp_path / "nan.exr")
+
+
+def test_an_exr_in_another_space_is_read_as_rec_709(tmp_path: Path) -> None:
+    """ACEScg by its chromaticities; no light is lost below 0 or above 1."""
+    aces = colour_space("acescg")
+    light = np.array([[[0.2, 0.5, 4.0], [0.0, 1.0, 0.0]]], np.float32)
+    stored = aces.from_linear(light)
+    write_exr(tmp_path / "a.exr", {name: stored[..., index] for index, name in enumerate("RGB")}, half=False,
+              header={"chromaticities": aces.chromaticities})
+    np.testing.assert_allclose(read_picture(tmp_path / "a.exr").pixels, light, atol=1e-5)
+    write_exr(tmp_path / "bad.exr", {name: stored[..., 0] for name in "RGB"}, header={"chromaticities": (0.3,) * 8})
+    with pytest.raises(FrameError, match=r"bad\.exr has chromaticities"):
+        read_picture(tmp_path / "bad.exr")

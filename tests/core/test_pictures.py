@@ -119,6 +119,6 @@ def test_an_exr_in_another_space_is_read_as_rec_709(tmp_path: Path) -> None:
     write_exr(tmp_path / "a.exr", {name: stored[..., index] for index, name in enumerate("RGB")}, half=False,
               header={"chromaticities": aces.chromaticities})
     np.testing.assert_allclose(read_picture(tmp_path / "a.exr").pixels, light, atol=1e-5)
-    write_exr(tmp_path / "bad.exr", {name: stored[..., 0] for name in "RGB"}, header={"chromaticities": (0.3,) * 8})
+    write_exr(tmp_path / "bad.exr", dict.fromkeys("RGB", stored[..., 0]), header={"chromaticities": (0.3,) * 8})
     with pytest.raises(FrameError, match=r"bad\.exr has chromaticities"):
         read_picture(tmp_path / "bad.exr")

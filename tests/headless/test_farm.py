@@ -68,11 +68,13 @@ def whole(capture: Path, made: Path, tmp_path_factory: pytest.TempPathFactory) -
     return out
 
 
-@pytest.mark.parametrize("template", TEMPLATES, ids=lambda path: path.stem)
-def test_templates_are_valid(template: Path) -> None:
-    ended = subprocess.run([sys.executable, "-m", "openjd", "check", template], capture_output=True, text=True,
-                           timeout=120, check=False)
-    assert ended.returncode == 0, ended.stdout + ended.stderr
+def test_templates_are_valid() -> None:
+    """`openjd check` of each, all at once."""
+    checks = [subprocess.Popen([sys.executable, "-m", "openjd", "check", path], stdout=subprocess.PIPE,
+                               stderr=subprocess.STDOUT, text=True) for path in TEMPLATES]
+    for check in checks:
+        said, _ = check.communicate(timeout=120)
+        assert check.returncode == 0, said
 
 
 def test_there_is_a_template_for_each_job() -> None:
@@ -80,11 +82,11 @@ def test_there_is_a_template_for_each_job() -> None:
 
 
 def test_three_chunks_make_what_one_command_makes(capture: Path, made: Path, whole: Path, tmp_path: Path) -> None:
-    """In any order, and one of them twice."""
+    """In any order."""
     parameters = {"Run": made, "Capture": capture, "Out": tmp_path / "out", "Frames": FRAMES, "FramesPerTask": 3}
-    chunks = json.dumps([{"Frame": text} for text in ("6-8", "0-2", "3-5", "0-2")])
+    chunks = json.dumps([{"Frame": text} for text in ("6-8", "0-2", "3-5")])
     log = job("bake.yaml", "Bake", "--tasks", chunks, **parameters)
-    assert re.findall(r"openjd_progress: (\d+)", log).count("100") == 4
+    assert re.findall(r"openjd_progress: (\d+)", log).count("100") == 3
     assert "openjd_status: bake 0/3" in log
     assert contents(tmp_path / "out") == contents(whole)
 

@@ -103,8 +103,9 @@ class SceneSettings:
 class FitSettings:
     """A whole fit. `width`: the working width in pixels at most; 0 keeps the frames' own size.
 
-    ssim_share is 1 - lambda of the paper's loss. `holdout`: None (every view is fitted), a number N (every
-    N-th view is held out) or a split file's name.
+    ssim_share is 1 - lambda of the paper's loss. `apart`: share of the iterations at the beginning in which the
+    flare is put before the flare-free frames instead of the scene; 0 in the paper. `holdout`: None (every view is
+    fitted), a number N (every N-th view is held out) or a split file's name.
     """
 
     mode: Mode = "default"
@@ -113,6 +114,7 @@ class FitSettings:
     width: int = 0
     seed: int = 0
     ssim_share: float = 0.1
+    apart: float = 0.0
     holdout: str | int | None = None
     kernels: Literal["auto", "torch", "tiles", "cpu", "cuda"] = "auto"
     checkpoint_every_s: float = 60.0
@@ -126,6 +128,7 @@ class FitSettings:
             (self.iterations >= 1, "iterations must be at least 1"),
             (self.width >= 0, "size must not be negative"),
             (0 <= self.ssim_share <= 1, "ssim_share must lie between 0 and 1"),
+            (0 <= self.apart <= 1, "apart must lie between 0 and 1"),
             (self.flare.count >= 1, "a flare starts with at least one Gaussian"),
             (0 < self.flare.opacity < 1, "a flare's opacity must lie between 0 and 1"),
             (self.seed >= 0, "seed must not be negative"),
@@ -136,6 +139,10 @@ class FitSettings:
             if not good:
                 raise SettingsError(f"The settings cannot be used: {sentence}.")
         return self
+
+
+APART = 0.7
+"""Share of the iterations in which our form fits scene and flare apart."""
 
 
 def preset(name: Preset, *, model: Literal["paper", "ours"] | None = None, mode: Mode = "default",
@@ -157,7 +164,8 @@ def preset(name: Preset, *, model: Literal["paper", "ours"] | None = None, mode:
     if blend is None:
         blend = "over" if model == "paper" else "add"
     flare = FlareSettings(form=form, occlusion=model == "ours")
-    settings = FitSettings(mode=mode, blend=blend, iterations=length, flare=flare)
+    settings = FitSettings(mode=mode, blend=blend, iterations=length, flare=flare,
+                           apart=APART if model == "ours" else 0.0)
     if name != "paper":
         count, most = {"draft": (300, 40_000), "standard": (500, 60_000), "high": (700, 200_000)}[name]
         settings = _shortened(settings, count, most)

@@ -71,7 +71,7 @@ class Trainer:
         scene = self.scene.render(targets.camera, sh_degree=self._sh_degree(), depth=False, kernels=settings.kernels)
         flare = render_flare(self.flare, settings.blend, targets.camera, settings.kernels, scene=self.scene,
                              visibility=settings.flare.occluded_by_scene)
-        picture = composite(scene.colour, flare, settings.blend)
+        picture = composite(self._behind_flare(targets, scene.colour), flare, settings.blend)
         weight = 1 - settings.ssim_share
         loss = l1_ssim(picture, targets.frame, weight)
         figures = {"loss": float(loss.detach())}
@@ -103,6 +103,17 @@ class Trainer:
         done = self.iteration - 1
         order = torch.randperm(len(self.views), generator=self._generator(done // len(self.views), 1))
         return self.views[int(order[done % len(self.views)])]
+
+    def _behind_flare(self, targets: Targets, scene: Tensor) -> Tensor:
+        """What the flare is put before: the flare-free frame while both are fitted apart, then the scene.
+
+        The faint and the small in a flare drown in the errors of a scene that is not learned yet. Later the
+        scene, on which all views have agreed, is the better judge of what one flare-free frame has left over.
+        """
+        apart = self.iteration <= self.settings.apart * self.settings.iterations
+        if apart and self.settings.mode in ("default", "2d") and targets.removed is not None:
+            return targets.removed
+        return scene
 
     def _scene_target(self, targets: Targets, picture: Tensor, scene: Tensor) -> Tensor | None:
         if self.settings.mode in ("default", "2d"):

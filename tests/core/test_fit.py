@@ -95,7 +95,7 @@ def test_a_fit_finds_the_flare(tmp_path: Path, capture: Capture) -> None:
     assert names >= {"config.toml", "flare.flare", "scene.ply", "metrics.jsonl", "preview.png", "log.txt"}
     lines = [json.loads(line) for line in (tmp_path / "run" / "metrics.jsonl").read_text().splitlines()]
     assert lines[-1]["iteration"] == 400
-    assert lines[-1]["loss"] < lines[0]["loss"]
+    assert lines[-1]["scene_loss"] < lines[0]["scene_loss"]
     assert lines[-1]["flare_gaussians"] > 60
 
 

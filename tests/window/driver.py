@@ -81,25 +81,20 @@ def drag(x0: float, y0: float, x1: float, y1: float, button: str = "LEFTMOUSE") 
     _queue.append((button, "RELEASE", x1, y1))
 
 
-def find(wanted: str, of: str = "UI", start: float = 0.0):
-    """A generator that looks for a button with the mouse: `place = yield from find("fit_flare.fit")`.
+def only(*panels) -> None:
+    """Show these panels of the tab alone, so that the first one's rows are where `row` says."""
+    for cls in [cls for cls in bpy.types.Panel.__subclasses__() if getattr(cls, "bl_category", "") == "Fit Flare"
+                and getattr(cls, "is_registered", False)]:
+        bpy.utils.unregister_class(cls)
+    for cls in panels:
+        bpy.utils.register_class(cls)
+    redraw()
 
-    wanted: the end of a property's data path, or an operator's name. Returns the window position, or None.
-    """
-    place = region(of)
-    x = place.x + place.width * 0.62
-    y = place.y + place.height - 14 - start
-    while y > place.y + 4:
-        move(x, y)
-        yield 0.12
-        with override(inner=of):
-            prop, operator = getattr(bpy.context, "property", None), getattr(bpy.context, "button_operator", None)
-        if prop is not None and str(prop[1]).endswith(wanted):
-            return x, y
-        if operator is not None and operator.bl_rna.identifier.lower().replace("_ot_", ".") == wanted:
-            return x, y
-        y -= 11
-    return None
+
+def row(below_header: float) -> tuple[float, float]:
+    """The middle of a row of the first panel: its distance below the panel's header, in pixels at scale 1."""
+    place, scale = region("UI"), bpy.context.preferences.system.ui_scale
+    return place.x + place.width * 0.6, place.y + place.height - (36 + below_header) * scale
 
 
 def quit_(status: int = 0) -> None:

@@ -126,13 +126,19 @@ def steps():
         bpy.ops.view3d.view_all()
     ticks: list[float] = []
     timed(module("jobs").Job, "poll", ticks)
-    place = yield from ui.find("fit_flare.fit")
-    assert place is not None, "the Fit button was not found"
-    ui.click(*place)
-    yield 1.5
-    fits = module("fits")
-    job = fits.job_of(scene)
-    assert job is not None and job.running, "the fit did not start"
+    panels, fits = module("panels"), module("fits")
+    every = panels._CLASSES
+    ui.only(panels.FITFLARE_PT_fit, panels.FITFLARE_PT_look)
+    yield 0.5
+    job = None
+    for nudge in (0, 7, -7):
+        ui.click(*ui.row(106 + nudge))
+        yield 2
+        job = fits.job_of(scene)
+        if job is not None:
+            break
+    assert job is not None and job.running, f"the fit did not start: {fits.why_not(scene)}"
+    ui.only(*every)
     gaps = Gaps()
     seen: set[int] = set()
     view = ui.region("WINDOW")
@@ -166,13 +172,18 @@ def steps():
     depsgraph = bpy.context.evaluated_depsgraph_get()
     dim = overlay.picture(scene, depsgraph, scene.camera, 480, 270)
     np.save(out / "overlay.npy", dim)
-    place = yield from ui.find("master.intensity")
-    assert place is not None, "the slider Intensity was not found"
-    ui.drag(place[0], place[1], place[0] + 50, place[1])
+    ui.only(panels.FITFLARE_PT_look)
     yield 0.5
+    for nudge in (0, 7, -7):
+        x, y = ui.row(31 + nudge)
+        ui.drag(x, y, x + 50, y)
+        yield 0.5
+        if state.master.intensity != 1.0:
+            break
     assert state.master.intensity > 1.1, f"Intensity is {state.master.intensity}"
     bright = overlay.picture(scene, bpy.context.evaluated_depsgraph_get(), scene.camera, 480, 270)
     shot("06_brighter")
+    ui.only(*every)
     done("drag", intensity=round(state.master.intensity, 3), brightness=round(float(bright.sum() / dim.sum()), 3))
     np.testing.assert_allclose(bright.sum() / dim.sum(), state.master.intensity, rtol=0.01)
 
@@ -193,6 +204,10 @@ def steps():
         yield 0.3
     assert job.state == "done", job.error
     done("bake", bake_s=round(time.perf_counter() - began, 1), layers=str(out / "layers"))
+
+    ui.only(panels.FITFLARE_PT_look, panels.FITFLARE_PT_bake)
+    yield 0.5
+    shot("06_look_and_bake")
 
     # The compositor, and a render through it.
     state.over = "plate"
@@ -246,6 +261,7 @@ def steps():
         result = bpy.ops.fit_flare.apply_flare(filepath=str(library.files()[0]))
     assert result == {"FINISHED"}
     ui.area().spaces.active.region_3d.view_perspective = "CAMERA"
+    ui.only(panels.FITFLARE_PT_look, panels.FITFLARE_PT_transfer)
     yield 1
     shot("08_transferred")
     free = overlay.picture(other, bpy.context.evaluated_depsgraph_get(), camera, 480, 270)

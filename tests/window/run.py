@@ -1,0 +1,47 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Drives the whole flow (flow.py) in a real Blender with its window.
+
+    python tests/window/run.py --out DIR [--blender PROGRAM] [--engine PYTHON]
+
+Needs a screen, or a virtual one (xvfb-run). The profile is an empty one of its own. DIR gets screenshots and
+facts.json. Where no Blender is found it says so and ends with status 77, the sign for a test left out.
+"""
+from __future__ import annotations
+
+import argparse
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+LEFT_OUT = 77
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--blender", default=os.environ.get("FIT_FLARE_BLENDER") or shutil.which("blender"))
+    parser.add_argument("--engine", default=os.environ.get("FIT_FLARE_ENGINE") or str(ROOT / ".venv"))
+    words = parser.parse_args()
+    if not words.blender:
+        print("left out: no Blender here; name one with --blender or FIT_FLARE_BLENDER.", file=sys.stderr)
+        return LEFT_OUT
+    out = words.out.resolve()
+    out.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory() as base:
+        folder = Path(base)
+        subprocess.run([sys.executable, str(ROOT / "headless" / "package.py"), str(folder)], check=True)
+        shutil.copytree(ROOT / "sample_scenes" / "desk", folder / "desk")
+        environment = {**os.environ, "BLENDER_USER_RESOURCES": str(folder / "profile"),
+                       "FIT_FLARE_ZIP": str(next(folder.glob("*.zip"))), "FIT_FLARE_CAPTURE": str(folder / "desk"),
+                       "FIT_FLARE_ENGINE": words.engine, "FIT_FLARE_OUT": str(out)}
+        command = [words.blender, "--enable-event-simulate", "--window-geometry", "0", "0", "1600", "1000", "-noaudio",
+                   "--python-exit-code", "1", "--python", str(ROOT / "tests" / "window" / "flow.py")]
+        return subprocess.run(command, env=environment, check=False).returncode
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,64 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The flare fitted alone, over the exact scene: what the representation can do, without the scene's errors."""
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+
+from core.capture import View
+from core.errors import CaptureError
+from core.fit.rendering import render_flare
+from core.fit.trainer import Trainer
+from core.flare.compositing import composite, decode
+from core.gaussians.loss import l1_ssim
+from core.metrics.pictures import psnr
+
+CLIPPED = 254.5 / 255
+
+
+class KnownScene(Trainer):
+    """A trainer whose scene is the flare-free frame of each view; lights are taken as visible."""
+
+    def step(self) -> dict[str, float]:
+        """One iteration on the next view; the loss."""
+        self.iteration += 1
+        settings = self.settings
+        targets = self.frames.targets(self._view())
+        if targets.removed is None:
+            raise CaptureError(f"{self.capture.folder} has no flare-free frames; the exact scene must be known.")
+        self._set_rates()
+        flare = render_flare(self.flare, settings.blend, targets.camera, settings.kernels)
+        loss = l1_ssim(composite(targets.removed, flare, settings.blend), targets.frame, 1 - settings.ssim_share)
+        if loss.requires_grad:
+            loss.backward()
+        for optimiser in (self.flare_adam, self.grid_adam):
+            if optimiser is not None:
+                optimiser.step()
+                optimiser.zero_grad()
+        self._change_flare_density()
+        return {"loss": float(loss.detach())}
+
+
+@torch.no_grad()
+def score(trainer: Trainer, views: Sequence[View]) -> dict[str, Any]:
+    """Means over views: the flare as |composite - scene| in display space, and in linear light where the frame is
+    not clipped (light added alone: what covers has no layer over an unknown scene)."""
+    display, linear, relative = [], [], []
+    for view in views:
+        targets = trainer.frames.targets(view)
+        assert targets.removed is not None
+        flare = render_flare(trainer.flare, trainer.settings.blend, targets.camera, trainer.settings.kernels)
+        if flare is None:
+            continue
+        picture = composite(targets.removed, flare, trainer.settings.blend)
+        display.append(psnr((picture - targets.removed).abs().numpy(), (targets.frame - targets.removed).abs().numpy()))
+        free = (targets.frame < CLIPPED).all(-1)
+        exact = (decode(targets.frame) - decode(targets.removed))[free]
+        found = (decode(picture) - decode(targets.removed))[free]
+        linear.append(psnr(found.numpy(), exact.numpy()))
+        relative.append(float((found - exact).norm() / exact.norm()))
+    return {"flare": {"psnr": float(np.mean(display))},
+            "flare_linear": {"psnr": float(np.mean(linear)), "relative_l2": float(np.mean(relative))}}

@@ -1,0 +1,166 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Blender's side, timed: import of a large capture, what a fit costs the window's thread, the overlay's numpy part.
+
+    python benchmarks/blender.py            in a Python that has bpy; prints a table
+
+Import: 400 cameras, 100,000 points. Thread: reading a fit's events and drawing what depends on them, for 400
+cameras in the scene. Overlay: one light of 2,000 Gaussians at 1920 x 1080, all but the GPU's own drawing.
+"""
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import json
+import os
+import struct
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+ROOT = Path(__file__).resolve().parents[1]
+CAMERAS, POINTS, GAUSSIANS, LEVELS = 400, 100_000, 2_000, 16
+
+
+def load(name: str) -> Any:
+    """A module of the tree, as the package fit_flare."""
+    spec = importlib.util.spec_from_file_location("run", ROOT / "headless" / "run.py")
+    assert spec is not None
+    assert spec.loader is not None
+    run = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(run)
+    return importlib.import_module(f"{run.load()}.{name}")
+
+
+def make_capture(folder: Path) -> Path:
+    """Text model of cameras on a circle, one-pixel frames of the right header, binary points."""
+    import zlib
+
+    model, images = folder / "sparse" / "0", folder / "images"
+    model.mkdir(parents=True)
+    images.mkdir()
+    raw = zlib.compress(b"".join(b"\0" + b"\x80" * 3 * 96 for _ in range(54)))
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    png = (b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", struct.pack(">IIBBBBB", 96, 54, 8, 2, 0, 0, 0)) + chunk(b"IDAT", raw)
+           + chunk(b"IEND", b""))
+    cameras = struct.pack("<Q", 1) + struct.pack("<iiQQ4d", 1, 1, 96, 54, 90.0, 90.0, 47.0, 28.0)
+    (model / "cameras.bin").write_bytes(cameras)
+    lines = [struct.pack("<Q", CAMERAS)]
+    for number in range(CAMERAS):
+        angle = 0.01 * number
+        name = f"{number + 1:04d}.png"
+        (images / name).write_bytes(png)
+        lines.append(struct.pack("<i7di", number + 1, np.cos(angle), 0, np.sin(angle), 0, 0, 0, 4, 1) + name.encode()
+                     + b"\0" + struct.pack("<Q", 0))
+    (model / "images.bin").write_bytes(b"".join(lines))
+    xyz = np.random.default_rng(0).normal(size=(POINTS, 3))
+    points = [struct.pack("<Q", POINTS)]
+    points += [struct.pack("<Q3d3BdQ", number, *place, 200, 100, 50, 0.5, 0) for number, place in enumerate(xyz)]
+    (model / "points3D.bin").write_bytes(b"".join(points))
+    (folder / "lights.json").write_text(json.dumps({"lights": [{"name": "lamp", "xyz": [0.3, -0.2, 1.0]}]}))
+    return folder
+
+
+def make_flare(path: Path) -> Path:
+    """A .flare of one light, written with numpy alone: weights at random, no touched table rows."""
+    random = np.random.default_rng(1)
+    widths = {"positions": 1, "log_scales": 2, "rotations": 2, "opacity_logits": 1, "sh": 3, "rings": 2}
+    n = GAUSSIANS
+    arrays = {f"0.gaussians.{name}": random.normal(size=(n, width)) for name, width in widths.items()}
+    arrays["0.gaussians.log_scales"] = np.log(random.uniform(0.01, 0.06, (n, 2)))
+    arrays["0.gaussians.opacity_logits"] -= 3
+    arrays["0.gaussians.rings"] = np.zeros((n, 2))
+    arrays["0.gaussians.offsets"], arrays["0.gaussians.latent"] = np.zeros((n, 2)), random.normal(size=(n, 4))
+    view, heads = 4 * LEVELS, sum(widths.values()) + 2
+    shapes = {"view_layer": (128, view), "layers.0": (128, 128), "layers.1": (128, 128), "head": (heads, 128),
+              "correction.0": (128, view), "correction.2": (2, 128)}
+    for name, shape in shapes.items():
+        arrays[f"0.network.{name}.weight"] = random.normal(size=shape) * 0.02
+        arrays[f"0.network.{name}.bias"] = np.zeros(shape[0])
+    arrays["0.network.gaussian_layer.weight"] = random.normal(size=(128, 10)) * 0.02
+    header: dict[str, Any] = {}
+    body = b""
+    for name, array in arrays.items():
+        data = np.ascontiguousarray(array, "<f4").tobytes()
+        header[name] = {"dtype": "F32", "shape": list(array.shape), "data_offsets": [len(body), len(body) + len(data)]}
+        body += data
+    for grid in ("light_grid", "camera_grid"):
+        for part, kind, shape in (("rows", "I32", [0]), ("values", "F32", [0, 2])):
+            header[f"0.network.{grid}.table.weight.{part}"] = {"dtype": kind, "shape": shape,
+                                                               "data_offsets": [len(body), len(body)]}
+    form = {"line": True, "light_correction": True, "plane_offset": True, "solid": False, "sh_degree": 0,
+            "static_offset": True, "rings": True, "latent": 4, "levels": LEVELS}
+    reach = {"camera_low": [-5, -5, -5], "camera_high": [5, 5, 5], "light_high": [0.6, 0.4, 0.7]}
+    camera = {"width": 96, "height": 54, "fx": 90.0, "fy": 90.0, "cx": 47.0, "cy": 28.0}
+    description = {"version": 1, "blend": "add", "camera": camera,
+                   "lights": [{"name": "lamp", "xyz": [0.3, -0.2, 1.0], "form": form, "range": reach, "count": n}]}
+    header["__metadata__"] = {"fit_flare": json.dumps(description)}
+    text = json.dumps(header).encode()
+    path.write_bytes(len(text).to_bytes(8, "little") + text + body)
+    return path
+
+
+def best(call: Any, times: int = 10) -> tuple[float, float]:
+    """(fastest, slowest) of some calls, in milliseconds."""
+    taken = []
+    for _ in range(times):
+        began = time.perf_counter()
+        call()
+        taken.append(1e3 * (time.perf_counter() - began))
+    return min(taken), max(taken)
+
+
+def main() -> None:
+    import bpy
+
+    bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+    load("flare_addon").register()
+    importing, looks, overlay, cameras, jobs = (load(f"flare_addon.{name}") for name in (
+        "capture_import", "looks", "overlay", "cameras", "jobs"))
+    rows = [f"Blender {bpy.app.version_string}, {os.cpu_count()} cores"]
+    with tempfile.TemporaryDirectory() as base:
+        folder = Path(base)
+        capture, flare = make_capture(folder / "capture"), make_flare(folder / "lamp.flare")
+        for kind in ("each", "animated"):
+            bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+            scene = bpy.context.scene
+            began = time.perf_counter()
+            importing.import_capture(scene, capture, importing.ImportSettings(cameras=kind))
+            rows.append(f"import of {CAMERAS} cameras ({kind}), {POINTS} points: {time.perf_counter() - began:.2f} s")
+        looks.use(scene, flare)
+        bpy.context.view_layer.update()
+
+        run = folder / "run"
+        run.mkdir()
+        event = {"type": "progress", "stage": "fit", "done": 1, "total": 3000, "left_s": 9.0, "figures": {"loss": 0.1}}
+        (run / jobs.EVENTS).write_text("".join(json.dumps({**event, "done": number}) + "\n" for number in range(3000)))
+        job = jobs.Job("fit", run, os.getpid(), None)
+        job._alive = lambda: True  # the process that is watched is this one
+        fast, slow = best(job.poll, 20)
+        rows.append(f"reading a fit's events, at most {jobs.AT_ONCE >> 10} kB a time: {fast:.2f} to {slow:.2f} ms")
+
+        depsgraph = bpy.context.evaluated_depsgraph_get()
+        core = cameras.core_camera(scene.camera.data, scene.camera.matrix_world, scene.render)
+        window = overlay.window_of(overlay.Frame(0, 0, 1920, 1080), (1920, 1080), core)
+
+        def frame() -> None:
+            found = overlay.joined(list(looks.seen(scene, depsgraph, scene.camera).values()))
+            overlay.levels(found, window, "add")
+
+        frame()
+        fast, slow = best(frame, 20)
+        count = sum(len(one) for one in looks.seen(scene, depsgraph, scene.camera).values())
+        rows.append(f"overlay of {count} Gaussians, all but the GPU: {fast:.1f} to {slow:.1f} ms")
+    print("\n".join(rows))
+    sys.stdout.flush()
+    os._exit(0)
+
+
+if __name__ == "__main__":
+    main()

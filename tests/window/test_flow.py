@@ -1,0 +1,25 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The driven flow in a real Blender's window, where one is named: FIT_FLARE_BLENDER_WINDOW=/path/to/blender."""
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+BLENDER = os.environ.get("FIT_FLARE_BLENDER_WINDOW", "")
+
+
+@pytest.mark.skipif(not BLENDER, reason="no real Blender with a window is named (FIT_FLARE_BLENDER_WINDOW); "
+                                        "the flow of tests/window was not run")
+def test_the_whole_work_in_the_real_window(tmp_path: Path) -> None:
+    runner = Path(__file__).with_name("run.py")
+    done = subprocess.run([sys.executable, str(runner), "--blender", BLENDER, "--out", str(tmp_path)],
+                          capture_output=True, text=True, timeout=1500, check=False)
+    assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
+    facts = json.loads((tmp_path / "facts.json").read_text())
+    assert facts["done"][-1] == "all"
+    assert facts["longest_poll_ms"] < 100

@@ -61,41 +61,50 @@ def run_jobs(words: argparse.Namespace, step: str, numbers: Sequence[int], progr
              extra: Sequence[str] = ()) -> None:
     """Run a step of the command once for each share of the frames, at once; returns when all are done.
 
-    extra: words that the processes are given besides.
+    extra: words that the processes are given besides. Raises what `run_parts` raises.
+    """
+    parts = [[*extra, "--jobs", "1", "--frames", frames] for frames in shares(numbers, words.jobs)]
+    run_parts(words, step, parts, words.jobs, len(numbers), progress)
 
+
+def run_parts(words: argparse.Namespace, step: str, parts: Sequence[Sequence[str]], jobs: int, total: int,
+              progress: Progress) -> None:
+    """Run a step of the command once for each part, its words with these after them, `jobs` of them at a time.
+
+    total: steps of all together, as the processes count them; where it is the number of parts, parts are counted.
     Raises Cancelled when asked to stop, after the processes have stopped; FitFlareError with the sentence of the
     first that failed, after the others have been stopped.
     """
     events: queue.Queue[tuple[int, dict[str, Any] | None]] = queue.Queue()
-    parts = shares(numbers, words.jobs)
-    threads = str(max((os.cpu_count() or 1) // max(len(parts), 1), 1))
+    threads = str(max((os.cpu_count() or 1) // max(min(jobs, len(parts)), 1), 1))
     environment = {**os.environ, "OMP_NUM_THREADS": threads, "NUMBA_NUM_THREADS": threads}
+    by_part = total == len(parts)
     children: list[subprocess.Popen[str]] = []
     noises: list[IO[bytes]] = []
-    progress.stage(step, len(numbers))
-    counted = [0] * len(parts)
-    errors: dict[int, str] = {}
+    counted, errors, ended = [0] * len(parts), dict[int, str](), 0
+    progress.stage(step, total)
     try:
-        for number, frames in enumerate(parts):
-            noises.append(tempfile.TemporaryFile())  # noqa: SIM115 - closed below, when its process has ended
-            whole = [sys.executable, str(hand_off.RUN), *words.words, *extra, "--step", step, "--jobs", "1",
-                     "--frames", frames, "--progress", "json"]
-            children.append(subprocess.Popen(whole, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
-                                             stderr=noises[-1], encoding="utf-8", errors="replace",
-                                             env=environment, **hand_off.own_group()))
-            threading.Thread(target=_listen, args=(number, children[-1], events), daemon=True).start()
-        left = len(children)
-        while left and not errors:
+        while ended < len(parts) and not errors:
+            while len(children) < len(parts) and len(children) - ended < jobs:
+                noises.append(tempfile.TemporaryFile())  # noqa: SIM115 - closed below, when its process has ended
+                whole = [sys.executable, str(hand_off.RUN), *words.words, "--step", step, *parts[len(children)],
+                         "--progress", "json"]
+                children.append(subprocess.Popen(whole, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
+                                                 stderr=noises[-1], encoding="utf-8", errors="replace",
+                                                 env=environment, **hand_off.own_group()))
+                threading.Thread(target=_listen, args=(len(children) - 1, children[-1], events), daemon=True).start()
             progress.check()
             try:
                 number, event = events.get(timeout=POLL_S)
             except queue.Empty:
                 continue
             if event is None:
-                left -= 1
+                ended += 1
                 if children[number].wait() != 0:
                     errors.setdefault(number, "")
-            elif event.get("type") in ("stage", "progress"):
+                elif by_part:
+                    progress.advance()
+            elif event.get("type") in ("stage", "progress") and not by_part:
                 made, counted[number] = event["done"] - counted[number], event["done"]
                 if made:
                     progress.advance(made)
@@ -103,14 +112,14 @@ def run_jobs(words: argparse.Namespace, step: str, numbers: Sequence[int], progr
                 errors[number] = event["text"]
     finally:
         _end(children)
-        said = _last_words(noises[next(iter(errors))]) if errors and len(noises) > next(iter(errors)) else ""
+        said = _last_words(noises[next(iter(errors))]) if errors else ""
         for noise in noises:
             noise.close()
     if errors:
         text = next((text for text in errors.values() if text), "")
         if not text:
             sys.stderr.write(said)
-            raise EngineError(f"One of {len(children)} processes of {step} failed; its last words stand above.")
+            raise EngineError(f"One of {len(parts)} processes of {step} failed; its last words stand above.")
         raise FitFlareError(text)
 
 

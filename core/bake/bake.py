@@ -110,19 +110,20 @@ def bake(renderer: Renderer, frames: Sequence[Frame], cameras: Mapping[str, Came
     done = [frame for frame in frames if _is_made(out / frame.file, notes(frame))]
     record = _add_to_record(out, made_from, names, [_entry(out, frame) for frame in done])
     progress.stage("bake", len(frames), len(done))
+    def made(frame: Frame) -> FrameLayers:
+        camera = settings.scaled(cameras[frame.view])
+        if of_frame is None:
+            return _layers(renderer, camera, edits[frame.number], renderer.lights).in_space(space)
+        one = of_frame(frame)
+        return one.finished(_layers(one, camera, edits[frame.number], renderer.lights).in_space(space), camera)
+
     for frame in frames:
         if frame in done:
             continue
         path = out / frame.file
         remove_partial_of(path)
-        camera = settings.scaled(cameras[frame.view])
-        if of_frame is None:
-            layers = _layers(renderer, camera, edits[frame.number], renderer.lights).in_space(space)
-        else:
-            one = of_frame(frame)
-            layers = _layers(one, camera, edits[frame.number], renderer.lights).in_space(space)
-            layers = one.finished(layers, camera)
-        write_layers(path, layers, half=settings.half, chromaticities=space.chromaticities, notes=notes(frame))
+        # Not kept in a name: at 4K the layers of one frame are half a gigabyte.
+        write_layers(path, made(frame), half=settings.half, chromaticities=space.chromaticities, notes=notes(frame))
         record = _add_to_record(out, made_from, names, [_entry(out, frame)])
         progress.advance()
     return record

@@ -8,6 +8,7 @@ from typing import Any
 
 from ...core.errors import SettingsError
 from ...core.progress import Progress
+from .. import jobs
 from ..command import Command, Step
 from .lights import with_lights
 
@@ -25,9 +26,10 @@ def arguments(parser: argparse.ArgumentParser) -> None:
                              "lights.json; lights are found and written there if it is missing")
     parser.add_argument("--out", type=Path, required=True, metavar="RUN", help="folder for the run")
     parser.add_argument("--list", type=Path, metavar="FILE", dest="listed",
-                        help="a text file with a capture's folder on each line, instead of CAPTURE; with --entry, for "
-                             "farms: --out is then the folder of the runs, each under its capture's name")
-    parser.add_argument("--entry", type=int, metavar="N", help="which line of --list, from 1")
+                        help="a text file with a capture's folder on each line, instead of CAPTURE: --out is then the "
+                             "folder of the runs, each under its capture's name")
+    parser.add_argument("--entry", type=int, metavar="N", help="which line of --list, from 1 (default: all of them)")
+    jobs.add_option(parser)
     parser.add_argument("--resume", action="store_true",
                         help="go on with the run in --out, with the settings it was begun with; begin it if there is "
                              "none")
@@ -59,6 +61,12 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     from ...core.fit import fit
     from ...core.fit.settings import changed, preset
 
+    if words.listed is not None and words.entry is None:
+        count = len(listed(words.listed))
+        parts = [["--entry", str(entry), "--jobs", "1"] for entry in range(1, count + 1)]
+        jobs.run_parts(words, "fit", parts, max(words.jobs, 1), count, progress)
+        progress.say(f"{count} runs are in {words.out}.")
+        return {"runs": str(words.out), "count": count}
     folder, out = place(words)
     given = {"model": words.model} if words.model else {}
     settings = preset(words.preset, mode=words.mode, blend=words.blend, iterations=words.iterations, **given)
@@ -85,17 +93,25 @@ def place(words: argparse.Namespace) -> tuple[Path, Path]:
         if words.capture is None:
             raise SettingsError("fit needs a capture: name its folder, or a list of them with --list and --entry.")
         return words.capture, words.out
-    try:
-        lines = words.listed.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as problem:
-        raise SettingsError(f"{words.listed} cannot be read ({problem}); it should list a folder a line.") from problem
-    folders = [words.listed.parent / line.strip() for line in lines if line.strip() and not line.startswith("#")]
-    if words.entry is None or not 1 <= words.entry <= len(folders):
+    folders = listed(words.listed)
+    if not 1 <= words.entry <= len(folders):
         raise SettingsError(f"{words.listed} lists {len(folders)} captures; --entry {words.entry} is none of them.")
     names = [folder.name for folder in folders]
     chosen = folders[words.entry - 1]
     name = chosen.name if names.count(chosen.name) == 1 else f"{words.entry:03d}_{chosen.name}"
     return chosen, words.out / name
+
+
+def listed(path: Path) -> list[Path]:
+    """The folders in a list of captures: one a line, relative to the list; lines that begin with # are comments."""
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as problem:
+        raise SettingsError(f"{path} cannot be read ({problem}); it should list a folder a line.") from problem
+    found = [path.parent / line.strip() for line in lines if line.strip() and not line.startswith("#")]
+    if not found:
+        raise SettingsError(f"{path} lists no captures; write a folder on each line.")
+    return found
 
 
 def holdout(text: str | None) -> str | int | None:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from ...core.errors import SettingsError
 from ...core.progress import Progress
+from .. import jobs
 from ..command import Command, Step
 
 if TYPE_CHECKING:
@@ -32,6 +33,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
                         help="network: the one that comes with the program; diffusion: a base model and a LoRA of "
                              "train-removal's, if diffusers, transformers and peft are at hand")
     parser.add_argument("--base", metavar="FOLDER_OR_NAME", help="the base model, for diffusion")
+    jobs.add_option(parser)
     parser.add_argument("--overwrite", action="store_true", help="make again what is there")
 
 
@@ -39,13 +41,17 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     from ...core.bake.frames import chosen, numbered
     from ...core.removal.batch import plates_of, remove_all
 
-    remover = _remover(words)
     wanted = None
-    if words.frames is not None:
+    if words.frames is not None or words.jobs != 1:
         names = [name.as_posix() for _, name in plates_of(words.plates)]
-        wanted = {Path(frame.view) for frame in chosen(numbered(names), words.frames)}
-    return remove_all(words.plates, words.out, remover, progress, flare_folder=words.flare, overwrite=words.overwrite,
-                      wanted=wanted)
+        frames = chosen(numbered(names), words.frames)
+        wanted = {Path(frame.view) for frame in frames}
+        if words.jobs != 1:
+            jobs.run_jobs(words, "remove", [frame.number for frame in frames], progress)
+            progress.say(f"The clean plates are in {words.out}.")
+            return {"plates": str(words.out)}
+    return remove_all(words.plates, words.out, _remover(words), progress, flare_folder=words.flare,
+                      overwrite=words.overwrite, wanted=wanted)
 
 
 def _remover(words: argparse.Namespace) -> Remover:

@@ -137,7 +137,11 @@ def test_fits_over_a_list_of_captures(capture: Path, tmp_path: Path) -> None:
     job("fit.yaml", "Fit", "--tasks", '[{"Entry": "1"}]', Captures=listed, Entries="1-2", Out=tmp_path / "runs",
         Preset="draft", Set="iterations=3")
     assert (tmp_path / "runs" / capture.name / "flare.flare").is_file()
-    ended = subprocess.run([sys.executable, RUN, "fit", "--list", listed, "--entry", "3", "--out", tmp_path / "runs"],
-                           capture_output=True, text=True, timeout=120, check=False)
-    assert ended.returncode == 1
-    assert "lists 2 captures; --entry 3 is none of them" in ended.stderr
+    words = [sys.executable, RUN, "fit", "--list", listed, "--out", tmp_path / "runs", "--resume"]
+    beyond = subprocess.run([*words, "--entry", "3"], capture_output=True, text=True, timeout=120, check=False)
+    assert beyond.returncode == 1
+    assert "lists 2 captures; --entry 3 is none of them" in beyond.stderr
+    # All of the list at once: the first is there already, the second cannot be.
+    whole = subprocess.run([*words, "--jobs", "2"], capture_output=True, text=True, timeout=120, check=False)
+    assert whole.returncode == 1
+    assert "absent is not a folder" in whole.stderr

@@ -78,10 +78,10 @@ class FrameLayers:
         `flare_lamp.R`, with the light's name made safe by `layer_names`.
         """
         channels: dict[str, Pixels] = {}
-        opaque = np.ones_like(self.scene[..., 0])
-        _add(channels, "", self.composite, opaque)
+        opaque, flare = np.ones_like(self.scene[..., 0]), self.flare
+        _add(channels, "", self.scene + flare, opaque)
         _add(channels, "scene.", self.scene)
-        _add(channels, "flare.", self.flare, matte(self.flare))
+        _add(channels, "flare.", flare, matte(flare))
         for light, layer in layer_names(self.flares).items():
             _add(channels, f"{layer}.", self.flares[light], matte(self.flares[light]))
         channels["depth.Z"] = np.where(self.depth > 0, self.depth, FARTHEST).astype(np.float32)

@@ -21,7 +21,7 @@ from core.flare import file as flare_file
 from core.flare.file import FlareFile, TrainingCamera
 from core.gaussians import SceneGaussians
 from core.gaussians.ply import write_ply
-from core.look import Look, ViewOfLight, read
+from core.look import KeyedEdits, Look, ViewOfLight, read
 from core.look.shot import PlacedLight, Shot, ShotFrame
 from core.pictures import read_exr, srgb_from_linear, write_exr, write_png
 from core.transfer import query as queries
@@ -320,3 +320,14 @@ def test_edits_go_by_the_target_s_lights(flare: Path, look: Look, tmp_path: Path
     assert (big > 0).sum() > 1.2 * (one > 0).sum()
     with pytest.raises(SettingsError, match="moon"):
         Transfer(flare, target).bake(tmp_path / "bad", settings=BakeSettings(edits=("moon.intensity=2",)))
+
+
+def test_edits_by_frame_may_be_toml(tmp_path: Path) -> None:
+    (tmp_path / "edits.toml").write_text('set = ["lamp.tint=1,0.5,1"]\n[frames]\n1 = ["lamp.intensity=0"]\n'
+                                         '3 = ["lamp.intensity=1"]\n')
+    keyed = KeyedEdits.read(tmp_path / "edits.toml")
+    assert keyed.at(2, ["lamp"]).light("lamp").intensity == pytest.approx(0.5)
+    assert keyed.at(2, ["lamp"]).light("lamp").tint == (1, 0.5, 1)
+    (tmp_path / "bad.toml").write_text("set = [")
+    with pytest.raises(SettingsError, match=r"bad\.toml is not valid TOML"):
+        KeyedEdits.read(tmp_path / "bad.toml")

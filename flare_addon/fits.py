@@ -123,6 +123,16 @@ def finished(job: Job) -> None:
                 looks.use(scene, folder / FLARE)
             except FitFlareError as problem:
                 job.error = str(problem)
+    _remember("Fit")
+
+
+def _remember(what: str) -> None:
+    """An undo step for what a timer changed, so that undoing what came later does not take it away too."""
+    manager = bpy.context.window_manager
+    if bpy.app.background or not manager.windows:
+        return
+    with bpy.context.temp_override(window=manager.windows[0]):
+        bpy.ops.ed.undo_push(message=f"Fit Flare: {what}")
 
 
 def find_lights(scene: Any) -> Job:
@@ -146,6 +156,7 @@ def lights_found(job: Job) -> None:
                 lights.reload(scene, capture)
             except FitFlareError as problem:
                 job.error = str(problem)
+    _remember("Lights")
 
 
 jobs.FINISHERS.update({"fit": finished, "lights": lights_found})

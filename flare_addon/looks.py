@@ -138,6 +138,12 @@ def edits_of(state: Any) -> LookEdits:
     return LookEdits(edit_of(state.master), lights, elements)
 
 
+def twice(state: Any) -> str:
+    """A name that two flares of the scene have, "" where all differ: edits and layers go by it."""
+    names = [item.name for item in state.lights]
+    return next((name for name in names if names.count(name) > 1), "")
+
+
 def query_of(state: Any) -> Query:
     """What appearance follows: the view itself in the capture's own scene, else the middle of what was trained."""
     return "target" if state.root is not None and state.native else "source"

@@ -184,6 +184,8 @@ class FITFLARE_PT_look(_Part, bpy.types.Panel):
             lines(layout, "The scene has no camera to see the flare from.", "ERROR")
         elif not _through_camera(context):
             layout.operator("view3d.view_camera", text="Look through the Camera", icon="VIEW_CAMERA")
+        if looks.twice(state):
+            lines(layout, f"Two flares have the name {looks.twice(state)}: rename one.", "ERROR")
         _sliders(layout, state.master)
         layout.prop(state, "occlusion")
         row = layout.row()

@@ -96,6 +96,8 @@ def bake(scene: Any, chosen: Sequence[Any]) -> Job:
     state = scene.fit_flare
     if not any(item.target is not None for item in state.lights):
         raise RunError("No flare has a light to come from; choose an object for each in the panel Look.")
+    if looks.twice(state):
+        raise RunError(f"Two flares have the name {looks.twice(state)!r}; rename one in the panel Look.")
     run = None
     if state.bake_scene:
         run = fits.folder_of(scene)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import FrameError, SettingsError
+from ..files import remove_partial_of
 from ..pictures import SUFFIXES, write_exr
 from ..progress import Progress
 from .inference import Remover
@@ -79,6 +80,8 @@ def remove_all(inputs: Sequence[Path], folder: Path, remover: Remover, progress:
 
 
 def _remove(path: Path, target: Path, flare_target: Path | None, remover: Remover) -> None:
+    for written in (target, *([flare_target] if flare_target is not None else [])):
+        remove_partial_of(written)  # of a task that was killed
     plate = read_plate(path)
     codes, flare = remover.remove(plate)
     write_plate(target, plate, codes)

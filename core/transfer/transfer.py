@@ -22,6 +22,7 @@ from ..bake.frames import Frame
 from ..bake.layers import FrameLayers
 from ..capture import Camera
 from ..colour import ColourSpace, colour_space
+from ..files import remove_partial_of
 from ..fit.rendering import as_tensors, pose_and_intrinsics
 from ..flare.compositing import decode, encode, splat_flare
 from ..flare.compositing import layers as linear_layers
@@ -249,6 +250,7 @@ class _OfFrame:
         if self._plate is None or self._plate.size != camera.size:
             return layers
         if self._out is not None and self._one.plate is not None:
+            remove_partial_of(self._out / self._one.plate.name)  # of a task that was killed
             self._plate.write(self._out / self._one.plate.name, self._space.to_linear(layers.flare))
         own = self._plate.space.matrix
         if own is not None and self._space.matrix is not None and np.allclose(own, self._space.matrix, atol=1e-9):

@@ -22,6 +22,9 @@ from core.bake.bake import read_record
 from core.capture import Capture
 from core.fit import fit, preset
 from core.fit.settings import changed
+from core.look import read
+from core.look.shot import PlacedLight, Shot, ShotFrame
+from core.removal.weights import IN_THE_BOX
 
 ROOT = Path(__file__).resolve().parents[2]
 RUN = ROOT / "headless" / "run.py"
@@ -145,3 +148,28 @@ def test_fits_over_a_list_of_captures(capture: Path, tmp_path: Path) -> None:
     whole = subprocess.run([*words, "--jobs", "2"], capture_output=True, text=True, timeout=120, check=False)
     assert whole.returncode == 1
     assert "absent is not a folder" in whole.stderr
+
+
+def test_a_transfer_in_chunks(capture: Path, made: Path, tmp_path: Path) -> None:
+    """On to a shot: two tasks and the record."""
+    flare = made / "flare.flare"
+    name = read(flare).names[0]
+    views = Capture.open(capture).views[:4]
+    shot = Shot(flare, tuple(ShotFrame(number, "Camera", view.camera, (
+        PlacedLight("sun", name, read(flare).lights[0].xyz + 3.0 * number),)) for number, view in enumerate(views, 1)))
+    shot.write(tmp_path / "shot.json")
+    job("transfer.yaml", "Record", "--run-dependencies", Flare=flare, To=tmp_path / "shot.json", Out=tmp_path / "out",
+        Frames="1-4", FramesPerTask=2, Query="blend")
+    record = read_record(tmp_path / "out")
+    assert [entry["frame"] for entry in record["frames"]] == [1, 2, 3, 4]
+    assert not list((tmp_path / "out").rglob(".*"))
+
+
+def test_plates_are_cleaned_in_chunks(capture: Path, tmp_path: Path) -> None:
+    if not IN_THE_BOX.is_file():
+        pytest.skip("the weights of removal are not there")
+    log = job("remove.yaml", "Remove", "--tasks", '[{"Frame": "2-3"}, {"Frame": "4-4"}]', Plates=capture / "images",
+              Out=tmp_path / "clean", Flares=tmp_path / "flares", Frames="2-4")
+    assert re.findall(r"openjd_progress: (\d+)", log).count("100") == 2
+    assert sorted(path.name for path in (tmp_path / "clean").iterdir()) == ["0002.png", "0003.png", "0004.png"]
+    assert len(list((tmp_path / "flares").iterdir())) == 3

@@ -18,6 +18,9 @@ try:
 except ImportError:
     real = None
 
+FAILED = ""
+"""Where a picture of the window is kept when a step fails."""
+
 _queue: list[tuple] = []
 
 
@@ -94,7 +97,7 @@ def only(*panels) -> None:
 def row(below_header: float) -> tuple[float, float]:
     """The middle of a row of the first panel: its distance below the panel's header, in pixels at scale 1."""
     place, scale = region("UI"), bpy.context.preferences.system.ui_scale
-    return place.x + place.width * 0.6, place.y + place.height - (36 + below_header) * scale
+    return place.x + place.width * 0.6, place.y + place.height - (15.4 + below_header) * scale
 
 
 def quit_(status: int = 0) -> None:
@@ -126,6 +129,8 @@ def run(steps) -> None:
             quit_(0)
         except BaseException:
             traceback.print_exc()
+            if FAILED:
+                screenshot(FAILED)
             quit_(1)
         return None
 

@@ -131,8 +131,8 @@ def steps():
     ui.only(panels.FITFLARE_PT_fit, panels.FITFLARE_PT_look)
     yield 0.5
     job = None
-    for nudge in (0, 7, -7):
-        ui.click(*ui.row(106 + nudge))
+    for nudge in (0, 7, -7, 20, 27):
+        ui.click(*ui.row(102 + nudge))
         yield 2
         job = fits.job_of(scene)
         if job is not None:
@@ -174,8 +174,8 @@ def steps():
     np.save(out / "overlay.npy", dim)
     ui.only(panels.FITFLARE_PT_look)
     yield 0.5
-    for nudge in (0, 7, -7):
-        x, y = ui.row(31 + nudge)
+    for nudge in (0, 7, -7, 20, 27):
+        x, y = ui.row(30 + nudge)
         ui.drag(x, y, x + 50, y)
         yield 0.5
         if state.master.intensity != 1.0:
@@ -321,4 +321,5 @@ def wait_for_gpu() -> None:
     gpu.state.active_framebuffer_get().read_color(0, 0, 1, 1, 4, 0, "FLOAT")
 
 
+ui.FAILED = str(out / "failed.png")
 ui.run(steps)

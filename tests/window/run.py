@@ -40,7 +40,22 @@ def main() -> int:
                        "FIT_FLARE_ENGINE": words.engine, "FIT_FLARE_OUT": str(out)}
         command = [words.blender, "--enable-event-simulate", "--window-geometry", "0", "0", "1600", "1000", "-noaudio",
                    "--python-exit-code", "1", "--python", str(ROOT / "tests" / "window" / "flow.py")]
-        return subprocess.run(command, env=environment, check=False).returncode
+        status = subprocess.run(command, env=environment, check=False).returncode
+    if not status:
+        print(f"overlay against the baked layer: {agreement(out):.1f} dB")
+    return status
+
+
+def agreement(out: Path) -> float:
+    """PSNR of what the GPU drew over the viewport against the flare layer that the engine baked, linear light."""
+    import numpy as np
+
+    sys.path.insert(0, str(ROOT))
+    from core.bake.exr import read_layers
+
+    drawn = np.load(out / "overlay.npy")
+    baked = read_layers(min((out / "layers").glob("layers.*.exr"))).flare
+    return float(10 * np.log10(1 / np.mean((drawn - baked) ** 2)))
 
 
 if __name__ == "__main__":

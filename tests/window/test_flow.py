@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from run import agreement
 
 BLENDER = os.environ.get("FIT_FLARE_BLENDER_WINDOW", "")
 
@@ -23,3 +24,4 @@ def test_the_whole_work_in_the_real_window(tmp_path: Path) -> None:
     facts = json.loads((tmp_path / "facts.json").read_text())
     assert facts["done"][-1] == "all"
     assert facts["longest_poll_ms"] < 100
+    assert agreement(tmp_path) > 50

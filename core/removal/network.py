@@ -54,7 +54,8 @@ def inputs(display: Tensor) -> Tensor:
 
 
 class Norm(nn.Module):
-    """Layer normalisation over the channels of each pixel."""
+    """Layer normalisation over the channels of each pixel; every layer but the first sees normalised values, for
+    without it what is carried from level to level grows out of bounds."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -101,9 +102,9 @@ class RemovalNetwork(nn.Module):
         self.stem = nn.Conv2d(INPUTS * FOLD**2, widths[0], 3, padding=1)
         self.down = nn.ModuleList(nn.Sequential(*(Block(width) for _ in range(depth)))
                                   for width, depth in zip(widths, depths, strict=True))
-        self.reduce = nn.ModuleList(nn.Conv2d(a, b, 2, stride=2) for a, b in pairwise(widths))
+        self.reduce = nn.ModuleList(nn.Sequential(Norm(a), nn.Conv2d(a, b, 2, stride=2)) for a, b in pairwise(widths))
         self.everywhere = Everywhere(widths[-1])
-        self.grow = nn.ModuleList(nn.Sequential(nn.Conv2d(b, 4 * a, 1), nn.PixelShuffle(2))
+        self.grow = nn.ModuleList(nn.Sequential(Norm(b), nn.Conv2d(b, 4 * a, 1), nn.PixelShuffle(2))
                                   for a, b in pairwise(widths))
         self.up = nn.ModuleList(nn.Sequential(*(Block(width) for _ in range(depth)))
                                 for width, depth in zip(widths[:-1], depths[:-1], strict=True))

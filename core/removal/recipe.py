@@ -20,10 +20,11 @@ class Recipe:
 
     seed: int = 1
     iterations: int = 8000
-    pixels: int = 400_000          # of a batch; frames of one size a batch
-    learning_rate: float = 1e-3
+    pixels: int = 200_000          # of a batch; frames of one size a batch
+    learning_rate: float = 5e-4
     warmup: int = 200
     cooldown: float = 0.3
+    floor: float = 1e-3            # squared error below which a picture counts as right
     weight_decay: float = 1e-4
     average: float = 0.996         # of the weights that are kept, over iterations
     widths: tuple[int, ...] = (64, 96, 128, 192)
@@ -31,7 +32,7 @@ class Recipe:
     small_until: int = 1800        # iterations with small frames, which are cheaper
     canvas: int = 448              # pixels a side of the flares' canvas
     bank: int = 250                # flares at hand at a time
-    renew_every: int = 4           # iterations for each new flare
+    renew_every: int = 6           # iterations for each new flare
     own_share: float = 0.3         # of the user's own flares, where there are any
     clean: float = 0.08            # of the frames have no flare
     half: bool = True              # bfloat16 in the convolutions

@@ -91,17 +91,20 @@ class Trainer:
         return figures
 
     def _loss(self, pairs: Sequence[Pair]) -> tuple[Tensor, dict[str, float]]:
-        """L1 of the two clean pictures, and the logarithm of the squared error of each, which asks as much of faint
-        flares as of strong ones; display values."""
+        """L1 and L2 of the two clean pictures, and the logarithm of the squared error of each, which asks as much of
+        faint flares as of strong ones, down to `floor`; display values.
+
+        A low floor lets the pictures without flare outweigh the others, and the network then learns to do nothing.
+        """
         frame, scene, gentle = (self._stack([getattr(one, name) for one in pairs])
                                 for name in ("frame", "scene", "gentle"))
         seen = inputs(frame).to(memory_format=torch.channels_last)
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.recipe.half):
             told = self.network(seen)
-        wrong = frame - told.flare - scene
+        wrong, mild = frame - told.flare - scene, frame - told.gentle - gentle
         squared, distance = wrong.square().mean((1, 2, 3)), wrong.abs().mean()
-        loss = (distance + 0.5 * (frame - told.gentle - gentle).abs().mean()
-                + 0.03 * torch.log(squared + 1e-5).mean())
+        loss = (distance + 4 * squared.mean() + 0.5 * (mild.abs().mean() + 4 * mild.square().mean())
+                + 0.02 * torch.log(squared + self.recipe.floor).mean())
         return loss, {"l1": float(distance.detach()),
                       "psnr": float(-10 * torch.log10(squared.detach() + 1e-6).mean())}
 
@@ -182,7 +185,7 @@ def train(recipe: Recipe, folder: Path | str, backgrounds: Backgrounds, lenses: 
           progress: Progress | None = None) -> Path:
     """Train in `folder` and give the path of the weights (safetensors, fp16).
 
-    With `resume` a training in the folder goes on, its recipe's length replaced by the given one. `start`:
+    With `resume` a training in the folder goes on, by the given recipe from there on. `start`:
     weights to begin with. `tests`: backgrounds and lenses kept out, for the checks in the log.
     Raises RunError, SettingsError, and Cancelled when asked to stop (after a checkpoint).
     """
@@ -195,8 +198,8 @@ def train(recipe: Recipe, folder: Path | str, backgrounds: Backgrounds, lenses: 
     iteration = 0
     if path.exists():
         state, kept = weights.read(path)
-        recipe = replace(from_dict(json.loads(kept["recipe"])), iterations=recipe.iterations, cooldown=recipe.cooldown,
-                         learning_rate=recipe.learning_rate)
+        given = from_dict(json.loads(kept["recipe"]))
+        recipe = replace(recipe, widths=given.widths, depths=given.depths, seed=given.seed)
         iteration = int(kept["iteration"])
     elif start is not None:
         state, kept = weights.read(start)

@@ -145,6 +145,26 @@ def find_lights(scene: Any) -> Job:
     return engine.run("lights", capture / "lights", ["lights", capture, "--keep"])
 
 
+def clean(scene: Any) -> Job:
+    """Have the engine take the flares out of the frames, into the capture's removed/. Raises EngineError,
+    CaptureError."""
+    capture = capture_of(scene)
+    if capture is None or not (capture / "images").is_dir():
+        raise CaptureError("There is no capture with a folder images/ yet; import one first.")
+    return engine.run("clean", capture / "removal", ["remove", capture / "images", "--out", capture / "removed"])
+
+
+def cleaned(job: Job) -> None:
+    """Fits of the scenes with this capture go by the clean frames from now on."""
+    if job.state != "done":
+        return
+    for scene in bpy.data.scenes:
+        capture = capture_of(scene)
+        if capture is not None and capture / "removal" == job.folder:
+            scene.fit_flare.mode = "default"
+    _remember("Clean Frames")
+
+
 def lights_found(job: Job) -> None:
     """Bring found lights into every scene with this capture."""
     if job.state != "done":
@@ -159,7 +179,7 @@ def lights_found(job: Job) -> None:
     _remember("Lights")
 
 
-jobs.FINISHERS.update({"fit": finished, "lights": lights_found})
+jobs.FINISHERS.update({"fit": finished, "lights": lights_found, "clean": cleaned})
 
 
 # ---- the preview ----------------------------------------------------------------------------------

@@ -89,6 +89,9 @@ class FITFLARE_PT_fit(_Part, bpy.types.Panel):
         settings.prop(state, "preset")
         settings.prop(state, "mode")
         settings.prop(state, "width")
+        capture = fits.capture_of(scene)
+        if capture is not None and (state.mode == "unsup" or jobs.find(capture / "removal") is not None):
+            _cleaning(layout, capture)
         if stage == "lost":
             lines(layout, f"The run's folder {folder} is gone: start a new fit.", "ERROR")
         elif stage == "resumable":
@@ -109,6 +112,19 @@ class FITFLARE_PT_fit(_Part, bpy.types.Panel):
         row.operator("fit_flare.fit", text="Fit" if stage in ("none", "lost") else "New Fit", icon="RENDER_ANIMATION")
         if folder is not None and folder.is_dir():
             _reading(layout, folder)
+
+
+def _cleaning(layout: Any, capture: Any) -> None:
+    """The frames without flare: made, being made, or to be made."""
+    job = jobs.find(capture / "removal")
+    if job is not None and job.running:
+        draw_progress(layout, job, "Clean frames")
+        return
+    if job is not None and job.state in ("failed", "stopped"):
+        lines(layout, job.error, "ERROR" if job.state == "failed" else "INFO")
+    if not (capture / "removed").is_dir() or (job is not None and job.state != "done"):
+        lines(layout, "There are no frames without flare; with them the fit separates better.", "INFO")
+        layout.operator("fit_flare.clean_frames", icon="BRUSH_DATA")
 
 
 def _fitting(layout: Any, job: jobs.Job) -> None:

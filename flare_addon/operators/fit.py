@@ -53,6 +53,29 @@ class FITFLARE_OT_resume(bpy.types.Operator):
         return outcome.status
 
 
+class FITFLARE_OT_clean_frames(bpy.types.Operator):
+    """Have the engine take the flares out of the frames, so that the fit has clean ones to learn the scene from"""
+
+    bl_idname = "fit_flare.clean_frames"
+    bl_label = "Make Clean Frames"
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        capture = fits.capture_of(context.scene)
+        if capture is None or not (capture / "images").is_dir():
+            cls.poll_message_set("Import a capture first")
+            return False
+        if engine.find() is None:
+            cls.poll_message_set(engine.MISSING)
+            return False
+        return True
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        with reported(self) as outcome:
+            fits.clean(context.scene)
+        return outcome.status
+
+
 class FITFLARE_OT_cancel(bpy.types.Operator):
     """Stop this; what is done is kept, and it can be gone on with (ESC with the mouse over this panel)"""
 
@@ -162,7 +185,7 @@ def _show(context: bpy.types.Context, kind: str, give: object) -> None:
     give(area.spaces.active)
 
 
-_CLASSES = (FITFLARE_OT_fit, FITFLARE_OT_resume, FITFLARE_OT_cancel, FITFLARE_OT_show_log, FITFLARE_OT_show_preview,
+_CLASSES = (FITFLARE_OT_fit, FITFLARE_OT_resume, FITFLARE_OT_clean_frames, FITFLARE_OT_cancel, FITFLARE_OT_show_log, FITFLARE_OT_show_preview,
             FITFLARE_OT_use_result)
 
 

@@ -185,8 +185,8 @@ def _show(context: bpy.types.Context, kind: str, give: object) -> None:
     give(area.spaces.active)
 
 
-_CLASSES = (FITFLARE_OT_fit, FITFLARE_OT_resume, FITFLARE_OT_clean_frames, FITFLARE_OT_cancel, FITFLARE_OT_show_log, FITFLARE_OT_show_preview,
-            FITFLARE_OT_use_result)
+_CLASSES = (FITFLARE_OT_fit, FITFLARE_OT_resume, FITFLARE_OT_clean_frames, FITFLARE_OT_cancel, FITFLARE_OT_show_log,
+            FITFLARE_OT_show_preview, FITFLARE_OT_use_result)
 
 
 def register() -> None:

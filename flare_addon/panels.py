@@ -137,11 +137,17 @@ def _fitting(layout: Any, job: jobs.Job) -> None:
         lines(layout, ", ".join(parts))
     icon = fits.preview_icon(job.folder)
     if icon:
-        layout.template_icon(icon_value=icon, scale=8.0)
-        lines(layout, "Frame, composite; scene, flare")
+        _picture(layout, icon)
     else:
         lines(layout, "A preview comes after an eighth of the way. Blender can be used, saved and closed meanwhile.")
     _reading(layout, job.folder)
+
+
+def _picture(layout: Any, icon: int) -> None:
+    """A preview, composite above flare, as wide as the panel."""
+    region, scale = bpy.context.region, bpy.context.preferences.system.ui_scale
+    width = region.width / scale if region is not None else 260
+    layout.template_icon(icon_value=icon, scale=max(min((width - 60) / 20, 16), 6))
 
 
 def _finished(layout: Any, scene: Any, job: jobs.Job | None) -> None:
@@ -149,7 +155,7 @@ def _finished(layout: Any, scene: Any, job: jobs.Job | None) -> None:
     assert folder is not None
     icon = fits.preview_icon(folder)
     if icon:
-        layout.template_icon(icon_value=icon, scale=8.0)
+        _picture(layout, icon)
     used = looks.path_of(scene)
     if job is not None and job.error:
         lines(layout, job.error, "ERROR")

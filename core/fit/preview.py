@@ -37,14 +37,13 @@ def write_preview(path: Path, rows: Sequence[NDArray[np.float32]]) -> None:
 
 
 def write_small(path: Path, strip: NDArray[np.float32]) -> None:
-    """One view, frame | composite over scene | flare, small enough to be read again and again by a panel."""
+    """One view, its composite above its flare, small enough to be read again and again by a panel."""
     width = (strip.shape[1] - 3 * GAP) // 4
-    frame, composite, scene, flare = (strip[:, at * (width + GAP):at * (width + GAP) + width] for at in range(4))
-    square = np.concatenate([np.concatenate([frame, composite], 1), np.concatenate([scene, flare], 1)])
-    step = max(SMALL / max(square.shape[:2]), 1e-9)
-    size = max(round(square.shape[1] * step), 1), max(round(square.shape[0] * step), 1)
-    picture = Picture(np.ascontiguousarray(square, np.float32), "srgb")
-    write_png(path, (picture.resized(*size) if step < 1 else picture).pixels)
+    composite, flare = (strip[:, at * (width + GAP):at * (width + GAP) + width] for at in (1, 3))
+    both = np.ascontiguousarray(np.concatenate([composite, flare]), np.float32)
+    share = min(SMALL / max(both.shape[:2]), 1.0)
+    picture = Picture(both, "srgb").resized(max(round(both.shape[1] * share), 1), max(round(both.shape[0] * share), 1))
+    write_png(path, picture.pixels)
 
 
 def spread(count: int, wanted: int) -> list[int]:

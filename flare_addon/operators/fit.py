@@ -85,12 +85,8 @@ class FITFLARE_OT_cancel(bpy.types.Operator):
     folder: bpy.props.StringProperty(options={"HIDDEN", "SKIP_SAVE"})  # type: ignore[valid-type]
 
     @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        region = context.region
-        over_panel = region is None or region.type != "WINDOW" or context.area is None or context.area.type != "VIEW_3D"
-        if region is not None and region.type == "UI" and hasattr(region, "active_panel_category"):
-            over_panel = region.active_panel_category in ("Fit Flare", "UNSUPPORTED")
-        return over_panel and bool(jobs.running())
+    def poll(cls, _context: bpy.types.Context) -> bool:
+        return bool(jobs.running())
 
     def execute(self, _context: bpy.types.Context) -> set[str]:
         stopped = [job for job in jobs.running() if not self.folder or job.folder == Path(self.folder)]
@@ -99,6 +95,26 @@ class FITFLARE_OT_cancel(bpy.types.Operator):
         if not stopped:
             self.report({"INFO"}, "It has ended already")
             return {"CANCELLED"}
+        self.report({"INFO"}, "Stopping; what is done is kept")
+        return {"FINISHED"}
+
+
+class FITFLARE_OT_cancel_by_key(bpy.types.Operator):
+    """Stop what the engine does, where the mouse is over the panel"""
+
+    bl_idname = "fit_flare.cancel_by_key"
+    bl_label = "Cancel Fit Flare"
+    bl_options = {"INTERNAL"}
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        region = context.region
+        return (region is not None and region.type == "UI" and bool(jobs.running())
+                and getattr(region, "active_panel_category", "") == "Fit Flare")
+
+    def execute(self, _context: bpy.types.Context) -> set[str]:
+        for job in jobs.running():
+            job.stop()
         self.report({"INFO"}, "Stopping; what is done is kept")
         return {"FINISHED"}
 
@@ -185,8 +201,8 @@ def _show(context: bpy.types.Context, kind: str, give: object) -> None:
     give(area.spaces.active)
 
 
-_CLASSES = (FITFLARE_OT_fit, FITFLARE_OT_resume, FITFLARE_OT_clean_frames, FITFLARE_OT_cancel, FITFLARE_OT_show_log,
-            FITFLARE_OT_show_preview, FITFLARE_OT_use_result)
+_CLASSES = (FITFLARE_OT_fit, FITFLARE_OT_resume, FITFLARE_OT_clean_frames, FITFLARE_OT_cancel,
+            FITFLARE_OT_cancel_by_key, FITFLARE_OT_show_log, FITFLARE_OT_show_preview, FITFLARE_OT_use_result)
 
 
 def register() -> None:
@@ -195,7 +211,7 @@ def register() -> None:
     keyconfig = bpy.context.window_manager.keyconfigs.addon
     if keyconfig is not None:  # None in the background
         keymap = keyconfig.keymaps.new("3D View Generic", space_type="VIEW_3D")
-        _keymaps.append((keymap, keymap.keymap_items.new(FITFLARE_OT_cancel.bl_idname, "ESC", "PRESS")))
+        _keymaps.append((keymap, keymap.keymap_items.new(FITFLARE_OT_cancel_by_key.bl_idname, "ESC", "PRESS")))
 
 
 def unregister() -> None:

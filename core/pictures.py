@@ -49,15 +49,17 @@ class Picture:
         return linear_from_srgb(self.pixels) if self.encoding == "srgb" else self.pixels
 
     def resized(self, width: int, height: int) -> Picture:
-        """This picture at another size: area average when it shrinks, bicubic when it grows."""
+        """This picture at another size. It shrinks by the average over areas, of light, as a coarser sensor would have
+        seen it; it grows bicubically."""
         if (width, height) == self.size:
             return self
         import cv2
 
-        shrinks = width <= self.size[0] and height <= self.size[1]
-        how = cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC
-        pixels = cv2.resize(self.pixels, (width, height), interpolation=how)
-        return Picture(np.asarray(pixels, np.float32), self.encoding)
+        if width > self.size[0] or height > self.size[1]:
+            grown = cv2.resize(self.pixels, (width, height), interpolation=cv2.INTER_CUBIC)
+            return Picture(np.asarray(grown, np.float32), self.encoding)
+        light = np.asarray(cv2.resize(self.linear(), (width, height), interpolation=cv2.INTER_AREA), np.float32)
+        return Picture(srgb_from_linear(light) if self.encoding == "srgb" else light, self.encoding)
 
 
 def srgb_from_linear(linear: NDArray[Any]) -> Pixels:

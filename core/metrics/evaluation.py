@@ -60,7 +60,8 @@ def evaluate(renderer: Renderer, capture: Capture, cameras: Mapping[View, Camera
         clean = {"truth": capture.truth_scene, "removed": capture.removed}.get(reference, _nothing)
         scored.append((view.name, score_view(
             composite, rendering.scene, capture.frame(view, camera.size), clean(view, camera.size),
-            capture.truth_flare(view, camera.size) if reference == "truth" else None)))
+            capture.truth_flare(view, camera.size) if reference == "truth" else None,
+            clipped(capture.frame(view), camera.size))))
         progress.advance()
     size = next(iter(cameras.values())).size if cameras else (0, 0)
     return summary(reference, scored, size)
@@ -71,10 +72,11 @@ def _nothing(_view: View, _size: tuple[int, int]) -> None:
 
 
 def score_view(composite: Array, scene: Array, frame: Picture, scene_reference: Picture | None,
-               flare_truth: Picture | None = None) -> dict[str, Scores]:
+               flare_truth: Picture | None = None, hidden: NDArray[np.bool_] | None = None) -> dict[str, Scores]:
     """Scores of one view by layer: psnr, ssim, lpips (null without weights), flip.
 
-    composite, scene: scene-linear layers (height, width, 3); the rest are pictures of the same size.
+    composite, scene: scene-linear layers (height, width, 3); the rest are pictures of the same size. hidden:
+    (height, width), where the linear flare is not judged; by default where the frame is clipped.
     A flare also has `empty_psnr`, what no flare at all would score.
     """
     shown, clean, filmed = _display(composite), _display(scene), frame.display()
@@ -86,18 +88,27 @@ def score_view(composite: Array, scene: Array, frame: Picture, scene_reference: 
         scores["flare"] = {**_picture_scores(flare, flare_reference),
                            "empty_psnr": psnr(np.zeros_like(flare), flare_reference)}
     if flare_truth is not None:
-        truth, layer, keep = flare_truth.linear(), composite - scene, ~clipped(frame)
+        truth, layer, keep = flare_truth.linear(), composite - scene, ~(clipped(frame) if hidden is None else hidden)
         scores["flare_linear"] = {
             "psnr": psnr(layer, truth, keep), "relative_l2": relative_l2(layer, truth, keep),
             "empty_psnr": psnr(np.zeros_like(layer), truth, keep)}
     return scores
 
 
-def clipped(frame: Picture) -> NDArray[np.bool_]:
-    """(height, width): where a frame's brightest code hides how bright it was. A linear frame hides nothing."""
+def clipped(frame: Picture, size: tuple[int, int] | None = None) -> NDArray[np.bool_]:
+    """(height, width): where a frame's brightest code hides how bright it was. A linear frame hides nothing.
+
+    size: (width, height) of the result, where the frame is larger: pixels with a clipped one among theirs.
+    """
     if frame.encoding == "linear":
-        return np.zeros(frame.pixels.shape[:2], bool)
-    return (frame.pixels >= _CLIPPED).any(-1)
+        hidden = np.zeros(frame.pixels.shape[:2], np.float32)
+    else:
+        hidden = (frame.pixels >= _CLIPPED).any(-1).astype(np.float32)
+    if size is not None and size != frame.size:
+        import cv2
+
+        hidden = np.asarray(cv2.resize(hidden, size, interpolation=cv2.INTER_AREA), np.float32)
+    return hidden > 0
 
 
 def _display(linear: Array) -> Array:

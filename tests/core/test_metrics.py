@@ -148,6 +148,7 @@ def test_clipped_pixels_do_not_count_against_the_linear_flare() -> None:
     truth[3, 4] = 50
     frame = Picture(np.clip(srgb_from_linear(scene + truth), 0, 1), "srgb")
     assert clipped(frame).sum() == 1
+    assert clipped(frame, (frame.size[0] // 2, frame.size[1] // 2)).sum() == 1
     assert not clipped(Picture(scene + truth, "linear")).any()
     scores = score_view(scene + flare, scene, frame, Picture(srgb_from_linear(scene), "srgb"), Picture(truth, "linear"))
     assert scores["flare_linear"]["relative_l2"] == pytest.approx(0, abs=1e-6)

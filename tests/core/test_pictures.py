@@ -122,3 +122,11 @@ def test_an_exr_in_another_space_is_read_as_rec_709(tmp_path: Path) -> None:
     write_exr(tmp_path / "bad.exr", dict.fromkeys("RGB", stored[..., 0]), header={"chromaticities": (0.3,) * 8})
     with pytest.raises(FrameError, match=r"bad\.exr has chromaticities"):
         read_picture(tmp_path / "bad.exr")
+
+
+def test_a_picture_shrinks_in_light() -> None:
+    board = np.zeros((4, 4, 3), np.float32)
+    board[::2, ::2] = board[1::2, 1::2] = 1
+    small = Picture(board, "srgb").resized(2, 2)
+    assert small.encoding == "srgb"
+    np.testing.assert_allclose(small.linear(), 0.5, atol=1e-6)

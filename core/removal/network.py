@@ -67,18 +67,20 @@ class Norm(nn.Module):
 
 
 class Block(nn.Module):
-    """x + convolutions(x); its last layer starts at zero, so that a deep network starts as a shallow one."""
+    """x + scale * convolutions(x). The scales start near zero, so that a deep network starts as a shallow one. Were it
+    the convolutions that start at zero, the first steps would turn all of their weights the same way, and what is
+    the same in every pixel would drown the rest.
+    """
 
     def __init__(self, width: int) -> None:
         super().__init__()
         self.norm = Norm(width)
         self.first = nn.Conv2d(width, width, 3, padding=1)
         self.second = nn.Conv2d(width, width, 3, padding=1)
-        nn.init.zeros_(self.second.weight)
-        nn.init.zeros_(self.second.bias)  # type: ignore[arg-type]
+        self.scale = nn.Parameter(torch.full((width, 1, 1), 0.05))
 
     def forward(self, x: Tensor) -> Tensor:
-        return x + self.second(F.leaky_relu(self.first(self.norm(x)), 0.1))
+        return x + self.scale * self.second(F.leaky_relu(self.first(self.norm(x)), 0.1))
 
 
 class Everywhere(nn.Module):

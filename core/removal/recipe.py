@@ -29,7 +29,7 @@ class Recipe:
     average: float = 0.996         # of the weights that are kept, over iterations
     widths: tuple[int, ...] = (64, 96, 128, 192)
     depths: tuple[int, ...] = (1, 2, 2, 4)
-    small_until: int = 1800        # iterations with small frames, which are cheaper
+    small_until: int = 1500        # iterations with small frames, which are cheaper
     canvas: int = 448              # pixels a side of the flares' canvas
     bank: int = 250                # flares at hand at a time
     renew_every: int = 6           # iterations for each new flare

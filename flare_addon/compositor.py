@@ -208,7 +208,7 @@ def _render(tree: Any) -> Any:
 
 
 def _footage(tree: Any, plate: tuple[Any, int, int, int]) -> Any:
-    node = tree.nodes.get(PLATE) or _named(_node(tree, "CompositorNodeImage", -4, 1), PLATE)
+    node = tree.nodes.get(PLATE) or _named(_node(tree, "CompositorNodeImage", -4, 2.5), PLATE)
     image, start, offset, duration = plate
     node.image = image
     if image.source == "SEQUENCE":

@@ -260,7 +260,6 @@ def _light(layout: Any, scene: Any, item: Any) -> None:
 class FITFLARE_PT_bake(_Part, bpy.types.Panel):
     bl_label = "Bake"
     bl_idname = "FITFLARE_PT_bake"
-    bl_options = {"DEFAULT_CLOSED"}
 
     def draw(self, context: bpy.types.Context) -> None:
         layout, scene = self.layout, context.scene
@@ -330,7 +329,6 @@ def _baked_log(layout: Any, job: jobs.Job) -> None:
 class FITFLARE_PT_transfer(_Part, bpy.types.Panel):
     bl_label = "Transfer"
     bl_idname = "FITFLARE_PT_transfer"
-    bl_options = {"DEFAULT_CLOSED"}
 
     def draw(self, context: bpy.types.Context) -> None:
         layout, state = self.layout, context.scene.fit_flare

@@ -23,6 +23,7 @@ from ..lights.detection import Detector
 from ..look import Look
 from ..look.shot import PlacedLight, Shot, ShotFrame
 from ..pictures import SUFFIXES, Picture, picture_size, read_picture
+from .query import Seen
 from .sources import assigned
 
 Mapped = Mapping[str, str]
@@ -75,11 +76,12 @@ class Target:
 
 def of_pictures(paths: Sequence[Path], look: Look, lights: Mapping[str, tuple[float, float]], wanted: Mapped,
                 distances: Mapping[str, float], *, detector: Detector | None = None, focal: float | None = None,
-                centre: tuple[float, float] | None = None) -> Target:
+                centre: tuple[float, float] | None = None, seen: Mapping[str, Seen] | None = None) -> Target:
     """Pictures with a light each in 2D: `lights` in pixels by name, else what `detector` finds.
 
     focal: in pixels (default: the training camera's field of view); centre: principal point in pixels (default: the
-    middle). distances: of each source, at which its flare is as bright as it was learned. Raises SettingsError where
+    middle). distances: of each source, at which its flare is as bright as it was learned. seen: what each source was
+    learned from; a light that was found shows the source that stood most like it. Raises SettingsError where
     a picture has no light.
     """
     frames = []
@@ -93,7 +95,11 @@ def of_pictures(paths: Sequence[Path], look: Look, lights: Mapping[str, tuple[fl
         found = dict(lights) or _detected(path, detector)
         if not found:
             raise SettingsError(f"No light was found in {path}; say where it is with --light X,Y.")
-        sources = assigned(list(found), look.names, {name: source for name, source in wanted.items() if name in found})
+        told = {name: source for name, source in wanted.items() if name in found}
+        if not lights:
+            places = {name: ((x - cx) / fx, (y - cy) / fy) for name, (x, y) in found.items()}
+            told = {**_most_alike(places, seen or {}), **told}
+        sources = assigned(list(found), look.names, told)
         placed = []
         for name, (x, y) in found.items():
             ray = np.array([(x - cx) / fx, (y - cy) / fy, 1.0])
@@ -106,7 +112,21 @@ def _detected(path: Path, detector: Detector | None) -> dict[str, tuple[float, f
     if detector is None:
         return {}
     found = detector.detect(read_picture(path))
-    return {f"light{number + 1}": (float(one.xy[0]), float(one.xy[1])) for number, one in enumerate(found)}
+    return {f"found{number + 1}": (float(one.xy[0]), float(one.xy[1])) for number, one in enumerate(found)}
+
+
+def _most_alike(places: Mapping[str, tuple[float, float]], seen: Mapping[str, Seen]) -> dict[str, str]:
+    """For each light at a place of the plane the source that training saw nearest to it, each source once if there
+    are enough."""
+    chosen: dict[str, str] = {}
+    pairs = sorted((float(np.linalg.norm(of.lights - place, axis=1).min()), name, source)
+                   for name, place in places.items() for source, of in seen.items())
+    while pairs and len(chosen) < len(places):
+        used = set(chosen.values())
+        free = [pair for pair in pairs if pair[1] not in chosen]
+        _, name, source = next((pair for pair in free if pair[2] not in used), free[0])
+        chosen[name] = source
+    return chosen
 
 
 # ---- captures and splats --------------------------------------------------------------------------

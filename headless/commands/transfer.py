@@ -116,7 +116,7 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     if words.smooth < 0 or not words.scale > 0:
         raise SettingsError("--smooth is 0 or more, and --scale more than 0.")
     flare, training = source(words)
-    return _made(words, "transfer", target_of(words, flare), flare, training, progress)
+    return _made(words, "transfer", target_of(words, flare, training), flare, training, progress)
 
 
 def _made(words: argparse.Namespace, step: str, target: Any, flare: Path, training: list[Any] | None,
@@ -186,8 +186,8 @@ def source(words: argparse.Namespace) -> tuple[Path, list[Any] | None]:
     return flare, [view.camera.world_to_camera for view in views]
 
 
-def target_of(words: argparse.Namespace, flare: Path) -> Any:
-    """The target, by what --to names."""
+def target_of(words: argparse.Namespace, flare: Path, training: list[Any] | None = None) -> Any:
+    """The target, by what --to names. training: poses, for a .flare that does not tell."""
     from ...core.capture import Capture
     from ...core.fit.run import CONFIG, SCENE, Run
     from ...core.lights.detection import Detector
@@ -203,11 +203,11 @@ def target_of(words: argparse.Namespace, flare: Path) -> Any:
         raise SettingsError("Several targets at once have to be pictures.")
     kind = to[0].suffix.lower()
     if kind in PICTURES:
-        seen = seen_by(flare, look.lights)
+        seen = seen_by(flare, look.lights, training)
         distances = {light.name: _usual_distance(light, seen.get(light.name)) for light in look.lights}
         detector: Detector | None = None if words.light else Exposure()
         return targets.of_pictures(to, look, _points(words.light), wanted, distances, detector=detector,
-                                   focal=words.focal, centre=_point(words.centre) if words.centre else None)
+                                   focal=words.focal, centre=_point(words.centre) if words.centre else None, seen=seen)
     if kind in (".blend", ".json"):
         path = shot_path(words) if kind == ".blend" else to[0]
         return targets.of_shot(Shot.read(path), look, wanted, plates=words.plates, scene=words.scene)

@@ -26,7 +26,7 @@ from core.look.shot import PlacedLight, Shot, ShotFrame
 from core.pictures import read_exr, srgb_from_linear, write_exr, write_png
 from core.transfer import query as queries
 from core.transfer.sources import assigned, parsed
-from core.transfer.target import Target, of_capture, of_pictures, of_shot
+from core.transfer.target import Target, _most_alike, of_capture, of_pictures, of_shot
 from core.transfer.transfer import Transfer, TransferSettings
 from tests.core.captures import make_capture
 from tests.core.flared import cameras
@@ -106,6 +106,19 @@ def test_on_to_a_picture_the_flare_goes_to_the_light(look: Look, tmp_path: Path)
     assert np.linalg.norm(one.shot.lights[0].xyz) == pytest.approx(4.0)
     with pytest.raises(SettingsError, match="No light was found"):
         of_pictures([tmp_path / "plate.0007.png"], look, {}, {}, {name(look): 4.0})
+
+
+def test_lights_that_were_found_show_what_stood_most_like_them() -> None:
+    """Each source once where there are enough; nearest pairs first."""
+    def at(*places: tuple[float, float]) -> queries.Seen:
+        return queries.Seen(np.zeros((len(places), 3)), np.array(places), np.ones(len(places)))
+
+    seen = {"left": at((-0.3, 0), (-0.2, 0)), "right": at((0.2, 0.1))}
+    assert _most_alike({"a": (0.1, 0), "b": (-0.2, 0.1)}, seen) == {"a": "right", "b": "left"}
+    assert _most_alike({"a": (0.3, 0), "b": (0.2, 0)}, seen) == {"b": "right", "a": "left"}
+    three = _most_alike({"a": (0.3, 0), "b": (0.2, 0), "c": (0.25, 0)}, seen)
+    assert three == {"b": "right", "c": "left", "a": "right"}
+    assert _most_alike({"a": (0.3, 0)}, {}) == {}
 
 
 # ---- visibility -----------------------------------------------------------------------------------

@@ -39,7 +39,8 @@ def test_every_command_explains_itself(name: str, capsys: pytest.CaptureFixture[
 def test_the_list_of_commands(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["--help"]) == 0
     told = capsys.readouterr().out
-    assert all(f"  {name} " in told for name in COMMANDS)
+    words = told.split()
+    assert all(name in words for name in COMMANDS)
     assert cli.main([]) == 2
 
 

@@ -26,7 +26,7 @@ from .weights import IN_THE_BOX, load
 
 Pixels = NDArray[np.float32]
 
-WORKING_SIZE = 512
+WORKING_SIZE = 192
 """Long side that the network sees: about the largest that it was trained at."""
 LEAST = 0.004
 """What a flare adds to display values, below which there is none: a code of 8 bit."""
@@ -86,7 +86,7 @@ class Remover:
     def flare(self, display: Pixels) -> Pixels:
         """Linear flare of a picture of display values 0..1 at the network's size; exactly 0 where it is none."""
         frame = torch.from_numpy(np.ascontiguousarray(display.transpose(2, 0, 1)))[None]
-        told = self.network(inputs(frame).to(memory_format=torch.channels_last))
+        told = self.network(inputs(frame))
         added = (told.gentle if self.keep_glare else told.flare).clamp(min=0)
         # A ramp from nothing to the whole, so that a faint flare has no rim.
         added = added * ((added - LEAST) / LEAST).clamp(0, 1)

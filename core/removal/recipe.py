@@ -8,51 +8,53 @@ from typing import Any
 import numpy as np
 
 from ..errors import SettingsError
+from .network import MULTIPLE
 
 
 @dataclass(frozen=True)
 class Recipe:
     """How the network is trained; the defaults made the weights in the box.
 
-    The learning rate rises over `warmup` iterations, stays, and falls to nothing over the last `cooldown` of
-    them (a share of `iterations`), so that a training can be made longer while it runs.
+    An iteration lays flares over `frames` new pictures, puts `cells` of each into a store that holds those of
+    the last `store` iterations, and takes `steps` steps on random cells of all of them. The learning rate
+    falls to nothing over the last `cooldown` of the iterations (a share), so that a training can be made
+    longer while it runs.
     """
 
     seed: int = 1
-    iterations: int = 8000
-    pixels: int = 200_000          # of a batch; frames of one size a batch
-    learning_rate: float = 5e-4
-    warmup: int = 200
-    cooldown: float = 0.3
-    floor: float = 1e-3            # squared error below which a picture counts as right
-    weight_decay: float = 1e-4
-    average: float = 0.996         # of the weights that are kept, over iterations
-    widths: tuple[int, ...] = (64, 96, 128, 192)
-    depths: tuple[int, ...] = (1, 2, 2, 4)
-    small_until: int = 1500        # iterations with small frames, which are cheaper
-    canvas: int = 448              # pixels a side of the flares' canvas
-    bank: int = 250                # flares at hand at a time
-    renew_every: int = 6           # iterations for each new flare
+    iterations: int = 1500
+    frames: int = 8
+    cells: int = 250
+    store: int = 400
+    steps: int = 4
+    batch: int = 8192              # cells of a step
+    learning_rate: float = 2e-3
+    cooldown: float = 0.5
+    average: float = 0.998         # of the weights that are kept, over steps
+    widths: tuple[int, ...] = (192, 128, 64)
+    longest: int = 192             # pixels of a frame, about; plates are worked at this size
+    canvas: int = 224              # pixels a side of the flares' canvas
+    bank: int = 400                # flares at hand at a time
+    renew_every: int = 4           # iterations for each new flare
     own_share: float = 0.3         # of the user's own flares, where there are any
-    clean: float = 0.08            # of the frames have no flare
-    half: bool = True              # bfloat16 in the convolutions
+    clean: float = 0.1             # of the frames have no flare
 
     def __post_init__(self) -> None:
-        if self.iterations < 1 or self.pixels < 1 or not 0 < self.learning_rate < 1:
-            raise SettingsError("A recipe needs at least one iteration, one pixel and a learning rate below 1.")
-        if len(self.widths) != len(self.depths) or len(self.widths) < 2:
-            raise SettingsError("A recipe's widths and depths must be as many, two at least.")
+        if min(self.iterations, self.frames, self.cells, self.store, self.steps, self.batch, self.bank) < 1:
+            raise SettingsError("A recipe needs at least one iteration, frame, cell, step and flare.")
+        if not 0 < self.learning_rate < 1 or not self.widths or self.longest < 2 * MULTIPLE:
+            raise SettingsError("A recipe needs a learning rate below 1, a hidden layer, and frames of "
+                                f"{2 * MULTIPLE} pixels.")
 
     def rate(self, iteration: int) -> float:
         """Learning rate of an iteration."""
-        rise = min((iteration + 1) / max(self.warmup, 1), 1.0)
         left = (self.iterations - iteration) / max(self.cooldown * self.iterations, 1)
-        return self.learning_rate * rise * min(left, 1.0)
+        return self.learning_rate * min(left, 1.0)
 
-    def frame_size(self, random: np.random.Generator, iteration: int) -> tuple[int, int]:
-        """(width, height), multiples of 32: small at first, then up to the size that plates are worked at."""
-        longest = int(random.integers(4, 8) if iteration < self.small_until else random.integers(7, 15)) * 32
-        width, height = longest, max(round(longest / random.uniform(1.0, 1.9) / 32) * 32, 96)
+    def frame_size(self, random: np.random.Generator) -> tuple[int, int]:
+        """(width, height), multiples of MULTIPLE, about `longest` on the long side."""
+        longest = max(round(self.longest * random.uniform(0.8, 1.25) / MULTIPLE), 2) * MULTIPLE
+        width, height = longest, max(round(longest / random.uniform(1.0, 1.9) / MULTIPLE), 2) * MULTIPLE
         return (width, height) if random.random() < 0.8 else (height, width)
 
 

@@ -11,6 +11,8 @@ from typing import Any
 
 import numpy as np
 import torch
+import torch.nn.functional as F  # noqa: N812 - its name everywhere
+from numpy.typing import NDArray
 from torch import Tensor
 
 from ..errors import Cancelled, RunError
@@ -18,7 +20,7 @@ from ..progress import Progress
 from . import weights
 from .backgrounds import Backgrounds
 from .bank import Mixed, OwnFlares, SynthesisBank
-from .network import RemovalNetwork, inputs
+from .network import CELL, INPUTS, RemovalNetwork, inputs
 from .pairs import Bank, Pair, pair
 from .recipe import Recipe, as_dict, from_dict
 from .synthesis.layers import flare
@@ -28,7 +30,7 @@ CHECKPOINT, WEIGHTS, LOG = "checkpoint.safetensors", "removal.safetensors", "tra
 CHECK_EVERY = 250
 CHECK_SEED = 20_000
 CHECKS = 40
-CHECK_SIZE = (384, 256)
+CHECK_SIZE = (192, 128)
 
 
 def device() -> torch.device:
@@ -36,8 +38,20 @@ def device() -> torch.device:
     return torch.device("cuda" if torch.cuda.is_available() else "cpu")
 
 
+def cells_of(one: Pair, which: NDArray[np.int64]) -> tuple[Tensor, Tensor]:
+    """Inputs (n, INPUTS) and goals (n, 7) of some cells of a pair: what the flare adds, its gentle part, weight."""
+    parts = (one.frame, one.scene, one.gentle)
+    frame, scene, gentle = (torch.from_numpy(part).permute(2, 0, 1)[None] for part in parts)
+    added = F.avg_pool2d(torch.cat([frame - scene, frame - gentle], 1), CELL)[0].flatten(1).T
+    weight = 0.01 / (float((frame - scene).square().mean()) + 0.002)
+    seen = inputs(frame)[0].flatten(1).T
+    index = torch.from_numpy(which % len(seen))
+    return seen[index], torch.cat([added[index], torch.full((len(index), 1), min(max(weight, 0.3), 5.0))], 1)
+
+
 class Trainer:
-    """Network, optimiser and flares at an iteration; what a step sees is a function of seed and iteration."""
+    """Network, optimiser, flares and store of cells at an iteration; what a step sees is a function of seed and
+    iteration."""
 
     def __init__(self, recipe: Recipe, backgrounds: Backgrounds, lenses: Sequence[Prescription],
                  own: OwnFlares | None = None) -> None:
@@ -46,86 +60,88 @@ class Trainer:
         self._backgrounds = backgrounds
         self._made = SynthesisBank(recipe.seed, recipe.bank, recipe.canvas, lenses)
         self._bank: Bank = Mixed(self._made, own, recipe.own_share) if own else self._made
+        self._seen = torch.zeros((recipe.store, recipe.frames * recipe.cells, INPUTS))
+        self._goals = torch.zeros((recipe.store, recipe.frames * recipe.cells, 7))
         torch.manual_seed(recipe.seed)
-        self.network = self._placed(RemovalNetwork(recipe.widths, recipe.depths))
-        self.optimiser = torch.optim.AdamW(self.network.parameters(), recipe.learning_rate, betas=(0.9, 0.99),
-                                           weight_decay=recipe.weight_decay, fused=True)
+        self.network = RemovalNetwork(recipe.widths).to(self.device)
+        self.optimiser = torch.optim.Adam(self.network.parameters(), recipe.learning_rate)
         self.averaged = {name: value.detach().clone() for name, value in self.network.state_dict().items()}
 
-    def _placed(self, network: RemovalNetwork) -> RemovalNetwork:
-        network.to(self.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
-        return network
-
     def fill(self, progress: Progress) -> None:
-        """Make the flares that this iteration has at hand."""
-        goal = self._serial()
+        """Make the flares and the cells that this iteration has at hand."""
+        goal = self._serial(self.iteration)
         first = max(goal - len(self._made), 0)
         progress.stage("flares", goal - first)
         for number in range(first, goal):
             self._made.renew_to(number + 1)
             progress.advance()
+        progress.stage("frames", self.recipe.store)
+        for number in range(self.iteration - self.recipe.store, self.iteration):
+            self._draw(number)
+            progress.advance()
+        if self.iteration == 0:
+            self.network.mean.copy_(self._seen.mean((0, 1)))
+            self.network.spread.copy_(self._seen.std((0, 1)) + 1e-3)
 
-    def _serial(self) -> int:
-        return len(self._made) + self.iteration // self.recipe.renew_every
+    def _serial(self, iteration: int) -> int:
+        return len(self._made) + iteration // self.recipe.renew_every
+
+    def _draw(self, number: int) -> None:
+        """Put the cells of the frames of an iteration (negative: of those before the first) into the store. A resumed
+        training draws them again, under the flares that are at hand then."""
+        random = np.random.default_rng((self.recipe.seed, number + (1 << 30)))
+        parts = []
+        for _ in range(self.recipe.frames):
+            one = pair(random, self._bank, self._backgrounds, *self.recipe.frame_size(random), clean=self.recipe.clean)
+            parts.append(cells_of(one, random.integers(1 << 40, size=self.recipe.cells)))
+        slot = number % self.recipe.store
+        self._seen[slot] = torch.cat([seen for seen, _ in parts])
+        self._goals[slot] = torch.cat([goals for _, goals in parts])
 
     def step(self) -> dict[str, float]:
         """One iteration; its figures."""
         recipe = self.recipe
-        random = np.random.default_rng((recipe.seed, self.iteration))
-        self._made.renew_to(self._serial())
-        width, height = recipe.frame_size(random, self.iteration)
-        count = max(round(recipe.pixels / (width * height)), 1)
-        pairs = [pair(random, self._bank, self._backgrounds, width, height, clean=recipe.clean) for _ in range(count)]
+        self._made.renew_to(self._serial(self.iteration))
+        self._draw(self.iteration)
+        chosen = torch.Generator().manual_seed(recipe.seed * (1 << 32) + self.iteration)
         for group in self.optimiser.param_groups:
             group["lr"] = recipe.rate(self.iteration)
-        loss, figures = self._loss(pairs)
-        self.optimiser.zero_grad(set_to_none=True)
-        loss.backward()
-        size = torch.nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
-        if torch.isfinite(size):
+        seen, goals = self._seen.flatten(0, 1), self._goals.flatten(0, 1)
+        figures: dict[str, float] = {}
+        for _ in range(recipe.steps):
+            which = torch.randint(len(seen), (recipe.batch,), generator=chosen)
+            loss, figures = self.loss(seen[which].to(self.device), goals[which].to(self.device))
+            self.optimiser.zero_grad(set_to_none=True)
+            loss.backward()
             self.optimiser.step()
+            with torch.no_grad():
+                for name, value in self.network.state_dict().items():
+                    self.averaged[name].lerp_(value, 1 - recipe.average)
         self.iteration += 1
-        keep = min(recipe.average, (1 + self.iteration) / (10 + self.iteration))
-        with torch.no_grad():
-            torch._foreach_lerp_(list(self.averaged.values()), list(self.network.state_dict().values()), 1 - keep)
         return figures
 
-    def _loss(self, pairs: Sequence[Pair]) -> tuple[Tensor, dict[str, float]]:
-        """L1 and L2 of the two clean pictures, and the logarithm of the squared error of each, which asks as much of
-        faint flares as of strong ones, down to `floor`; display values.
-
-        A low floor lets the pictures without flare outweigh the others, and the network then learns to do nothing.
-        """
-        frame, scene, gentle = (self._stack([getattr(one, name) for one in pairs])
-                                for name in ("frame", "scene", "gentle"))
-        seen = inputs(frame).to(memory_format=torch.channels_last)
-        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.recipe.half):
-            told = self.network(seen)
-        wrong, mild = frame - told.flare - scene, frame - told.gentle - gentle
-        squared, distance = wrong.square().mean((1, 2, 3)), wrong.abs().mean()
-        loss = (distance + 4 * squared.mean() + 0.5 * (mild.abs().mean() + 4 * mild.square().mean())
-                + 0.02 * torch.log(squared + self.recipe.floor).mean())
-        return loss, {"l1": float(distance.detach()),
-                      "psnr": float(-10 * torch.log10(squared.detach() + 1e-6).mean())}
-
-    def _stack(self, pictures: Sequence[Any]) -> Tensor:
-        stacked = torch.from_numpy(np.stack(pictures)).permute(0, 3, 1, 2)
-        return stacked.to(self.device, memory_format=torch.channels_last)
+    def loss(self, seen: Tensor, goals: Tensor) -> tuple[Tensor, dict[str, float]]:
+        """L1 and L2 of what the flare adds, and of its gentle part at half the weight; cells of pictures with a
+        faint flare, or none, count for more, since there an error is seen."""
+        told = self.network.cells(seen)
+        wrong = (told - goals[:, :6])
+        each = wrong.abs() + 4 * wrong.square()
+        loss = (goals[:, 6:] * (each[:, :3] + 0.5 * each[:, 3:])).mean()
+        return loss, {"l1": float(wrong[:, :3].detach().abs().mean()),
+                      "untouched": float(goals[:, :3].abs().mean())}
 
     @torch.no_grad()
     def check(self, pairs: Mapping[str, Sequence[Pair]]) -> dict[str, float]:
         """PSNR gained over the untouched frame, dB, by class and on average, by the averaged weights."""
-        network = RemovalNetwork(self.recipe.widths, self.recipe.depths)
-        network.load_state_dict(self.averaged)
-        self._placed(network)
+        network = RemovalNetwork(self.recipe.widths)
+        network.load_state_dict({name: value.cpu() for name, value in self.averaged.items()})
         gains: dict[str, float] = {}
         for kind, some in pairs.items():
             values = []
             for one in some:
-                frame, scene = self._stack([one.frame]), self._stack([one.scene])
-                with torch.autocast(self.device.type, torch.bfloat16, enabled=self.recipe.half):
-                    told = network(inputs(frame).to(memory_format=torch.channels_last))
-                after = (frame - told.flare.clamp(min=0) - scene).clamp(min=-1).square().mean()
+                frame, scene = (torch.from_numpy(part).permute(2, 0, 1)[None] for part in (one.frame, one.scene))
+                told = network(inputs(frame)).flare.clamp(min=0)
+                after = ((frame - told).clamp(min=0) - scene).square().mean()
                 before = (frame - scene).square().mean()
                 values.append(float(10 * torch.log10((before + 1e-8) / (after + 1e-8))))
             gains[kind] = round(float(np.mean(values)), 3)
@@ -155,10 +171,8 @@ class Trainer:
             self.averaged[name] = state[f"averaged.{name}"].float().to(self.device)
         for name, parameter in self.network.named_parameters():
             if f"moment.step.{name}" in state:
-                # In the parameter's own order of memory, which the fused step takes for granted.
-                moments = {key: torch.empty_like(parameter).copy_(state[f"moment.{key}.{name}"])
-                           for key in ("exp_avg", "exp_avg_sq")}
-                self.optimiser.state[parameter] = {**moments, "step": state[f"moment.step.{name}"].to(self.device)}
+                moments = {key: state[f"moment.{key}.{name}"].to(self.device) for key in ("exp_avg", "exp_avg_sq")}
+                self.optimiser.state[parameter] = {**moments, "step": state[f"moment.step.{name}"]}
 
 
 def checks(backgrounds: Backgrounds, lenses: Sequence[Prescription], count: int = CHECKS) -> dict[str, list[Pair]]:
@@ -171,7 +185,7 @@ def checks(backgrounds: Backgrounds, lenses: Sequence[Prescription], count: int 
 
         def draw(self, random: np.random.Generator) -> Any:
             from .pairs import Layers
-            made = flare((CHECK_SEED, self.number, int(random.integers(1 << 30))), 384, lenses, self.kind)
+            made = flare((CHECK_SEED, self.number, int(random.integers(1 << 30))), 224, lenses, self.kind)
             return Layers(made.rest, made.glare, made.light, made.lights)
 
     return {kind: [pair(np.random.default_rng((CHECK_SEED, index, k)), One(kind, k), backgrounds, *CHECK_SIZE, clean=0)
@@ -199,12 +213,12 @@ def train(recipe: Recipe, folder: Path | str, backgrounds: Backgrounds, lenses: 
     if path.exists():
         state, kept = weights.read(path)
         given = from_dict(json.loads(kept["recipe"]))
-        recipe = replace(recipe, widths=given.widths, depths=given.depths, seed=given.seed)
+        recipe = replace(recipe, widths=given.widths, seed=given.seed)
         iteration = int(kept["iteration"])
     elif start is not None:
         state, kept = weights.read(start)
         given = from_dict(json.loads(kept["recipe"]))
-        recipe = replace(recipe, widths=given.widths, depths=given.depths)
+        recipe = replace(recipe, widths=given.widths)
     trainer = Trainer(recipe, backgrounds, lenses, own)
     if state:
         trainer.load_state(state, iteration)

@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from functools import lru_cache
 from pathlib import Path
 
-import torch
 from torch import Tensor
 
 from ..errors import RunError
@@ -46,9 +45,8 @@ def load(path: Path = IN_THE_BOX) -> RemovalNetwork:
     tensors, about = read(path)
     try:
         recipe = from_dict(json.loads(about["recipe"]))
-        network = RemovalNetwork(recipe.widths, recipe.depths)
+        network = RemovalNetwork(recipe.widths)
         network.load_state_dict({name: value.float() for name, value in tensors.items()})
     except (KeyError, ValueError, RuntimeError) as problem:
         raise RunError(f"{path} holds no weights of the removal network; train it with train-removal.") from problem
-    network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     return network.eval()

@@ -17,6 +17,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from fit_flare.headless import cli
 
 from core.bake.bake import read_record
 from core.capture import Capture
@@ -66,8 +67,7 @@ def contents(folder: Path) -> dict[str, str]:
 def whole(capture: Path, made: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """All frames by one command: what any number of tasks must come to."""
     out = tmp_path_factory.mktemp("whole") / "layers"
-    subprocess.run([sys.executable, RUN, "bake", made, "--capture", capture, "--out", out, "--set", "*.intensity=1"],
-                   check=True, capture_output=True, timeout=300, env={**os.environ, "OMP_NUM_THREADS": "1"})
+    assert cli.main(["bake", str(made), "--capture", str(capture), "--out", str(out), "--set", "*.intensity=1"]) == 0
     return out
 
 
@@ -117,37 +117,32 @@ def test_a_task_that_is_killed_and_run_again_leaves_the_same_files(capture: Path
 
 
 def test_several_processes_share_the_frames(capture: Path, made: Path, whole: Path, tmp_path: Path) -> None:
-    ended = subprocess.run([sys.executable, RUN, "bake", made, "--capture", capture, "--out", tmp_path / "out", "--set",
-                            "*.intensity=1", "--jobs", "2", "--progress", "json"], capture_output=True, text=True,
-                           timeout=300, check=False)
-    assert ended.returncode == 0, ended.stderr
+    assert cli.main(["bake", str(made), "--capture", str(capture), "--out", str(tmp_path / "out"), "--set",
+                     "*.intensity=1", "--jobs", "2"]) == 0
     assert contents(tmp_path / "out") == contents(whole)
     assert len(read_record(tmp_path / "out")["frames"]) == 9
 
 
-def test_a_job_that_fails_says_why_and_stops_the_others(capture: Path, made: Path, tmp_path: Path) -> None:
+def test_a_job_that_fails_says_why_and_stops_the_others(capture: Path, made: Path, tmp_path: Path,
+                                                        capfd: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "out").write_text("a file where the folder should be")
-    ended = subprocess.run([sys.executable, RUN, "bake", made, "--capture", capture, "--out", tmp_path / "out",
-                            "--jobs", "2", "--progress", "openjd"], capture_output=True, text=True, timeout=300,
-                           check=False)
-    assert ended.returncode == 1
-    assert "openjd_fail: The system refused" in ended.stdout
+    assert cli.main(["bake", str(made), "--capture", str(capture), "--out", str(tmp_path / "out"), "--jobs", "2",
+                     "--progress", "openjd"]) == 1
+    assert "openjd_fail: The system refused" in capfd.readouterr().out
 
 
-def test_fits_over_a_list_of_captures(capture: Path, tmp_path: Path) -> None:
+def test_fits_over_a_list_of_captures(capture: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     listed = tmp_path / "captures.txt"
     listed.write_text(f"# the shoot\n{capture}\n{tmp_path / 'absent'}\n")
     job("fit.yaml", "Fit", "--tasks", '[{"Entry": "1"}]', Captures=listed, Entries="1-2", Out=tmp_path / "runs",
         Preset="draft", Set="iterations=3")
     assert (tmp_path / "runs" / capture.name / "flare.flare").is_file()
     words = [sys.executable, RUN, "fit", "--list", listed, "--out", tmp_path / "runs", "--resume"]
-    beyond = subprocess.run([*words, "--entry", "3"], capture_output=True, text=True, timeout=120, check=False)
-    assert beyond.returncode == 1
-    assert "lists 2 captures; --entry 3 is none of them" in beyond.stderr
+    assert cli.main([*map(str, words[2:]), "--entry", "3"]) == 1
+    assert "lists 2 captures; --entry 3 is none of them" in capfd.readouterr().err
     # All of the list at once: the first is there already, the second cannot be.
-    whole = subprocess.run([*words, "--jobs", "2"], capture_output=True, text=True, timeout=120, check=False)
-    assert whole.returncode == 1
-    assert "absent is not a folder" in whole.stderr
+    assert cli.main([*map(str, words[2:]), "--jobs", "2"]) == 1
+    assert "absent is not a folder" in capfd.readouterr().err
 
 
 def test_a_transfer_in_chunks(capture: Path, made: Path, tmp_path: Path) -> None:

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import importlib.util
 import json
-import os
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from fit_flare.headless import cli
 
 from core.bake.exr import read_description, read_layers
 from core.capture import Capture
@@ -24,7 +25,6 @@ from core.look.shot import Shot
 from core.pictures import read_picture, write_png
 
 ROOT = Path(__file__).resolve().parents[2]
-RUN = ROOT / "headless" / "run.py"
 
 
 @pytest.fixture(scope="module")
@@ -38,15 +38,23 @@ def made(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def run(*words: object, status: int = 0) -> list[dict[str, Any]]:
+Run = Callable[..., list[dict[str, Any]]]
+
+
+@pytest.fixture
+def run(capfd: pytest.CaptureFixture[str]) -> Run:
     """The events of a command."""
-    ended = subprocess.run([sys.executable, str(RUN), *map(str, words), "--progress", "json"], capture_output=True,
-                           text=True, timeout=300, check=False, env={**os.environ, "OMP_NUM_THREADS": "1"})
-    assert ended.returncode == status, ended.stderr + ended.stdout
-    return [json.loads(line) for line in ended.stdout.splitlines()]
+    def go(*words: object, status: int = 0) -> list[dict[str, Any]]:
+        capfd.readouterr()
+        ended = cli.main([*map(str, words), "--progress", "json"])
+        told = capfd.readouterr()
+        assert ended == status, told.out + told.err
+        return [json.loads(line) for line in told.out.splitlines()]
+
+    return go
 
 
-def test_on_to_a_picture(made: Path, tmp_path: Path) -> None:
+def test_on_to_a_picture(run: Run, made: Path, tmp_path: Path) -> None:
     write_png(tmp_path / "plate.png", np.full((54, 96, 3), 0.3))
     run("transfer", made, "--to", tmp_path / "plate.png", "--light", "sun=60,10", "--out", tmp_path / "out", "--set",
         "sun.intensity=3")
@@ -58,7 +66,7 @@ def test_on_to_a_picture(made: Path, tmp_path: Path) -> None:
     assert "No light was found in" in problem["text"]
 
 
-def test_a_bare_flare_is_baked_as_its_run_is(made: Path, capture: Path, tmp_path: Path) -> None:
+def test_a_bare_flare_is_baked_as_its_run_is(run: Run, made: Path, capture: Path, tmp_path: Path) -> None:
     """With the capture's cameras: the same light, less what the run's scene hides, over black."""
     run("bake", made / "flare.flare", "--capture", capture, "--out", tmp_path / "flare", "--frames", "3-4", "--space",
         "acescg", "--float")
@@ -71,7 +79,7 @@ def test_a_bare_flare_is_baked_as_its_run_is(made: Path, capture: Path, tmp_path
     assert "--blend" in sentence
 
 
-def test_export(made: Path, tmp_path: Path) -> None:
+def test_export(run: Run, made: Path, tmp_path: Path) -> None:
     run("export", made, "--as", "ply", "--out", tmp_path / "ply", "--frames", "2")
     assert len(read_ply(tmp_path / "ply" / "flare.0002.ply")) == read(made / "flare.flare").count
     run("export", made, "--as", "preset", "--out", tmp_path / "lamp.json", "--frames", "2")
@@ -119,7 +127,7 @@ def blend(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_on_to_a_blend_its_objects_hide_the_light(made: Path, blend: Path, tmp_path: Path) -> None:
+def test_on_to_a_blend_its_objects_hide_the_light(run: Run, made: Path, blend: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     run("transfer", made, "--to", blend, "--out", out, "--frames", "1-9", "--jobs", "2", "--float")
     shot = Shot.read(out / "shot.1-9.json")
@@ -140,7 +148,7 @@ def test_on_to_a_blend_its_objects_hide_the_light(made: Path, blend: Path, tmp_p
     assert (tmp_path / "part" / "layers.0004.exr").read_bytes() == (out / "layers.0004.exr").read_bytes()
 
 
-def test_a_bare_flare_is_baked_for_a_blend(made: Path, blend: Path, tmp_path: Path) -> None:
+def test_a_bare_flare_is_baked_for_a_blend(run: Run, made: Path, blend: Path, tmp_path: Path) -> None:
     run("bake", made / "flare.flare", "--blend", blend, "--out", tmp_path / "out", "--frames", "1", "--lights", "sun")
     layers = read_layers(tmp_path / "out" / "layers.0001.exr")
     assert list(layers.flares) == ["sun"]
@@ -150,7 +158,7 @@ def test_a_bare_flare_is_baked_for_a_blend(made: Path, blend: Path, tmp_path: Pa
     assert "no object 'moon'" in problem["text"]
 
 
-def test_the_animated_camera_of_a_blend_is_a_capture(blend: Path, tmp_path: Path) -> None:
+def test_the_animated_camera_of_a_blend_is_a_capture(run: Run, blend: Path, tmp_path: Path) -> None:
     for frame in range(1, 5):
         write_png(tmp_path / "renders" / f"render.{frame:04d}.png", np.full((54, 96, 3), 0.1 * frame))
     run("solve", blend, "--plates", tmp_path / "renders", "--out", tmp_path / "capture")

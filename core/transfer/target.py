@@ -165,13 +165,14 @@ def _undistorted(capture: Capture, view: View) -> Callable[[], Picture]:
     return lambda: capture.frame(view)
 
 
-def of_cameras(capture: Capture, look: Look) -> Target:
+def of_cameras(capture: Capture, look: Look, scene: Path | None = None) -> Target:
     """A capture's cameras without its pictures, and the lights where the flare was learned: for a flare that is shown
-    in the scene it comes from."""
+    in the scene it comes from. scene: a 3DGS PLY that hides them."""
     placed = tuple(PlacedLight(light.name, light.name, light.xyz) for light in look.lights)
     views = {view.name: view for view in capture.views}
     return Target(tuple(TargetFrame(frame, ShotFrame(frame.number, str(Path(frame.view).parent),
-                                                     views[frame.view].camera, placed)) for frame in numbered(views)))
+                                                     views[frame.view].camera, placed)) for frame in numbered(views)),
+                  read_ply(scene) if scene else None)
 
 
 # ---- shots ----------------------------------------------------------------------------------------

@@ -33,6 +33,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
                              "where it was learned")
     parser.add_argument("--blend", type=Path, metavar="FILE",
                         help="of a .flare: a .blend, whose camera and lights it is shown for, behind what hides them")
+    parser.add_argument("--scene", type=Path, metavar="PLY", help="of a .flare: a 3DGS scene that hides its lights")
     parser.add_argument("--lights", metavar="NAMES", help="objects of the .blend that are lights (default: its lamps)")
     parser.add_argument("--shot", type=Path, help=argparse.SUPPRESS)
     space_options(parser)

@@ -164,7 +164,7 @@ def bake_flare(bake_words: argparse.Namespace, progress: Progress) -> dict[str, 
         words.capture = None
         return _made(words, "bake", target_of(words, words.flare), words.flare, None, progress)
     views = Capture.open(words.capture, need_frames=False)
-    return _made(words, "bake", of_cameras(views, read(words.flare)), words.flare, None, progress)
+    return _made(words, "bake", of_cameras(views, read(words.flare), words.scene), words.flare, None, progress)
 
 
 def source(words: argparse.Namespace) -> tuple[Path, list[Any] | None]:

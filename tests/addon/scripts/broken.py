@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -15,6 +16,8 @@ import bpy
 sys.path.insert(0, str(Path(__file__).parent))
 from start import NAME, empty, install, leave, part, refusal
 
+# Started in the background, a test run has SIGINT ignored, and so would the sham engine, which cannot undo that.
+signal.signal(signal.SIGINT, signal.SIG_DFL)
 package, capture, flare, out, sham = sys.argv[1:6]
 install(package)
 sys.path.remove(str(Path(__file__).parent))

@@ -23,6 +23,9 @@ from bpy.props import (
 
 from ..core.look import Edit
 
+# From 4.5 on a path that may be relative to the .blend has to say so; before, the word is unknown.
+PATH = {"PATH_SUPPORTS_BLEND_RELATIVE"} if bpy.app.version >= (4, 5, 0) else set()
+
 PRESETS = (
     ("draft", "Draft", "A first look in minutes: 1,500 iterations"),
     ("standard", "Standard", "Good for most shots: 3,000 iterations"),
@@ -122,7 +125,8 @@ class FITFLARE_PG_scene(bpy.types.PropertyGroup):
     """Everything of one scene."""
 
     capture: StringProperty(  # type: ignore[valid-type]
-        name="Capture", description="Folder with images/, a camera solve and lights.json", subtype="DIR_PATH")
+        name="Capture", description="Folder with images/, a camera solve and lights.json", subtype="DIR_PATH",
+        options=PATH)
     root: PointerProperty(  # type: ignore[valid-type]
         name="Root", description="The empty that carries the imported capture: move, turn or scale it as you like",
         type=bpy.types.Object, update=redraw)
@@ -134,7 +138,8 @@ class FITFLARE_PG_scene(bpy.types.PropertyGroup):
         update=_footage)
 
     run: StringProperty(  # type: ignore[valid-type]
-        name="Run", description="Folder of the fit: settings, checkpoint, preview and result", subtype="DIR_PATH")
+        name="Run", description="Folder of the fit: settings, checkpoint, preview and result", subtype="DIR_PATH",
+        options=PATH)
     preset: EnumProperty(  # type: ignore[valid-type]
         name="Quality", description="How long and how fine the fit is", items=PRESETS, default="draft")
     mode: EnumProperty(  # type: ignore[valid-type]
@@ -144,7 +149,8 @@ class FITFLARE_PG_scene(bpy.types.PropertyGroup):
         max=16384)
 
     flare: StringProperty(  # type: ignore[valid-type]
-        name="Flare", description="The .flare file that is shown", subtype="FILE_PATH", update=redraw)
+        name="Flare", description="The .flare file that is shown", subtype="FILE_PATH",
+        options=PATH, update=redraw)
     native: BoolProperty(  # type: ignore[valid-type]
         name="Of This Capture", description="The flare was learned from the imported capture, so its appearance "
         "follows the camera; in another scene it keeps its middle look", default=False, update=redraw)
@@ -158,7 +164,8 @@ class FITFLARE_PG_scene(bpy.types.PropertyGroup):
         default=True, update=redraw)
 
     layers: StringProperty(  # type: ignore[valid-type]
-        name="Layers", description="Folder for the EXR layers", subtype="DIR_PATH")
+        name="Layers", description="Folder for the EXR layers", subtype="DIR_PATH",
+        options=PATH)
     bake_range: EnumProperty(  # type: ignore[valid-type]
         name="Frames", description="Which frames are baked",
         items=(("scene", "Scene Range", "All frames of the scene"), ("current", "Current", "This frame alone"),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import json
 import os
+import shlex
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -29,6 +30,30 @@ class Blender:
         assert done.returncode == 0, f"{done.stdout[-2000:]}\n{done.stderr[-4000:]}"
         lines = [line for line in done.stdout.splitlines() if line.startswith(("{", "["))]
         return json.loads(lines[-1])
+
+
+@dataclass(frozen=True)
+class Program(Blender):
+    """A whole Blender, by the words that start it; the script sees the words that a module's would."""
+
+    words: tuple[str, ...] = ()
+
+    def run(self, script: Path, *words: object, user: Path) -> Any:
+        argv = [str(script), *map(str, words)]
+        code = f"import runpy, sys; sys.argv = {argv!r}; runpy.run_path({str(script)!r}, run_name='__main__')"
+        command = [*self.words, "-b", "--python-exit-code", "1", "--python-expr", code]
+        environment = {**os.environ, "BLENDER_USER_RESOURCES": str(user)}
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=240, check=False)
+        assert done.returncode == 0, f"{done.stdout[-2000:]}\n{done.stderr[-4000:]}"
+        lines = [line for line in done.stdout.splitlines() if line.startswith(("{", "["))]
+        return json.loads(lines[-1])
+
+
+def named() -> Blender | None:
+    """The Blender that FIT_FLARE_BLENDER names, a program or a whole command line."""
+    text = os.environ.get("FIT_FLARE_BLENDER", "")
+    words = [text] if Path(text).is_file() else shlex.split(text, posix=os.name != "nt")
+    return Program(Path(words[0]), tuple(words)) if words else None
 
 
 def newer() -> Blender | None:

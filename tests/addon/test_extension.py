@@ -46,8 +46,8 @@ def test_it_installs_and_registers(facts: Any) -> None:
     assert classes <= set(facts["classes"])
 
 
-def test_the_preferences_name_the_engine(facts: Any, blender: Blender) -> None:
-    assert facts["engine"] == ["", str(blender.python)]
+def test_the_preferences_name_the_engine(facts: Any) -> None:
+    assert facts["engine"] == ["", facts["python"]]
 
 
 def test_its_button_works_and_refuses_in_words(facts: Any) -> None:

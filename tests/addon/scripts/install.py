@@ -28,6 +28,7 @@ preferences = importlib.import_module(f"{NAME}.flare_addon.preferences")
 facts["engine"] = [preferences.engine_path()]
 bpy.context.preferences.addons[NAME].preferences.engine = sys.executable
 facts["engine"].append(preferences.engine_path())
+facts["python"] = sys.executable
 
 facts["set up"] = list(bpy.ops.fit_flare.set_up_compositor(directory=layers))
 scene = bpy.context.scene

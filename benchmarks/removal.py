@@ -33,7 +33,7 @@ from core.metrics.pictures import psnr  # noqa: E402
 from core.pictures import read_picture, write_exr, write_png  # noqa: E402
 from core.progress import Progress  # noqa: E402
 from core.removal.batch import remove_all  # noqa: E402
-from core.removal.inference import Remover  # noqa: E402
+from core.removal.inference import WORKING_SIZE, Remover  # noqa: E402
 from core.removal.plates import read_plate  # noqa: E402
 
 CASES = {"1920x1080 png": (1920, 1080), "4096x2160 exr": (4096, 2160)}
@@ -71,7 +71,7 @@ def speed(weights: Path | None) -> None:
             path = Path(folder) / f"plate.{name.split()[1]}"
             plate(path, width, height)
             figures: dict[str, dict[str, float]] = {}
-            for kind, size in (("working", 512), ("full", width)):
+            for kind, size in (("working", WORKING_SIZE), ("full", width)):
                 words = [sys.executable, __file__, "one", str(path), "--size", str(size)]
                 done = subprocess.run(words + (["--weights", str(weights)] if weights else []), capture_output=True,
                                       text=True, check=False)
@@ -156,7 +156,7 @@ def main() -> None:
     parser.add_argument("paths", type=Path, nargs="*")
     parser.add_argument("--capture", type=Path, default=ROOT / "sample_scenes" / "desk")
     parser.add_argument("--weights", type=Path)
-    parser.add_argument("--size", type=int, default=512)
+    parser.add_argument("--size", type=int, default=WORKING_SIZE)
     parser.add_argument("--sheet", type=Path)
     parser.add_argument("--count", type=int, default=400)
     words = parser.parse_args()

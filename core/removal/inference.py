@@ -27,9 +27,12 @@ from .weights import IN_THE_BOX, load
 Pixels = NDArray[np.float32]
 
 WORKING_SIZE = 192
-"""Long side that the network sees: about the largest that it was trained at."""
-LEAST = 0.004
-"""What a flare adds to display values, below which there is none: a code of 8 bit."""
+"""Long side that the network sees: what it was trained at, and reaches over."""
+LEAST = 0.015
+"""What a flare adds to display values, below which there is none."""
+SURE = 0.035
+"""Mean over the frame of what a flare adds, below which the network is not trusted at all; from twice as much on
+it is trusted whole. It tells small flares where there are none."""
 RADIUS, SMOOTHNESS = 2, 1e-3
 """Of the guided filter, at the working size."""
 ROWS = 256
@@ -90,6 +93,7 @@ class Remover:
         added = (told.gentle if self.keep_glare else told.flare).clamp(min=0)
         # A ramp from nothing to the whole, so that a faint flare has no rim.
         added = added * ((added - LEAST) / LEAST).clamp(0, 1)
+        added = added * ((added.mean() - SURE) / max(SURE, 1e-9)).clamp(0, 1)
         light = torch.where(added > 0, flare_light(frame, added), 0.0)
         return np.ascontiguousarray(light[0].permute(1, 2, 0).numpy())
 

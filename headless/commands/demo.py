@@ -14,6 +14,7 @@ from ...core.progress import Progress
 from ..command import Command, Step
 from . import compose, evaluate, fit
 from .lights import LIGHTS, with_lights
+from .remove import REMOVED, with_removed
 
 ROOT = Path(__file__).resolve().parents[2]
 SAMPLE = ROOT / "sample_scenes" / "desk"
@@ -26,6 +27,9 @@ def arguments(parser: argparse.ArgumentParser) -> None:
                         help="folder for everything (default build/demo in the repository)")
     parser.add_argument("--capture", type=Path, metavar="CAPTURE",
                         help="another capture than the sample, which is worked on in a copy, DIR/capture")
+    parser.add_argument("--remove", action="store_true",
+                        help="take the flares out of the frames as `remove` does, in place of the sample's exact "
+                             "flare-free frames")
     parser.add_argument("--model", choices=fit.MODELS, help="the flare's form, as of `fit`")
     parser.add_argument("--iterations", type=int, metavar="N", help="length of the fit (default: the preset's)")
     parser.add_argument("--preset", choices=("draft", "standard", "high"), default="draft",
@@ -45,7 +49,9 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
         raise CaptureError(f"There is no capture in {source}; the sample comes with the repository, "
                            "or name another with --capture.")
     began = time.monotonic()
-    capture = with_lights(Capture.open(words.capture or _copy_of_sample(out)), progress)
+    capture = with_lights(Capture.open(words.capture or _copy_of_sample(out, words.remove)), progress)
+    if words.remove or not capture.has_truth:
+        capture = with_removed(capture, progress)
     progress.say(f"{source.name}: {len(capture.views)} frames, {len(capture.lights)} lights. {_supervision(capture)}")
     given = {"model": words.model} if words.model else {}
     settings = preset(words.preset, iterations=words.iterations, **given)
@@ -60,13 +66,14 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     return {**result, "run": str(made.folder), "layers": str(out / "layers"), "sheet": str(out / SHEET)}
 
 
-def _copy_of_sample(out: Path) -> Path:
+def _copy_of_sample(out: Path, remove: bool) -> Path:
     """The sample's frames and cameras in DIR/capture, where what is found in them can be written; without its
-    lights, which are to be found."""
-    copy = out / "capture"
+    lights, which are to be found, and, to `remove`, without its flare-free frames, which are to be made."""
+    copy = out / ("capture-removal" if remove else "capture")
+    left_out = [LIGHTS, REMOVED] if remove else [LIGHTS]
     if not copy.exists():
         with atomic_folder(copy) as temporary:
-            shutil.copytree(SAMPLE, temporary, ignore=shutil.ignore_patterns(LIGHTS), dirs_exist_ok=True)
+            shutil.copytree(SAMPLE, temporary, ignore=shutil.ignore_patterns(*left_out), dirs_exist_ok=True)
     return copy
 
 

@@ -11,6 +11,7 @@ from ...core.progress import Progress
 from .. import jobs
 from ..command import Command, Step
 from .lights import with_lights
+from .remove import with_removed
 
 # Spelled out here, since the settings themselves can only be imported where torch is.
 PRESETS = ("draft", "standard", "high", "paper")
@@ -82,6 +83,8 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     capture = Capture.open(folder, cache_bytes=DECODED_BYTES)
     if settings.mode != "3dgs":
         capture = with_lights(capture, progress)
+    if settings.mode in ("default", "2d") and not settings.scene.frozen and not capture.has_truth:
+        capture = with_removed(capture, progress)
     done = fit(capture, settings, out, progress, resume=words.resume)
     progress.say(f"The run is in {done.folder}: see preview.png there, then `eval` and `bake` it.")
     return {"run": str(done.folder)}

@@ -45,7 +45,7 @@ def uniform_log(random: Random, low: float, high: float) -> float:
     return float(math.exp(random.uniform(math.log(low), math.log(high))))
 
 
-@njit(cache=True, fastmath=True)
+@njit(fastmath=True)  # not cached: a cache is of one name of this package, and the commands give it another
 def draw_ghost(layer: Array, centre: Array, radius: Array, clip_centre: Array, clip_radius: Array,
                second_centre: Array, second_radius: Array, weight: Array, blades: int, turn: float, roundness: float,
                soft: float, rim: float, rim_width: float, hollow: float, slope: float) -> None:

@@ -1,0 +1,93 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The commands remove, train-removal, eval-removal, and what fit makes of a capture without flare-free frames."""
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from fit_flare.core.pictures import read_picture, write_png
+from fit_flare.headless import cli
+
+SMALL = ("--set", "widths=[8]", "--set", "frames=1", "--set", "cells=20", "--set", "store=2", "--set", "steps=1",
+         "--set", "batch=20", "--set", "bank=2", "--set", "canvas=64", "--set", "longest=64")
+
+
+@pytest.fixture(scope="module")
+def backgrounds(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("backgrounds")
+    x, y = np.meshgrid(np.linspace(0, 0.6, 120), np.linspace(0.1, 0.5, 80))
+    for name in ("a.png", "b.png"):  # neither is one of those that are kept for tests
+        write_png(folder / name, np.stack([x, y, 0.5 - y], -1))
+    return folder
+
+
+def test_training_is_stopped_by_its_length_and_goes_on(backgrounds: Path, tmp_path: Path,
+                                                       capsys: pytest.CaptureFixture[str]) -> None:
+    torch.set_num_threads(1)
+    words = ["train-removal", "--backgrounds", str(backgrounds), "--out", str(tmp_path / "made"), *SMALL]
+    assert cli.main([*words, "--iterations", "2"]) == 0
+    assert cli.main([*words, "--iterations", "3"]) == 1
+    assert "--resume" in capsys.readouterr().err
+    assert cli.main([*words, "--iterations", "3", "--resume"]) == 0
+    weights = str(tmp_path / "made" / "removal.safetensors")
+    assert cli.main(["remove", str(backgrounds), "--out", str(tmp_path / "clean"), "--weights", weights]) == 0
+    assert {path.name for path in (tmp_path / "clean").iterdir()} == {"a.png", "b.png"}
+    assert cli.main(["train-removal", "--backgrounds", str(backgrounds), "--out", str(tmp_path / "x"),
+                     "--set", "speed=3"]) == 1
+    assert "speed" in capsys.readouterr().err
+
+
+def test_bad_plates_are_listed_at_the_end(backgrounds: Path, tmp_path: Path,
+                                          capfd: pytest.CaptureFixture[str]) -> None:
+    folder = tmp_path / "plates"
+    shutil.copytree(backgrounds, folder)
+    (folder / "0_bad.png").write_bytes(b"no picture")
+    assert cli.main(["remove", str(folder), "--out", str(tmp_path / "clean"), "--progress", "json"]) == 1
+    events = [json.loads(line) for line in capfd.readouterr().out.splitlines()]
+    assert events[-1]["type"] == "error"
+    assert "1 of 3 plates" in events[-1]["text"]
+    assert "0_bad.png" in events[-1]["text"]
+    assert len(list((tmp_path / "clean").iterdir())) == 2
+
+
+def test_diffusion_without_a_base_or_its_packages(backgrounds: Path, tmp_path: Path,
+                                                  capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["remove", str(backgrounds), "--out", str(tmp_path), "--model", "diffusion"]) == 1
+    told = capsys.readouterr().err
+    assert "--base" in told or "needs diffusers" in told
+
+
+def test_scores_of_pairs(tmp_path: Path, backgrounds: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for kind in ("input", "gt"):
+        shutil.copytree(backgrounds, tmp_path / "pairs" / kind)
+    assert cli.main(["eval-removal", str(tmp_path / "pairs"), "--out", str(tmp_path / "eval")]) == 0
+    assert "LPIPS is left out" in capsys.readouterr().err
+    scores = json.loads((tmp_path / "eval" / "eval.json").read_text(encoding="utf-8"))
+    assert scores["mean"]["count"] == 2
+    assert (tmp_path / "eval" / "worst.png").exists()
+    assert cli.main(["eval-removal", "--out", str(tmp_path)]) == 1
+    assert "--synthetic" in capsys.readouterr().err
+    assert cli.main(["eval-removal", "--out", str(tmp_path / "made"), "--synthetic", "1", "--size", "96", "64",
+                     "--backgrounds", str(backgrounds), "--all-backgrounds"]) == 0
+    assert len(json.loads((tmp_path / "made" / "eval.json").read_text(encoding="utf-8"))["categories"]) == 8
+
+
+def test_fit_takes_the_flare_out_where_nobody_did(capture: Path, tmp_path: Path,
+                                                  capsys: pytest.CaptureFixture[str]) -> None:
+    bare = tmp_path / "bare"
+    shutil.copytree(capture, bare, ignore=shutil.ignore_patterns("removed", "truth"))
+    words = ["fit", str(bare), "--out", str(tmp_path / "run"), "--iterations", "2"]
+    assert cli.main(words) == 0
+    assert "has no removed/" in capsys.readouterr().err
+    frames = {path.stem: path for path in (bare / "images").iterdir()}
+    made = {path.stem: path for path in (bare / "removed").iterdir()}
+    assert frames.keys() == made.keys()
+    for name, path in made.items():
+        assert (read_picture(path).pixels <= read_picture(frames[name]).pixels + 1e-6).all()
+    shutil.rmtree(tmp_path / "run")
+    assert cli.main(words) == 0
+    assert "has no removed/" not in capsys.readouterr().err, "they are kept"

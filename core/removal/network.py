@@ -9,8 +9,8 @@ is the part that is not the glow round the lights. The clean picture is the fram
 difference of the two in light: what the network does not call flare, the source of light among it, is the
 frame's own.
 
-Since it is the same in every cell, it can be trained on cells of thousands of frames at a time, which is what
-made it learn in minutes of one processor core what a U-Net did not in an hour.
+Since it is the same in every cell, it can be trained on cells of thousands of frames at a time, so that minutes
+of one processor core are enough to learn something.
 """
 from __future__ import annotations
 

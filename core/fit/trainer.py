@@ -34,6 +34,9 @@ from .rendering import render_flare
 from .settings import FitSettings
 
 TABLE = "table.weight"
+SOURCE = 0.02
+"""Radius about a light, of the frame's width, in which what is white is taken for the light itself."""
+WHITE = 0.97
 
 
 class Trainer:
@@ -112,8 +115,27 @@ class Trainer:
         """
         apart = self.iteration <= self.settings.apart * self.settings.iterations
         if apart and self.settings.mode in ("default", "2d") and targets.removed is not None:
-            return targets.removed
+            return self._without_sources(targets)
         return scene
+
+    def _without_sources(self, targets: Targets) -> Tensor:
+        """The flare-free frame with each light's own clipped disc taken out, where light is added.
+
+        Frame and flare-free frame are white there, so nothing would tell how bright the flare is in its middle, and
+        over another shot a hole would show. Black behind it, it has to be white by itself.
+        """
+        removed = targets.removed
+        assert removed is not None
+        if self.settings.blend != "add" or self.flare is None:
+            return removed
+        height, width = removed.shape[:2]
+        pixels, depth = targets.camera.project(self.flare.positions.numpy())
+        across, down = torch.arange(width) + 0.5, torch.arange(height)[:, None] + 0.5
+        source = torch.zeros(height, width, dtype=torch.bool)
+        for (x, y), z in zip(pixels.tolist(), depth.tolist(), strict=True):
+            if z > 0:
+                source |= (across - x).square() + (down - y).square() < (SOURCE * width) ** 2
+        return removed.masked_fill((source & (removed >= WHITE).all(-1))[..., None], 0)
 
     def _scene_target(self, targets: Targets, picture: Tensor, scene: Tensor) -> Tensor | None:
         if self.settings.mode in ("default", "2d"):

@@ -22,6 +22,7 @@ from core.capture import Capture
 from core.errors import Cancelled, CaptureError, FlareFileError, RunError
 from core.fit import FitSettings, Run, fit, preset
 from core.fit.settings import changed
+from core.fit.trainer import Trainer
 from core.progress import Progress
 from tests.core.flared import flared_capture
 
@@ -97,6 +98,19 @@ def test_a_fit_finds_the_flare(tmp_path: Path, capture: Capture) -> None:
     assert lines[-1]["iteration"] == 400
     assert lines[-1]["scene_loss"] < lines[0]["scene_loss"]
     assert lines[-1]["flare_gaussians"] > 60
+
+
+def test_the_light_itself_is_not_what_its_flare_lies_before(capture: Capture) -> None:
+    trainer = Trainer(capture, quick())
+    targets = trainer.frames.targets(trainer.views[0])
+    assert targets.removed is not None
+    (x, y), = targets.camera.project(capture.lights[0].xyz)[0].astype(int)
+    white = targets.removed.clone()
+    white[y, x] = white[0, 0] = 1
+    seen = trainer._without_sources(targets._replace(removed=white))
+    assert not seen[y, x].any()
+    white[y, x] = 0
+    assert torch.equal(seen, white)
 
 
 def test_stopped_and_resumed_is_bit_for_bit_the_unbroken_fit(tmp_path: Path, capture: Capture) -> None:

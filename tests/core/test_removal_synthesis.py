@@ -133,7 +133,7 @@ def test_pairs_are_brighter_with_flare_and_keep_the_light() -> None:
     for one in made:
         assert one.frame.shape == one.scene.shape == one.gentle.shape == (64, 96, 3)
         assert one.frame.min() >= 0 and one.frame.max() <= 1
-        assert (one.gentle - one.scene).min() > -0.03, "the glow adds; a camera's saturation may take a little of a channel"
+        assert (one.gentle - one.scene).min() > -0.03, "the glow adds, but for what saturation takes"
         assert (one.frame - one.scene).mean() > -0.01
     again = pairs.pair(np.random.default_rng(3), bank, backgrounds(), 96, 64, clean=0)
     assert np.array_equal(again.frame, made[3].frame)

@@ -24,7 +24,7 @@ State = dict[str, Any]
 
 def save(path: Path, state: Mapping[str, Any]) -> None:
     """Write a state atomically."""
-    from safetensors.torch import save_file
+    from safetensors.torch import save as packed
 
     tensors: dict[str, Tensor] = {}
     values: dict[str, Any] = {}
@@ -43,7 +43,8 @@ def save(path: Path, state: Mapping[str, Any]) -> None:
         tensors[name] = tensor
     description = json.dumps({"version": VERSION, "values": values, "shapes": shapes})
     with atomic_path(path) as temporary:
-        save_file(tensors, str(temporary), {"checkpoint": description})
+        # As bytes: its own writer makes a temporary file of another name, which a kill would leave behind.
+        temporary.write_bytes(packed(tensors, {"checkpoint": description}))
 
 
 def load(path: Path) -> State:

@@ -58,7 +58,7 @@ class FlareFile:
 
 def save(path: Path | str, flare: FlareFile) -> None:
     """Write a .flare atomically."""
-    from safetensors.torch import save_file
+    from safetensors.torch import save as packed
 
     forms = [asdict(light.form) for light in flare.model.lights]
     lights = [
@@ -69,7 +69,8 @@ def save(path: Path | str, flare: FlareFile) -> None:
     description = {"version": VERSION, "blend": flare.blend, "lights": lights, "camera": asdict(flare.camera),
                    "elements": flare.elements, "seen": flare.seen, "licence": flare.licence, "notes": flare.notes}
     with atomic_path(path) as temporary:
-        save_file(_packed(flare.model), str(temporary), {_KEY: json.dumps(description)})
+        # As bytes: its own writer makes a temporary file of another name, which a kill would leave behind.
+        temporary.write_bytes(packed(_packed(flare.model), {_KEY: json.dumps(description)}))
 
 
 def load(path: Path | str) -> FlareFile:

@@ -19,10 +19,12 @@ IN_THE_BOX = Path(__file__).parent / "box" / "removal.safetensors"
 
 def write(path: Path | str, tensors: Mapping[str, Tensor], about: Mapping[str, str]) -> None:
     """Tensors and text about them, whole or not at all."""
-    from safetensors.torch import save_file
+    from safetensors.torch import save as packed
 
     with atomic_path(path) as temporary:
-        save_file({name: value.cpu().contiguous() for name, value in tensors.items()}, str(temporary), dict(about))
+        # As bytes: its own writer makes a temporary file of another name, which a kill would leave behind.
+        whole = {name: value.cpu().contiguous() for name, value in tensors.items()}
+        temporary.write_bytes(packed(whole, dict(about)))
 
 
 def read(path: Path | str) -> tuple[dict[str, Tensor], dict[str, str]]:

@@ -35,16 +35,18 @@ class OfCamera(Protocol):
 
 
 class FrameRenderer(OfCamera, Protocol):
-    """What renders one frame. fingerprint: changes whenever this frame's picture would, beyond the whole's.
-    finished: its layers, already in the space asked for, as they are to be written."""
+    """What renders one frame. fingerprint: changes whenever this frame's picture would, beyond the whole's; empty
+    where nothing is this frame's alone. finished: its layers, already in the space asked for, as they are to be
+    written."""
 
     @property
     def fingerprint(self) -> str: ...
     def finished(self, layers: FrameLayers, camera: Camera) -> FrameLayers: ...
 
 
-class Renderer(OfCamera, Protocol):
-    """A fitted run, as `bake` uses it. `fingerprint` changes whenever its pictures would; elements: names by light."""
+class Sequenced(Protocol):
+    """What a folder of frames is made from. `fingerprint` changes whenever all pictures would; elements: names by
+    light."""
 
     @property
     def fingerprint(self) -> str: ...
@@ -52,6 +54,24 @@ class Renderer(OfCamera, Protocol):
     def lights(self) -> Sequence[str]: ...
     @property
     def elements(self) -> Mapping[str, Sequence[str]]: ...
+
+
+class Renderer(OfCamera, Sequenced, Protocol):
+    """A fitted run, as `bake` uses it: a frame is a matter of its camera alone."""
+
+
+@dataclass(frozen=True)
+class _AnyFrame:
+    """A frame of such a renderer."""
+
+    renderer: Renderer
+    fingerprint: str = ""
+
+    def render(self, camera: Camera, edits: LookEdits | None = None) -> Rendering:
+        return self.renderer.render(camera) if edits is None else self.renderer.render(camera, edits)
+
+    def finished(self, layers: FrameLayers, camera: Camera) -> FrameLayers:  # noqa: ARG002 - nothing to add
+        return layers
 
 
 @dataclass(frozen=True)
@@ -80,10 +100,16 @@ class BakeSettings:
 
 def bake(renderer: Renderer, frames: Sequence[Frame], cameras: Mapping[str, Camera], out: Path | str,
          settings: BakeSettings | None = None, progress: Progress | None = None, *,
-         overwrite: bool = False, of_frame: Callable[[Frame], FrameRenderer] | None = None) -> dict[str, Any]:
-    """Write the layers of `frames` (cameras by the view's name) under `out`; returns the content of bake.json.
+         overwrite: bool = False) -> dict[str, Any]:
+    """Write the layers of `frames` (cameras by the view's name) under `out`; see `bake_frames`."""
+    any_frame = _AnyFrame(renderer)
+    return bake_frames(renderer, frames, cameras, out, lambda _: any_frame, settings, progress, overwrite=overwrite)
 
-    of_frame: what renders a frame, where that is more than a matter of its camera.
+
+def bake_frames(source: Sequenced, frames: Sequence[Frame], cameras: Mapping[str, Camera], out: Path | str,
+                of_frame: Callable[[Frame], FrameRenderer], settings: BakeSettings | None = None,
+                progress: Progress | None = None, *, overwrite: bool = False) -> dict[str, Any]:
+    """Write the layers of `frames`, each by its own renderer, under `out`; returns the content of bake.json.
 
     Frames that an earlier bake with the same settings finished are left as they are, and stay in the record.
     Raises RunError where `out` holds layers made with other settings, unless `overwrite`; SettingsError for
@@ -91,8 +117,8 @@ def bake(renderer: Renderer, frames: Sequence[Frame], cameras: Mapping[str, Came
     """
     settings, progress, out = settings or BakeSettings(), progress or Progress(), Path(out)
     keyed = settings.keyed.and_always(settings.edits)
-    edits = {frame.number: keyed.at(frame.number, renderer.lights, renderer.elements) for frame in frames}
-    made_from = {"renderer": renderer.fingerprint, "half": settings.half, "edits": list(keyed.always),
+    edits = {frame.number: keyed.at(frame.number, source.lights, source.elements) for frame in frames}
+    made_from = {"renderer": source.fingerprint, "half": settings.half, "edits": list(keyed.always),
                  "size": [settings.width, settings.height]}
     space = colour_space(settings.space, settings.config)
     if settings.space != "linear" or settings.config is not None:
@@ -100,22 +126,21 @@ def bake(renderer: Renderer, frames: Sequence[Frame], cameras: Mapping[str, Came
     if keyed.frames:
         made_from["keyed"] = keyed.described()["frames"]
     _begin(out, made_from, overwrite)
-    names = layer_names(renderer.lights)
+    names = layer_names(source.lights)
 
     def notes(frame: Frame) -> dict[str, Any]:
         """What the frame's header is to say."""
-        own = {"inputs": of_frame(frame).fingerprint} if of_frame is not None else {}
+        inputs = of_frame(frame).fingerprint
+        own = {"inputs": inputs} if inputs else {}
         return {"view": frame.view, "frame": frame.number, **own, **made_from}
 
     done = [frame for frame in frames if _is_made(out / frame.file, notes(frame))]
     record = _add_to_record(out, made_from, names, [_entry(out, frame) for frame in done])
     progress.stage("bake", len(frames), len(done))
+
     def made(frame: Frame) -> FrameLayers:
-        camera = settings.scaled(cameras[frame.view])
-        if of_frame is None:
-            return _layers(renderer, camera, edits[frame.number], renderer.lights).in_space(space)
-        one = of_frame(frame)
-        return one.finished(_layers(one, camera, edits[frame.number], renderer.lights).in_space(space), camera)
+        camera, one = settings.scaled(cameras[frame.view]), of_frame(frame)
+        return one.finished(_layers(one, camera, edits[frame.number], source.lights).in_space(space), camera)
 
     for frame in frames:
         if frame in done:

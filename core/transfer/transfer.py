@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ..bake.bake import BakeSettings, bake
+from ..bake.bake import BakeSettings, bake_frames
 from ..bake.frames import Frame
 from ..bake.layers import FrameLayers
 from ..capture import Camera
@@ -109,10 +109,6 @@ class Transfer:
         names = self.look.element_names
         return {light.name: names.get(light.source, []) for one in self.target.frames for light in one.shot.lights}
 
-    def render(self, camera: Camera, edits: LookEdits | None = None) -> _Rendering:
-        """Not for a camera alone: see `of_frame`."""
-        raise NotImplementedError("a transfer renders frames")
-
     # ---- flares -----------------------------------------------------------------------------------
 
     def flares(self, index: int, camera: Camera, edits: LookEdits | None = None) -> dict[str, Splats]:
@@ -190,8 +186,8 @@ class Transfer:
         cameras = {one.frame.view: one.shot.camera for one in self.target.frames}
         if settings.half and self._has_full_float():
             settings = replace(settings, half=False)
-        return bake(self, frames, cameras, out, settings, progress, overwrite=overwrite,
-                    of_frame=lambda frame: self.of_frame(frame, space, Path(out) / FRAMES))
+        return bake_frames(self, frames, cameras, out, lambda frame: self.of_frame(frame, space, Path(out) / FRAMES),
+                           settings, progress, overwrite=overwrite)
 
     def _has_full_float(self) -> bool:
         first = next((one for one in self.target.frames if one.plate is not None), None)

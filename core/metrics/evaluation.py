@@ -3,8 +3,9 @@
 
 The flare of a view is |composite - scene| in display space, against |frame - reference scene|, as the
 paper measures it. Where the exact flare is known, `flare_linear` compares the linear layer itself, with
-the pixels that the frame clipped left out, since nothing can be learned from those. PSNR flatters faint
-flares, so each flare score stands beside that of an empty flare.
+the pixels that the camera clipped left out, since nothing can be learned from those: exact layers tell which
+they are, where the frame's codes no longer do (noise and JPEG leave a clipped pixel just below white). PSNR
+flatters faint flares, so each flare score stands beside that of an empty flare.
 """
 from __future__ import annotations
 
@@ -61,7 +62,7 @@ def evaluate(renderer: Renderer, capture: Capture, cameras: Mapping[View, Camera
         scored.append((view.name, score_view(
             composite, rendering.scene, capture.frame(view, camera.size), clean(view, camera.size),
             capture.truth_flare(view, camera.size) if reference == "truth" else None,
-            clipped(capture.frame(view), camera.size))))
+            hidden(capture, view, camera.size))))
         progress.advance()
     size = next(iter(cameras.values())).size if cameras else (0, 0)
     return summary(reference, scored, size)
@@ -95,20 +96,39 @@ def score_view(composite: Array, scene: Array, frame: Picture, scene_reference: 
     return scores
 
 
+def hidden(capture: Capture, view: View, size: tuple[int, int] | None = None) -> NDArray[np.bool_]:
+    """(height, width): where the camera clipped and the linear flare is not judged.
+
+    Pixels that carry the frame's brightest code and, where the exact layers are known, all those in which scene and
+    flare together reach white in any channel. size: (width, height) of the result, the camera's by default.
+    """
+    frame, scene, flare = capture.frame(view), capture.truth_scene(view), capture.truth_flare(view)
+    white = clipped(frame)
+    if scene is not None and flare is not None and frame.encoding != "linear":
+        reached = (scene.linear() + flare.linear() >= 1).any(-1)
+        white = white | reached if reached.shape == white.shape else white
+    return _reduced(white, frame.size, size)
+
+
 def clipped(frame: Picture, size: tuple[int, int] | None = None) -> NDArray[np.bool_]:
     """(height, width): where a frame's brightest code hides how bright it was. A linear frame hides nothing.
 
     size: (width, height) of the result, where the frame is larger: pixels with a clipped one among theirs.
     """
     if frame.encoding == "linear":
-        hidden = np.zeros(frame.pixels.shape[:2], np.float32)
+        white = np.zeros(frame.pixels.shape[:2], np.bool_)
     else:
-        hidden = (frame.pixels >= _CLIPPED).any(-1).astype(np.float32)
-    if size is not None and size != frame.size:
-        import cv2
+        white = (frame.pixels >= _CLIPPED).any(-1)
+    return _reduced(white, frame.size, size)
 
-        hidden = np.asarray(cv2.resize(hidden, size, interpolation=cv2.INTER_AREA), np.float32)
-    return hidden > 0
+
+def _reduced(mask: NDArray[np.bool_], full: tuple[int, int], size: tuple[int, int] | None) -> NDArray[np.bool_]:
+    """A mask at another size: pixels with a set one among theirs."""
+    if size is None or size == full:
+        return mask
+    import cv2
+
+    return np.asarray(cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA), np.float32) > 0
 
 
 def _display(linear: Array) -> Array:

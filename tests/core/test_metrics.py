@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from core.errors import SettingsError
-from core.metrics.evaluation import clipped, score_view, summary, table
+from core.metrics.evaluation import clipped, hidden, score_view, summary, table
 from core.metrics.pictures import flip, has_flip, psnr, relative_l2, ssim
 from core.pictures import Picture, srgb_from_linear
 
@@ -152,6 +152,32 @@ def test_clipped_pixels_do_not_count_against_the_linear_flare() -> None:
     assert not clipped(Picture(scene + truth, "linear")).any()
     scores = score_view(scene + flare, scene, frame, Picture(srgb_from_linear(scene), "srgb"), Picture(truth, "linear"))
     assert scores["flare_linear"]["relative_l2"] == pytest.approx(0, abs=1e-6)
+
+
+def test_the_exact_layers_tell_what_noise_hides_of_clipping() -> None:
+    scene, flare = layers()
+    truth = flare.copy()
+    truth[3, 4] = 50
+    frame = np.clip(srgb_from_linear(scene + truth), 0, 1)
+    frame[3, 4] = 0.97  # clipped by the camera, less than white after JPEG
+
+    class Known:
+        def frame(self, *_: object) -> Picture:
+            return Picture(frame, "srgb")
+
+        def truth_scene(self, *_: object) -> Picture | None:
+            return Picture(scene, "linear")
+
+        def truth_flare(self, *_: object) -> Picture | None:
+            return Picture(truth, "linear")
+
+    class Unknown(Known):
+        def truth_flare(self, *_: object) -> Picture | None:
+            return None
+
+    assert not hidden(Unknown(), None).any()
+    assert np.argwhere(hidden(Known(), None)).tolist() == [[3, 4]]
+    assert hidden(Known(), None, (frame.shape[1] // 2, frame.shape[0] // 2)).sum() == 1
 
 
 def test_the_summary_is_the_mean_and_json() -> None:

@@ -12,33 +12,42 @@ Studies:
                   two corrections delta_l and delta_f
   known           the flare alone, over the exact scene: what the representation itself can do
   extrapolation   our form, with a stretch of the path held out instead of every n-th view
+  reconstruction  the paper's table 3: 3DGS trained on the frames, on the frames with a bilateral grid for each, and on
+                  flare-free frames, judged on exact flare-free views; the scene of our form beside them
 
-Each fit has a folder of its own under --out; finished ones are not repeated, broken ones go on where they were.
+Each fit has a folder of its own under --out, named after its settings: finished ones are not repeated, not for another
+study either, and broken ones go on where they were.
 """
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks import report
+from benchmarks.bilateral import GradedScene
+from benchmarks.hidden_lights import hidden_flare
 from benchmarks.known_scene import KnownScene, score
-from core.capture import Capture, Light
+from core.capture import Camera, Capture, Light
 from core.files import write_json
 from core.fit import fit
 from core.fit.frames import Frames
-from core.fit.run import Run
+from core.fit.rendering import render
+from core.fit.run import Run, ViewLayers
 from core.fit.settings import FitSettings, changed, preset
+from core.gaussians.scene import SceneGaussians
 from core.metrics.evaluation import evaluate
 from core.progress import Progress, TerminalProgress
 
@@ -46,31 +55,48 @@ DOCUMENT = report.ROOT / "docs" / "ablations.md"
 SAMPLE = report.ROOT / "sample_scenes" / "desk"
 SIGMAS = (0.0, 0.1, 0.5, 1.0)
 SCORES = "scores.json"
+Length = Callable[..., FitSettings]
+"""A preset of a given number of iterations, for which form and mode are chosen."""
+Results = dict[str, dict[str, dict[str, dict[str, Any]]]]
+"""Scores by study, by row, by capture."""
+STUDIES = ("form", "comparison", "robustness", "known", "extrapolation", "reconstruction")
 
 
 @dataclass(frozen=True)
 class Experiment:
-    """One fit of one capture. `lights`: displaced by Gaussian noise of this sigma, scene units."""
+    """One fit of each capture.
+
+    displacement: of the lights, by Gaussian noise of this sigma, scene units. known_scene: the flare alone, over the
+    exact scene. stretch: a stretch of the path is held out. frames: what the scene of a fit without flare is trained
+    on, as filmed, as filmed with a bilateral grid for each, or without flare.
+    """
 
     study: str
     name: str
     settings: FitSettings
     displacement: float = 0.0
     known_scene: bool = False
+    stretch: bool = False
+    frames: Literal["filmed", "graded", "removed"] = "filmed"
+
+    def key(self) -> str:
+        """The same for two experiments that are the same fit."""
+        made = {**asdict(self), "study": "", "name": ""}
+        return hashlib.sha256(json.dumps(made, sort_keys=True).encode()).hexdigest()[:16]
 
 
-def ours(length: str, **changes: Any) -> FitSettings:
-    """Our form at a preset's length, with settings changed by dotted name (`__` for the dot)."""
-    return changed(preset(length), {name.replace("__", "."): value for name, value in changes.items()})  # type: ignore[arg-type]
+def ours(length: Length, **changes: Any) -> FitSettings:
+    """Our form at this length, with settings changed by dotted name (`__` for the dot)."""
+    return changed(length(), {name.replace("__", "."): value for name, value in changes.items()})
 
 
-def papers(length: str, mode: str = "default", **changes: Any) -> FitSettings:
+def papers(length: Length, mode: str = "default", **changes: Any) -> FitSettings:
     """The paper's form and loss at the same length, with the same rates."""
-    made = preset(length, model="paper", mode=mode)  # type: ignore[arg-type]
+    made = length(model="paper", mode=mode)
     return changed(made, {name.replace("__", "."): value for name, value in changes.items()})
 
 
-def experiments(length: str) -> list[Experiment]:
+def experiments(length: Length) -> list[Experiment]:
     """All studies."""
     def of(study: str, variants: dict[str, FitSettings]) -> list[Experiment]:
         return [Experiment(study, name, settings) for name, settings in variants.items()]
@@ -105,7 +131,14 @@ def experiments(length: str) -> list[Experiment]:
     alone = changed(ours(length), {"flare.count": 900, "flare.occlusion": False})
     made += [Experiment("known", "ours", alone, known_scene=True),
              Experiment("known", "the paper's", papers(length, flare__count=900), known_scene=True)]
-    made += of("extrapolation", {"every n-th view": ours(length), "a stretch": ours(length)})
+    made += [Experiment("extrapolation", "every n-th view", ours(length)),
+             Experiment("extrapolation", "a stretch", ours(length), stretch=True),
+             Experiment("extrapolation", "a stretch, the paper's", papers(length), stretch=True)]
+    plain = papers(length, "3dgs")
+    made += [Experiment("reconstruction", "3dgs on the frames", plain),
+             Experiment("reconstruction", "3dgs on the frames, bilateral grids", plain, frames="graded"),
+             Experiment("reconstruction", "3dgs on flare-free frames", plain, frames="removed"),
+             Experiment("reconstruction", "our joint fit", ours(length))]
     return made
 
 
@@ -133,17 +166,20 @@ def run(experiment: Experiment, folder: Path, capture: Path, width: int, progres
         return found
     opened = displaced(Capture.open(capture), experiment.displacement)
     settings = replace(experiment.settings, width=width)
-    if experiment.name == "a stretch":
-        split = folder.parent / "stretch.json"
+    if experiment.stretch:
+        split = folder / "stretch.json"
         write_json(split, {"test": stretch(opened)})
         settings = replace(settings, holdout=str(split))
     began = time.monotonic()
     if experiment.known_scene:
         scores = _known(opened, settings, progress)
+    elif experiment.frames == "graded":
+        scores = _graded(opened, settings, progress)
     else:
-        made = fit(opened, settings, folder / "run", progress, resume=True)
-        scores = _scores(made, capture, progress)
-    scores["seconds"] = round(time.monotonic() - began)
+        source = _without_flare(capture, folder / "capture") if experiment.frames == "removed" else None
+        made = fit(opened if source is None else Capture.open(source), settings, folder / "run", progress, resume=True)
+        scores = _scores(made, capture, settings, progress)
+    scores["seconds"], scores["commit"] = round(time.monotonic() - began), _commit()
     write_json(file, scores)
     return scores
 
@@ -157,13 +193,53 @@ def _known(capture: Capture, settings: FitSettings, progress: Progress) -> dict[
     return score(trainer, capture.split(settings.holdout)[1])
 
 
-def _scores(made: Run, folder: Path, progress: Progress) -> dict[str, Any]:
-    """Means over the held-out views, against the capture as it is: lights are displaced for the fit alone."""
+@dataclass(frozen=True)
+class _SceneAlone:
+    """A scene without flare, as `evaluate` renders it."""
+
+    scene: SceneGaussians
+
+    def render(self, camera: Camera) -> ViewLayers:
+        view = render(self.scene, None, "over", camera)
+        return ViewLayers(view.layers.scene.numpy(), {}, view.scene.depth.numpy())
+
+
+def _graded(capture: Capture, settings: FitSettings, progress: Progress) -> dict[str, Any]:
+    trainer = GradedScene(capture, settings)
+    progress.stage("scene with grids", settings.iterations)
+    for _ in range(settings.iterations):
+        trainer.step()
+        progress.advance()
+    return _scores(_SceneAlone(trainer.scene), capture.folder, settings, progress)
+
+
+def _without_flare(capture: Path, folder: Path) -> Path:
+    """A capture whose frames are the flare-free ones of another."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, origin in (("images", "removed"), ("sparse", "sparse"), ("split.json", "split.json")):
+        link = folder / name
+        if not link.is_symlink() and (capture / origin).exists():
+            link.symlink_to((capture / origin).resolve())
+    return folder
+
+
+def _scores(made: Run | _SceneAlone, folder: Path, settings: FitSettings, progress: Progress) -> dict[str, Any]:
+    """Means over the held-out views, against the capture as it is: lights are displaced for the fit alone.
+
+    `hidden`: see `hidden_lights`, over all views, since few of those held out hide a light.
+    """
     capture = Capture.open(folder)
-    held_out = capture.split(made.settings.holdout)[1]
-    frames = Frames(capture, made.settings.width)
+    held_out = capture.split(settings.holdout)[1]
+    frames = Frames(capture, settings.width)
     found = evaluate(made, capture, {view: frames.camera(view) for view in held_out}, progress)
-    return {layer: part for layer, part in found.items() if isinstance(part, dict)}
+    scores: dict[str, Any] = {layer: part for layer, part in found.items() if isinstance(part, dict)}
+    if settings.mode == "3dgs":  # what it calls a flare is nothing at all
+        scores = {layer: part for layer, part in scores.items() if not layer.startswith("flare")}
+    else:
+        hidden = hidden_flare(made, folder, {view: frames.camera(view) for view in capture.views})
+        if hidden is not None:
+            scores["hidden"] = hidden
+    return scores
 
 
 # ---- tables ---------------------------------------------------------------------------------------
@@ -172,7 +248,7 @@ COLUMNS: tuple[tuple[str, str, str], ...] = (
     ("flare", "psnr", "flare, dB"), ("flare", "ssim", "SSIM"), ("flare", "flip", "FLIP"),
     ("flare_linear", "psnr", "linear flare, dB"), ("flare_linear", "relative_l2", "rel. L2"),
     ("scene", "psnr", "scene, dB"), ("scene", "ssim", "SSIM"), ("composite", "psnr", "composite, dB"),
-    ("composite", "ssim", "SSIM"),
+    ("composite", "ssim", "SSIM"), ("hidden", "residual", "hidden / visible"),
 )  # fmt: skip
 
 
@@ -181,32 +257,53 @@ def _cell(values: Iterable[float | None], digits: int) -> str:
     return f"{np.mean(known):.{digits}f}" if known else "–"
 
 
-def tables(results: dict[str, dict[str, list[dict[str, Any]]]]) -> str:
-    """A table for each study; figures are means over the captures."""
+def tables(results: Results) -> str:
+    """A table for each study; figures are means over the captures that all of its rows have."""
     parts = []
     for study, rows in results.items():
-        shown = [column for column in COLUMNS
-                 if any(value.get(column[0], {}).get(column[1]) is not None for row in rows.values() for value in row)]
+        names = shared(rows)
+        scores = {name: [row[capture] for capture in names] for name, row in rows.items()}
+        known = [one for row in scores.values() for one in row]
+        shown = [(layer, key, title) for layer, key, title in COLUMNS
+                 if any(one.get(layer, {}).get(key) is not None for one in known)]
         lines = []
-        for name, scores in rows.items():
-            cells = [_cell((one.get(layer, {}).get(key) for one in scores), 2 if key == "psnr" else 3)
+        for name, row in scores.items():
+            cells = [_cell((one.get(layer, {}).get(key) for one in row), 2 if key == "psnr" else 3)
                      for layer, key, _ in shown]
-            lines.append([name, *cells, _cell((one.get("seconds") for one in scores), 0)])
-        parts.append(f"### {study}\n\n" + report.table([study, *[title for *_, title in shown], "s"], lines))
+            lines.append([name, *cells, _cell((one.get("seconds") for one in row), 0)])
+        table = report.table([study, *[title for *_, title in shown], "s"], lines)
+        parts.append(f"### {study}\n\nMeans over {', '.join(names)}.\n\n{table}")
     return "\n\n".join(parts)
 
 
-def plot(results: dict[str, dict[str, list[dict[str, Any]]]], picture: Path) -> None:
+def shared(rows: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """Names of the captures that every row of a study has, in the first row's order."""
+    first, *others = rows.values()
+    return [name for name in first if all(name in other for other in others)]
+
+
+def by_capture(rows: Mapping[str, Mapping[str, dict[str, Any]]]) -> str:
+    """A table of one study, capture by capture: the flare in dB, and the linear flare's relative error."""
+    names = shared(rows)
+    lines = []
+    for title, row in rows.items():
+        cells = [(row[name].get("flare", {}).get("psnr"), row[name].get("flare_linear", {}).get("relative_l2"))
+                 for name in names]
+        lines.append([title, *[f"{_cell([decibels], 2)}; {_cell([error], 3)}" for decibels, error in cells]])
+    return report.table(["flare, dB; rel. L2", *names], lines)
+
+
+def plot(rows: Mapping[str, Mapping[str, dict[str, Any]]], picture: Path) -> None:
     """The flare's PSNR against the displacement of its light."""
     import matplotlib
 
     matplotlib.use("Agg")
     from matplotlib import pyplot
 
-    rows = results.get("robustness", {})
+    names = shared(rows)
     figure, axes = pyplot.subplots(figsize=(6, 3.6), layout="constrained")
     for corrections in dict.fromkeys(name.split(",")[0] for name in rows):
-        points = [(float(name.rsplit(" ", 1)[1]), np.mean([one["flare"]["psnr"] for one in scores]))
+        points = [(float(name.rsplit(" ", 1)[1]), np.mean([scores[one]["flare"]["psnr"] for one in names]))
                   for name, scores in rows.items() if name.split(",")[0] == corrections]
         axes.plot(*zip(*points, strict=True), "o-", label=corrections)
     axes.set(xlabel="displacement of the lights, sigma in scene units", ylabel="flare, dB")
@@ -222,15 +319,18 @@ def _commit() -> str:
     return done.stdout.strip() or "unknown"
 
 
-def write(results: dict[str, dict[str, list[dict[str, Any]]]], captures: Sequence[Path], width: int, length: str,
-          document: Path) -> str:
+def write(results: Results, length: str, document: Path) -> str:
     """The tables, with what they were made of, into the document; returns them."""
-    head = (f"Means over {', '.join(path.name for path in captures)}; preset {length}, width {width or 'as filmed'}, "
-            f"commit {_commit()}. {report.conditions()}")
+    commits = {one["commit"]: None for rows in results.values() for row in rows.values() for one in row.values()}
+    head = (f"{length}; fitted at commit {', '.join(commits)}; times are of a machine with other work on it. "
+            f"{report.conditions()}")
     text = f"## Figures\n\n{head}\n\n{tables(results)}"
+    for study in ("form", "known", "extrapolation"):
+        if study in results and len(shared(results[study])) > 1:
+            text += f"\n\n### {study}, by capture\n\n" + by_capture(results[study])
     if "robustness" in results:
         picture = document.parent / "ablations-robustness.png"
-        plot(results, picture)
+        plot(results["robustness"], picture)
         text += f"\n\n![The flare against the displacement of its light]({picture.name})"
     report.write_section(document, "ablations", text)
     return text
@@ -240,25 +340,34 @@ def main() -> None:
     """See the module's head."""
     parser = argparse.ArgumentParser(description="Takes the model's choices away one by one.")
     parser.add_argument("--captures", nargs="+", type=Path, default=[SAMPLE])
-    parser.add_argument("--only", nargs="+", choices=("form", "comparison", "robustness", "known", "extrapolation"))
+    parser.add_argument("--only", nargs="+", choices=STUDIES)
     parser.add_argument("--variants", nargs="+", metavar="NAME", help="of the studies' rows; all by default")
     parser.add_argument("--preset", choices=("draft", "standard", "high"), default="draft")
+    parser.add_argument("--iterations", type=int, help="of each fit, with every schedule stretched to it")
     parser.add_argument("--width", type=int, default=240, help="of the frames; 0: as filmed (default 240)")
+    parser.add_argument("--finished", action="store_true", help="write down what is finished, and fit nothing")
     parser.add_argument("--out", type=Path, default=report.ROOT / "build" / "ablations")
     parser.add_argument("--document", type=Path, default=DOCUMENT)
     words = parser.parse_args()
-    results: dict[str, dict[str, list[dict[str, Any]]]] = {}
+    results: Results = {}
     wanted: Callable[[Experiment], bool] = lambda one: (  # noqa: E731
         (not words.only or one.study in words.only) and (not words.variants or one.name in words.variants))
+    length = partial(preset, words.preset, iterations=words.iterations)
+    made = length()
     progress = TerminalProgress()
-    for experiment in filter(wanted, experiments(words.preset)):
+    for experiment in filter(wanted, experiments(length)):
         for capture in words.captures:
+            root = words.out / f"{words.preset}-{made.iterations}-{words.width}"
+            folder = root / experiment.key() / capture.name
+            if words.finished and not (folder / SCORES).is_file():
+                continue
             progress.say(f"{experiment.study}: {experiment.name}, {capture.name}")
-            folder = words.out / f"{words.preset}-{words.width}" / experiment.study / experiment.name / capture.name
             scores = run(experiment, folder, capture.resolve(), words.width, progress)
-            results.setdefault(experiment.study, {}).setdefault(experiment.name, []).append(scores)
+            results.setdefault(experiment.study, {}).setdefault(experiment.name, {})[capture.name] = scores
     progress.close()
-    sys.stdout.write(write(results, words.captures, words.width, words.preset, words.document) + "\n")
+    size = f"{words.width} pixels wide" if words.width else "at the size of the frames"
+    text = write(results, f"Preset {words.preset} of {made.iterations} iterations, {size}", words.document)
+    sys.stdout.write(text + "\n")
 
 
 if __name__ == "__main__":

@@ -14,9 +14,8 @@ from core.fit.rendering import render_flare
 from core.fit.trainer import Trainer
 from core.flare.compositing import composite, decode
 from core.gaussians.loss import l1_ssim
-from core.metrics.pictures import psnr
-
-CLIPPED = 254.5 / 255
+from core.metrics.evaluation import hidden
+from core.metrics.pictures import psnr, relative_l2
 
 
 class KnownScene(Trainer):
@@ -44,8 +43,8 @@ class KnownScene(Trainer):
 
 @torch.no_grad()
 def score(trainer: Trainer, views: Sequence[View]) -> dict[str, Any]:
-    """Means over views: the flare as |composite - scene| in display space, and in linear light where the frame is
-    not clipped (light added alone: what covers has no layer over an unknown scene)."""
+    """Means over views: the flare as |composite - scene| in display space, and the linear layer itself where the
+    camera did not clip, against the exact one."""
     display, linear, relative = [], [], []
     for view in views:
         targets = trainer.frames.targets(view)
@@ -55,10 +54,17 @@ def score(trainer: Trainer, views: Sequence[View]) -> dict[str, Any]:
             continue
         picture = composite(targets.removed, flare, trainer.settings.blend)
         display.append(psnr((picture - targets.removed).abs().numpy(), (targets.frame - targets.removed).abs().numpy()))
-        free = (targets.frame < CLIPPED).all(-1)
-        exact = (decode(targets.frame) - decode(targets.removed))[free]
-        found = (decode(picture) - decode(targets.removed))[free]
-        linear.append(psnr(found.numpy(), exact.numpy()))
-        relative.append(float((found - exact).norm() / exact.norm()))
-    return {"flare": {"psnr": float(np.mean(display))},
-            "flare_linear": {"psnr": float(np.mean(linear)), "relative_l2": float(np.mean(relative))}}
+        truth = trainer.capture.truth_flare(view, targets.camera.size)
+        if truth is None:
+            continue
+        keep = ~hidden(trainer.capture, view, targets.camera.size)
+        found = flare.colour if trainer.settings.blend == "add" else decode(picture) - decode(targets.removed)
+        linear.append(psnr(found.numpy(), truth.linear(), keep))
+        relative.append(relative_l2(found.numpy(), truth.linear(), keep))
+    return {"flare": {"psnr": _mean(display)}, "flare_linear": {"psnr": _mean(linear), "relative_l2": _mean(relative)}}
+
+
+def _mean(values: Sequence[float]) -> float | None:
+    """Of those that are finite: a view without flare has no relative error."""
+    finite = [value for value in values if np.isfinite(value)]
+    return float(np.mean(finite)) if finite else None

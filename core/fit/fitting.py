@@ -14,6 +14,7 @@ from ..files import atomic_path, remove_partial
 from ..flare import file as flare_file
 from ..flare.file import FlareFile, TrainingCamera
 from ..gaussians.ply import write_ply
+from ..look import list_elements
 from ..progress import Progress
 from . import checkpoint
 from .preview import row, spread, write_preview, write_small
@@ -98,6 +99,7 @@ def _finish(trainer: Trainer, run: Run) -> None:
         flare_file.save(run.folder / FLARE, FlareFile(
             trainer.flare, run.settings.blend, lens,
             seen=trainer.flare.seen_from([torch.from_numpy(view.camera.world_to_camera) for view in trainer.views])))
+        list_elements(run.folder / FLARE)
     (run.folder / CHECKPOINT).unlink(missing_ok=True)
 
 

@@ -21,8 +21,8 @@ from .drawing import draw
 from .edits import Edit, LookEdits
 from .elements import Element
 from .keyed import KeyedEdits
-from .look import LightLook, Look, TrainedCamera, ViewOfLight, read
+from .look import LightLook, Look, TrainedCamera, ViewOfLight, list_elements, read
 from .plane import PlaneGaussians, pixels
 
 __all__ = ["Edit", "Element", "KeyedEdits", "LightLook", "Look", "LookEdits", "PlaneGaussians", "TrainedCamera",
-           "ViewOfLight", "draw", "pixels", "read"]
+           "ViewOfLight", "draw", "list_elements", "pixels", "read"]

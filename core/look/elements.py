@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The Gaussians of a light as elements that an artist knows: the glare at the source, ghosts, streaks, rings.
 
-A fit that groups its Gaussians writes the groups into the .flare; for one that does not, `group` finds them
-from the canonical Gaussians alone: by kind (ring, streak, compact), and along the line where their energy
-has valleys. Element names are unique within a light.
+A fit groups its Gaussians at its end and writes the groups into the .flare (`entries`); where a file has none,
+`group` finds them from the canonical Gaussians alone: by kind (ring, streak, compact), and along the line where
+their energy has valleys. Element names are unique within a light.
 """
 from __future__ import annotations
 
@@ -31,20 +31,29 @@ VALLEY = 0.6  # a peak stands alone where the energy falls below this share of i
 @dataclass(frozen=True, eq=False)
 class Element:
     """One element of a light. members: (n,) rows of its Gaussians, ascending. mu: its place on the line
-    (0 principal point, 1 light). energy: its share of the light's, 0..1."""
+    (0 principal point, 1 light). energy: its share of the light's, 0..1. extent: root mean square distance of its
+    light from its centre, normalised image units. colour: its mean, the largest channel 1."""
 
     name: str
     kind: Kind
     members: NDArray[np.int64]
     mu: float = 0.0
     energy: float = 0.0
+    extent: float = 0.0
+    colour: tuple[float, float, float] = (1.0, 1.0, 1.0)
+
+    def entry(self, light: str) -> dict[str, Any]:
+        """What a .flare's description lists of it; `read` takes it."""
+        return {"light": light, "name": self.name, "kind": self.kind, "members": self.members.tolist(),
+                "mu": round(self.mu, 5), "energy": round(self.energy, 5), "extent": round(self.extent, 5),
+                "colour": [round(value, 4) for value in self.colour]}
 
 
 def read(entries: Sequence[Mapping[str, Any]], light: str, count: int) -> list[Element]:
     """The elements of `light` that a .flare's description lists; [] where it lists none that fit.
 
-    An entry: {"light", "name", "kind", "members": rows, "mu", "energy"}. Gaussians that no entry holds make
-    the element "rest".
+    An entry: see `Element.entry`; "light" and "members" it must have. Gaussians that no entry holds make the
+    element "rest".
     """
     found: list[Element] = []
     free = np.ones(count, bool)
@@ -58,7 +67,8 @@ def read(entries: Sequence[Mapping[str, Any]], light: str, count: int) -> list[E
         free[rows] = False
         kind = entry.get("kind")
         found.append(Element(_free(str(entry.get("name", "element")), found), kind if kind in KINDS else "ghost", rows,
-                             float(entry.get("mu", 0.0)), float(entry.get("energy", 0.0))))
+                             float(entry.get("mu", 0.0)), float(entry.get("energy", 0.0)),
+                             float(entry.get("extent", 0.0)), _colour(entry.get("colour", (1, 1, 1)))))
     if found and free.any():
         found.append(Element(_free("rest", found), "ghost", np.flatnonzero(free)))
     return found
@@ -84,8 +94,27 @@ def group(gaussians: PlaneGaussians, mu: Floats | None) -> list[Element]:
         place = float(np.average(mu[rows], weights=energy[rows])) if mu is not None else 0.0
         compact = "glare" if mu is not None and abs(place - 1) < SOURCE else "ghost"
         name = cast(Kind, compact if kind == "compact" else kind)
-        found.append(Element(_free(name, found), name, rows, place, float(energy[rows].sum() / energy.sum())))
+        found.append(Element(_free(name, found), name, rows, place, float(energy[rows].sum() / energy.sum()),
+                             *_shape(gaussians.kept(rows), energy[rows])))
     return found
+
+
+def _shape(gaussians: PlaneGaussians, energy: Floats) -> tuple[float, tuple[float, float, float]]:
+    """Extent and colour of some Gaussians together."""
+    weights = energy / energy.sum()
+    away = gaussians.means - weights @ gaussians.means
+    spread = gaussians.covariances[:, 0] + gaussians.covariances[:, 2]
+    if gaussians.rings is not None:  # the mean of r² over a ring, that of the plain profile for r0 = 0
+        r0, w = np.maximum(gaussians.rings[:, 0], 0), gaussians.rings[:, 1]
+        spread = spread * (r0 * r0 + 2 * w * w) / 2
+    extent = float(np.sqrt(weights @ ((away * away).sum(-1) + spread)))
+    colour = weights @ np.maximum(gaussians.colours, 0)
+    return extent, _colour(colour / max(float(colour.max()), 1e-12))
+
+
+def _colour(values: Any) -> tuple[float, float, float]:
+    red, green, blue = (float(value) for value in values)
+    return red, green, blue
 
 
 def owners(elements: Sequence[Element], count: int) -> NDArray[np.int64]:

@@ -228,6 +228,15 @@ def describe(path: Path | str) -> dict[str, Any]:
     return _described(Path(path), container.read_tensors(path)[1])
 
 
+def list_elements(path: Path | str) -> None:
+    """Write the elements of each light into a .flare that lists none, so that they stay what they are."""
+    look = read(path)
+    _, metadata = container.read_tensors(path)
+    listed = [element.entry(light.name) for light in look.lights for element in light.elements]
+    description = {**_described(Path(path), metadata), "elements": listed}
+    container.rewritten(path, path, {**metadata, _KEY: json.dumps(description)})
+
+
 def annotated(source: Path | str, target: Path | str, *, notes: str, licence: str) -> None:
     """A copy of a .flare with other notes and licence. Raises FlareFileError where `source` is not a flare."""
     _, metadata = container.read_tensors(source)

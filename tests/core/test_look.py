@@ -16,7 +16,7 @@ from core.flare import file as flare_file
 from core.flare.compositing import splat_flare
 from core.flare.file import FlareFile, TrainingCamera
 from core.flare.model import OURS, PAPER, FlareForm, FlareModel
-from core.look import Edit, KeyedEdits, LookEdits, PlaneGaussians, draw, read
+from core.look import Edit, KeyedEdits, LookEdits, PlaneGaussians, draw, list_elements, read
 from core.look import elements as grouping
 from core.look.container import read_tensors
 from core.look.edits import edited
@@ -185,6 +185,35 @@ def test_every_gaussian_has_one_element_whatever_they_are() -> None:
             assert len({element.name for element in found}) == len(found)
             members = np.concatenate([np.zeros(0, np.int64), *(element.members for element in found)])
             assert sorted(members.tolist()) == list(range(count))
+
+
+def test_an_element_knows_its_extent_and_colour() -> None:
+    gaussians = replace(plane([1.0, 0.4, 0.44], size=0.02), colours=np.array([[2, 1, 0]] * 3, np.float32))
+    source, pair = grouping.group(gaussians, gaussians.means[:, 0] / np.float32(0.3))
+    if source.mu < pair.mu:
+        source, pair = pair, source
+    assert source.extent == pytest.approx(0.02 * np.sqrt(2), rel=1e-4)
+    assert pair.extent == pytest.approx(np.sqrt(2 * 0.02**2 + (0.3 * 0.02) ** 2), rel=1e-4)
+    assert source.colour == (1.0, 0.5, 0.0)
+    hole = grouping.group(plane([1.0], size=0.02, ring=5), np.ones(1, np.float32))[0]
+    assert hole.extent == pytest.approx(0.02 * 5, rel=0.1)
+
+
+def test_elements_that_are_listed_stay_what_they_are(tmp_path: Path) -> None:
+    path = tmp_path / "a.flare"
+    flare_file.save(path, FlareFile(some_flare(SMALL, 40, 2), "add", CAMERA))
+    found = read(path)
+    list_elements(path)
+    again = read(path)
+    assert len(flare_file.load(path).elements) == sum(len(light.elements) for light in found.lights)
+    for before, after_ in zip(found.lights, again.lights, strict=True):
+        assert [element.name for element in before.elements] == [element.name for element in after_.elements]
+        for one, other in zip(before.elements, after_.elements, strict=True):
+            np.testing.assert_array_equal(one.members, other.members)
+            assert other.kind == one.kind
+            assert other.mu == pytest.approx(one.mu, abs=1e-4)
+            assert other.extent == pytest.approx(one.extent, abs=1e-4)
+            assert other.colour == pytest.approx(one.colour, abs=1e-3)
 
 
 def test_elements_of_the_file_come_first(tmp_path: Path) -> None:

@@ -36,7 +36,8 @@ from .settings import FitSettings
 TABLE = "table.weight"
 SOURCE = 0.02
 """Radius about a light, of the frame's width, in which what is white is taken for the light itself."""
-WHITE = 0.97
+WHITE = 0.93
+"""Display value from which a pixel of a light's disc counts as clipped: JPEG and noise leave white a little less."""
 
 
 class Trainer:
@@ -113,29 +114,30 @@ class Trainer:
         The faint and the small in a flare drown in the errors of a scene that is not learned yet. Later the
         scene, on which all views have agreed, is the better judge of what one flare-free frame has left over.
         """
+        if self.settings.mode not in ("default", "2d") or targets.removed is None:
+            return scene
         apart = self.iteration <= self.settings.apart * self.settings.iterations
-        if apart and self.settings.mode in ("default", "2d") and targets.removed is not None:
-            return self._without_sources(targets)
-        return scene
+        behind = targets.removed if apart else scene
+        sources = self._sources(targets)
+        return behind if sources is None else behind.masked_fill(sources[..., None], 0)
 
-    def _without_sources(self, targets: Targets) -> Tensor:
-        """The flare-free frame with each light's own clipped disc taken out, where light is added.
+    def _sources(self, targets: Targets) -> Tensor | None:
+        """(height, width): each light's own clipped disc, which is taken from behind the flare where light is added.
 
         Frame and flare-free frame are white there, so nothing would tell how bright the flare is in its middle, and
         over another shot a hole would show. Black behind it, it has to be white by itself.
         """
         removed = targets.removed
-        assert removed is not None
-        if self.settings.blend != "add" or self.flare is None:
-            return removed
+        if self.settings.blend != "add" or self.flare is None or removed is None:
+            return None
         height, width = removed.shape[:2]
         pixels, depth = targets.camera.project(self.flare.positions.numpy())
         across, down = torch.arange(width) + 0.5, torch.arange(height)[:, None] + 0.5
-        source = torch.zeros(height, width, dtype=torch.bool)
+        near = torch.zeros(height, width, dtype=torch.bool)
         for (x, y), z in zip(pixels.tolist(), depth.tolist(), strict=True):
             if z > 0:
-                source |= (across - x).square() + (down - y).square() < (SOURCE * width) ** 2
-        return removed.masked_fill((source & (removed >= WHITE).all(-1))[..., None], 0)
+                near |= (across - x).square() + (down - y).square() < (SOURCE * width) ** 2
+        return near & (removed >= WHITE).all(-1)
 
     def _scene_target(self, targets: Targets, picture: Tensor, scene: Tensor) -> Tensor | None:
         if self.settings.mode in ("default", "2d"):

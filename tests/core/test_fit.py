@@ -107,10 +107,14 @@ def test_the_light_itself_is_not_what_its_flare_lies_before(capture: Capture) ->
     (x, y), = targets.camera.project(capture.lights[0].xyz)[0].astype(int)
     white = targets.removed.clone()
     white[y, x] = white[0, 0] = 1
-    seen = trainer._without_sources(targets._replace(removed=white))
-    assert not seen[y, x].any()
-    white[y, x] = 0
-    assert torch.equal(seen, white)
+    scene = torch.full_like(white, 0.25)
+    for progress, behind in ((1, white), (trainer.settings.iterations, scene)):
+        trainer.iteration = progress
+        seen = trainer._behind_flare(targets._replace(removed=white), scene)
+        assert not seen[y, x].any()
+        expected = behind.clone()
+        expected[y, x] = 0
+        assert torch.equal(seen, expected)
 
 
 def test_stopped_and_resumed_is_bit_for_bit_the_unbroken_fit(tmp_path: Path, capture: Capture) -> None:

@@ -7,6 +7,7 @@ an empty flare would score, |frame - scene| against nothing, in dB.
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 from pathlib import Path
 
@@ -21,8 +22,9 @@ from core.pictures import read_picture
 
 
 def empty_flare(frame: NDArray[np.float32], scene: NDArray[np.float32]) -> float:
-    """PSNR of no flare at all against |frame - scene|, display values."""
-    return float(-10 * np.log10(np.mean((frame - scene) ** 2)))
+    """PSNR of no flare at all against |frame - scene|, display values; infinite where there is no flare."""
+    error = float(np.mean((frame - scene) ** 2))
+    return -10 * math.log10(error) if error > 0 else math.inf
 
 
 def contact_sheet(capture: Path, columns: int, rows: int, width: int) -> NDArray[np.uint8]:

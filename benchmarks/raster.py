@@ -148,8 +148,8 @@ class Iteration:
     def step(self) -> None:
         s, size = self.scene, (self.job.width, self.job.height)
         picture = rasterization(
-            s.means, s.quaternions, s.scales, s.opacities, s.sh, *self.camera, *size,
-            kernels=self.kernel_set, depth=False,  # type: ignore[arg-type]
+            s.means, s.quaternions, s.log_scales, s.opacity_logits, s.sh, *self.camera, *size,
+            kernels=self.kernel_set, depth=False, raw=True,  # type: ignore[arg-type]
         ).colour  # fmt: skip
         if self.job.flares:
             laid = splat(

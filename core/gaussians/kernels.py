@@ -34,7 +34,7 @@ class KernelSet(Protocol):
     def rasterize_scene(
         self, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, sh: Tensor,
         world_to_camera: Tensor, intrinsics: Tensor, width: int, height: int,
-        *, background: Tensor | None, sh_degree: int, near: float, dilation: float, depth: bool,
+        *, background: Tensor | None, sh_degree: int, near: float, dilation: float, depth: bool, raw: bool,
     ) -> Rendering: ...  # fmt: skip
 
     def splat(

@@ -22,6 +22,7 @@ def rasterization(
     world_to_camera: Tensor, intrinsics: Tensor, width: int, height: int,
     *, background: Tensor | None = None, sh_degree: int | None = None,
     kernels: Kernels = "auto", near: float = NEAR, dilation: float = DILATION, depth: bool = True,
+    raw: bool = False,
 ) -> Rendering:  # fmt: skip
     """Renders n 3D Gaussians (Kerbl et al. 2023), nearest first; `reference.py` has the definition.
 
@@ -38,6 +39,8 @@ def rasterization(
     near             camera depth at which Gaussians are culled, world units
     dilation         px², added to both diagonal elements of the projected covariances
     depth            False leaves depth and median_depth empty, (0, 0), which saves time
+    raw              True: scales are given as logarithms and opacities as logits, as they are optimised, which
+                     saves passes over them
 
     Differentiable by every tensor. Raises SettingsError for shapes and values that do not fit,
     EngineError for kernels that are not installed.
@@ -59,7 +62,7 @@ def rasterization(
         degree = sh_degree
     return choose(kernels, means).rasterize_scene(
         means, quats, scales, opacities, sh, world_to_camera, intrinsics, width, height,
-        background=background, sh_degree=degree, near=near, dilation=dilation, depth=depth,
+        background=background, sh_degree=degree, near=near, dilation=dilation, depth=depth, raw=raw,
     )  # fmt: skip
 
 

@@ -33,6 +33,7 @@ from .rendering import (
     TRANSMITTANCE_MIN,
     Rendering,
     Splats,
+    activated,
     extent,
     record_gradient,
 )
@@ -98,9 +99,10 @@ def _in_chunks(pixels: Tensor, count: int, shade: Callable[[Tensor], Tensor]) ->
 def rasterize_scene(
     means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, sh: Tensor,
     world_to_camera: Tensor, intrinsics: Tensor, width: int, height: int,
-    *, background: Tensor | None, sh_degree: int, near: float, dilation: float, depth: bool,
+    *, background: Tensor | None, sh_degree: int, near: float, dilation: float, depth: bool, raw: bool,
 ) -> Rendering:  # fmt: skip
     """See `rasterization`."""
+    scales, opacities = activated(scales, opacities, raw)
     seen = project(means, quats, scales, world_to_camera, intrinsics, width, height, near, dilation)
     order = torch.argsort(seen.depths, stable=True)
     index, centres, covariances, depths = (part[order] for part in seen)

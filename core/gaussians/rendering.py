@@ -59,6 +59,11 @@ class Splats:
     transmittance: Tensor
 
 
+def activated(scales: Tensor, opacities: Tensor, raw: bool) -> tuple[Tensor, Tensor]:
+    """Standard deviations (n, 3) and opacities (n,) from what `rasterization` was given: if raw, logs and logits."""
+    return (scales.exp(), opacities.sigmoid()) if raw else (scales, opacities)
+
+
 def extent(peaks: Tensor, blend: str = "over", rings: Tensor | None = None) -> Tensor:
     """(n,) Mahalanobis radius beyond which a Gaussian, or a ring (n, 2), is skipped; 0 if all of it is.
 

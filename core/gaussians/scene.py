@@ -100,11 +100,11 @@ class SceneGaussians(nn.Module):
     ) -> Rendering:  # fmt: skip
         """The scene as the camera sees it; see `rasterization`. Differentiable by the Gaussians."""
         return rasterization(
-            self.means, self.quaternions, self.scales, self.opacities, self.sh,
+            self.means, self.quaternions, self.log_scales, self.opacity_logits, self.sh,
             torch.as_tensor(camera.world_to_camera).to(self.means),
             torch.as_tensor(camera.intrinsics).to(self.means),
             camera.width, camera.height, background=background, sh_degree=sh_degree, kernels=kernels,
-            depth=depth,
+            depth=depth, raw=True,
         )  # fmt: skip
 
 

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from .projection import camera_position, determinants, half_sizes, project, visible_radii
-from .rendering import ALPHA_MIN, OPACITY_MAX, Rendering, Splats, extent, record_gradient
+from .rendering import ALPHA_MIN, OPACITY_MAX, Rendering, Splats, activated, extent, record_gradient
 from .spherical_harmonics import colours as colours_of
 
 ENTRIES_MAX = 1 << 24
@@ -153,9 +153,10 @@ def rasterize_scene(
     draw: Draw, size: int,
     means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, sh: Tensor,
     world_to_camera: Tensor, intrinsics: Tensor, width: int, height: int,
-    *, background: Tensor | None, sh_degree: int, near: float, dilation: float, depth: bool,
+    *, background: Tensor | None, sh_degree: int, near: float, dilation: float, depth: bool, raw: bool,
 ) -> Rendering:  # fmt: skip
     """See `rasterization`; with this drawing, in tiles of this size."""
+    scales, opacities = activated(scales, opacities, raw)
     dtype = means.dtype
     seen = project(
         _geometry(means), _geometry(quats), _geometry(scales), _geometry(world_to_camera),

@@ -140,3 +140,20 @@ def test_elementary_functions() -> None:
     assert (exp2[x < -126] <= 1.2e-38).all() and (exp2[x > 127] >= 2**126).all()
     np.testing.assert_allclose(log2, np.log2(positive.astype(np.float64)), rtol=3e-7, atol=3e-7)
     np.testing.assert_allclose(less, np.expm1(small.astype(np.float64) * np.log(2)), rtol=4e-7, atol=1e-30)
+
+
+def test_activations() -> None:
+    x = np.linspace(-20, 20, 16 * 4000).astype(np.float32)
+    x[:3] = np.nan, np.inf, -np.inf
+
+    def body(out, a):  # type: ignore[no-untyped-def]
+        for i in range(0, a.size, 16):
+            v.store(out, i, v.exp(v.load(a, i)))
+            v.store(out, i + a.size, v.sigmoid(v.load(a, i)))
+
+    exp, sigmoid = run(body, x, size=2 * x.size).reshape(2, -1)
+    exact = np.exp(x[3:].astype(np.float64))
+    np.testing.assert_allclose(exp[3:], exact, rtol=1e-6)
+    np.testing.assert_allclose(sigmoid[3:], exact / (1 + exact), rtol=1e-6)
+    assert np.isnan(exp[0]) and exp[1] == np.inf and exp[2] < 2e-38, "what is not finite stays so"
+    assert np.isnan(sigmoid[0]) and sigmoid[1] == 1 and sigmoid[2] < 2e-38

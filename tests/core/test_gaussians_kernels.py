@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import pytest
 import torch
@@ -36,6 +37,19 @@ def test_scenes(kernels: str, part: int) -> None:
 @pytest.mark.parametrize("part", range(10))
 def test_splats(kernels: str, part: int) -> None:
     wrong = [line for seed in range(part, SPLATS, 10) for line in differences(splat_case(seed), kernels)]
+    assert not wrong, "\n".join(wrong)
+
+
+@pytest.mark.parametrize("kernels", SETS)
+def test_logarithms_and_logits(kernels: str) -> None:
+    """The same scenes in the form in which they are optimised; of fewer than 16 Gaussians, too."""
+    wrong = []
+    for seed in range(0, SCENES, 5):
+        case = scene_case(seed)
+        inputs = dict(case.inputs)
+        inputs["scales"] = inputs["scales"].clamp(min=1e-12).log()
+        inputs["opacities"] = torch.logit(inputs["opacities"], eps=1e-5)
+        wrong += differences(replace(case, inputs=inputs, options={**case.options, "raw": True}), kernels)
     assert not wrong, "\n".join(wrong)
 
 

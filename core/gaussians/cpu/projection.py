@@ -15,6 +15,8 @@ so alpha = opacity 2^(A u² + D d_y²), u = d_x + k d_y. From one pixel row to t
 difference is 2 C with C = A k² + D; `step` = 2^(2 C) - 1 and `run` = sqrt(-32 / C), the rows over which e falls
 from its peak to 2^-32, serve the recurrence of the rasterizer.
 
+Scales and opacities may come as logarithms and logits, the form in which they are optimised (`raw`).
+
 Backward: the rasterizer sends moments of g = dL / d ln alpha over the pixels: sums of g, g u, g d_y, g u²,
 g u d_y, g d_y², which give the gradients of centre, covariance and opacity (`_from_moments`), and those of the
 colour and depth as they are.
@@ -57,6 +59,7 @@ from .vector import (
     LANES,
     any_of,
     deinterleave,
+    exp,
     exp2_less_one,
     fma,
     get,
@@ -68,6 +71,7 @@ from .vector import (
     maximum,
     minimum,
     opaque,
+    sigmoid,
     splat,
     sqrt,
     store,
@@ -261,6 +265,18 @@ def _store4(array, first, values):
 
 
 @inlined
+def _load_scales(scales, first, raw):
+    s = _load3(scales, first)
+    return (exp(s[0]), exp(s[1]), exp(s[2])) if raw else s
+
+
+@inlined
+def _load_opacities(opacities, first, raw):
+    o = load(opacities, first)
+    return sigmoid(o) if raw else o
+
+
+@inlined
 def _tiles_bound(x, y, half_x, half_y, visible, width, height):
     """How many tiles the box around each Gaussian meets."""
     right, bottom = np.float32(width - 1), np.float32(height - 1)
@@ -273,7 +289,7 @@ def _tiles_bound(x, y, half_x, half_y, visible, width, height):
 
 @inlined
 def _project_block(
-    means, quats, scales, opacities, sh, sh_width, degree, camera, width, height, first, turned, basis,
+    means, quats, scales, opacities, sh, sh_width, degree, raw, camera, width, height, first, turned, basis,
     records, centres, radii, bounds, slopes_out,
 ):  # fmt: skip
     """Projects the 16 Gaussians from `first` on. slopes_out: see `project`."""
@@ -289,10 +305,10 @@ def _project_block(
 
     (qw, qx, qy, qz), _ = _unit(_load4(quats, first))
     v = _turned(camera, _rotation(qw, qx, qy, qz))
-    a, b, _, _ = _picture_axes(camera, v, _load3(scales, first), slopes, inverse_z)
+    a, b, _, _ = _picture_axes(camera, v, _load_scales(scales, first, raw), slopes, inverse_z)
     xx, xy, yy, determinant = _covariance(a, b, camera[DILATION])
 
-    opacity = minimum(load(opacities, first), OPACITY_MAX)
+    opacity = minimum(_load_opacities(opacities, first, raw), OPACITY_MAX)
     reach = log2(maximum(opacity, ALPHA_MIN) * ALPHA_MIN_INVERSE)  # half the squared radius, over ln 2
     radius2 = reach * TWO_LN2
     half_x, half_y = sqrt(radius2 * xx), sqrt(radius2 * yy)
@@ -346,12 +362,12 @@ def _colour_slopes(turned, degree, direction, inverse_distance, out):
 
 @kernel
 def project(
-    counter, scratch, means, quats, scales, opacities, sh, sh_width, degree, camera, width, height,
+    counter, scratch, means, quats, scales, opacities, sh, sh_width, degree, raw, camera, width, height,
     records, centres, radii, bounds, chunk_bounds, slopes,
 ):  # fmt: skip
     """Writes a record, the centre, the radius and a bound on the number of tiles for each of n >= 16 Gaussians;
     chunk_bounds: the sums of the bounds over chunks. slopes: gradients of the colours by the means, 9 vectors
-    a block of 16; empty where no gradients are wanted."""
+    a block of 16; empty where no gradients are wanted. raw: scales are logarithms and opacities logits."""
     n = opacities.size
     turned, basis = scratch[:TURNED], scratch[TURNED : TURNED + SQUARE]
     while True:
@@ -362,7 +378,7 @@ def project(
         for block in range(start, end, LANES):
             first = min(block, n - LANES)  # the last block overlaps the one before and writes the same again
             _project_block(
-                means, quats, scales, opacities, sh, sh_width, degree, camera, width, height, first, turned, basis,
+                means, quats, scales, opacities, sh, sh_width, degree, raw, camera, width, height, first, turned, basis,
                 records, centres, radii, bounds, slopes[block * SLOPES :],
             )  # fmt: skip
         total = 0
@@ -441,10 +457,10 @@ def _offset_gradient(d_colour, slopes):
 
 @inlined
 def _project_block_backward(
-    means, quats, scales, opacities, sh_width, degree, camera, records, colour_slopes, first, fresh, fields,
+    means, quats, scales, opacities, sh_width, degree, raw, camera, records, colour_slopes, first, fresh, fields,
     turned, rows, d_means, d_quats, d_scales, d_opacities, d_sh, d_centres, sums, with_camera,
 ):  # fmt: skip
-    mean, scale = _load3(means, first), _load3(scales, first)
+    mean, scale = _load3(means, first), _load_scales(scales, first, raw)
     px, py, pz = _seen(camera, mean)
     before = pz > camera[NEAR]
     inverse_z = ONE / where(before, pz, ONE)
@@ -459,9 +475,11 @@ def _project_block_backward(
     dx, dy, d_xx, d_xy, d_yy = _from_moments(fields, xy, yy, determinant)
     _store2(d_centres, first, dx, dy)
 
-    opacity = load(opacities, first)
+    opacity = _load_opacities(opacities, first, raw)
     free = (opacity <= OPACITY_MAX) & (opacity >= ALPHA_MIN)
-    store(d_opacities, first, where(free, fields[G] / where(free, opacity, ONE), ZERO))
+    # G is the gradient by ln opacity; by the logit it is 1 - opacity times as large
+    d_opacity = fields[G] * (ONE - opacity) if raw else fields[G] / where(free, opacity, ONE)
+    store(d_opacities, first, where(free, d_opacity, ZERO))
 
     # covariance -> a, b -> V, scales, slopes, depth
     da = _sum(_scaled(d_xx * TWO, a), d_xy, b)
@@ -476,7 +494,7 @@ def _project_block_backward(
         fma(na[1], v[0][1], fma(nb[1], v[1][1], n2[1] * v[2][1])),
         fma(na[2], v[0][2], fma(nb[2], v[1][2], n2[2] * v[2][2])),
     )
-    _store3(d_scales, first, d_scale)
+    _store3(d_scales, first, _times(d_scale, scale) if raw else d_scale)
     dv = (_times(na, scale), _times(nb, scale), _times(n2, scale))
     gw, gx, gy, gz = _rotation_backward(qw, qx, qy, qz, _turned_back(camera, dv))
     along = fma(gw, qw, _dot((gx, gy, gz), (qx, qy, qz)))
@@ -517,7 +535,7 @@ def _project_block_backward(
 
 @kernel
 def project_backward(
-    counter, scratch, means, quats, scales, opacities, sh_width, degree, camera, records, slopes,
+    counter, scratch, means, quats, scales, opacities, sh_width, degree, raw, camera, records, slopes,
     gradients, slots, counts,
     d_means, d_quats, d_scales, d_opacities, d_sh, d_centres, d_camera, with_camera,
 ):  # fmt: skip
@@ -541,7 +559,7 @@ def project_backward(
             fields = _gathered(gradients, slots, counts, first, rows)
             fresh = lanes() >= np.float32(block - first)
             _project_block_backward(
-                means, quats, scales, opacities, sh_width, degree, camera, records, slopes[block * SLOPES :],
+                means, quats, scales, opacities, sh_width, degree, raw, camera, records, slopes[block * SLOPES :],
                 first, fresh, fields, turned, rows,
                 d_means, d_quats, d_scales, d_opacities, d_sh, d_centres, sums, with_camera,
             )  # fmt: skip

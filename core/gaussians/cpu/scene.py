@@ -2,6 +2,7 @@
 """`rasterize_scene` on the CPU: the kernels in their order, as one function of autograd."""
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -25,6 +26,7 @@ class _Frame(Grid):
     near: float
     dilation: float
     depth: bool
+    raw: bool
 
 
 class _Rasterize(torch.autograd.Function):
@@ -46,7 +48,7 @@ class _Rasterize(torch.autograd.Function):
         chunk_bounds = np.zeros(-(-n // projection.CHUNK), np.int64)
         parallel(
             projection.project, *(flat(t) for t in (means, quats, scales, opacities, sh)), sh.shape[1] * 3,
-            frame.sh_degree, camera, w, h, records, centres_flat, radii_flat, bounds, chunk_bounds, slopes,
+            frame.sh_degree, frame.raw, camera, w, h, records, centres_flat, radii_flat, bounds, chunk_bounds, slopes,
             scratch=projection.SCRATCH,
         )  # fmt: skip
         bins = bin_gaussians(records, bounds, chunk_bounds, frame)
@@ -84,15 +86,15 @@ class _Rasterize(torch.autograd.Function):
         gradients, gradients_flat = zip(
             *(buffers.pair(*t.shape) for t in (means, quats, scales, opacities, sh)), strict=True
         )
-        d_centres, d_centres_flat = buffers.pair(n, 2)
+        d_centres = buffers.empty(2 * n)
         with_camera = ctx.needs_input_grad[5] or ctx.needs_input_grad[6]
         sums = np.zeros((-(-n // projection.CHUNK), projection.CAMERA_SUMS), np.float32)
         parallel(
             projection.project_backward, *(flat(t) for t in (means, quats, scales, opacities)), sh.shape[1] * 3,
-            frame.sh_degree, camera, records, slopes, rows, bins.firsts, bins.counts,
-            *gradients_flat, d_centres_flat, sums, with_camera, scratch=projection.SCRATCH,
+            frame.sh_degree, frame.raw, camera, records, slopes, rows, bins.firsts, bins.counts,
+            *gradients_flat, d_centres, sums, with_camera, scratch=projection.SCRATCH,
         )  # fmt: skip
-        ctx.centre_gradients.add_(d_centres)
+        flat(ctx.centre_gradients)[:] += d_centres
         d_world_to_camera, d_intrinsics = _camera_gradients(sums, camera) if with_camera else (None, None)
         d_background = None
         if ctx.needs_input_grad[7] and d_image is not None:
@@ -117,18 +119,22 @@ def _camera_gradients(sums: Array, camera: Array) -> tuple[Tensor, Tensor]:
 def rasterize_scene(
     means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, sh: Tensor,
     world_to_camera: Tensor, intrinsics: Tensor, width: int, height: int,
-    *, background: Tensor | None, sh_degree: int, near: float, dilation: float, depth: bool = True,
+    *, background: Tensor | None, sh_degree: int, near: float, dilation: float, depth: bool, raw: bool,
 ) -> Rendering:  # fmt: skip
     """See `rasterization`. depth=False leaves depth and median_depth empty (0, 0), and is faster."""
     n = len(means)
     inputs = [t.to(torch.float32) for t in (means, quats, scales, opacities, sh)]
     camera = [t.to(torch.float32) for t in (world_to_camera, intrinsics)]
     if n < LANES:  # the kernels work on 16 at a time; opacity 0 is never seen
-        inputs = [torch.cat([t, t.new_zeros(LANES - n, *t.shape[1:])]) for t in inputs]
+        rest = [0.0, 0.0, 0.0, -math.inf if raw else 0.0, 0.0]
+        inputs = [
+            torch.cat([t, t.new_full((LANES - n, *t.shape[1:]), value)]) for t, value in zip(inputs, rest, strict=True)
+        ]
     if background is None:
         background = inputs[0].new_zeros(3)
-    centre_gradients = torch.zeros(len(inputs[0]), 2)
-    frame = _Frame(width, height, sh_degree, near, dilation, depth)
+    centre_gradients, zeros = buffers.pair(len(inputs[0]), 2)
+    zeros.fill(0)
+    frame = _Frame(width, height, sh_degree, near, dilation, depth, raw)
     image, alpha, depths, median, centres, radii = _Rasterize.apply(
         *inputs, *camera, background, frame, centre_gradients
     )

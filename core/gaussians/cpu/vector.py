@@ -568,6 +568,22 @@ def exp2(x):
     return exp2_inside(minimum(maximum(x, _EXP2_MIN), _EXP2_MAX))
 
 
+_LOG2_E = np.float32(1.4426950408889634)
+_LARGEST, _INFINITY = np.float32(3.4028235e38), np.float32(np.inf)
+
+
+@inlined
+def exp(x):
+    """e^x, 1e-6 relative within -20 .. 20; NaN and infinity stay, so that those who look for them find them."""
+    return where(x <= _LARGEST, exp2(x * _LOG2_E), x)
+
+
+@inlined
+def sigmoid(x):
+    """1 / (1 + e^-x); NaN stays."""
+    return where(x <= _INFINITY, np.float32(1) / (exp2(x * -_LOG2_E) + np.float32(1)), x)
+
+
 # (2^f - 1) / f on [-1/2, 1/2].
 _EXP2_LESS_ONE = tuple(
     np.float32(c) for c in (0.6931471807, 0.2402265068, 0.05550358232, 0.009618535704, 0.001339278274, 0.0001527416535)

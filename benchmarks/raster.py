@@ -29,6 +29,8 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 START = time.perf_counter()
+# As headless/run.py has it: torch's threads that spin while they wait would take a core from the kernels.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import torch  # noqa: E402

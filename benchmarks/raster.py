@@ -39,7 +39,7 @@ from torch import Tensor  # noqa: E402
 from benchmarks import opensplat, report, workload  # noqa: E402
 from benchmarks.report import milliseconds, table  # noqa: E402
 from benchmarks.timing import medians, on_threads  # noqa: E402
-from core.gaussians import Adam, SceneGaussians, kernels, l1_ssim, rasterization, splat  # noqa: E402
+from core.gaussians import Adam, SceneGaussians, kernels, l1_ssim, over, rasterization, splat  # noqa: E402
 from core.gaussians.scene import learning_rates  # noqa: E402
 from core.gaussians.spherical_harmonics import colours  # noqa: E402
 
@@ -118,7 +118,7 @@ class Raster:
         if not self.job.flares:
             return colour
         laid = splat(*self.flares, *size, kernels=self.kernel_set)  # type: ignore[arg-type]
-        return laid.colour + laid.transmittance[..., None] * colour
+        return over(laid, colour)
 
     def forward(self) -> None:
         with torch.no_grad():
@@ -157,7 +157,7 @@ class Iteration:
             laid = splat(
                 *self.flares, *size, kernels=self.kernel_set, resolution=self.job.resolution,  # type: ignore[arg-type]
             )  # fmt: skip
-            picture = laid.colour + laid.transmittance[..., None] * picture
+            picture = over(laid, picture)
         self.optimiser.zero_grad()
         l1_ssim(picture, self.target, 0.8, kernels=self.fused).backward()  # type: ignore[arg-type]
         self.optimiser.step()

@@ -17,7 +17,7 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from ..gaussians import Splats, splat
+from ..gaussians import Splats, over, splat
 from ..gaussians.rasterizer import Kernels, Resolution
 from . import placement
 from .placement import PlaneGaussians
@@ -59,7 +59,7 @@ def composite(scene: Tensor, flare: Splats | None, blend: Blend) -> Tensor:
     if flare is None:
         return scene
     if blend == "over":
-        return flare.colour + flare.transmittance[..., None] * scene
+        return over(flare, scene)
     return clip_through(encode(decode(clip_through(scene)) + flare.colour))
 
 
@@ -119,7 +119,7 @@ def layers(scene: Tensor, flares: Mapping[str, Splats], blend: Blend) -> Layers:
         return Layers(scene_linear + total, scene_linear, total, parts)
     below, picture = scene_linear, display
     for name, splats in reversed(list(flares.items())):  # the first light lies in front
-        picture = splats.colour + splats.transmittance[..., None] * picture
+        picture = over(splats, picture)
         above = decode(picture.clamp_min(0))
         parts[name] = above - below
         below = above

@@ -16,10 +16,11 @@ for _kind in (np.float32, np.float64):
     np.finfo(_kind)
 torch.set_flush_denormal(True)
 
+from .layers import over  # noqa: E402
 from .loss import l1_ssim, ssim  # noqa: E402
 from .optimiser import Adam  # noqa: E402
 from .rasterizer import rasterization, splat  # noqa: E402
 from .rendering import Rendering, Splats  # noqa: E402
 from .scene import SceneGaussians  # noqa: E402
 
-__all__ = ["Adam", "Rendering", "SceneGaussians", "Splats", "l1_ssim", "rasterization", "splat", "ssim"]
+__all__ = ["Adam", "Rendering", "SceneGaussians", "Splats", "l1_ssim", "over", "rasterization", "splat", "ssim"]

@@ -18,12 +18,11 @@ cut off (1/255 or 1/4096). Flares are made of many faint Gaussians, of which few
 """
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from torch import Tensor
 
 from .kernels import KernelSet
+from .layers import enlarged, over
 from .rendering import Splats
 
 TOLERANCE = 1 / 32
@@ -32,8 +31,8 @@ REDUCTIONS = (1, 2, 4)
 
 
 @torch.no_grad()
-def error_bound(factor: int, covariances: Tensor, rings: Tensor | None, arcs: Tensor | None) -> Tensor:
-    """(n,) largest error of each Gaussian drawn at 1/factor size, as a share of its peak; see above."""
+def error_bounds(covariances: Tensor, rings: Tensor | None, arcs: Tensor | None) -> Tensor:
+    """(3, n) largest error of each Gaussian at each of REDUCTIONS, as a share of its peak; see above."""
     xx, xy, yy = covariances.unbind(-1)
     larger = (xx + yy) / 2 + (((xx - yy) / 2) ** 2 + xy * xy).sqrt()
     smaller = ((xx * yy - xy * xy) / larger).clamp(min=1e-12)  # without cancellation
@@ -48,51 +47,17 @@ def error_bound(factor: int, covariances: Tensor, rings: Tensor | None, arcs: Te
     if arcs is not None:
         k = arcs[:, 2].abs()
         curvature = curvature + (k * k / 10 + k / 2) / (hole * hole).clamp(min=1e-12)
-    return factor**2 / 8 * curvature + factor / 2**0.5 * slope
+    return torch.stack([factor**2 / 8 * curvature + factor / 2**0.5 * slope for factor in REDUCTIONS])
 
 
 @torch.no_grad()
 def reductions(covariances: Tensor, rings: Tensor | None, arcs: Tensor | None) -> Tensor:
     """(n,) 1, 2 or 4: at which share of the size each Gaussian is drawn."""
+    bounds = error_bounds(covariances, rings, arcs)
     chosen = torch.ones(len(covariances), dtype=torch.int64, device=covariances.device)
-    for factor in REDUCTIONS[1:]:
-        chosen[error_bound(factor, covariances, rings, arcs) <= TOLERANCE] = factor
+    for place, factor in enumerate(REDUCTIONS[1:], 1):
+        chosen.masked_fill_(bounds[place] <= TOLERANCE, factor)
     return chosen
-
-
-def enlarge(picture: Tensor, factor: int) -> Tensor:
-    """((h - 2) factor, (w - 2) factor, c) from (h, w, c), bilinear; the border pixels are neighbours only."""
-    across = _EnlargeRows.apply(picture.transpose(0, 1), factor)
-    return _EnlargeRows.apply(across.transpose(0, 1), factor)
-
-
-class _EnlargeRows(torch.autograd.Function):
-    """((h - 2) factor, w, c) from (h, w, c): each row becomes `factor` rows, mixed from it and its neighbours."""
-
-    @staticmethod
-    def forward(ctx: Any, picture: Tensor, factor: int) -> Tensor:
-        picture = picture.contiguous()
-        height, *row = picture.shape
-        ctx.row, ctx.factor = row, factor
-        size = row[0] * row[1]
-        neighbours = picture.as_strided((height - 2, 3, size), (size, size, 1))  # overlapping, not copied
-        return (_mixture(factor, picture) @ neighbours).view((height - 2) * factor, *row)
-
-    @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
-        size = ctx.row[0] * ctx.row[1]
-        parts = gradient.contiguous().view(-1, ctx.factor, size)
-        shares = _mixture(ctx.factor, gradient).T @ parts
-        total = gradient.new_zeros(len(parts) + 2, size)
-        for place, share in enumerate(shares.unbind(1)):
-            total[place : place + len(parts)] += share
-        return total.view(-1, *ctx.row), None
-
-
-def _mixture(factor: int, like: Tensor) -> Tensor:
-    """(factor, 3) shares of the row before, the row itself and the row after, in each new row."""
-    place = (torch.arange(factor, dtype=like.dtype, device=like.device) + 0.5) / factor - 0.5
-    return torch.stack([(-place).clamp(min=0), 1 - place.abs(), place.clamp(min=0)], 1)
 
 
 def splat_mixed(
@@ -108,16 +73,14 @@ def splat_mixed(
             continue
         border = 0 if factor == 1 else 1  # so that interpolation has neighbours on all sides
         layer = kernels.splat(
-            centres[index] / factor + border, covariances[index] / factor**2,
-            opacities[index], colours[index],
+            _rows(centres, index) / factor + border, _rows(covariances, index) / factor**2,
+            _rows(opacities, index), _rows(colours, index),
             -(-width // factor) + 2 * border, -(-height // factor) + 2 * border,
-            rings=None if rings is None else rings[index], arcs=None if arcs is None else arcs[index],
+            rings=None if rings is None else _rows(rings, index), arcs=None if arcs is None else _rows(arcs, index),
             blend=blend,
         )  # fmt: skip
         if factor > 1:
-            planes = torch.cat([layer.colour, layer.transmittance[..., None]], -1)
-            planes = enlarge(planes, factor)[:height, :width]
-            layer = Splats(planes[..., :3], planes[..., 3])
+            layer = enlarged(layer, factor, width, height)
         picture = layer if picture is None else _behind(picture, layer, blend)
     if picture is None:
         return kernels.splat(
@@ -126,10 +89,13 @@ def splat_mixed(
     return picture
 
 
+def _rows(tensor: Tensor, index: Tensor) -> Tensor:
+    """tensor[index], which is ascending: the tensor itself if that is all of it."""
+    return tensor if len(index) == len(tensor) else tensor[index]
+
+
 def _behind(front: Splats, back: Splats, blend: str) -> Splats:
     """Two layers as one."""
     if blend == "add":
         return Splats(front.colour + back.colour, front.transmittance)
-    return Splats(
-        front.colour + front.transmittance[..., None] * back.colour, front.transmittance * back.transmittance
-    )
+    return Splats(over(front, back.colour), front.transmittance * back.transmittance)

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from core.gaussians import mixed, splat
+from core.gaussians import Splats, layers, mixed, over, splat
 from core.gaussians.rendering import PROFILE_MIN
 
 SIZE = (150, 110)
@@ -48,7 +48,8 @@ def test_each_is_within_its_bound(what: str) -> None:
         inputs = (centres[one], covariances[one], torch.ones(1), torch.ones(1, 3), *SIZE)
         error = splat(*inputs, **arguments, resolution="mixed").colour - splat(*inputs, **arguments).colour
         factor = int(factors[i])
-        bound = mixed.error_bound(factor, covariances[one], arguments["rings"], arguments["arcs"])
+        bounds = mixed.error_bounds(covariances[one], arguments["rings"], arguments["arcs"])
+        bound = bounds[mixed.REDUCTIONS.index(factor)]
         assert error.abs().max() <= (bound if factor > 1 else 0) + PROFILE_MIN
         assert factor == 1 or bound <= mixed.TOLERANCE
         largest = max(largest, error.abs().max().item())
@@ -97,8 +98,35 @@ def test_enlarging_is_torchs(factor: int) -> None:
     small = torch.rand(7, 5, 4, dtype=torch.float64, generator=generator, requires_grad=True)
     planes = small.permute(2, 0, 1)[None]
     expected = torch.nn.functional.interpolate(planes, scale_factor=factor, mode="bilinear")[0].permute(1, 2, 0)
-    assert torch.allclose(mixed.enlarge(small, factor), expected[factor:-factor, factor:-factor])
-    assert torch.autograd.gradcheck(lambda s: mixed.enlarge(s, factor), small)
+    assert torch.allclose(layers.enlarge(small, factor), expected[factor:-factor, factor:-factor])
+    assert torch.autograd.gradcheck(lambda s: layers.enlarge(s, factor), small)
+
+
+@pytest.mark.parametrize("factor", [2, 4])
+@pytest.mark.parametrize("size", [(150, 111), (64, 32), (17, 1), (5, 3)])
+def test_layers_in_single_precision(factor: int, size: tuple[int, int]) -> None:
+    """The fused kernels, pictures that no vector and no small pixel divides, and those too small for them."""
+    width, height = size
+    small = (-(-height // factor) + 2, -(-width // factor) + 2)
+    generator = torch.Generator().manual_seed(0)
+    values = [torch.rand(*shape, generator=generator) for shape in ((*small, 3), small, (height, width, 3))]
+    pattern = torch.rand(height, width, 3, generator=generator)
+    found = []
+    for dtype in (torch.float64, torch.float32):
+        colour, t, behind = inputs = [v.to(dtype, copy=True).requires_grad_() for v in values]
+        layer = layers.enlarged(Splats(colour, t), factor, width, height)
+        picture = over(layer, behind)
+        (picture * pattern).sum().backward()
+        found.append([picture.detach(), layer.transmittance.detach(), *(v.grad for v in inputs)])
+    for exact, fast in zip(*found, strict=True):
+        assert torch.allclose(fast.double(), exact, atol=1e-5)
+
+
+def test_layers_whose_transmittance_no_one_asks_for() -> None:
+    colour, t = torch.rand(20, 30, 3, requires_grad=True), torch.rand(20, 30, requires_grad=True)
+    layers.enlarged(Splats(colour, t), 2, 50, 33).colour.sum().backward()
+    assert colour.grad is not None and colour.grad.sum() == pytest.approx(3 * 50 * 33, rel=1e-5)
+    assert t.grad is None or not t.grad.any()
 
 
 def test_nothing_is_nothing() -> None:

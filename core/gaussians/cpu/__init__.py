@@ -7,9 +7,10 @@ lanes as a type), then each kernel with its mathematics in its head: `spherical_
 """
 from __future__ import annotations
 
+from .layers import enlarged, over
 from .loss import l1_ssim
 from .optimiser import adam_step
 from .scene import rasterize_scene
 from .splats import splat
 
-__all__ = ["adam_step", "l1_ssim", "rasterize_scene", "splat"]
+__all__ = ["adam_step", "enlarged", "l1_ssim", "over", "rasterize_scene", "splat"]

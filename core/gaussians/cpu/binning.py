@@ -10,10 +10,13 @@ offset of the column's edge from the centre, and the record's A, k, D, C and rea
 
 and the extreme points of the whole ellipse, y = ± half_y, lie at X = ∓ k half_y.
 
-First, `list_and_sort` writes down the tiles of each Gaussian, in the Gaussians' own order, each in a slot, and
-orders the Gaussians by depth; then `count`, `deal` and `scatter` walk them in that order and deal the slots out
-to the tiles, so that no tile needs sorting. A slot number also is the place of the gradient that the tile sends
-back to the Gaussian.
+Gaussians have a key, by which they are drawn, lowest first: the bits of the depth, which sort as it does, or their
+number. `list_in_order` cuts the range of keys into parts of about equal work, one to a thread at a time. A part
+sorts its own Gaussians and lists the tiles of each; `deal` and `scatter` then send the lists to the tiles, part
+after part, so that no tile needs sorting. What comes out does not depend on where the cuts are.
+
+Each pair of Gaussian and tile has a slot, the place of the gradient that the tile sends back to the Gaussian. Those
+of a Gaussian follow each other, in the Gaussians' own order, which is the order in which they will be read.
 """
 from __future__ import annotations
 
@@ -23,7 +26,7 @@ import numpy as np
 
 from .compilation import inlined, kernel
 from .layout import (
-    DEPTH,
+    CHUNK,
     END_ROW,
     ENTRY,
     FIRST_ROW,
@@ -46,12 +49,14 @@ from .layout import (
     X,
     Y,
 )
-from .projection import CHUNK
-from .vector import get, opaque, prefetch, take_number
+from .vector import get, opaque, prefetch, take, take_number
 
 ROW_BITS, ROW_MASK = TILE_SHIFT_Y, TILE_HEIGHT - 1
 DIGITS = 3
 AHEAD = 8
+LISTED = 3
+NOWHERE = 0x7F800000
+"""The key of what is not drawn: the bits of infinity, above those of every depth."""
 SLACK = np.float32(0.02)
 """Pixels by which the row range is widened against rounding."""
 
@@ -78,178 +83,176 @@ def _pixel_rows(y, low, high, height):
 
 
 @inlined
-def _crossing(records, at, x):
-    """Lowest and highest point of the ellipse at the horizontal offset x, or where it is nearest to that."""
-    half_x, k, major = get(records, at + HALF_X), get(records, at + K), get(records, at + A)
-    inverse = ONE / (major * k * k + get(records, at + D))
+def _crossing(half_x, square, bend, lean, x):
+    """Lowest and highest point of the ellipse at the horizontal offset x, or where it is nearest to that: with
+    square = t / C, bend = A D / C², lean = -A k / C."""
     x = _least(_most(x, -half_x), half_x)
-    major = major * inverse
-    square = inverse * (get(records, at + REACH) - major * get(records, at + D) * x * x)
-    root = math.sqrt(_most(square, ZERO))
-    middle = -major * k * x
+    root, middle = math.sqrt(_most(square - bend * x * x, ZERO)), lean * x
     return middle - root, middle + root
 
 
 @inlined
-def _write_column(column, top, bottom, tiles_x, slots, slot):
-    """Writes the tiles of a column that pixel rows top .. bottom meet; returns the next slot."""
+def _write_column(column, top, bottom, tiles_x, i, slots_ahead, listed, at, numbers):
+    """Lists the tiles of a column that pixel rows top .. bottom meet; returns the next place."""
     row, one = top >> TILE_SHIFT_Y, opaque(1)
     while row << TILE_SHIFT_Y <= bottom:
         base = row << TILE_SHIFT_Y
         first = top - base if top > base else 0
         last = bottom - base if bottom - base < ROW_MASK else ROW_MASK
-        slots[slot] = (((row * tiles_x + column) << ROW_BITS | first) << ROW_BITS) | last
-        slot += one
+        tile = row * tiles_x + column
+        listed[at * LISTED], listed[at * LISTED + 1] = i, at + slots_ahead
+        listed[at * LISTED + 2] = ((tile << ROW_BITS | first) << ROW_BITS) | last
+        numbers[tile] += 1
+        at += one
         row += one
-    return slot
+    return at
 
 
 @inlined
-def _list_gaussian(records, i, slot, width, height, tiles_x, slots):
-    """Writes the tiles of Gaussian i from this slot on; returns the slot after the last."""
+def _list_gaussian(records, i, width, height, tiles_x, slots_ahead, listed, place, numbers):
+    """Lists the tiles of Gaussian i from this place on; returns the place after the last."""
     at = i * RECORD
-    x, half_x = get(records, at + X), get(records, at + HALF_X) + SLACK
+    x, extent = get(records, at + X), get(records, at + HALF_X)
+    half_x = extent + SLACK
     y, half_y = get(records, at + Y), get(records, at + HALF_Y)
     column = int(_most(x - half_x, ZERO)) >> TILE_SHIFT_X
     last_column = int(_least(x + half_x, np.float32(width - 1))) >> TILE_SHIFT_X
     if column == last_column:
         top, bottom = _pixel_rows(y, -half_y, half_y, height)
-        return _write_column(column, top, bottom, tiles_x, slots, slot)
-    tip = get(records, at + K) * half_y  # the highest point lies at -tip, the lowest at tip
-    one = opaque(1)
+        return _write_column(column, top, bottom, tiles_x, i, slots_ahead, listed, place, numbers)
+    major, k, minor = get(records, at + A), get(records, at + K), get(records, at + D)
+    tip = k * half_y  # the highest point lies at -tip, the lowest at tip
+    inverse, one = ONE / (major * k * k + minor), opaque(1)
+    square, bend, lean = get(records, at + REACH) * inverse, major * inverse * (minor * inverse), -major * k * inverse
     left = np.float32(column << TILE_SHIFT_X) - x
-    low0, high0 = _crossing(records, at, left)
+    low0, high0 = _crossing(extent, square, bend, lean, left)
     while column <= last_column:
         right = left + np.float32(TILE_WIDTH)
-        low1, high1 = _crossing(records, at, right)
+        low1, high1 = _crossing(extent, square, bend, lean, right)
         low = -half_y if left <= tip <= right else _least(low0, low1)
         high = half_y if left <= -tip <= right else _most(high0, high1)
         top, bottom = _pixel_rows(y, low, high, height)
-        slot = _write_column(column, top, bottom, tiles_x, slots, slot)
+        place = _write_column(column, top, bottom, tiles_x, i, slots_ahead, listed, place, numbers)
         left, low0, high0 = right, low1, high1
         column += one
-    return slot
+    return place
 
 
 @inlined
-def _list_chunk(chunk, records, bounds, chunk_starts, width, height, tiles_x, slots, firsts, counts):
-    slot = chunk_starts[chunk]
-    for i in range(chunk * CHUNK, min(chunk * CHUNK + CHUNK, bounds.size)):
-        first = slot
-        if bounds[i] > 0:
-            slot = _list_gaussian(records, i, slot, width, height, tiles_x, slots)
-        firsts[i] = first
-        counts[i] = slot - first
-
-
-@kernel
-def list_and_sort(
-    counter, records, bits, bounds, chunk_starts, width, height, tiles_x, by_depth,
-    slots, firsts, counts, places, keys, spare_keys, order, spare_order,
-):  # fmt: skip
-    """slots: tile, first and last row of every pair of Gaussian and tile, in the Gaussians' order; those of
-    Gaussian i are the counts[i] from firsts[i] on. chunk_starts: where each chunk may write. order: see `_sort`;
-    as many as there are bounds > 0. bits: the records as uint32."""
-    while True:
-        piece = take_number(counter)
-        if piece > chunk_starts.size:
-            break
-        if piece > 0:
-            _list_chunk(
-                piece - 1, records, bounds, chunk_starts, width, height, tiles_x, slots, firsts, counts
-            )
-        elif by_depth:  # the longest piece goes first
-            _sort(bits, bounds, places, keys, spare_keys, order, spare_order)
-        else:
-            m = 0
-            for i in range(bounds.size):
-                if bounds[i] > 0:
-                    order[m] = i
-                    m += 1
+def number_slots(bounds, start, end, firsts):
+    """firsts: sums of the bounds before each, from `start` on; returns the sum of all."""
+    total = 0
+    for i in range(start, end):
+        firsts[i] = total
+        total += bounds[i]
+    return total
 
 
 @inlined
-def _sort(bits, bounds, places, keys, spare_keys, order, spare_order):
-    """Writes to `order` the Gaussians whose bound is not 0, nearest first.
+def _choose(keys, bounds, low, high, taken, pairs):
+    """Takes those whose key lies within low .. high - 1 into a stretch of pairs[0] of their own, key above number.
+    Returns its beginning and length, the range of the keys, and how much room their lists may need."""
+    count, room, smallest, largest = 0, 0, high, low
+    for i in range(keys.size):
+        key = np.int64(keys[i])
+        if low <= key < high:
+            count += 1
+            room += bounds[i]
+            smallest = min(key, smallest)
+            largest = max(key, largest)
+    begin = at = take(taken, 0, count + 1)
+    for i in range(keys.size):  # every one is written, over the last if that is not to stay: no branch to guess
+        key = np.int64(keys[i])
+        pairs[0, at] = (key - smallest) << 32 | i
+        at += np.int64(low <= key) & np.int64(key < high)
+    return begin, count, largest - smallest, room
 
-    Depths are positive, so their bits sort as they do. Three passes of a radix sort, stable, by digits as short
-    as the range of the depths allows; places (DIGITS, 2^11) and the arrays (n,) are its workspace.
-    """
-    smallest, largest, m = np.uint32(0xFFFFFFFF), np.uint32(0), 0
-    for i in range(bounds.size):
-        if bounds[i] > 0:
-            key = get(bits, i * RECORD + DEPTH)
-            smallest = key if key < smallest else smallest
-            largest = key if key > largest else largest
-            spare_keys[m] = key
-            spare_order[m] = i
-            m += 1
-    if m == 0:
-        return
+
+@inlined
+def _sort(pairs, begin, count, largest, places):
+    """From pairs[0] to pairs[1], by key: three passes of a stable radix sort, by digits as short as the range of
+    keys allows. places (DIGITS, 2^11): workspace."""
     length = 1
-    while (largest - smallest) >> np.uint32(length) > 0:
+    while largest >> length > 0:
         length += 1
     digit = (length + DIGITS - 1) // DIGITS
     mask = (1 << digit) - 1
     places[:, : mask + 1] = 0
-    for i in range(m):
-        key = spare_keys[i] - smallest
-        spare_keys[i] = key
+    for j in range(begin, begin + count):
+        key = pairs[0, j] >> 32
         for d in range(DIGITS):
-            places[d, (key >> np.uint32(d * digit)) & mask] += 1
-    _distribute(spare_keys, spare_order, m, digit * 0, mask, places[0], keys, order)
-    _distribute(keys, order, m, digit, mask, places[1], spare_keys, spare_order)
-    _distribute(spare_keys, spare_order, m, 2 * digit, mask, places[2], keys, order)
+            places[d, (key >> (d * digit)) & mask] += 1
+    for d in range(DIGITS):
+        total = begin
+        for b in range(mask + 1):
+            number = places[d, b]
+            places[d, b] = total
+            total += number
+    _distribute(pairs[0], begin, count, 32, mask, places[0], pairs[1])
+    _distribute(pairs[1], begin, count, 32 + digit, mask, places[1], pairs[0])
+    _distribute(pairs[0], begin, count, 32 + 2 * digit, mask, places[2], pairs[1])
 
 
 @inlined
-def _distribute(keys, order, m, shift, mask, places, to_keys, to_order):
-    """One pass: by the digit above `shift`, whose counts are in `places`."""
-    total = 0
-    for b in range(mask + 1):
-        number = places[b]
-        places[b] = total
-        total += number
-    for i in range(m):
-        key = keys[i]
-        b = (key >> np.uint32(shift)) & mask
+def _distribute(pairs, begin, count, shift, mask, places, out):
+    """One pass: by the digit above `shift`, to where `places` says."""
+    for j in range(begin, begin + count):
+        pair = pairs[j]
+        b = (pair >> shift) & mask
         place = places[b]
         places[b] = place + 1
-        to_keys[place] = key
-        to_order[place] = order[i]
+        out[place] = pair
 
 
 @inlined
-def _part(order_size, parts, part):
-    return order_size * part // parts, order_size * (part + 1) // parts
+def _number_of(pair):
+    return pair & 0xFFFFFFFF
 
 
 @inlined
-def _prefetch_slots(j, end, order, slots, firsts, counts):
-    """Asks for what the walk in order of depth will need soon: it jumps about in memory."""
-    far = get(order, _least(j + 2 * AHEAD, end - 1))
-    prefetch(firsts, far)
-    prefetch(counts, far)
-    prefetch(slots, get(firsts, get(order, _least(j + AHEAD, end - 1))))
+def _list_part(pairs, begin, count, records, bounds, firsts, starts, width, height, tiles_x, listed, place, numbers):
+    """Lists the tiles of sorted Gaussians; returns the end of the list. Turns their bounds into counts, and firsts
+    into the number of their first slot."""
+    end = begin + count
+    for j in range(begin, end):
+        far = _number_of(get(pairs, _least(j + AHEAD, end - 1)))  # the walk jumps about in memory
+        prefetch(records, far * RECORD)
+        prefetch(firsts, far)
+        prefetch(bounds, far)
+        i = _number_of(get(pairs, j))
+        slot, before = starts[i // CHUNK] + get(firsts, i), place
+        place = _list_gaussian(records, i, width, height, tiles_x, slot - place, listed, place, numbers)
+        firsts[i] = slot
+        bounds[i] = place - before
+    return place
 
 
 @kernel
-def count(counter, order, m, slots, firsts, counts, numbers):
-    """numbers (parts, tiles): how often each tile is met by each part of the sorted Gaussians."""
+def list_in_order(
+    counter, records, keys, bounds, firsts, starts, cuts, width, height, tiles_x, taken, places, pairs,
+    listed, spans, numbers,
+):  # fmt: skip
+    """listed: Gaussian, slot, and tile, first and last row in one number, of every pair; those of a part lie within
+    its span (parts, 2), lowest key first. numbers (parts, tiles): how often a part meets a tile.
+
+    keys: from 0, uint32, NOWHERE for what is not drawn; cuts (parts + 1,): where parts begin and end. bounds, firsts:
+    see `number_slots`, firsts counted from that of the chunk in `starts`; become counts, and slots.
+    taken (2,): 0, 0; places (parts, DIGITS, 2^11), pairs (2, n + parts): workspace."""
     parts = numbers.shape[0]
     while True:
         part = take_number(counter)
         if part >= parts:
             break
         numbers[part] = 0
-        start, end = _part(m, parts, part)
-        for j in range(start, end):
-            _prefetch_slots(j, end, order, slots, firsts, counts)
-            i = order[j]
-            slot, stop, one = get(firsts, i), get(firsts, i) + get(counts, i), opaque(1)
-            while slot < stop:
-                numbers[part, get(slots, slot) >> (2 * ROW_BITS)] += 1
-                slot += one
+        low, high = np.int64(cuts[part]), np.int64(cuts[part + 1])
+        begin, count, largest, room = _choose(keys, bounds, low, high, taken, pairs)
+        _sort(pairs, begin, count, largest, places[part])
+        place = take(taken, 1, room)
+        spans[part, 0] = place
+        spans[part, 1] = _list_part(
+            pairs[1], begin, count, records, bounds, firsts, starts, width, height, tiles_x, listed, place,
+            numbers[part],
+        )  # fmt: skip
 
 
 @kernel
@@ -267,24 +270,17 @@ def deal(numbers, starts):
 
 
 @kernel
-def scatter(counter, order, m, slots, firsts, counts, places, entries):
-    """Writes the entries of all tiles, nearest first; places: from `deal`, used up."""
-    parts = places.shape[0]
+def scatter(counter, listed, spans, places, entries):
+    """Writes the entries of all tiles, lowest key first; places: from `deal`, used up."""
     while True:
         part = take_number(counter)
-        if part >= parts:
+        if part >= spans.shape[0]:
             break
-        start, end = _part(m, parts, part)
-        for j in range(start, end):
-            _prefetch_slots(j, end, order, slots, firsts, counts)
-            i = order[j]
-            slot, stop, one = get(firsts, i), get(firsts, i) + get(counts, i), opaque(1)
-            while slot < stop:
-                word = get(slots, slot)
-                tile = word >> (2 * ROW_BITS)
-                place = places[part, tile]
-                places[part, tile] = place + 1
-                at = place * ENTRY
-                entries[at + GAUSSIAN], entries[at + SLOT] = i, slot
-                entries[at + FIRST_ROW], entries[at + END_ROW] = (word >> ROW_BITS) & ROW_MASK, (word & ROW_MASK) + 1
-                slot += one
+        of_part = places[part]
+        for at in range(spans[part, 0] * LISTED, spans[part, 1] * LISTED, LISTED):
+            word = np.int64(get(listed, at + 2))
+            tile = word >> (2 * ROW_BITS)
+            to = of_part[tile] * ENTRY
+            of_part[tile] += 1
+            entries[to + GAUSSIAN], entries[to + SLOT] = get(listed, at), get(listed, at + 1)
+            entries[to + FIRST_ROW], entries[to + END_ROW] = (word >> ROW_BITS) & ROW_MASK, (word & ROW_MASK) + 1

@@ -25,10 +25,12 @@ import math
 import numpy as np
 
 from .. import rendering
+from .binning import NOWHERE, number_slots
 from .compilation import inlined, kernel
 from .layout import (
     ALPHA_MIN,
     BLUE,
+    CHUNK,
     DEPTH,
     END_ROW,
     ENTRY,
@@ -147,8 +149,12 @@ def _tiles(centre, half, size, shift):
 
 
 @kernel
-def prepare(centres, covariances, opacities, colours, rings, arcs, width, height, add, records, shapes, bounds):
-    """Writes record, shape and bound on the number of tiles of each Gaussian; in float64, for needles.
+def prepare(
+    centres, covariances, opacities, colours, rings, arcs, width, height, add,
+    records, shapes, keys, bounds, firsts, chunk_bounds,
+):  # fmt: skip
+    """Writes record, shape and bound on the number of tiles of each Gaussian; in float64, for needles. The key is its
+    number; firsts, chunk_bounds: see `binning`.
 
     rings, arcs: empty where there are none. Where light adds, the opacity goes into the colour.
     """
@@ -161,7 +167,7 @@ def prepare(centres, covariances, opacities, colours, rings, arcs, width, height
         opacity = np.float64(opacities[i]) if add else min(np.float64(opacities[i]), rendering.OPACITY_MAX)
         r0, w = (np.float64(rings[2 * i]), np.float64(rings[2 * i + 1])) if rings.size > 0 else (0.0, 1.0)
         reach = _reach(opacity, rings.size > 0, r0, w, add)
-        bounds[i] = 0
+        keys[i], bounds[i] = NOWHERE, 0
         if not (determinant > 0 and xx > 0 and reach >= 0):
             continue
         x, y, k = np.float64(centres[2 * i]), np.float64(centres[2 * i + 1]), -xy / yy
@@ -183,7 +189,10 @@ def prepare(centres, covariances, opacities, colours, rings, arcs, width, height
         records[at + HALF_X], records[at + HALF_Y] = half_x, half_y
         _write_shape(shapes, i, r0, w, reach - r0, arcs)
         columns = _tiles(x, half_x + 0.5, width, TILE_SHIFT_X)
-        bounds[i] = columns * _tiles(y, half_y + 0.5, height, TILE_SHIFT_Y)
+        keys[i], bounds[i] = i, columns * _tiles(y, half_y + 0.5, height, TILE_SHIFT_Y)
+    for chunk in range(chunk_bounds.size):
+        end = min(chunk * CHUNK + CHUNK, bounds.size)
+        chunk_bounds[chunk] = number_slots(bounds, chunk * CHUNK, end, firsts)
 
 
 @inlined

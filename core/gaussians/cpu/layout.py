@@ -14,6 +14,9 @@ TILE_WIDTH, TILE_HEIGHT = 1 << TILE_SHIFT_X, 1 << TILE_SHIFT_Y
 X, Y, A, K, D, OPACITY, STEP, RUN, RED, GREEN, BLUE, DEPTH, REACH, HALF_X, HALF_Y, K_REST = range(16)
 RECORD = 16
 
+CHUNK = 1024
+"""Gaussians to a piece of work."""
+
 # A row of gradients for each pair of Gaussian and tile: sums of g u, g d_y, g u², g u d_y, g d_y², g; then those of
 # colour and depth, or of ring and arc (`flare`).
 G_U, G_Y, G_UU, G_UY, G_YY, G, G_RED, G_GREEN, G_BLUE, G_DEPTH = range(10)

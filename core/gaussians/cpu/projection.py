@@ -30,10 +30,12 @@ import numpy as np
 from .. import rendering
 from ..projection import FRUSTUM_MARGIN
 from . import spherical_harmonics as harmonics
+from .binning import number_slots
 from .compilation import inlined, kernel
 from .layout import (
     ALPHA_MIN,
     BLUE,
+    CHUNK,
     G_BLUE,
     G_DEPTH,
     G_GREEN,
@@ -93,8 +95,6 @@ TURNED = harmonics.ROWS * LANES
 SQUARE = LANES * LANES
 SCRATCH = TURNED + SQUARE + CAMERA_SUMS * LANES
 
-CHUNK = 1024
-"""Gaussians to a piece of work."""
 H = np.float32(-0.5 / math.log(2))
 TWO_LN2 = np.float32(2 * math.log(2))
 LN2 = np.float32(math.log(2))
@@ -103,7 +103,7 @@ MARGIN = np.float32(1e-4)
 """Added to the reach, a power of two: rounding must not lose a pixel at the rim, where alpha is tested anyway."""
 NORM2_MIN = np.float32(1e-16)
 TINY = np.float32(1e-24)
-LARGEST = np.float32(1e30)
+LARGEST, INFINITY = np.float32(1e30), np.float32(np.inf)
 RUN_POWERS, RUN_MAX = np.float32(32), np.float32(32)
 """Powers of two, and rows, over which a recurrence runs (see `raster_forward`): rounding adds up."""
 
@@ -290,7 +290,7 @@ def _tiles_bound(x, y, half_x, half_y, visible, width, height):
 @inlined
 def _project_block(
     means, quats, scales, opacities, sh, sh_width, degree, raw, camera, width, height, first, turned, basis,
-    records, centres, radii, bounds, slopes_out,
+    records, centres, radii, depths, bounds, slopes_out,
 ):  # fmt: skip
     """Projects the 16 Gaussians from `first` on. slopes_out: see `project`."""
     mean = _load3(means, first)
@@ -320,6 +320,7 @@ def _project_block(
     largest = (xx + yy) * HALF + sqrt(fma(half_difference, half_difference, xy * xy))
     store(radii, first, where(visible & (radius2 > ZERO), sqrt(largest) * np.float32(3), ZERO))
 
+    store(depths, first, where(visible, pz, INFINITY))
     inverse_y = ONE / where(visible, yy, ONE)
     k = -xy * inverse_y
     major = yy * H / where(visible, determinant, ONE)
@@ -363,11 +364,12 @@ def _colour_slopes(turned, degree, direction, inverse_distance, out):
 @kernel
 def project(
     counter, scratch, means, quats, scales, opacities, sh, sh_width, degree, raw, camera, width, height,
-    records, centres, radii, bounds, chunk_bounds, slopes,
+    records, centres, radii, depths, bounds, firsts, chunk_bounds, slopes,
 ):  # fmt: skip
-    """Writes a record, the centre, the radius and a bound on the number of tiles for each of n >= 16 Gaussians;
-    chunk_bounds: the sums of the bounds over chunks. slopes: gradients of the colours by the means, 9 vectors
-    a block of 16; empty where no gradients are wanted. raw: scales are logarithms and opacities logits."""
+    """Writes a record, the centre, the radius, the depth (infinite for what is not seen) and a bound on the number of
+    tiles for each of n >= 16 Gaussians; firsts, chunk_bounds: sums of the bounds within and over chunks (`binning`).
+    slopes: gradients of the colours by the means, 9 vectors a block of 16; empty where no gradients are wanted.
+    raw: scales are logarithms and opacities logits."""
     n = opacities.size
     turned, basis = scratch[:TURNED], scratch[TURNED : TURNED + SQUARE]
     while True:
@@ -379,12 +381,9 @@ def project(
             first = min(block, n - LANES)  # the last block overlaps the one before and writes the same again
             _project_block(
                 means, quats, scales, opacities, sh, sh_width, degree, raw, camera, width, height, first, turned, basis,
-                records, centres, radii, bounds, slopes[block * SLOPES :],
+                records, centres, radii, depths, bounds, slopes[block * SLOPES :],
             )  # fmt: skip
-        total = 0
-        for i in range(start, end):
-            total += bounds[i]
-        chunk_bounds[chunk] = total
+        chunk_bounds[chunk] = number_slots(bounds, start, end, firsts)
 
 
 @inlined

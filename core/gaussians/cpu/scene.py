@@ -40,18 +40,19 @@ class _Rasterize(torch.autograd.Function):
         projection.describe_camera(
             flat(world_to_camera), flat(intrinsics), w, h, frame.near, frame.dilation, camera
         )
-        records, bounds = buffers.empty(n * layout.RECORD), buffers.empty(n, np.int32)
+        records, depths_of = buffers.empty(n * layout.RECORD), buffers.empty(n)
+        bounds, firsts = buffers.empty(n, np.int32), buffers.empty(n, np.int32)
         centres, centres_flat = buffers.pair(n, 2)
         radii, radii_flat = buffers.pair(n)
         blocks = -(-n // LANES) if any(ctx.needs_input_grad) else 0
         slopes = buffers.empty(blocks * LANES * projection.SLOPES)
-        chunk_bounds = np.zeros(-(-n // projection.CHUNK), np.int64)
+        chunk_bounds = np.zeros(-(-n // layout.CHUNK), np.int64)
         parallel(
             projection.project, *(flat(t) for t in (means, quats, scales, opacities, sh)), sh.shape[1] * 3,
-            frame.sh_degree, frame.raw, camera, w, h, records, centres_flat, radii_flat, bounds, chunk_bounds, slopes,
-            scratch=projection.SCRATCH,
+            frame.sh_degree, frame.raw, camera, w, h, records, centres_flat, radii_flat, depths_of, bounds, firsts,
+            chunk_bounds, slopes, scratch=projection.SCRATCH,
         )  # fmt: skip
-        bins = bin_gaussians(records, bounds, chunk_bounds, frame)
+        bins = bin_gaussians(records, depths_of.view(np.uint32), bounds, firsts, chunk_bounds, frame)
 
         image, image_flat = buffers.pair(h, w, 3)
         alpha, alpha_flat = buffers.pair(h, w)
@@ -88,7 +89,7 @@ class _Rasterize(torch.autograd.Function):
         )
         d_centres = buffers.empty(2 * n)
         with_camera = ctx.needs_input_grad[5] or ctx.needs_input_grad[6]
-        sums = np.zeros((-(-n // projection.CHUNK), projection.CAMERA_SUMS), np.float32)
+        sums = np.zeros((-(-n // layout.CHUNK), projection.CAMERA_SUMS), np.float32)
         parallel(
             projection.project_backward, *(flat(t) for t in (means, quats, scales, opacities)), sh.shape[1] * 3,
             frame.sh_degree, frame.raw, camera, records, slopes, rows, bins.firsts, bins.counts,

@@ -9,18 +9,11 @@ import torch
 from torch import Tensor
 
 from ..rendering import Splats
-from . import buffers, flare, layout, projection, raster_backward, raster_forward
-from .buffers import Array
+from . import buffers, flare, layout, raster_backward, raster_forward
 from .threads import parallel
-from .tiles import EMPTY, Bins, Grid, bin_gaussians, flat
+from .tiles import EMPTY, Grid, bin_gaussians, flat
 
 BLACK = np.zeros(3, np.float32)
-
-
-def _bin(records: Array, bounds: Array, grid: Grid) -> Bins:
-    chunks = np.arange(0, len(bounds), projection.CHUNK)
-    sums = np.add.reduceat(bounds, chunks, dtype=np.int64) if len(bounds) else np.zeros(0, np.int64)
-    return bin_gaussians(records, bounds, sums, grid, by_depth=False)
 
 
 class _Splat(torch.autograd.Function):
@@ -34,9 +27,10 @@ class _Splat(torch.autograd.Function):
         inputs = [flat(t) for t in (centres, covariances, opacities, colours)]
         shape_inputs = [EMPTY if t is None else flat(t) for t in (rings, arcs)]
         records, shapes = buffers.empty(n * layout.RECORD), buffers.empty(n * flare.SHAPE)
-        bounds = buffers.empty(n, np.int32)
-        flare.prepare(*inputs, *shape_inputs, w, h, add, records, shapes, bounds)
-        bins = _bin(records, bounds, grid)
+        keys, bounds, firsts = (buffers.empty(n, kind) for kind in (np.uint32, np.int32, np.int32))
+        chunk_bounds = np.empty(-(-n // layout.CHUNK), np.int64)
+        flare.prepare(*inputs, *shape_inputs, w, h, add, records, shapes, keys, bounds, firsts, chunk_bounds)
+        bins = bin_gaussians(records, keys, bounds, firsts, chunk_bounds, grid)
 
         image, image_flat = buffers.pair(h, w, 3)
         alpha, alpha_flat = buffers.pair(h, w)

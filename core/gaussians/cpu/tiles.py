@@ -13,6 +13,8 @@ from .buffers import Array
 from .threads import parallel
 
 EMPTY = np.empty(0, np.float32)
+PARTS_MAX, SAMPLE = 8, 1024
+"""Parts of the Gaussians that are sorted apart, and how many of them are asked where to cut."""
 
 
 @dataclass(frozen=True)
@@ -48,27 +50,35 @@ def flat(tensor: Tensor) -> Array:
 
 
 def bin_gaussians(
-    records: Array, bounds: Array, chunk_bounds: Array, grid: Grid, *, by_depth: bool = True
+    records: Array, keys: Array, bounds: Array, firsts: Array, chunk_bounds: Array, grid: Grid
 ) -> Bins:
-    """Sorts the n records into tiles; by depth or in the order given."""
-    n = len(bounds)
-    starts_of_chunks = np.cumsum(chunk_bounds) - chunk_bounds
+    """Sorts the n records into tiles, by key; the arguments are those of `binning.list_in_order`, which changes bounds
+    and firsts, and the sums of the bounds over chunks."""
+    n, parts = len(keys), min(torch.get_num_threads(), PARTS_MAX)  # each looks through all keys
     room = int(chunk_bounds.sum())
-    slots = buffers.empty(room, np.int32)
-    firsts, counts = buffers.empty(n, np.int32), buffers.empty(n, np.int32)
-    keys, spare_keys = buffers.empty(n, np.uint32), buffers.empty(n, np.uint32)
-    order, spare_order = buffers.empty(n, np.int32), buffers.empty(n, np.int32)
-    places = np.empty((binning.DIGITS, 1 << 11), np.int32)
+    listed = buffers.empty(room * binning.LISTED, np.int32)
+    spans, numbers = np.empty((parts, 2), np.int64), np.empty((parts, grid.tiles), np.int32)
     parallel(
-        binning.list_and_sort, records, records.view(np.uint32), bounds, starts_of_chunks,
-        grid.width, grid.height, grid.tiles_x, by_depth, slots, firsts, counts,
-        places, keys, spare_keys, order, spare_order,
+        binning.list_in_order, records, keys, bounds, firsts, np.cumsum(chunk_bounds) - chunk_bounds,
+        _cuts(keys, bounds, parts), grid.width, grid.height, grid.tiles_x,
+        np.zeros(2, np.int64), np.empty((parts, binning.DIGITS, 1 << 11), np.int32),
+        buffers.empty(2 * (n + parts), np.int64).reshape(2, -1), listed, spans, numbers,
     )  # fmt: skip
-    m = int(np.count_nonzero(bounds))
-    numbers = np.empty((torch.get_num_threads(), grid.tiles), np.int32)
     starts = np.empty(grid.tiles + 1, np.int64)
-    parallel(binning.count, order, m, slots, firsts, counts, numbers)
     binning.deal(numbers, starts)
     entries = buffers.empty(int(starts[-1]) * layout.ENTRY, np.int32)
-    parallel(binning.scatter, order, m, slots, firsts, counts, numbers, entries)
-    return Bins(entries, starts, firsts, counts, room)
+    parallel(binning.scatter, listed, spans, numbers, entries)
+    return Bins(entries, starts, firsts, bounds, room)
+
+
+def _cuts(keys: Array, bounds: Array, parts: int) -> Array:
+    """(parts + 1,) keys between which there is about the same number of tiles to list, judged by a sample."""
+    cuts = np.zeros(parts + 1, np.int64)
+    cuts[parts] = binning.NOWHERE
+    if parts > 1 and len(keys):
+        step = -(-len(keys) // SAMPLE)
+        order = np.argsort(keys[::step])
+        work = np.cumsum(bounds[::step][order])
+        places = np.searchsorted(work, work[-1] * np.arange(1, parts) / parts)
+        cuts[1:parts] = np.minimum(keys[::step][order[places]], binning.NOWHERE)
+    return cuts

@@ -60,19 +60,23 @@ class Adam:
     @torch.no_grad()
     def step(self) -> None:
         """Moves every parameter that has a gradient and a rate."""
+        options = {"beta1": self.betas[0], "beta2": self.betas[1], "epsilon": self.epsilon}
+        cpu, together = None, []
         for name, rate in self.rates.items():
             parameter = self.parameters[name]
             if parameter.grad is None or parameter.numel() == 0:
                 continue
             self.steps[name] += 1
-            moments = self.moments[name]
             data = parameter.data
-            cpu = fused(data) if self.kernels == "auto" and data.is_contiguous() else None
-            advance = adam_step if cpu is None else cpu.adam_step
-            advance(
-                data, parameter.grad.contiguous(), moments.first, moments.second, step=self.steps[name],
-                rate=rate, beta1=self.betas[0], beta2=self.betas[1], epsilon=self.epsilon,
-            )  # fmt: skip
+            values = (data, parameter.grad.contiguous(), *self.moments[name], self.steps[name], rate)
+            found = fused(data) if self.kernels == "auto" and data.is_contiguous() else None
+            if found is None:
+                adam_step(*values, **options)
+            else:
+                cpu = found
+                together.append(cpu.Step(*values))
+        if cpu is not None:
+            cpu.adam_steps(together, **options)
 
     def zero_grad(self) -> None:
         """Forgets the gradients."""
@@ -137,8 +141,8 @@ def replace_rows(parameter: Parameter, rows: Tensor) -> None:
 
 
 def adam_step(
-    parameter: Tensor, gradient: Tensor, first: Tensor, second: Tensor,
-    *, step: int, rate: Rate, beta1: float, beta2: float, epsilon: float,
+    parameter: Tensor, gradient: Tensor, first: Tensor, second: Tensor, step: int, rate: Rate,
+    *, beta1: float, beta2: float, epsilon: float,
 ) -> None:  # fmt: skip
     """One step in place, in torch; `step` counts from 1, `rate` is a float or has the shape of a row."""
     first.lerp_(gradient, 1 - beta1)

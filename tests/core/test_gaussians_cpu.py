@@ -19,7 +19,7 @@ pytest.importorskip("numba")
 from core.gaussians import loss as definition
 from core.gaussians import optimiser as plain_optimiser
 from core.gaussians import rasterization, splat
-from core.gaussians.cpu import adam_step, buffers, compilation, l1_ssim, threads
+from core.gaussians.cpu import Step, adam_steps, buffers, compilation, l1_ssim, threads
 
 ROOT = Path(__file__).parents[2]
 SIZE = (70, 45)
@@ -283,10 +283,15 @@ def test_adam(shape: tuple[int, ...], rate: float | Tensor) -> None:
     moments = [torch.zeros(shape) for _ in range(2)]
     exact, exact_moments = values.double(), [m.double() for m in moments]
     exact_rate = rate.double() if isinstance(rate, Tensor) else rate
+    other, other_moments = torch.zeros(40_000), [torch.zeros(40_000) for _ in range(2)]  # in the same call
     for step in range(1, 5):
         gradient = torch.randn(shape, generator=g)
-        constants = {"step": step, "beta1": 0.9, "beta2": 0.999, "epsilon": 1e-15}
-        adam_step(values, gradient, *moments, rate=rate, **constants)
-        plain_optimiser.adam_step(exact, gradient.double(), *exact_moments, rate=exact_rate, **constants)
+        constants = {"beta1": 0.9, "beta2": 0.999, "epsilon": 1e-15}
+        others = Step(other, torch.ones(40_000), *other_moments, 1, 0.5)
+        adam_steps([Step(values, gradient, *moments, step, rate), others], **constants)
+        plain_optimiser.adam_step(exact, gradient.double(), *exact_moments, step, exact_rate, **constants)
+        for moment in other_moments:
+            moment.zero_()
+    assert torch.allclose(other, torch.tensor(-2.0))
     assert (values - exact).abs().max() < 3e-6
     assert (moments[0] - exact_moments[0]).abs().max() < 1e-6

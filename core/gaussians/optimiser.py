@@ -60,7 +60,7 @@ class Adam:
     @torch.no_grad()
     def step(self) -> None:
         """Moves every parameter that has a gradient and a rate."""
-        options = {"beta1": self.betas[0], "beta2": self.betas[1], "epsilon": self.epsilon}
+        options: dict[str, Any] = {"beta1": self.betas[0], "beta2": self.betas[1], "epsilon": self.epsilon}
         cpu, together = None, []
         for name, rate in self.rates.items():
             parameter = self.parameters[name]

@@ -255,7 +255,7 @@ class _L1Ssim(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, d_loss: Tensor) -> Any:  # type: ignore[override]
         (d_image,) = ctx.saved_tensors
-        return d_image if d_loss == 1 else d_image * d_loss, None, None
+        return d_image if d_loss.item() == 1 else d_image * d_loss, None, None
 
 
 def l1_ssim(image: Tensor, target: Tensor, lam: float) -> Tensor:

@@ -64,7 +64,7 @@ class _Rasterize(torch.autograd.Function):
             image_flat, alpha_flat, depth_flat, median_flat, ends, scratch=raster_forward.STATE,
         )  # fmt: skip
         ctx.save_for_backward(means, quats, scales, opacities, sh, image, alpha, depth)
-        ctx.frame, ctx.bins, ctx.centre_gradients = frame, bins, centre_gradients
+        ctx.frame, ctx.bins, ctx.centre_gradients, ctx.first = frame, bins, centre_gradients, True
         ctx.arrays = records, camera, slopes, ends, behind
         ctx.mark_non_differentiable(median, centres, radii)
         ctx.set_materialize_grads(False)
@@ -87,7 +87,9 @@ class _Rasterize(torch.autograd.Function):
         gradients, gradients_flat = zip(
             *(buffers.pair(*t.shape) for t in (means, quats, scales, opacities, sh)), strict=True
         )
-        d_centres = buffers.empty(2 * n)
+        # the first time the kernel writes them where they belong; a second backward adds to them
+        first, ctx.first = ctx.first, False
+        d_centres = flat(ctx.centre_gradients) if first else buffers.empty(2 * n)
         with_camera = ctx.needs_input_grad[5] or ctx.needs_input_grad[6]
         sums = np.zeros((-(-n // layout.CHUNK), projection.CAMERA_SUMS), np.float32)
         parallel(
@@ -95,7 +97,8 @@ class _Rasterize(torch.autograd.Function):
             frame.sh_degree, frame.raw, camera, records, slopes, rows, bins.firsts, bins.counts,
             *gradients_flat, d_centres, sums, with_camera, scratch=projection.SCRATCH,
         )  # fmt: skip
-        flat(ctx.centre_gradients)[:] += d_centres
+        if not first:
+            flat(ctx.centre_gradients)[:] += d_centres
         d_world_to_camera, d_intrinsics = _camera_gradients(sums, camera) if with_camera else (None, None)
         d_background = None
         if ctx.needs_input_grad[7] and d_image is not None:

@@ -20,6 +20,7 @@ import argparse
 import importlib
 import json
 import os
+import statistics
 import subprocess
 import sys
 import tempfile
@@ -38,7 +39,7 @@ from torch import Tensor  # noqa: E402
 
 from benchmarks import opensplat, report, workload  # noqa: E402
 from benchmarks.report import milliseconds, table  # noqa: E402
-from benchmarks.timing import medians, on_threads  # noqa: E402
+from benchmarks.timing import medians, on_threads, once, threads  # noqa: E402
 from core.gaussians import Adam, SceneGaussians, kernels, l1_ssim, over, rasterization, splat  # noqa: E402
 from core.gaussians.scene import learning_rates  # noqa: E402
 from core.gaussians.spherical_harmonics import colours  # noqa: E402
@@ -211,6 +212,63 @@ def iteration_section(sets: list[str], counts: list[int], rounds: int) -> str:
         for job in ITERATION_JOBS
     ]
     return table(["A training iteration, ms", *[f"{name}, {_count(c)}" for name in shown for c in counts]], rows)
+
+
+STAGES = {
+    "projection": ("project",),
+    "tiles and depth order": ("list_in_order", "scatter"),
+    "raster, forward": ("raster",),
+    "raster, backward": ("raster_backward",),
+    "projection, backward": ("project_backward",),
+    "loss": ("compare", "gradient"),
+    "Adam": ("_advance_all",),
+}
+STAGE_JOBS = (ITERATION_JOBS[0], ITERATION_JOBS[3])
+
+
+def stage_section(counts: list[int], rounds: int) -> str:
+    """The CPU kernels within whole iterations, and what is left: autograd, Python, memory."""
+    rows = {name: [name] for name in (*STAGES, "between the kernels", "iteration", "the raster alone")}
+    for job in STAGE_JOBS:
+        for count in counts:
+            iteration = Iteration(job, "cpu")
+            with threads(count):
+                found = _stage_times(iteration.step, 10 * rounds)
+            found["the raster alone"] = found["raster, forward"] + found["raster, backward"]
+            for name, row in rows.items():
+                row.append(milliseconds(found[name]))
+    head = ["ms", *[f"{job}, {_count(count)}" for job in STAGE_JOBS for count in counts]]
+    return table(head, list(rows.values()))
+
+
+def _stage_times(step: Callable[[], object], repeats: int) -> dict[str, float]:
+    """Median seconds of each stage over repetitions of a step."""
+    step()  # loads the kernels
+    spent: dict[str, float] = {}
+    parallel = importlib.import_module("core.gaussians.cpu.threads").parallel
+
+    def timed(function: Callable[..., object], *arguments: object, **options: object) -> None:
+        start = time.perf_counter()
+        parallel(function, *arguments, **options)
+        spent[function.__name__] = spent.get(function.__name__, 0.0) + time.perf_counter() - start
+
+    users = [module for name, module in sys.modules.items()
+             if name.startswith("core.gaussians.cpu.") and getattr(module, "parallel", None) is parallel]
+    samples: dict[str, list[float]] = {name: [] for name in (*STAGES, "between the kernels", "iteration")}
+    for module in users:
+        module.parallel = timed  # type: ignore[attr-defined]
+    try:
+        for _ in range(3 + repeats):
+            spent.clear()
+            whole = once(step)
+            for name, functions in STAGES.items():
+                samples[name].append(sum(spent.get(function, 0.0) for function in functions))
+            samples["between the kernels"].append(whole - sum(spent.values()))
+            samples["iteration"].append(whole)
+    finally:
+        for module in users:
+            module.parallel = parallel  # type: ignore[attr-defined]
+    return {name: statistics.median(values[3:]) for name, values in samples.items()}
 
 
 def flare_section(sets: list[str], rounds: int) -> str:
@@ -431,6 +489,7 @@ def main() -> None:
     write: dict[str, Callable[[], str]] = {
         "raster": lambda: raster_section(engines, counts, rounds, arguments.device),
         "iteration": lambda: iteration_section(arguments.kernels, counts, rounds),
+        "stages": lambda: stage_section(counts, rounds),
         "flares": lambda: flare_section(arguments.kernels, rounds),
         "curve": lambda: curve_section(engines, rounds, arguments.device, arguments.out.parent / "engine-curve.png"),
         "process": lambda: process_section(arguments.kernels),
@@ -449,6 +508,7 @@ def main() -> None:
 SECTIONS = {
     "raster": "Rasterization",
     "iteration": "Training",
+    "stages": "By stage",
     "flares": "Flares",
     "curve": "Against the number of Gaussians",
     "process": "Memory, first calls, instruction sets",

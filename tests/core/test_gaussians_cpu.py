@@ -2,6 +2,7 @@
 """The CPU kernels as a piece of machinery: the same result on every machine, thread count and start."""
 from __future__ import annotations
 
+import math
 import os
 import subprocess
 import sys
@@ -71,6 +72,35 @@ def test_every_run_and_every_thread_count_gives_the_same_bits() -> None:
     for count in (1, 2, 3):
         for a, b in zip(first, gradients(count), strict=True):
             assert torch.equal(a, b), count
+
+
+@pytest.mark.parametrize("planes", [1, 3])
+def test_equal_depths_are_drawn_in_the_order_given(planes: int) -> None:
+    """Depths that many share: cuts between the threads' parts fall on them, and parts may be empty."""
+    means = scene()["means"]  # type: ignore[operator]
+    z = means[:, 2].quantile((torch.arange(planes) + 0.5) / planes)[torch.arange(len(means)) % planes]
+    means = means * (z / means[:, 2])[:, None]
+    means[:, 2] = z
+    changes = {"means": means, "near": 0.1}
+    exact = rasterization(**{**scene(), **changes, "kernels": "torch"}).colour  # type: ignore[operator]
+    first = gradients(1, **changes)
+    assert (first[0] - exact).abs().max() < 1e-4
+    for count in (2, 5):
+        for a, b in zip(first, gradients(count, **changes), strict=True):
+            assert torch.equal(a, b), count
+
+
+def test_what_is_not_a_number_is_not_drawn() -> None:
+    """In the raw form too: exponential and sigmoid must not turn NaN into a size and an opacity."""
+    arguments = scene()  # type: ignore[operator]
+    kept = torch.arange(len(arguments["means"])) % 7 != 0
+    names = ("means", "quats", "scales", "opacities", "sh")
+    arguments |= {"scales": arguments["scales"].log(), "opacities": torch.logit(arguments["opacities"]), "raw": True}
+    without = rasterization(**{**arguments, **{name: arguments[name][kept] for name in names}}).colour
+    for name in ("scales", "opacities"):
+        spoiled = arguments[name].clone()
+        spoiled[~kept] = math.nan
+        assert torch.equal(rasterization(**{**arguments, name: spoiled}).colour, without)
 
 
 def test_splats_give_the_same_bits_on_all_thread_counts() -> None:

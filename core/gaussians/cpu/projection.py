@@ -308,7 +308,7 @@ def _project_block(
     a, b, _, _ = _picture_axes(camera, v, _load_scales(scales, first, raw), slopes, inverse_z)
     xx, xy, yy, determinant = _covariance(a, b, camera[DILATION])
 
-    opacity = minimum(_load_opacities(opacities, first, raw), OPACITY_MAX)
+    opacity = minimum(splat(OPACITY_MAX), _load_opacities(opacities, first, raw))  # NaN, as second, stays NaN
     reach = log2(maximum(opacity, ALPHA_MIN) * ALPHA_MIN_INVERSE)  # half the squared radius, over ln 2
     radius2 = reach * TWO_LN2
     half_x, half_y = sqrt(radius2 * xx), sqrt(radius2 * yy)

@@ -2,19 +2,25 @@
 """Transfer against exact flares: the sample's lens and lights on another path, through another scene.
 
     python benchmarks/transfer.py RUN [--world moved] [--frames 40] [--query blend] [--out FOLDER]
+    python benchmarks/transfer.py RUN --to CAPTURE --scene PLY [--query blend] [--out FOLDER]
 
 The target is made here: a camera path that the capture does not have, its focal length, principal point and
 aspect other than the capture's, a plain background, and lights that are hidden in known frames. Its flares come
 from the generator of the sample (traced ghosts, diffraction), at the target's own views. `--world moved` turns and
 shifts the whole target, so that nothing in its coordinates is the source's. Scored are views whose lights stand
 where training saw lights, in the frame's terms: inside the range of their place and distance.
+
+With `--to` the target is a rendered capture whose layers are known, with the same lens and lights
+(`sample_scenes/render.py --scene studio`), and PLY its scene as splats (`fit --mode 3dgs` of its flare-free frames),
+which alone says what hides a light.
 """
 from __future__ import annotations
 
 import argparse
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,12 +28,13 @@ from numpy.typing import NDArray
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from core.capture import Camera, Capture
-from core.files import write_json
+from core.errors import CaptureError
+from core.files import read_json, write_json
 from core.fit.run import FLARE, Run
 from core.look import Look, ViewOfLight, read
 from core.look.shot import PlacedLight, Shot, ShotFrame
 from core.pictures import srgb_from_linear, write_png
-from core.transfer.target import of_shot
+from core.transfer.target import Target, of_capture, of_shot
 from core.transfer.transfer import Transfer, TransferSettings
 from sample_scenes.description import looking_at
 from sample_scenes.flares import LOOKS, render_flare
@@ -38,10 +45,11 @@ Pixels = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class Truth:
-    """A target's frame: what it is, and the exact flare by light."""
+    """A target's frame: what it is, with the exact share of each light; the exact flare and scene, scene-linear."""
 
     shot: ShotFrame
-    flares: dict[str, Pixels]
+    flare: Pixels
+    scene: Pixels
 
 
 def path(number: int, count: int) -> NDArray[np.float64]:
@@ -64,12 +72,8 @@ def moved(pose: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.fl
 
 
 def target(count: int, world: str, size: tuple[int, int], look: Look) -> list[Truth]:
-    """Frames with exact flares. Each light is hidden for some frames, and behind an edge for two beside them.
-
-    A light's source is the light of the look that was found nearest to where it is.
-    """
-    sources = {light.name: min(look.lights, key=lambda one: float(np.linalg.norm(one.xyz - light.xyz))).name
-               for light in DESK.lights}
+    """Frames with exact flares. Each light is hidden for some frames, and behind an edge for two beside them."""
+    sources = sources_of(look)
     width, height = size
     made = []
     for number in range(count):
@@ -78,18 +82,41 @@ def target(count: int, world: str, size: tuple[int, int], look: Look) -> list[Tr
         if world == "moved":
             motion, there = moved(pose)
             camera = Camera(width, height, camera.fx, camera.fy, camera.cx, camera.cy, there)
-        lights, flares = [], {}
+        lights, flare = [], np.zeros((height, width, 3), np.float32)
         for index, light in enumerate(DESK.lights):
             centre = count * (0.35 + 0.3 * index)
             share = float(np.clip((abs(number - centre) - 2.5) / 3, 0, 1))
             xyz = np.array(light.xyz)
             local = pose[:3, :3] @ xyz + pose[:3, 3]
-            flares[light.name] = render_flare(
-                LOOKS[DESK.lens], camera, local, colour=light.colour, visible_share=share,
-                intensity=light.strength(float(np.linalg.norm(local))))
+            flare += render_flare(LOOKS[DESK.lens], camera, local, colour=light.colour, visible_share=share,
+                                  intensity=light.strength(float(np.linalg.norm(local))))
             lights.append(PlacedLight(light.name, sources[light.name], motion[:3, :3] @ xyz + motion[:3, 3], share))
-        made.append(Truth(ShotFrame(number + 1, "Camera", camera, tuple(lights)), flares))
+        made.append(Truth(ShotFrame(number + 1, "Camera", camera, tuple(lights)), flare, background(camera)))
     return made
+
+
+def rendered(folder: Path, scene: Path, look: Look) -> tuple[list[Truth], Target]:
+    """The frames of a capture with exact layers, and the target that a transfer on to it has: its cameras, the
+    places of its lights, and its splats, but nothing that only the truth knows."""
+    capture = Capture.open(folder)
+    shares = read_json(folder / "truth" / "visible_share.json", CaptureError)
+    found = of_capture(capture, look, sources_of(look), scene=scene)
+    views = {view.name: view for view in capture.views}
+    made = []
+    for one in found.frames:
+        view = views[one.frame.view]
+        flare, below = capture.truth_flare(view), capture.truth_scene(view)
+        if flare is None or below is None:
+            raise CaptureError(f"{folder} has no exact layers; make it with sample_scenes/render.py.")
+        lights = tuple(replace(light, share=shares[view.name][light.name]) for light in one.shot.lights)
+        made.append(Truth(replace(one.shot, lights=lights), flare.pixels, below.pixels))
+    return made, found
+
+
+def sources_of(look: Look) -> dict[str, str]:
+    """The light of the look that was found nearest to where each of the desk's lights is."""
+    return {light.name: min(look.lights, key=lambda one: float(np.linalg.norm(one.xyz - light.xyz))).name
+            for light in DESK.lights}
 
 
 def background(camera: Camera) -> Pixels:
@@ -117,6 +144,8 @@ def main() -> None:
     parser.add_argument("--smooth", type=int, default=1)
     parser.add_argument("--frames", type=int, default=40)
     parser.add_argument("--width", type=int, default=480)
+    parser.add_argument("--to", type=Path, metavar="CAPTURE", help="a rendered target with exact layers")
+    parser.add_argument("--scene", type=Path, metavar="PLY", help="of the rendered target")
     parser.add_argument("--out", type=Path)
     words = parser.parse_args()
 
@@ -125,16 +154,19 @@ def main() -> None:
     capture = Capture.open(made.capture_folder if made.capture_folder.is_dir() else "sample_scenes/desk",
                            need_frames=False)
     training = [view.camera.world_to_camera for view in capture.split(made.settings.holdout)[0]]
-    truths = target(words.frames, words.world, (words.width, words.width * 5 // 8), look)
-    shot = Shot(words.run / FLARE, tuple(truth.shot for truth in truths))
-    transfer = Transfer(words.run / FLARE, of_shot(shot, look, {}),
-                        TransferSettings(query=words.query, smooth=words.smooth), training)
+    if words.to:
+        truths, onto = rendered(words.to, words.scene, look)
+    else:
+        truths = target(words.frames, words.world, (words.width, words.width * 5 // 8), look)
+        onto = of_shot(Shot(words.run / FLARE, tuple(truth.shot for truth in truths)), look, {})
+    transfer = Transfer(words.run / FLARE, onto, TransferSettings(query=words.query, smooth=words.smooth), training)
     ranges = {light.name: transfer.seen[light.name] for light in look.lights}
 
-    rows, hidden, pictures = [], 0.0, []
+    rows: list[dict[str, Any]] = []
+    hidden, pictures = 0.0, []
     for index, truth in enumerate(truths):
         camera = truth.shot.camera
-        exact = sum(truth.flares.values())
+        exact, scene = truth.flare, truth.scene
         layers = transfer.of_frame(transfer.target.frames[index].frame).render(camera)
         ours = sum(layers.flare_by_light.values())
         for light in truth.shot.lights:
@@ -142,12 +174,11 @@ def main() -> None:
                 hidden = max(hidden, float(np.abs(layers.flare_by_light[light.name]).max()))
         inside = all(is_inside(ranges[light.source], ViewOfLight.of(camera.world_to_camera, light.xyz),
                                float(np.linalg.norm(camera.position - light.xyz))) for light in truth.shot.lights)
-        scene = background(camera)
         clipped = np.clip(scene + exact, 0, 1), np.clip(scene + ours, 0, 1)
         rows.append({"frame": truth.shot.frame, "inside": inside, "shares": [one.share for one in truth.shot.lights],
                      "flare": psnr(shown(scene, exact), shown(scene, ours)), "flare_linear": psnr(*clipped),
                      "empty": psnr(shown(scene, exact), 0 * exact)})
-        if index % max(words.frames // 6, 1) == 0:
+        if index % max(len(truths) // 6, 1) == 0:
             pictures.append(np.concatenate([srgb_from_linear(part) for part in clipped], 1))
         print(f"frame {rows[-1]['frame']:3}  inside {inside!s:5}  shares "
               + " ".join(f"{share:.2f}" for share in rows[-1]["shares"])
@@ -160,8 +191,9 @@ def main() -> None:
           f"{worst['flare']:.2f}, frame {worst['frame']}), in linear light {means['flare_linear']:.2f}, empty "
           f"{means['empty']:.2f}; most light of a hidden light: {hidden:g}")
     if words.out:
-        write_png(words.out / f"transfer_{words.world}_{words.query}.png", np.concatenate(pictures))
-        write_json(words.out / f"transfer_{words.world}_{words.query}.json", {"means": means, "views": rows})
+        name = f"transfer_{words.to.name if words.to else words.world}_{words.query}"
+        write_png(words.out / f"{name}.png", np.concatenate(pictures))
+        write_json(words.out / f"{name}.json", {"means": means, "views": rows})
 
 
 def is_inside(seen: object, view: ViewOfLight, distance: float) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from ..description import SceneDescription
-from . import desk, gallery, garden, street
+from . import desk, gallery, garden, street, studio
 
 SCENES: dict[str, SceneDescription] = {scene.name: scene for scene in (
-    desk.DESK, street.STREET, gallery.GALLERY, garden.GARDEN)}
+    desk.DESK, street.STREET, gallery.GALLERY, garden.GARDEN, studio.STUDIO)}

@@ -210,7 +210,8 @@ def test_an_anamorphic_lens_draws_its_ghosts_and_streak_along_x() -> None:
 
 def test_every_scene_has_a_look_and_a_lens_of_its_own() -> None:
     assert len({scene.seed for scene in SCENES.values()}) == len(SCENES) >= 4
-    lenses = [LOOKS[scene.lens].lens for scene in SCENES.values()]
+    # The studio is what the desk's flare is put on to, so it has the desk's lens.
+    lenses = [LOOKS[scene.lens].lens for name, scene in SCENES.items() if name != "studio"]
     assert len(set(lenses)) == len(lenses) and set(lenses) <= set(LENSES)
     for scene in SCENES.values():
         np.testing.assert_allclose(np.linalg.det(scene.poses[:, :3, :3]), 1.0)

@@ -319,20 +319,20 @@ def _commit() -> str:
     return done.stdout.strip() or "unknown"
 
 
-def write(results: Results, length: str, document: Path) -> str:
-    """The tables, with what they were made of, into the document; returns them."""
+def write(results: Results, section: str, length: str, document: Path) -> str:
+    """The tables, with what they were made of, into a section of the document; returns them."""
     commits = {one["commit"]: None for rows in results.values() for row in rows.values() for one in row.values()}
-    head = (f"{length}; fitted at commit {', '.join(commits)}; times are of a machine with other work on it. "
+    head = (f"Fitted at commit {', '.join(commits)}; times are of a machine with other work on it. "
             f"{report.conditions()}")
-    text = f"## Figures\n\n{head}\n\n{tables(results)}"
+    text = f"## Figures: {length[0].lower()}{length[1:]}\n\n{head}\n\n{tables(results)}"
     for study in ("form", "known", "extrapolation"):
         if study in results and len(shared(results[study])) > 1:
             text += f"\n\n### {study}, by capture\n\n" + by_capture(results[study])
     if "robustness" in results:
-        picture = document.parent / "ablations-robustness.png"
+        picture = document.parent / f"{section}-robustness.png"
         plot(results["robustness"], picture)
         text += f"\n\n![The flare against the displacement of its light]({picture.name})"
-    report.write_section(document, "ablations", text)
+    report.write_section(document, section, text)
     return text
 
 
@@ -354,11 +354,11 @@ def main() -> None:
         (not words.only or one.study in words.only) and (not words.variants or one.name in words.variants))
     length = partial(preset, words.preset, iterations=words.iterations)
     made = length()
+    section = f"ablations-{words.preset}-{made.iterations}-{words.width}"
     progress = TerminalProgress()
     for experiment in filter(wanted, experiments(length)):
         for capture in words.captures:
-            root = words.out / f"{words.preset}-{made.iterations}-{words.width}"
-            folder = root / experiment.key() / capture.name
+            folder = words.out / section / experiment.key() / capture.name
             if words.finished and not (folder / SCORES).is_file():
                 continue
             progress.say(f"{experiment.study}: {experiment.name}, {capture.name}")
@@ -366,7 +366,7 @@ def main() -> None:
             results.setdefault(experiment.study, {}).setdefault(experiment.name, {})[capture.name] = scores
     progress.close()
     size = f"{words.width} pixels wide" if words.width else "at the size of the frames"
-    text = write(results, f"Preset {words.preset} of {made.iterations} iterations, {size}", words.document)
+    text = write(results, section, f"Preset {words.preset} of {made.iterations} iterations, {size}", words.document)
     sys.stdout.write(text + "\n")
 
 

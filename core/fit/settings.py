@@ -29,7 +29,10 @@ Preset = Literal["draft", "standard", "high", "paper"]
 
 @dataclass(frozen=True)
 class FlareRates:
-    """Adam's learning rates for the flare; `position` decays exponentially to `position_final`."""
+    """Adam's learning rates for the flare; `position` decays exponentially to `position_final`.
+
+    settled: the share of the others that is left at the end, to which they fall exponentially from the middle on.
+    """
 
     network: float = 1e-4
     grids: float = 1e-4
@@ -42,6 +45,7 @@ class FlareRates:
     offset: float = 1e-3
     ring: float = 5e-3
     latent: float = 5e-3
+    settled: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -63,6 +67,10 @@ class FlareSettings:
 
     `detection` False puts every light at the centroid of the points plus uniform noise (ablation).
     `occlusion` scales each flare by the share of its light that the scene leaves visible (`visibility`).
+    `begin`: share of the iterations in which the scene is fitted alone first, where it has flare-free frames: a
+    flare that is fitted before the scene hides its light learns to vanish by itself, and in the views beside, too.
+    `steady`: weight of the squared delta_l in the loss. Where a light is hidden nothing else holds delta_l, and Adam
+    makes of the faintest gradient a full step: it wanders out of the frame and takes the views beside along.
     """
 
     form: FlareForm = PAPER
@@ -72,6 +80,8 @@ class FlareSettings:
     rates: FlareRates = field(default_factory=FlareRates)
     detection: bool = True
     occlusion: bool = False
+    begin: float = 0.0
+    steady: float = 0.0
     visibility: VisibilitySettings = field(default_factory=VisibilitySettings)
 
     @property
@@ -130,6 +140,8 @@ class FitSettings:
             (0 <= self.ssim_share <= 1, "ssim_share must lie between 0 and 1"),
             (0 <= self.apart <= 1, "apart must lie between 0 and 1"),
             (self.flare.count >= 1, "a flare starts with at least one Gaussian"),
+            (0 <= self.flare.begin < 1, "flare.begin must lie between 0 and 1"),
+            (self.flare.steady >= 0, "flare.steady must not be negative"),
             (0 < self.flare.opacity < 1, "a flare's opacity must lie between 0 and 1"),
             (self.seed >= 0, "seed must not be negative"),
             (not self.scene.frozen or bool(self.scene.start), "a frozen scene needs a PLY to start from"),
@@ -143,6 +155,12 @@ class FitSettings:
 
 APART = 0.7
 """Share of the iterations in which our form fits scene and flare apart."""
+BEGIN = 0.08
+"""Share of the iterations in which our form fits the scene alone."""
+STEADY = 0.1
+"""Far less than what the picture holds delta_l with where there is a flare, far more than what pulls it elsewhere."""
+SETTLED = 0.05
+"""Share of the flare's rates that is left at the end of a short schedule."""
 
 
 def preset(name: Preset, *, model: Literal["paper", "ours"] | None = None, mode: Mode = "default",
@@ -163,7 +181,9 @@ def preset(name: Preset, *, model: Literal["paper", "ours"] | None = None, mode:
     form = replace(PAPER if model == "paper" else OURS, line=mode != "2d")
     if blend is None:
         blend = "over" if model == "paper" else "add"
-    flare = FlareSettings(form=form, occlusion=model == "ours")
+    flare = FlareSettings(form=form)
+    if model == "ours":
+        flare = replace(flare, occlusion=True, begin=BEGIN, steady=STEADY)
     settings = FitSettings(mode=mode, blend=blend, iterations=length, flare=flare,
                            apart=APART if model == "ours" else 0.0)
     if name != "paper":
@@ -183,10 +203,11 @@ def _shortened(settings: FitSettings, count: int, most: int) -> FitSettings:
     """
     length = settings.iterations
     every = max(round(length / 40), 20)
-    density = replace(settings.flare.density, start=max(round(length * 0.1), every), stop=round(length * 0.6),
-                      every=every, clone_ratio=0.1)
+    begin = settings.flare.begin
+    density = replace(settings.flare.density, start=max(round(length * (begin + 0.1)), every),
+                      stop=round(length * (begin * 0.6 + 0.6)), every=every, clone_ratio=0.1)
     rates = replace(settings.flare.rates, network=1e-3, grids=5e-3, position=1.6e-3, position_final=1.6e-5,
-                    features=1e-2, scale=0.02, rotation=5e-3)
+                    features=1e-2, scale=0.02, rotation=5e-3, settled=SETTLED)
     classic = replace(settings.scene.classic, start=round(length * 0.05), stop=round(length * 0.6),
                       every=max(round(length / 50), 20), reset_every=10 * length, cap=most)
     scene = replace(settings.scene, classic=classic, sh_every=max(round(length / 6), 1),

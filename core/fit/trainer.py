@@ -22,6 +22,7 @@ from ..flare.compositing import composite
 from ..flare.deformation import QueryRange
 from ..flare.density import clone_and_prune
 from ..flare.model import FlareModel, LightFlare, ViewOfLight
+from ..flare.visibility import clear_shares
 from ..gaussians.densification import Classic, Mcmc, Strategy
 from ..gaussians.loss import l1_ssim
 from ..gaussians.optimiser import Adam
@@ -38,6 +39,11 @@ SOURCE = 0.02
 """Radius about a light, of the frame's width, in which what is white is taken for the light itself."""
 WHITE = 0.93
 """Display value from which a pixel of a light's disc counts as clipped: JPEG and noise leave white a little less."""
+
+CLEAR_EVERY = 50
+"""Iterations between two looks at how much of the lights the scene leaves (`visibility.clear_shares`)."""
+CLEAR_VIEWS = 40
+"""About as many views are asked."""
 
 
 class Trainer:
@@ -63,6 +69,7 @@ class Trainer:
         self.scene_adam = Adam(dict(self.scene.named_parameters()), self._scene_rates())
         self.strategy = self._strategy()
         self.flare_adam, self.grid_adam = _flare_optimisers(self.flare, settings)
+        self._flare_rates = dict(self.flare_adam.rates) if self.flare_adam else {}
 
     # ---- one iteration ----------------------------------------------------------------------------
 
@@ -73,11 +80,13 @@ class Trainer:
         targets = self.frames.targets(self._view())
         self._set_rates()
         scene = self.scene.render(targets.camera, sh_degree=self._sh_degree(), depth=False, kernels=settings.kernels)
-        flare = render_flare(self.flare, settings.blend, targets.camera, settings.kernels, scene=self.scene,
-                             visibility=settings.flare.occluded_by_scene)
+        self._look_for_lights()
+        alone = self._scene_alone(targets)
+        flare = None if alone else render_flare(self.flare, settings.blend, targets.camera, settings.kernels,
+                                                scene=self.scene, visibility=settings.flare.occluded_by_scene)
         picture = composite(self._behind_flare(targets, scene.colour), flare, settings.blend)
         weight = 1 - settings.ssim_share
-        loss = l1_ssim(picture, targets.frame, weight)
+        loss = scene.colour.new_zeros(()) if alone else l1_ssim(picture, targets.frame, weight)
         figures = {"loss": float(loss.detach())}
         clean = self._scene_target(targets, picture, scene.colour)
         if clean is not None and self.scene_is_fitted:
@@ -88,6 +97,9 @@ class Trainer:
             raise RunError(f"The fit diverged at iteration {self.iteration}; start it anew with lower learning rates.")
         if self.scene_is_fitted:
             loss = loss + self.strategy.regulariser()
+        if flare is not None and self.flare is not None and settings.flare.steady:
+            pose = torch.from_numpy(targets.camera.world_to_camera)
+            loss = loss + settings.flare.steady * self.flare.corrections(pose).square().sum()
         if loss.requires_grad:  # a frozen scene without a light in front of the camera teaches nothing
             loss.backward()
         if self.scene_is_fitted:
@@ -107,6 +119,21 @@ class Trainer:
         done = self.iteration - 1
         order = torch.randperm(len(self.views), generator=self._generator(done // len(self.views), 1))
         return self.views[int(order[done % len(self.views)])]
+
+    def _look_for_lights(self) -> None:
+        """What the scene leaves of each light where nothing hides it, anew every now and then."""
+        visibility = self.settings.flare.occluded_by_scene
+        if self.flare is None or visibility is None or self.iteration % CLEAR_EVERY != 1:
+            return
+        poses = [torch.from_numpy(view.camera.world_to_camera) for view in self.views]
+        chosen = poses[:: max(len(poses) // CLEAR_VIEWS, 1)]
+        self.flare.clear.copy_(clear_shares(self.scene, self.flare, chosen, visibility, self.settings.kernels))
+
+    def _scene_alone(self, targets: Targets) -> bool:
+        """Whether the scene is fitted alone as yet, so that it hides lights by the time their flares are fitted."""
+        begun = self.iteration > self.settings.flare.begin * self.settings.iterations
+        taught = self.settings.mode in ("default", "2d") and self.scene_is_fitted and targets.removed is not None
+        return taught and not begun
 
     def _behind_flare(self, targets: Targets, scene: Tensor) -> Tensor:
         """What the flare is put before: the flare-free frame while both are fitted apart, then the scene.
@@ -186,13 +213,16 @@ class Trainer:
 
     def _set_rates(self) -> None:
         self.scene_adam.rates["means"] = self._scene_rates()["means"]
-        if self.flare_adam is None:
+        if self.flare_adam is None or self.grid_adam is None:
             return
-        rates = self.settings.flare.rates
-        now = _decayed(rates.position, rates.position_final, self.iteration / self.settings.iterations)
-        for name in self.flare_adam.rates:
-            if name.endswith("gaussians.positions"):
-                self.flare_adam.rates[name] = now
+        rates, progress = self.settings.flare.rates, self.iteration / self.settings.iterations
+        settled = _decayed(1.0, rates.settled, 2 * progress - 1)
+        for name, rate in self._flare_rates.items():
+            position = name.endswith("gaussians.positions")
+            now = _decayed(rates.position, rates.position_final, progress) if position else rate * settled
+            self.flare_adam.rates[name] = now
+        for group in self.grid_adam.param_groups:
+            group["lr"] = rates.grids * settled
 
     def _change_flare_density(self) -> None:
         settings = self.settings.flare.density
@@ -233,6 +263,7 @@ class Trainer:
             if self.flare is not None and self.flare_adam is not None and self.grid_adam is not None:
                 _load_parameters(dict(self.flare.named_parameters()), state["flare"])
                 self.flare.positions.copy_(state["flare"]["positions"])
+                self.flare.clear.copy_(state["flare"]["clear"])
                 self.flare_adam.load_state_dict(state["flare_adam"])
                 groups = self.grid_adam.state_dict()["param_groups"]
                 moments = {int(key): value for key, value in state.get("grid_adam", {}).items()}

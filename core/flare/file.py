@@ -62,9 +62,10 @@ def save(path: Path | str, flare: FlareFile) -> None:
 
     forms = [asdict(light.form) for light in flare.model.lights]
     lights = [
-        {"name": name, "xyz": xyz, "form": form, "range": asdict(light.query_range), "count": light.count}
-        for name, xyz, form, light in zip(flare.model.names, flare.model.positions.tolist(), forms,
-                                          flare.model.lights, strict=True)
+        {"name": name, "xyz": xyz, "form": form, "range": asdict(light.query_range), "count": light.count,
+         "clear": clear}
+        for name, xyz, form, light, clear in zip(flare.model.names, flare.model.positions.tolist(), forms,
+                                                 flare.model.lights, flare.model.clear.tolist(), strict=True)
     ]
     description = {"version": VERSION, "blend": flare.blend, "lights": lights, "camera": asdict(flare.camera),
                    "elements": flare.elements, "seen": flare.seen, "licence": flare.licence, "notes": flare.notes}
@@ -121,7 +122,7 @@ def _unpacked(description: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> 
     for name, tensor in tensors.items():
         if tensor.is_floating_point() and not tensor.isfinite().all():
             raise ValueError(f"{name} holds values that are not finite")
-    flares, names, positions = [], [], []
+    flares, names, positions, clear = [], [], [], []
     for light in description["lights"]:
         count = int(light["count"])
         xyz = [float(value) for value in light["xyz"]]
@@ -135,7 +136,11 @@ def _unpacked(description: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> 
         flares.append(LightFlare(form, QueryRange(low, high, reach), count, torch.Generator()))
         names.append(str(light["name"]))
         positions.append(xyz)
+        clear.append(float(light.get("clear", 1.0)))
+        if not 0 < clear[-1] <= 1:
+            raise ValueError("a light's clear share makes no sense")
     model = FlareModel(names, torch.tensor(positions, dtype=torch.float64).reshape(-1, 3), flares)
+    model.clear.copy_(torch.tensor(clear))
     state = model.flares.state_dict()
     for name in state:
         if name.endswith("table.weight"):

@@ -174,14 +174,20 @@ def _canonical(form: FlareForm, count: int, opacity: float, generator: torch.Gen
 
 
 class FlareModel(nn.Module):
-    """The flares of a capture: one `LightFlare` for each light, by name, in the capture's order."""
+    """The flares of a capture: one `LightFlare` for each light, by name, in the capture's order.
+
+    clear: (lights,) the share of each light that the fitted scene leaves where nothing hides it, 0..1. Less than 1,
+    since something in the scene shows the lamp itself, and a sky may stand nearer than the sun.
+    """
 
     positions: Tensor
+    clear: Tensor
 
     def __init__(self, names: Sequence[str], positions: Tensor, flares: Sequence[LightFlare]) -> None:
         super().__init__()
         self.names = tuple(names)
         self.register_buffer("positions", positions.double())  # (lights, 3), world units
+        self.register_buffer("clear", torch.ones(len(positions)))
         self.flares = nn.ModuleList(flares)
 
     @property
@@ -206,6 +212,12 @@ class FlareModel(nn.Module):
                 if view.depth > 0:
                     seen[name].append([round(value, 5) for value in (*view.camera.tolist(), *view.light.tolist())])
         return seen
+
+    def corrections(self, world_to_camera: Tensor) -> Tensor:
+        """delta_l (n, 2) of the n lights in front of one pose (4, 4), normalised coordinates."""
+        found = [flare.network.light_correction(flare.network.view_features(view.camera, view.light))
+                 for flare, view in zip(self.lights, self.views(world_to_camera), strict=True) if view.depth > 0]
+        return torch.stack(found) if found else torch.zeros(0, 2)
 
     def forward(self, world_to_camera: Tensor, shares: Mapping[str, Tensor] | None = None) -> dict[str, PlaneGaussians]:
         """The Gaussians of every light in front of the camera, by the light's name.

@@ -4,9 +4,13 @@
 A small camera at the view's position looks straight at the light, in the frame or not, and rasterises the
 scene Gaussians that lie before it; what transmittance is left over a soft disk is the visible share. It is
 differentiable by the scene's Gaussians, and fades as a light with a size fades.
+
+A scene that is learned from pictures hides every light a little: Gaussians that show the lamp, or a sky without
+depth, stand before it. So shares are taken of what the training views that see most of the light see (`clear`).
 """
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -16,6 +20,10 @@ from ..gaussians import rasterization
 from ..gaussians.rasterizer import Kernels
 from ..gaussians.scene import SceneGaussians
 from .model import FlareModel
+
+LEAST_CLEAR = 0.01
+CLEAR_FROM = 0.9
+"""Quantile of the views' shares that counts as clear: a light may be hidden in most of them."""
 
 
 @dataclass(frozen=True)
@@ -30,11 +38,24 @@ class VisibilitySettings:
 
 def visible_shares(scene: SceneGaussians, model: FlareModel, world_to_camera: Tensor, settings: VisibilitySettings,
                    kernels: Kernels = "auto") -> dict[str, Tensor]:
-    """The visible share of each light from a pose (4, 4), by the light's name."""
+    """The visible share of each light from a pose (4, 4), by the light's name, as part of `FlareModel.clear`."""
     pose = world_to_camera.double()
     camera = -pose[:3, :3].T @ pose[:3, 3]
-    return {name: visible_share(scene, camera, light, settings, kernels)
-            for name, light in zip(model.names, model.positions, strict=True)}
+    return {name: (visible_share(scene, camera, light, settings, kernels) / clear).clamp(max=1)
+            for name, light, clear in zip(model.names, model.positions, model.clear, strict=True)}
+
+
+@torch.no_grad()
+def clear_shares(scene: SceneGaussians, model: FlareModel, poses: Sequence[Tensor], settings: VisibilitySettings,
+                 kernels: Kernels = "auto") -> Tensor:
+    """(lights,) the share that the scene leaves of each light where nothing hides it: what it leaves in the clearest
+    tenth of these poses (4, 4), and never less than `LEAST_CLEAR`."""
+    cameras = [-pose[:3, :3].double().T @ pose[:3, 3].double() for pose in poses]
+    found = []
+    for light in model.positions:
+        shares = torch.stack([visible_share(scene, camera, light, settings, kernels) for camera in cameras])
+        found.append(shares.quantile(CLEAR_FROM))
+    return torch.stack(found).clamp(LEAST_CLEAR, 1)
 
 
 def visible_share(scene: SceneGaussians, camera: Tensor, light: Tensor, settings: VisibilitySettings | None = None,

@@ -275,6 +275,7 @@ CAMERA = TrainingCamera(64, 40, 70.0, 70.0, 33.0, 19.5)
 @pytest.mark.parametrize("form", [PAPER, OURS, replace(PAPER, line=False)])
 def test_a_flare_comes_back_bit_by_bit(tmp_path: Path, form: FlareForm) -> None:
     model = some_flare(replace(form, levels=5), lights=2)
+    model.clear.copy_(torch.tensor([0.25, 1.0]))
     path = tmp_path / "look.flare"
     flare_file.save(path, FlareFile(model, "add", CAMERA, "CC0", "warm evening", [{"name": "ghost 1"}]))
     back = flare_file.load(path)

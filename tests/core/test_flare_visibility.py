@@ -5,8 +5,11 @@ from __future__ import annotations
 import pytest
 import torch
 
-from core.flare.visibility import VisibilitySettings, visible_share
+from core.flare.model import FlareModel
+from core.flare.visibility import LEAST_CLEAR, VisibilitySettings, clear_shares, visible_share, visible_shares
 from core.gaussians.scene import SceneGaussians
+from tests.core.test_flare import some_flare
+from tests.core.test_look import SMALL
 
 LIGHT = torch.tensor([0.0, 0.0, 4.0])
 CAMERA = torch.zeros(3)
@@ -64,3 +67,24 @@ def test_it_is_differentiable_by_what_hides_the_light() -> None:
     visible_share(scene, CAMERA, LIGHT, kernels="torch").backward()
     gradient = scene.opacity_logits.grad
     assert gradient is not None and float(gradient.min()) < 0 and float(gradient.max()) <= 1e-7
+
+
+def test_what_always_stands_before_a_light_does_not_hide_it() -> None:
+    """A haze before the light in all views is no occluder; a wall in one of them is."""
+    haze = wall(half_width=3.0, opacity=0.06)
+    model = FlareModel(["sun"], LIGHT[None], [some_flare(SMALL, 4).lights[0]])
+    poses = []
+    for x in torch.linspace(-0.5, 0.5, 12).tolist():
+        pose = torch.eye(4)
+        pose[0, 3] = -x
+        poses.append(pose)
+    settings = VisibilitySettings(radius=0.02)
+    with torch.no_grad():
+        raw = [float(visible_share(haze, -pose[:3, 3], LIGHT, settings, kernels="torch")) for pose in poses]
+        assert max(raw) < 0.7
+        model.clear.copy_(clear_shares(haze, model, poses, settings, kernels="torch"))
+        for pose in poses:
+            assert float(visible_shares(haze, model, pose, settings, "torch")["sun"]) == pytest.approx(1, abs=0.1)
+        assert float(visible_shares(wall(), model, torch.eye(4), settings, "torch")["sun"]) < 0.02
+        nowhere = clear_shares(wall(half_width=3.0), model, poses, settings, kernels="torch")
+    assert float(nowhere) == pytest.approx(LEAST_CLEAR)

@@ -40,6 +40,9 @@ from .visibility import smoothed
 
 Pixels = NDArray[np.float32]
 
+SURE = 0.02
+"""Splats never hide all of a light, nor show all of it: a share so near to none or the whole is taken for that."""
+
 FRAMES = "frames"
 """Folder of the plates with their flares, beside the layers."""
 
@@ -146,8 +149,9 @@ class Transfer:
             share = placed.share if placed is not None else 0.0
             if placed is not None and share > 0 and self.target.scene is not None:
                 with torch.no_grad():
-                    share *= float(visible_share(self.target.scene, torch.from_numpy(shot.camera.position),
-                                                 torch.from_numpy(placed.xyz), self.settings.visibility))
+                    seen = float(visible_share(self.target.scene, torch.from_numpy(shot.camera.position),
+                                               torch.from_numpy(placed.xyz), self.settings.visibility))
+                share *= min(max((seen - SURE) / (1 - 2 * SURE), 0.0), 1.0)
             self._shares[key] = share
         return self._shares[key]
 

@@ -19,6 +19,9 @@ from . import placement
 from .deformation import DeformationNetwork, QueryRange
 from .placement import PlaneGaussians
 
+TEACHES = 0.2
+"""Visible share of a light from which a view says something about its flare."""
+
 
 @dataclass(frozen=True)
 class FlareForm:
@@ -214,18 +217,30 @@ class FlareModel(nn.Module):
         return seen
 
     def corrections(self, world_to_camera: Tensor) -> Tensor:
-        """delta_l (n, 2) of the n lights in front of one pose (4, 4), normalised coordinates."""
-        found = [flare.network.light_correction(flare.network.view_features(view.camera, view.light))
+        """delta_l (n, 2) of the n lights in front of one pose (4, 4), normalised coordinates.
+
+        Its gradient stops at the features of the view, which the whole flare shares: rows of the grids that only a
+        view with a hidden light touches would move by full steps for its sake.
+        """
+        found = [flare.network.light_correction(flare.network.view_features(view.camera, view.light).detach())
                  for flare, view in zip(self.lights, self.views(world_to_camera), strict=True) if view.depth > 0]
         return torch.stack(found) if found else torch.zeros(0, 2)
 
     def forward(self, world_to_camera: Tensor, shares: Mapping[str, Tensor] | None = None) -> dict[str, PlaneGaussians]:
         """The Gaussians of every light in front of the camera, by the light's name.
 
-        shares: how much of each light is visible, 0..1 (see `visibility`); it scales the opacities.
+        shares: how much of each light is visible, 0..1 (see `visibility`); it scales the opacities. A light of which
+        less than `TEACHES` is left hands no gradient to its flare: there is nothing to be learned from next to nothing,
+        and Adam would learn it at full rate, from the little by which the share is wrong.
         """
         seen = zip(self.names, self.lights, self.views(world_to_camera), strict=True)
         flares = {name: flare(view) for name, flare, view in seen if view.depth > 0}
         if shares is None:
             return flares
-        return {name: one._replace(opacities=one.opacities * shares[name]) for name, one in flares.items()}
+        seen_flares = {name: one if shares[name] >= TEACHES else _untaught(one) for name, one in flares.items()}
+        return {name: one._replace(opacities=one.opacities * shares[name]) for name, one in seen_flares.items()}
+
+
+def _untaught(gaussians: PlaneGaussians) -> PlaneGaussians:
+    """The same, without a way back for gradients."""
+    return PlaneGaussians(*(None if part is None else part.detach() for part in gaussians))  # type: ignore[arg-type]

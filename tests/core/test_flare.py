@@ -288,6 +288,18 @@ def test_a_flare_comes_back_bit_by_bit(tmp_path: Path, form: FlareForm) -> None:
         assert a is b is None or torch.equal(a, b)
 
 
+def test_a_view_that_hides_the_light_teaches_its_flare_nothing() -> None:
+    model = some_flare(PAPER, lights=1)
+    for value, taught in ((0.1, False), (0.9, True)):
+        share = torch.tensor(value, requires_grad=True)
+        shown = model(pose(), {"lamp 0": share})["lamp 0"]
+        torch.testing.assert_close(shown.opacities, model(pose())["lamp 0"].opacities * value)
+        assert shown.means.requires_grad == taught
+        shown.opacities.sum().backward()
+        assert share.grad is not None and share.grad > 0
+        assert (model.lights[0].gaussians["opacity_logits"].grad is not None) == taught
+
+
 def _described(path: Path, **changes: Any) -> None:
     """Write the file again with its description changed."""
     from safetensors import safe_open

@@ -351,11 +351,4 @@ _CLASSES = (FITFLARE_PT_capture, FITFLARE_PT_lights, FITFLARE_PT_fit, FITFLARE_P
             FITFLARE_PT_transfer)
 
 
-def register() -> None:
-    for cls in _CLASSES:
-        bpy.utils.register_class(cls)
-
-
-def unregister() -> None:
-    for cls in reversed(_CLASSES):
-        bpy.utils.unregister_class(cls)
+register, unregister = bpy.utils.register_classes_factory(_CLASSES)

@@ -7,6 +7,7 @@ from typing import Any
 import bpy
 
 from . import engine, jobs
+from .reports import Action
 
 # The extension's full name ("bl_ext.user_default.fit_flare"), by which Blender knows its preferences.
 PACKAGE = __package__.rpartition(".")[0]
@@ -127,84 +128,61 @@ def library_path() -> str:
     return bpy.path.abspath(preferences.library) if preferences is not None and preferences.library else ""
 
 
-class FITFLARE_OT_test_engine(bpy.types.Operator):
+class FITFLARE_OT_test_engine(Action, bpy.types.Operator):
     """Start the engine and ask for its version and device"""
 
     bl_idname = "fit_flare.test_engine"
     bl_label = "Test"
 
     @classmethod
-    def poll(cls, _context: bpy.types.Context) -> bool:
+    def why_not(cls, _context: bpy.types.Context) -> str:
         if engine.find() is None:
-            cls.poll_message_set("No engine is set up or named")
-            return False
-        return True
+            return "No engine is set up or named"
+        return ""
 
-    def execute(self, _context: bpy.types.Context) -> set[str]:
-        from .reports import reported
-
-        with reported(self) as outcome:
-            engine.test()
-        return outcome.status
+    def act(self, _context: bpy.types.Context) -> None:
+        engine.test()
 
 
-class FITFLARE_OT_set_up_engine(bpy.types.Operator):
+class FITFLARE_OT_set_up_engine(Action, bpy.types.Operator):
     """Install the engine (torch and its libraries, about 1 GB to download) into the extension's own folder"""
 
     bl_idname = "fit_flare.set_up_engine"
     bl_label = "Set Up Engine"
 
     @classmethod
-    def poll(cls, _context: bpy.types.Context) -> bool:
+    def why_not(cls, _context: bpy.types.Context) -> str:
         if not bpy.app.online_access:
-            cls.poll_message_set("Allow Online Access in Preferences > System > Network first")
-            return False
+            return "Allow Online Access in Preferences > System > Network first"
         making = engine.setting_up()
         if making is not None and making.running:
-            cls.poll_message_set("The engine is being set up")
-            return False
-        return True
+            return "The engine is being set up"
+        return ""
 
-    def execute(self, _context: bpy.types.Context) -> set[str]:
-        from .reports import reported
-
-        with reported(self) as outcome:
-            engine.set_up()
-        return outcome.status
+    def act(self, _context: bpy.types.Context) -> None:
+        engine.set_up()
 
 
-class FITFLARE_OT_remove_engine(bpy.types.Operator):
+class FITFLARE_OT_remove_engine(Action, bpy.types.Operator):
     """Delete the engine that Set Up Engine has installed, and free its disk space"""
 
     bl_idname = "fit_flare.remove_engine"
     bl_label = "Remove"
 
     @classmethod
-    def poll(cls, _context: bpy.types.Context) -> bool:
+    def why_not(cls, _context: bpy.types.Context) -> str:
         if not (engine.user_folder(engine.FOLDER) / "python").is_dir():
-            cls.poll_message_set("No engine was set up here; one that is named by its path is not touched")
-            return False
-        return True
+            return "No engine was set up here; one that is named by its path is not touched"
+        return ""
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         return context.window_manager.invoke_confirm(self, event)
 
-    def execute(self, _context: bpy.types.Context) -> set[str]:
-        from .reports import reported
-
-        with reported(self) as outcome:
-            engine.remove()
-        return outcome.status
+    def act(self, _context: bpy.types.Context) -> None:
+        engine.remove()
 
 
 _CLASSES = (FITFLARE_AP_preferences, FITFLARE_OT_test_engine, FITFLARE_OT_set_up_engine, FITFLARE_OT_remove_engine)
 
 
-def register() -> None:
-    for cls in _CLASSES:
-        bpy.utils.register_class(cls)
-
-
-def unregister() -> None:
-    for cls in reversed(_CLASSES):
-        bpy.utils.unregister_class(cls)
+register, unregister = bpy.utils.register_classes_factory(_CLASSES)

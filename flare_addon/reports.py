@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Errors as Blender shows them: one sentence in the report, never a traceback."""
+"""What buttons tell people: why they cannot be pressed, and what went wrong, in a sentence, never a traceback."""
 from __future__ import annotations
 
 import contextlib
@@ -30,3 +30,34 @@ def reported(operator: Any) -> Iterator[Outcome]:
         where = f" ({problem.filename})" if problem.filename else ""
         operator.report({"ERROR"}, f"The system refused: {problem.strerror or problem}{where}.")
         outcome.status = {"CANCELLED"}
+
+
+class Action:
+    """For an operator to inherit beside bpy.types.Operator: `why_not` greys its button out, `act` does the work."""
+
+    @classmethod
+    def why_not(cls, _context: Any) -> str:
+        """Why it cannot run now, as its tooltip says it; "" where it can."""
+        return ""
+
+    @classmethod
+    def poll(cls, context: Any) -> bool:
+        """Blender's question whether the button can be pressed."""
+        why = cls.why_not(context)
+        if why:
+            cls.poll_message_set(why)  # type: ignore[attr-defined]  # Operator's
+        return not why
+
+    def act(self, _context: Any) -> None:
+        """The work; what goes wrong is raised."""
+
+    def execute(self, context: Any) -> set[str]:
+        """Blender's call: the work, and a report of what went wrong."""
+        with reported(self) as outcome:
+            self.act(context)
+        return outcome.status
+
+
+NO_FLARE = "Fit or open a flare first"
+NO_CAMERA = "The scene has no camera"
+NO_CAPTURE = "Import a capture first"

@@ -12,10 +12,10 @@ from ...core.bake.layers import layer_names
 from ...core.errors import FrameError
 from .. import compositor, engine, jobs, looks, shots
 from ..layer_folder import LayerFolder
-from ..reports import reported
+from ..reports import NO_CAMERA, NO_FLARE, Action
 
 
-class FITFLARE_OT_bake(bpy.types.Operator):
+class FITFLARE_OT_bake(Action, bpy.types.Operator):
     """Render the flares to EXR layers in the engine, for the frames and the camera of the scene"""
 
     bl_idname = "fit_flare.bake"
@@ -26,30 +26,40 @@ class FITFLARE_OT_bake(bpy.types.Operator):
         default=False)
 
     @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
+    def why_not(cls, context: bpy.types.Context) -> str:
         scene = context.scene
-        job = jobs.find(shots.layers_folder(scene)) if scene.fit_flare.layers else None
         if not scene.fit_flare.flare:
-            cls.poll_message_set("Fit or open a flare first")
-        elif scene.camera is None:
-            cls.poll_message_set("The scene has no camera")
-        elif engine.find() is None:
-            cls.poll_message_set(engine.MISSING)
-        elif job is not None and job.running:
-            cls.poll_message_set("A bake is running")
-        else:
-            return True
-        return False
+            return NO_FLARE
+        if scene.camera is None:
+            return NO_CAMERA
+        if engine.find() is None:
+            return engine.MISSING
+        return "A bake is running" if _baking(scene) else ""
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
+    def act(self, context: bpy.types.Context) -> None:
         scene = context.scene
         chosen = [item for item in context.selected_objects if item.type == "CAMERA"] if self.selected else []
-        with reported(self) as outcome:
-            shots.bake(scene, chosen or [scene.camera])
-        return outcome.status
+        shots.bake(scene, chosen or [scene.camera])
 
 
-class FITFLARE_OT_set_up_compositor(bpy.types.Operator):
+def _baking(scene: Any) -> bool:
+    """Whether the engine is at work on this scene's layers."""
+    job = jobs.find(shots.layers_folder(scene)) if scene.fit_flare.layers else None
+    return job is not None and job.running
+
+
+def set_up(operator: Any, scene: Any, folder: str, *, keep_image: bool, plate: bool, match: bool = False) -> None:
+    """Nodes for the layers in a folder, over the baked scene, what the compositor shows now (`keep_image`) or the
+    footage behind the camera (`plate`); `match` gives the scene their frames and size. Raises FrameError."""
+    layers = LayerFolder.open(bpy.path.abspath(folder))
+    compositor.set_up(scene, layers, keep_image=keep_image, plate=footage_of(scene) if plate else None)
+    if match:
+        compositor.match_scene(scene, layers, layers.size())
+    live = "; Intensity and Tint of the panel act on it" if wire(scene, layers) else ""
+    operator.report({"INFO"}, f"{len(layers.files)} frames of layers set up{live}")
+
+
+class FITFLARE_OT_set_up_compositor(Action, bpy.types.Operator):
     """Put baked layers together in the compositor of this scene, over what is there"""
 
     bl_idname = "fit_flare.set_up_compositor"
@@ -83,18 +93,9 @@ class FITFLARE_OT_set_up_compositor(bpy.types.Operator):
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
-        scene = context.scene
-        with reported(self) as outcome:
-            layers = LayerFolder.open(bpy.path.abspath(self.directory))
-            plate = footage_of(scene) if self.plate else None
-            compositor.set_up(scene, layers, keep_image=self.keep_image, plate=plate)
-            if self.match_scene:
-                compositor.match_scene(scene, layers, layers.size())
-            wired = wire(scene, layers)
-            live = "; Intensity and Tint of the panel act on it" if wired else ""
-            self.report({"INFO"}, f"{len(layers.files)} frames of layers set up{live}")
-        return outcome.status
+    def act(self, context: bpy.types.Context) -> None:
+        set_up(self, context.scene, self.directory, keep_image=self.keep_image, plate=self.plate,
+               match=self.match_scene)
 
 
 def footage_of(scene: Any) -> tuple[Any, int, int, int]:
@@ -120,7 +121,7 @@ def wire(scene: Any, layers: LayerFolder) -> bool:
     return True
 
 
-class FITFLARE_OT_remove_compositor(bpy.types.Operator):
+class FITFLARE_OT_remove_compositor(Action, bpy.types.Operator):
     """Take Fit Flare's nodes out of the compositor; what was there before is there again"""
 
     bl_idname = "fit_flare.remove_compositor"
@@ -128,19 +129,16 @@ class FITFLARE_OT_remove_compositor(bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}
 
     @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
+    def why_not(cls, context: bpy.types.Context) -> str:
         if compositor.find_node(context.scene) is None:
-            cls.poll_message_set("The compositor is not set up")
-            return False
-        return True
+            return "The compositor is not set up"
+        return ""
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
-        with reported(self) as outcome:
-            compositor.remove(context.scene)
-        return outcome.status
+    def act(self, context: bpy.types.Context) -> None:
+        compositor.remove(context.scene)
 
 
-class FITFLARE_OT_set_up_baked(bpy.types.Operator):
+class FITFLARE_OT_set_up_baked(Action, bpy.types.Operator):
     """Put the layers that were baked here together in the compositor"""
 
     bl_idname = "fit_flare.set_up_baked"
@@ -148,27 +146,15 @@ class FITFLARE_OT_set_up_baked(bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}
 
     @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
+    def why_not(cls, context: bpy.types.Context) -> str:
         state = context.scene.fit_flare
         if not state.layers:
-            cls.poll_message_set("Bake layers first, or choose their folder")
-            return False
-        job = jobs.find(shots.layers_folder(context.scene))
-        if job is not None and job.running:
-            cls.poll_message_set("The bake is still running")
-            return False
-        return True
+            return "Bake layers first, or choose their folder"
+        return "The bake is still running" if _baking(context.scene) else ""
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
+    def act(self, context: bpy.types.Context) -> None:
         state = context.scene.fit_flare
-        with reported(self) as outcome:
-            layers = LayerFolder.open(bpy.path.abspath(state.layers))
-            plate = footage_of(context.scene) if state.over == "plate" else None
-            compositor.set_up(context.scene, layers, keep_image=state.over == "present", plate=plate)
-            wired = wire(context.scene, layers)
-            live = "; Intensity and Tint of the panel act on it" if wired else ""
-            self.report({"INFO"}, f"{len(layers.files)} frames of layers set up{live}")
-        return outcome.status
+        set_up(self, context.scene, state.layers, keep_image=state.over == "present", plate=state.over == "plate")
 
 
 class FITFLARE_OT_open_folder(bpy.types.Operator):

@@ -8,10 +8,10 @@ import bpy
 
 from .. import capture_export
 from ..capture_import import ImportSettings, import_capture
-from ..reports import reported
+from ..reports import NO_CAMERA, Action
 
 
-class FITFLARE_OT_import_capture(bpy.types.Operator):
+class FITFLARE_OT_import_capture(Action, bpy.types.Operator):
     """Import a capture: its cameras with the frames behind them, its points and its lights"""
 
     bl_idname = "fit_flare.import_capture"
@@ -53,18 +53,16 @@ class FITFLARE_OT_import_capture(bpy.types.Operator):
         for name in ("cameras", "up", "scale", "frames", "points", "match_scene"):
             layout.prop(self, name)
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
+    def act(self, context: bpy.types.Context) -> None:
         chosen = Path(bpy.path.abspath(self.filepath or self.directory))
         if not chosen.exists() and self.directory:
             chosen = Path(bpy.path.abspath(self.directory))
         settings = ImportSettings(self.cameras, self.up, self.scale, self.frames, self.points, self.match_scene)
-        with reported(self) as outcome:
-            made = import_capture(context.scene, chosen, settings)
-            for note in made.notes:
-                self.report({"WARNING"}, note)
-            self.report({"INFO"}, f"{chosen.name}: cameras {len(made.cameras)}, lights {len(made.lights)}")
-            _look_through_camera(context)
-        return outcome.status
+        made = import_capture(context.scene, chosen, settings)
+        for note in made.notes:
+            self.report({"WARNING"}, note)
+        self.report({"INFO"}, f"{chosen.name}: cameras {len(made.cameras)}, lights {len(made.lights)}")
+        _look_through_camera(context)
 
 
 def _look_through_camera(context: bpy.types.Context) -> None:
@@ -76,7 +74,7 @@ def _look_through_camera(context: bpy.types.Context) -> None:
         space.region_3d.view_perspective = "CAMERA"
 
 
-class FITFLARE_OT_capture_from_camera(bpy.types.Operator):
+class FITFLARE_OT_capture_from_camera(Action, bpy.types.Operator):
     """Make a capture of the scene's camera as it is animated, with the pictures of its background or clip"""
 
     bl_idname = "fit_flare.capture_from_camera"
@@ -86,24 +84,20 @@ class FITFLARE_OT_capture_from_camera(bpy.types.Operator):
     directory: bpy.props.StringProperty(name="Folder", description="Folder for the capture", subtype="DIR_PATH")  # type: ignore[valid-type]
 
     @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
+    def why_not(cls, context: bpy.types.Context) -> str:
         if context.scene.camera is None:
-            cls.poll_message_set("The scene has no camera")
-            return False
+            return NO_CAMERA
         if capture_export.footage_of(context.scene.camera) is None:
-            cls.poll_message_set("The camera has no background image sequence or movie clip to take the frames from")
-            return False
-        return True
+            return "The camera has no background image sequence or movie clip to take the frames from"
+        return ""
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
-        with reported(self) as outcome:
-            count = capture_export.export(context.scene, Path(bpy.path.abspath(self.directory)))
-            self.report({"INFO"}, f"{count} frames are now a capture in {self.directory}")
-        return outcome.status
+    def act(self, context: bpy.types.Context) -> None:
+        count = capture_export.export(context.scene, Path(bpy.path.abspath(self.directory)))
+        self.report({"INFO"}, f"{count} frames are now a capture in {self.directory}")
 
 
 class FITFLARE_FH_capture(bpy.types.FileHandler):
@@ -122,11 +116,4 @@ class FITFLARE_FH_capture(bpy.types.FileHandler):
 _CLASSES = (FITFLARE_OT_import_capture, FITFLARE_OT_capture_from_camera, FITFLARE_FH_capture)
 
 
-def register() -> None:
-    for cls in _CLASSES:
-        bpy.utils.register_class(cls)
-
-
-def unregister() -> None:
-    for cls in reversed(_CLASSES):
-        bpy.utils.unregister_class(cls)
+register, unregister = bpy.utils.register_classes_factory(_CLASSES)

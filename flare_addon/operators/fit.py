@@ -7,73 +7,60 @@ from pathlib import Path
 import bpy
 
 from .. import engine, fits, jobs, looks
-from ..reports import reported
+from ..reports import NO_CAPTURE, Action
 
 _keymaps: list[tuple[object, object]] = []
 
 
-class FITFLARE_OT_fit(bpy.types.Operator):
+class FITFLARE_OT_fit(Action, bpy.types.Operator):
     """Learn the flare of every light from the footage, in the engine; Blender stays free meanwhile"""
 
     bl_idname = "fit_flare.fit"
     bl_label = "Fit"
 
     @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        why = fits.why_not(context.scene)
-        if why:
-            cls.poll_message_set(why)
-        return not why
+    def why_not(cls, context: bpy.types.Context) -> str:
+        return fits.why_not(context.scene)
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
-        with reported(self) as outcome:
-            fits.start(context.scene)
-        return outcome.status
+    def act(self, context: bpy.types.Context) -> None:
+        fits.start(context.scene)
 
 
-class FITFLARE_OT_resume(bpy.types.Operator):
+class FITFLARE_OT_resume(Action, bpy.types.Operator):
     """Go on with the fit where it was stopped"""
 
     bl_idname = "fit_flare.resume"
     bl_label = "Resume"
 
     @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
+    def why_not(cls, context: bpy.types.Context) -> str:
         if engine.find() is None:
-            cls.poll_message_set(engine.MISSING)
-            return False
+            return engine.MISSING
         if fits.state_of(context.scene) != "resumable":
-            cls.poll_message_set("There is no broken-off fit to go on with")
-            return False
-        return True
+            return "There is no broken-off fit to go on with"
+        return ""
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
-        with reported(self) as outcome:
-            fits.resume(context.scene)
-        return outcome.status
+    def act(self, context: bpy.types.Context) -> None:
+        fits.resume(context.scene)
 
 
-class FITFLARE_OT_clean_frames(bpy.types.Operator):
+class FITFLARE_OT_clean_frames(Action, bpy.types.Operator):
     """Have the engine take the flares out of the frames, so that the fit has clean ones to learn the scene from"""
 
     bl_idname = "fit_flare.clean_frames"
     bl_label = "Make Clean Frames"
 
     @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
+    def why_not(cls, context: bpy.types.Context) -> str:
         capture = fits.capture_of(context.scene)
         if capture is None or not (capture / "images").is_dir():
-            cls.poll_message_set("Import a capture first")
-            return False
+            return NO_CAPTURE
         if engine.find() is None:
-            cls.poll_message_set(engine.MISSING)
-            return False
-        return True
+            return engine.MISSING
+        return ""
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
-        with reported(self) as outcome:
-            fits.clean(context.scene)
-        return outcome.status
+    def act(self, context: bpy.types.Context) -> None:
+        fits.clean(context.scene)
 
 
 class FITFLARE_OT_cancel(bpy.types.Operator):
@@ -143,19 +130,18 @@ class FITFLARE_OT_show_log(bpy.types.Operator):
         return {"FINISHED"}
 
 
-class FITFLARE_OT_show_preview(bpy.types.Operator):
+class FITFLARE_OT_show_preview(Action, bpy.types.Operator):
     """Open the fit's preview picture: frame, composite, scene, flare"""
 
     bl_idname = "fit_flare.show_preview"
     bl_label = "Show Preview"
 
     @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
+    def why_not(cls, context: bpy.types.Context) -> str:
         folder = fits.folder_of(context.scene)
         if folder is None or not (folder / "preview.png").is_file():
-            cls.poll_message_set("The fit has not made a preview yet")
-            return False
-        return True
+            return "The fit has not made a preview yet"
+        return ""
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         folder = fits.folder_of(context.scene)
@@ -166,7 +152,7 @@ class FITFLARE_OT_show_preview(bpy.types.Operator):
         return {"FINISHED"}
 
 
-class FITFLARE_OT_use_result(bpy.types.Operator):
+class FITFLARE_OT_use_result(Action, bpy.types.Operator):
     """Show the flare that this fit has learned"""
 
     bl_idname = "fit_flare.use_result"
@@ -174,18 +160,15 @@ class FITFLARE_OT_use_result(bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}
 
     @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
+    def why_not(cls, context: bpy.types.Context) -> str:
         if fits.state_of(context.scene) != "finished":
-            cls.poll_message_set("The fit is not finished")
-            return False
-        return True
+            return "The fit is not finished"
+        return ""
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
+    def act(self, context: bpy.types.Context) -> None:
         folder = fits.folder_of(context.scene)
         assert folder is not None
-        with reported(self) as outcome:
-            looks.use(context.scene, folder / fits.FLARE)
-        return outcome.status
+        looks.use(context.scene, folder / fits.FLARE)
 
 
 def _show(context: bpy.types.Context, kind: str, give: object) -> None:

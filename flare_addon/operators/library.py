@@ -9,10 +9,10 @@ from mathutils import Vector
 
 from ...core.errors import FlareFileError
 from .. import cameras, library, lights, looks, overlay
-from ..reports import reported
+from ..reports import NO_CAMERA, NO_FLARE, Action
 
 
-class FITFLARE_OT_save_flare(bpy.types.Operator):
+class FITFLARE_OT_save_flare(Action, bpy.types.Operator):
     """Keep this scene's flare in the library, with a thumbnail and notes"""
 
     bl_idname = "fit_flare.save_flare"
@@ -23,26 +23,23 @@ class FITFLARE_OT_save_flare(bpy.types.Operator):
     licence: bpy.props.StringProperty(name="Licence", description="Under which terms others may use it")  # type: ignore[valid-type]
 
     @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
+    def why_not(cls, context: bpy.types.Context) -> str:
         if not context.scene.fit_flare.flare:
-            cls.poll_message_set("Fit or open a flare first")
-            return False
-        return True
+            return NO_FLARE
+        return ""
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
         path = looks.path_of(context.scene)
         self.name = self.name or (path.parent.name if path and path.stem == "flare" else path.stem if path else "")
         return context.window_manager.invoke_props_dialog(self, width=360)
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
-        with reported(self) as outcome:
-            look = looks.look_of(context.scene)
-            path = library.save(look, self.name, self.notes or look.notes, self.licence or look.licence)
-            self.report({"INFO"}, f"{path.stem} is in the library")
-        return outcome.status
+    def act(self, context: bpy.types.Context) -> None:
+        look = looks.look_of(context.scene)
+        path = library.save(look, self.name, self.notes or look.notes, self.licence or look.licence)
+        self.report({"INFO"}, f"{path.stem} is in the library")
 
 
-class FITFLARE_OT_apply_flare(bpy.types.Operator):
+class FITFLARE_OT_apply_flare(Action, bpy.types.Operator):
     """Show the chosen flare of the library in this scene, at the selected objects or the lights of the same names"""
 
     bl_idname = "fit_flare.apply_flare"
@@ -52,32 +49,29 @@ class FITFLARE_OT_apply_flare(bpy.types.Operator):
     filepath: bpy.props.StringProperty(options={"HIDDEN", "SKIP_SAVE"})  # type: ignore[valid-type]
 
     @classmethod
-    def poll(cls, _context: bpy.types.Context) -> bool:
+    def why_not(cls, _context: bpy.types.Context) -> str:
         if not library.files():
-            cls.poll_message_set("The library is empty: save a flare into it first")
-            return False
-        return True
+            return "The library is empty: save a flare into it first"
+        return ""
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
+    def act(self, context: bpy.types.Context) -> None:
         path = self.filepath or context.window_manager.fit_flare_library
-        with reported(self) as outcome:
-            if not path:
-                raise FlareFileError("Choose a flare of the library first.")
-            look = looks.use(context.scene, Path(path))
-            free = [item for item in context.scene.fit_flare.lights if item.target is None]
-            chosen = [item for item in context.selected_objects if item.type != "CAMERA"]
-            for item, target in zip(free, chosen, strict=False):
-                item.target = target
-            for target in chosen[len(free):]:
-                if all(item.target != target for item in context.scene.fit_flare.lights):
-                    looks.add_instance(context.scene, target, look.names[0])
-            missing = [item.name for item in context.scene.fit_flare.lights if item.target is None]
-            if missing:
-                self.report({"WARNING"}, f"{', '.join(missing)}: choose the object it comes from in the panel Look")
-        return outcome.status
+        if not path:
+            raise FlareFileError("Choose a flare of the library first.")
+        look = looks.use(context.scene, Path(path))
+        free = [item for item in context.scene.fit_flare.lights if item.target is None]
+        chosen = [item for item in context.selected_objects if item.type != "CAMERA"]
+        for item, target in zip(free, chosen, strict=False):
+            item.target = target
+        for target in chosen[len(free):]:
+            if all(item.target != target for item in context.scene.fit_flare.lights):
+                looks.add_instance(context.scene, target, look.names[0])
+        missing = [item.name for item in context.scene.fit_flare.lights if item.target is None]
+        if missing:
+            self.report({"WARNING"}, f"{', '.join(missing)}: choose the object it comes from in the panel Look")
 
 
-class FITFLARE_OT_pick_light(bpy.types.Operator):
+class FITFLARE_OT_pick_light(Action, bpy.types.Operator):
     """Click on the light in the camera view: the flare comes from there"""
 
     bl_idname = "fit_flare.pick_light"
@@ -91,14 +85,12 @@ class FITFLARE_OT_pick_light(bpy.types.Operator):
         min=0.0, subtype="DISTANCE")
 
     @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
+    def why_not(cls, context: bpy.types.Context) -> str:
         if context.scene.camera is None:
-            cls.poll_message_set("The scene has no camera")
-            return False
+            return NO_CAMERA
         if not context.scene.fit_flare.flare:
-            cls.poll_message_set("Open a flare, or apply one of the library, first")
-            return False
-        return True
+            return "Open a flare, or apply one of the library, first"
+        return ""
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
         areas = [area for area in context.screen.areas if area.type == "VIEW_3D"]
@@ -132,30 +124,28 @@ class FITFLARE_OT_pick_light(bpy.types.Operator):
         context.workspace.status_text_set(None)
         return status
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
+    def act(self, context: bpy.types.Context) -> None:
         scene = context.scene
-        with reported(self) as outcome:
-            depsgraph = context.evaluated_depsgraph_get()
-            camera = scene.camera.evaluated_get(depsgraph)
-            core = cameras.core_camera(camera.data, camera.matrix_world, scene.render)
-            ray = Vector(core.rays([[self.x * core.width, self.y * core.height]])[0].tolist())
-            eye = camera.matrix_world.translation
-            hit, where, *_ = scene.ray_cast(depsgraph, eye, ray)
-            if not hit:
-                where = eye + ray * (self.distance or 10.0 * max(camera.matrix_world.to_scale()))
-            look, state = looks.look_of(scene), scene.fit_flare
-            item = next((one for one in state.lights if one.target is None), None)
-            light = lights.add(scene, where, item.name if item is not None else "light1")
-            light.fit_flare.is_light = state.root is not None
-            light.empty_display_size = 0.02 * (where - eye).length
-            if item is None:
-                item = looks.add_instance(scene, light, state.lights[state.light].source if state.lights
-                                          else look.names[0])
-            item.target = light
-        return outcome.status
+        depsgraph = context.evaluated_depsgraph_get()
+        camera = scene.camera.evaluated_get(depsgraph)
+        core = cameras.core_camera(camera.data, camera.matrix_world, scene.render)
+        ray = Vector(core.rays([[self.x * core.width, self.y * core.height]])[0].tolist())
+        eye = camera.matrix_world.translation
+        hit, where, *_ = scene.ray_cast(depsgraph, eye, ray)
+        if not hit:
+            where = eye + ray * (self.distance or 10.0 * max(camera.matrix_world.to_scale()))
+        look, state = looks.look_of(scene), scene.fit_flare
+        item = next((one for one in state.lights if one.target is None), None)
+        light = lights.add(scene, where, item.name if item is not None else "light1")
+        light.fit_flare.is_light = state.root is not None
+        light.empty_display_size = 0.02 * (where - eye).length
+        if item is None:
+            item = looks.add_instance(scene, light, state.lights[state.light].source if state.lights
+                                      else look.names[0])
+        item.target = light
 
 
-class FITFLARE_OT_shot_from_picture(bpy.types.Operator):
+class FITFLARE_OT_shot_from_picture(Action, bpy.types.Operator):
     """Set the scene up for a single picture: a camera of its size with the picture behind it"""
 
     bl_idname = "fit_flare.shot_from_picture"
@@ -170,32 +160,30 @@ class FITFLARE_OT_shot_from_picture(bpy.types.Operator):
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
+    def act(self, context: bpy.types.Context) -> None:
         scene = context.scene
-        with reported(self) as outcome:
-            try:
-                image = bpy.data.images.load(bpy.path.abspath(self.filepath), check_existing=True)
-            except RuntimeError as problem:
-                raise FlareFileError(f"{self.filepath} is not a picture that Blender can open.") from problem
-            if 0 in image.size:
-                raise FlareFileError(f"{self.filepath} is not a picture that Blender can open.")
-            data = bpy.data.cameras.new(Path(self.filepath).stem)
-            data.sensor_fit, data.sensor_width = "HORIZONTAL", 36.0
-            data.lens = 36.0
-            if scene.fit_flare.flare:  # the flare's own lens, which its shapes belong to
-                filmed = looks.look_of(scene).camera
-                data.lens = 36.0 * filmed.fx / filmed.width
-            camera = bpy.data.objects.new(data.name, data)
-            scene.collection.objects.link(camera)
-            camera.rotation_euler = (1.5707963, 0, 0)
-            data.show_background_images = True
-            back = data.background_images.new()
-            back.image, back.alpha, back.frame_method = image, 1.0, "STRETCH"
-            scene.camera = camera
-            scene.render.resolution_x, scene.render.resolution_y = image.size
-            scene.render.resolution_percentage = 100
-            scene.render.pixel_aspect_x = scene.render.pixel_aspect_y = 1.0
-        return outcome.status
+        try:
+            image = bpy.data.images.load(bpy.path.abspath(self.filepath), check_existing=True)
+        except RuntimeError as problem:
+            raise FlareFileError(f"{self.filepath} is not a picture that Blender can open.") from problem
+        if 0 in image.size:
+            raise FlareFileError(f"{self.filepath} is not a picture that Blender can open.")
+        data = bpy.data.cameras.new(Path(self.filepath).stem)
+        data.sensor_fit, data.sensor_width = "HORIZONTAL", 36.0
+        data.lens = 36.0
+        if scene.fit_flare.flare:  # the flare's own lens, which its shapes belong to
+            filmed = looks.look_of(scene).camera
+            data.lens = 36.0 * filmed.fx / filmed.width
+        camera = bpy.data.objects.new(data.name, data)
+        scene.collection.objects.link(camera)
+        camera.rotation_euler = (1.5707963, 0, 0)
+        data.show_background_images = True
+        back = data.background_images.new()
+        back.image, back.alpha, back.frame_method = image, 1.0, "STRETCH"
+        scene.camera = camera
+        scene.render.resolution_x, scene.render.resolution_y = image.size
+        scene.render.resolution_percentage = 100
+        scene.render.pixel_aspect_x = scene.render.pixel_aspect_y = 1.0
 
 
 _CLASSES = (FITFLARE_OT_save_flare, FITFLARE_OT_apply_flare, FITFLARE_OT_pick_light, FITFLARE_OT_shot_from_picture)

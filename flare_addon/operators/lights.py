@@ -5,10 +5,10 @@ from __future__ import annotations
 import bpy
 
 from .. import engine, fits, lights
-from ..reports import reported
+from ..reports import NO_CAPTURE, Action
 
 
-class FITFLARE_OT_add_light(bpy.types.Operator):
+class FITFLARE_OT_add_light(Action, bpy.types.Operator):
     """Add a light at the 3D cursor; move it on to the lamp in the footage"""
 
     bl_idname = "fit_flare.add_light"
@@ -18,17 +18,15 @@ class FITFLARE_OT_add_light(bpy.types.Operator):
     name: bpy.props.StringProperty(name="Name", description="Name of the light and of its flare's layer",  # type: ignore[valid-type]
                                    default="light1")
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
-        with reported(self) as outcome:
-            light = lights.add(context.scene, context.scene.cursor.location, self.name)
-            for item in context.selected_objects:
-                item.select_set(False)
-            light.select_set(True)
-            context.view_layer.objects.active = light
-        return outcome.status
+    def act(self, context: bpy.types.Context) -> None:
+        light = lights.add(context.scene, context.scene.cursor.location, self.name)
+        for item in context.selected_objects:
+            item.select_set(False)
+        light.select_set(True)
+        context.view_layer.objects.active = light
 
 
-class FITFLARE_OT_lights_from_selected(bpy.types.Operator):
+class FITFLARE_OT_lights_from_selected(Action, bpy.types.Operator):
     """Make the selected objects lights: the fit learns a flare for each"""
 
     bl_idname = "fit_flare.lights_from_selected"
@@ -36,11 +34,10 @@ class FITFLARE_OT_lights_from_selected(bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}
 
     @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
+    def why_not(cls, context: bpy.types.Context) -> str:
         if not context.selected_objects:
-            cls.poll_message_set("Select the objects that are lights first")
-            return False
-        return True
+            return "Select the objects that are lights first"
+        return ""
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         taken = {lights.name_of(item) for item in lights.of_scene(context.scene)}
@@ -69,37 +66,26 @@ class FITFLARE_OT_remove_light(bpy.types.Operator):
         return {"FINISHED"}
 
 
-class FITFLARE_OT_find_lights(bpy.types.Operator):
+class FITFLARE_OT_find_lights(Action, bpy.types.Operator):
     """Have the engine look for light sources in the frames; lights that are there already stay"""
 
     bl_idname = "fit_flare.find_lights"
     bl_label = "Find in Frames"
 
     @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
+    def why_not(cls, context: bpy.types.Context) -> str:
         capture = fits.capture_of(context.scene)
         if capture is None or not capture.is_dir():
-            cls.poll_message_set("Import a capture first")
-            return False
+            return NO_CAPTURE
         if engine.find() is None:
-            cls.poll_message_set(engine.MISSING)
-            return False
-        return True
+            return engine.MISSING
+        return ""
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
-        with reported(self) as outcome:
-            fits.find_lights(context.scene)
-        return outcome.status
+    def act(self, context: bpy.types.Context) -> None:
+        fits.find_lights(context.scene)
 
 
 _CLASSES = (FITFLARE_OT_add_light, FITFLARE_OT_lights_from_selected, FITFLARE_OT_remove_light, FITFLARE_OT_find_lights)
 
 
-def register() -> None:
-    for cls in _CLASSES:
-        bpy.utils.register_class(cls)
-
-
-def unregister() -> None:
-    for cls in reversed(_CLASSES):
-        bpy.utils.unregister_class(cls)
+register, unregister = bpy.utils.register_classes_factory(_CLASSES)

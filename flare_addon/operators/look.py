@@ -10,7 +10,7 @@ import bpy
 from ...core.errors import FitFlareError
 from .. import looks
 from ..properties import EDIT_NAMES
-from ..reports import reported
+from ..reports import NO_FLARE, Action
 
 
 def _sources(_self: Any, context: Any) -> list[tuple[str, str, str]]:
@@ -26,7 +26,7 @@ def _sources(_self: Any, context: Any) -> list[tuple[str, str, str]]:
 _shown: list[tuple[str, str, str]] = []
 
 
-class FITFLARE_OT_open_flare(bpy.types.Operator):
+class FITFLARE_OT_open_flare(Action, bpy.types.Operator):
     """Show a .flare in this scene: its flares come from the lights of the same names, or the selected objects"""
 
     bl_idname = "fit_flare.open_flare"
@@ -42,18 +42,16 @@ class FITFLARE_OT_open_flare(bpy.types.Operator):
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
-        with reported(self) as outcome:
-            look = looks.use(context.scene, Path(bpy.path.abspath(self.filepath)))
-            free = [item for item in context.scene.fit_flare.lights if item.target is None]
-            chosen = [item for item in context.selected_objects if item.type != "CAMERA"]
-            for item, target in zip(free, chosen, strict=False):
-                item.target = target
-            self.report({"INFO"}, f"{Path(self.filepath).name}: {len(look.lights)} lights, {look.count} Gaussians")
-        return outcome.status
+    def act(self, context: bpy.types.Context) -> None:
+        look = looks.use(context.scene, Path(bpy.path.abspath(self.filepath)))
+        free = [item for item in context.scene.fit_flare.lights if item.target is None]
+        chosen = [item for item in context.selected_objects if item.type != "CAMERA"]
+        for item, target in zip(free, chosen, strict=False):
+            item.target = target
+        self.report({"INFO"}, f"{Path(self.filepath).name}: {len(look.lights)} lights, {look.count} Gaussians")
 
 
-class FITFLARE_OT_add_flare(bpy.types.Operator):
+class FITFLARE_OT_add_flare(Action, bpy.types.Operator):
     """Let the selected objects flare with the look of a light of the .flare"""
 
     bl_idname = "fit_flare.add_flare"
@@ -63,25 +61,21 @@ class FITFLARE_OT_add_flare(bpy.types.Operator):
     source: bpy.props.EnumProperty(name="Look", description="Which light's look they get", items=_sources)  # type: ignore[valid-type]
 
     @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
+    def why_not(cls, context: bpy.types.Context) -> str:
         if not context.scene.fit_flare.flare:
-            cls.poll_message_set("Fit or open a flare first")
-            return False
+            return NO_FLARE
         if not any(item.type != "CAMERA" for item in context.selected_objects):
-            cls.poll_message_set("Select the objects that are to flare first")
-            return False
-        return True
+            return "Select the objects that are to flare first"
+        return ""
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
-        with reported(self) as outcome:
-            look = looks.look_of(context.scene)
-            for item in context.selected_objects:
-                if item.type != "CAMERA":
-                    looks.add_instance(context.scene, item, self.source or look.names[0])
-        return outcome.status
+    def act(self, context: bpy.types.Context) -> None:
+        look = looks.look_of(context.scene)
+        for item in context.selected_objects:
+            if item.type != "CAMERA":
+                looks.add_instance(context.scene, item, self.source or look.names[0])
 
 
-class FITFLARE_OT_remove_flare(bpy.types.Operator):
+class FITFLARE_OT_remove_flare(Action, bpy.types.Operator):
     """Take this flare out of the scene; its light object stays"""
 
     bl_idname = "fit_flare.remove_flare"
@@ -89,12 +83,11 @@ class FITFLARE_OT_remove_flare(bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}
 
     @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
+    def why_not(cls, context: bpy.types.Context) -> str:
         state = context.scene.fit_flare
         if not 0 <= state.light < len(state.lights):
-            cls.poll_message_set("There is no flare to remove")
-            return False
-        return True
+            return "There is no flare to remove"
+        return ""
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         state = context.scene.fit_flare
@@ -159,11 +152,4 @@ _CLASSES = (FITFLARE_OT_open_flare, FITFLARE_OT_add_flare, FITFLARE_OT_remove_fl
             FITFLARE_FH_flare, FITFLARE_UL_lights, FITFLARE_UL_elements)
 
 
-def register() -> None:
-    for cls in _CLASSES:
-        bpy.utils.register_class(cls)
-
-
-def unregister() -> None:
-    for cls in reversed(_CLASSES):
-        bpy.utils.unregister_class(cls)
+register, unregister = bpy.utils.register_classes_factory(_CLASSES)

@@ -25,26 +25,18 @@ from ..flare.visibility import visible_share
 from ..look import LookEdits, read
 from ..look.shot import PlacedLight, Shot, ShotFrame, evaluate
 from ..progress import Progress
-from .bake import BakeSettings, bake
+from .bake import BakeSettings, bake_frames
 from .frames import Frame
-from .layers import Pixels
-
-
-@dataclass(frozen=True)
-class _Rendering:
-    scene: Pixels
-    flare_by_light: Mapping[str, Pixels]
-    depth: Pixels
+from .layers import FrameLayers, Rendered
 
 
 class ShotRenderer:
-    """Renders the frames of a shot, each by the camera that belongs to it; what `bake` wants."""
+    """Renders the frames of a shot; what `bake_frames` wants."""
 
     def __init__(self, shot: Shot) -> None:
         self.shot, self.look = shot, read(shot.flare)
         self.run = Run.open(shot.run) if shot.run else None
         self.lights = shot.lights
-        self._by_camera = {id(one.camera): one for one in shot.frames}
 
     @property
     def elements(self) -> Mapping[str, list[str]]:
@@ -66,11 +58,10 @@ class ShotRenderer:
             digest.update(self.run.fingerprint.encode())
         return digest.hexdigest()[:16]
 
-    def render(self, camera: Camera, edits: LookEdits | None = None) -> _Rendering:  # noqa: ARG002 - see the frame
-        """The layers of the frame whose camera this is."""
+    def render(self, one: ShotFrame, camera: Camera) -> Rendered:
+        """The layers of a frame, under its camera at the size asked for."""
         import torch
 
-        one = self._by_camera[id(camera)]
         words = LookEdits.parse(one.edits, self.lights, self.elements)
         placed = [self._behind_the_scene(light, camera) for light in one.lights]
         with torch.no_grad():
@@ -84,8 +75,8 @@ class ShotRenderer:
         found = {name: np.maximum(layer.numpy(), 0) if scene is None else layer.numpy()
                  for name, layer in parts.flares.items()}
         depth = dark[..., 0] if scene is None else scene.depth
-        return _Rendering(parts.scene.numpy(), {name: found.get(name, dark.numpy()) for name in self.lights},
-                          depth.detach().numpy())
+        return Rendered(parts.scene.numpy(), {name: found.get(name, dark.numpy()) for name in self.lights},
+                        depth.detach().numpy())
 
     def _behind_the_scene(self, light: PlacedLight, camera: Camera) -> PlacedLight:
         """The light with what the fitted scene hides of it."""
@@ -100,6 +91,21 @@ class ShotRenderer:
         return PlacedLight(light.name, light.source, light.xyz, light.share * float(share))
 
 
+@dataclass(frozen=True)
+class _OfFrame:
+    """A frame of a shot. Its edits are the shot's own."""
+
+    renderer: ShotRenderer
+    one: ShotFrame
+    fingerprint: str = ""
+
+    def render(self, camera: Camera, edits: LookEdits | None = None) -> Rendered:  # noqa: ARG002 - see above
+        return self.renderer.render(self.one, camera)
+
+    def finished(self, layers: FrameLayers, camera: Camera) -> FrameLayers:  # noqa: ARG002 - nothing to add
+        return layers
+
+
 def bake_shot(shot: Shot, out: Path | str, *, half: bool = True, overwrite: bool = False,
               progress: Progress | None = None, wanted: Container[int] | None = None, space: str = "linear",
               config: str | None = None) -> dict[str, Any]:
@@ -107,16 +113,13 @@ def bake_shot(shot: Shot, out: Path | str, *, half: bool = True, overwrite: bool
     several. wanted: frame numbers, None for all. space, config: see `BakeSettings`. Returns the content of bake.json.
     Raises what `bake` raises, and FlareFileError."""
     several = len({one.name for one in shot.frames}) > 1
-    frames: list[Frame] = []
-    cameras: dict[str, Camera] = {}
-    for one in shot.frames:
-        if wanted is not None and one.frame not in wanted:
-            continue
-        view = f"{one.name}/{one.frame}"
-        frames.append(Frame(view, one.frame, _file(one, several)))
-        cameras[view] = one.camera
+    shown = {f"{one.name}/{one.frame}": one for one in shot.frames if wanted is None or one.frame in wanted}
+    frames = [Frame(view, one.frame, _file(one, several)) for view, one in shown.items()]
+    cameras = {view: one.camera for view, one in shown.items()}
+    renderer = ShotRenderer(shot)
     settings = BakeSettings(half=half, space=space, config=config)
-    return bake(ShotRenderer(shot), frames, cameras, out, settings, progress, overwrite=overwrite)
+    return bake_frames(renderer, frames, cameras, out, lambda frame: _OfFrame(renderer, shown[frame.view]), settings,
+                       progress, overwrite=overwrite)
 
 
 def _file(one: ShotFrame, several: bool) -> str:

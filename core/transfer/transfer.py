@@ -7,7 +7,7 @@ resolution may be any. Lights behind the camera, and lights that are hidden, giv
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from ..bake.bake import BakeSettings, bake_frames
 from ..bake.frames import Frame
-from ..bake.layers import FrameLayers
+from ..bake.layers import FrameLayers, Rendered
 from ..capture import Camera
 from ..colour import ColourSpace, colour_space
 from ..files import remove_partial_of
@@ -58,13 +58,6 @@ class TransferSettings:
     smooth: int = 1
     plate_space: str = AUTO
     visibility: VisibilitySettings = field(default_factory=VisibilitySettings)
-
-
-@dataclass(frozen=True)
-class _Rendering:
-    scene: Pixels
-    flare_by_light: Mapping[str, Pixels]
-    depth: Pixels
 
 
 class Transfer:
@@ -216,7 +209,7 @@ class _OfFrame:
         """See `Transfer.fingerprint_of`."""
         return self._transfer.fingerprint_of(self._index)
 
-    def render(self, camera: Camera, edits: LookEdits | None = None) -> _Rendering:
+    def render(self, camera: Camera, edits: LookEdits | None = None) -> Rendered:
         """Scene, flare of each light, depth; scene-linear Rec. 709."""
         with torch.no_grad():
             scene, depth = self._background(camera)
@@ -225,7 +218,7 @@ class _OfFrame:
             display = encode(torch.from_numpy(np.clip(scene, 0, 1)))
             parts = linear_layers(display, flares, self._transfer.look.blend)
         dark = np.zeros_like(scene)
-        return _Rendering(scene, {name: parts.flares[name].numpy() if name in parts.flares else dark
+        return Rendered(scene, {name: parts.flares[name].numpy() if name in parts.flares else dark
                                   for name in self._transfer.lights}, depth)
 
     def _background(self, camera: Camera) -> tuple[Pixels, Pixels]:

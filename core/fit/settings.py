@@ -207,7 +207,7 @@ def _shortened(settings: FitSettings, count: int, most: int) -> FitSettings:
     density = replace(settings.flare.density, start=max(round(length * (begin + 0.1)), every),
                       stop=round(length * (begin * 0.6 + 0.6)), every=every, clone_ratio=0.1)
     rates = replace(settings.flare.rates, network=1e-3, grids=5e-3, position=1.6e-3, position_final=1.6e-5,
-                    features=1e-2, scale=0.02, rotation=5e-3, settled=SETTLED)
+                    features=1e-2, scale=0.02, rotation=5e-3, ring=2e-2, settled=SETTLED)
     classic = replace(settings.scene.classic, start=round(length * 0.05), stop=round(length * 0.6),
                       every=max(round(length / 50), 20), reset_every=10 * length, cap=most)
     scene = replace(settings.scene, classic=classic, sh_every=max(round(length / 6), 1),

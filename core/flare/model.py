@@ -22,6 +22,9 @@ from .placement import PlaneGaussians
 TEACHES = 0.2
 """Visible share of a light from which a view says something about its flare."""
 
+RING_EVERY = 4
+"""One in so many Gaussians is a ring at first, where the form has them."""
+
 
 @dataclass(frozen=True)
 class FlareForm:
@@ -171,6 +174,8 @@ def _canonical(form: FlareForm, count: int, opacity: float, generator: torch.Gen
         rows["offsets"] = torch.zeros(count, 2)
     if form.rings:
         rows["rings"] = torch.zeros(count, 2)
+        # A disc finds the way to a ring through worse pictures; so some begin as rings, of three deviations' radius.
+        rows["rings"][::RING_EVERY] = torch.tensor([3.0, math.log(0.5)])
     if form.latent:
         rows["latent"] = 0.1 * torch.randn(count, form.latent, generator=generator)
     return rows

@@ -137,7 +137,7 @@ def _unpacked(description: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> 
         names.append(str(light["name"]))
         positions.append(xyz)
         clear.append(float(light.get("clear", 1.0)))
-        if not 0 < clear[-1] <= 1:
+        if not 0 <= clear[-1] <= 1:
             raise ValueError("a light's clear share makes no sense")
     model = FlareModel(names, torch.tensor(positions, dtype=torch.float64).reshape(-1, 3), flares)
     model.clear.copy_(torch.tensor(clear))

@@ -185,7 +185,7 @@ class FlareModel(nn.Module):
     """The flares of a capture: one `LightFlare` for each light, by name, in the capture's order.
 
     clear: (lights,) the share of each light that the fitted scene leaves where nothing hides it, 0..1. Less than 1,
-    since something in the scene shows the lamp itself, and a sky may stand nearer than the sun.
+    since something in the scene shows the lamp itself, and a sky may stand nearer than the sun. 0: shares are 1.
     """
 
     positions: Tensor

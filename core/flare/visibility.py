@@ -41,21 +41,23 @@ def visible_shares(scene: SceneGaussians, model: FlareModel, world_to_camera: Te
     """The visible share of each light from a pose (4, 4), by the light's name, as part of `FlareModel.clear`."""
     pose = world_to_camera.double()
     camera = -pose[:3, :3].T @ pose[:3, 3]
-    return {name: (visible_share(scene, camera, light, settings, kernels) / clear).clamp(max=1)
-            for name, light, clear in zip(model.names, model.positions, model.clear, strict=True)}
+    return {name: (visible_share(scene, camera, light, settings, kernels) / clear).clamp(max=1) if clear > 0
+            else torch.ones(()) for name, light, clear in zip(model.names, model.positions, model.clear, strict=True)}
 
 
 @torch.no_grad()
 def clear_shares(scene: SceneGaussians, model: FlareModel, poses: Sequence[Tensor], settings: VisibilitySettings,
                  kernels: Kernels = "auto") -> Tensor:
     """(lights,) the share that the scene leaves of each light where nothing hides it: what it leaves in the clearest
-    tenth of these poses (4, 4), and never less than `LEAST_CLEAR`."""
+    tenth of these poses (4, 4). 0 where even those see less than `LEAST_CLEAR`: a scene that hides a light from
+    everywhere, as one does that the light was placed inside of, says nothing about it, and its shares are 1."""
     cameras = [-pose[:3, :3].double().T @ pose[:3, 3].double() for pose in poses]
     found = []
     for light in model.positions:
         shares = torch.stack([visible_share(scene, camera, light, settings, kernels) for camera in cameras])
         found.append(shares.quantile(CLEAR_FROM))
-    return torch.stack(found).clamp(LEAST_CLEAR, 1)
+    least = torch.stack(found).clamp(max=1)
+    return least.masked_fill(least < LEAST_CLEAR, 0)
 
 
 def visible_share(scene: SceneGaussians, camera: Tensor, light: Tensor, settings: VisibilitySettings | None = None,

@@ -65,7 +65,7 @@ def _say_once(sentence: str) -> None:
 def fused(like: Tensor) -> Any:
     """The CPU kernels if they can take tensors such as `like`, else None: for the loss and the optimiser,
     which have a plain torch form of their own."""
-    if like.device.type != "cpu" or like.dtype != torch.float32:
+    if not like.is_cpu or like.dtype != torch.float32:
         return None
     kernels = _load("cpu")
     return None if isinstance(kernels, ImportError) else kernels

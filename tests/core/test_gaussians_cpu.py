@@ -8,6 +8,7 @@ import subprocess
 import sys
 import textwrap
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +21,7 @@ pytest.importorskip("numba")
 from core.gaussians import loss as definition
 from core.gaussians import optimiser as plain_optimiser
 from core.gaussians import rasterization, splat
-from core.gaussians.cpu import Step, adam_steps, buffers, compilation, l1_ssim, threads
+from core.gaussians.cpu import Step, adam_steps, binning, buffers, compilation, l1_ssim, threads
 
 ROOT = Path(__file__).parents[2]
 SIZE = (70, 45)
@@ -119,6 +120,23 @@ def test_splats_give_the_same_bits_on_all_thread_counts() -> None:
 
     for a, b in zip(draw(1), draw(2), strict=True):
         assert torch.equal(a, b)
+
+
+@pytest.mark.parametrize("count", [1, 2, 4])
+def test_plan_shares_the_work_and_leaves_nothing_out(count: int) -> None:
+    rng = np.random.default_rng(0)
+    keys = rng.uniform(2, 10, 20_000).astype(np.float32).view(np.uint32)
+    keys[::5] = binning.NOWHERE
+    bounds = np.where(keys < binning.NOWHERE, rng.integers(1, 6, len(keys)), 0).astype(np.int32)
+    chunk_bounds = np.add.reduceat(bounds, np.arange(0, len(keys), 1024)).astype(np.int64)
+    for some in (keys, np.full_like(keys, binning.NOWHERE), np.full_like(keys, 7)):
+        starts, cuts = np.empty(len(chunk_bounds), np.int64), np.empty(count + 1, np.int64)
+        room = binning.plan(some, bounds, chunk_bounds, 3, np.empty(binning.CLASSES, np.int64), starts, cuts)
+        assert room == bounds.sum() and (starts == np.cumsum(chunk_bounds) - chunk_bounds).all()
+        assert cuts[0] == 0 and cuts[-1] == binning.NOWHERE and (np.diff(cuts) >= 0).all()
+        if some is keys:
+            shares = [bounds[(keys >= a) & (keys < b)].sum() for a, b in pairwise(cuts)]
+            assert max(shares) < 1.2 * min(shares)
 
 
 def test_two_renderings_may_wait_for_their_gradients() -> None:

@@ -54,6 +54,10 @@ from .vector import get, opaque, prefetch, take, take_number
 ROW_BITS, ROW_MASK = TILE_SHIFT_Y, TILE_HEIGHT - 1
 DIGITS = 3
 AHEAD = 8
+CLASSES = 1 << 10
+"""Of keys, between which parts may be cut."""
+PER_GAUSSIAN = 2
+"""What it takes to sort and look at a Gaussian, in tiles to list."""
 LISTED = 3
 NOWHERE = 0x7F800000
 """The key of what is not drawn: the bits of infinity, above those of every depth."""
@@ -146,6 +150,39 @@ def number_slots(bounds, start, end, firsts):
         firsts[i] = total
         total += bounds[i]
     return total
+
+
+@kernel
+def plan(keys, bounds, chunk_bounds, step, work, starts, cuts):
+    """What `list_in_order` needs first: starts (chunks,), sums of chunk_bounds before each, of which the sum of all is
+    returned; and cuts (parts + 1,), between which there is about the same to do, judged by every step-th Gaussian.
+    work (CLASSES,): workspace."""
+    room = number_slots(chunk_bounds, 0, chunk_bounds.size, starts)
+    parts = cuts.size - 1
+    cuts[0], cuts[1:] = 0, NOWHERE
+    low, high = np.int64(NOWHERE), np.int64(0)
+    for i in range(0, keys.size, step):
+        key = np.int64(keys[i])
+        if key < NOWHERE:
+            low, high = min(key, low), max(key, high)
+    shift = 0
+    while (high - low) >> shift >= CLASSES:
+        shift += 1
+    work[:] = 0
+    total = 0
+    for i in range(0, keys.size, step):
+        key = np.int64(keys[i])
+        if key < NOWHERE:
+            amount = bounds[i] + PER_GAUSSIAN
+            work[(key - low) >> shift] += amount
+            total += amount
+    part, done = 1, 0
+    for c in range(CLASSES if total > 0 else 0):
+        done += work[c]
+        while part < parts and done * parts >= total * part:
+            cuts[part] = min(low + ((c + 1) << shift), NOWHERE)
+            part += 1
+    return room
 
 
 @inlined

@@ -105,4 +105,4 @@ def pair(*shape: int) -> tuple[Tensor, Array]:
     for extent in shape:
         count *= extent
     array = empty(count)
-    return torch.from_numpy(array).view(shape), array
+    return torch.from_numpy(array.reshape(shape)), array

@@ -244,7 +244,7 @@ class _L1Ssim(torch.autograd.Function):
         x, y = flat(image), flat(target)
         maps, sums = buffers.empty(3 * x.size).reshape(3, x.size), np.empty((height, 2))
         parallel(compare, x, y, mu_y, s_y, width, height, maps, sums, scratch=_scratch_size(width))
-        l1, similarity = sums.sum(0) / x.size
+        l1, similarity = (sums.sum(0) / x.size).tolist()
         if ctx.needs_input_grad[0]:
             d_image, d_image_flat = buffers.pair(height, width, 3)
             scales = np.float32(lam / x.size), np.float32((lam - 1) / x.size)

@@ -17,7 +17,6 @@ from .vector import LANES, fma, load, sqrt, store, take_number
 
 PIECE = 1 << 13
 """Least number of values to a piece of work."""
-ROW = np.ones(LANES, np.float32)
 
 
 @kernel
@@ -79,7 +78,7 @@ def _arguments(
     beta1: float, beta2: float, epsilon: float,
 ) -> tuple[Any, ...]:  # fmt: skip
     """Of `advance`, with a counter of its own."""
-    row = flat(rate) if isinstance(rate, Tensor) else ROW * np.float32(rate)
+    row = flat(rate) if isinstance(rate, Tensor) else np.full(LANES, rate, np.float32)
     if row.size % LANES:
         row = np.tile(row, math.lcm(row.size, LANES) // row.size)
     rates = row / np.float32(1 - beta1**step)

@@ -88,7 +88,7 @@ def _load_gradients(
     alpha = load(alphas, pixel)
     t = ONE - alpha
     behind = fma(v[0], background[0], fma(v[1], background[1], v[2] * background[2]))
-    v_alpha = load(d_alphas, pixel) - behind
+    v_alpha = (load(d_alphas, pixel) if d_alphas.size > 0 else splat(ZERO)) - behind
     s = fma(v[0], colour[0], fma(v[1], colour[1], v[2] * colour[2])) - t * behind
     if with_depth:
         store(state, at + V_DEPTH, load(d_depths, pixel) / where(alpha > DEPTH_ALPHA_MIN, alpha, DEPTH_ALPHA_MIN))
@@ -206,7 +206,9 @@ def _edge_row(edge, pixel, count, image, alphas, depths, d_image, d_alphas, d_de
         lane += one
     lane = 0
     while lane < count:
-        edge[2, lane], edge[3, lane] = alphas[pixel + lane], d_alphas[pixel + lane]
+        edge[2, lane] = alphas[pixel + lane]
+        if d_alphas.size > 0:
+            edge[3, lane] = d_alphas[pixel + lane]
         if with_depth:
             edge[4, lane], edge[5, lane] = depths[pixel + lane], d_depths[pixel + lane]
         lane += one
@@ -254,7 +256,7 @@ def raster_backward(
     counter, scratch, entries, starts, ends, records, background, width, height, tiles_x, image, alphas, depths,
     d_image, d_alphas, d_depths, gradients,
 ):  # fmt: skip
-    """gradients: the row of each slot. d_depths may be empty."""
+    """gradients: the row of each slot. d_alphas and d_depths may be empty."""
     state, edge = scratch[:STATE], scratch[STATE:SCRATCH].reshape(6, EDGE)
     with_depth = d_depths.size > 0
     while True:

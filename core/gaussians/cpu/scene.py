@@ -17,6 +17,8 @@ from .threads import parallel
 from .tiles import EMPTY, Grid, bin_gaussians, flat
 from .vector import LANES
 
+_BLACK = torch.zeros(3)
+
 
 @dataclass(frozen=True)
 class _Frame(Grid):
@@ -44,11 +46,12 @@ class _Rasterize(torch.autograd.Function):
         bounds, firsts = buffers.empty(n, np.int32), buffers.empty(n, np.int32)
         centres, centres_flat = buffers.pair(n, 2)
         radii, radii_flat = buffers.pair(n)
+        given = [flat(t) for t in (means, quats, scales, opacities)]
         blocks = -(-n // LANES) if any(ctx.needs_input_grad) else 0
         slopes = buffers.empty(blocks * LANES * projection.SLOPES)
         chunk_bounds = np.zeros(-(-n // layout.CHUNK), np.int64)
         parallel(
-            projection.project, *(flat(t) for t in (means, quats, scales, opacities, sh)), sh.shape[1] * 3,
+            projection.project, *given, flat(sh), sh.shape[1] * 3,
             frame.sh_degree, frame.raw, camera, w, h, records, centres_flat, radii_flat, depths_of, bounds, firsts,
             chunk_bounds, slopes, scratch=projection.SCRATCH,
         )  # fmt: skip
@@ -56,8 +59,9 @@ class _Rasterize(torch.autograd.Function):
 
         image, image_flat = buffers.pair(h, w, 3)
         alpha, alpha_flat = buffers.pair(h, w)
-        depth, depth_flat = buffers.pair(*((h, w) if frame.depth else (0, 0)))
-        median, median_flat = buffers.pair(*depth.shape)
+        (depth, depth_flat), (median, median_flat) = (
+            (buffers.pair(h, w), buffers.pair(h, w)) if frame.depth else (_nothing(), _nothing())
+        )
         ends, behind = np.empty(frame.tiles, np.int64), flat(background)
         parallel(
             raster_forward.raster, bins.entries, bins.starts, records, behind, w, h, frame.tiles_x,
@@ -65,24 +69,24 @@ class _Rasterize(torch.autograd.Function):
         )  # fmt: skip
         ctx.save_for_backward(means, quats, scales, opacities, sh, image, alpha, depth)
         ctx.frame, ctx.bins, ctx.centre_gradients, ctx.first = frame, bins, centre_gradients, True
-        ctx.arrays = records, camera, slopes, ends, behind
+        ctx.arrays = records, camera, slopes, ends, behind, given, (image_flat, alpha_flat, depth_flat)
         ctx.mark_non_differentiable(median, centres, radii)
         ctx.set_materialize_grads(False)
         return image, alpha, depth, median, centres, radii
 
     @staticmethod
     def backward(ctx: Any, d_image: Tensor | None, d_alpha: Tensor | None, d_depth: Tensor | None, *_: Any) -> Any:
-        means, quats, scales, opacities, sh, image, alpha, depth = ctx.saved_tensors
+        means, quats, scales, opacities, sh, _, alpha, _ = ctx.saved_tensors  # asks whether they are as they were
         frame, bins = ctx.frame, ctx.bins
-        records, camera, slopes, ends, behind = ctx.arrays
+        records, camera, slopes, ends, behind, given, pictures = ctx.arrays
         n, w, h = len(means), frame.width, frame.height
         v_image = buffers.zeros(h * w * 3) if d_image is None else flat(d_image)
-        v_alpha = buffers.zeros(h * w) if d_alpha is None else flat(d_alpha)
+        v_alpha = EMPTY if d_alpha is None else flat(d_alpha)
         v_depth = EMPTY if d_depth is None else flat(d_depth)
         rows = buffers.empty(bins.slots * layout.RECORD)
         parallel(
             raster_backward.raster_backward, bins.entries, bins.starts, ends, records, behind, w, h, frame.tiles_x,
-            flat(image), flat(alpha), flat(depth), v_image, v_alpha, v_depth, rows, scratch=raster_backward.SCRATCH,
+            *pictures, v_image, v_alpha, v_depth, rows, scratch=raster_backward.SCRATCH,
         )  # fmt: skip
         gradients, gradients_flat = zip(
             *(buffers.pair(*t.shape) for t in (means, quats, scales, opacities, sh)), strict=True
@@ -93,9 +97,8 @@ class _Rasterize(torch.autograd.Function):
         with_camera = ctx.needs_input_grad[5] or ctx.needs_input_grad[6]
         sums = np.zeros((-(-n // layout.CHUNK), projection.CAMERA_SUMS), np.float32)
         parallel(
-            projection.project_backward, *(flat(t) for t in (means, quats, scales, opacities)), sh.shape[1] * 3,
-            frame.sh_degree, frame.raw, camera, records, slopes, rows, bins.firsts, bins.counts,
-            *gradients_flat, d_centres, sums, with_camera, scratch=projection.SCRATCH,
+            projection.project_backward, *given, sh.shape[1] * 3, frame.sh_degree, frame.raw, camera, records, slopes,
+            rows, bins.firsts, bins.counts, *gradients_flat, d_centres, sums, with_camera, scratch=projection.SCRATCH,
         )  # fmt: skip
         if not first:
             flat(ctx.centre_gradients)[:] += d_centres
@@ -127,19 +130,30 @@ def rasterize_scene(
 ) -> Rendering:  # fmt: skip
     """See `rasterization`. depth=False leaves depth and median_depth empty (0, 0), and is faster."""
     n = len(means)
-    inputs = [t.to(torch.float32) for t in (means, quats, scales, opacities, sh)]
-    camera = [t.to(torch.float32) for t in (world_to_camera, intrinsics)]
+    inputs = [_single(t) for t in (means, quats, scales, opacities, sh)]
     if n < LANES:  # the kernels work on 16 at a time; opacity 0 is never seen
         rest = [0.0, 0.0, 0.0, -math.inf if raw else 0.0, 0.0]
         inputs = [
             torch.cat([t, t.new_full((LANES - n, *t.shape[1:]), value)]) for t, value in zip(inputs, rest, strict=True)
         ]
     if background is None:
-        background = inputs[0].new_zeros(3)
+        background = _BLACK
     centre_gradients, zeros = buffers.pair(len(inputs[0]), 2)
     zeros.fill(0)
     frame = _Frame(width, height, sh_degree, near, dilation, depth, raw)
     image, alpha, depths, median, centres, radii = _Rasterize.apply(
-        *inputs, *camera, background, frame, centre_gradients
+        *inputs, _single(world_to_camera), _single(intrinsics), background, frame, centre_gradients
     )
-    return Rendering(image, alpha, depths, median, centres[:n], radii[:n], centre_gradients[:n])
+    of_gaussians = (centres, radii, centre_gradients)
+    if n < LANES:
+        of_gaussians = (centres[:n], radii[:n], centre_gradients[:n])
+    return Rendering(image, alpha, depths, median, *of_gaussians)
+
+
+def _single(tensor: Tensor) -> Tensor:
+    return tensor if tensor.dtype == torch.float32 else tensor.to(torch.float32)
+
+
+def _nothing() -> tuple[Tensor, Array]:
+    """Instead of a pair of depth."""
+    return torch.empty(0, 0), EMPTY

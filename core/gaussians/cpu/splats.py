@@ -58,7 +58,7 @@ class _Splat(torch.autograd.Function):
         covariances, opacities, colours, rings, arcs = inputs[1:]
         h, w = grid.height, grid.width
         v_image = buffers.zeros(h * w * 3) if d_image is None else flat(d_image)
-        v_alpha = buffers.zeros(h * w) if d_alpha is None else flat(d_alpha)
+        v_alpha = EMPTY if d_alpha is None else flat(d_alpha)
         rows = buffers.empty(bins.slots * layout.RECORD)
         tiles = (bins.entries, bins.starts, ends, records)
         pictures = (flat(image), flat(alpha))

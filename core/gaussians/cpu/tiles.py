@@ -13,7 +13,7 @@ from .buffers import Array
 from .threads import parallel
 
 EMPTY = np.empty(0, np.float32)
-PARTS_MAX, SAMPLE = 8, 1024
+PARTS_MAX, SAMPLE = 8, 4096
 """Parts of the Gaussians that are sorted apart, and how many of them are asked where to cut."""
 
 
@@ -46,7 +46,7 @@ class Bins:
 
 def flat(tensor: Tensor) -> Array:
     """The numbers of a float32 tensor, as one contiguous row; the same memory if they are."""
-    return np.ravel(tensor.detach().numpy())
+    return tensor.detach().numpy().ravel()
 
 
 def bin_gaussians(
@@ -55,13 +55,15 @@ def bin_gaussians(
     """Sorts the n records into tiles, by key; the arguments are those of `binning.list_in_order`, which changes bounds
     and firsts, and the sums of the bounds over chunks."""
     n, parts = len(keys), min(torch.get_num_threads(), PARTS_MAX)  # each looks through all keys
-    room = int(chunk_bounds.sum())
+    starts_of_chunks, cuts = np.empty(len(chunk_bounds), np.int64), np.empty(parts + 1, np.int64)
+    room = binning.plan(
+        keys, bounds, chunk_bounds, max(1, -(-n // SAMPLE)), np.empty(binning.CLASSES, np.int64), starts_of_chunks, cuts
+    )
     listed = buffers.empty(room * binning.LISTED, np.int32)
     spans, numbers = np.empty((parts, 2), np.int64), np.empty((parts, grid.tiles), np.int32)
     parallel(
-        binning.list_in_order, records, keys, bounds, firsts, np.cumsum(chunk_bounds) - chunk_bounds,
-        _cuts(keys, bounds, parts), grid.width, grid.height, grid.tiles_x,
-        np.zeros(2, np.int64), np.empty((parts, binning.DIGITS, 1 << 11), np.int32),
+        binning.list_in_order, records, keys, bounds, firsts, starts_of_chunks, cuts, grid.width, grid.height,
+        grid.tiles_x, np.zeros(2, np.int64), np.empty((parts, binning.DIGITS, 1 << 11), np.int32),
         buffers.empty(2 * (n + parts), np.int64).reshape(2, -1), listed, spans, numbers,
     )  # fmt: skip
     starts = np.empty(grid.tiles + 1, np.int64)
@@ -69,16 +71,3 @@ def bin_gaussians(
     entries = buffers.empty(int(starts[-1]) * layout.ENTRY, np.int32)
     parallel(binning.scatter, listed, spans, numbers, entries)
     return Bins(entries, starts, firsts, bounds, room)
-
-
-def _cuts(keys: Array, bounds: Array, parts: int) -> Array:
-    """(parts + 1,) keys between which there is about the same number of tiles to list, judged by a sample."""
-    cuts = np.zeros(parts + 1, np.int64)
-    cuts[parts] = binning.NOWHERE
-    if parts > 1 and len(keys):
-        step = -(-len(keys) // SAMPLE)
-        order = np.argsort(keys[::step])
-        work = np.cumsum(bounds[::step][order])
-        places = np.searchsorted(work, work[-1] * np.arange(1, parts) / parts)
-        cuts[1:parts] = np.minimum(keys[::step][order[places]], binning.NOWHERE)
-    return cuts

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,7 @@ from .threads import parallel
 from .tiles import EMPTY, Grid, bin_gaussians, flat
 from .vector import LANES
 
-_BLACK = torch.zeros(3)
+_BLACK, _NOTHING = torch.zeros(3), torch.empty(0, 0)
 
 
 @dataclass(frozen=True)
@@ -29,6 +29,8 @@ class _Frame(Grid):
     dilation: float
     depth: bool
     raw: bool
+    found: list[Tensor] = field(default_factory=list)
+    """Centres and radii, which are not differentiated and so need not pass through autograd."""
 
 
 class _Rasterize(torch.autograd.Function):
@@ -36,7 +38,7 @@ class _Rasterize(torch.autograd.Function):
     def forward(
         ctx: Any, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, sh: Tensor,
         world_to_camera: Tensor, intrinsics: Tensor, background: Tensor, frame: _Frame, centre_gradients: Tensor,
-    ) -> tuple[Tensor, ...]:  # fmt: skip
+    ) -> tuple[Tensor | None, ...]:  # fmt: skip
         n, w, h = len(means), frame.width, frame.height
         camera = np.empty(projection.CAMERA, np.float32)
         projection.describe_camera(
@@ -60,7 +62,7 @@ class _Rasterize(torch.autograd.Function):
         image, image_flat = buffers.pair(h, w, 3)
         alpha, alpha_flat = buffers.pair(h, w)
         (depth, depth_flat), (median, median_flat) = (
-            (buffers.pair(h, w), buffers.pair(h, w)) if frame.depth else (_nothing(), _nothing())
+            (buffers.pair(h, w), buffers.pair(h, w)) if frame.depth else ((None, EMPTY), (None, EMPTY))
         )
         ends, behind = np.empty(frame.tiles, np.int64), flat(background)
         parallel(
@@ -70,9 +72,11 @@ class _Rasterize(torch.autograd.Function):
         ctx.save_for_backward(means, quats, scales, opacities, sh, image, alpha, depth)
         ctx.frame, ctx.bins, ctx.centre_gradients, ctx.first = frame, bins, centre_gradients, True
         ctx.arrays = records, camera, slopes, ends, behind, given, (image_flat, alpha_flat, depth_flat)
-        ctx.mark_non_differentiable(median, centres, radii)
         ctx.set_materialize_grads(False)
-        return image, alpha, depth, median, centres, radii
+        frame.found.extend((centres, radii))
+        if median is not None:
+            ctx.mark_non_differentiable(median)
+        return image, alpha, depth, median
 
     @staticmethod
     def backward(ctx: Any, d_image: Tensor | None, d_alpha: Tensor | None, d_depth: Tensor | None, *_: Any) -> Any:
@@ -141,19 +145,16 @@ def rasterize_scene(
     centre_gradients, zeros = buffers.pair(len(inputs[0]), 2)
     zeros.fill(0)
     frame = _Frame(width, height, sh_degree, near, dilation, depth, raw)
-    image, alpha, depths, median, centres, radii = _Rasterize.apply(
+    image, alpha, depths, median = _Rasterize.apply(
         *inputs, _single(world_to_camera), _single(intrinsics), background, frame, centre_gradients
     )
-    of_gaussians = (centres, radii, centre_gradients)
+    if not depth:
+        depths, median = _NOTHING, _NOTHING
+    of_gaussians = (*frame.found, centre_gradients)
     if n < LANES:
-        of_gaussians = (centres[:n], radii[:n], centre_gradients[:n])
+        of_gaussians = tuple(t[:n] for t in of_gaussians)
     return Rendering(image, alpha, depths, median, *of_gaussians)
 
 
 def _single(tensor: Tensor) -> Tensor:
     return tensor if tensor.dtype == torch.float32 else tensor.to(torch.float32)
-
-
-def _nothing() -> tuple[Tensor, Array]:
-    """Instead of a pair of depth."""
-    return torch.empty(0, 0), EMPTY

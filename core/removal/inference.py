@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Flare removal of plates of any size and depth.
 
-The network sees the plate at a bounded working size. The flare that it tells is carried up by a guided
-filter (He et al. 2013, in the fast form of He and Sun 2015): flare = a * plate + b, with a and b found at
-the working size, smooth, and applied to the plate's own pixels, so that the edges of a light or of what
-stands before it stay sharp. What was carried up is taken from the plate in linear light. Where the network
-tells less than a threshold the flare is exactly zero, and the plate's own codes are kept.
+The network sees the plate at a bounded working size. The flare that it tells is carried up as it is, since a flare
+lies over the scene and knows nothing of its edges. But where the plate is over-exposed, only a part of the flare is
+to be seen in it, and that part ends where the clipping does: there it is carried up by a guided filter (He et al.
+2013, in the fast form of He and Sun 2015), flare = a * plate + b, with a and b found at the working size, smooth,
+and applied to the plate's own pixels. What was carried up is taken from the plate in linear light. Where the
+network tells less than a threshold the flare is exactly zero, and the plate's own codes are kept.
 """
 from __future__ import annotations
 
@@ -20,21 +21,23 @@ from numpy.typing import NDArray
 
 from ..errors import SettingsError
 from ..pictures import Encoding, linear_from_srgb
-from .network import GAMMA, MULTIPLE, RemovalNetwork, flare_light, inputs
+from .network import GAMMA, MULTIPLE, RemovalNetwork, flare_light
 from .plates import Plate
 from .weights import IN_THE_BOX, load
 
 Pixels = NDArray[np.float32]
 
-WORKING_SIZE = 192
-"""Long side that the network sees: what it was trained at, and reaches over."""
-LEAST = 0.015
+WORKING_SIZE = 256
+"""Long side that the network sees: about what it was trained at last."""
+LEAST = 0.01
 """What a flare adds to display values, below which there is none."""
-SURE = 0.035
+SURE = 0.015
 """Mean over the frame of what a flare adds, below which the network is not trusted at all; from twice as much on
 it is trusted whole. It tells small flares where there are none."""
-RADIUS, SMOOTHNESS = 2, 1e-3
+RADIUS, SMOOTHNESS = 1, 1e-3
 """Of the guided filter, at the working size."""
+CLIPPED = 0.97
+"""Display value from which on a plate is taken for over-exposed."""
 ROWS = 256
 """Rows of the plate that are worked on at a time, which bounds the memory."""
 
@@ -83,13 +86,13 @@ class Remover:
     def find(self, codes: NDArray[Any], encoding: Encoding, top: float = 1.0) -> FlareMap:
         """The flare of a picture's codes (height, width, 3), at the working size."""
         small = self._seen(codes, encoding, top)
-        return _guided(small, self.flare(small))
+        return _carrier(small, self.flare(small))
 
     @torch.inference_mode()
     def flare(self, display: Pixels) -> Pixels:
         """Linear flare of a picture of display values 0..1 at the network's size; exactly 0 where it is none."""
         frame = torch.from_numpy(np.ascontiguousarray(display.transpose(2, 0, 1)))[None]
-        told = self.network(inputs(frame))
+        told = self.network(frame)
         added = (told.gentle if self.keep_glare else told.flare).clamp(min=0)
         # A ramp from nothing to the whole, so that a faint flare has no rim.
         added = added * ((added - LEAST) / LEAST).clamp(0, 1)
@@ -148,8 +151,9 @@ def _display(light: Pixels) -> Pixels:
 _TABLE = np.power(np.arange(256, dtype=np.float32) / 255, np.float32(GAMMA)).astype(np.float32)
 
 
-def _guided(display: Pixels, flare: Pixels) -> FlareMap:
-    """The guided filter's two maps, channel by channel: box means over a window, then their own means."""
+def _carrier(display: Pixels, flare: Pixels) -> FlareMap:
+    """The flare itself; about over-exposed places the guided filter's two maps, channel by channel: box means over
+    a window, then their own means, those of windows with an edge first."""
     import cv2
 
     if not flare.any():
@@ -159,6 +163,9 @@ def _guided(display: Pixels, flare: Pixels) -> FlareMap:
     def mean(values: Pixels) -> Pixels:
         return np.asarray(cv2.blur(values, window, borderType=cv2.BORDER_REFLECT), np.float32)
 
+    reach = (4 * RADIUS + 1, 4 * RADIUS + 1)  # as far as the two means carry what is clipped
+    clipped = cv2.dilate((display.max(-1) > CLIPPED).astype(np.uint8), np.ones(reach, np.uint8))
+    guided = mean(clipped.astype(np.float32))[..., None]
     mean_i, mean_f = mean(display), mean(flare)
     covariance = mean(display * flare) - mean_i * mean_f
     variance = np.maximum(mean(display * display) - mean_i**2, 0)
@@ -166,8 +173,12 @@ def _guided(display: Pixels, flare: Pixels) -> FlareMap:
     # Running sums leave crumbs where there is nothing at all.
     anything = cv2.dilate((flare > 0).any(-1).astype(np.uint8), np.ones(window, np.uint8))[..., None]
     offset = mean_f - gain * mean_i
-    wide = cv2.dilate(anything, np.ones(window, np.uint8))[..., None]
-    return FlareMap(mean(gain * anything) * wide, mean(offset * anything) * wide)
+    guided = guided * cv2.dilate(anything, np.ones(window, np.uint8))[..., None]
+    # Of the windows about a place those count that hold an edge: what they say fits both of its sides.
+    weight = (variance + np.float32(SMOOTHNESS)) * anything
+    total = mean(variance + np.float32(SMOOTHNESS))
+    gain, offset = mean(gain * weight) / total, mean(offset * weight) / total
+    return FlareMap(guided * gain, guided * offset + (1 - guided) * flare)
 
 
 def carried_up(found: FlareMap, codes: NDArray[Any], encoding: Encoding,

@@ -1,19 +1,19 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The network in the box: tells the flare of a frame from what lies round each place, near and far.
+"""The network in the box: tells the flare of a frame from the whole frame.
 
-For each cell of a few pixels it sees the colour and over-exposure there and in ever larger neighbourhoods, the
-darkest values of each (a veil lifts the darkest), the same of the whole frame, what lies at the place turned
-by 180 degrees about the principal point, where a light's ghosts mirror it, and where on the frame it is. A
-perceptron, the same in every cell, tells what the flare adds to the frame's display values, of which `gentle`
-is the part that is not the glow round the lights. The clean picture is the frame less that, and the flare the
-difference of the two in light: what the network does not call flare, the source of light among it, is the
-frame's own.
+A U-Net of residual blocks. A flare is known by what it does over long ways: a veil lifts the darkest values of
+the whole frame, and ghosts lie on the line from a light through the principal point. So it is given, beside the
+frame, on every level the means, the darkest values and the over-exposure of what a place covers, the same turned
+by 180 degrees about the middle, where a light's mirrored ghosts fall, and where on the frame the place is; and on
+the two coarsest levels every place attends to every other.
 
-Since it is the same in every cell, it can be trained on cells of thousands of frames at a time, so that minutes
-of one processor core are enough to learn something.
+It tells what the flare adds to the frame's display values, of which `gentle` is the part that is not the glow
+round the lights. The clean picture is the frame less that, and the flare the difference of the two in light:
+what the network does not call flare, the source of light among it, is the frame's own.
 """
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import NamedTuple
 
 import torch
@@ -21,12 +21,10 @@ import torch.nn.functional as F  # noqa: N812 - its name everywhere
 from torch import Tensor, nn
 
 CELL = 2
-"""Pixels a side of what the network tells one flare for."""
-REACHES = (4, 8, 16, 32)
-"""Sides of the neighbourhoods, in cells."""
-MULTIPLE = CELL * REACHES[-1] // 2
+"""Pixels a side of what the finest level sees as one place."""
+LEVELS = 5
+MULTIPLE = CELL * 2 ** (LEVELS - 1)
 """Height and width that the network takes are multiples of this."""
-INPUTS = 7 + 7 * len(REACHES) + 7 + 14 + 3
 GAMMA = 2
 """Of the light that flares are taken from display values in: the middle of what pictures are formed with, and cheap."""
 
@@ -41,58 +39,123 @@ class Prediction(NamedTuple):
     gentle: Tensor
 
 
-def inputs(display: Tensor) -> Tensor:
-    """(n, INPUTS, h / CELL, w / CELL) from whole frames (n, 3, h, w) of display values 0..1, the principal point
-    in the middle; h and w multiples of MULTIPLE."""
+def seen(display: Tensor) -> list[Tensor]:
+    """What each level is shown of whole frames (n, 3, h, w) of display values 0..1, the principal point in the
+    middle; h and w multiples of MULTIPLE. The finest, at h / CELL, the frame's own pixels; every one its means,
+    darkest values and over-exposure, the same turned, and the place."""
     over = ((display.amin(1, keepdim=True) - 0.9) * 10).clamp(0, 1)
-    mean = F.avg_pool2d(torch.cat([display, over], 1), CELL)
-    dark = -F.max_pool2d(-display, CELL)
-    n, _, height, width = mean.shape
-    found = [mean, dark]
-    for reach in REACHES:
-        side = min(reach, height, width)
-        coarse = torch.cat([F.avg_pool2d(mean, side, ceil_mode=True, count_include_pad=False),
-                            -F.max_pool2d(-dark, side, ceil_mode=True)], 1)
-        found.append(F.interpolate(coarse, size=(height, width), mode="bilinear", align_corners=False))
-    near = found[3]  # of the second reach
-    found.append(torch.cat([mean.mean((2, 3)), dark.amin((2, 3))], 1)[:, :, None, None].expand(-1, -1, height, width))
-    found.append(torch.flip(torch.cat([mean, dark, near], 1), (2, 3)))
+    mean, dark, bright = torch.cat([display, over], 1), display, over
+    shown = []
+    for level in range(LEVELS):
+        side = CELL if level == 0 else 2
+        mean, dark = F.avg_pool2d(mean, side), -F.max_pool2d(-dark, side)
+        bright = F.max_pool2d(bright, side)
+        here = torch.cat([mean, dark, bright], 1)
+        n, _, height, width = here.shape
+        shown.append(torch.cat([here, torch.flip(here, (2, 3)),
+                                _place(display, height, width).expand(n, 3, height, width)], 1))
+    shown[0] = torch.cat([F.pixel_unshuffle(display, CELL), shown[0]], 1)
+    return shown
+
+
+def _place(like: Tensor, height: int, width: int) -> Tensor:
+    """(3, height, width): x, y and their squares' sum, of which the corners have 1."""
     half = (height**2 + width**2) ** 0.5 / 2
-    y = (torch.arange(height, dtype=display.dtype, device=display.device) + 0.5 - height / 2) / half
-    x = (torch.arange(width, dtype=display.dtype, device=display.device) + 0.5 - width / 2) / half
+    y = (torch.arange(height, dtype=like.dtype, device=like.device) + 0.5 - height / 2) / half
+    x = (torch.arange(width, dtype=like.dtype, device=like.device) + 0.5 - width / 2) / half
     x, y = torch.broadcast_tensors(x[None, :], y[:, None])
-    found.append(torch.stack([x, y, x * x + y * y]).expand(n, 3, height, width))
-    return torch.cat(found, 1)
+    return torch.stack([x, y, x * x + y * y])
+
+
+SHOWN = 2 * (4 + 3 + 1) + 3
+"""Planes of `seen` that every level has."""
+
+
+class Norm(nn.LayerNorm):
+    """LayerNorm over the planes of each place."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        return super().forward(x.permute(0, 2, 3, 1)).permute(0, 3, 1, 2)
+
+
+class Block(nn.Module):
+    """x + what two convolutions make of it, which is nothing before training."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.norm = Norm(width)
+        self.first = nn.Conv2d(width, width, 3, padding=1)
+        self.second = nn.Conv2d(width, width, 3, padding=1)
+        nn.init.zeros_(self.second.weight)
+        nn.init.zeros_(self.second.bias)  # type: ignore[arg-type]
+
+    def forward(self, x: Tensor) -> Tensor:
+        return x + self.second(F.relu(self.first(self.norm(x))))
+
+
+class Attention(nn.Module):
+    """x + what each place takes from every other, by likeness and by where the two are."""
+
+    def __init__(self, width: int, heads: int) -> None:
+        super().__init__()
+        self.heads = heads
+        self.norm = Norm(width)
+        self.place = nn.Conv2d(5, width, 1)
+        self.asked = nn.Conv2d(width, 3 * width, 1)
+        self.told = nn.Conv2d(width, width, 1)
+        nn.init.zeros_(self.told.weight)
+        nn.init.zeros_(self.told.bias)  # type: ignore[arg-type]
+
+    def forward(self, x: Tensor) -> Tensor:
+        n, width, rows, columns = x.shape
+        place = _place(x, rows, columns)
+        place = torch.cat([place, place[:2] / (place[2:].sqrt() + 0.1)])[None]  # with the direction from the middle
+        parts = self.asked(self.norm(x) + self.place(place)).flatten(2)
+        query, key, value = parts.reshape(n, 3, self.heads, width // self.heads, rows * columns).mT.unbind(1)
+        found = F.scaled_dot_product_attention(query, key, value)
+        return x + self.told(found.mT.reshape(n, width, rows, columns))
 
 
 class RemovalNetwork(nn.Module):
-    """widths: of the perceptron's hidden layers."""
+    """widths: planes of each of the LEVELS levels, from the finest; the coarsest two are multiples of HEADS."""
 
-    def __init__(self, widths: tuple[int, ...] = (192, 128, 64)) -> None:
+    HEADS = 4
+    BLOCKS = (0, 1, 1, 2, 2)
+    """On the way down, of each level; one each on the way up."""
+
+    def __init__(self, widths: tuple[int, ...] = (32, 48, 96, 128, 160)) -> None:
         super().__init__()
         self.widths = tuple(widths)
-        self.register_buffer("mean", torch.zeros(INPUTS))
-        self.register_buffer("spread", torch.ones(INPUTS))
-        sides = (INPUTS, *widths)
-        self.hidden = nn.ModuleList(nn.Linear(a, b) for a, b in zip(sides, widths, strict=False))
-        self.head = nn.Linear(widths[-1], 6)
+        planes = (3 * CELL**2 + SHOWN, *(SHOWN for _ in widths[1:]))
+        self.see = nn.ModuleList(nn.Conv2d(a, b, 3, padding=1) for a, b in zip(planes, widths, strict=True))
+        self.down = nn.ModuleList(nn.Conv2d(a, b, 2, stride=2) for a, b in pairwise(widths))
+        self.up = nn.ModuleList(nn.Conv2d(b, a, 1) for a, b in pairwise(widths))
+        self.enter = nn.ModuleList(nn.Sequential(*(Block(width) for _ in range(count)))
+                                   for width, count in zip(widths, self.BLOCKS, strict=True))
+        self.leave = nn.ModuleList(Block(width) for width in widths)
+        self.attention = nn.ModuleList(Attention(width, self.HEADS) for width in widths[-2:])
+        self.head = nn.Conv2d(widths[0], 6 * CELL**2, 1)
+        nn.init.normal_(self.head.weight, std=1e-3)
+        nn.init.zeros_(self.head.bias)  # type: ignore[arg-type]
 
-    mean: Tensor
-    spread: Tensor
-
-    def forward(self, seen: Tensor) -> Prediction:
-        """seen: as `inputs` makes it; the prediction is CELL times as high and wide."""
-        out = self.cells(seen.permute(0, 2, 3, 1)).permute(0, 3, 1, 2)
-        out = F.interpolate(out, scale_factor=CELL, mode="bilinear", align_corners=False)
-        return Prediction(out[:, :3], out[:, 3:])
-
-    def cells(self, seen: Tensor) -> Tensor:
-        """(…, 6) flare and its gentle part, from (…, INPUTS)."""
-        x = (seen - self.mean) / self.spread
-        for layer in self.hidden:
-            x = F.leaky_relu(layer(x), 0.1)
-        out = self.head(x)
-        return torch.cat([out[..., :3], out[..., :3] * torch.sigmoid(out[..., 3:])], -1)
+    def forward(self, display: Tensor) -> Prediction:
+        """display: whole frames (n, 3, h, w), values 0..1, the principal point in the middle; h and w multiples of
+        MULTIPLE."""
+        shown = [self.see[level](part) for level, part in enumerate(seen(display))]
+        x, kept = shown[0], []
+        for level, enter in enumerate(self.enter):
+            if level:
+                kept.append(x)
+                x = self.down[level - 1](x) + shown[level]
+            x = enter(x)
+            if level >= LEVELS - 2:
+                x = self.attention[level - LEVELS + 2](x)
+        for level in reversed(range(LEVELS)):
+            x = self.leave[level](x)
+            if level:
+                x = F.interpolate(self.up[level - 1](x), scale_factor=2, mode="nearest") + kept.pop()
+        out = F.pixel_shuffle(self.head(x), CELL).float()
+        return Prediction(out[:, :3], out[:, :3] * torch.sigmoid(out[:, 3:] * 4))
 
 
 def flare_light(display: Tensor, added: Tensor) -> Tensor:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from torch import Tensor
 
-from ..errors import RunError
+from ..errors import RunError, SettingsError
 from ..files import atomic_path
 from .network import RemovalNetwork
 from .recipe import from_dict
@@ -49,6 +49,6 @@ def load(path: Path = IN_THE_BOX) -> RemovalNetwork:
         recipe = from_dict(json.loads(about["recipe"]))
         network = RemovalNetwork(recipe.widths)
         network.load_state_dict({name: value.float() for name, value in tensors.items()})
-    except (KeyError, ValueError, RuntimeError) as problem:
+    except (KeyError, ValueError, RuntimeError, SettingsError) as problem:
         raise RunError(f"{path} holds no weights of the removal network; train it with train-removal.") from problem
     return network.eval()

@@ -19,11 +19,11 @@ from core.progress import Progress
 from core.removal import inference, weights
 from core.removal.batch import plates_of, remove_all
 from core.removal.inference import FlareMap, Remover, carried_up
-from core.removal.network import INPUTS, RemovalNetwork, flare_light, inputs
+from core.removal.network import LEVELS, SHOWN, RemovalNetwork, flare_light, seen
 from core.removal.plates import read_plate, write_plate
 from core.removal.recipe import Recipe, as_dict
 
-TINY = Recipe(widths=(8, 8))
+TINY = Recipe(widths=(8, 8, 8, 8, 8))
 
 
 def network_file(path: Path, seed: int = 0, bias: float = 0.0) -> Path:
@@ -69,20 +69,37 @@ def test_what_the_flare_adds_as_light() -> None:
     torch.testing.assert_close(flare_light(frame, added), torch.tensor([0.0, 0.64 - 0.25, 0.01]))
 
 
-def test_the_network_sees_the_frame_turned_about_its_middle() -> None:
-    frame = torch.rand(1, 3, 32, 64)
-    seen = inputs(frame)
-    assert seen.shape == (1, INPUTS, 16, 32)
-    turned = frame[:, :, 24:26, 54:56].mean((2, 3))  # of the cell 3, 4 from the other corner
-    torch.testing.assert_close(seen[:, INPUTS - 17:INPUTS - 14, 3, 4], turned)
-    assert seen[0, -3].abs().max() < 1
-    assert seen[0, -3, 0, 0] == -seen[0, -3, 0, -1]
+def test_every_level_sees_the_frame_turned_about_its_middle_and_its_darkest_values() -> None:
+    frame = torch.rand(1, 3, 64, 96)
+    levels = seen(frame)
+    assert [tuple(part.shape[2:]) for part in levels] == [(64 >> k, 96 >> k) for k in range(1, LEVELS + 1)]
+    for level, part in enumerate(levels):
+        assert part.shape[1] == SHOWN + (12 if level == 0 else 0)
+        side = 2 << level
+        here = part[:, -SHOWN:]
+        torch.testing.assert_close(here[:, :3, 0, 1], frame[:, :, :side, side:2 * side].mean((2, 3)))
+        torch.testing.assert_close(here[:, 4:7, 0, 1], frame[:, :, :side, side:2 * side].amin((2, 3)))
+        torch.testing.assert_close(here[:, 8:16], torch.flip(here[:, :8], (2, 3)))
+        assert here[0, -3].abs().max() < 1
+        assert here[0, -3, 0, 0] == -here[0, -3, 0, -1]
 
 
 @pytest.mark.parametrize("size", [(32, 32), (64, 128)])
 def test_the_network_is_fully_convolutional(size: tuple[int, int]) -> None:
-    told = RemovalNetwork(TINY.widths)(inputs(torch.rand(2, 3, *size)))
+    told = RemovalNetwork(TINY.widths)(torch.rand(2, 3, *size))
     assert told.flare.shape == told.gentle.shape == (2, 3, *size)
+
+
+def test_what_is_far_away_counts() -> None:
+    """A light in one corner may have its ghost in the other."""
+    torch.manual_seed(3)
+    network = RemovalNetwork(TINY.widths)
+    for parameter in network.parameters():
+        torch.nn.init.normal_(parameter, std=0.3)
+    frame = torch.full((1, 3, 96, 96), 0.2, requires_grad=True)
+    network(frame).flare[0, :, -4:, :4].sum().backward()
+    assert frame.grad is not None
+    assert float(frame.grad[0, :, :4, :4].abs().sum()) > 0
 
 
 def test_weights_keep_their_recipe_and_damage_is_told(tmp_path: Path, everywhere: Path) -> None:

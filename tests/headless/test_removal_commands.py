@@ -12,8 +12,7 @@ import torch
 from fit_flare.core.pictures import read_picture, write_png
 from fit_flare.headless import cli
 
-SMALL = ("--set", "widths=[8]", "--set", "frames=1", "--set", "cells=20", "--set", "store=2", "--set", "steps=1",
-         "--set", "batch=20", "--set", "bank=2", "--set", "canvas=64", "--set", "longest=64")
+SMALL = ("--set", "widths=[8,8,8,8,8]", "--set", "stages=[[1.0,64,1]]", "--set", "bank=2", "--set", "canvas=64")
 
 
 @pytest.fixture(scope="module")

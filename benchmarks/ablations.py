@@ -184,12 +184,16 @@ def run(experiment: Experiment, folder: Path, capture: Path, width: int, progres
     return scores
 
 
-def _known(capture: Capture, settings: FitSettings, progress: Progress) -> dict[str, Any]:
-    trainer = KnownScene(capture, settings)
-    progress.stage("flare alone", settings.iterations)
-    for _ in range(settings.iterations):
+def _train(trainer: KnownScene | GradedScene, stage: str, iterations: int, progress: Progress) -> None:
+    progress.stage(stage, iterations)
+    for _ in range(iterations):
         trainer.step()
         progress.advance()
+
+
+def _known(capture: Capture, settings: FitSettings, progress: Progress) -> dict[str, Any]:
+    trainer = KnownScene(capture, settings)
+    _train(trainer, "flare alone", settings.iterations, progress)
     return score(trainer, capture.split(settings.holdout)[1])
 
 
@@ -206,10 +210,7 @@ class _SceneAlone:
 
 def _graded(capture: Capture, settings: FitSettings, progress: Progress) -> dict[str, Any]:
     trainer = GradedScene(capture, settings)
-    progress.stage("scene with grids", settings.iterations)
-    for _ in range(settings.iterations):
-        trainer.step()
-        progress.advance()
+    _train(trainer, "scene with grids", settings.iterations, progress)
     return _scores(_SceneAlone(trainer.scene), capture.folder, settings, progress)
 
 

@@ -14,7 +14,7 @@ from core.fit.rendering import render_flare
 from core.fit.trainer import Trainer
 from core.flare.compositing import composite, decode
 from core.gaussians.loss import l1_ssim
-from core.metrics.evaluation import hidden
+from core.metrics.evaluation import out_of_range
 from core.metrics.pictures import psnr, relative_l2
 
 
@@ -57,7 +57,7 @@ def score(trainer: Trainer, views: Sequence[View]) -> dict[str, Any]:
         truth = trainer.capture.truth_flare(view, targets.camera.size)
         if truth is None:
             continue
-        keep = ~hidden(trainer.capture, view, targets.camera.size)
+        keep = ~out_of_range(trainer.capture, view, targets.camera.size)
         found = flare.colour if trainer.settings.blend == "add" else decode(picture) - decode(targets.removed)
         linear.append(psnr(found.numpy(), truth.linear(), keep))
         relative.append(relative_l2(found.numpy(), truth.linear(), keep))

@@ -62,7 +62,7 @@ def evaluate(renderer: Renderer, capture: Capture, cameras: Mapping[View, Camera
         scored.append((view.name, score_view(
             composite, rendering.scene, capture.frame(view, camera.size), clean(view, camera.size),
             capture.truth_flare(view, camera.size) if reference == "truth" else None,
-            hidden(capture, view, camera.size))))
+            out_of_range(capture, view, camera.size))))
         progress.advance()
     size = next(iter(cameras.values())).size if cameras else (0, 0)
     return summary(reference, scored, size)
@@ -96,7 +96,7 @@ def score_view(composite: Array, scene: Array, frame: Picture, scene_reference: 
     return scores
 
 
-def hidden(capture: Capture, view: View, size: tuple[int, int] | None = None) -> NDArray[np.bool_]:
+def out_of_range(capture: Capture, view: View, size: tuple[int, int] | None = None) -> NDArray[np.bool_]:
     """(height, width): where the camera clipped and the linear flare is not judged.
 
     Pixels that carry the frame's brightest code and, where the exact layers are known, all those in which scene and

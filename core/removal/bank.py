@@ -65,6 +65,18 @@ class SynthesisBank:
         return Layers(rest, glare, light, one.lights)
 
 
+class OneFlare:
+    """A bank of a single flare of a class, for tests: seed and what it is drawn with make it."""
+
+    def __init__(self, seed: Sequence[int], size: int, lenses: Sequence[Prescription], kind: str) -> None:
+        self._seed, self._size, self._lenses, self._kind = tuple(seed), size, lenses, kind
+
+    def draw(self, random: Random) -> Layers:
+        """That flare."""
+        made = flare((*self._seed, int(random.integers(1 << 30))), self._size, self._lenses, self._kind)
+        return Layers(made.rest, made.glare, made.light, made.lights)
+
+
 class OwnFlares:
     """Flare layers that the user has, as pictures or video frames, read when they are drawn."""
 

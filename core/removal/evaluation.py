@@ -169,24 +169,15 @@ def worst_sheet(cases: Sequence[Case], clean: Callable[[Pixels], Pixels], scores
 def synthetic(seed: int, count: int, backgrounds: Any, lenses: Sequence[Any], size: tuple[int, int]) -> list[Case]:
     """`count` cases of every class of flare, a function of the seed: the test set that needs no data but clean
     pictures. Frames are 8 bit codes."""
-    from .pairs import Layers, pair
-    from .synthesis.layers import CLASSES, flare
-
-    class One:
-        """A bank of a single flare, of the class that is due."""
-
-        def __init__(self, index: int, number: int) -> None:
-            self._index, self._number = index, number
-
-        def draw(self, random: np.random.Generator) -> Layers:
-            again = int(random.integers(1 << 30))
-            made = flare((seed, self._index, self._number, again), 640, lenses, CLASSES[self._index])
-            return Layers(made.rest, made.glare, made.light, made.lights)
+    from .bank import OneFlare
+    from .pairs import pair
+    from .synthesis.layers import CLASSES
 
     def reader(index: int, number: int) -> Callable[[], tuple[Pixels, Pixels, None]]:
         def read() -> tuple[Pixels, Pixels, None]:
             random = np.random.default_rng((seed, index, number))
-            made = pair(random, One(index, number), backgrounds, *size, clean=0)
+            bank = OneFlare((seed, index, number), 640, lenses, CLASSES[index])
+            made = pair(random, bank, backgrounds, *size, clean=0)
             return np.round(made.frame * 255).astype(np.float32) / 255, made.scene, None
 
         return read

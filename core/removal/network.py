@@ -123,7 +123,7 @@ class RemovalNetwork(nn.Module):
     BLOCKS = (0, 1, 1, 2, 2)
     """On the way down, of each level; one each on the way up."""
 
-    def __init__(self, widths: tuple[int, ...] = (32, 48, 96, 128, 160)) -> None:
+    def __init__(self, widths: tuple[int, ...]) -> None:
         super().__init__()
         self.widths = tuple(widths)
         planes = (3 * CELL**2 + SHOWN, *(SHOWN for _ in widths[1:]))

@@ -69,13 +69,9 @@ def _tuples(value: Any) -> Any:
     return tuple(map(_tuples, value)) if isinstance(value, list | tuple) else value
 
 
-def _lists(value: Any) -> Any:
-    return list(map(_lists, value)) if isinstance(value, list | tuple) else value
-
-
 def as_dict(recipe: Recipe) -> dict[str, Any]:
     """JSON-able."""
-    return {key: _lists(value) for key, value in asdict(recipe).items()}
+    return asdict(recipe)
 
 
 def from_dict(data: dict[str, Any]) -> Recipe:

@@ -17,22 +17,22 @@ from ..errors import Cancelled, RunError
 from ..progress import Progress
 from . import weights
 from .backgrounds import Backgrounds
-from .bank import Mixed, OwnFlares, SynthesisBank
+from .bank import Mixed, OneFlare, OwnFlares, SynthesisBank
 from .network import RemovalNetwork
 from .pairs import Bank, Pair, pair
 from .recipe import Recipe, as_dict, from_dict
-from .synthesis.layers import flare
+from .synthesis.layers import CLASSES
 from .synthesis.prescription import Prescription
 
 CHECKPOINT, WEIGHTS, LOG = "checkpoint.safetensors", "removal.safetensors", "training.jsonl"
 CHECK_EVERY = 500
 CHECK_SEED = 20_000
 CHECKS = 64
-CHECK_SIZE = (256, 160)
-UNSEEN = (1e-3, 2e-4)
+CHECK_SIZE, CHECK_CANVAS = (256, 160), 288
+FAINT = (1e-3, 2e-4)
 """Mean square of a flare, to which the errors of fainter ones are compared: 30 dB, and from three quarters of a
 training on falling to 37 dB."""
-NOT_SEEN = 3e-5
+UNSEEN = 3e-5
 """Mean square of an error that is not seen: 45 dB."""
 
 
@@ -122,13 +122,13 @@ class Trainer:
         before = goal.square().mean((1, 2, 3))
         error = torch.stack([told.flare - goal, told.gentle - (frame - gentle)]).square().mean((2, 3, 4))
         done = min(self.iteration / self.recipe.iterations, 1.0)
-        unseen = UNSEEN[0] * (UNSEEN[1] / UNSEEN[0]) ** max(4 * done - 3, 0.0)
+        faint = FAINT[0] * (FAINT[1] / FAINT[0]) ** max(4 * done - 3, 0.0)
         if done < 1 - self.recipe.polish:
-            left = error / (before + unseen) ** (0.5 + 0.5 * done)
+            left = error / (before + faint) ** (0.5 + 0.5 * done)
         else:
-            left = torch.log(error + NOT_SEEN)
+            left = torch.log(error + UNSEEN)
         loss = left[0].mean() + 0.5 * left[1].mean()
-        gain = 10 * torch.log10((before + NOT_SEEN) / (error[0].detach() + NOT_SEEN))
+        gain = 10 * torch.log10((before + UNSEEN) / (error[0].detach() + UNSEEN))
         return loss, {"loss": float(loss.detach()), "error": float(error[0].detach().mean()),
                       "untouched": float(before.mean()), "gain": float(gain.mean())}
 
@@ -179,18 +179,11 @@ class Trainer:
 
 def checks(backgrounds: Backgrounds, lenses: Sequence[Prescription], count: int = CHECKS) -> dict[str, list[Pair]]:
     """Pairs that no training sees: other flares, lenses and backgrounds, some of each class."""
-    from .synthesis.layers import CLASSES
+    def bank(kind: str, number: int) -> OneFlare:
+        return OneFlare((CHECK_SEED, number), CHECK_CANVAS, lenses, kind)
 
-    class One:
-        def __init__(self, kind: str, number: int) -> None:
-            self.kind, self.number = kind, number
-
-        def draw(self, random: np.random.Generator) -> Any:
-            from .pairs import Layers
-            made = flare((CHECK_SEED, self.number, int(random.integers(1 << 30))), 288, lenses, self.kind)
-            return Layers(made.rest, made.glare, made.light, made.lights)
-
-    return {kind: [pair(np.random.default_rng((CHECK_SEED, index, k)), One(kind, k), backgrounds, *CHECK_SIZE, clean=0)
+    return {kind: [pair(np.random.default_rng((CHECK_SEED, index, k)), bank(kind, k), backgrounds, *CHECK_SIZE,
+                        clean=0)
                    for k in range(max(count // len(CLASSES), 1))]
             for index, kind in enumerate(CLASSES)}
 

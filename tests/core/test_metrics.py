@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from core.errors import SettingsError
-from core.metrics.evaluation import clipped, hidden, score_view, summary, table
+from core.metrics.evaluation import clipped, out_of_range, score_view, summary, table
 from core.metrics.pictures import flip, has_flip, psnr, relative_l2, ssim
 from core.pictures import Picture, srgb_from_linear
 
@@ -175,9 +175,9 @@ def test_the_exact_layers_tell_what_noise_hides_of_clipping() -> None:
         def truth_flare(self, *_: object) -> Picture | None:
             return None
 
-    assert not hidden(Unknown(), None).any()
-    assert np.argwhere(hidden(Known(), None)).tolist() == [[3, 4]]
-    assert hidden(Known(), None, (frame.shape[1] // 2, frame.shape[0] // 2)).sum() == 1
+    assert not out_of_range(Unknown(), None).any()
+    assert np.argwhere(out_of_range(Known(), None)).tolist() == [[3, 4]]
+    assert out_of_range(Known(), None, (frame.shape[1] // 2, frame.shape[0] // 2)).sum() == 1
 
 
 def test_the_summary_is_the_mean_and_json() -> None:

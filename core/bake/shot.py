@@ -21,7 +21,7 @@ from ..fit.rendering import as_tensors, pose_and_intrinsics
 from ..fit.run import Run
 from ..flare.compositing import layers as linear_layers
 from ..flare.compositing import splat_flare
-from ..flare.visibility import visible_share
+from ..flare.visibility import of_clear, visible_share
 from ..look import LookEdits, read
 from ..look.shot import PlacedLight, Shot, ShotFrame, evaluate
 from ..progress import Progress
@@ -37,6 +37,8 @@ class ShotRenderer:
         self.shot, self.look = shot, read(shot.flare)
         self.run = Run.open(shot.run) if shot.run else None
         self.lights = shot.lights
+        model = self.run.flare.model if self.run is not None and self.run.flare is not None else None
+        self._clear = dict(zip(model.names, model.clear.tolist(), strict=True)) if model is not None else {}
 
     @property
     def elements(self) -> Mapping[str, list[str]]:
@@ -88,7 +90,8 @@ class ShotRenderer:
         with torch.no_grad():
             share = visible_share(self.run.scene, torch.from_numpy(camera.position), torch.from_numpy(light.xyz),
                                   settings)
-        return PlacedLight(light.name, light.source, light.xyz, light.share * float(share))
+        return PlacedLight(light.name, light.source, light.xyz,
+                           light.share * float(of_clear(share, self._clear.get(light.source, 1.0))))
 
 
 @dataclass(frozen=True)

@@ -41,8 +41,13 @@ def visible_shares(scene: SceneGaussians, model: FlareModel, world_to_camera: Te
     """The visible share of each light from a pose (4, 4), by the light's name, as part of `FlareModel.clear`."""
     pose = world_to_camera.double()
     camera = -pose[:3, :3].T @ pose[:3, 3]
-    return {name: (visible_share(scene, camera, light, settings, kernels) / clear).clamp(max=1) if clear > 0
-            else torch.ones(()) for name, light, clear in zip(model.names, model.positions, model.clear, strict=True)}
+    return {name: of_clear(visible_share(scene, camera, light, settings, kernels), clear)
+            for name, light, clear in zip(model.names, model.positions, model.clear, strict=True)}
+
+
+def of_clear(share: Tensor, clear: Tensor | float) -> Tensor:
+    """A visible share as part of what the scene leaves of the light where nothing hides it; see `FlareModel.clear`."""
+    return (share / clear).clamp(max=1) if clear > 0 else torch.ones(())
 
 
 @torch.no_grad()

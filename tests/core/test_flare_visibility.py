@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from core.flare.model import FlareModel
-from core.flare.visibility import VisibilitySettings, clear_shares, visible_share, visible_shares
+from core.flare.visibility import VisibilitySettings, clear_shares, of_clear, visible_share, visible_shares
 from core.gaussians.scene import SceneGaussians
 from tests.core.test_flare import some_flare
 from tests.core.test_look import SMALL
@@ -90,3 +90,11 @@ def test_what_always_stands_before_a_light_does_not_hide_it() -> None:
         model.clear.copy_(clear_shares(walled, model, poses, settings, kernels="torch"))
         assert float(model.clear) == 0
         assert float(visible_shares(walled, model, torch.eye(4), settings, "torch")["sun"]) == 1
+
+
+def test_shares_are_taken_of_what_is_clear() -> None:
+    half = torch.tensor(0.5)
+    assert float(of_clear(half, 1.0)) == 0.5
+    assert float(of_clear(half, 0.66)) == pytest.approx(0.5 / 0.66)
+    assert float(of_clear(half, 0.4)) == 1, "clearer than clear is clear"
+    assert float(of_clear(half, 0.0)) == 1, "a scene that hides a light from everywhere says nothing about it"

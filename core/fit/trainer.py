@@ -60,7 +60,7 @@ class Trainer:
         self.views, _ = capture.split(settings.holdout)
         self.iteration = 0
         self.scene_is_fitted = not settings.scene.frozen
-        if settings.mode in ("default", "2d") and not self.frames.reference and self.scene_is_fitted:
+        if self._supervised and not self.frames.reference and self.scene_is_fitted:
             raise CaptureError(f"{capture.folder} has no flare-free frames (removed/); run remove on it first, "
                                "or fit with --mode unsup.")
         self.scene = _first_scene(capture, settings)
@@ -129,11 +129,15 @@ class Trainer:
         chosen = poses[:: max(len(poses) // CLEAR_VIEWS, 1)]
         self.flare.clear.copy_(clear_shares(self.scene, self.flare, chosen, visibility, self.settings.kernels))
 
+    @property
+    def _supervised(self) -> bool:
+        """Whether the scene is taught by flare-free frames."""
+        return self.settings.mode in ("default", "2d")
+
     def _scene_alone(self, targets: Targets) -> bool:
         """Whether the scene is fitted alone as yet, so that it hides lights by the time their flares are fitted."""
         begun = self.iteration > self.settings.flare.begin * self.settings.iterations
-        taught = self.settings.mode in ("default", "2d") and self.scene_is_fitted and targets.removed is not None
-        return taught and not begun
+        return self._supervised and self.scene_is_fitted and targets.removed is not None and not begun
 
     def _behind_flare(self, targets: Targets, scene: Tensor) -> Tensor:
         """What the flare is put before: the flare-free frame while both are fitted apart, then the scene.
@@ -141,7 +145,7 @@ class Trainer:
         The faint and the small in a flare drown in the errors of a scene that is not learned yet. Later the
         scene, on which all views have agreed, is the better judge of what one flare-free frame has left over.
         """
-        if self.settings.mode not in ("default", "2d") or targets.removed is None:
+        if not self._supervised or targets.removed is None:
             return scene
         apart = self.iteration <= self.settings.apart * self.settings.iterations
         behind = targets.removed if apart else scene
@@ -167,7 +171,7 @@ class Trainer:
         return near & (removed >= WHITE).all(-1)
 
     def _scene_target(self, targets: Targets, picture: Tensor, scene: Tensor) -> Tensor | None:
-        if self.settings.mode in ("default", "2d"):
+        if self._supervised:
             return targets.removed
         if self.settings.mode == "in-flare":
             # Input minus the flare as reconstructed so far: the composite's gain over the scene.

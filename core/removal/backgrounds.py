@@ -36,12 +36,15 @@ class Backgrounds:
     maps: Sequence[NDArray[np.float16]]
 
     def draw(self, random: Random, width: int, height: int, gamma: float) -> Pixels:
-        """(height, width, 3) linear light: a random window of a random picture, at a random scale."""
+        """(height, width, 3) linear light: a random window of a random picture, at a random scale; one in eight out
+        of focus, so that what is bright and soft is no flare for that alone."""
         photos = len(self.photos)
         share = len(self.maps) * 3 / (photos + len(self.maps) * 3)
         if random.random() < share:
-            return _view(random, self.maps[int(random.integers(len(self.maps)))], width, height)
-        return _window(random, self.photos[int(random.integers(photos))], width, height, gamma)
+            scene = _view(random, self.maps[int(random.integers(len(self.maps)))], width, height)
+        else:
+            scene = _window(random, self.photos[int(random.integers(photos))], width, height, gamma)
+        return _defocused(random, scene) if random.random() < 0.125 else scene
 
 
 def read_backgrounds(folders: Iterable[Path | str], part: Part = "all", longest: int = 720) -> Backgrounds:
@@ -108,7 +111,7 @@ def _window(random: Random, photo: NDArray[np.uint8], width: int, height: int, g
 
     h, w = photo.shape[:2]
     fit = min(w / width, h / height)
-    scale = fit * random.uniform(0.5, 1.0) if fit > 0.7 else fit
+    scale = fit * random.uniform(0.3, 1.0) if fit > 0.7 else fit
     cw, ch = min(int(width * scale), w), min(int(height * scale), h)
     x, y = int(random.integers(w - cw + 1)), int(random.integers(h - ch + 1))
     how = cv2.INTER_AREA if scale > 1 else cv2.INTER_LINEAR
@@ -137,3 +140,14 @@ def _view(random: Random, light: NDArray[np.float16], width: int, height: int) -
                      cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
     exposure = math.exp(random.normal(math.log(0.18), 0.5)) / max(float(np.median(seen)), 1e-4)
     return np.asarray(seen * min(exposure, 20.0), np.float32)
+
+
+def _defocused(random: Random, scene: Pixels) -> Pixels:
+    """Under a disc of 1 to 8 % of the width."""
+    import cv2
+
+    radius = scene.shape[1] * math.exp(random.uniform(math.log(0.005), math.log(0.04)))
+    reach = math.ceil(radius)
+    y, x = np.mgrid[-reach:reach + 1, -reach:reach + 1]
+    disc = np.clip(radius + 0.5 - np.hypot(x, y), 0, 1).astype(np.float32)
+    return np.asarray(cv2.filter2D(scene, -1, disc / disc.sum(), borderType=cv2.BORDER_REFLECT), np.float32)

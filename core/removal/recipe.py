@@ -32,10 +32,10 @@ class Recipe:
     polish: float = 0.15           # of the iterations, the last of them, go for each picture's PSNR
     widths: tuple[int, ...] = (32, 48, 96, 128, 160)
     canvas: int = 256              # pixels a side of the flares' canvas
-    bank: int = 400                # flares at hand at a time
-    renew_every: int = 2           # iterations for each new flare
+    bank: int = 800                # flares at hand at a time
+    renew_every: int = 6           # iterations for each new flare
     own_share: float = 0.3         # of the user's own flares, where there are any
-    clean: float = 0.1             # of the frames have no flare
+    clean: float = 0.12            # of the frames have no flare
 
     def __post_init__(self) -> None:
         if min(self.iterations, self.bank, self.renew_every, self.warm) < 1:

@@ -10,6 +10,7 @@ Studies:
   comparison      the paper's table 1, with its form and loss
   robustness      its study of displaced lights: each moved once by Gaussian noise of sigma, with and without the
                   two corrections delta_l and delta_f
+  robustness-ours the same of our form
   known           the flare alone, over the exact scene: what the representation itself can do
   extrapolation   our form, with a stretch of the path held out instead of every n-th view
   reconstruction  the paper's table 3: 3DGS trained on the frames, on the frames with a bilateral grid for each, and on
@@ -59,7 +60,7 @@ Length = Callable[..., FitSettings]
 """A preset of a given number of iterations, for which form and mode are chosen."""
 Results = dict[str, dict[str, dict[str, dict[str, Any]]]]
 """Scores by study, by row, by capture."""
-STUDIES = ("form", "comparison", "robustness", "known", "extrapolation", "reconstruction")
+STUDIES = ("form", "comparison", "robustness", "robustness-ours", "known", "extrapolation", "reconstruction")
 
 
 @dataclass(frozen=True)
@@ -85,9 +86,9 @@ class Experiment:
         return hashlib.sha256(json.dumps(made, sort_keys=True).encode()).hexdigest()[:16]
 
 
-def ours(length: Length, **changes: Any) -> FitSettings:
+def ours(length: Length, mode: str = "default", **changes: Any) -> FitSettings:
     """Our form at this length, with settings changed by dotted name (`__` for the dot)."""
-    return changed(length(), {name.replace("__", "."): value for name, value in changes.items()})
+    return changed(length(mode=mode), {name.replace("__", "."): value for name, value in changes.items()})
 
 
 def papers(length: Length, mode: str = "default", **changes: Any) -> FitSettings:
@@ -108,6 +109,7 @@ def experiments(length: Length) -> list[Experiment]:
         "without latent": ours(length, flare__form__latent=0),
         "without plane offsets": ours(length, flare__form__plane_offset=False),
         "without light correction": ours(length, flare__form__light_correction=False),
+        "without the line (2d)": ours(length, "2d"),
         "without occlusion": ours(length, flare__occlusion=False),
         "fine grids": ours(length, flare__form__levels=16, flare__form__base=16),
         "fitted jointly throughout": ours(length, apart=0.0),
@@ -126,8 +128,9 @@ def experiments(length: Length) -> list[Experiment]:
     })
     for corrections, light, plane in (("both", True, True), ("delta_l", True, False), ("delta_f", False, True),
                                       ("neither", False, False)):
-        settings = papers(length, flare__form__light_correction=light, flare__form__plane_offset=plane)
-        made += [Experiment("robustness", f"{corrections}, sigma {sigma:g}", settings, sigma) for sigma in SIGMAS]
+        for study, form in (("robustness", papers), ("robustness-ours", ours)):
+            settings = form(length, flare__form__light_correction=light, flare__form__plane_offset=plane)
+            made += [Experiment(study, f"{corrections}, sigma {sigma:g}", settings, sigma) for sigma in SIGMAS]
     alone = changed(ours(length), {"flare.count": 900, "flare.occlusion": False})
     made += [Experiment("known", "ours", alone, known_scene=True),
              Experiment("known", "the paper's", papers(length, flare__count=900), known_scene=True)]
@@ -329,10 +332,11 @@ def write(results: Results, section: str, length: str, document: Path) -> str:
     for study in ("form", "known", "extrapolation"):
         if study in results and len(shared(results[study])) > 1:
             text += f"\n\n### {study}, by capture\n\n" + by_capture(results[study])
-    if "robustness" in results:
-        picture = document.parent / f"{section}-robustness.png"
-        plot(results["robustness"], picture)
-        text += f"\n\n![The flare against the displacement of its light]({picture.name})"
+    for study in ("robustness", "robustness-ours"):
+        if study in results:
+            picture = document.parent / f"{section}-{study}.png"
+            plot(results[study], picture)
+            text += f"\n\n![The flare against the displacement of its light]({picture.name})"
     report.write_section(document, section, text)
     return text
 

@@ -30,7 +30,7 @@ import numpy as np
 from .. import rendering
 from ..projection import FRUSTUM_MARGIN
 from . import spherical_harmonics as harmonics
-from .binning import number_slots
+from .binning import few_tiles, number_slots
 from .compilation import inlined, kernel
 from .layout import (
     ALPHA_MIN,
@@ -290,7 +290,7 @@ def _tiles_bound(x, y, half_x, half_y, visible, width, height):
 @inlined
 def _project_block(
     means, quats, scales, opacities, sh, sh_width, degree, raw, camera, width, height, first, turned, basis,
-    records, centres, radii, depths, bounds, slopes_out,
+    records, centres, radii, depths, bounds, tiles, tile_rows, slopes_out,
 ):  # fmt: skip
     """Projects the 16 Gaussians from `first` on. slopes_out: see `project`."""
     mean = _load3(means, first)
@@ -327,6 +327,9 @@ def _project_block(
     minor = inverse_y * H
     bend = fma(major * k, k, minor)
     store(bounds, first, _tiles_bound(x, y, half_x + HALF, half_y + HALF, visible, width, height))
+    tile, tile_row = few_tiles(x, y, half_x, half_y, major, k, minor, -(reach + MARGIN), visible, width, height)
+    store(tiles, first, tile)
+    store(tile_rows, first, tile_row)
 
     red, green, blue = zero, zero, zero
     if any_of(visible):
@@ -364,10 +367,11 @@ def _colour_slopes(turned, degree, direction, inverse_distance, out):
 @kernel
 def project(
     counter, scratch, means, quats, scales, opacities, sh, sh_width, degree, raw, camera, width, height,
-    records, centres, radii, depths, bounds, firsts, chunk_bounds, slopes,
+    records, centres, radii, depths, bounds, tiles, tile_rows, firsts, chunk_bounds, slopes,
 ):  # fmt: skip
-    """Writes a record, the centre, the radius, the depth (infinite for what is not seen) and a bound on the number of
-    tiles for each of n >= 16 Gaussians; firsts, chunk_bounds: sums of the bounds within and over chunks (`binning`).
+    """Writes a record, the centre, the radius, the depth (infinite for what is not seen), a bound on the number of
+    tiles and what `few_tiles` says of them for each of n >= 16 Gaussians; firsts, chunk_bounds: sums of the bounds
+    within and over chunks (`binning`).
     slopes: gradients of the colours by the means, 9 vectors a block of 16; empty where no gradients are wanted.
     raw: scales are logarithms and opacities logits."""
     n = opacities.size
@@ -381,7 +385,7 @@ def project(
             first = min(block, n - LANES)  # the last block overlaps the one before and writes the same again
             _project_block(
                 means, quats, scales, opacities, sh, sh_width, degree, raw, camera, width, height, first, turned, basis,
-                records, centres, radii, depths, bounds, slopes[block * SLOPES :],
+                records, centres, radii, depths, bounds, tiles, tile_rows, slopes[block * SLOPES :],
             )  # fmt: skip
         chunk_bounds[chunk] = number_slots(bounds, start, end, firsts)
 

@@ -45,7 +45,7 @@ class _Rasterize(torch.autograd.Function):
             flat(world_to_camera), flat(intrinsics), w, h, frame.near, frame.dilation, camera
         )
         records, depths_of = buffers.empty(n * layout.RECORD), buffers.empty(n)
-        bounds, firsts = buffers.empty(n, np.int32), buffers.empty(n, np.int32)
+        bounds, firsts, tiles, tile_rows = (buffers.empty(n, np.int32) for _ in range(4))
         centres, centres_flat = buffers.pair(n, 2)
         radii, radii_flat = buffers.pair(n)
         given = [flat(t) for t in (means, quats, scales, opacities)]
@@ -54,10 +54,10 @@ class _Rasterize(torch.autograd.Function):
         chunk_bounds = np.zeros(-(-n // layout.CHUNK), np.int64)
         parallel(
             projection.project, *given, flat(sh), sh.shape[1] * 3,
-            frame.sh_degree, frame.raw, camera, w, h, records, centres_flat, radii_flat, depths_of, bounds, firsts,
-            chunk_bounds, slopes, scratch=projection.SCRATCH,
+            frame.sh_degree, frame.raw, camera, w, h, records, centres_flat, radii_flat, depths_of, bounds, tiles,
+            tile_rows, firsts, chunk_bounds, slopes, scratch=projection.SCRATCH,
         )  # fmt: skip
-        bins = bin_gaussians(records, depths_of.view(np.uint32), bounds, firsts, chunk_bounds, frame)
+        bins = bin_gaussians(records, depths_of.view(np.uint32), tiles, tile_rows, bounds, firsts, chunk_bounds, frame)
 
         image, image_flat = buffers.pair(h, w, 3)
         alpha, alpha_flat = buffers.pair(h, w)

@@ -30,7 +30,8 @@ class _Splat(torch.autograd.Function):
         keys, bounds, firsts = (buffers.empty(n, kind) for kind in (np.uint32, np.int32, np.int32))
         chunk_bounds = np.empty(-(-n // layout.CHUNK), np.int64)
         flare.prepare(*inputs, *shape_inputs, w, h, add, records, shapes, keys, bounds, firsts, chunk_bounds)
-        bins = bin_gaussians(records, keys, bounds, firsts, chunk_bounds, grid)
+        large = np.full(n, -1, np.int32)  # as most flares are
+        bins = bin_gaussians(records, keys, large, large, bounds, firsts, chunk_bounds, grid)
 
         image, image_flat = buffers.pair(h, w, 3)
         alpha, alpha_flat = buffers.pair(h, w)

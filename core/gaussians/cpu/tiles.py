@@ -50,8 +50,9 @@ def flat(tensor: Tensor) -> Array:
 
 
 def bin_gaussians(
-    records: Array, keys: Array, bounds: Array, firsts: Array, chunk_bounds: Array, grid: Grid
-) -> Bins:
+    records: Array, keys: Array, tiles: Array, rows: Array, bounds: Array, firsts: Array, chunk_bounds: Array,
+    grid: Grid,
+) -> Bins:  # fmt: skip
     """Sorts the n records into tiles, by key; the arguments are those of `binning.list_in_order`, which changes bounds
     and firsts, and the sums of the bounds over chunks."""
     n, parts = len(keys), min(torch.get_num_threads(), PARTS_MAX)  # each looks through all keys
@@ -59,11 +60,11 @@ def bin_gaussians(
     room = binning.plan(
         keys, bounds, chunk_bounds, max(1, -(-n // SAMPLE)), np.empty(binning.CLASSES, np.int64), starts_of_chunks, cuts
     )
-    listed = buffers.empty(room * binning.LISTED, np.int32)
+    listed = buffers.empty((room + parts) * binning.LISTED, np.int32)
     spans, numbers = np.empty((parts, 2), np.int64), np.empty((parts, grid.tiles), np.int32)
     parallel(
-        binning.list_in_order, records, keys, bounds, firsts, starts_of_chunks, cuts, grid.width, grid.height,
-        grid.tiles_x, np.zeros(2, np.int64), np.empty((parts, binning.DIGITS, 1 << 11), np.int32),
+        binning.list_in_order, records, keys, tiles, rows, bounds, firsts, starts_of_chunks, cuts, grid.width,
+        grid.height, grid.tiles_x, np.zeros(2, np.int64), np.empty((parts, binning.DIGITS, 1 << 11), np.int32),
         buffers.empty(2 * (n + parts), np.int64).reshape(2, -1), listed, spans, numbers,
     )  # fmt: skip
     starts = np.empty(grid.tiles + 1, np.int64)

@@ -374,8 +374,9 @@ def list_in_order(
     """listed: Gaussian, slot, and tile, first and last row in one number, of every pair; those of a part lie within
     its span (parts, 2), lowest key first. numbers (parts, tiles): how often a part meets a tile.
 
-    keys: from 0, uint32, NOWHERE for what is not drawn; tiles, rows: of `few_tiles`; cuts (parts + 1,): where parts begin and end. bounds, firsts:
-    see `number_slots`, firsts counted from that of the chunk in `starts`; become counts, and slots.
+    keys: from 0, uint32, NOWHERE for what is not drawn; tiles, rows: of `few_tiles`; cuts (parts + 1,): where parts
+    begin and end. bounds, firsts: see `number_slots`, firsts counted from that of the chunk in `starts`; become counts,
+    and slots.
     taken (2,): 0, 0; places (parts, DIGITS, 2^11), pairs (2, n + parts): workspace."""
     parts = numbers.shape[0]
     while True:

@@ -6,6 +6,8 @@ The commands and the add-on show it as it stands; anything else that escapes is 
 """
 from __future__ import annotations
 
+import errno
+
 
 class FitFlareError(Exception):
     """Base of all errors whose message is meant to be read by the user."""
@@ -37,3 +39,14 @@ class EngineError(FitFlareError):
 
 class Cancelled(FitFlareError):
     """The user, or the system, asked a long job to stop; what is on disk is whole."""
+
+
+DISK_FULL = (errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC))
+
+
+def refusal(problem: OSError) -> str:
+    """The sentence for what the system refused: a full disk, a folder that may not be written, …"""
+    where = f" ({problem.filename})" if problem.filename else ""
+    if problem.errno in DISK_FULL:
+        return f"The disk is full{where}; make room and start it again, what is finished is kept."
+    return f"The system refused: {problem.strerror or problem}{where}."

@@ -34,6 +34,9 @@ def atomic_path(target: Path | str) -> Iterator[Path]:
         # mkstemp makes private files; the result gets the permissions that any new file here would have.
         temporary.chmod(0o666 & ~_umask())
         temporary.replace(target)
+    except OSError as problem:  # a write to an open file does not say which
+        problem.filename = problem.filename or str(target)
+        raise
     finally:
         temporary.unlink(missing_ok=True)
 

@@ -8,6 +8,7 @@ neither, can import this module.
 """
 from __future__ import annotations
 
+import errno
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -253,7 +254,11 @@ def write_exr(path: Path | str, channels: Mapping[str, NDArray[Any]], *, half: b
     attributes = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **(header or {})}
     packed = {name: stored(name, pixels) for name, pixels in channels.items()}
     with atomic_path(path) as temporary, OpenEXR.File(attributes, packed) as file:
-        file.write(str(temporary))
+        try:
+            file.write(str(temporary))
+        except RuntimeError as problem:  # how the library hands on what the system refused, by its words alone
+            full = os.strerror(errno.ENOSPC) in str(problem)
+            raise OSError(errno.ENOSPC if full else errno.EIO, str(problem), str(path)) from problem
 
 
 def write_png(path: Path | str, display: NDArray[Any], bits: Literal[8, 16] = 8) -> None:
@@ -267,4 +272,4 @@ def write_png(path: Path | str, display: NDArray[Any], bits: Literal[8, 16] = 8)
     if not done:
         raise FrameError(f"{path} could not be encoded as PNG.")
     with atomic_path(path) as temporary:
-        data.tofile(temporary)
+        temporary.write_bytes(data.tobytes())

@@ -23,7 +23,7 @@ import time
 from collections.abc import Iterator
 from typing import Any, TextIO
 
-from .errors import Cancelled
+from .errors import DISK_FULL, Cancelled
 
 
 class Progress:
@@ -165,8 +165,13 @@ class JsonProgress(Progress):
         self._last = 0.0
 
     def _send(self, **event: Any) -> None:
-        self._stream.write(json.dumps(event) + "\n")
-        self._stream.flush()
+        try:
+            self._stream.write(json.dumps(event) + "\n")
+            self._stream.flush()
+        except OSError as problem:
+            # A disk too full for the events is no reason to end: the work goes on, or says so by its own failure.
+            if problem.errno not in DISK_FULL:
+                raise
 
     def _show_stage(self) -> None:
         self._last = 0.0

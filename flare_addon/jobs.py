@@ -14,6 +14,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import shutil
 import signal
 import subprocess
 import time
@@ -23,7 +24,7 @@ from typing import Any, Literal
 
 import bpy
 
-from ..core.errors import EngineError, FitFlareError, RunError
+from ..core.errors import DISK_FULL, EngineError, FitFlareError, RunError, refusal
 from ..core.files import write_json
 from .properties import redraw
 
@@ -33,7 +34,9 @@ RECORD, EVENTS, LOG = "job.json", "events.jsonl", "engine.log"
 WINDOWS = os.name == "nt"
 STOPPED = 130  # the status of a command that was stopped (headless/cli.py)
 EVERY_S = 0.2
+NICENESS = 5
 AT_ONCE = 1 << 16  # bytes of events read at a time
+FULL = 1 << 16  # a disk with fewer bytes free is full
 
 FINISHERS: dict[str, Callable[[Job], None]] = {}
 """By kind of work: what is to be done in the scenes when it has ended."""
@@ -141,9 +144,19 @@ class Job:
             self.state = "failed"
         elif not self.folder.is_dir():
             self.state, self.error = "failed", f"The folder {self.folder} was removed while the engine worked in it."
+        elif _is_full(self.folder):  # then its last words found no room either
+            self.state = "failed"
+            self.error = f"The disk of {self.folder} is full; make room and start it again, what is finished is kept."
         else:
             self.state = "failed"
             self.error = f"The engine ended without a result{_last_words(self.log)}; {LOG} in {self.folder} has it all."
+
+
+def _is_full(folder: Path) -> bool:
+    try:
+        return shutil.disk_usage(folder).free < FULL
+    except OSError:
+        return False
 
 
 def _last_words(log: Path) -> str:
@@ -193,16 +206,24 @@ def start(kind: str, folder: Path, command: Sequence[str], environment: Mapping[
         raise RunError(f"The engine works in {folder} already; wait for it or cancel it first.")
     apart: dict[str, Any] = {"start_new_session": True}
     if WINDOWS:
-        apart = {"creationflags": getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0)}
+        apart = {"creationflags": getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0)
+                 | getattr(subprocess, "BELOW_NORMAL_PRIORITY_CLASS", 0)}
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with open(folder / EVENTS, "wb") as events, open(folder / LOG, "ab") as log:
             process = subprocess.Popen(list(command), stdin=subprocess.DEVNULL, stdout=events, stderr=log,
                                        env=dict(environment) if environment is not None else None, **apart)
-        write_json(folder / RECORD, {"kind": kind, "pid": process.pid, "started": time.time()})
+        _yield_to_the_window(process.pid)
+        try:
+            write_json(folder / RECORD, {"kind": kind, "pid": process.pid, "started": time.time()})
+        except OSError:
+            process.kill()  # nobody would find it again
+            raise
     except FileNotFoundError as problem:
         raise EngineError(f"{command[0]} cannot be started; set up the engine in the preferences.") from problem
     except OSError as problem:
+        if problem.errno in DISK_FULL:
+            raise RunError(refusal(problem)) from problem
         raise RunError(f"{folder} cannot be used ({problem.strerror or problem}); choose another folder.") from problem
     job = Job(kind, folder, process.pid, process)
     _jobs[_key(folder)] = job
@@ -211,6 +232,13 @@ def start(kind: str, folder: Path, command: Sequence[str], environment: Mapping[
     else:
         _watch()
     return job
+
+
+def _yield_to_the_window(pid: int) -> None:
+    """The engine takes every core, and Blender's window comes first where they are wanted."""
+    if not WINDOWS:
+        with contextlib.suppress(OSError):
+            os.setpriority(os.PRIO_PROCESS, pid, NICENESS)
 
 
 def find(folder: Path | str | None) -> Job | None:

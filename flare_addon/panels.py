@@ -250,7 +250,9 @@ def _light(layout: Any, scene: Any, item: Any) -> None:
     column.prop(item, "radius")
     if not item.elements:
         return
-    box.prop(item, "show_elements", icon="TRIA_DOWN" if item.show_elements else "TRIA_RIGHT", emboss=False)
+    row = box.row()
+    row.alignment = "LEFT"
+    row.prop(item, "show_elements", icon="TRIA_DOWN" if item.show_elements else "TRIA_RIGHT", emboss=False)
     if item.show_elements:
         box.template_list("FITFLARE_UL_elements", "", item, "elements", item, "element", rows=4)
         if 0 <= item.element < len(item.elements):

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
-from ..core.errors import FitFlareError
+from ..core.errors import FitFlareError, refusal
 
 
 @dataclass
@@ -27,8 +27,7 @@ def reported(operator: Any) -> Iterator[Outcome]:
         operator.report({"ERROR"}, str(problem))
         outcome.status = {"CANCELLED"}
     except OSError as problem:
-        where = f" ({problem.filename})" if problem.filename else ""
-        operator.report({"ERROR"}, f"The system refused: {problem.strerror or problem}{where}.")
+        operator.report({"ERROR"}, refusal(problem))
         outcome.status = {"CANCELLED"}
 
 

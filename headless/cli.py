@@ -13,7 +13,7 @@ import traceback
 from collections.abc import Iterator, Sequence
 from typing import Any, NoReturn, TextIO
 
-from ..core.errors import Cancelled, EngineError, FitFlareError
+from ..core.errors import Cancelled, EngineError, FitFlareError, refusal
 from ..core.progress import JsonProgress, OpenJdProgress, Progress, TerminalProgress, stoppable
 from . import hand_off
 from .command import Command, Step
@@ -73,7 +73,7 @@ def main(words: Sequence[str]) -> int:
     try:
         with _progress(words) as progress:
             return _status(words, progress)
-    except BrokenPipeError:  # whoever listened has gone
+    except OSError:  # whoever listened has gone, or the disk that keeps the events is full
         return FAILED
 
 
@@ -99,8 +99,7 @@ def _status(words: Sequence[str], progress: Progress) -> int:
     except BrokenPipeError:
         raise
     except OSError as problem:
-        where = f" ({problem.filename})" if problem.filename else ""
-        progress.error(f"The system refused: {problem.strerror or problem}{where}.")
+        progress.error(refusal(problem))
         return FAILED
     except Exception as problem:
         traceback.print_exc()

@@ -7,10 +7,13 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from blenders import Blender
 from test_work import a_flare
 
+from core.bake.exr import write_layers
+from core.bake.layers import FrameLayers
 from tests.core.flared import flared_capture
 
 SCRIPTS = Path(__file__).parent / "scripts"
@@ -24,7 +27,8 @@ def said(blender: Blender, package: Path, tmp_path_factory: pytest.TempPathFacto
     sham = base / "sham_engine.sh"
     shutil.copy(SCRIPTS / "sham_engine.sh", sham)
     capture, flare = flared_capture(base / "capture", 4), a_flare(base / "lamp.flare")
-    (base / "out").mkdir()
+    layer = np.ones((8, 16, 3), np.float32)
+    write_layers(base / "out" / "real" / "layers.0001.exr", FrameLayers(layer, {"lamp": layer}, layer[..., 0]))
     return blender.run(SCRIPTS / "broken.py", package, capture, flare, base / "out", sham, user=base / "user")
 
 
@@ -40,7 +44,8 @@ def test_an_empty_scene_offers_what_can_be_done_alone(said: Any) -> None:
 @pytest.mark.parametrize("what", ["import of nothing", "import of a broken capture", "cut flare", "newer flare",
                                   "absent flare", "flare deleted later", "save of a deleted flare", "orthographic",
                                   "bake of a deleted flare", "log of nothing", "folder of nothing", "layers of nothing",
-                                  "library name"])
+                                  "library name", "bake on a full disk", "save on a full disk", "fit on a full disk",
+                                  "no room for the last words"])
 def test_what_cannot_be_done_is_one_sentence(said: Any, what: str) -> None:
     assert is_sentence(said[what]), said[what]
 
@@ -53,6 +58,35 @@ def test_refusals_leave_nothing_behind(said: Any) -> None:
 def test_without_an_engine_the_button_says_so(said: Any) -> None:
     assert said["no engine"]
     assert said["engine named, not there"] == [False, False]
+
+
+def test_every_panel_says_what_is_missing(said: Any) -> None:
+    capture, lights, fit, look, bake, transfer = said["panels of an empty scene"]
+    assert "Footage with a camera solve" in capture
+    assert "No lights yet" in lights
+    assert "No engine is set up" in fit
+    assert "No flare yet" in look
+    assert "Nothing to bake yet" in bake
+    assert "The library is empty" in transfer
+    assert "No engine is set up" in said["panel without an engine"]
+    assert "no camera" in said["panel without a camera"]
+
+
+def test_a_full_disk_is_told_and_what_is_finished_is_kept(said: Any) -> None:
+    broken, filled, again = said["bakes"]
+    assert "ended without a result" in broken[0]
+    assert "disk is full" in filled[0]
+    for text, panel, layers in (broken, filled):
+        assert is_sentence(text)
+        assert text.split(" (")[0].split("; ")[0] in panel
+        assert layers == ["layers.0001.exr"]
+    assert again[0] == ""
+    assert "2 frames of layers are baked." in again[1]
+    assert again[2] == ["layers.0001.exr", "layers.0002.exr"]
+    for what in ("bake on a full disk", "save on a full disk", "fit on a full disk", "no room for the last words"):
+        assert "full" in said[what]
+    assert said["library after"] == []
+    assert said["its engine is not left alone"]
 
 
 def test_an_engine_that_dies_is_told(said: Any) -> None:
@@ -82,6 +116,11 @@ def test_work_is_found_again_and_can_be_cancelled(said: Any) -> None:
 def test_folders_that_went_are_told(said: Any) -> None:
     assert said["run folder deleted"] == ["lost", True, False]
     assert said["capture moved"] == [False, False]
+    assert "is gone: start a new fit" in said["panel of a lost run"]
+    capture, fit = said["panels of a moved capture"]
+    assert "is not there any more" in capture
+    assert "is not there any more" in fit
+    assert all(text and "Traceback" not in text for text in said["operators of a moved capture"])
 
 
 def test_cameras_lights_and_scenes(said: Any) -> None:

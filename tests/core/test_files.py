@@ -2,12 +2,14 @@
 """Files are whole or absent, and names stay inside their folder."""
 from __future__ import annotations
 
+import errno
+import os
 import time
 from pathlib import Path
 
 import pytest
 
-from core.errors import CaptureError
+from core.errors import CaptureError, refusal
 from core.files import atomic_folder, atomic_path, inside, locked, read_json, remove_partial_of, write_json, write_text
 
 
@@ -19,6 +21,19 @@ def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> 
         raise ZeroDivisionError
     assert target.read_text() == "old"
     assert list(tmp_path.iterdir()) == [target]
+
+
+def test_what_the_system_refuses_is_one_sentence_that_names_the_file(tmp_path: Path) -> None:
+    target = tmp_path / "a.txt"
+    write_text(target, "old")
+    with pytest.raises(OSError) as full, atomic_path(target):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))  # as a write to an open file says it
+    assert refusal(full.value) == (
+        f"The disk is full ({target}); make room and start it again, what is finished is kept.")
+    assert target.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [target]
+    assert refusal(PermissionError(errno.EACCES, "Permission denied", "/a")) == (
+        "The system refused: Permission denied (/a).")
 
 
 def test_a_write_replaces_the_file_and_makes_its_folder(tmp_path: Path) -> None:

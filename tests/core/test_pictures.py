@@ -2,12 +2,16 @@
 """Pictures read back as they were written, and broken ones are refused by name."""
 from __future__ import annotations
 
+import contextlib
+import errno
+from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
+from core import pictures
 from core.colour import colour_space
 from core.errors import FrameError
 from core.pictures import (
@@ -130,3 +134,19 @@ def test_a_picture_shrinks_in_light() -> None:
     small = Picture(board, "srgb").resized(2, 2)
     assert small.encoding == "srgb"
     np.testing.assert_allclose(small.linear(), 0.5, atol=1e-6)
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs the device that is always full, which Linux has")
+def test_a_full_disk_is_told_as_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    @contextlib.contextmanager
+    def full(_target: Path) -> Iterator[Path]:
+        yield Path("/dev/full")
+
+    monkeypatch.setattr(pictures, "atomic_path", full)
+    with pytest.raises(OSError) as told:
+        write_exr(tmp_path / "a.exr", {"R": np.random.default_rng(0).random((200, 300)).astype(np.float32)})
+    assert told.value.errno == errno.ENOSPC
+    assert told.value.filename == str(tmp_path / "a.exr")
+    with pytest.raises(OSError) as told:
+        write_png(tmp_path / "a.png", RAMP)
+    assert told.value.errno == errno.ENOSPC

@@ -2,6 +2,7 @@
 """Progress speaks JSON by the line, and a stop is heard at the next step."""
 from __future__ import annotations
 
+import errno
 import io
 import json
 import os
@@ -47,6 +48,29 @@ def test_a_stop_is_heard_at_the_next_step() -> None:
     progress.request_stop()
     with pytest.raises(Cancelled, match="fit"):
         progress.advance()
+
+
+class FullDisk(io.StringIO):
+    """A stream whose disk takes no more."""
+
+    def flush(self) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+class Gone(io.StringIO):
+    """A stream that nobody reads any more."""
+
+    def flush(self) -> None:
+        raise BrokenPipeError
+
+
+def test_a_disk_too_full_for_events_does_not_end_the_work() -> None:
+    progress = JsonProgress(FullDisk())
+    progress.stage("fit", 2)
+    progress.advance(2)
+    progress.error("The disk is full.")
+    with pytest.raises(BrokenPipeError):
+        JsonProgress(Gone()).say("hello")
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import sys
 import traceback
+from collections.abc import Callable
 
 import bpy
 
@@ -18,10 +19,12 @@ try:
 except ImportError:
     real = None
 
+SETTLE_S = 0.12
 FAILED = ""
 """Where a picture of the window is kept when a step fails."""
 
-_queue: list[tuple] = []
+_queue: list[dict] = []
+_mouse = 0, 0
 
 
 def window():
@@ -34,7 +37,9 @@ def area(kind: str = "VIEW_3D"):
 
 
 def region(kind: str, of=None):
-    return next(one for one in (of or area()).regions if one.type == kind)
+    found = [one for one in (of or area()).regions if one.type == kind]
+    assert found, f"the area has no region {kind}"
+    return found[0]
 
 
 def override(kind: str = "VIEW_3D", inner: str = "WINDOW"):
@@ -59,18 +64,24 @@ def screenshot(path: str) -> None:
         bpy.ops.screen.screenshot(filepath=path)
 
 
-def move(x: float, y: float) -> None:
+def point(x: float, y: float) -> None:
+    """Move the mouse there."""
     if real is not None:
-        real.move(x, window().height - y)
+        real._send(("mousemove", int(x), int(window().height - y)))
     else:
-        _queue.append(("MOUSEMOVE", "NOTHING", x, y))
+        _simulate("MOUSEMOVE", "NOTHING", x, y)
 
 
-def click(x: float, y: float) -> None:
+def click(x: float, y: float, ctrl: bool = False) -> None:
     if real is not None:
+        down, up = ([("keydown", "ctrl")], [("keyup", "ctrl")]) if ctrl else ([], [])
+        real._send(*down)
         real.click(x, window().height - y)
-    else:
-        _queue.extend([("MOUSEMOVE", "NOTHING", x, y), ("LEFTMOUSE", "PRESS", x, y), ("LEFTMOUSE", "RELEASE", x, y)])
+        real._send(*up)
+        return
+    _simulate("MOUSEMOVE", "NOTHING", x, y)
+    _simulate("LEFTMOUSE", "PRESS", x, y, ctrl=ctrl)
+    _simulate("LEFTMOUSE", "RELEASE", x, y, ctrl=ctrl)
 
 
 def drag(x0: float, y0: float, x1: float, y1: float, button: str = "LEFTMOUSE") -> None:
@@ -78,26 +89,208 @@ def drag(x0: float, y0: float, x1: float, y1: float, button: str = "LEFTMOUSE") 
         top = window().height
         real.drag(x0, top - y0, x1, top - y1, button={"LEFTMOUSE": 1, "MIDDLEMOUSE": 2}[button])
         return
-    _queue.extend([("MOUSEMOVE", "NOTHING", x0, y0), (button, "PRESS", x0, y0)])
-    _queue.extend(("MOUSEMOVE", "NOTHING", x0 + (x1 - x0) * step / 6, y0 + (y1 - y0) * step / 6)
-                  for step in range(1, 7))
-    _queue.append((button, "RELEASE", x1, y1))
+    _simulate("MOUSEMOVE", "NOTHING", x0, y0)
+    _simulate(button, "PRESS", x0, y0)
+    for step in range(1, 7):
+        _simulate("MOUSEMOVE", "NOTHING", x0 + (x1 - x0) * step / 6, y0 + (y1 - y0) * step / 6)
+    _simulate(button, "RELEASE", x1, y1)
 
 
-def only(*panels) -> None:
-    """Show these panels of the tab alone, so that the first one's rows are where `row` says."""
-    for cls in [cls for cls in bpy.types.Panel.__subclasses__() if getattr(cls, "bl_category", "") == "Fit Flare"
-                and getattr(cls, "is_registered", False)]:
-        bpy.utils.unregister_class(cls)
-    for cls in panels:
-        bpy.utils.register_class(cls)
-    redraw()
+X_NAMES = {"RET": "Return", "ESC": "Escape", "DEL": "Delete", "HOME": "Home", "END": "End", "PAGE_DOWN": "Next",
+           "DOWN_ARROW": "Down", "NUMPAD_0": "KP_0"}
 
 
-def row(below_header: float) -> tuple[float, float]:
-    """The middle of a row of the first panel: its distance below the panel's header, in pixels at scale 1."""
-    place, scale = region("UI"), bpy.context.preferences.system.ui_scale
-    return place.x + place.width * 0.6, place.y + place.height - (15.4 + below_header) * scale
+def press(key: str, *, ctrl: bool = False, shift: bool = False) -> None:
+    """A key by Blender's name; it goes to what is under the mouse."""
+    if real is not None:
+        name = X_NAMES.get(key, key.lower() if len(key) == 1 else key)
+        real.key("+".join(["ctrl"] * ctrl + ["shift"] * shift + [name]))
+        return
+    _simulate(key, "PRESS", ctrl=ctrl, shift=shift)
+    _simulate(key, "RELEASE", ctrl=ctrl, shift=shift)
+
+
+KEYS = {**dict(zip("0123456789", ("ZERO", "ONE", "TWO", "THREE", "FOUR", "FIVE", "SIX", "SEVEN", "EIGHT", "NINE"),
+                   strict=True)), "/": "SLASH", ".": "PERIOD", "-": "MINUS", "_": "MINUS", " ": "SPACE"}
+
+
+def write(text: str) -> None:
+    """Type a text."""
+    if real is not None:
+        real.text(text)
+        return
+    for letter in text:
+        key = KEYS.get(letter, letter.upper())
+        _simulate(key, "PRESS", unicode=letter)
+        _simulate(key, "RELEASE")
+
+
+def _simulate(kind: str, value: str, x: float | None = None, y: float | None = None, **more: object) -> None:
+    """Queue an event for Blender's own simulation, where the mouse is if no place is given."""
+    global _mouse
+    if x is not None and y is not None:
+        _mouse = int(x), int(y)
+    _queue.append({"type": kind, "value": value, "x": _mouse[0], "y": _mouse[1], **more})
+
+
+# ---- what is under the mouse ------------------------------------------------------------------------
+
+NOTHING = "nothing was copied"
+
+
+def copied(x: float, y: float, path: bool = False):
+    """What Ctrl-C copies from the button there: an operator's call, a field's value (`path`: with Shift, which
+    property it shows). Steps; their value is the text."""
+    manager = bpy.context.window_manager
+    manager.clipboard = NOTHING
+    point(x, y)
+    press("C", ctrl=True, shift=path)
+    yield 0.05
+    return manager.clipboard
+
+
+def find(wanted: str | Callable[[str], bool], place, *, path: bool = False, across: float = 0.55,
+         below: float | None = None, pages: int = 4):
+    """The place of the button whose operator is `wanted` (or whose copied text pleases it; `path`: whose property it
+    is), looked for by walking down a region with the mouse, page by page.
+
+    across: where in the region's width. below: start on the present page, under this height. Steps; raises LookupError.
+    """
+    def right(text: str) -> bool:
+        if callable(wanted):
+            return wanted(text)
+        return text == wanted if path else text.startswith(f"bpy.ops.{wanted}(")
+
+    step, x = 10 * bpy.context.preferences.system.ui_scale, place.x + place.width * across
+    for page in range(pages):
+        y = place.y + place.height - 8
+        if page == 0 and below is not None:
+            y = below
+        else:
+            point(x, y)
+            press("PAGE_DOWN" if page else "HOME")
+            yield 0.2
+        while y > place.y + 4:
+            text = yield from copied(x, y, path)
+            if right(text):
+                return x, y - 0.5 * step
+            y -= step
+    raise LookupError(f"{wanted} is nowhere under the mouse in the region {place.type}")
+
+
+def press_button(wanted: str, place, **how: object):
+    """Find an operator's button and click it; its place. Steps."""
+    x, y = yield from find(wanted, place, **how)
+    click(x, y)
+    yield 0.3
+    return x, y
+
+
+def fill(x: float, y: float, text: str):
+    """Click into the field there and type. Steps."""
+    click(x, y)
+    yield 0.3
+    press("A", ctrl=True)
+    write(text)
+    press("RET")
+    yield 0.3
+
+
+def choose_item(x: float, y: float, down: int):
+    """Choose the entry that lies `down` below the present one in the menu that opens there. Steps."""
+    click(x, y)
+    yield 0.4
+    for _ in range(down):
+        press("DOWN_ARROW")
+    press("RET")
+    yield 0.3
+
+
+def show_editor(of, kind: str):
+    """The preferences or the 3D view in an area, by the button at the left end of its header: they are the menu's last
+    and first entry. Steps."""
+    header = region("HEADER", of)
+    click(header.x + 20 * bpy.context.preferences.system.ui_scale, header.y + header.height / 2)
+    yield 0.5
+    press({"PREFERENCES": "END", "VIEW_3D": "HOME"}[kind])
+    press("RET")
+    for _ in range(20):
+        yield 0.3
+        if of.type == kind:
+            return
+    raise LookupError(f"the editor is {of.type}, not {kind}")
+
+
+def go_to_section(of, section: str):
+    """A section of the preferences, by clicking down the list at their left. Steps."""
+    settings = bpy.context.preferences
+    tabs = min((one for one in of.regions if one.type in ("UI", "NAVIGATION_BAR")), key=lambda one: one.x)
+    y = tabs.y + tabs.height - 20
+    while settings.active_section != section and y > tabs.y:
+        click(tabs.x + tabs.width * 0.5, y)
+        yield 0.2
+        y -= 12
+    assert settings.active_section == section
+
+
+def choose_file(folder: str, file: str = ""):
+    """Type folder and file into the file browser that has opened in this window, and confirm. Steps."""
+    for _ in range(20):
+        if any(one.type == "FILE_BROWSER" for one in window().screen.areas):
+            break
+        yield 0.3
+    browser = area("FILE_BROWSER")
+    yield 0.5
+    x, y = yield from _field(region("UI", browser), os.sep)
+    yield from fill(x, y, folder)
+    files = region("WINDOW", browser)
+    click(files.x + 0.5 * files.width, files.y + 12)  # a field of folders goes on being typed into until then
+    yield 0.4
+    if file:
+        place = region("EXECUTE", browser)
+        yield from fill(place.x + 0.3 * place.width, place.y + place.height / 2, file)
+    yield 0.5
+    place = region("EXECUTE", browser)
+    yield from press_along("file.execute", place, place.y + place.height / 2)
+
+
+def _field(place, ending: str):
+    """The field in a low region whose text ends so. Steps."""
+    for share in (0.3, 0.4, 0.5, 0.6, 0.2):
+        x, y = place.x + place.width * share, place.y + place.height / 2
+        text = yield from copied(x, y)
+        if text.endswith(ending):
+            return x, y
+    raise LookupError(f"no field in the region {place.type} ends with {ending}")
+
+
+def press_along(call: str, place, y: float):
+    """Find a button by walking along a row from the right, and click it. Steps."""
+    x = place.x + place.width - 6
+    while x > place.x:
+        text = yield from copied(x, y)
+        if text.startswith(f"bpy.ops.{call}"):
+            click(x - 3, y)
+            yield 0.5
+            return
+        x -= 6
+    raise LookupError(f"{call} is nowhere along the region {place.type}")
+
+
+def open_tab(name: str):
+    """The sidebar of the 3D viewport with N, and its tab by clicking down the tabs. Steps."""
+    view = region("WINDOW")
+    if not area().spaces.active.show_region_ui:
+        point(view.x + view.width * 0.4, view.y + view.height * 0.4)
+        press("N")
+        yield 0.5
+    side, scale = region("UI"), bpy.context.preferences.system.ui_scale
+    y = side.y + side.height - 30 * scale
+    while side.active_panel_category != name and y > side.y:
+        click(side.x + side.width - 12 * scale, y)
+        yield 0.3
+        y -= 25 * scale
+    assert side.active_panel_category == name, f"the sidebar has no tab {name}"
 
 
 def quit_(status: int = 0) -> None:
@@ -119,11 +312,10 @@ def run(steps) -> None:
                 return 0.05
             if sent:  # let Blender handle what was sent
                 sent = False
-                return 0.3
+                return SETTLE_S
             if _queue:
-                kind, value, x, y = _queue.pop(0)
-                window().event_simulate(type=kind, value=value, x=int(x), y=int(y))
-                return 0.06
+                window().event_simulate(**_queue.pop(0))
+                return 0.03
             return next(walk) or 0.01
         except StopIteration:
             quit_(0)

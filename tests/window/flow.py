@@ -1,13 +1,16 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The whole work in Blender's real window, from an empty profile: install, import, fit while orbiting, drag a
-slider, bake, compositor, render, transfer. A screenshot of each step, and facts.json.
+"""The whole work in Blender's real window, from an empty profile, by mouse and keys: install, name the engine, import,
+fit while orbiting, drag a slider, bake, compositor, render, transfer. A screenshot of each step, and facts.json.
+
+Buttons are found as the mouse finds them: Ctrl-C over a button copies its operator (driver.py). Operators and
+properties are called from here only to measure, or to make what an artist has before Fit Flare is used: another shot
+with a camera and a lamp. Dropping a file on the window is left out: neither X nor Blender can simulate it.
 
 Started by tests/window/run.py, which names in the environment: the zip (FIT_FLARE_ZIP), a capture that may be
 written to (FIT_FLARE_CAPTURE), the engine's Python (FIT_FLARE_ENGINE), the folder to write (FIT_FLARE_OUT).
 """
 from __future__ import annotations
 
-import importlib
 import json
 import math
 import os
@@ -20,15 +23,11 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent))
 import driver as ui
+from measure import NAME, Gaps, Ours, milliseconds, module, timed
 
 ZIP, CAPTURE, ENGINE, OUT = (os.environ[f"FIT_FLARE_{name}"] for name in ("ZIP", "CAPTURE", "ENGINE", "OUT"))
-NAME = "bl_ext.user_default.fit_flare"
 out = Path(OUT)
 facts: dict[str, object] = {"blender": bpy.app.version_string, "done": []}
-
-
-def module(name: str):
-    return importlib.import_module(f"{NAME}.flare_addon.{name}")
 
 
 def shot(name: str) -> None:
@@ -42,132 +41,120 @@ def done(step: str, **figures: object) -> None:
     print("step:", step, figures, flush=True)
 
 
-class Gaps:
-    """The longest time between two calls of a 10 ms timer: what a mouse would have to wait."""
-
-    def __init__(self) -> None:
-        self.gaps: list[float] = []
-        self.last = time.perf_counter()
-        self.on, self.paused = True, False
-        bpy.app.timers.register(self.tick, persistent=True)
-
-    def tick(self):
-        now = time.perf_counter()
-        if not self.paused:
-            self.gaps.append(now - self.last)
-        self.last, self.paused = now, False
-        return 0.01 if self.on else None
-
-    def pause(self) -> None:
-        """Leave out what comes now, a screenshot that this script itself takes."""
-        self.paused = True
-
-    def stop(self) -> dict[str, float]:
-        self.on = False
-        gaps = sorted(self.gaps[2:]) or [0.0]
-        return {"longest_gap_ms": round(1e3 * gaps[-1]), "gap_99_percent_ms": round(1e3 * gaps[len(gaps) * 99 // 100])}
+def wait(true, seconds: float):
+    """Let Blender live until something is true. Steps; their value is how long it took."""
+    began = time.perf_counter()
+    while not true():
+        assert time.perf_counter() - began < seconds, f"not within {seconds} s"
+        yield 0.3
+    return time.perf_counter() - began
 
 
-def timed(target, name: str, record: list[float]):
-    """Measure each call of a function of the add-on."""
-    inner = getattr(target, name)
-
-    def call(*words, **named):
-        began = time.perf_counter()
-        try:
-            return inner(*words, **named)
-        finally:
-            record.append(time.perf_counter() - began)
-    setattr(target, name, call)
-
-
-def timed_draw(panel, record: list[float]) -> None:
-    """The same of a panel's drawing, with the signature that Blender asks for."""
-    inner = panel.draw
-
-    def draw(self, context):
-        began = time.perf_counter()
-        inner(self, context)
-        record.append(time.perf_counter() - began)
-    panel.draw = draw
-
-
-def open_tab() -> None:
-    space = ui.area().spaces.active
-    space.show_region_ui = True
-    ui.redraw()
-    ui.region("UI").active_panel_category = "Fit Flare"
-    ui.redraw()
+def panel():
+    return ui.region("UI")
 
 
 def steps():
-    bpy.context.preferences.view.show_splash = False
-    bpy.context.preferences.inputs.use_mouse_continuous = False
-    bpy.ops.extensions.package_install_files(filepath=ZIP, repo="user_default", enable_on_install=True, overwrite=True)
+    settings = bpy.context.preferences
+    settings.view.show_splash = False
+    settings.inputs.use_mouse_continuous = False
+    settings.view.filebrowser_display_type = "SCREEN"  # the window that is driven is the only one
+    settings.view.render_display_type = "AREA"
     yield 1
-    assert NAME in bpy.context.preferences.addons, "the extension did not install"
+    area = ui.area()
+    yield from ui.show_editor(area, "PREFERENCES")
+    yield from install(area)
+    yield from name_the_engine(area)
+    yield from ui.show_editor(area, "VIEW_3D")
+    yield from import_capture()
+    yield from fit()
+    yield from brighten()
+    yield from bake()
+    yield from compositor_and_render()
+    yield from transfer()
+    done("all")
+
+
+def install(area):
+    """Preferences > Get Extensions > the menu at the right > Install from Disk."""
+    yield from ui.go_to_section(area, "EXTENSIONS")
+    place = ui.region("WINDOW", area)
+    top = place.y + place.height - 19
+    yield from ui.press_along("wm.call_menu(name=\"USERPREF_MT_extensions_settings\"", place, top)
+    shot("00_install")
+    entry = yield from ui.find("extensions.package_install_files", place, across=1 - 16 / place.width, below=top - 4,
+                               pages=1)
+    ui.click(*entry)
+    yield from ui.choose_file(*os.path.split(ZIP))
+    yield from wait(lambda: NAME in bpy.context.preferences.addons, 30)
     done("install")
-    bpy.context.preferences.addons[NAME].preferences.engine = ENGINE
-    chosen = ui.area()
-    show_preferences(chosen)
-    yield 1
-    with bpy.context.temp_override(window=ui.window(), screen=ui.window().screen, area=chosen):
-        bpy.ops.fit_flare.test_engine()
-    test = module("engine").tested()
-    while test.running:
-        yield 0.3
+
+
+def name_the_engine(area):
+    """Preferences > Add-ons > Fit Flare: a path into the field Engine, and Test."""
+    yield from ui.go_to_section(area, "ADDONS")
+    place = ui.region("WINDOW", area)
+    yield from ui.fill(place.x + 0.2 * place.width, place.y + place.height - 19, "Fit Flare")
+    # The first row of the list is the field's own result.
+    yield from ui.press_button("preferences.addon_expand", place, across=24 / place.width)
+    x, y = yield from ui.find(lambda text: text == "", place, across=0.6)
+    yield from ui.fill(x, y, ENGINE)
+    assert bpy.context.preferences.addons[NAME].preferences.engine == ENGINE
+    yield from ui.press_button("fit_flare.test_engine", place, across=0.15, below=y)
+    engine = module("engine")
+    yield from wait(lambda: engine.tested() is not None and not engine.tested().running, 120)
+    test = engine.tested()
     assert test.state == "done", test.error
     yield 0.5
     shot("01_preferences")
     done("engine", engine=test.result)
-    chosen.type = "VIEW_3D"
+
+
+def import_capture():
+    """The start file's objects away with A and Delete; the button Import Capture and the file browser it opens."""
+    view = ui.region("WINDOW")
+    ui.point(view.x + 0.4 * view.width, view.y + 0.5 * view.height)
+    ui.press("A")
+    ui.press("DEL")
     yield 0.5
-    for item in list(bpy.data.objects):
-        bpy.data.objects.remove(item)
-    open_tab()
+    assert not bpy.data.objects, "the start file's objects are still there"
+    yield from ui.open_tab("Fit Flare")
     yield 0.5
     shot("02_empty")
-    began = time.perf_counter()
-    with ui.override():
-        assert bpy.ops.fit_flare.import_capture(directory=CAPTURE) == {"FINISHED"}
-    scene = bpy.context.scene
-    state = scene.fit_flare
-    state.width = 240
-    done("import", import_s=round(time.perf_counter() - began, 3))
+    importing: list[float] = []
+    timed(module("operators.capture"), "import_capture", importing)
+    yield from ui.press_button("fit_flare.import_capture", panel())
+    shot("02_file_browser")
+    yield from ui.choose_file(CAPTURE + os.sep)
+    yield from wait(lambda: bpy.context.scene.fit_flare.capture, 30)
+    done("import", import_s=round(importing[0], 3))
     yield 0.5
     shot("03_imported")
 
-    # Fit, by a click, while the view is turned.
-    ui.area().spaces.active.region_3d.view_perspective = "PERSP"
-    with ui.override():
-        bpy.ops.view3d.view_all()
-    ticks: list[float] = []
-    timed(module("jobs").Job, "_read", ticks)
-    draws: list[float] = []
-    for name in ("capture", "lights", "fit", "look", "bake", "transfer"):
-        timed_draw(getattr(module("panels"), f"FITFLARE_PT_{name}"), draws)
-    began = time.perf_counter()
-    ui.redraw()
-    redraw_ms = round(1e3 * (time.perf_counter() - began))  # of Blender's whole window, before any fit
-    taken: list[float] = []
-    timed(module("looks"), "use", taken)
-    panels, fits = module("panels"), module("fits")
-    every = panels._CLASSES
-    ui.only(panels.FITFLARE_PT_fit, panels.FITFLARE_PT_look)
-    yield 0.5
-    job = None
-    for nudge in (0, 7, -7, 20, 27):
-        ui.click(*ui.row(102 + nudge))
-        yield 2
-        job = fits.job_of(scene)
-        if job is not None:
-            break
-    assert job is not None and job.running, f"the fit did not start: {fits.why_not(scene)}"
-    ui.only(*every)
-    gaps = Gaps()
-    seen: set[int] = set()
+
+def fit():
+    """Width into its field, a click on Fit, and the view turned while the engine works."""
+    scene = bpy.context.scene
+    state, fits = scene.fit_flare, module("fits")
+    x, y = yield from ui.find("fit_flare.width", panel(), path=True, across=0.65)
+    yield from ui.fill(x, y, "240")
+    assert state.width == 240
     view = ui.region("WINDOW")
     middle = view.x + view.width * 0.35, view.y + view.height * 0.5
+    ui.drag(*middle, middle[0] + 10, middle[1], button="MIDDLEMOUSE")  # out of the camera's view
+    ui.press("HOME")
+    yield 0.5
+    quiet = Gaps()
+    yield 5
+    began = time.perf_counter()
+    ui.redraw()
+    redraw_ms = milliseconds(time.perf_counter() - began)  # of Blender's whole window, before any fit
+    ours = Ours()
+    yield from ui.press_button("fit_flare.fit", panel(), below=y)
+    job = fits.job_of(scene)
+    assert job is not None and job.running, f"the fit did not start: {fits.why_not(scene)}"
+    gaps = Gaps()
+    seen: set[int] = set()
     before = ui.area().spaces.active.region_3d.view_rotation.copy()
     turned = shown = False
     began = time.perf_counter()
@@ -186,76 +173,82 @@ def steps():
     assert turned and orbit > 0.05, "the view did not turn during the fit"
     assert len(seen) > 5, "the bar did not move"
     done("fit", fit_s=round(time.perf_counter() - began, 1), bar_positions=len(seen), orbit_degrees=math.degrees(orbit),
-         **gaps.stop(), longest_draw_ms=round(1e3 * max(draws), 2), redraw_alone_ms=redraw_ms,
-         longest_read_ms=round(1e3 * max(ticks), 2),
-         taken_in_ms=round(1e3 * max(taken), 2))
+         before_the_fit=quiet.stop(), while_it_fits=gaps.stop(), redraw_alone_ms=redraw_ms, ours_ms=ours.longest())
     assert state.flare, "the fit's flare is not shown"
 
-    # Drag Intensity: the overlay brightens.
-    state.footage = "removed"
-    ui.area().spaces.active.region_3d.view_perspective = "CAMERA"
+
+def brighten():
+    """Without Flare, the camera's view, and Intensity dragged: the overlay brightens."""
+    scene = bpy.context.scene
+    state = scene.fit_flare
+    x, y = yield from ui.find("fit_flare.footage", panel(), path=True, across=0.75)
+    ui.click(x, y)
+    yield 0.5
+    assert state.footage == "removed"
+    view = ui.region("WINDOW")
+    ui.point(view.x + 0.35 * view.width, view.y + 0.5 * view.height)
+    ui.press("NUMPAD_0")
     yield 1
+    assert ui.area().spaces.active.region_3d.view_perspective == "CAMERA"
     shot("05_flare")
     overlay = module("overlay")
-    depsgraph = bpy.context.evaluated_depsgraph_get()
-    dim = overlay.picture(scene, depsgraph, scene.camera, 480, 270)
+    dim = overlay.picture(scene, bpy.context.evaluated_depsgraph_get(), scene.camera, 480, 270)
     np.save(out / "overlay.npy", dim)
-    ui.only(panels.FITFLARE_PT_look)
+    x, y = yield from ui.find("fit_flare.master.intensity", panel(), path=True, across=0.6)
+    ui.drag(x, y, x + 50, y)
     yield 0.5
-    for nudge in (0, 7, -7, 20, 27):
-        x, y = ui.row(30 + nudge)
-        ui.drag(x, y, x + 50, y)
-        yield 0.5
-        if state.master.intensity != 1.0:
-            break
     assert state.master.intensity > 1.1, f"Intensity is {state.master.intensity}"
     shot("06_brighter")
     bright = overlay.picture(scene, bpy.context.evaluated_depsgraph_get(), scene.camera, 480, 270)
-    ui.only(*every)
     done("drag", intensity=round(state.master.intensity, 3), brightness=round(float(bright.sum() / dim.sum()), 3))
     np.testing.assert_allclose(bright.sum() / dim.sum(), state.master.intensity, rtol=0.01)
+    yield from ui.fill(x, y, "1")
+    done("speed", **speed_of(overlay, scene))
 
-    # What the overlay costs.
-    speeds = speed_of(overlay, scene)
-    done("speed", **speeds)
 
-    # Bake, and the overlay against it.
-    state.master.intensity = 1.0
-    state.layers, state.bake_range = str(out / "layers"), "custom"
-    state.bake_first, state.bake_last = scene.frame_current, scene.frame_current + 2
-    ui.area().spaces.active.region_3d.view_perspective = "CAMERA"
-    with ui.override():
-        assert bpy.ops.fit_flare.bake() == {"FINISHED"}
+def bake():
+    """Three frames into a folder that is typed, by the panel's fields and Bake Layers."""
+    scene = bpy.context.scene
+    state, now = scene.fit_flare, scene.frame_current
+    x, y = yield from ui.find("fit_flare.bake_range", panel(), path=True, across=0.65)
+    yield from ui.choose_item(x, y, 2)
+    assert state.bake_range == "custom"
+    for name, text in (("bake_first", str(now)), ("bake_last", str(now + 2)), ("layers", str(out / "layers"))):
+        x, y = yield from ui.find(f"fit_flare.{name}", panel(), path=True, across=0.55, below=y)
+        yield from ui.fill(x, y, text)
+    assert (state.bake_first, state.bake_last) == (now, now + 2)
+    yield from ui.press_button("fit_flare.bake", panel(), below=y)
     job = module("jobs").find(Path(state.layers))
-    began = time.perf_counter()
-    while job.running and time.perf_counter() - began < 300:
-        yield 0.3
+    assert job is not None, "the bake did not start"
+    took = yield from wait(lambda: not job.running, 300)
     assert job.state == "done", job.error
-    done("bake", bake_s=round(time.perf_counter() - began, 1), layers=str(out / "layers"))
-
-    ui.only(panels.FITFLARE_PT_look, panels.FITFLARE_PT_bake)
     yield 0.5
     shot("06_look_and_bake")
+    done("bake", bake_s=round(took, 1), layers=str(out / "layers"))
 
-    # The compositor, and a render through it.
-    state.over = "plate"
-    with ui.override():
-        assert bpy.ops.fit_flare.set_up_baked() == {"FINISHED"}
-    scene.render.engine = "BLENDER_WORKBENCH"
+
+def compositor_and_render():
+    """Over the Footage, Set Up Compositor, F12 at three intensities, and the nodes away again."""
+    scene = bpy.context.scene
+    state = scene.fit_flare
+    x, y = yield from ui.find("fit_flare.over", panel(), path=True, across=0.65)
+    yield from ui.choose_item(x, y, 1)
+    assert state.over == "plate"
+    yield from ui.press_button("fit_flare.set_up_baked", panel(), below=y)
+    compositor = module("compositor")
+    assert compositor.find_node(scene) is not None
+    scene.render.engine = "BLENDER_WORKBENCH"  # the quickest; what it renders lies behind the plate
     figures = {}
-    for factor in (0.0, 1.0, 2.0):
-        state.master.intensity = factor
-        scene.render.filepath = str(out / f"render_{factor:.0f}.png")
-        bpy.ops.render.render(write_still=True)
-        image = bpy.data.images.load(scene.render.filepath)
-        pixels = np.empty(4 * image.size[0] * image.size[1], np.float32)
-        image.pixels.foreach_get(pixels)
-        figures[factor] = float(pixels.reshape(-1, 4)[:, :3].mean())
-        bpy.data.images.remove(image)
-    state.master.intensity = 1.0
-    assert figures[0.0] < figures[1.0] < figures[2.0], figures
+    x, y = yield from ui.find("fit_flare.master.intensity", panel(), path=True, across=0.6)
+    view = ui.region("WINDOW")
+    for factor in (0, 2, 1):
+        yield from ui.fill(x, y, str(factor))
+        assert state.master.intensity == factor
+        ui.point(view.x + 0.35 * view.width, view.y + 0.5 * view.height)
+        figures[factor] = yield from render(out / f"render_{factor}.png")
+    assert figures[0] < figures[1] < figures[2], figures
     done("render", render_means=figures)
-    bpy.context.window.workspace = bpy.data.workspaces["Compositing"]
+    bpy.context.window.workspace = bpy.data.workspaces["Compositing"]  # only to look at the nodes
     yield 1
     try:
         with ui.override("NODE_EDITOR"):
@@ -266,31 +259,56 @@ def steps():
     shot("07_compositor")
     bpy.context.window.workspace = bpy.data.workspaces["Layout"]
     yield 1
-    with ui.override():
-        assert bpy.ops.fit_flare.remove_compositor() == {"FINISHED"}
+    yield from ui.press_button("fit_flare.remove_compositor", panel())
+    assert compositor.find_node(scene) is None
 
-    # Transfer: to the library, and on to another camera with a cube before one of the lights.
-    with ui.override():
-        assert bpy.ops.fit_flare.save_flare(name="Desk lamp", notes="From the sample") == {"FINISHED"}
-    other = bpy.data.scenes.new("Another Shot")
-    bpy.context.window.scene = other
-    data = bpy.data.cameras.new("Second")
-    camera = bpy.data.objects.new("Second", data)
-    camera.rotation_euler = (math.pi / 2, 0, 0)
-    lamp = bpy.data.objects.new("Sun lamp", bpy.data.lights.new("Sun lamp", "POINT"))
-    lamp.location = (-1.2, 6, 0.9)
-    for item in (camera, lamp):
-        other.collection.objects.link(item)
-    other.camera = camera
-    bpy.context.view_layer.update()
-    lamp.select_set(True)
-    library = module("library")
-    with ui.override():
-        result = bpy.ops.fit_flare.apply_flare(filepath=str(library.files()[0]))
-    assert result == {"FINISHED"}
-    ui.area().spaces.active.region_3d.view_perspective = "CAMERA"
-    ui.only(panels.FITFLARE_PT_look, panels.FITFLARE_PT_transfer)
+
+def render(path: Path):
+    """F12, a picture of the window, and Escape back. Steps; their value is the mean of the picture, which is saved."""
+    finished: list[bool] = []
+
+    def note(*_words: object) -> None:
+        finished.append(True)
+
+    bpy.app.handlers.render_complete.append(note)
+    ui.press("F12")
+    yield from wait(lambda: finished, 120)
+    bpy.app.handlers.render_complete.remove(note)
+    yield 0.5
+    shot("06_rendered")
+    ui.press("ESC")
+    yield 0.5
+    assert any(area.type == "VIEW_3D" for area in ui.window().screen.areas)
+    bpy.data.images["Render Result"].save_render(str(path))  # nobody else can read a render's pixels
+    image = bpy.data.images.load(str(path))
+    pixels = np.empty(4 * image.size[0] * image.size[1], np.float32)
+    image.pixels.foreach_get(pixels)
+    bpy.data.images.remove(image)
+    return float(pixels.reshape(-1, 4)[:, :3].mean())
+
+
+def transfer():
+    """To the library, and on to another camera, first free, then with a wall before the lamp."""
+    yield from ui.press_button("fit_flare.save_flare", panel())
+    yield 0.5
+    ui.press("A", ctrl=True)
+    ui.write("Desk lamp")
+    yield 0.3
+    shot("08_save")
+    ui.press("RET")  # out of the field
+    ui.press("RET")  # the dialog
+    library, overlay = module("library"), module("overlay")
+    yield from wait(library.files, 10)
+    assert [path.stem for path in library.files()] == ["Desk lamp"]
+    other, camera = another_shot()
+    yield 0.5
+    view = ui.region("WINDOW")
+    if ui.area().spaces.active.region_3d.view_perspective != "CAMERA":
+        ui.point(view.x + 0.35 * view.width, view.y + 0.5 * view.height)
+        ui.press("NUMPAD_0")
+    yield from ui.press_button("fit_flare.apply_flare", panel())
     yield 1
+    assert [item.target.name for item in other.fit_flare.lights if item.target] == ["Sun lamp"]
     shot("08_transferred")
     free = overlay.picture(other, bpy.context.evaluated_depsgraph_get(), camera, 480, 270)
     mesh = bpy.data.meshes.new("Wall")
@@ -304,19 +322,22 @@ def steps():
     assert hidden.sum() < 0.01 * free.sum()
     yield 0.5
     shot("09_hidden")
-    done("all")
 
 
-def show_preferences(area) -> None:
-    """The preferences of the extension in an area of the window."""
-    import addon_utils
-
-    area.type = "PREFERENCES"
-    bpy.context.preferences.active_section = "ADDONS"
-    bpy.context.window_manager.addon_search = "Fit Flare"
-    for other in addon_utils.modules(refresh=True):
-        if other.__name__ == NAME:
-            addon_utils.module_bl_info(other)["show_expanded"] = True
+def another_shot():
+    """Another scene with a camera and a selected lamp, as an artist has it before a flare is laid over it."""
+    other = bpy.data.scenes.new("Another Shot")
+    bpy.context.window.scene = other
+    camera = bpy.data.objects.new("Second", bpy.data.cameras.new("Second"))
+    camera.rotation_euler = (math.pi / 2, 0, 0)
+    lamp = bpy.data.objects.new("Sun lamp", bpy.data.lights.new("Sun lamp", "POINT"))
+    lamp.location = (-1.2, 6, 0.9)
+    for item in (camera, lamp):
+        other.collection.objects.link(item)
+    other.camera = camera
+    bpy.context.view_layer.update()
+    lamp.select_set(True)
+    return other, camera
 
 
 def speed_of(overlay, scene) -> dict[str, float]:

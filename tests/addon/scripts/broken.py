@@ -2,12 +2,14 @@
 """Inside Blender: everything that can be broken. Words: the zip, a capture, a .flare of it, a folder, a sham engine."""
 from __future__ import annotations
 
+import errno
 import os
 import shutil
 import signal
 import subprocess
 import sys
 import time
+import types
 from functools import partial
 from pathlib import Path
 
@@ -33,12 +35,54 @@ def polls(name: str) -> bool:
     return bool(getattr(ops, name).poll())
 
 
+class Drawn:
+    """Stands for a layout: keeps the labels, takes other calls as Blender would, and looks at what they name."""
+
+    def __init__(self) -> None:
+        self.labels: list[str] = []
+
+    def label(self, text: str = "", **_named: object) -> None:
+        self.labels.append(text)
+
+    def prop(self, data: object, name: str, **_named: object) -> None:
+        getattr(data, name)
+
+    def operator(self, name: str, **_named: object) -> object:
+        group, _, verb = name.partition(".")
+        assert getattr(getattr(bpy.ops, group), verb).get_rna_type(), name
+        return types.SimpleNamespace()
+
+    def template_list(self, kind: str, _id: str, data: object, items: str, active: object, index: str,
+                      **_named: object) -> None:
+        assert hasattr(bpy.types, kind)
+        assert hasattr(data, items)
+        assert hasattr(active, index)
+
+    def __getattr__(self, name: str) -> object:
+        return lambda *_words, **_named: self
+
+
+def shown(name: str) -> str:
+    """What a panel says at the moment."""
+    cls = getattr(part("flare_addon.panels"), f"FITFLARE_PT_{name}")
+    layout = Drawn()
+    own = {key: value for key, value in vars(cls).items() if callable(value)}
+    panel = types.SimpleNamespace(layout=layout)
+    for key, value in own.items():
+        setattr(panel, key, partial(value, panel))
+    panel.draw(bpy.context)
+    return " ".join(layout.labels)
+
+
+PANELS = ("capture", "lights", "fit", "look", "bake", "transfer")
+
 # ---- nothing there yet ------------------------------------------------------------------------------
 scene = empty()
 said["polls of an empty scene"] = {name: polls(name) for name in (
     "import_capture", "capture_from_camera", "add_light", "lights_from_selected", "find_lights", "fit", "resume",
     "bake", "set_up_baked", "remove_compositor", "open_flare", "add_flare", "remove_flare", "save_flare", "apply_flare",
     "pick_light", "test_engine", "remove_engine", "use_result", "show_preview", "cancel")}
+said["panels of an empty scene"] = [shown(name) for name in PANELS]
 said["import of nothing"] = refusal(lambda: ops.import_capture(directory=str(folder)))
 (folder / "bad" / "images").mkdir(parents=True)
 (folder / "bad" / "sparse" / "0").mkdir(parents=True)
@@ -51,6 +95,7 @@ said["no engine"] = refusal(lambda: ops.fit())
 ops.import_capture(directory=capture)
 preferences.engine = str(folder / "nowhere")
 said["engine named, not there"] = [polls("fit"), polls("test_engine")]
+said["panel without an engine"] = shown("fit")
 preferences.engine = sham
 
 
@@ -97,12 +142,15 @@ again.poll()
 said["another program has the number"] = again.state
 shutil.rmtree(run)
 jobs.forget(run)
+said["panel of a lost run"] = shown("fit")
 said["run folder deleted"] = [fits.state_of(scene), jobs.find(run) is None, polls("resume")]
 
 # ---- a capture that moved ---------------------------------------------------------------------------
 scene.fit_flare.run = ""
 Path(capture).rename(Path(capture).with_name("away"))
 said["capture moved"] = [polls("fit"), fits.capture_of(scene).is_dir()]
+said["panels of a moved capture"] = [shown("capture"), shown("fit")]
+said["operators of a moved capture"] = [refusal(ops.find_lights), refusal(ops.clean_frames), refusal(ops.fit)]
 Path(capture).with_name("away").rename(capture)
 
 # ---- .flare files -----------------------------------------------------------------------------------
@@ -124,6 +172,42 @@ except part("core.errors").FitFlareError as problem:
 said["save of a deleted flare"] = refusal(lambda: ops.save_flare(name="x"))
 said["bake of a deleted flare"] = refusal(lambda: ops.bake())
 
+# ---- a full disk, and an engine that dies while it bakes ----------------------------------------------
+ops.open_flare(filepath=flare)
+scene.fit_flare.layers = str(folder / "layers")
+baked: list[object] = []
+for how in ("breaks", "fills", "bakes"):
+    behave(how)
+    baked.append([refusal(lambda: ops.bake()), shown("bake"), sorted(
+        path.name for path in (folder / "layers").glob("*.exr"))])
+said["bakes"] = baked
+
+
+def full(*_words: object, **_named: object) -> None:
+    """A disk that takes nothing more."""
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(folder))
+
+
+lights, library, shots = (part(f"flare_addon.{name}") for name in ("lights", "library", "shots"))
+write_shot, shots.Shot.write = shots.Shot.write, full
+said["bake on a full disk"] = refusal(lambda: ops.bake())
+shots.Shot.write = write_shot
+annotated, library.annotated = library.annotated, full
+said["save on a full disk"] = refusal(lambda: ops.save_flare(name="full"))
+said["library after"] = [path.name for path in library.files()]
+library.annotated = annotated
+write_json, jobs.write_json = jobs.write_json, full
+scene.fit_flare.run = ""
+behave("sleeps")
+began = time.monotonic()
+said["fit on a full disk"] = refusal(lambda: ops.fit())
+said["its engine is not left alone"] = time.monotonic() - began < 5 and not jobs.running()
+jobs.write_json, jobs.FULL = write_json, 1 << 62  # every disk is full by that
+behave("ends")
+said["no room for the last words"] = refusal(lambda: ops.fit())
+jobs.FULL = 1 << 16
+scene.fit_flare.run = ""
+
 # ---- cameras and scenes -----------------------------------------------------------------------------
 ops.open_flare(filepath=flare)
 scene.camera.data.type = "ORTHO"
@@ -131,6 +215,7 @@ said["orthographic"] = refusal(lambda: ops.bake())
 scene.camera.data.type = "PERSP"
 bpy.data.objects.remove(scene.camera)
 said["camera deleted"] = [polls("bake"), scene.camera is None]
+said["panel without a camera"] = shown("look")
 target = scene.fit_flare.lights[0].target
 bpy.data.objects.remove(target)
 said["light deleted"] = scene.fit_flare.lights[0].target is None
@@ -151,7 +236,33 @@ def dump() -> list[object]:
     now = bpy.context.scene
     state = now.fit_flare
     return [sorted(item.name for item in bpy.data.objects), state.flare, [item.name for item in state.lights],
-            state.master.intensity, now.render.resolution_x, state.capture]
+            state.master.intensity, now.render.resolution_x, state.capture, len(state.lights),
+            sorted(item.name for item in now.objects if item.fit_flare.is_light),
+            part("flare_addon.compositor").find_node(now) is not None]
+
+
+def slide() -> set[str]:
+    """A slider dragged, which reset_look puts back."""
+    bpy.context.scene.fit_flare.master.intensity = 2.0
+    return {"FINISHED"}
+
+
+def prepare(name: str) -> None:
+    """What an operator needs, done before its undo step."""
+    state = bpy.context.scene.fit_flare
+    if name == "lights_from_selected":
+        cube = bpy.data.objects.new("Bulb", None)
+        bpy.context.scene.collection.objects.link(cube)
+        bpy.context.view_layer.update()
+        for item in bpy.context.selected_objects:
+            item.select_set(False)
+        cube.select_set(True)
+    elif name == "apply_flare":
+        assert ops.save_flare(name="Saved") == {"FINISHED"}
+        state.flare = ""
+        state.lights.clear()
+    elif name == "set_up_baked":
+        state.layers = str(folder / "real")
 
 
 undone: dict[str, bool] = {}
@@ -162,7 +273,15 @@ for name, call in (("import_capture", lambda: ops.import_capture(directory=captu
                    ("remove_flare", lambda: ops.remove_flare()),
                    ("shot_from_picture", lambda: ops.shot_from_picture(
                        filepath=str(sorted((Path(capture) / "images").iterdir())[0]))),
-                   ("pick_light", lambda: ops.pick_light(x=0.5, y=0.5))):
+                   ("pick_light", lambda: ops.pick_light(x=0.5, y=0.5)),
+                   ("lights_from_selected", lambda: ops.lights_from_selected()),
+                   ("remove_light", lambda: ops.remove_light(object="lamp")),
+                   ("slider", slide), ("reset_look", lambda: ops.reset_look()),
+                   ("apply_flare", lambda: ops.apply_flare(filepath=flare)),
+                   ("set_up_baked", lambda: ops.set_up_baked()),
+                   ("remove_compositor", lambda: ops.remove_compositor())):
+    prepare(name)
+    bpy.ops.ed.undo_push(message="before")
     before = dump()
     assert call() == {"FINISHED"}, name
     bpy.ops.ed.undo_push(message=name)

@@ -15,6 +15,12 @@ case $(cat "$here/behaviour") in
   refuses) echo '{"type": "error", "text": "The frames are not there; put them back."}'; exit 1 ;;
   chatters) echo 'no JSON'; echo '{"type": 7'; echo '[]'; echo '{"text": 1}'; exit 3 ;;
   ends) exit 0 ;;
+  fills) mkdir -p "$out"; echo layer > "$out/layers.0001.exr"
+         echo '{"type": "error", "text": "The disk is full (layers.0002.exr); make room and start it again, what is finished is kept."}'
+         exit 1 ;;
+  breaks) mkdir -p "$out"; echo layer > "$out/layers.0001.exr"; kill -9 $$ ;;
+  bakes) [ -f "$out/layers.0001.exr" ] && echo layer > "$out/layers.0002.exr"
+         echo '{"type": "result", "data": {"layers": "x", "frames": 2}}' ;;
   finishes) mkdir -p "$out"; cp "$here/lamp.flare" "$out/flare.flare"; echo '{"type": "result", "data": {"run": "x"}}' ;;
   answers) echo '{"type": "result", "data": {"version": "1", "torch": "2", "device": "a sham"}}' ;;
   sleeps) trap 'echo "{\"type\": \"error\", \"text\": \"Stopped during fit as asked; run it again to go on.\"}"; exit 130' INT

@@ -1,0 +1,95 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What a mouse has to wait for: the longest time between two calls of a timer, and how much of it is our own code."""
+from __future__ import annotations
+
+import importlib
+import time
+
+import bpy
+
+NAME = "bl_ext.user_default.fit_flare"
+
+
+def module(name: str):
+    """A module of the installed extension."""
+    return importlib.import_module(f"{NAME}.flare_addon.{name}")
+
+
+class Gaps:
+    """The longest time between two calls of a 10 ms timer, while Blender draws, handles events and runs our code."""
+
+    def __init__(self) -> None:
+        self.gaps: list[float] = []
+        self.last = time.perf_counter()
+        self.on, self.paused = True, False
+        bpy.app.timers.register(self.tick, persistent=True)
+
+    def tick(self):
+        now = time.perf_counter()
+        if not self.paused:
+            self.gaps.append(now - self.last)
+        self.last, self.paused = now, False
+        return 0.01 if self.on else None
+
+    def pause(self) -> None:
+        """Leave out what comes now, a screenshot that this script itself takes."""
+        self.paused = True
+
+    def stop(self) -> dict[str, float]:
+        self.on = False
+        gaps = sorted(self.gaps[2:]) or [0.0]
+        return {"longest_gap_ms": milliseconds(gaps[-1]),
+                "gap_99_percent_ms": milliseconds(gaps[len(gaps) * 99 // 100]),
+                "gaps_over_100_ms": sum(gap > 0.1 for gap in gaps), "gaps": len(gaps)}
+
+
+def milliseconds(seconds: float) -> float:
+    return round(1e3 * seconds, 1)
+
+
+def timed(target, name: str, record: list[float]) -> None:
+    """Measure each call of a function of the add-on."""
+    inner = getattr(target, name)
+
+    def call(*words, **named):
+        began = time.perf_counter()
+        try:
+            return inner(*words, **named)
+        finally:
+            record.append(time.perf_counter() - began)
+    setattr(target, name, call)
+
+
+def timed_draw(panel, record: list[float]) -> None:
+    """The same of a panel's drawing, with the signature that Blender asks for."""
+    inner = panel.draw
+
+    def draw(self, context):
+        began = time.perf_counter()
+        inner(self, context)
+        record.append(time.perf_counter() - began)
+    panel.draw = draw
+
+
+class Ours:
+    """Times of all that the extension does in the window's thread while the engine works."""
+
+    def __init__(self) -> None:
+        self.times: dict[str, list[float]] = {}
+        timed(module("jobs"), "_tick", self._of("look at the engine"))
+        for panel in module("panels")._CLASSES:
+            timed_draw(panel, self._of(f"panel {panel.bl_label}"))
+        timed(module("looks"), "use", self._of("take the flare in"))
+        timed(module("looks"), "read", self._of("read a .flare"))
+        for name in ("overlay", "points"):
+            drawn = module(name)
+            drawn.unregister()
+            timed(drawn, "_draw", self._of(f"draw {name}"))
+            drawn.register()
+
+    def _of(self, name: str) -> list[float]:
+        return self.times.setdefault(name, [])
+
+    def longest(self) -> dict[str, float]:
+        """Milliseconds of the longest call, by what it was."""
+        return {name: milliseconds(max(times)) for name, times in self.times.items() if times}

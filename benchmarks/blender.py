@@ -35,8 +35,8 @@ def load(name: str) -> Any:
     return importlib.import_module(f"{run.load()}.{name}")
 
 
-def make_capture(folder: Path) -> Path:
-    """Text model of cameras on a circle, one-pixel frames of the right header, binary points."""
+def make_capture(folder: Path, cameras: int = CAMERAS) -> Path:
+    """Binary model of cameras on a circle, grey frames, points."""
     import zlib
 
     model, images = folder / "sparse" / "0", folder / "images"
@@ -49,10 +49,10 @@ def make_capture(folder: Path) -> Path:
 
     png = (b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", struct.pack(">IIBBBBB", 96, 54, 8, 2, 0, 0, 0)) + chunk(b"IDAT", raw)
            + chunk(b"IEND", b""))
-    cameras = struct.pack("<Q", 1) + struct.pack("<iiQQ4d", 1, 1, 96, 54, 90.0, 90.0, 47.0, 28.0)
-    (model / "cameras.bin").write_bytes(cameras)
-    lines = [struct.pack("<Q", CAMERAS)]
-    for number in range(CAMERAS):
+    lens = struct.pack("<Q", 1) + struct.pack("<iiQQ4d", 1, 1, 96, 54, 90.0, 90.0, 47.0, 28.0)
+    (model / "cameras.bin").write_bytes(lens)
+    lines = [struct.pack("<Q", cameras)]
+    for number in range(cameras):
         angle = 0.01 * number
         name = f"{number + 1:04d}.png"
         (images / name).write_bytes(png)

@@ -26,7 +26,6 @@ import bpy
 
 from ..core.errors import DISK_FULL, EngineError, FitFlareError, RunError, refusal
 from ..core.files import write_json
-from .properties import redraw
 
 State = Literal["running", "done", "failed", "stopped"]
 
@@ -35,6 +34,7 @@ WINDOWS = os.name == "nt"
 STOPPED = 130  # the status of a command that was stopped (headless/cli.py)
 EVERY_S = 0.2
 NICENESS = 5
+TAB = "Fit Flare"  # of the sidebar
 AT_ONCE = 1 << 16  # bytes of events read at a time
 FULL = 1 << 16  # a disk with fewer bytes free is full
 
@@ -291,11 +291,20 @@ def _watch() -> None:
 def _tick() -> float | None:
     news = [job.poll() for job in running()]
     if any(news):
-        redraw()
-        for area in (area for window in bpy.context.window_manager.windows for area in window.screen.areas):
-            if area.type in ("IMAGE_EDITOR", "PREFERENCES"):
-                area.tag_redraw()
+        _redraw_bars()
     return EVERY_S if running() else None
+
+
+def _redraw_bars() -> None:
+    """Have what shows progress drawn again: the sidebars with our tab and the preferences. Not the 3D views, which are
+    dear to draw; where the work changes what they show, its properties say so."""
+    for area in (area for window in bpy.context.window_manager.windows for area in window.screen.areas):
+        if area.type == "PREFERENCES":
+            area.tag_redraw()
+        elif area.type == "VIEW_3D":
+            for region in area.regions:
+                if region.type == "UI" and region.active_panel_category == TAB:
+                    region.tag_redraw()
 
 
 def unregister() -> None:

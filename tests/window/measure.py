@@ -90,6 +90,11 @@ class Ours:
     def _of(self, name: str) -> list[float]:
         return self.times.setdefault(name, [])
 
+    def forget(self) -> None:
+        """Begin anew."""
+        for times in self.times.values():
+            times.clear()
+
     def longest(self) -> dict[str, float]:
         """Milliseconds of the longest call, by what it was."""
         return {name: milliseconds(max(times)) for name, times in self.times.items() if times}

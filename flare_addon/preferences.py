@@ -2,6 +2,7 @@
 """What the user sets once: the engine, and the library of flares."""
 from __future__ import annotations
 
+import sys
 from typing import Any
 
 import bpy
@@ -11,6 +12,7 @@ from .reports import Action
 
 # The extension's full name ("bl_ext.user_default.fit_flare"), by which Blender knows its preferences.
 PACKAGE = __package__.rpartition(".")[0]
+DOWNLOAD = f"about {'3 GB, most of it CUDA,' if sys.platform == 'linux' else '1 GB'} to download once"
 
 
 class FITFLARE_AP_preferences(bpy.types.AddonPreferences):
@@ -42,17 +44,19 @@ def _draw_engine(layout: Any) -> None:
     python, test, making = engine.find(), engine.tested(), engine.setting_up()
     if making is not None and making.running:
         draw_progress(box, making, "Setting up the engine")
+        _log_of(box, making)
         return
     if python is None:
         named = bool(engine_path())
         box.label(text="The engine that is named is not there" if named else "No engine yet", icon="ERROR")
-        lines(box, "Set it up here (about 1 GB to download, once), or name a Python above that has torch.")
+        lines(box, f"Set it up here ({DOWNLOAD}), or name a Python above that has torch.")
         if not bpy.app.online_access:
             lines(box, "Set Up Engine needs online access: allow it in System > Network.", "INTERNET_OFFLINE")
     else:
         box.label(text=f"Engine: {python}", icon="CHECKMARK")
     if making is not None and making.state in ("failed", "stopped"):
         lines(box, making.error, "ERROR")
+        _log_of(box, making)
     if test is not None and test.running:
         box.label(text="Testing …", icon="SORTTIME")
     elif test is not None and test.state == "done":
@@ -65,6 +69,12 @@ def _draw_engine(layout: Any) -> None:
     row.operator("fit_flare.test_engine", icon="PLAY")
     row.operator("fit_flare.set_up_engine", icon="IMPORT")
     row.operator("fit_flare.remove_engine", icon="TRASH")
+
+
+def _log_of(layout: Any, job: jobs.Job) -> None:
+    row = layout.row()
+    row.alignment = "LEFT"
+    row.operator("fit_flare.show_log", icon="TEXT", text="Log").folder = str(job.folder)
 
 
 def draw_progress(layout: Any, job: jobs.Job, text: str) -> None:
@@ -145,7 +155,7 @@ class FITFLARE_OT_test_engine(Action, bpy.types.Operator):
 
 
 class FITFLARE_OT_set_up_engine(Action, bpy.types.Operator):
-    """Install the engine (torch and its libraries, about 1 GB to download) into the extension's own folder"""
+    """Install the engine (torch and its libraries, 1 GB to download, 3 on Linux) into the extension's own folder"""
 
     bl_idname = "fit_flare.set_up_engine"
     bl_label = "Set Up Engine"

@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Installs the engine: `python headless/set_up.py FOLDER` makes a virtual environment there and fills it.
 
-The add-on runs it with Blender's own Python, which has pip; it needs nothing but the standard library. The
-packages are those of the group "engine" in pyproject.toml, at the versions of constraints.txt where this
-Python has them. Events go to standard output, one JSON object a line (core/progress.py). A folder that a
-stopped set-up left is made anew.
+The add-on runs it with Blender's own Python; it needs nothing but the standard library. The packages are those of
+the group "engine" in pyproject.toml, at the versions of constraints.txt. Events go to standard output, one JSON
+object a line (core/progress.py). A folder that a stopped set-up left is made anew.
 """
 from __future__ import annotations
 
@@ -33,6 +32,35 @@ def python_in(folder: Path) -> Path:
     return folder / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
 
 
+def run(command: list[str]) -> str:
+    """Run a command whose words go to the log; "" where it ended well, else what it said was wrong."""
+    last, unreached = "", False
+    with subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+                          text=True, errors="replace") as process:
+        assert process.stdout is not None
+        for line in process.stdout:
+            print(line, end="", file=sys.stderr, flush=True)
+            unreached |= "Retrying (" in line  # what pip makes of that in the end speaks of versions
+            if not last.startswith("ERROR:"):
+                last = line.strip() or last
+    if not process.returncode:
+        return ""
+    if unreached:
+        return "the network could not be reached"
+    return last.removeprefix("ERROR:").strip(" .")[:200] or f"status {process.returncode}"
+
+
+def base() -> str | None:
+    """The Python to make the environment with: this one, else one on the PATH, that has what `venv` needs; a Blender of
+    a Linux distribution often comes without. None where there is none."""
+    ask = "import ensurepip, sys, venv; sys.exit(sys.version_info < (3, 11))"
+    places = [sys.executable, *(shutil.which(f"python3.{minor}") for minor in (13, 12, 11)), shutil.which("python3")]
+    for python in filter(None, places):
+        if subprocess.run([python, "-I", "-c", ask], capture_output=True, check=False).returncode == 0:
+            return python
+    return None
+
+
 def main(words: list[str]) -> int:
     if not words:
         print(__doc__, file=sys.stderr)
@@ -40,23 +68,29 @@ def main(words: list[str]) -> int:
     folder, wanted = Path(words[0]), words[1:] or packages()
     steps = ["a place of its own", *wanted, "a test"]
     say(type="stage", name="set up", total=len(steps), done=0)
+    maker = base()
+    if maker is None:
+        say(type="error", text=f"{sys.executable} has no ensurepip to make an environment with (Debian keeps it in "
+                               "python3-venv); install it, or name a Python that has torch in the field Engine.")
+        return 1
     shutil.rmtree(folder, ignore_errors=True)
     python = python_in(folder)
     constraints = ROOT / "constraints.txt"
-    pip = [str(python), "-m", "pip", "install", "--disable-pip-version-check", "--no-input"]
+    pip = [str(python), "-m", "pip", "install", "--disable-pip-version-check", "--no-input",
+           "--only-binary", ":all:"]  # building one takes a compiler, which an artist has not
     if constraints.is_file():
         pip += ["-c", str(constraints)]
     test = "import importlib.util, sys; sys.exit(importlib.util.find_spec('torch') is None)"
-    commands = [[sys.executable, "-m", "venv", str(folder)], *([*pip, name] for name in wanted)]
+    commands = [[maker, "-m", "venv", str(folder)], *([*pip, name] for name in wanted)]
     if not words[1:]:
         commands.append([str(python), "-c", test])
     for number, (what, command) in enumerate(zip(steps, commands, strict=False)):
         say(type="say", text=f"Installing {what}")
-        done = subprocess.run(command, stdin=subprocess.DEVNULL, stdout=sys.stderr, stderr=sys.stderr, check=False)
-        if done.returncode:
+        refused = run(command)
+        if refused:
             shutil.rmtree(folder, ignore_errors=True)
-            say(type="error", text=f"{what.capitalize()} could not be installed (status {done.returncode}); look at "
-                                   "the log, check the network and the free disk space, and set up again.")
+            say(type="error", text=f"{what[0].upper()}{what[1:]} could not be installed ({refused}); look at the log, "
+                                   "check the network and the free disk space, and set up again.")
             return 1
         say(type="progress", stage="set up", done=number + 1, total=len(steps), left_s=None, figures={})
     say(type="result", data={"engine": str(python)})

@@ -46,5 +46,6 @@ def test_it_makes_an_environment_and_fills_it(tmp_path: Path) -> None:
 def test_a_failure_is_told_and_leaves_nothing(tmp_path: Path) -> None:
     status, events = set_up(tmp_path / "engine", tmp_path / "nowhere-1.0-py3-none-any.whl")
     assert status == 1
-    assert "could not be installed" in events[-1]["text"]
+    assert "could not be installed (" in events[-1]["text"]
+    assert "nowhere-1.0" in events[-1]["text"], "what pip said"
     assert not (tmp_path / "engine").exists()

@@ -71,7 +71,7 @@ def steps():
     module("looks").use(scene, flare)  # what the end of a fit does
     yield 2
     figures["a flare taken in"] = gaps.stop()
-    figures["ours_ms"] = ours.longest()
+    figures.update(ours.longest())
     (out / "blocking.json").write_text(json.dumps(figures, indent=2))
     print(json.dumps(figures, indent=2), flush=True)
 

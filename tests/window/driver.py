@@ -196,14 +196,19 @@ def fill(x: float, y: float, text: str):
     yield 0.3
 
 
-def choose_item(x: float, y: float, down: int):
-    """Choose the entry that lies `down` below the present one in the menu that opens there. Steps."""
-    click(x, y)
-    yield 0.4
-    for _ in range(down):
-        press("DOWN_ARROW")
-    press("RET")
-    yield 0.3
+def choose_item(x: float, y: float, chosen: Callable[[], bool]):
+    """Choose from the menu that opens there, an entry further down each time, until it is the one. Steps."""
+    for down in range(8):
+        click(x, y)
+        yield 0.4
+        press("HOME")
+        for _ in range(down):
+            press("DOWN_ARROW")
+        press("RET")
+        yield 0.4
+        if chosen():
+            return
+    raise LookupError("the menu has no such entry")
 
 
 def show_editor(of, kind: str):

@@ -2,8 +2,10 @@
 """What a mouse has to wait for: the longest time between two calls of a timer, and how much of it is our own code."""
 from __future__ import annotations
 
+import contextlib
 import importlib
 import time
+from collections.abc import Iterator
 
 import bpy
 
@@ -47,27 +49,37 @@ def milliseconds(seconds: float) -> float:
     return round(1e3 * seconds, 1)
 
 
-def timed(target, name: str, record: list[float]) -> None:
+Times = list[tuple[float, float]]
+"""Of each call the seconds that went by, and those that this thread worked: a busy machine makes the first longer."""
+
+
+@contextlib.contextmanager
+def noted(record: Times) -> Iterator[None]:
+    """Measure a block."""
+    began, worked = time.perf_counter(), time.thread_time()
+    try:
+        yield
+    finally:
+        record.append((time.perf_counter() - began, time.thread_time() - worked))
+
+
+def timed(target, name: str, record: Times) -> None:
     """Measure each call of a function of the add-on."""
     inner = getattr(target, name)
 
     def call(*words, **named):
-        began = time.perf_counter()
-        try:
+        with noted(record):
             return inner(*words, **named)
-        finally:
-            record.append(time.perf_counter() - began)
     setattr(target, name, call)
 
 
-def timed_draw(panel, record: list[float]) -> None:
+def timed_draw(panel, record: Times) -> None:
     """The same of a panel's drawing, with the signature that Blender asks for."""
     inner = panel.draw
 
     def draw(self, context):
-        began = time.perf_counter()
-        inner(self, context)
-        record.append(time.perf_counter() - began)
+        with noted(record):
+            inner(self, context)
     panel.draw = draw
 
 
@@ -75,7 +87,7 @@ class Ours:
     """Times of all that the extension does in the window's thread while the engine works."""
 
     def __init__(self) -> None:
-        self.times: dict[str, list[float]] = {}
+        self.times: dict[str, Times] = {}
         timed(module("jobs"), "_tick", self._of("look at the engine"))
         for panel in module("panels")._CLASSES:
             timed_draw(panel, self._of(f"panel {panel.bl_label}"))
@@ -87,7 +99,7 @@ class Ours:
             timed(drawn, "_draw", self._of(f"draw {name}"))
             drawn.register()
 
-    def _of(self, name: str) -> list[float]:
+    def _of(self, name: str) -> Times:
         return self.times.setdefault(name, [])
 
     def forget(self) -> None:
@@ -95,6 +107,7 @@ class Ours:
         for times in self.times.values():
             times.clear()
 
-    def longest(self) -> dict[str, float]:
-        """Milliseconds of the longest call, by what it was."""
-        return {name: milliseconds(max(times)) for name, times in self.times.items() if times}
+    def longest(self) -> dict[str, dict[str, float]]:
+        """Milliseconds of the longest call, by what it was: by the clock, and at work."""
+        return {kind: {name: milliseconds(max(one[index] for one in times)) for name, times in self.times.items()
+                       if times} for index, kind in enumerate(("ours_ms", "ours_at_work_ms"))}

@@ -23,5 +23,5 @@ def test_the_whole_work_in_the_real_window(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
     facts = json.loads((tmp_path / "facts.json").read_text())
     assert facts["done"][-1] == "all"
-    assert facts["longest_read_ms"] < 100
+    assert max(facts["ours_at_work_ms"].values()) < 100
     assert agreement(tmp_path) > 50

@@ -34,7 +34,7 @@ class FITFLARE_OT_import_capture(Action, bpy.types.Operator):
     scale: bpy.props.FloatProperty(  # type: ignore[valid-type]
         name="Scale", description="Scene units for each unit of the capture", default=1.0, min=1e-6, soft_max=100.0)
     frames: bpy.props.BoolProperty(  # type: ignore[valid-type]
-        name="Frames behind Cameras", description="Show the frames as background images", default=True)
+        name="Frames", description="Show the frames behind the cameras, as background images", default=True)
     points: bpy.props.BoolProperty(  # type: ignore[valid-type]
         name="Points", description="Bring the point cloud in as a mesh with colours", default=True)
     match_scene: bpy.props.BoolProperty(  # type: ignore[valid-type]

@@ -13,16 +13,25 @@ events through a module `ui_driver`. {base} is the folder with the package and t
 from __future__ import annotations
 
 import argparse
+import contextlib
 import os
 import shlex
 import shutil
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
 LEFT_OUT = 77
+VIEW, PREFERENCES = (0, 28, 1313, 908), (168, 55, 1313, 465)
+PICTURES = {
+    "preferences": ("01_preferences", PREFERENCES), "setting_up": ("11_setting_up", PREFERENCES),
+    "imported": ("03_imported", VIEW), "fitting": ("04_fitting", VIEW), "flare": ("05_flare", VIEW),
+    "look": ("06_look_and_bake", VIEW), "compositor": ("07_compositor", (0, 0, 1600, 1000)),
+    "transferred": ("08_transferred", VIEW), "hidden": ("09_hidden", VIEW)}
+"""The handbook's pictures: of which screenshot, and which part (left, top, right, bottom) at 1600x1000."""
 
 
 def main() -> int:
@@ -33,19 +42,22 @@ def main() -> int:
     parser.add_argument("--engine", default=os.environ.get("FIT_FLARE_ENGINE") or str(ROOT / ".venv"))
     parser.add_argument("--script", type=Path, default=ROOT / "tests" / "window" / "flow.py")
     parser.add_argument("--size", default="1600x1000")
+    parser.add_argument("--pictures", type=Path, metavar="DIR", help="cut the handbook's pictures out of the shots")
     words = parser.parse_args()
     if not words.blender and not words.command:
         print("left out: no Blender here; name one with --blender or FIT_FLARE_BLENDER.", file=sys.stderr)
         return LEFT_OUT
     out = words.out.resolve()
     out.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory() as base:
-        folder = Path(base)
+    with base_folder(words.pictures is not None) as folder:
         subprocess.run([sys.executable, str(ROOT / "headless" / "package.py"), str(folder)], check=True)
         shutil.copytree(ROOT / "sample_scenes" / "desk", folder / "desk")
         environment = {**os.environ, "BLENDER_USER_RESOURCES": str(folder / "profile"),
                        "FIT_FLARE_ZIP": str(next(folder.glob("*.zip"))), "FIT_FLARE_CAPTURE": str(folder / "desk"),
                        "FIT_FLARE_ENGINE": words.engine, "FIT_FLARE_OUT": str(out)}
+        if words.pictures and words.engine:  # their paths are to say nothing of this machine
+            (folder / "engine").symlink_to(Path(words.engine).resolve())
+            environment["FIT_FLARE_ENGINE"] = str(folder / "engine")
         script = words.script.resolve()
         command = [words.blender, "--enable-event-simulate", "--window-geometry", "0", "0", *words.size.split("x"),
                    "-noaudio", "--python-exit-code", "1", "--python", str(script)]
@@ -55,7 +67,37 @@ def main() -> int:
         status = subprocess.run(command, env=environment, check=False).returncode
     if not status and (out / "overlay.npy").is_file():
         print(f"overlay against the baked layer: {agreement(out):.1f} dB")
+    if not status and words.pictures:
+        cut(out, words.pictures)
     return status
+
+
+@contextlib.contextmanager
+def base_folder(plain: bool) -> Iterator[Path]:
+    """A temporary folder, of a plain name where it is to be seen in pictures."""
+    with tempfile.TemporaryDirectory() as made:
+        folder = Path(tempfile.gettempdir()) / "fit_flare" if plain else Path(made)
+        folder.mkdir(exist_ok=True)
+        try:
+            yield folder
+        finally:
+            if plain:
+                shutil.rmtree(folder)
+
+
+def cut(shots: Path, pictures: Path) -> None:
+    """JPEG, 1200 pixels wide at most, of the screenshots that are there."""
+    import cv2
+
+    for name, (shot, (left, top, right, bottom)) in PICTURES.items():
+        whole = cv2.imread(str(shots / f"{shot}.png"))
+        if whole is None:
+            continue
+        part = whole[top:bottom, left:right]
+        width = min(part.shape[1], 1200)
+        size = width, round(part.shape[0] * width / part.shape[1])
+        cv2.imwrite(str(pictures / f"{name}.jpg"), cv2.resize(part, size, interpolation=cv2.INTER_AREA),
+                    [cv2.IMWRITE_JPEG_QUALITY, 80])
 
 
 def agreement(out: Path) -> float:

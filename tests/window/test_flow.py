@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The driven flow in a real Blender's window, where one is named: FIT_FLARE_BLENDER_WINDOW=/path/to/blender."""
+"""The driven flow in a real Blender's window, where one is named: FIT_FLARE_BLENDER_WINDOW=/path/to/blender, or
+FIT_FLARE_WINDOW_COMMAND with a command line as tests/window/run.py takes it."""
 from __future__ import annotations
 
 import json
@@ -11,11 +12,12 @@ from pathlib import Path
 import pytest
 from run import agreement
 
-BLENDER = os.environ.get("FIT_FLARE_BLENDER_WINDOW", "")
+BLENDER, COMMAND = (os.environ.get(f"FIT_FLARE_{name}", "") for name in ("BLENDER_WINDOW", "WINDOW_COMMAND"))
 
 
-@pytest.mark.skipif(not BLENDER, reason="no real Blender with a window is named (FIT_FLARE_BLENDER_WINDOW); "
-                                        "the flow of tests/window was not run")
+@pytest.mark.skipif(not BLENDER and not COMMAND,
+                    reason="no real Blender with a window is named (FIT_FLARE_BLENDER_WINDOW, FIT_FLARE_WINDOW_COMMAND); "
+                           "the flow of tests/window was not run")
 def test_the_whole_work_in_the_real_window(tmp_path: Path) -> None:
     runner = Path(__file__).with_name("run.py")
     done = subprocess.run([sys.executable, str(runner), "--blender", BLENDER, "--out", str(tmp_path)],

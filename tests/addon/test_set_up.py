@@ -2,13 +2,16 @@
 """The engine's set-up by one click, with a package made on the spot in place of torch."""
 from __future__ import annotations
 
+import importlib.util
 import json
+import os
 import subprocess
 import sys
 import zipfile
 from pathlib import Path
 from typing import Any
 
+import pytest
 from blenders import ROOT
 
 SCRIPT = ROOT / "headless" / "set_up.py"
@@ -49,3 +52,36 @@ def test_a_failure_is_told_and_leaves_nothing(tmp_path: Path) -> None:
     assert "could not be installed (" in events[-1]["text"]
     assert "nowhere-1.0" in events[-1]["text"], "what pip said"
     assert not (tmp_path / "engine").exists()
+
+
+def module() -> Any:
+    spec = importlib.util.spec_from_file_location("set_up", SCRIPT)
+    assert spec is not None
+    assert spec.loader is not None
+    found = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(found)
+    return found
+
+
+@pytest.mark.skipif(os.name == "nt", reason="the Python without ensurepip is a shell script")
+def test_a_blender_without_ensurepip_takes_another_python(tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+                                                          capsys: pytest.CaptureFixture[str]) -> None:
+    set_up_, able = module(), sys.executable
+    unable = tmp_path / "blenders-own"
+    unable.write_text("#!/bin/sh\nexit 1\n")
+    unable.chmod(0o755)
+    monkeypatch.setattr(sys, "executable", str(unable))
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert set_up_.main([str(tmp_path / "engine")]) == 1
+    event = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert event["type"] == "error"
+    assert "python3-venv" in event["text"]
+    (tmp_path / "python3.11").symlink_to(able)
+    assert set_up_.base() == str(tmp_path / "python3.11")
+
+
+def test_a_network_that_is_down_is_told_as_one() -> None:
+    said = "print('WARNING: Retrying (Retry(total=4)) after connection broken'); print('ERROR: No matching'); exit(1)"
+    assert module().run([sys.executable, "-c", said]) == "the network could not be reached"
+    assert module().run([sys.executable, "-c", "print('ERROR: No room left.'); exit(1)"]) == "No room left"
+    assert module().run([sys.executable, "-c", "print('fine')"]) == ""

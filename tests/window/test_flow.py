@@ -16,7 +16,7 @@ BLENDER, COMMAND = (os.environ.get(f"FIT_FLARE_{name}", "") for name in ("BLENDE
 
 
 @pytest.mark.skipif(not BLENDER and not COMMAND,
-                    reason="no real Blender with a window is named (FIT_FLARE_BLENDER_WINDOW, FIT_FLARE_WINDOW_COMMAND); "
+                    reason="neither FIT_FLARE_BLENDER_WINDOW nor FIT_FLARE_WINDOW_COMMAND names a real Blender; "
                            "the flow of tests/window was not run")
 def test_the_whole_work_in_the_real_window(tmp_path: Path) -> None:
     runner = Path(__file__).with_name("run.py")

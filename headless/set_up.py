@@ -33,13 +33,15 @@ def python_in(folder: Path) -> Path:
 
 
 def run(command: list[str]) -> str:
-    """Run a command whose words go to the log; "" where it ended well, else what it said was wrong."""
+    """Run a command whose words go to the log, what it loads to the window too; "" where it ended well, else what it said was wrong."""
     last, unreached = "", False
     with subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
                           text=True, errors="replace") as process:
         assert process.stdout is not None
         for line in process.stdout:
             print(line, end="", file=sys.stderr, flush=True)
+            if line.strip().startswith(("Downloading ", "Installing collected")):
+                say(type="say", text=line.strip()[:120])  # torch takes minutes
             unreached |= "Retrying (" in line  # what pip makes of that in the end speaks of versions
             if not last.startswith("ERROR:"):
                 last = line.strip() or last

@@ -33,7 +33,8 @@ def python_in(folder: Path) -> Path:
 
 
 def run(command: list[str]) -> str:
-    """Run a command whose words go to the log, what it loads to the window too; "" where it ended well, else what it said was wrong."""
+    """Run a command whose words go to the log, what it loads to the events too; "" where it ended well, else what it
+    said was wrong."""
     last, unreached = "", False
     with subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
                           text=True, errors="replace") as process:

@@ -41,7 +41,7 @@ def test_it_makes_an_environment_and_fills_it(tmp_path: Path) -> None:
     status, events = set_up(tmp_path / "engine", wheel(tmp_path, "sham_torch"))
     assert status == 0
     assert [event["type"] for event in events if event["type"] != "say"] == ["stage", "progress", "progress", "result"]
-    assert "Installing collected packages: sham_torch" in [event.get("text") for event in events]
+    assert any("Installing collected packages" in event.get("text", "") for event in events)
     python = events[-1]["data"]["engine"]
     assert subprocess.run([python, "-c", "import sham_torch"], check=False).returncode == 0
     assert not (tmp_path / "engine" / "left").exists()

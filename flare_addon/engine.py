@@ -10,6 +10,7 @@ from pathlib import Path
 import bpy
 
 from ..core.errors import EngineError, FitFlareError
+from ..core.files import write_text
 from . import jobs
 from .jobs import Job
 
@@ -17,6 +18,7 @@ ROOT = Path(__file__).resolve().parents[1]
 RUN = ROOT / "headless" / "run.py"
 PACKAGE = (__package__ or "").rpartition(".")[0]
 FOLDER = "engine"
+TESTED = "python.txt"  # which Python the last test was of
 MISSING = "No engine is set up. Open the preferences of Fit Flare and set one up, or name a Python that has it"
 
 
@@ -77,12 +79,19 @@ def run(kind: str, folder: Path, words: Sequence[object]) -> Job:
 
 def test() -> Job:
     """Ask the engine what it is; the answer is the job's result (version, torch, device, kernels)."""
-    return run("test", user_folder("test", create=True), ["engine"])
+    folder = user_folder("test", create=True)
+    write_text(folder / TESTED, str(find()))
+    return run("test", folder, ["engine"])
 
 
 def tested() -> Job | None:
-    """The last test, if there was one."""
-    return jobs.find(user_folder("test"))
+    """The last test, if it was of the engine that is there now."""
+    folder, python = user_folder("test"), find()
+    try:
+        same = python is not None and (folder / TESTED).read_text(encoding="utf-8") == str(python)
+    except (OSError, ValueError):
+        return None
+    return jobs.find(folder) if same else None
 
 
 def set_up() -> Job:

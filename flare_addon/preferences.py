@@ -186,7 +186,8 @@ class FITFLARE_OT_remove_engine(Action, bpy.types.Operator):
         return ""
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
-        return context.window_manager.invoke_confirm(self, event)
+        return context.window_manager.invoke_confirm(
+            self, event, title="Remove the engine?", message="Set Up Engine installs it again", confirm_text="Remove")
 
     def act(self, _context: bpy.types.Context) -> None:
         engine.remove()

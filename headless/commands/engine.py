@@ -28,7 +28,9 @@ def run(_words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     centres = torch.full((2, 2), 8.0)
     covariances = torch.tensor([[4.0, 0.0, 4.0]]).repeat(2, 1)
     light = splat(centres, covariances, torch.ones(2), torch.ones(2, 3), 16, 16, blend="add").colour
-    device = torch.cuda.get_device_name(0) if torch.cuda.is_available() else f"CPU, {torch.get_num_threads()} threads"
+    threads = torch.get_num_threads()
+    device = (torch.cuda.get_device_name(0) if torch.cuda.is_available()
+              else f"CPU, {threads} thread{'s' if threads > 1 else ''}")
     progress.say(f"Fit Flare {version}, Python {platform.python_version()}, torch {torch.__version__}, {device}.")
     return {"version": version, "python": platform.python_version(), "torch": str(torch.__version__), "device": device,
             "works": bool(light.max() > 1)}

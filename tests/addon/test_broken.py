@@ -103,6 +103,7 @@ def test_a_fit_that_ends_well_shows_its_flare(said: Any) -> None:
 
 
 def test_the_engine_says_what_it_is(said: Any) -> None:
+    assert said["test of another engine"]
     assert said["test"] == ["", {"version": "1", "torch": "2", "device": "a sham"}]
 
 

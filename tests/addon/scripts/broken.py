@@ -115,6 +115,10 @@ said["a fit that ends well"] = [refusal(lambda: ops.fit()), fits.state_of(scene)
 behave("answers")
 said["test"] = [refusal(lambda: ops.test_engine()), engine.tested().result]
 
+preferences.engine = str(folder / "nowhere")
+said["test of another engine"] = engine.tested() is None
+preferences.engine = sham
+
 # ---- work that goes on while Blender is closed, found again and cancelled ---------------------------
 behave("sleeps")
 run = folder / "long"

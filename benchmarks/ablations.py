@@ -11,6 +11,8 @@ Studies:
   robustness      its study of displaced lights: each moved once by Gaussian noise of sigma, with and without the
                   two corrections delta_l and delta_f
   robustness-ours the same of our form
+  supervision     our form taught by exact flare-free frames, by those that `remove` makes, and by none: split by
+                  parallax, or as the paper does without (unsup)
   known           the flare alone, over the exact scene: what the representation itself can do
   extrapolation   our form, with a stretch of the path held out instead of every n-th view
   reconstruction  the paper's table 3: 3DGS trained on the frames, on the frames with a bilateral grid for each, and on
@@ -51,6 +53,8 @@ from core.fit.settings import FitSettings, changed, preset
 from core.gaussians.scene import SceneGaussians
 from core.metrics.evaluation import evaluate
 from core.progress import Progress, TerminalProgress
+from core.removal.captured import remove_from
+from core.removal.inference import Remover
 
 DOCUMENT = report.ROOT / "docs" / "ablations.md"
 SAMPLE = report.ROOT / "sample_scenes" / "desk"
@@ -60,7 +64,8 @@ Length = Callable[..., FitSettings]
 """A preset of a given number of iterations, for which form and mode are chosen."""
 Results = dict[str, dict[str, dict[str, dict[str, Any]]]]
 """Scores by study, by row, by capture."""
-STUDIES = ("form", "comparison", "robustness", "robustness-ours", "known", "extrapolation", "reconstruction")
+STUDIES = ("form", "comparison", "robustness", "robustness-ours", "supervision", "known", "extrapolation",
+           "reconstruction")
 
 
 @dataclass(frozen=True)
@@ -69,7 +74,8 @@ class Experiment:
 
     displacement: of the lights, by Gaussian noise of this sigma, scene units. known_scene: the flare alone, over the
     exact scene. stretch: a stretch of the path is held out. frames: what the scene of a fit without flare is trained
-    on, as filmed, as filmed with a bilateral grid for each, or without flare.
+    on, as filmed, as filmed with a bilateral grid for each, or without flare; "cleaned": with what `remove` makes for
+    flare-free frames.
     """
 
     study: str
@@ -78,7 +84,7 @@ class Experiment:
     displacement: float = 0.0
     known_scene: bool = False
     stretch: bool = False
-    frames: Literal["filmed", "graded", "removed"] = "filmed"
+    frames: Literal["filmed", "graded", "removed", "cleaned"] = "filmed"
 
     def key(self) -> str:
         """The same for two experiments that are the same fit."""
@@ -131,6 +137,9 @@ def experiments(length: Length) -> list[Experiment]:
         for study, form in (("robustness", papers), ("robustness-ours", ours)):
             settings = form(length, flare__form__light_correction=light, flare__form__plane_offset=plane)
             made += [Experiment(study, f"{corrections}, sigma {sigma:g}", settings, sigma) for sigma in SIGMAS]
+    made += of("supervision", {"exact flare-free frames": ours(length), "none: split": ours(length, "split"),
+                               "none: unsup": ours(length, "unsup")})
+    made.append(Experiment("supervision", "what remove makes", ours(length), frames="cleaned"))
     alone = changed(ours(length), {"flare.count": 900, "flare.occlusion": False})
     made += [Experiment("known", "ours", alone, known_scene=True),
              Experiment("known", "the paper's", papers(length, flare__count=900), known_scene=True)]
@@ -179,8 +188,11 @@ def run(experiment: Experiment, folder: Path, capture: Path, width: int, progres
     elif experiment.frames == "graded":
         scores = _graded(opened, settings, progress)
     else:
-        source = _without_flare(capture, folder / "capture") if experiment.frames == "removed" else None
-        made = fit(opened if source is None else Capture.open(source), settings, folder / "run", progress, resume=True)
+        if experiment.frames == "removed":
+            opened = _capture_of(folder / "capture", capture, images="removed")
+        elif experiment.frames == "cleaned":
+            opened = _cleaned(folder / "capture", capture, progress)
+        made = fit(opened, settings, folder / "run", progress, resume=True)
         scores = _scores(made, capture, settings, progress)
     scores["seconds"], scores["commit"] = round(time.monotonic() - began), _commit()
     write_json(file, scores)
@@ -217,14 +229,22 @@ def _graded(capture: Capture, settings: FitSettings, progress: Progress) -> dict
     return _scores(_SceneAlone(trainer.scene), capture.folder, settings, progress)
 
 
-def _without_flare(capture: Path, folder: Path) -> Path:
-    """A capture whose frames are the flare-free ones of another."""
+def _capture_of(folder: Path, capture: Path, **origins: str) -> Capture:
+    """A capture of another's frames, cameras and lights, without its flare-free frames; origins: what stands for one of
+    these instead."""
     folder.mkdir(parents=True, exist_ok=True)
-    for name, origin in (("images", "removed"), ("sparse", "sparse"), ("split.json", "split.json")):
-        link = folder / name
-        if not link.is_symlink() and (capture / origin).exists():
-            link.symlink_to((capture / origin).resolve())
-    return folder
+    for name in ("images", "sparse", "split.json", "lights.json"):
+        link, origin = folder / name, capture / origins.get(name, name)
+        if not link.is_symlink() and origin.exists():
+            link.symlink_to(origin.resolve())
+    return Capture.open(folder)
+
+
+def _cleaned(folder: Path, capture: Path, progress: Progress) -> Capture:
+    made = _capture_of(folder, capture)
+    if not made.has_removed:
+        remove_from(made, Remover(), progress)
+    return Capture.open(folder)
 
 
 def _scores(made: Run | _SceneAlone, folder: Path, settings: FitSettings, progress: Progress) -> dict[str, Any]:

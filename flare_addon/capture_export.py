@@ -85,7 +85,7 @@ def export(scene: Any, folder: Path) -> int:
     write_json(folder / "transforms.json",
                {"camera_model": "PINHOLE", "ply_file_path": "points.ply", "frames": entries})
     state = scene.fit_flare
-    state.capture, state.root, state.mode = stored(folder), None, "unsup"
+    state.capture, state.root, state.mode = stored(folder), None, "split"
     return len(entries)
 
 

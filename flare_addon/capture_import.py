@@ -87,7 +87,7 @@ def import_capture(scene: Any, folder: Path | str, settings: ImportSettings | No
                    for light in capture.lights)
     state = scene.fit_flare
     state.capture, state.root = stored(folder), root
-    state.mode = "default" if capture.has_removed or capture.has_truth else "unsup"
+    state.mode = "default" if capture.has_removed or capture.has_truth else "split"
     scene.camera = made[0]
     if settings.match_scene:
         view = scene.view_settings  # footage is shown as it is, not through AgX

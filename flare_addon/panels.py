@@ -90,7 +90,7 @@ class FITFLARE_PT_fit(_Part, bpy.types.Panel):
         settings.prop(state, "mode")
         settings.prop(state, "width")
         capture = fits.capture_of(scene)
-        if capture is not None and (state.mode == "unsup" or jobs.find(capture / "removal") is not None):
+        if capture is not None and (state.mode == "split" or jobs.find(capture / "removal") is not None):
             _cleaning(layout, capture)
         if stage == "lost":
             lines(layout, f"The run's folder {folder} is gone: start a new fit.", "ERROR")

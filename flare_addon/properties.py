@@ -33,7 +33,7 @@ PRESETS = (
 )
 MODES = (
     ("default", "Clean Frames", "The capture has the frames without flare in its folder removed/ (or truth/scene/)"),
-    ("unsup", "No Clean Frames", "There are no frames without flare; the separation is poorer"),
+    ("split", "No Clean Frames", "There are no frames without flare: scene and flare are told apart by parallax"),
 )
 
 

@@ -23,7 +23,7 @@ from ..flare.model import OURS, PAPER, FlareForm
 from ..flare.visibility import VisibilitySettings
 from ..gaussians.densification import ClassicSettings, McmcSettings
 
-Mode = Literal["default", "unsup", "in-flare", "2d", "3dgs"]
+Mode = Literal["default", "split", "unsup", "in-flare", "2d", "3dgs"]
 Preset = Literal["draft", "standard", "high", "paper"]
 
 
@@ -110,6 +110,24 @@ class SceneSettings:
 
 
 @dataclass(frozen=True)
+class SplitSettings:
+    """Mode `split`: how a scene is told from flare without flare-free frames.
+
+    A flare adds light, and its place in the picture changes from view to view as no part of the scene's does. So the
+    scene is fitted alone first, for the share `begin` of the iterations, to what the frames agree on from below: where
+    a frame is brighter than the scene, that counts for `excess` of what it counts where it is darker. From then on both
+    are fitted to the frames, and the same holds the scene down with `weight`. `sh_degree`: of the scene's colours,
+    which could follow a flare if they were free to change with the direction. `sky`: points far away to begin with.
+    """
+
+    begin: float = 0.05
+    excess: float = 0.25
+    weight: float = 0.05
+    sh_degree: int = 1
+    sky: bool = True
+
+
+@dataclass(frozen=True)
 class FitSettings:
     """A whole fit. `width`: the working width in pixels at most; 0 keeps the frames' own size.
 
@@ -131,6 +149,7 @@ class FitSettings:
     preview_every: int = 1000
     flare: FlareSettings = field(default_factory=FlareSettings)
     scene: SceneSettings = field(default_factory=SceneSettings)
+    split: SplitSettings = field(default_factory=SplitSettings)
 
     def checked(self) -> FitSettings:
         """Itself; raises SettingsError where a value makes no sense."""
@@ -145,6 +164,10 @@ class FitSettings:
             (0 < self.flare.opacity < 1, "a flare's opacity must lie between 0 and 1"),
             (self.seed >= 0, "seed must not be negative"),
             (not self.scene.frozen or bool(self.scene.start), "a frozen scene needs a PLY to start from"),
+            (0 <= self.split.begin < 1, "split.begin must lie between 0 and 1"),
+            (0 <= self.split.excess <= 1, "split.excess must lie between 0 and 1"),
+            (self.split.weight >= 0, "split.weight must not be negative"),
+            (0 <= self.split.sh_degree <= 3, "split.sh_degree must lie between 0 and 3"),
             (self.mode != "2d" or not self.flare.form.line, "mode 2d needs a form without the line"),
         )
         for good, sentence in checks:

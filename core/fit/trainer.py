@@ -33,6 +33,7 @@ from .checkpoint import State
 from .frames import Frames, Targets
 from .rendering import render_flare
 from .settings import FitSettings
+from .sky import with_sky
 
 TABLE = "table.weight"
 SOURCE = 0.02
@@ -63,7 +64,7 @@ class Trainer:
         if self._supervised and not self.frames.reference and self.scene_is_fitted:
             raise CaptureError(f"{capture.folder} has no flare-free frames (removed/); run remove on it first, "
                                "or fit with --mode unsup.")
-        self.scene = _first_scene(capture, settings)
+        self.scene = _first_scene(capture, settings, self.views, self.frames)
         self.flare = None if settings.mode == "3dgs" else _new_flare(capture, self.views, settings)
         self.extent = capture.extent
         self.scene_adam = Adam(dict(self.scene.named_parameters()), self._scene_rates())
@@ -93,6 +94,10 @@ class Trainer:
             scene_loss = l1_ssim(scene.colour, clean, weight)
             figures["scene_loss"] = float(scene_loss.detach())
             loss = loss + scene_loss
+        elif settings.mode == "split" and self.scene_is_fitted:
+            scene_loss = from_below(scene.colour, targets.frame, settings.split.excess)
+            figures["scene_loss"] = float(scene_loss.detach())
+            loss = loss + scene_loss * (1 if alone else settings.split.weight)
         if not all(map(math.isfinite, figures.values())):
             raise RunError(f"The fit diverged at iteration {self.iteration}; start it anew with lower learning rates.")
         if self.scene_is_fitted:
@@ -136,6 +141,8 @@ class Trainer:
 
     def _scene_alone(self, targets: Targets) -> bool:
         """Whether the scene is fitted alone as yet, so that it hides lights by the time their flares are fitted."""
+        if self.settings.mode == "split":
+            return self.iteration <= self.settings.split.begin * self.settings.iterations
         begun = self.iteration > self.settings.flare.begin * self.settings.iterations
         return self._supervised and self.scene_is_fitted and targets.removed is not None and not begun
 
@@ -145,30 +152,32 @@ class Trainer:
         The faint and the small in a flare drown in the errors of a scene that is not learned yet. Later the
         scene, on which all views have agreed, is the better judge of what one flare-free frame has left over.
         """
-        if not self._supervised or targets.removed is None:
+        if self.settings.mode == "split":
+            behind, clean = scene, targets.frame
+        elif self._supervised and targets.removed is not None:
+            apart = self.iteration <= self.settings.apart * self.settings.iterations
+            behind, clean = targets.removed if apart else scene, targets.removed
+        else:
             return scene
-        apart = self.iteration <= self.settings.apart * self.settings.iterations
-        behind = targets.removed if apart else scene
-        sources = self._sources(targets)
+        sources = self._sources(targets, clean)
         return behind if sources is None else behind.masked_fill(sources[..., None], 0)
 
-    def _sources(self, targets: Targets) -> Tensor | None:
+    def _sources(self, targets: Targets, clean: Tensor) -> Tensor | None:
         """(height, width): each light's own clipped disc, which is taken from behind the flare where light is added.
 
         Frame and flare-free frame are white there, so nothing would tell how bright the flare is in its middle, and
         over another shot a hole would show. Black behind it, it has to be white by itself.
         """
-        removed = targets.removed
-        if self.settings.blend != "add" or self.flare is None or removed is None:
+        if self.settings.blend != "add" or self.flare is None:
             return None
-        height, width = removed.shape[:2]
+        height, width = clean.shape[:2]
         pixels, depth = targets.camera.project(self.flare.positions.numpy())
         across, down = torch.arange(width) + 0.5, torch.arange(height)[:, None] + 0.5
         near = torch.zeros(height, width, dtype=torch.bool)
         for (x, y), z in zip(pixels.tolist(), depth.tolist(), strict=True):
             if z > 0:
                 near |= (across - x).square() + (down - y).square() < (SOURCE * width) ** 2
-        return near & (removed >= WHITE).all(-1)
+        return near & (clean >= WHITE).all(-1)
 
     def _scene_target(self, targets: Targets, picture: Tensor, scene: Tensor) -> Tensor | None:
         if self._supervised:
@@ -181,7 +190,8 @@ class Trainer:
     def _sh_degree(self) -> int:
         if self.settings.scene.start:
             return 3  # it was trained before
-        return min(3, self.iteration // self.settings.scene.sh_every)
+        most = self.settings.split.sh_degree if self.settings.mode == "split" else 3
+        return min(most, self.iteration // self.settings.scene.sh_every)
 
     def _generator(self, number: int, purpose: int) -> torch.Generator:
         """A random stream of its own for each purpose and moment."""
@@ -276,6 +286,13 @@ class Trainer:
             raise RunError(f"The checkpoint does not fit this fit ({problem}); start it anew.") from problem
 
 
+def from_below(scene: Tensor, frame: Tensor, excess: float) -> Tensor:
+    """Mean |scene - frame|, of which what the frame has more counts for `excess`: fitted to several frames, their
+    excess / (1 + excess) quantile."""
+    more = frame - scene
+    return torch.where(more > 0, more * excess, -more).mean()
+
+
 def _load_parameters(parameters: dict[str, Parameter], state: State) -> None:
     """Values of any number of rows: Gaussians come and go during a fit."""
     for name, parameter in parameters.items():
@@ -287,7 +304,7 @@ def _decayed(first: float, last: float, progress: float) -> float:
     return first * (last / first) ** min(max(progress, 0.0), 1.0)
 
 
-def _first_scene(capture: Capture, settings: FitSettings) -> SceneGaussians:
+def _first_scene(capture: Capture, settings: FitSettings, views: tuple[View, ...], frames: Frames) -> SceneGaussians:
     """The scene a fit begins with: one that was trained elsewhere, or a Gaussian at each point."""
     if settings.scene.start:
         scene = read_ply(settings.scene.start)
@@ -298,7 +315,8 @@ def _first_scene(capture: Capture, settings: FitSettings) -> SceneGaussians:
         return scene
     if not len(capture.points):
         raise CaptureError(f"{capture.folder} has no 3D points to start from; solve it again.")
-    return SceneGaussians.from_points(capture.points)
+    sky = settings.mode == "split" and settings.split.sky
+    return SceneGaussians.from_points(with_sky(capture, views, frames) if sky else capture.points)
 
 
 def _new_flare(capture: Capture, views: tuple[View, ...], settings: FitSettings) -> FlareModel:

@@ -27,9 +27,13 @@ def arguments(parser: argparse.ArgumentParser) -> None:
                         help="folder for everything (default build/demo in the repository)")
     parser.add_argument("--capture", type=Path, metavar="CAPTURE",
                         help="another capture than the sample, which is worked on in a copy, DIR/capture")
-    parser.add_argument("--remove", action="store_true",
-                        help="take the flares out of the frames as `remove` does, in place of the sample's exact "
-                             "flare-free frames")
+    without = parser.add_mutually_exclusive_group()
+    without.add_argument("--split", action="store_true",
+                         help="do without flare-free frames: tell scene and flare apart by parallax, as `fit` does "
+                              "where there are none")
+    without.add_argument("--remove", action="store_true",
+                         help="take the flares out of the frames as `remove` does, in place of the sample's exact "
+                              "flare-free frames")
     parser.add_argument("--model", choices=fit.MODELS, help="the flare's form, as of `fit`")
     parser.add_argument("--iterations", type=int, metavar="N", help="length of the fit (default: the preset's)")
     parser.add_argument("--preset", choices=("draft", "standard", "high"), default="draft",
@@ -50,11 +54,13 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
                            "or name another with --capture.")
     began = time.monotonic()
     capture = with_lights(Capture.open(words.capture or _copy_of_sample(out, words.remove)), progress)
-    if words.remove or not capture.has_truth:
+    if words.remove:
         capture = with_removed(capture, progress)
-    progress.say(f"{source.name}: {len(capture.views)} frames, {len(capture.lights)} lights. {_supervision(capture)}")
+    mode = "split" if words.split else fit.mode_for(capture, False, progress)
+    progress.say(f"{source.name}: {len(capture.views)} frames, {len(capture.lights)} lights. "
+                 f"{_supervision(capture, mode)}")
     given = {"model": words.model} if words.model else {}
-    settings = preset(words.preset, iterations=words.iterations, **given)
+    settings = preset(words.preset, mode=mode, iterations=words.iterations, **given)
     _check_earlier(out / "run", settings, capture)
     made = fit_capture(capture, settings, out / "run", progress, resume=True)
     result = evaluate.scores_of(made.folder, progress)
@@ -88,8 +94,10 @@ def _check_earlier(folder: Path, settings: Any, capture: Any) -> None:
                            "another folder with --out.")
 
 
-def _supervision(capture: Any) -> str:
+def _supervision(capture: Any, mode: str) -> str:
     """Where the flare-free frames come from, which the scene is learned from."""
+    if mode == "split":
+        return "No flare-free frame is looked at."
     if capture.has_removed:
         return f"The flare-free frames are those in {capture.folder / 'removed'}; no flare is removed here."
     if capture.has_truth:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ...core.errors import SettingsError
 from ...core.progress import Progress
@@ -13,9 +13,12 @@ from ..command import Command, Step
 from .lights import with_lights
 from .remove import with_removed
 
+if TYPE_CHECKING:
+    from ...core.capture import Capture
+
 # Spelled out here, since the settings themselves can only be imported where torch is.
 PRESETS = ("draft", "standard", "high", "paper")
-MODES = ("default", "unsup", "in-flare", "2d", "3dgs")
+MODES = ("default", "split", "unsup", "in-flare", "2d", "3dgs")
 MODELS = ("paper", "ours")
 BLENDS = ("over", "add")
 DECODED_BYTES = 1 << 26
@@ -37,9 +40,11 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--preset", choices=PRESETS, default="standard",
                         help="how long and how fine (default standard)")
     parser.add_argument("--model", choices=MODELS, help="the flare's form: the paper's, or ours with rings and offsets")
-    parser.add_argument("--mode", choices=MODES, default="default",
-                        help="default; unsup: no flare-free frames; in-flare: scene supervised by frame less flare; "
-                             "2d: flare free on the plane; 3dgs: scene alone")
+    parser.add_argument("--mode", choices=MODES,
+                        help="default: with flare-free frames, which `remove` makes if there are none; split: "
+                             "without, by parallax; unsup: as the paper does without; in-flare: scene supervised by "
+                             "frame less flare; 2d: flare free on the plane; 3dgs: scene alone (default: default if the "
+                             "capture has flare-free frames, else split)")
     parser.add_argument("--blend", choices=BLENDS,
                         help="over: the flare covers, in display space; add: it adds, in linear light")
     parser.add_argument("--holdout", metavar="FILE|N",
@@ -70,7 +75,10 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
         return {"runs": str(words.out), "count": count}
     folder, out = place(words)
     given = {"model": words.model} if words.model else {}
-    settings = preset(words.preset, mode=words.mode, blend=words.blend, iterations=words.iterations, **given)
+    # The fit keeps pictures itself, and smaller.
+    capture = Capture.open(folder, cache_bytes=DECODED_BYTES)
+    mode = words.mode or mode_for(capture, words.freeze_scene, progress)
+    settings = preset(words.preset, mode=mode, blend=words.blend, iterations=words.iterations, **given)
     changes = {"width": words.size, "seed": words.seed, "holdout": holdout(words.holdout)}
     if words.scene:
         if not words.scene.is_file():
@@ -79,8 +87,6 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     changes["scene.frozen"] = words.freeze_scene or None
     changes = {name: value for name, value in changes.items() if value is not None}
     settings = changed(settings, {**changes, **dict(map(change, words.changes))})
-    # The fit keeps pictures itself, and smaller.
-    capture = Capture.open(folder, cache_bytes=DECODED_BYTES)
     if settings.mode != "3dgs":
         capture = with_lights(capture, progress)
     if settings.mode in ("default", "2d") and not settings.scene.frozen and not capture.has_truth:
@@ -88,6 +94,15 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     done = fit(capture, settings, out, progress, resume=words.resume)
     progress.say(f"The run is in {done.folder}: see preview.png there, then `eval` and `bake` it.")
     return {"run": str(done.folder)}
+
+
+def mode_for(capture: Capture, frozen: bool, progress: Progress) -> str:
+    """What a fit goes by where nobody says: flare-free frames if there are any."""
+    if frozen or capture.has_removed or capture.has_truth:
+        return "default"
+    progress.say(f"{capture.folder} has no flare-free frames (removed/): scene and flare are told apart by parallax, "
+                 "mode split.")
+    return "split"
 
 
 def place(words: argparse.Namespace) -> tuple[Path, Path]:

@@ -30,7 +30,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--flare", type=Path, metavar="DIR", help="write the flares too, as EXR in linear light")
     parser.add_argument("--keep-glare", action="store_true", help="leave the glow round the lights")
     parser.add_argument("--working-size", type=int, metavar="PIXELS",
-                        help="long side that the network sees (default 192, which it was trained at)")
+                        help="long side that the network sees (default 256, about what it was trained at)")
     parser.add_argument("--weights", type=Path, metavar="FILE",
                         help="weights of train-removal's (default: those that come with the program)")
     parser.add_argument("--model", choices=("network", "diffusion"), default="network",

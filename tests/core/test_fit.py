@@ -21,8 +21,10 @@ import torch
 from core.capture import Capture
 from core.errors import Cancelled, CaptureError, FlareFileError, RunError
 from core.fit import FitSettings, Run, fit, preset
+from core.fit.frames import Frames
 from core.fit.settings import changed
-from core.fit.trainer import Trainer
+from core.fit.sky import COUNT, with_sky
+from core.fit.trainer import Trainer, from_below
 from core.progress import Progress
 from tests.core.flared import flared_capture
 
@@ -163,7 +165,7 @@ def test_killed_and_resumed_leaves_nothing_half_written(tmp_path: Path, capture:
 
 
 @pytest.mark.parametrize(("mode", "changes"), [
-    ("unsup", {}), ("in-flare", {}), ("2d", {}), ("3dgs", {}), ("default", {"flare.detection": False}),
+    ("split", {}), ("unsup", {}), ("in-flare", {}), ("2d", {}), ("3dgs", {}), ("default", {"flare.detection": False}),
     ("default", {"flare.form.light_correction": False}), ("default", {"flare.form.plane_offset": False}),
     ("default", {"scene.strategy": "mcmc", "scene.mcmc.start": 5, "scene.mcmc.every": 5}),
 ])
@@ -176,6 +178,40 @@ def test_every_mode_runs_and_renders(tmp_path: Path, capture: Capture, mode: Any
     layers = reopened.render(capture.views[0].camera)
     assert layers.scene.shape == (40, 64, 3)
     assert list(layers.flare_by_light) == ([] if mode == "3dgs" else ["lamp"])
+
+
+def test_scene_and_flare_come_apart_without_a_flare_free_frame(tmp_path: Path, capture: Capture) -> None:
+    bare = tmp_path / "bare"
+    shutil.copytree(capture.folder, bare, ignore=shutil.ignore_patterns("removed", "truth"))
+    settings = changed(quick(400), {"mode": "split", "flare.density.stop": 120})
+    found, empty = flare_psnr(fit(Capture.open(bare), settings, tmp_path / "run"), capture)
+    assert found > empty + 4, (found, empty)
+    settings = changed(settings, {"mode": "unsup"})
+    assert found > flare_psnr(fit(Capture.open(bare), settings, tmp_path / "unsup"), capture)[0] + 2
+
+
+def test_what_frames_agree_on_from_below_is_a_quantile() -> None:
+    frames = torch.tensor([0.2, 0.2, 0.2, 0.3, 0.9])[:, None]
+    levels = torch.linspace(0, 1, 101)
+    costs = torch.stack([from_below(level.expand(5, 1), frames, excess=0.25) for level in levels])
+    assert levels[costs.argmin()] == pytest.approx(0.2, abs=0.01)
+    evenly = torch.stack([from_below(level.expand(5, 1), frames, excess=1.0) for level in levels])
+    assert torch.allclose(evenly, (levels[:, None] - frames[:, 0]).abs().mean(-1), atol=1e-6)
+
+
+def test_a_sky_lies_about_the_points_in_colours_that_the_frames_have(capture: Capture) -> None:
+    views, frames = capture.views, Frames(capture)
+    found = with_sky(capture, views, frames)
+    added = found.xyz[len(capture.points):]
+    assert 20 < len(added) < COUNT, "only what some view sees"
+    middle = np.mean([view.camera.position for view in views], 0)
+    away = np.linalg.norm(added - middle, axis=1)
+    assert away.min() > np.linalg.norm(capture.points.xyz - middle, axis=1).max()
+    np.testing.assert_allclose(away, away[0], rtol=1e-4)
+    brightest = max(float(frames.frame(view).max()) for view in views)
+    assert found.rgb[len(capture.points):].max() <= round(255 * brightest)
+    seen = [view.camera.contains(*view.camera.project(added)) for view in views]
+    assert np.any(seen, 0).all()
 
 
 def test_ours_runs_in_linear_light(tmp_path: Path, capture: Capture) -> None:

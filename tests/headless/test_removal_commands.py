@@ -75,11 +75,21 @@ def test_scores_of_pairs(tmp_path: Path, backgrounds: Path, capsys: pytest.Captu
     assert len(json.loads((tmp_path / "made" / "eval.json").read_text(encoding="utf-8"))["categories"]) == 8
 
 
+def test_fit_does_without_flare_free_frames_where_there_are_none(capture: Path, tmp_path: Path,
+                                                                  capsys: pytest.CaptureFixture[str]) -> None:
+    bare, run = tmp_path / "bare", tmp_path / "run"
+    shutil.copytree(capture, bare, ignore=shutil.ignore_patterns("removed", "truth"))
+    assert cli.main(["fit", str(bare), "--out", str(run), "--iterations", "2"]) == 0
+    assert "no flare-free frames" in capsys.readouterr().err
+    assert not (bare / "removed").exists()
+    assert 'mode = "split"' in (run / "config.toml").read_text(encoding="utf-8")
+
+
 def test_fit_takes_the_flare_out_where_nobody_did(capture: Path, tmp_path: Path,
                                                   capsys: pytest.CaptureFixture[str]) -> None:
     bare = tmp_path / "bare"
     shutil.copytree(capture, bare, ignore=shutil.ignore_patterns("removed", "truth"))
-    words = ["fit", str(bare), "--out", str(tmp_path / "run"), "--iterations", "2"]
+    words = ["fit", str(bare), "--out", str(tmp_path / "run"), "--iterations", "2", "--mode", "default"]
     assert cli.main(words) == 0
     assert "has no removed/" in capsys.readouterr().err
     frames = {path.stem: path for path in (bare / "images").iterdir()}

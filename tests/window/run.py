@@ -27,7 +27,7 @@ ROOT = Path(__file__).resolve().parents[2]
 LEFT_OUT = 77
 VIEW, PREFERENCES = (0, 28, 1313, 908), (168, 55, 1313, 465)
 PICTURES = {
-    "preferences": ("01_preferences", PREFERENCES), "setting_up": ("11_setting_up", PREFERENCES),
+    "preferences": ("01_preferences", PREFERENCES), "setting_up": ("11_setting_up", (168, 310, 1313, 465)),
     "imported": ("03_imported", VIEW), "fitting": ("04_fitting", VIEW), "flare": ("05_flare", VIEW),
     "look": ("06_look_and_bake", VIEW), "compositor": ("07_compositor", (0, 0, 1600, 1000)),
     "transferred": ("08_transferred", VIEW), "hidden": ("09_hidden", VIEW)}
@@ -90,10 +90,9 @@ def cut(shots: Path, pictures: Path) -> None:
     import cv2
 
     for name, (shot, (left, top, right, bottom)) in PICTURES.items():
-        whole = cv2.imread(str(shots / f"{shot}.png"))
-        if whole is None:
+        if not (shots / f"{shot}.png").is_file():
             continue
-        part = whole[top:bottom, left:right]
+        part = cv2.imread(str(shots / f"{shot}.png"))[top:bottom, left:right]
         width = min(part.shape[1], 1200)
         size = width, round(part.shape[0] * width / part.shape[1])
         cv2.imwrite(str(pictures / f"{name}.jpg"), cv2.resize(part, size, interpolation=cv2.INTER_AREA),

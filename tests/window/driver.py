@@ -2,7 +2,8 @@
 """Blender's window driven from inside: mouse, keys, screenshots.
 
 Where the module `ui_driver` is at hand (a virtual screen with real X events) it is used; anywhere else
-Blender simulates the events itself (start it with --enable-event-simulate). Steps are a generator: `yield N`
+Blender simulates the events itself (start it with --enable-event-simulate), and so it does where FIT_FLARE_SIMULATE is
+set. Steps are a generator: `yield N`
 lets Blender live N seconds. Positions are window pixels from the lower left corner.
 """
 from __future__ import annotations
@@ -17,6 +18,8 @@ import bpy
 try:
     import ui_driver as real
 except ImportError:
+    real = None
+if os.environ.get("FIT_FLARE_SIMULATE"):
     real = None
 
 SETTLE_S = 0.12

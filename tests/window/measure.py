@@ -18,18 +18,20 @@ def module(name: str):
 
 
 class Gaps:
-    """The longest time between two calls of a 10 ms timer, while Blender draws, handles events and runs our code."""
+    """The longest time between two calls of a 10 ms timer, while Blender draws, handles events and runs our code; and
+    the longest that the window's thread itself worked in between, which other programs do not make longer (nor does
+    drawing in software, which has threads of its own)."""
 
     def __init__(self) -> None:
-        self.gaps: list[float] = []
-        self.last = time.perf_counter()
+        self.gaps: list[tuple[float, float]] = []
+        self.last = time.perf_counter(), time.thread_time()
         self.on, self.paused = True, False
         bpy.app.timers.register(self.tick, persistent=True)
 
     def tick(self):
-        now = time.perf_counter()
+        now = time.perf_counter(), time.thread_time()
         if not self.paused:
-            self.gaps.append(now - self.last)
+            self.gaps.append((now[0] - self.last[0], now[1] - self.last[1]))
         self.last, self.paused = now, False
         return 0.01 if self.on else None
 
@@ -39,10 +41,13 @@ class Gaps:
 
     def stop(self) -> dict[str, float]:
         self.on = False
-        gaps = sorted(self.gaps[2:]) or [0.0]
-        return {"longest_gap_ms": milliseconds(gaps[-1]),
-                "gap_99_percent_ms": milliseconds(gaps[len(gaps) * 99 // 100]),
-                "gaps_over_100_ms": sum(gap > 0.1 for gap in gaps), "gaps": len(gaps)}
+        figures: dict[str, float] = {"gaps": len(self.gaps)}
+        for name, times in zip(("gap", "work"), zip(*(self.gaps[2:] or [(0.0, 0.0)]), strict=True), strict=True):
+            ordered = sorted(times)
+            figures |= {f"longest_{name}_ms": milliseconds(ordered[-1]),
+                        f"{name}_99_percent_ms": milliseconds(ordered[len(ordered) * 99 // 100]),
+                        f"{name}s_over_100_ms": sum(one > 0.1 for one in ordered)}
+        return figures
 
 
 def milliseconds(seconds: float) -> float:

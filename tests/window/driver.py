@@ -164,7 +164,7 @@ def find(wanted: str | Callable[[str], bool], place, *, path: bool = False, acro
             return wanted(text)
         return text == wanted if path else text.startswith(f"bpy.ops.{wanted}(")
 
-    step, x = 10 * bpy.context.preferences.system.ui_scale, place.x + place.width * across
+    step, x = 13 * bpy.context.preferences.system.ui_scale, place.x + place.width * across
     for page in range(pages):
         y = place.y + place.height - 8
         if page == 0 and below is not None:
@@ -176,7 +176,7 @@ def find(wanted: str | Callable[[str], bool], place, *, path: bool = False, acro
         while y > place.y + 4:
             text = yield from copied(x, y, path)
             if right(text):
-                return x, y - 0.5 * step
+                return x, y - 0.3 * step
             y -= step
     raise LookupError(f"{wanted} is nowhere under the mouse in the region {place.type}")
 

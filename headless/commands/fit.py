@@ -41,10 +41,10 @@ def arguments(parser: argparse.ArgumentParser) -> None:
                         help="how long and how fine (default standard)")
     parser.add_argument("--model", choices=MODELS, help="the flare's form: the paper's, or ours with rings and offsets")
     parser.add_argument("--mode", choices=MODES,
-                        help="default: with flare-free frames, which `remove` makes if there are none; split: "
+                        help="default: with flare-free frames, which `remove` makes where there are none; split: "
                              "without, by parallax; unsup: as the paper does without; in-flare: scene supervised by "
-                             "frame less flare; 2d: flare free on the plane; 3dgs: scene alone (default: default if the "
-                             "capture has flare-free frames, else split)")
+                             "frame less flare; 2d: flare free on the plane; 3dgs: scene alone (if not given: default "
+                             "where the capture has flare-free frames, else split)")
     parser.add_argument("--blend", choices=BLENDS,
                         help="over: the flare covers, in display space; add: it adds, in linear light")
     parser.add_argument("--holdout", metavar="FILE|N",

@@ -21,8 +21,11 @@ REMOVED = "removed"
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("plates", type=Path, nargs="+", metavar="PLATE",
+    parser.add_argument("plates", type=Path, nargs="*", metavar="PLATE",
                         help="pictures (PNG, JPEG, TIFF, EXR), or folders of them")
+    parser.add_argument("--run", type=Path, metavar="RUN",
+                        help="instead of PLATE: the frames of the capture that this run was fitted to, less the flare "
+                             "that it found in them")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR",
                         help="folder for the clean plates, under the names that the plates have")
     parser.add_argument("--frames", metavar="A-B",
@@ -45,6 +48,10 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     from ...core.bake.frames import chosen, numbered
     from ...core.removal.batch import plates_of, remove_all
 
+    if (words.run is None) == (not words.plates):
+        raise SettingsError("remove needs plates, or a fitted run with --run: the one or the other.")
+    if words.run is not None:
+        return _by_run(words, progress)
     wanted = None
     if words.frames is not None or words.jobs != 1:
         names = [name.as_posix() for _, name in plates_of(words.plates)]
@@ -56,6 +63,23 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
             return {"plates": str(words.out)}
     return remove_all(words.plates, words.out, _remover(words), progress, flare_folder=words.flare,
                       overwrite=words.overwrite, wanted=wanted)
+
+
+def _by_run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
+    from ...core.bake.frames import chosen, numbered
+    from ...core.capture import Capture
+    from ...core.fit import Run
+    from ...core.removal.fitted import remove_fitted
+
+    if words.jobs != 1 or words.model != "network" or words.weights or words.working_size or words.keep_glare:
+        raise SettingsError("--run takes away the flare that was fitted: of the other options only --out, --frames, "
+                            "--flare and --overwrite go with it.")
+    fitted = Run.open(words.run)
+    capture = Capture.open(fitted.capture_folder)
+    frames = chosen(numbered([view.name for view in capture.views]), words.frames)
+    wanted = {frame.view for frame in frames}
+    return remove_fitted(fitted, capture, [view for view in capture.views if view.name in wanted], words.out, progress,
+                         flare_folder=words.flare, overwrite=words.overwrite)
 
 
 def _remover(words: argparse.Namespace) -> Remover:
@@ -94,5 +118,6 @@ plate; the flare is carried up to full size and taken away in linear light, and 
 is kept to the last bit. A plate that cannot be read is told at the end, and does not stop the others.
 
   run.py remove plate.exr --out clean
-  run.py remove shots/sh010 --out clean/sh010 --flare flares/sh010 --keep-glare""",
+  run.py remove shots/sh010 --out clean/sh010 --flare flares/sh010 --keep-glare
+  run.py remove --run my_run --out clean          # what `fit` found, out of the frames it was fitted to""",
     arguments, (Step("remove", "engine", run),))

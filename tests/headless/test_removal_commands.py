@@ -83,6 +83,14 @@ def test_fit_does_without_flare_free_frames_where_there_are_none(capture: Path, 
     assert "no flare-free frames" in capsys.readouterr().err
     assert not (bare / "removed").exists()
     assert 'mode = "split"' in (run / "config.toml").read_text(encoding="utf-8")
+    clean = tmp_path / "clean"
+    assert cli.main(["remove", "--run", str(run), "--out", str(clean), "--frames", "0-1"]) == 0
+    filmed = sorted(path.name for path in (bare / "images").iterdir())
+    assert sorted(path.name for path in clean.iterdir()) == filmed[:2]
+    for words in (["remove", "--out", str(clean)], ["remove", str(bare), "--run", str(run), "--out", str(clean)],
+                  ["remove", "--run", str(run), "--out", str(clean), "--keep-glare"]):
+        assert cli.main(words) == 1
+        assert "--run" in capsys.readouterr().err
 
 
 def test_fit_takes_the_flare_out_where_nobody_did(capture: Path, tmp_path: Path,

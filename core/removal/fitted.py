@@ -1,0 +1,96 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""A capture's frames without the flare that a fit has found in them.
+
+What a fit knows of a flare it knows from all views together, which is more than any single plate says. Its flare is
+taken from a plate in linear light. Where the plate is clipped, nothing is left of what lay under the flare: there the
+fitted scene stands in, as far as it is brighter.
+"""
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..capture import Camera, Capture, View
+from ..errors import CaptureError, SettingsError
+from ..files import inside, remove_partial_of
+from ..pictures import linear_from_srgb, srgb_from_linear, write_exr
+from ..progress import Progress
+from .inference import CLIPPED
+from .plates import Plate, read_plate, write_plate
+
+Pixels = NDArray[np.float32]
+
+
+class FittedLayers(Protocol):
+    """Scene-linear layers of a view (height, width, 3): the scene, and each light's flare."""
+
+    @property
+    def scene(self) -> Pixels: ...
+    @property
+    def flare_by_light(self) -> Mapping[str, Pixels]: ...
+
+
+class Fitted(Protocol):
+    """A fitted run."""
+
+    def render(self, camera: Camera) -> FittedLayers: ...
+
+
+def remove_fitted(fitted: Fitted, capture: Capture, views: Sequence[View], folder: Path, progress: Progress, *,
+                  flare_folder: Path | None = None, overwrite: bool = False) -> dict[str, Any]:
+    """Write the views' frames without the fitted flare below `folder`, each under its own name, in its own kind and
+    depth; those that are there and newer than the frame are kept, unless `overwrite`.
+
+    Raises CaptureError for frames with lens distortion, which the flare was not fitted with, SettingsError where frames
+    would be overwritten, FrameError for a frame that cannot be read.
+    """
+    if any(view.lens for view in views):
+        raise CaptureError(f"The frames of {capture.folder} are distorted by their lens, and the flare was fitted "
+                           "without that; undistort them first (for instance with COLMAP's image_undistorter).")
+    progress.stage("remove", len(views))
+    made = 0
+    for view in views:
+        path, target = capture.frame_path(view), inside(folder, view.name, CaptureError)
+        if target.resolve() == path.resolve():
+            raise SettingsError(f"{path} would be overwritten by its own result; choose another folder with --out.")
+        if overwrite or not target.is_file() or target.stat().st_mtime < path.stat().st_mtime:
+            _remove(fitted, view, path, target, flare_folder)
+            made += 1
+        progress.advance()
+    progress.say(f"{made} clean plates are in {folder}.")
+    return {"plates": str(folder), "made": made, "kept": len(views) - made}
+
+
+def _remove(fitted: Fitted, view: View, path: Path, target: Path, flare_folder: Path | None) -> None:
+    remove_partial_of(target)
+    plate = read_plate(path)
+    height, width = plate.codes.shape[:2]
+    camera = view.camera if view.camera.size == (width, height) else view.camera.scaled(width, height)
+    layers = fitted.render(camera)
+    flare = np.sum([np.zeros((height, width, 3), np.float32), *layers.flare_by_light.values()], axis=0)
+    write_plate(target, plate, without(plate, flare, layers.scene))
+    if flare_folder is not None:
+        exr = inside(flare_folder, str(Path(view.name).with_suffix(".exr")), CaptureError)
+        write_exr(exr, {name: np.ascontiguousarray(flare[..., k], np.float16) for k, name in enumerate("RGB")})
+
+
+def without(plate: Plate, flare: Pixels, scene: Pixels) -> NDArray[Any]:
+    """The plate's codes less a flare, given linear light of flare and scene as (height, width, 3); kept to the last bit
+    where there is no flare, and where they are no numbers."""
+    if plate.encoding == "srgb":
+        display = plate.codes.astype(np.float32) / np.float32(plate.top)
+        light, clipped = linear_from_srgb(display), display.max(-1, keepdims=True) >= CLIPPED
+    else:
+        light = np.nan_to_num(plate.codes.astype(np.float32), nan=0.0, posinf=65504.0, neginf=0.0)
+        clipped = np.zeros((*light.shape[:2], 1), bool)
+    less = light - flare
+    less = np.maximum(np.where(clipped, np.maximum(less, np.minimum(scene, light)), less), np.minimum(light, 0))
+    if plate.encoding == "srgb":
+        codes = (srgb_from_linear(less) * np.float32(plate.top) + np.float32(0.5)).astype(plate.codes.dtype)
+    else:
+        codes = less.astype(plate.codes.dtype)
+    return np.where((flare > 0) & np.isfinite(plate.codes.astype(np.float32)), codes, plate.codes)

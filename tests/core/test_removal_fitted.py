@@ -1,0 +1,116 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Frames of a capture without the flare that was fitted to them."""
+from __future__ import annotations
+
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from core.capture import Camera, Capture
+from core.errors import CaptureError, SettingsError
+from core.pictures import linear_from_srgb, read_exr, read_picture, write_exr
+from core.progress import Progress
+from core.removal.fitted import remove_fitted, without
+from core.removal.plates import Plate, read_plate
+from tests.core.flared import flare, flared_capture
+
+
+@dataclass
+class Layers:
+    scene: np.ndarray
+    flare_by_light: dict[str, np.ndarray]
+
+
+class Exact:
+    """A fit that found the very flare, by two lights."""
+
+    def __init__(self) -> None:
+        self.rendered = 0
+
+    def render(self, camera: Camera) -> Layers:
+        self.rendered += 1
+        whole = flare(camera)
+        return Layers(np.full_like(whole, 0.25), {"a": whole * 0.25, "b": whole * 0.75})
+
+
+@pytest.fixture
+def capture(tmp_path: Path) -> Capture:
+    return Capture.open(flared_capture(tmp_path / "capture", count=3))
+
+
+def test_the_exact_flare_leaves_the_exact_scene(capture: Capture, tmp_path: Path) -> None:
+    out, fitted = tmp_path / "clean", Exact()
+    found = remove_fitted(fitted, capture, capture.views, out, Progress(), flare_folder=tmp_path / "flare")
+    assert found["made"] == 3
+    for view in capture.views:
+        filmed, clean = read_picture(capture.frame_path(view)).pixels, read_picture(out / view.name).pixels
+        truth = read_picture(capture.folder / "removed" / view.name).pixels
+        light = flare(view.camera)
+        lit = (filmed.max(-1) < 0.95) & (light.max(-1) > 0.02)
+        assert lit.sum() > 50 and np.abs(filmed - truth)[lit].mean() > 0.05
+        # what 8 bit codes of a bright frame can say of a dark scene below it
+        assert np.abs(linear_from_srgb(clean) - linear_from_srgb(truth))[lit].max() < 0.009
+        np.testing.assert_array_equal(clean[light.max(-1) == 0], filmed[light.max(-1) == 0])
+        written = read_exr(tmp_path / "flare" / Path(view.name).with_suffix(".exr"))
+        np.testing.assert_allclose(np.stack([written[name] for name in "RGB"], -1), light, atol=1e-3)
+    assert remove_fitted(fitted, capture, capture.views, out, Progress())["kept"] == 3
+    assert fitted.rendered == 3, "what is there is not made again"
+    assert remove_fitted(fitted, capture, capture.views[:1], out, Progress(), overwrite=True)["made"] == 1
+
+
+def test_where_the_plate_is_clipped_the_scene_stands_in() -> None:
+    codes = np.full((2, 2, 3), 255, np.uint8)
+    codes[0, 0] = 128
+    plate = Plate(Path("a.png"), codes, "srgb")
+    light, scene = np.full((2, 2, 3), 0.9, np.float32), np.full((2, 2, 3), 0.5, np.float32)
+    light[1, 1] = 0
+    clean = without(plate, light, scene)
+    assert clean[0, 0].max() == 0, "more flare than there is light"
+    assert clean[0, 1, 0] == 188, "0.5 of white"
+    assert clean[1, 1, 0] == 255
+
+
+def test_floats_keep_what_is_above_white_below_black_or_no_number() -> None:
+    codes = np.array([[[8.0, np.nan, 0.5]], [[-0.25, np.inf, 0.125]]], np.float32)
+    plate = Plate(Path("a.exr"), codes, "linear")
+    clean = without(plate, np.full((2, 1, 3), 0.25, np.float32), np.zeros((2, 1, 3), np.float32))
+    assert clean[0, 0, 0] == 7.75 and np.isnan(clean[0, 0, 1]) and clean[0, 0, 2] == 0.25
+    assert clean[1, 0, 0] == -0.25 and np.isinf(clean[1, 0, 1]) and clean[1, 0, 2] == 0
+
+
+def test_what_cannot_be_done_is_said_before_anything_is_written(capture: Capture, tmp_path: Path) -> None:
+    with pytest.raises(SettingsError, match="another folder"):
+        remove_fitted(Exact(), capture, capture.views, capture.folder / "images", Progress())
+    bent = tmp_path / "bent"
+    shutil.copytree(capture.folder, bent)
+    cameras = bent / "sparse" / "0" / "cameras.txt"
+    lines = cameras.read_text(encoding="utf-8").splitlines()
+    lines = [line.replace("PINHOLE", "OPENCV") + " 0.1 0 0 0" if line and line[0] != "#" else line for line in lines]
+    cameras.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    distorted = Capture.open(bent)
+    with pytest.raises(CaptureError, match="distorted"):
+        remove_fitted(Exact(), distorted, distorted.views, tmp_path / "clean", Progress())
+    assert not (tmp_path / "clean").exists()
+
+
+def test_an_exr_frame_stays_one(capture: Capture, tmp_path: Path) -> None:
+    view = capture.views[0]
+    shutil.copytree(capture.folder, tmp_path / "exr" / "capture")
+    folder = tmp_path / "exr" / "capture" / "images"
+    for path in sorted(folder.iterdir()):
+        light = linear_from_srgb(read_picture(path).pixels)
+        write_exr(path.with_suffix(".exr"), {name: light[..., k] for k, name in enumerate("RGB")}, half=False)
+        path.unlink()
+    images = folder.parent / "sparse" / "0" / "images.txt"
+    images.write_text(images.read_text(encoding="utf-8").replace(".png", ".exr"), encoding="utf-8")
+    shutil.rmtree(folder.parent / "removed")
+    linear = Capture.open(folder.parent)
+    remove_fitted(Exact(), linear, linear.views[:1], tmp_path / "clean", Progress())
+    clean = read_plate(tmp_path / "clean" / linear.views[0].name)
+    assert clean.encoding == "linear" and clean.codes.dtype == np.float32
+    truth = linear_from_srgb(read_picture(capture.folder / "removed" / view.name).pixels)
+    below = read_picture(capture.frame_path(view)).pixels.max(-1) < 0.99
+    assert np.abs(clean.codes - truth)[below].max() < 0.01

@@ -97,7 +97,9 @@ def ending_with(problem: BaseException | None, monkeypatch: pytest.MonkeyPatch) 
     (FitFlareError("It is broken."), 1, "It is broken."),
     (Cancelled("Stopped as asked."), 130, "Stopped as asked."),
     (KeyboardInterrupt(), 130, "Stopped."),
-    (OSError(28, "No space left on device", "x.exr"), 1, "The system refused: No space left on device (x.exr)."),
+    (OSError(28, "No space left on device", "x.exr"), 1,
+     "The disk is full (x.exr); make room and start it again, what is finished is kept."),
+    (OSError(13, "Permission denied", "x.exr"), 1, "The system refused: Permission denied (x.exr)."),
     (ZeroDivisionError("division by zero"), 1,
      "A defect of Fit Flare, please report it: ZeroDivisionError: division by zero."),
 ])

@@ -285,6 +285,20 @@ def press_along(call: str, place, y: float):
     raise LookupError(f"{call} is nowhere along the region {place.type}")
 
 
+def press_in_top_bar(menu: str):
+    """Find a menu of the window's top bar by walking along it from the left, and click it. Steps."""
+    scale = bpy.context.preferences.system.ui_scale
+    x, y = 30 * scale, window().height - 13 * scale
+    while x < 0.4 * window().width:
+        text = yield from copied(x, y)
+        if menu in text:
+            click(x, y)
+            yield 0.5
+            return
+        x += 16 * scale
+    raise LookupError(f"{menu} is nowhere along the top bar")
+
+
 def open_tab(name: str):
     """The sidebar of the 3D viewport with N, and its tab by clicking down the tabs. Steps."""
     view = region("WINDOW")

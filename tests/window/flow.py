@@ -229,7 +229,7 @@ def bake():
 
 
 def compositor_and_render():
-    """Over the Footage, Set Up Compositor, F12 at three intensities, and the nodes away again."""
+    """Over the Footage, Set Up Compositor, a render at three intensities, and the nodes away again."""
     scene = bpy.context.scene
     state = scene.fit_flare
     x, y = yield from ui.find("fit_flare.over", panel(), path=True, across=0.65)
@@ -240,11 +240,9 @@ def compositor_and_render():
     scene.render.engine = "BLENDER_WORKBENCH"  # the quickest; what it renders lies behind the plate
     figures = {}
     x, y = yield from ui.find("fit_flare.master.intensity", panel(), path=True, across=0.6)
-    view = ui.region("WINDOW")
     for factor in (0, 2, 1):
         yield from ui.fill(x, y, str(factor))
         assert state.master.intensity == factor
-        ui.point(view.x + 0.35 * view.width, view.y + 0.5 * view.height)
         figures[factor] = yield from render(out / f"render_{factor}.png")
     assert figures[0] < figures[1] < figures[2], figures
     done("render", render_means=figures)
@@ -264,18 +262,23 @@ def compositor_and_render():
 
 
 def render(path: Path):
-    """F12, a picture of the window, and Escape back. Steps; their value is the mean of the picture, which is saved."""
+    """Render > Render Image, a picture of the window, and Escape back. Steps; their value is the mean of the picture,
+    which is saved."""
     finished: list[bool] = []
 
     def note(*_words: object) -> None:
         finished.append(True)
 
     bpy.app.handlers.render_complete.append(note)
-    ui.press("F12")
+    yield from ui.press_in_top_bar("TOPBAR_MT_render")
+    ui.press("HOME")  # Render Image
+    ui.press("RET")
     yield from wait(lambda: finished, 120)
     bpy.app.handlers.render_complete.remove(note)
     yield 0.5
     shot("06_rendered")
+    largest = max(ui.window().screen.areas, key=lambda area: area.width * area.height)
+    ui.point(largest.x + 0.35 * largest.width, largest.y + 0.5 * largest.height)
     ui.press("ESC")
     yield 0.5
     assert any(area.type == "VIEW_3D" for area in ui.window().screen.areas)
@@ -370,5 +373,6 @@ def wait_for_gpu() -> None:
     gpu.state.active_framebuffer_get().read_color(0, 0, 1, 1, 4, 0, "FLOAT")
 
 
-ui.FAILED = str(out / "failed.png")
-ui.run(steps)
+if __name__ == "__main__":
+    ui.FAILED = str(out / "failed.png")
+    ui.run(steps)

@@ -33,13 +33,6 @@ class FITFLARE_OT_save_flare(Action, bpy.types.Operator):
         self.name = self.name or (path.parent.name if path and path.stem == "flare" else path.stem if path else "")
         return context.window_manager.invoke_props_dialog(self, width=360, confirm_text="Save")
 
-    def draw(self, _context: bpy.types.Context) -> None:
-        column = self.layout.column()
-        column.use_property_split = True
-        column.activate_init = True  # the name can be typed at once
-        for name in ("name", "notes", "licence"):
-            column.prop(self, name)
-
     def act(self, context: bpy.types.Context) -> None:
         look = looks.look_of(context.scene)
         path = library.save(look, self.name, self.notes or look.notes, self.licence or look.licence)

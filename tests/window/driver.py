@@ -199,6 +199,23 @@ def fill(x: float, y: float, text: str):
     yield 0.3
 
 
+def fill_above(x: float, y: float, text: str, new: str):
+    """Type over the field with that text, in the dialog whose button has come under the mouse: it may be typed into at
+    once, or is looked for upwards. Steps."""
+    for step in range(20):
+        found = yield from copied(x, y + 8 * step)
+        if found == text:
+            if step:
+                click(x, y + 8 * step + 4)
+                yield 0.3
+            press("A", ctrl=True)
+            write(new)
+            press("RET")
+            yield 0.3
+            return
+    raise LookupError(f"no field above has the text {text}")
+
+
 def choose_item(x: float, y: float, chosen: Callable[[], bool]):
     """Choose from the menu that opens there, an entry further down each time, until it is the one. Steps."""
     for down in range(8):

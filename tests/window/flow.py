@@ -292,14 +292,12 @@ def render(path: Path):
 
 def transfer():
     """To the library, and on to another camera, first free, then with a wall before the lamp."""
-    yield from ui.press_button("fit_flare.save_flare", panel())
-    yield 0.5
-    ui.press("A", ctrl=True)
-    ui.write("Desk lamp")
-    yield 0.3
+    x, y = yield from ui.press_button("fit_flare.save_flare", panel())
+    yield 1
+    suggested = module("looks").path_of(bpy.context.scene).parent.name
+    yield from ui.fill_above(x, y, suggested, "Desk lamp")
     shot("08_save")
-    ui.press("RET")  # out of the field
-    ui.press("RET")  # the dialog
+    ui.press("RET")
     library, overlay = module("library"), module("overlay")
     yield from wait(library.files, 10)
     assert [path.stem for path in library.files()] == ["Desk lamp"]

@@ -200,18 +200,12 @@ def fill(x: float, y: float, text: str):
 
 
 def fill_above(x: float, y: float, text: str, new: str):
-    """Type over the field with that text, in the dialog whose button has come under the mouse: it may be typed into at
-    once, or is looked for upwards. Steps."""
+    """Type over the field with that text, in the dialog that has come under the mouse: it is looked for upwards. Outside
+    a field a letter is the key of a button. Steps."""
     for step in range(20):
         found = yield from copied(x, y + 8 * step)
         if found == text:
-            if step:
-                click(x, y + 8 * step + 4)
-                yield 0.3
-            press("A", ctrl=True)
-            write(new)
-            press("RET")
-            yield 0.3
+            yield from fill(x, y + 8 * step + 2, new)
             return
     raise LookupError(f"no field above has the text {text}")
 

@@ -2,7 +2,8 @@
 """What the removal of flares costs and what it is worth.
 
     python benchmarks/removal.py speed                       # 1920x1080 and 4096x2160, time and memory
-    python benchmarks/removal.py sample [--capture CAPTURE]  # against the exact scene, and flicker
+    python benchmarks/removal.py sample [--capture CAPTURE]  # against the exact scene, and flicker; of frames cleaned
+                                        [--cleaned FOLDER]   # before, such as by remove --run, or by the network now
     python benchmarks/removal.py clean PHOTOS...             # pictures without flare, against themselves
     python benchmarks/removal.py coverage [--sheet FILE]     # what the synthesis spans, and a sheet of it
 
@@ -86,26 +87,31 @@ def speed(weights: Path | None) -> None:
                 print(f"{name:16} ratio    {figures['full']['again_s'] / figures['working']['again_s']:.1f}")
 
 
-def sample(capture: Path, weights: Path | None) -> None:
+def sample(capture: Path, weights: Path | None, cleaned: Path | None) -> None:
     """PSNR of every frame against the exact scene, and flicker."""
-    remover = Remover(weights)
+    remover = Remover(weights) if cleaned is None else None
     before: Any = None
     scores, flicker = [], []
     for path in sorted((capture / "images").iterdir()):
         truth = read_picture(capture / "truth" / "scene" / f"{path.stem}.exr").display()
         found = read_plate(path)
         frame = found.codes.astype(np.float32) / 255
-        clean = remover.remove(found)[0].astype(np.float32) / 255
+        codes = remover.remove(found)[0] if remover else read_plate(_cleaned(cleaned or capture, path.stem)).codes
+        clean = codes.astype(np.float32) / 255
         scores.append((psnr(frame, truth), psnr(clean, truth)))
         errors = (frame - truth, clean - truth)
         if before is not None:
             flicker.append([float(np.abs(now - then).mean()) for now, then in zip(errors, before, strict=True)])
         before = errors
-    untouched, cleaned = np.mean(scores, 0)
+    untouched, after = np.mean(scores, 0)
     gains = np.diff(scores, axis=1)[:, 0]
-    print(f"scene PSNR {cleaned:.2f} dB, untouched {untouched:.2f}, gain {gains.mean():+.2f} "
+    print(f"scene PSNR {after:.2f} dB, untouched {untouched:.2f}, gain {gains.mean():+.2f} "
           f"(lowest {gains.min():+.2f}, highest {gains.max():+.2f}) over {len(scores)} frames")
     print(f"flicker {np.mean(flicker, 0)[1]:.5f}, untouched {np.mean(flicker, 0)[0]:.5f}")
+
+
+def _cleaned(folder: Path, stem: str) -> Path:
+    return next(path for path in sorted(folder.iterdir()) if path.stem == stem)
 
 
 def clean_pictures(folders: list[Path], weights: Path | None) -> None:
@@ -155,6 +161,7 @@ def main() -> None:
     parser.add_argument("what", choices=("speed", "sample", "clean", "coverage", "one"))
     parser.add_argument("paths", type=Path, nargs="*")
     parser.add_argument("--capture", type=Path, default=ROOT / "sample_scenes" / "desk")
+    parser.add_argument("--cleaned", type=Path)
     parser.add_argument("--weights", type=Path)
     parser.add_argument("--size", type=int, default=WORKING_SIZE)
     parser.add_argument("--sheet", type=Path)
@@ -165,7 +172,7 @@ def main() -> None:
     elif words.what == "speed":
         speed(words.weights)
     elif words.what == "sample":
-        sample(words.capture, words.weights)
+        sample(words.capture, words.weights, words.cleaned)
     elif words.what == "clean":
         clean_pictures(words.paths, words.weights)
     else:

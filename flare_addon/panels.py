@@ -123,7 +123,7 @@ def _cleaning(layout: Any, capture: Any) -> None:
     if job is not None and job.state in ("failed", "stopped"):
         lines(layout, job.error, "ERROR" if job.state == "failed" else "INFO")
     if not (capture / "removed").is_dir() or (job is not None and job.state != "done"):
-        lines(layout, "There are no frames without flare; with them the fit separates better.", "INFO")
+        lines(layout, "No frames without flare: they are told apart by how they move.", "INFO")
         layout.operator("fit_flare.clean_frames", icon="BRUSH_DATA")
 
 

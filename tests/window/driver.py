@@ -200,8 +200,9 @@ def fill(x: float, y: float, text: str):
 
 
 def fill_above(x: float, y: float, text: str, new: str):
-    """Type over the field with that text, in the dialog that has come under the mouse: it is looked for upwards. Outside
-    a field a letter is the key of a button. Steps."""
+    """Type over the field with that text, in the dialog that has come under the mouse: it is looked for upwards. Steps.
+
+    Outside a field a letter would be the key of a button."""
     for step in range(20):
         found = yield from copied(x, y + 8 * step)
         if found == text:

@@ -3,7 +3,8 @@
 
     python benchmarks/removal.py speed                       # 1920x1080 and 4096x2160, time and memory
     python benchmarks/removal.py sample [--capture CAPTURE]  # against the exact scene, and flicker; of frames cleaned
-                                        [--cleaned FOLDER]   # before, such as by remove --run, or by the network now
+                                        [--cleaned FOLDER]   # before, such as by remove --run, or by the network now;
+                                        [--sheet FILE]       # and a picture: frame, cleaned, exact scene
     python benchmarks/removal.py clean PHOTOS...             # pictures without flare, against themselves
     python benchmarks/removal.py coverage [--sheet FILE]     # what the synthesis spans, and a sheet of it
 
@@ -37,6 +38,8 @@ from core.removal.batch import remove_all  # noqa: E402
 from core.removal.inference import WORKING_SIZE, Remover  # noqa: E402
 from core.removal.plates import read_plate  # noqa: E402
 
+SHOWN = 3
+"""Frames on a sheet of the sample."""
 CASES = {"1920x1080 png": (1920, 1080), "4096x2160 exr": (4096, 2160)}
 
 
@@ -87,18 +90,21 @@ def speed(weights: Path | None) -> None:
                 print(f"{name:16} ratio    {figures['full']['again_s'] / figures['working']['again_s']:.1f}")
 
 
-def sample(capture: Path, weights: Path | None, cleaned: Path | None) -> None:
+def sample(capture: Path, weights: Path | None, cleaned: Path | None, sheet: Path | None) -> None:
     """PSNR of every frame against the exact scene, and flicker."""
     remover = Remover(weights) if cleaned is None else None
     before: Any = None
-    scores, flicker = [], []
-    for path in sorted((capture / "images").iterdir()):
+    scores, flicker, rows = [], [], []
+    paths = sorted((capture / "images").iterdir())
+    for number, path in enumerate(paths):
         truth = read_picture(capture / "truth" / "scene" / f"{path.stem}.exr").display()
         found = read_plate(path)
         frame = found.codes.astype(np.float32) / 255
         codes = remover.remove(found)[0] if remover else read_plate(_cleaned(cleaned or capture, path.stem)).codes
         clean = codes.astype(np.float32) / 255
         scores.append((psnr(frame, truth), psnr(clean, truth)))
+        if number % max(len(paths) // SHOWN, 1) == 5:
+            rows.append(np.concatenate([frame, clean, np.clip(truth, 0, 1)], 1))
         errors = (frame - truth, clean - truth)
         if before is not None:
             flicker.append([float(np.abs(now - then).mean()) for now, then in zip(errors, before, strict=True)])
@@ -108,6 +114,11 @@ def sample(capture: Path, weights: Path | None, cleaned: Path | None) -> None:
     print(f"scene PSNR {after:.2f} dB, untouched {untouched:.2f}, gain {gains.mean():+.2f} "
           f"(lowest {gains.min():+.2f}, highest {gains.max():+.2f}) over {len(scores)} frames")
     print(f"flicker {np.mean(flicker, 0)[1]:.5f}, untouched {np.mean(flicker, 0)[0]:.5f}")
+    if sheet:
+        import cv2
+
+        picture = cv2.resize(np.concatenate(rows[:SHOWN]), None, fx=0.75, fy=0.75, interpolation=cv2.INTER_AREA)
+        cv2.imwrite(str(sheet), (picture[..., ::-1] * 255 + 0.5).astype(np.uint8), [cv2.IMWRITE_JPEG_QUALITY, 88])
 
 
 def _cleaned(folder: Path, stem: str) -> Path:
@@ -172,7 +183,7 @@ def main() -> None:
     elif words.what == "speed":
         speed(words.weights)
     elif words.what == "sample":
-        sample(words.capture, words.weights, words.cleaned)
+        sample(words.capture, words.weights, words.cleaned, words.sheet)
     elif words.what == "clean":
         clean_pictures(words.paths, words.weights)
     else:

@@ -17,6 +17,7 @@ from torch import Tensor
 from torch.nn import Parameter
 
 from ..capture import Capture, View
+from ..capture.discs import clipped_discs
 from ..errors import CaptureError, RunError
 from ..flare.compositing import composite
 from ..flare.deformation import QueryRange
@@ -36,11 +37,6 @@ from .settings import FitSettings
 from .sky import with_sky
 
 TABLE = "table.weight"
-SOURCE = 0.02
-"""Radius about a light, of the frame's width, in which what is white is taken for the light itself."""
-WHITE = 0.93
-"""Display value from which a pixel of a light's disc counts as clipped: JPEG and noise leave white a little less."""
-
 CLEAR_EVERY = 50
 """Iterations between two looks at how much of the lights the scene leaves (`visibility.clear_shares`)."""
 CLEAR_VIEWS = 40
@@ -170,14 +166,7 @@ class Trainer:
         """
         if self.settings.blend != "add" or self.flare is None:
             return None
-        height, width = clean.shape[:2]
-        pixels, depth = targets.camera.project(self.flare.positions.numpy())
-        across, down = torch.arange(width) + 0.5, torch.arange(height)[:, None] + 0.5
-        near = torch.zeros(height, width, dtype=torch.bool)
-        for (x, y), z in zip(pixels.tolist(), depth.tolist(), strict=True):
-            if z > 0:
-                near |= (across - x).square() + (down - y).square() < (SOURCE * width) ** 2
-        return near & (clean >= WHITE).all(-1)
+        return torch.from_numpy(clipped_discs(clean.numpy(), targets.camera, self.flare.positions.numpy()))
 
     def _scene_target(self, targets: Targets, picture: Tensor, scene: Tensor) -> Tensor | None:
         if self._supervised:

@@ -3,7 +3,7 @@
 
 What a fit knows of a flare it knows from all views together, which is more than any single plate says. Its flare is
 taken from a plate in linear light. Where the plate is clipped, nothing is left of what lay under the flare: there the
-fitted scene stands in, as far as it is brighter.
+fitted scene stands in, as far as it is brighter. The lights' own clipped discs stay as they are.
 """
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..capture import Camera, Capture, View
+from ..capture.discs import clipped_discs
 from ..errors import CaptureError, SettingsError
 from ..files import inside, remove_partial_of
 from ..pictures import linear_from_srgb, srgb_from_linear, write_exr
@@ -58,31 +59,40 @@ def remove_fitted(fitted: Fitted, capture: Capture, views: Sequence[View], folde
         if target.resolve() == path.resolve():
             raise SettingsError(f"{path} would be overwritten by its own result; choose another folder with --out.")
         if overwrite or not target.is_file() or target.stat().st_mtime < path.stat().st_mtime:
-            _remove(fitted, view, path, target, flare_folder)
+            _remove(fitted, capture, view, path, target, flare_folder)
             made += 1
         progress.advance()
     progress.say(f"{made} clean plates are in {folder}.")
     return {"plates": str(folder), "made": made, "kept": len(views) - made}
 
 
-def _remove(fitted: Fitted, view: View, path: Path, target: Path, flare_folder: Path | None) -> None:
+def _remove(fitted: Fitted, capture: Capture, view: View, path: Path, target: Path,
+            flare_folder: Path | None) -> None:
     remove_partial_of(target)
     plate = read_plate(path)
     height, width = plate.codes.shape[:2]
     camera = view.camera if view.camera.size == (width, height) else view.camera.scaled(width, height)
     layers = fitted.render(camera)
     flare = np.sum([np.zeros((height, width, 3), np.float32), *layers.flare_by_light.values()], axis=0)
-    write_plate(target, plate, without(plate, flare, layers.scene))
+    lights = clipped_discs(_display(plate), camera, [light.xyz for light in capture.lights])
+    write_plate(target, plate, without(plate, np.where(lights[..., None], 0, flare), layers.scene))
     if flare_folder is not None:
         exr = inside(flare_folder, str(Path(view.name).with_suffix(".exr")), CaptureError)
         write_exr(exr, {name: np.ascontiguousarray(flare[..., k], np.float16) for k, name in enumerate("RGB")})
+
+
+def _display(plate: Plate) -> Pixels:
+    """Display values of the codes, 0..1."""
+    if plate.encoding == "srgb":
+        return plate.codes.astype(np.float32) / np.float32(plate.top)
+    return srgb_from_linear(np.clip(np.nan_to_num(plate.codes.astype(np.float32)), 0, 1))
 
 
 def without(plate: Plate, flare: Pixels, scene: Pixels) -> NDArray[Any]:
     """The plate's codes less a flare, given linear light of flare and scene as (height, width, 3); kept to the last bit
     where there is no flare, and where they are no numbers."""
     if plate.encoding == "srgb":
-        display = plate.codes.astype(np.float32) / np.float32(plate.top)
+        display = _display(plate)
         light, clipped = linear_from_srgb(display), display.max(-1, keepdims=True) >= CLIPPED
     else:
         light = np.nan_to_num(plate.codes.astype(np.float32), nan=0.0, posinf=65504.0, neginf=0.0)

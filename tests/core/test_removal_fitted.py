@@ -6,6 +6,7 @@ import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -15,7 +16,7 @@ from core.pictures import linear_from_srgb, read_exr, read_picture, write_exr
 from core.progress import Progress
 from core.removal.fitted import remove_fitted, without
 from core.removal.plates import Plate, read_plate
-from tests.core.flared import flare, flared_capture
+from tests.core.flared import LIGHT, flare, flared_capture
 
 
 @dataclass
@@ -71,6 +72,25 @@ def test_where_the_plate_is_clipped_the_scene_stands_in() -> None:
     assert clean[0, 0].max() == 0, "more flare than there is light"
     assert clean[0, 1, 0] == 188, "0.5 of white"
     assert clean[1, 1, 0] == 255
+
+
+def test_a_light_s_own_disc_stays(capture: Capture, tmp_path: Path) -> None:
+    view = capture.views[1]
+    x, y = view.camera.project(LIGHT)[0][0]
+    codes = cv2.imread(str(capture.frame_path(view)))
+    codes[int(y), int(x)] = 255
+    codes[2, 3] = 255
+    cv2.imwrite(str(capture.frame_path(view)), codes)
+
+    class Bright(Exact):
+        def render(self, camera: Camera) -> Layers:
+            flare = np.ones((camera.height, camera.width, 3), np.float32)
+            return Layers(np.zeros_like(flare), {"lamp": flare})
+
+    remove_fitted(Bright(), capture, [view], tmp_path / "clean", Progress())
+    clean = cv2.imread(str(tmp_path / "clean" / view.name))
+    assert (clean[int(y), int(x)] == 255).all()
+    assert (clean[2, 3] == 0).all(), "white far from every light is flare"
 
 
 def test_floats_keep_what_is_above_white_below_black_or_no_number() -> None:

@@ -116,14 +116,16 @@ class SplitSettings:
     A flare adds light, and its place in the picture changes from view to view as no part of the scene's does. So the
     scene is fitted alone first, for the share `begin` of the iterations, to what the frames agree on from below: where
     a frame is brighter than the scene, that counts for `excess` of what it counts where it is darker. From then on both
-    are fitted to the frames, and the same holds the scene down with `weight`. `sh_degree`: of the scene's colours,
-    which could follow a flare if they were free to change with the direction. `sky`: points far away to begin with.
+    are fitted to the frames, and the same holds the scene down with `weight`. `sh_degree`: of the scene's colours for
+    the share `plain` of the iterations, since they could follow a flare if they were free to change with the direction.
+    `sky`: points far away to begin with.
     """
 
     begin: float = 0.05
     excess: float = 0.25
     weight: float = 0.05
     sh_degree: int = 1
+    plain: float = 0.7
     sky: bool = True
 
 
@@ -167,6 +169,7 @@ class FitSettings:
             (0 <= self.split.begin < 1, "split.begin must lie between 0 and 1"),
             (0 <= self.split.excess <= 1, "split.excess must lie between 0 and 1"),
             (self.split.weight >= 0, "split.weight must not be negative"),
+            (0 <= self.split.plain <= 1, "split.plain must lie between 0 and 1"),
             (0 <= self.split.sh_degree <= 3, "split.sh_degree must lie between 0 and 3"),
             (self.mode != "2d" or not self.flare.form.line, "mode 2d needs a form without the line"),
         )

@@ -179,7 +179,8 @@ class Trainer:
     def _sh_degree(self) -> int:
         if self.settings.scene.start:
             return 3  # it was trained before
-        most = self.settings.split.sh_degree if self.settings.mode == "split" else 3
+        plain = self.settings.mode == "split" and self.iteration <= self.settings.split.plain * self.settings.iterations
+        most = self.settings.split.sh_degree if plain else 3
         return min(most, self.iteration // self.settings.scene.sh_every)
 
     def _generator(self, number: int, purpose: int) -> torch.Generator:

@@ -151,7 +151,13 @@ def clean(scene: Any) -> Job:
     capture = capture_of(scene)
     if capture is None or not (capture / "images").is_dir():
         raise CaptureError("There is no capture with a folder images/ yet; import one first.")
-    return engine.run("clean", capture / "removal", ["remove", capture / "images", "--out", capture / "removed"])
+    return engine.run("clean", capture / "removal", cleaning(scene, capture))
+
+
+def cleaning(scene: Any, capture: Path) -> list[object]:
+    """The engine's words for it: a finished fit knows the flare of all frames, a network sees each frame by itself."""
+    plates = ["--run", folder_of(scene)] if state_of(scene) == "finished" else [capture / "images"]
+    return ["remove", *plates, "--out", capture / "removed"]
 
 
 def cleaned(job: Job) -> None:

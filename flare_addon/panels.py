@@ -91,7 +91,7 @@ class FITFLARE_PT_fit(_Part, bpy.types.Panel):
         settings.prop(state, "width")
         capture = fits.capture_of(scene)
         if capture is not None and (state.mode == "split" or jobs.find(capture / "removal") is not None):
-            _cleaning(layout, capture)
+            _cleaning(layout, capture, stage)
         if stage == "lost":
             lines(layout, f"The run's folder {folder} is gone: start a new fit.", "ERROR")
         elif stage == "resumable":
@@ -114,7 +114,7 @@ class FITFLARE_PT_fit(_Part, bpy.types.Panel):
             _reading(layout, folder)
 
 
-def _cleaning(layout: Any, capture: Any) -> None:
+def _cleaning(layout: Any, capture: Any, stage: str) -> None:
     """The frames without flare: made, being made, or to be made."""
     job = jobs.find(capture / "removal")
     if job is not None and job.running:
@@ -123,7 +123,8 @@ def _cleaning(layout: Any, capture: Any) -> None:
     if job is not None and job.state in ("failed", "stopped"):
         lines(layout, job.error, "ERROR" if job.state == "failed" else "INFO")
     if not (capture / "removed").is_dir() or (job is not None and job.state != "done"):
-        lines(layout, "No frames without flare: they are told apart by how they move.", "INFO")
+        lines(layout, "The fit can take its flare out of the frames." if stage == "finished" else
+              "No frames without flare: scene and flare are told apart by how they move.", "INFO")
         layout.operator("fit_flare.clean_frames", icon="BRUSH_DATA")
 
 

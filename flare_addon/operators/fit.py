@@ -45,7 +45,7 @@ class FITFLARE_OT_resume(Action, bpy.types.Operator):
 
 
 class FITFLARE_OT_clean_frames(Action, bpy.types.Operator):
-    """Have the engine take the flares out of the frames, so that the fit has clean ones to learn the scene from"""
+    """Have the engine take the flares out of the frames: by the fit once it is finished, before that by a network"""
 
     bl_idname = "fit_flare.clean_frames"
     bl_label = "Make Clean Frames"

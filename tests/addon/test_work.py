@@ -53,6 +53,13 @@ def facts(made: tuple[Any, Path]) -> Any:
     return made[0]
 
 
+def test_a_finished_fit_cleans_the_frames(made: tuple[Any, Path]) -> None:
+    facts, base = made
+    images, removed = str(Path("capture") / "images"), str(Path("capture") / "removed")
+    assert facts["cleaned by the network"] == ["remove", images, "--out", removed]
+    assert facts["cleaned by the fit"] == ["remove", "--run", str(base / "a run"), "--out", removed]
+
+
 @pytest.mark.parametrize("kind", ["animated", "each"])
 def test_cameras_see_points_where_the_footage_has_them(facts: Any, kind: str) -> None:
     """Off-centre principal point, turned and scaled root; by the matrices Blender renders with."""

@@ -68,6 +68,15 @@ for kind, up, scale in (("animated", "Z", 1.0), ("each", "-Y", 2.5)):
         facts["lights"] = {item.name: [round(value, 5) for value in item.location] for item in scene.objects
                            if item.fit_flare.is_light}
 
+# ---- clean frames -----------------------------------------------------------------------------------
+fits = part("flare_addon.fits")
+facts["cleaned by the network"] = [str(word) for word in fits.cleaning(scene, Path("capture"))]
+run = Path(out) / "a run"
+run.mkdir()
+(run / fits.FLARE).write_bytes(b"")
+scene.fit_flare.run = str(run)
+facts["cleaned by the fit"] = [str(word) for word in fits.cleaning(scene, Path("capture"))]
+
 # ---- one undo step ----------------------------------------------------------------------------------
 scene = empty()
 bpy.ops.ed.undo_push(message="before")

@@ -114,14 +114,15 @@ class SplitSettings:
     """Mode `split`: how a scene is told from flare without flare-free frames.
 
     A flare adds light, and its place in the picture changes from view to view as no part of the scene's does. So the
-    scene is fitted alone first, for the share `begin` of the iterations, to what the frames agree on from below: where
-    a frame is brighter than the scene, that counts for `excess` of what it counts where it is darker. From then on both
-    are fitted to the frames, and the same holds the scene down with `weight`. `sh_degree`: of the scene's colours for
-    the share `plain` of the iterations, since they could follow a flare if they were free to change with the direction.
-    `sky`: points far away to begin with.
+    scene is fitted alone first, until every view was looked at `rounds` times (a third of the iterations at most), to
+    what the frames agree on from below: where a frame is brighter than the scene, that counts for `excess` of what it
+    counts where it is darker. Longer, and it takes up the glow about the lights; shorter, and the flare takes walls.
+    From then on both are fitted to the frames, and the same holds the scene down with `weight`. `sh_degree`: of the
+    scene's colours for the share `plain` of the iterations, since they could follow a flare if they were free to change
+    with the direction. `sky`: points far away to begin with.
     """
 
-    begin: float = 0.05
+    rounds: int = 2
     excess: float = 0.25
     weight: float = 0.05
     sh_degree: int = 1
@@ -166,7 +167,7 @@ class FitSettings:
             (0 < self.flare.opacity < 1, "a flare's opacity must lie between 0 and 1"),
             (self.seed >= 0, "seed must not be negative"),
             (not self.scene.frozen or bool(self.scene.start), "a frozen scene needs a PLY to start from"),
-            (0 <= self.split.begin < 1, "split.begin must lie between 0 and 1"),
+            (self.split.rounds >= 0, "split.rounds must not be negative"),
             (0 <= self.split.excess <= 1, "split.excess must lie between 0 and 1"),
             (self.split.weight >= 0, "split.weight must not be negative"),
             (0 <= self.split.plain <= 1, "split.plain must lie between 0 and 1"),

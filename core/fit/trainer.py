@@ -138,7 +138,7 @@ class Trainer:
     def _scene_alone(self, targets: Targets) -> bool:
         """Whether the scene is fitted alone as yet, so that it hides lights by the time their flares are fitted."""
         if self.settings.mode == "split":
-            return self.iteration <= self.settings.split.begin * self.settings.iterations
+            return self.iteration <= min(self.settings.split.rounds * len(self.views), self.settings.iterations // 3)
         begun = self.iteration > self.settings.flare.begin * self.settings.iterations
         return self._supervised and self.scene_is_fitted and targets.removed is not None and not begun
 

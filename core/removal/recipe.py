@@ -14,7 +14,7 @@ from .network import LEVELS, MULTIPLE
 
 @dataclass(frozen=True)
 class Recipe:
-    """How the network is trained; the defaults made the weights in the box.
+    """How the network is trained; the weights in the box began with the defaults (their card has the rest).
 
     An iteration is a step on new pictures of one size under flares from the bank; they are small at first, since
     most of what a flare looks like is learned as well, and sooner, on those. The learning rate rises over the first

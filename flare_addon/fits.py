@@ -120,7 +120,8 @@ def finished(job: Job) -> None:
         folder = folder_of(scene)
         if folder is not None and folder == job.folder:
             try:
-                looks.use(scene, folder / FLARE)
+                look = looks.use(scene, folder / FLARE)
+                lights.follow(scene, {light.name: light.xyz for light in look.lights}, capture_of(scene))
             except FitFlareError as problem:
                 job.error = str(problem)
     _remember("Fit")

@@ -2,11 +2,12 @@
 """Light objects: which there are, and how they become the lights.json of a fit."""
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..core.capture import read_lights
 from ..core.errors import CaptureError
@@ -105,3 +106,16 @@ def reload(scene: Any, folder: Path) -> int:
             size = max((item.empty_display_size for item in there.values() if item.type == "EMPTY"), default=0.2)
             there[light.name] = add_light(collection, root, light.name, light.xyz, size)
     return len(found)
+
+
+def follow(scene: Any, places: Mapping[str, ArrayLike], capture: Path | None) -> None:
+    """Move lights to where a fit has put them (3,), by name, in the capture's coordinates: those that still are where
+    the fit was given them, as the capture's lights.json has it, and that nothing else moves."""
+    path = None if capture is None else capture / "lights.json"
+    given = {} if path is None or not path.is_file() else {light.name: light.xyz for light in read_lights(path)}
+    for item in of_scene(scene):
+        name = name_of(item)
+        if name in places and name in given and item.parent == scene.fit_flare.root and item.animation_data is None:
+            where = place_of(item, scene.fit_flare.root)
+            if np.allclose(where, given[name], atol=1e-4) and not np.allclose(where, places[name], atol=1e-4):
+                item.location = np.asarray(places[name]).tolist()

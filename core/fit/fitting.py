@@ -51,6 +51,10 @@ def fit(capture: Capture, settings: FitSettings, folder: Path | str, progress: P
     path = folder / CHECKPOINT
     if continued and path.exists():
         trainer.load_state(checkpoint.load(path))
+    else:
+        for text in trainer.says:
+            progress.say(text)
+            _log(run, text)
     _forget_after(folder / METRICS, trainer.iteration)
     _log(run, f"begun at iteration {trainer.iteration} of {run.settings.iterations}")
     progress.stage("fit", run.settings.iterations, trainer.iteration)

@@ -69,6 +69,8 @@ class FlareSettings:
     `occlusion` scales each flare by the share of its light that the scene leaves visible (`visibility`).
     `begin`: share of the iterations in which the scene is fitted alone first, where it has flare-free frames: a
     flare that is fitted before the scene hides its light learns to vanish by itself, and in the views beside, too.
+    `snap`: lights that were given beside their flares are put where those are (`lights.snap`), where flare-free frames
+    show them.
     `steady`: weight of the squared delta_l in the loss. Where a light is hidden nothing else holds delta_l, and Adam
     makes of the faintest gradient a full step: it wanders out of the frame and takes the views beside along.
     """
@@ -81,6 +83,7 @@ class FlareSettings:
     detection: bool = True
     occlusion: bool = False
     begin: float = 0.0
+    snap: bool = False
     steady: float = 0.0
     visibility: VisibilitySettings = field(default_factory=VisibilitySettings)
 
@@ -210,7 +213,7 @@ def preset(name: Preset, *, model: Literal["paper", "ours"] | None = None, mode:
         blend = "over" if model == "paper" else "add"
     flare = FlareSettings(form=form)
     if model == "ours":
-        flare = replace(flare, occlusion=True, begin=BEGIN, steady=STEADY)
+        flare = replace(flare, occlusion=True, begin=BEGIN, snap=True, steady=STEADY)
     settings = FitSettings(mode=mode, blend=blend, iterations=length, flare=flare,
                            apart=APART if model == "ours" else 0.0)
     if name != "paper":

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import Parameter
@@ -30,6 +31,7 @@ from ..gaussians.optimiser import Adam
 from ..gaussians.ordering import morton_order
 from ..gaussians.ply import read_ply
 from ..gaussians.scene import SceneGaussians
+from ..lights.snap import Sight, sight, snapped
 from .checkpoint import State
 from .frames import Frames, Targets
 from .rendering import render_flare
@@ -41,6 +43,8 @@ CLEAR_EVERY = 50
 """Iterations between two looks at how much of the lights the scene leaves (`visibility.clear_shares`)."""
 CLEAR_VIEWS = 40
 """About as many views are asked."""
+SNAP_WIDTH, SNAP_VIEWS = 160, 40
+"""Pixels of the pictures that lights are placed by, and about how many of them."""
 
 
 class Trainer:
@@ -61,7 +65,8 @@ class Trainer:
             raise CaptureError(f"{capture.folder} has no flare-free frames (removed/); run remove on it first, "
                                "or fit with --mode unsup.")
         self.scene = _first_scene(capture, settings, self.views, self.frames)
-        self.flare = None if settings.mode == "3dgs" else _new_flare(capture, self.views, settings)
+        self.flare = None if settings.mode == "3dgs" else _new_flare(capture, self.views, self.frames, settings)
+        self.says = () if self.flare is None else _snaps(capture, self.flare)
         self.extent = capture.extent
         self.scene_adam = Adam(dict(self.scene.named_parameters()), self._scene_rates())
         self.strategy = self._strategy()
@@ -309,7 +314,7 @@ def _first_scene(capture: Capture, settings: FitSettings, views: tuple[View, ...
     return SceneGaussians.from_points(with_sky(capture, views, frames) if sky else capture.points)
 
 
-def _new_flare(capture: Capture, views: tuple[View, ...], settings: FitSettings) -> FlareModel:
+def _new_flare(capture: Capture, views: tuple[View, ...], frames: Frames, settings: FitSettings) -> FlareModel:
     if not capture.lights:
         raise CaptureError(f"{capture.folder} has no lights.json; run lights on it first, or fit with --mode 3dgs.")
     generator = torch.Generator().manual_seed(settings.seed)
@@ -318,6 +323,8 @@ def _new_flare(capture: Capture, views: tuple[View, ...], settings: FitSettings)
         # Paper, appendix: the centroid of the points, offset by uniform noise in [0, 1) along each axis.
         centroid = torch.from_numpy(capture.points.xyz).double().mean(0)
         positions = centroid + torch.rand(positions.shape, generator=generator, dtype=torch.float64)
+    elif settings.flare.snap and frames.reference:
+        positions = torch.from_numpy(snapped(_sights(capture, views), positions.numpy()))
     poses = [torch.from_numpy(view.camera.world_to_camera) for view in views]
     flares = []
     for name, xyz in zip((light.name for light in capture.lights), positions, strict=True):
@@ -328,6 +335,21 @@ def _new_flare(capture: Capture, views: tuple[View, ...], settings: FitSettings)
         query = QueryRange.of(torch.stack([one.camera for one in seen]), torch.stack([one.light for one in seen]))
         flares.append(LightFlare(settings.flare.form, query, settings.flare.count, generator, settings.flare.opacity))
     return FlareModel([light.name for light in capture.lights], positions, flares)
+
+
+def _sights(capture: Capture, views: tuple[View, ...]) -> list[Sight]:
+    """Of some of the views with flare-free frames, small, which is all that placing lights takes."""
+    small = Frames(capture, SNAP_WIDTH)
+    targets = [small.targets(view) for view in views[:: max(len(views) // SNAP_VIEWS, 1)]]
+    return [sight(one.camera, one.frame.numpy(), one.removed.numpy()) for one in targets if one.removed is not None]
+
+
+def _snaps(capture: Capture, flare: FlareModel) -> tuple[str, ...]:
+    """A sentence for each light that is not where the capture has it."""
+    away = [float(np.linalg.norm(xyz - light.xyz)) for light, xyz in
+            zip(capture.lights, flare.positions.numpy(), strict=True)]
+    return tuple(f"The light {light.name!r} was put where its flare is, {distance:.3g} from where it was given."
+                 for light, distance in zip(capture.lights, away, strict=True) if distance > 0)
 
 
 def _flare_optimisers(flare: FlareModel | None, settings: FitSettings) -> tuple[Adam | None, Any]:

@@ -91,6 +91,11 @@ def test_lights_of_the_scene_are_those_of_the_fit(facts: Any) -> None:
     np.testing.assert_allclose(facts["lights.json"]["lamp"], LIGHT, atol=1e-5)
 
 
+def test_lights_follow_a_fit_that_has_moved_them_unless_the_artist_has(facts: Any) -> None:
+    assert facts["followed"] == {"key": False, "lamp": True}
+    np.testing.assert_allclose(facts["followed back"], LIGHT + 1, atol=1e-4)  # lights.json has it elsewhere
+
+
 def test_a_flare_finds_its_light(facts: Any) -> None:
     assert facts["open"] == ["FINISHED"]
     assert facts["flares"] == [["lamp", "lamp", "lamp", True]]

@@ -18,13 +18,14 @@ import numpy as np
 import pytest
 import torch
 
-from core.capture import Capture
+from core.capture import Capture, Light
 from core.errors import Cancelled, CaptureError, FlareFileError, RunError
 from core.fit import FitSettings, Run, fit, preset
 from core.fit.frames import Frames
 from core.fit.settings import changed
 from core.fit.sky import COUNT, with_sky
 from core.fit.trainer import Trainer, from_below
+from core.pictures import read_picture, write_png
 from core.progress import Progress
 from tests.core.flared import flared_capture
 
@@ -117,6 +118,30 @@ def test_the_light_itself_is_not_what_its_flare_lies_before(capture: Capture) ->
         expected = behind.clone()
         expected[y, x] = 0
         assert torch.equal(seen, expected)
+
+
+def test_a_light_given_beside_its_flare_is_put_there(tmp_path: Path) -> None:
+    capture = Capture.open(flared_capture(tmp_path / "capture"))
+    lamp = capture.lights[0]
+    for view in capture.views:  # the lamp itself, which the painted flare lacks
+        (x, y), = view.camera.project(lamp.xyz)[0].astype(int)
+        for folder in ("images", "removed"):
+            path = capture.folder / folder / view.name
+            picture = read_picture(path).display()
+            picture[max(y - 1, 0):y + 2, max(x - 1, 0):x + 2] = 1
+            write_png(path, picture)
+    capture.lights = (Light(lamp.name, lamp.xyz + np.array([0.2, 0.15, 0.3])),)
+    says: list[str] = []
+
+    class Heard(Progress):
+        def say(self, text: str) -> None:
+            says.append(text)
+
+    for snap in (True, False):
+        run = fit(capture, quick(4, **{"flare.snap": snap}), tmp_path / f"run {snap}", Heard())
+        off = np.linalg.norm(run.flare.model.positions.numpy()[0] - lamp.xyz)
+        assert off < 0.1 if snap else off > 0.35
+    assert [text.split(" was put")[0] for text in says] == ["The light 'lamp'"]
 
 
 def test_stopped_and_resumed_is_bit_for_bit_the_unbroken_fit(tmp_path: Path, capture: Capture) -> None:

@@ -103,6 +103,18 @@ facts["bulb stays"] = "Bulb" in scene.objects
 lights.write(scene, Path(capture))
 written = core_capture.read_lights(Path(capture) / "lights.json")
 facts["lights.json"] = {light.name: light.xyz.tolist() for light in written}
+key, places = scene.objects["key"], {light.name: light.xyz + 1 for light in written}
+key.location.x += 0.5
+bpy.context.view_layer.update()
+lights.follow(scene, places, Path(capture))
+bpy.context.view_layer.update()
+facts["followed"] = {name: bool(np.allclose(lights.place_of(item, scene.fit_flare.root), places[name], atol=1e-4))
+                     for name in places for item in lights.of_scene(scene) if lights.name_of(item) == name}
+lights.follow(scene, {light.name: light.xyz for light in written}, Path(capture))
+bpy.context.view_layer.update()
+facts["followed back"] = lights.place_of(scene.objects["lamp"], scene.fit_flare.root).tolist()
+lights.reload(scene, Path(capture))
+bpy.context.view_layer.update()
 ops.remove_light(object="key")
 lights.write(scene, Path(capture))
 

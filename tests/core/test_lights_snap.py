@@ -1,0 +1,88 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Lights that were given beside their flares are put where those are; others stay as they were given, to the bit."""
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from core.capture import Camera
+from core.lights.snap import Sight, sight, snapped
+from core.pictures import srgb_from_linear
+from tests.core.flared import HEIGHT, WIDTH, cameras
+
+LAMP, SPOT = np.array([0.3, -0.6, 1.5]), np.array([-0.9, 0.3, 2.0])
+SCALE = 3
+
+
+def glow(small: Camera, lights: Sequence[tuple[NDArray[np.float64], float]]) -> Sight:
+    """Glow about each (place, strength) with a clipped core, a ghost on the other side, before a grey scene."""
+    camera = small.scaled(SCALE * WIDTH, SCALE * HEIGHT)
+    across, down = np.arange(camera.width) + 0.5, np.arange(camera.height)[:, None] + 0.5
+    scene = np.full((camera.height, camera.width), 0.1)
+    flare = np.zeros_like(scene)
+    for place, strength in lights:
+        (pixel,), (depth,) = camera.project(place)
+        if depth <= 0:
+            continue
+        away = np.hypot(across - pixel[0], down - pixel[1])
+        scene = np.where(away < 3, 4.0, scene)
+        flare += strength * (0.5 / (1 + (away / 4) ** 2) + 0.02 * np.exp(-0.5 * ((away - 25) / 3) ** 2))
+        ghost = np.hypot(across - 2 * camera.cx + pixel[0], down - 2 * camera.cy + pixel[1])
+        flare += strength * 0.05 * (ghost < 12)
+    frame, clean = (np.repeat(srgb_from_linear(np.clip(light, 0, 1))[..., None], 3, -1).astype(np.float32)
+                    for light in (scene + flare, scene))
+    return sight(camera, frame, clean)
+
+
+def sights(*lights: tuple[NDArray[np.float64], float]) -> list[Sight]:
+    return [glow(camera, lights) for camera in cameras(9)]
+
+
+def off(seen: Sequence[Sight], found: NDArray[np.float64], truth: NDArray[np.float64]) -> float:
+    """Mean distance in the pictures, of their width."""
+    return float(np.mean([np.linalg.norm(np.subtract(*(one.camera.project(place)[0][0] for place in (found, truth))))
+                          / one.camera.width for one in seen]))
+
+
+@pytest.mark.parametrize("moved", [(0.3, 0.2, -0.1), (-0.25, 0.3, 0.4), (0.0, -0.4, 0.0), (0.1, 0.0, -0.6)])
+def test_a_light_beside_its_flare_is_put_there(moved: tuple[float, float, float]) -> None:
+    seen = sights((LAMP, 1.0))
+    given = LAMP + np.array(moved)
+    found = snapped(seen, [given])[0]
+    assert off(seen, given, LAMP) > 0.02
+    assert off(seen, found, LAMP) < 0.004
+
+
+def test_a_light_in_its_place_stays_to_the_bit_beside_a_far_brighter_one_too() -> None:
+    given = LAMP + np.array([0.004, -0.003, 0.01])
+    assert (snapped(sights((LAMP, 1.0)), [given])[0] == given).all()
+    near = LAMP + np.array([0.5, 0.1, 0.0])
+    seen = sights((LAMP, 0.4), (near, 4.0))
+    assert (snapped(seen, [LAMP])[0] == LAMP).all()
+    assert (snapped(seen, [LAMP, near]) == [LAMP, near]).all()
+
+
+def test_two_lights_find_one_flare_each() -> None:
+    seen = sights((LAMP, 1.0), (SPOT, 0.5))
+    given = np.add([LAMP, SPOT], [[0.2, 0.25, 0.1], [0.15, -0.3, 0.2]])
+    found = snapped(seen, given)
+    assert off(seen, found[0], LAMP) < 0.004 and off(seen, found[1], SPOT) < 0.004
+
+
+def test_two_lights_do_not_climb_one_flare() -> None:
+    """The second light has no flare of its own."""
+    seen = sights((LAMP, 1.0))
+    given = np.add(LAMP, [[0, 0, 0], [0.3, 0.1, 0.0]])
+    assert (snapped(seen, given) == given).all()
+
+
+def test_without_a_flare_nothing_moves() -> None:
+    given = np.array([LAMP, SPOT])
+    assert (snapped(sights(), given) == given).all()
+    behind = np.array([[0.0, 0.0, -9.0]])
+    assert (snapped(sights((LAMP, 1.0)), behind) == behind).all()
+    assert snapped(sights((LAMP, 1.0)), np.zeros((0, 3))).shape == (0, 3)
+    assert (snapped([], given) == given).all()

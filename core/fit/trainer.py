@@ -12,7 +12,6 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import Parameter
@@ -21,30 +20,24 @@ from ..capture import Capture, View
 from ..capture.discs import clipped_discs
 from ..errors import CaptureError, RunError
 from ..flare.compositing import composite
-from ..flare.deformation import QueryRange
 from ..flare.density import clone_and_prune
-from ..flare.model import FlareModel, LightFlare, ViewOfLight
+from ..flare.model import FlareModel
 from ..flare.visibility import clear_shares
 from ..gaussians.densification import Classic, Mcmc, Strategy
 from ..gaussians.loss import l1_ssim
 from ..gaussians.optimiser import Adam
 from ..gaussians.ordering import morton_order
-from ..gaussians.ply import read_ply
-from ..gaussians.scene import SceneGaussians
-from ..lights.snap import Sight, sight, snapped
+from .beginning import first_flare, first_scene, said_of_lights
 from .checkpoint import State
 from .frames import Frames, Targets
 from .rendering import render_flare
 from .settings import FitSettings
-from .sky import with_sky
 
 TABLE = "table.weight"
 CLEAR_EVERY = 50
 """Iterations between two looks at how much of the lights the scene leaves (`visibility.clear_shares`)."""
 CLEAR_VIEWS = 40
 """About as many views are asked."""
-SNAP_WIDTH, SNAP_VIEWS = 160, 40
-"""Pixels of the pictures that lights are placed by, and about how many of them."""
 
 
 class Trainer:
@@ -64,9 +57,9 @@ class Trainer:
         if self._supervised and not self.frames.reference and self.scene_is_fitted:
             raise CaptureError(f"{capture.folder} has no flare-free frames (removed/); run remove on it first, "
                                "or fit with --mode unsup.")
-        self.scene = _first_scene(capture, settings, self.views, self.frames)
-        self.flare = None if settings.mode == "3dgs" else _new_flare(capture, self.views, self.frames, settings)
-        self.says = () if self.flare is None else _snaps(capture, self.flare)
+        self.scene = first_scene(capture, settings, self.views, self.frames)
+        self.flare = None if settings.mode == "3dgs" else first_flare(capture, self.views, self.frames, settings)
+        self.says = () if self.flare is None else said_of_lights(capture, self.flare)
         self.extent = capture.extent
         self.scene_adam = Adam(dict(self.scene.named_parameters()), self._scene_rates())
         self.strategy = self._strategy()
@@ -297,59 +290,6 @@ def _load_parameters(parameters: dict[str, Parameter], state: State) -> None:
 def _decayed(first: float, last: float, progress: float) -> float:
     """Exponential decay from `first` to `last` as progress goes from 0 to 1."""
     return first * (last / first) ** min(max(progress, 0.0), 1.0)
-
-
-def _first_scene(capture: Capture, settings: FitSettings, views: tuple[View, ...], frames: Frames) -> SceneGaussians:
-    """The scene a fit begins with: one that was trained elsewhere, or a Gaussian at each point."""
-    if settings.scene.start:
-        scene = read_ply(settings.scene.start)
-        if not len(scene):
-            raise CaptureError(f"{settings.scene.start} holds no Gaussians; export it again.")
-        for parameter in scene.parameters():
-            parameter.requires_grad_(not settings.scene.frozen)
-        return scene
-    if not len(capture.points):
-        raise CaptureError(f"{capture.folder} has no 3D points to start from; solve it again.")
-    sky = settings.mode == "split" and settings.split.sky
-    return SceneGaussians.from_points(with_sky(capture, views, frames) if sky else capture.points)
-
-
-def _new_flare(capture: Capture, views: tuple[View, ...], frames: Frames, settings: FitSettings) -> FlareModel:
-    if not capture.lights:
-        raise CaptureError(f"{capture.folder} has no lights.json; run lights on it first, or fit with --mode 3dgs.")
-    generator = torch.Generator().manual_seed(settings.seed)
-    positions = torch.tensor([list(map(float, light.xyz)) for light in capture.lights], dtype=torch.float64)
-    if not settings.flare.detection:
-        # Paper, appendix: the centroid of the points, offset by uniform noise in [0, 1) along each axis.
-        centroid = torch.from_numpy(capture.points.xyz).double().mean(0)
-        positions = centroid + torch.rand(positions.shape, generator=generator, dtype=torch.float64)
-    elif settings.flare.snap and frames.reference:
-        positions = torch.from_numpy(snapped(_sights(capture, views), positions.numpy()))
-    poses = [torch.from_numpy(view.camera.world_to_camera) for view in views]
-    flares = []
-    for name, xyz in zip((light.name for light in capture.lights), positions, strict=True):
-        seen = [one for one in (ViewOfLight.of(pose, xyz) for pose in poses) if one.depth > 0]
-        if not seen:
-            raise CaptureError(f"The light {name!r} is behind the camera in every view of {capture.folder}; "
-                               "correct or remove it in lights.json.")
-        query = QueryRange.of(torch.stack([one.camera for one in seen]), torch.stack([one.light for one in seen]))
-        flares.append(LightFlare(settings.flare.form, query, settings.flare.count, generator, settings.flare.opacity))
-    return FlareModel([light.name for light in capture.lights], positions, flares)
-
-
-def _sights(capture: Capture, views: tuple[View, ...]) -> list[Sight]:
-    """Of some of the views with flare-free frames, small, which is all that placing lights takes."""
-    small = Frames(capture, SNAP_WIDTH)
-    targets = [small.targets(view) for view in views[:: max(len(views) // SNAP_VIEWS, 1)]]
-    return [sight(one.camera, one.frame.numpy(), one.removed.numpy()) for one in targets if one.removed is not None]
-
-
-def _snaps(capture: Capture, flare: FlareModel) -> tuple[str, ...]:
-    """A sentence for each light that is not where the capture has it."""
-    away = [float(np.linalg.norm(xyz - light.xyz)) for light, xyz in
-            zip(capture.lights, flare.positions.numpy(), strict=True)]
-    return tuple(f"The light {light.name!r} was put where its flare is, {distance:.3g} from where it was given."
-                 for light, distance in zip(capture.lights, away, strict=True) if distance > 0)
 
 
 def _flare_optimisers(flare: FlareModel | None, settings: FitSettings) -> tuple[Adam | None, Any]:

@@ -7,17 +7,18 @@ fitted scene stands in, as far as it is brighter. The lights' own clipped discs 
 """
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..capture import Camera, Capture, View
+from ..capture import Capture, View
 from ..capture.discs import clipped_discs
 from ..errors import CaptureError, SettingsError
 from ..files import inside, remove_partial_of
+from ..metrics.evaluation import Renderer
 from ..pictures import linear_from_srgb, srgb_from_linear, write_exr
 from ..progress import Progress
 from .inference import CLIPPED
@@ -26,22 +27,7 @@ from .plates import Plate, read_plate, write_plate
 Pixels = NDArray[np.float32]
 
 
-class FittedLayers(Protocol):
-    """Scene-linear layers of a view (height, width, 3): the scene, and each light's flare."""
-
-    @property
-    def scene(self) -> Pixels: ...
-    @property
-    def flare_by_light(self) -> Mapping[str, Pixels]: ...
-
-
-class Fitted(Protocol):
-    """A fitted run."""
-
-    def render(self, camera: Camera) -> FittedLayers: ...
-
-
-def remove_fitted(fitted: Fitted, capture: Capture, views: Sequence[View], folder: Path, progress: Progress, *,
+def remove_fitted(fitted: Renderer, capture: Capture, views: Sequence[View], folder: Path, progress: Progress, *,
                   flare_folder: Path | None = None, overwrite: bool = False) -> dict[str, Any]:
     """Write the views' frames without the fitted flare below `folder`, each under its own name, in its own kind and
     depth; those that are there and newer than the frame are kept, unless `overwrite`.
@@ -66,7 +52,7 @@ def remove_fitted(fitted: Fitted, capture: Capture, views: Sequence[View], folde
     return {"plates": str(folder), "made": made, "kept": len(views) - made}
 
 
-def _remove(fitted: Fitted, capture: Capture, view: View, path: Path, target: Path,
+def _remove(fitted: Renderer, capture: Capture, view: View, path: Path, target: Path,
             flare_folder: Path | None) -> None:
     remove_partial_of(target)
     plate = read_plate(path)

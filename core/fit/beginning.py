@@ -1,0 +1,74 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What a fit begins with: a scene, and a flare for each light, which is put in its place first."""
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from ..capture import Capture, View
+from ..errors import CaptureError
+from ..flare.deformation import QueryRange
+from ..flare.model import FlareModel, LightFlare, ViewOfLight
+from ..gaussians.ply import read_ply
+from ..gaussians.scene import SceneGaussians
+from ..lights.snap import Sight, sight, snapped
+from .frames import Frames
+from .settings import FitSettings
+from .sky import with_sky
+
+SNAP_WIDTH, SNAP_VIEWS = 160, 40
+"""Pixels of the pictures that lights are placed by, and about how many of them."""
+
+
+def first_scene(capture: Capture, settings: FitSettings, views: tuple[View, ...], frames: Frames) -> SceneGaussians:
+    """The scene a fit begins with: one that was trained elsewhere, or a Gaussian at each point."""
+    if settings.scene.start:
+        scene = read_ply(settings.scene.start)
+        if not len(scene):
+            raise CaptureError(f"{settings.scene.start} holds no Gaussians; export it again.")
+        for parameter in scene.parameters():
+            parameter.requires_grad_(not settings.scene.frozen)
+        return scene
+    if not len(capture.points):
+        raise CaptureError(f"{capture.folder} has no 3D points to start from; solve it again.")
+    sky = settings.mode == "split" and settings.split.sky
+    return SceneGaussians.from_points(with_sky(capture, views, frames) if sky else capture.points)
+
+
+def first_flare(capture: Capture, views: tuple[View, ...], frames: Frames, settings: FitSettings) -> FlareModel:
+    """The flares a fit begins with. Raises CaptureError where there are no lights, or one is behind all cameras."""
+    if not capture.lights:
+        raise CaptureError(f"{capture.folder} has no lights.json; run lights on it first, or fit with --mode 3dgs.")
+    generator = torch.Generator().manual_seed(settings.seed)
+    positions = torch.tensor([list(map(float, light.xyz)) for light in capture.lights], dtype=torch.float64)
+    if not settings.flare.detection:
+        # Paper, appendix: the centroid of the points, offset by uniform noise in [0, 1) along each axis.
+        centroid = torch.from_numpy(capture.points.xyz).double().mean(0)
+        positions = centroid + torch.rand(positions.shape, generator=generator, dtype=torch.float64)
+    elif settings.flare.snap and frames.reference:
+        positions = torch.from_numpy(snapped(_sights(capture, views), positions.numpy()))
+    poses = [torch.from_numpy(view.camera.world_to_camera) for view in views]
+    flares = []
+    for name, xyz in zip((light.name for light in capture.lights), positions, strict=True):
+        seen = [one for one in (ViewOfLight.of(pose, xyz) for pose in poses) if one.depth > 0]
+        if not seen:
+            raise CaptureError(f"The light {name!r} is behind the camera in every view of {capture.folder}; "
+                               "correct or remove it in lights.json.")
+        query = QueryRange.of(torch.stack([one.camera for one in seen]), torch.stack([one.light for one in seen]))
+        flares.append(LightFlare(settings.flare.form, query, settings.flare.count, generator, settings.flare.opacity))
+    return FlareModel([light.name for light in capture.lights], positions, flares)
+
+
+def _sights(capture: Capture, views: tuple[View, ...]) -> list[Sight]:
+    """Of some of the views with flare-free frames, small, which is all that placing lights takes."""
+    small = Frames(capture, SNAP_WIDTH)
+    targets = [small.targets(view) for view in views[:: max(len(views) // SNAP_VIEWS, 1)]]
+    return [sight(one.camera, one.frame.numpy(), one.removed.numpy()) for one in targets if one.removed is not None]
+
+
+def said_of_lights(capture: Capture, flare: FlareModel) -> tuple[str, ...]:
+    """A sentence for each light that is not where the capture has it."""
+    away = [float(np.linalg.norm(xyz - light.xyz)) for light, xyz in
+            zip(capture.lights, flare.positions.numpy(), strict=True)]
+    return tuple(f"The light {light.name!r} was put where its flare is, {distance:.3g} from where it was given."
+                 for light, distance in zip(capture.lights, away, strict=True) if distance > 0)

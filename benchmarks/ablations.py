@@ -13,7 +13,7 @@ Studies:
   robustness-ours the same of our form
   supervision     our form taught by exact flare-free frames, by those that `remove` makes, and by none: split by
                   parallax, or as the paper does without (unsup)
-  known           the flare alone, over the exact scene: what the representation itself can do
+  known           the flare alone, over the exact scene, 900 Gaussians a light: what the representation itself can do
   extrapolation   our form, with a stretch of the path held out instead of every n-th view
   reconstruction  the paper's table 3: 3DGS trained on the frames, on the frames with a bilateral grid for each, and on
                   flare-free frames, judged on exact flare-free views; the scene of our form beside them
@@ -142,9 +142,11 @@ def experiments(length: Length) -> list[Experiment]:
     made += of("supervision", {"exact flare-free frames": ours(length), "none: split": ours(length, "split"),
                                "none: unsup": ours(length, "unsup")})
     made.append(Experiment("supervision", "what remove makes", ours(length), frames="cleaned"))
-    alone = changed(ours(length), {"flare.count": 900, "flare.occlusion": False})
+    many = {"flare.count": 900, "flare.density.most": 900}  # of each light, from the beginning to the end
+    alone = changed(ours(length), {**many, "flare.occlusion": False})
     made += [Experiment("known", "ours", alone, known_scene=True),
-             Experiment("known", "the paper's", papers(length, flare__count=900), known_scene=True)]
+             Experiment("known", "without rings", changed(alone, {"flare.form.rings": False}), known_scene=True),
+             Experiment("known", "the paper's", changed(papers(length), many), known_scene=True)]
     made += [Experiment("extrapolation", "every n-th view", ours(length)),
              Experiment("extrapolation", "a stretch", ours(length), stretch=True),
              Experiment("extrapolation", "a stretch, the paper's", papers(length), stretch=True)]

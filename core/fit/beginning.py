@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
+from torch import Tensor
 
-from ..capture import Capture, View
+from ..capture import Camera, Capture, View
 from ..errors import CaptureError
 from ..flare.deformation import QueryRange
 from ..flare.model import FlareModel, LightFlare, ViewOfLight
@@ -46,7 +48,7 @@ def first_flare(capture: Capture, views: tuple[View, ...], frames: Frames, setti
         centroid = torch.from_numpy(capture.points.xyz).double().mean(0)
         positions = centroid + torch.rand(positions.shape, generator=generator, dtype=torch.float64)
     elif settings.flare.snap and frames.reference:
-        positions = torch.from_numpy(snapped(_sights(capture, views), positions.numpy()))
+        positions = torch.from_numpy(snapped(_sights(views, frames), positions.numpy()))
     poses = [torch.from_numpy(view.camera.world_to_camera) for view in views]
     flares = []
     for name, xyz in zip((light.name for light in capture.lights), positions, strict=True):
@@ -59,11 +61,24 @@ def first_flare(capture: Capture, views: tuple[View, ...], frames: Frames, setti
     return FlareModel([light.name for light in capture.lights], positions, flares)
 
 
-def _sights(capture: Capture, views: tuple[View, ...]) -> list[Sight]:
-    """Of some of the views with flare-free frames, small, which is all that placing lights takes."""
-    small = Frames(capture, SNAP_WIDTH)
-    targets = [small.targets(view) for view in views[:: max(len(views) // SNAP_VIEWS, 1)]]
-    return [sight(one.camera, one.frame.numpy(), one.removed.numpy()) for one in targets if one.removed is not None]
+def _sights(views: tuple[View, ...], frames: Frames) -> list[Sight]:
+    """Of some of the views with flare-free frames, small, which is all that placing lights takes. The frames are those
+    that the fit looks at, so that none is decoded twice."""
+    targets = (frames.targets(view) for view in views[:: max(len(views) // SNAP_VIEWS, 1)])
+    return [sight(_small(one.camera), _shrunk(one.frame, one.camera), _shrunk(one.removed, one.camera))
+            for one in targets if one.removed is not None]
+
+
+def _small(camera: Camera) -> Camera:
+    width = min(SNAP_WIDTH, camera.width)
+    return camera.scaled(width, max(round(camera.height * width / camera.width), 1))
+
+
+def _shrunk(display: Tensor, camera: Camera) -> NDArray[np.float32]:
+    """Display values at the size of `_small`, by the mean over areas of about their light."""
+    import cv2
+
+    return np.sqrt(cv2.resize(np.square(display.numpy()), _small(camera).size, interpolation=cv2.INTER_AREA))
 
 
 def said_of_lights(capture: Capture, flare: FlareModel) -> tuple[str, ...]:

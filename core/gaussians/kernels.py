@@ -29,7 +29,8 @@ log = logging.getLogger(__name__)
 
 @runtime_checkable
 class KernelSet(Protocol):
-    """Arguments as the functions of the same purpose in `rasterizer.py` take them, checked there."""
+    """Arguments as the functions of the same purpose in `rasterizer.py` take them, checked there; arcs (n, 3), as
+    `levelled` of `rendering.py` makes them."""
 
     def rasterize_scene(
         self, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, sh: Tensor,

@@ -7,8 +7,9 @@ deviation, px, and in shares of the peak:
 
     Gaussian    |d²G| <= 1/s² along each axis
     ring        1/(w s)² likewise; at its centre a cusp of slope r0 / (w² s) exp(-r0² / (2 w²))
-    arc         the window turns over k cos(theta): it adds (k²/10 + k/2) / rho² at the distance rho from its
-                apex, nothing of which is drawn where the ring's hole of radius (r0 - 2 w) s is
+    arc         those of the ring, with exp(-(r0 + w² beta)² / (2 w²)) for the height of the cusp: G = exp f, b·d adds
+                nothing to f's second derivatives, and whitened, -f = w² |grad f|² / 2 + beta r0 (1 - c), no less than
+                for the ring, holds down what the gradient adds to G's
 
 The largest f of 4, 2, 1 at which that comes to no more than TOLERANCE of the peak is taken: a plain Gaussian
 is drawn at 1/4 size from s = 11.3 px, at 1/2 from 5.7 px. To the error comes the step at which a profile is
@@ -23,7 +24,7 @@ from torch import Tensor
 
 from .kernels import KernelSet
 from .layers import enlarged, over
-from .rendering import Splats
+from .rendering import Splats, arc_strengths
 
 TOLERANCE = 1 / 32
 """Largest error of a Gaussian drawn small, as a share of its peak."""
@@ -38,15 +39,11 @@ def error_bounds(covariances: Tensor, rings: Tensor | None, arcs: Tensor | None)
     smaller = ((xx * yy - xy * xy) / larger).clamp(min=1e-12)  # without cancellation
     curvature = 2 / smaller
     slope = torch.zeros_like(smaller)
-    hole = torch.zeros_like(smaller)
     if rings is not None:
         r0, w = rings.unbind(-1)
         curvature = curvature / (w * w).clamp(max=1)
-        slope = r0.abs() / (w * w) * torch.exp(-((r0 / w) ** 2) / 2) * smaller.rsqrt()
-        hole = (r0 - 2 * w).clamp(min=0) * smaller.sqrt()
-    if arcs is not None:
-        k = arcs[:, 2].abs()
-        curvature = curvature + (k * k / 10 + k / 2) / (hole * hole).clamp(min=1e-12)
+        brightest = r0 if arcs is None else r0 + w * w * arc_strengths(covariances, arcs).to(r0.dtype)
+        slope = r0.abs() / (w * w) * torch.exp(-((brightest / w) ** 2) / 2) * smaller.rsqrt()
     return torch.stack([factor**2 / 8 * curvature + factor / 2**0.5 * slope for factor in REDUCTIONS])
 
 
@@ -76,8 +73,8 @@ def splat_mixed(
             _rows(centres, index) / factor + border, _rows(covariances, index) / factor**2,
             _rows(opacities, index), _rows(colours, index),
             -(-width // factor) + 2 * border, -(-height // factor) + 2 * border,
-            rings=None if rings is None else _rows(rings, index), arcs=None if arcs is None else _rows(arcs, index),
-            blend=blend,
+            rings=None if rings is None else _rows(rings, index),
+            arcs=None if arcs is None else _rows(arcs, index) * arcs.new_tensor([factor, factor, 1]), blend=blend,
         )  # fmt: skip
         if factor > 1:
             layer = enlarged(layer, factor, width, height)

@@ -9,7 +9,7 @@ from torch import Tensor
 from ..errors import SettingsError
 from .kernels import choose
 from .mixed import splat_mixed
-from .rendering import DILATION, NEAR, Rendering, Splats
+from .rendering import DILATION, NEAR, Rendering, Splats, levelled
 from .spherical_harmonics import degree_of
 
 Kernels = Literal["auto", "torch", "tiles", "cpu", "cuda"]
@@ -79,7 +79,7 @@ def splat(
     opacities    (n,)   0..1 ("add": any gain >= 0)
     colours      (n, 3)
     rings        (n, 2) r0 and w > 0, Mahalanobis distance: the profile is a ring, not a disc
-    arcs         (n, 3) theta0 (radians, from x to y), cos delta, k: the profile is cut to an arc
+    arcs         (n, 2) b, px^-1: the profile is times exp(b·d) and one at its peak, so that one side is brighter
     blend        "over": front to back in the order given; "add": a sum, for scene-linear light
     resolution   "mixed": those large against the pixel are drawn at 1/4 or 1/2 size and enlarged
                  (behind the small ones, if "over"); see `mixed.py` for the error
@@ -95,12 +95,14 @@ def splat(
     if rings is not None:
         _expect(rings, (n, 2), "rings")
     if arcs is not None:
-        _expect(arcs, (n, 3), "arcs")
+        _expect(arcs, (n, 2), "arcs")
     _check_size(width, height)
     if blend not in ("over", "add"):
         raise SettingsError(f"blend is over or add, not {blend!r}.")
     if resolution not in ("full", "mixed"):
         raise SettingsError(f"resolution is full or mixed, not {resolution!r}.")
+    if arcs is not None:
+        arcs = levelled(arcs, covariances, rings)
     chosen = choose(kernels, centres)
     if resolution == "mixed":
         return splat_mixed(

@@ -8,8 +8,8 @@ At a pixel centre (x + 1/2, y + 1/2), with d its offset from a Gaussian's centre
     q = d^T covariance^-1 d                                       squared Mahalanobis distance
     G = exp(-q / 2)                                               the plain profile, or
     G = exp(-(sqrt(q) - r0)² / (2 w²))                            a ring (METHOD: r0 = 0, w = 1 is plain)
-    G = G * sigmoid(k (c - cos delta))                            an arc of either, where
-    c = (d_x cos theta0 + d_y sin theta0) / sqrt(d_x² + d_y² + 1/4)    is cos(theta - theta0), theta = atan2(d_y, d_x)
+    G = G * exp(b·d - m)                                          an arc of either: brighter towards b, px^-1, where
+    m = beta r0 + beta² w² / 2,  beta² = b^T covariance b         makes its peak 1 (see `levelled` of `rendering.py`)
 
     over:  alpha_i = min(opacity_i, 0.99) G_i, or 0 if that is below 1/255
            T_i = prod_{j before i} (1 - alpha_j)
@@ -27,7 +27,6 @@ from torch.utils.checkpoint import checkpoint
 from .projection import camera_position, determinants, project, visible_radii
 from .rendering import (
     ALPHA_MIN,
-    ARC_APEX,
     OPACITY_MAX,
     PROFILE_MIN,
     TRANSMITTANCE_MIN,
@@ -54,20 +53,19 @@ def pixel_centres(width: int, height: int, like: Tensor) -> Tensor:
 def profiles(
     pixels: Tensor, centres: Tensor, covariances: Tensor, rings: Tensor | None, arcs: Tensor | None
 ) -> Tensor:
-    """G of n Gaussians at p pixels: (n, p), 0..1."""
+    """G of n Gaussians at p pixels: (n, p), 0..1. arcs: (n, 3) b and m."""
     dx, dy = (pixels[None] - centres[:, None]).unbind(-1)
     xx, xy, yy = covariances[:, :, None].unbind(1)
     q = (yy * dx * dx - 2 * xy * dx * dy + xx * dy * dy) / determinants(covariances)[:, None]
     if rings is None:
-        g = torch.exp(-q / 2)
+        log_g = -q / 2
     else:
         r0, w = rings[:, :, None].unbind(1)
-        g = torch.exp(-((q.clamp(min=RADIUS_MIN**2).sqrt() - r0) ** 2) / (2 * w * w))
+        log_g = -((q.clamp(min=RADIUS_MIN**2).sqrt() - r0) ** 2) / (2 * w * w)
     if arcs is not None:
-        theta0, cos_delta, k = arcs[:, :, None].unbind(1)
-        cosine = (dx * theta0.cos() + dy * theta0.sin()) * (dx * dx + dy * dy + ARC_APEX**2).rsqrt()
-        g = g * torch.sigmoid(k * (cosine - cos_delta))
-    return g
+        b_x, b_y, m = arcs[:, :, None].unbind(1)
+        log_g = log_g + (b_x * dx + b_y * dy - m)
+    return log_g.exp()
 
 
 def over(g: Tensor, opacities: Tensor) -> tuple[Tensor, Tensor]:

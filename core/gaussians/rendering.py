@@ -17,9 +17,8 @@ TRANSMITTANCE_MIN = 1e-4
 PROFILE_MIN = 1 / 4096
 """Added contributions are skipped where the profile is below this share of its own peak. Relative to
 the peak, so that the extent of a Gaussian (4.08 sigma) depends on neither its opacity nor its colour."""
-ARC_APEX = 0.5
-"""px: nearer to its centre than this an arc has no angle, which no pixel could show; and the angle's
-gradient, one over the distance, stays bounded where a centre falls on a pixel's."""
+STRENGTH2_MIN = 1e-16
+"""Arcs whose squared strength is below this have no direction, nor a gradient by it."""
 NEAR = 0.2
 """Gaussians at this camera depth or nearer are culled."""
 DILATION = 0.3
@@ -64,17 +63,48 @@ def activated(scales: Tensor, opacities: Tensor, raw: bool) -> tuple[Tensor, Ten
     return (scales.exp(), opacities.sigmoid()) if raw else (scales, opacities)
 
 
-def extent(peaks: Tensor, blend: str = "over", rings: Tensor | None = None) -> Tensor:
-    """(n,) Mahalanobis radius beyond which a Gaussian, or a ring (n, 2), is skipped; 0 if all of it is.
+def arc_strengths(covariances: Tensor, arcs: Tensor) -> Tensor:
+    """(n,) beta = sqrt(b^T covariance b) of arcs (n, 2 or more) that begin with b, px^-1; at least sqrt(STRENGTH2_MIN).
 
-    peaks: (n,) opacities, already clamped. Solves peak * exp(-r²/2) = threshold for r.
+    In double precision where there is any: on needles the terms of the sum cancel.
+    """
+    wide = torch.float32 if arcs.device.type == "mps" else torch.float64
+    xx, xy, yy = covariances.to(wide).unbind(-1)
+    x, y = arcs[:, :2].to(wide).unbind(-1)
+    return (xx * x * x + 2 * xy * x * y + yy * y * y).clamp(min=STRENGTH2_MIN).sqrt()
+
+
+def levelled(arcs: Tensor, covariances: Tensor, rings: Tensor | None) -> Tensor:
+    """(n, 3) b and m from b (n, 2), px^-1: kernels take m = beta r0 + beta² w² / 2 off b·d, so that profiles peak at 1.
+
+    In every direction the profile is highest somewhere on a ray, with c the cosine from that of the peak:
+
+        -(r - r0)² / (2 w²) + beta r c - m  =  -(r - r0 - w² beta)² / (2 w²) - beta r (1 - c)
+
+    So it is nowhere above a ring of radius r0 + w² beta and width w, which `extent` goes by, and meets it at c = 1.
+    """
+    beta = arc_strengths(covariances, arcs)
+    r0, w = (0.0, 1.0) if rings is None else rings.to(beta.dtype).unbind(-1)
+    return torch.cat([arcs, (beta * (r0 + beta * w * w / 2)).to(arcs.dtype)[:, None]], -1)
+
+
+def extent(
+    peaks: Tensor, blend: str = "over", rings: Tensor | None = None, strengths: Tensor | None = None
+) -> Tensor:
+    """(n,) Mahalanobis radius beyond which a Gaussian, or a ring (n, 2), or an arc of this strength (n,) of either, is
+    skipped; 0 if all of it is.
+
+    peaks: (n,) opacities, already clamped. Solves peak * exp(-r²/2) = threshold for r; arcs: see `levelled`.
     """
     if blend == "add":
         reach = torch.full_like(peaks, math.sqrt(-2 * math.log(PROFILE_MIN)))
     else:
         reach = (2 * (peaks / ALPHA_MIN).clamp(min=1.0).log()).sqrt()
     if rings is not None:
-        reach = (rings[:, 0] + rings[:, 1] * reach).clamp(min=0)
+        reach = rings[:, 0] + rings[:, 1] * reach
+    if strengths is not None:
+        reach = reach + strengths.to(reach.dtype) * (1.0 if rings is None else rings[:, 1].square())
+    reach = reach.clamp(min=0)
     return reach if blend == "add" else reach.masked_fill(peaks < ALPHA_MIN, 0)
 
 

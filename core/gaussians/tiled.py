@@ -20,7 +20,16 @@ import torch
 from torch import Tensor
 
 from .projection import camera_position, determinants, half_sizes, project, visible_radii
-from .rendering import ALPHA_MIN, OPACITY_MAX, Rendering, Splats, activated, extent, record_gradient
+from .rendering import (
+    ALPHA_MIN,
+    OPACITY_MAX,
+    Rendering,
+    Splats,
+    activated,
+    arc_strengths,
+    extent,
+    record_gradient,
+)
 from .spherical_harmonics import colours as colours_of
 
 ENTRIES_MAX = 1 << 24
@@ -42,7 +51,8 @@ class Lists(NamedTuple):
 
 class Gaussians(NamedTuple):
     """What is drawn. places (n, 5): centres x, y and whitening W xx, yx, yy; values (n, 1 + c): peaks, and what
-    is blended (where light adds, peaks are 1 and opacity is in the values); rings; arcs."""
+    is blended (where light adds, peaks are 1 and opacity is in the values); rings; arcs (n, 3) whitened: what b·d is
+    of u and of v, and m."""
 
     places: Tensor
     values: Tensor
@@ -62,6 +72,13 @@ def whitening(covariances: Tensor) -> Tensor:
     w_xx = xx.rsqrt()
     w_yy = (yy - xy * xy / xx).rsqrt()
     return torch.stack([w_xx, -xy / xx * w_yy, w_yy], -1)
+
+
+def whitened_arcs(arcs: Tensor, whitening: Tensor) -> Tensor:
+    """(n, 3) a_u, a_v and m from b and m, with b·d = a_u u + a_v v: a = M^T b."""
+    w_xx, w_yx, w_yy = whitening.unbind(-1)
+    b_x, b_y, m = arcs.to(whitening.dtype).unbind(-1)
+    return torch.stack([(b_x - b_y * w_yx / w_yy) / w_xx, b_y / w_yy, m], -1)
 
 
 def _span(centres: Tensor, half: Tensor, radii: Tensor, columns: int, rows: int, size: int) -> tuple[Tensor, Tensor]:
@@ -215,9 +232,12 @@ def splat(
         peaks = torch.ones_like(opacities)
         colours = opacities[:, None] * colours
     with torch.no_grad():
-        reach = extent(peaks, blend, rings)
+        reach = extent(peaks, blend, rings, None if arcs is None else arc_strengths(covariances, arcs))
     values = torch.cat([peaks[:, None], colours, torch.ones_like(colours[:, :1])], -1)
-    drawn = Gaussians(torch.cat([centres, whitening(covariances)], -1), values, rings, arcs)
+    white = whitening(covariances)
+    if arcs is not None:
+        arcs = whitened_arcs(arcs, white).to(values.dtype)
+    drawn = Gaussians(torch.cat([centres, white], -1), values, rings, arcs)
     half = half_sizes(covariances.detach(), reach)
     picture, _ = draw_tiles(draw, size, drawn, reach, half, width, height, blend=blend)
     alpha = picture[..., 3]

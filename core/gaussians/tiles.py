@@ -12,11 +12,11 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.nn.functional import logsigmoid, threshold
+from torch.nn.functional import threshold
 
 from . import tiled
 from .reference import RADIUS_MIN
-from .rendering import ALPHA_MIN, ARC_APEX, OPACITY_MAX, PROFILE_MIN, TRANSMITTANCE_MIN
+from .rendering import ALPHA_MIN, OPACITY_MAX, PROFILE_MIN, TRANSMITTANCE_MIN
 from .tiled import Gaussians, Lists
 
 TILE = 8
@@ -61,8 +61,7 @@ class _Chunk:
         self.cx, self.cy, self.w_xx, self.w_yx, self.w_yy = places.to(pixels.dtype).unbind(-1)
         values = drawn.values[index]
         self.peaks, self.values = values[:, None, :, 0], values[..., 1:]  # (b, 1, k), (b, k, c)
-        zero, one = torch.zeros_like(self.cx), torch.ones_like(self.cx)
-        self.u = self._linear(self.w_xx, zero)
+        self.u = self._linear(self.w_xx, torch.zeros_like(self.w_xx))
         self.v = self._linear(self.w_yx, self.w_yy)
         q = (self.u * self.u).addcmul_(self.v, self.v)
         if drawn.rings is None:
@@ -73,13 +72,8 @@ class _Chunk:
             self.t = (self.r - r0) / self.w
             log_g = self.t.square() * -0.5
         if drawn.arcs is not None:
-            theta0, self.cos_delta, self.k = drawn.arcs[index][:, None].unbind(-1)
-            self.cos, self.sin = theta0.cos(), theta0.sin()
-            self.dx, self.dy = self._linear(one, zero), self._linear(zero, one)
-            self.per_distance = (self.dx * self.dx + self.dy * self.dy + ARC_APEX**2).rsqrt()
-            self.cosine = (self.dx * self.cos + self.dy * self.sin) * self.per_distance
-            self.angle = self.k * (self.cosine - self.cos_delta)
-            log_g = log_g + logsigmoid(self.angle)
+            self.a_u, self.a_v, m = drawn.arcs[index][:, None].unbind(-1)
+            log_g = log_g + (self.a_u * self.u + self.a_v * self.v - m)
         self.g = log_g.exp_()
 
     def _linear(self, along_x: Tensor, along_y: Tensor) -> Tensor:
@@ -95,22 +89,15 @@ class _Chunk:
             dr = h * self.t / self.w  # dL/dr0
             extras += [dr.sum(1), (dr * self.t).sum(1)]
             pull = dr / self.r
-        # Sums over the pixels of -dL/du and -dL/dv times x, y, 1.
-        sx_u, _, s_u = (self.pixels.T @ (pull * self.u)).unbind(1)
-        sx_v, sy_v, s_v = (self.pixels.T @ (pull * self.v)).unbind(1)
+        pull_u, pull_v = pull * self.u, pull * self.v  # -dL/du, -dL/dv
+        if self.drawn.arcs is not None:
+            extras += [(h * self.u).sum(1), (h * self.v).sum(1), -h.sum(1)]
+            pull_u, pull_v = pull_u - h * self.a_u, pull_v - h * self.a_v
+        # Sums over the pixels, times x, y, 1.
+        sx_u, _, s_u = (self.pixels.T @ pull_u).unbind(1)
+        sx_v, sy_v, s_v = (self.pixels.T @ pull_v).unbind(1)
         d_cx, d_cy = self.w_xx * s_u + self.w_yx * s_v, self.w_yy * s_v
         d_whitening = [self.cx * s_u - sx_u, self.cx * s_v - sx_v, self.cy * s_v - sy_v]
-        if self.drawn.arcs is not None:
-            d_angle = h * torch.sigmoid(-self.angle)
-            d_cosine = d_angle * self.k * self.per_distance
-            extras += [
-                (d_cosine * (self.dy * self.cos - self.dx * self.sin)).sum(1),
-                -(d_angle * self.k).sum(1),
-                (d_angle * (self.cosine - self.cos_delta)).sum(1),
-            ]
-            radial = self.cosine * self.per_distance
-            d_cx = d_cx - (d_cosine * (self.cos - radial * self.dx)).sum(1)
-            d_cy = d_cy - (d_cosine * (self.sin - radial * self.dy)).sum(1)
         return [d_cx, d_cy, *d_whitening, *extras]
 
 

@@ -34,15 +34,9 @@ _Shape = wp.types.vector(length=SHAPES, dtype=wp.float32)
 _ALPHA_MIN = wp.constant(rendering.ALPHA_MIN)
 _PROFILE_MIN = wp.constant(rendering.PROFILE_MIN)
 _TRANSMITTANCE_MIN = wp.constant(rendering.TRANSMITTANCE_MIN)
-_APEX2 = wp.constant(rendering.ARC_APEX**2)
 _RADIUS2_MIN = wp.constant(RADIUS_MIN**2)
 _CHECK = wp.constant(32)
 """Entries between two looks at whether all pixels of a tile are finished."""
-
-
-@wp.func
-def _window(shape: _Shape, cosine: float) -> float:
-    return 1.0 / (1.0 + wp.exp(-shape[4] * (cosine - shape[3])))
 
 
 @wp.func
@@ -51,14 +45,13 @@ def _profile(dx: float, dy: float, place: _Place, shape: _Shape, rings: bool, ar
     u = place[2] * dx
     v = place[3] * dx + place[4] * dy
     q = u * u + v * v
-    g = wp.exp(-0.5 * q)
     if rings:
         t = (wp.sqrt(wp.max(q, _RADIUS2_MIN)) - shape[0]) / shape[1]
-        g = wp.exp(-0.5 * t * t)
+        q = t * t
+    log_g = -0.5 * q
     if arcs:
-        cosine = (dx * wp.cos(shape[2]) + dy * wp.sin(shape[2])) / wp.sqrt(dx * dx + dy * dy + _APEX2)
-        g = g * _window(shape, cosine)
-    return g
+        log_g += shape[2] * u + shape[3] * v - shape[4]
+    return wp.exp(log_g)
 
 
 @functools.cache
@@ -156,21 +149,14 @@ def _kernels(channels: int) -> tuple[Any, Any]:
                 found[SHAPE + 1] = found[SHAPE] * t
                 pull = found[SHAPE] / r
             pull_u, pull_v = pull * u, pull * v
-            d_cx = place[2] * pull_u + place[3] * pull_v
-            d_cy = place[4] * pull_v
             if arcs:
-                cos, sin = wp.cos(shape[2]), wp.sin(shape[2])
-                per_distance = 1.0 / wp.sqrt(dx * dx + dy * dy + _APEX2)
-                cosine = (dx * cos + dy * sin) * per_distance
-                d_angle = h * (1.0 - _window(shape, cosine))
-                d_cosine = d_angle * shape[4] * per_distance
-                found[SHAPE + 2] = d_cosine * (dy * cos - dx * sin)
-                found[SHAPE + 3] = -d_angle * shape[4]
-                found[SHAPE + 4] = d_angle * (cosine - shape[3])
-                d_cx -= d_cosine * (cos - cosine * per_distance * dx)
-                d_cy -= d_cosine * (sin - cosine * per_distance * dy)
-            found[PLACE] = d_cx
-            found[PLACE + 1] = d_cy
+                found[SHAPE + 2] = h * u
+                found[SHAPE + 3] = h * v
+                found[SHAPE + 4] = -h
+                pull_u -= h * shape[2]
+                pull_v -= h * shape[3]
+            found[PLACE] = place[2] * pull_u + place[3] * pull_v
+            found[PLACE + 1] = place[4] * pull_v
             found[PLACE + 2] = -pull_u * dx
             found[PLACE + 3] = -pull_v * dx
             found[PLACE + 4] = -pull_v * dy

@@ -19,7 +19,7 @@ from torch import Tensor
 from core.gaussians import rasterization, splat
 from core.gaussians import reference as r
 from core.gaussians.projection import camera_position, frustum_limits, project
-from core.gaussians.rendering import ALPHA_MIN, DILATION, NEAR, PROFILE_MIN, TRANSMITTANCE_MIN
+from core.gaussians.rendering import ALPHA_MIN, DILATION, NEAR, PROFILE_MIN, TRANSMITTANCE_MIN, levelled
 from core.gaussians.spherical_harmonics import basis
 
 HAIR = 1e-4
@@ -126,7 +126,8 @@ def splat_case(seed: int) -> Case:
     if "rings" in what:
         inputs["rings"] = np.stack([rng.uniform(0, 2, n), rng.uniform(0.15, 1, n)], 1)
     if "arcs" in what:
-        inputs["arcs"] = np.stack([rng.uniform(-4, 4, n), rng.uniform(-1, 1, n), rng.uniform(0.5, 8, n)], 1)
+        along = rng.normal(0, 1.5, (n, 2)) * rng.choice([0.0, 0.1, 1.0], (n, 1), p=[0.1, 0.2, 0.7]) / sigma
+        inputs["arcs"] = np.stack([c * along[:, 0] - s * along[:, 1], s * along[:, 0] + c * along[:, 1]], 1)
     case = Case(
         f"{what}, {blend}, seed {seed}", _float32(inputs), {"width": width, "height": height, "blend": blend}
     )
@@ -190,7 +191,8 @@ def splat_steps(case: Case) -> tuple[Tensor, Tensor]:
     width, height = case.size
     i = {name: value.double() for name, value in case.inputs.items()}
     pixels = r.pixel_centres(width, height, i["centres"])
-    g = r.profiles(pixels, i["centres"], i["covariances"], i.get("rings"), i.get("arcs"))
+    arcs = levelled(i["arcs"], i["covariances"], i.get("rings")) if "arcs" in i else None
+    g = r.profiles(pixels, i["centres"], i["covariances"], i.get("rings"), arcs)
     if case.options["blend"] == "add":
         return torch.zeros(len(g), dtype=torch.bool), _near(g, PROFILE_MIN).any(1)
     alpha, before = r.over(g, i["opacities"])

@@ -16,7 +16,8 @@ from core.errors import EngineError, SettingsError
 from core.gaussians import kernels as registry
 from core.gaussians import rasterization, splat
 from core.gaussians.projection import project, rotation_matrices
-from core.gaussians.rendering import OPACITY_MAX
+from core.gaussians.reference import profiles
+from core.gaussians.rendering import ALPHA_MIN, OPACITY_MAX, PROFILE_MIN, arc_strengths, extent, levelled
 from core.gaussians.spherical_harmonics import basis, colours
 
 SETS = [name for name in ("torch", "tiles", "cpu") if registry.available(name)]
@@ -122,11 +123,12 @@ def test_colours_are_not_negative() -> None:
 def test_rings_arcs_and_blends_by_hand(kernels: str) -> None:
     centre, covariance = torch.tensor([[10.0, 8.0]]), torch.tensor([[9.0, 0.0, 4.0]])
     opacity, colour = torch.tensor([0.8]), torch.tensor([[1.0, 2.0, 3.0]])
-    rings, arcs = torch.tensor([[1.5, 0.4]]), torch.tensor([[0.7, 0.3, 5.0]])
+    rings, arcs = torch.tensor([[1.5, 0.4]]), torch.tensor([[0.2, -0.1]])
     d = np.array([12.5, 9.5]) - [10, 8]
     r = math.sqrt(d[0] ** 2 / 9 + d[1] ** 2 / 4)
-    cosine = (d[0] * math.cos(0.7) + d[1] * math.sin(0.7)) / math.sqrt(d @ d + 0.25)
-    ring = math.exp(-((r - 1.5) ** 2) / (2 * 0.4**2)) / (1 + math.exp(-5 * (cosine - 0.3)))
+    beta = math.hypot(0.2 * 3, 0.1 * 2)
+    peak = math.exp(beta * 1.5 + beta**2 * 0.4**2 / 2)
+    ring = math.exp(-((r - 1.5) ** 2) / (2 * 0.4**2)) * math.exp(0.2 * d[0] - 0.1 * d[1]) / peak
     laid = splat(centre, covariance, opacity, colour, *SIZE, rings=rings, arcs=arcs, blend="add", kernels=kernels)
     assert torch.allclose(laid.colour[9, 12], 0.8 * ring * colour[0], atol=1e-5)
     assert (laid.transmittance == 1).all()
@@ -137,6 +139,62 @@ def test_rings_arcs_and_blends_by_hand(kernels: str) -> None:
     assert laid.transmittance[9, 12].item() == pytest.approx((1 - alpha) ** 2, abs=1e-5)
     opaque = splat(centre, covariance * 100, torch.ones(1), torch.ones(1, 3), *SIZE, kernels=kernels)
     assert opaque.transmittance.min().item() == pytest.approx(1 - OPACITY_MAX, abs=1e-3)
+
+
+@pytest.mark.parametrize("kernels", SETS)
+def test_an_arc_of_a_plain_gaussian_is_its_shift(kernels: str) -> None:
+    """By covariance b; its peak stays what it was, and an arc of nothing changes nothing at all."""
+    centre, covariance = torch.tensor([[10.0, 8.0]]), torch.tensor([[9.0, 2.0, 4.0]])
+    shown = torch.tensor([0.8]), torch.tensor([[1.0, 2.0, 3.0]])
+    b = torch.tensor([[0.5, -0.3]])
+    shift = torch.tensor([[9 * 0.5 - 2 * 0.3, 2 * 0.5 - 4 * 0.3]])
+    for blend in ("over", "add"):
+        plain = splat(centre, covariance, *shown, *SIZE, blend=blend, kernels=kernels)
+        nothing = splat(centre, covariance, *shown, *SIZE, arcs=torch.zeros(1, 2), blend=blend, kernels=kernels)
+        assert torch.allclose(nothing.colour, plain.colour, atol=1e-6)
+        moved = splat(centre + shift, covariance, *shown, *SIZE, blend=blend, kernels=kernels)
+        arc = splat(centre, covariance, *shown, *SIZE, arcs=b, blend=blend, kernels=kernels)
+        assert torch.allclose(arc.colour, moved.colour, atol=1e-5)
+        assert torch.allclose(arc.transmittance, moved.transmittance, atol=1e-5)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_arcs_peak_at_one_and_end_where_they_should(seed: int) -> None:
+    """At the radius r0 + w² beta towards covariance b, and nowhere beyond what `extent` says."""
+    rng = np.random.default_rng(seed)
+    factor = torch.tensor([[3.0, 0.0], [rng.normal(), rng.uniform(1, 4)]], dtype=torch.float64)
+    (xx, xy), (_, yy) = (factor @ factor.T).tolist()
+    covariance = torch.tensor([[xx, xy, yy]], dtype=torch.float64)
+    rings = torch.tensor([[rng.uniform(0, 4), rng.uniform(0.2, 2)]], dtype=torch.float64)
+    a = torch.tensor(rng.normal(0, 1, 2))
+    b = torch.linalg.solve(factor.T, a)[None]
+    arcs = levelled(b, covariance, rings)
+    r0, w = rings[0].tolist()
+    beta = math.hypot(*a.tolist())
+    assert arc_strengths(covariance, b).item() == pytest.approx(beta)
+    grid = torch.cartesian_prod(*[torch.linspace(-30, 30, 401, dtype=torch.float64)] * 2)  # whitened
+    brightest = (r0 + w * w * beta) * a / beta
+    peak, *g = profiles(torch.cat([brightest[None], grid]) @ factor.T, torch.zeros(1, 2), covariance, rings, arcs)[0]
+    assert peak.item() == pytest.approx(1) and max(g) <= 1
+    for opacity, blend, least in ((1.0, "add", PROFILE_MIN), (0.3, "over", ALPHA_MIN / 0.3)):
+        reach = extent(torch.tensor([opacity]), blend, rings, arc_strengths(covariance, b)).item()
+        drawn = grid[torch.stack(g) >= least]
+        assert drawn.norm(dim=1).max() <= reach * (1 + 1e-6)
+        edge = reach * a / beta  # on the bright side nothing is given away
+        at_edge = profiles((edge @ factor.T)[None], torch.zeros(1, 2), covariance, rings, arcs).item()
+        assert at_edge == pytest.approx(least, rel=1e-5)
+
+
+def test_gradients_of_arcs_by_differences() -> None:
+    inputs = [torch.tensor(values, dtype=torch.float64, requires_grad=True) for values in (
+        [[7.3, 6.1], [11.0, 9.5]], [[9.0, 2.0, 4.0], [5.0, -1.0, 8.0]], [0.6, 0.8], [[1.0, 2.0, 3.0], [0.5, 1.0, 0.2]],
+        [[1.5, 0.6], [0.0, 1.0]], [[0.3, -0.2], [-0.2, 0.1]])]  # fmt: skip
+
+    def picture(*given: Tensor) -> Tensor:
+        *rest, rings, arcs = given
+        return splat(*rest, 12, 10, rings=rings, arcs=arcs, blend="over", kernels="torch").colour.sum((0, 1))
+
+    assert torch.autograd.gradcheck(picture, inputs, atol=1e-4)
 
 
 @pytest.mark.parametrize("kernels", SETS)
@@ -176,7 +234,7 @@ def test_gradients_stay_finite(kernels: str) -> None:
     flat = {
         "centres": torch.tensor([[10.5, 8.5]]), "covariances": torch.tensor([[4.0, 0, 4.0]]),
         "opacities": torch.ones(1), "colours": torch.ones(1, 3), "rings": torch.tensor([[0.0, 1.0]]),
-        "arcs": torch.tensor([[0.0, 0.5, 4.0]]),
+        "arcs": torch.zeros(1, 2),
     }  # fmt: skip
     for blend in ("over", "add"):
         leaves = {name: value.clone().requires_grad_() for name, value in flat.items()}
@@ -235,7 +293,7 @@ def test_what_does_not_fit_is_refused() -> None:
         ({"blend": "under"}, "over or add"),
         ({"resolution": "half"}, "full or mixed"),
         ({"rings": torch.ones(2, 3)}, "rings"),
-        ({"arcs": torch.ones(2, 2)}, "arcs"),
+        ({"arcs": torch.ones(2, 3)}, "arcs"),
     ):
         with pytest.raises(SettingsError, match=message):
             splat(*flat, **changes)

@@ -7,7 +7,7 @@ kernel of their own: they are a scene that is already projected. What else there
 
     r = sqrt(-2 ln 2 (A u² + D d_y²))      Mahalanobis distance
     ring      G = 2^-(s (r - r0)²),         s = 1 / (2 ln 2 w²)
-    arc       G = G sigmoid(k (c - cos delta)),   c = (d_x cos theta0 + d_y sin theta0) / l,  l² = |d|² + 1/4
+    arc       G = G exp(b·d - m),             b·d = b_x u + b_s d_y,   b_s = b_y - k b_x
     add       picture = sum opacity colour G:   no order, no transmittance; its tiles are sums
 
 Backward, g = dL / d ln alpha as in the scene. A profile acts on centre and covariance through q alone, as the plain
@@ -15,8 +15,8 @@ one does with g replaced by
 
     h = -2 g d ln G / dq = g (r - r0) / (w² r)
 
-and an arc through the angle, too: d ln sigmoid = k (1 - sigmoid) dc, where
-dc/dtheta0 = (-d_x sin theta0 + d_y cos theta0) / l and, by the centre, dc = (c d / l - (cos theta0, sin theta0)) / l.
+and an arc on the centre through b·d, too: d ln G = -b. Its own gradients are sums of g u, g d_y and g, since d_x is
+u - k d_y.
 """
 from __future__ import annotations
 
@@ -35,13 +35,12 @@ from .layout import (
     END_ROW,
     ENTRY,
     FIRST_ROW,
-    G_ARC_X,
+    G_ARC_U,
     G_ARC_Y,
     G_BLUE,
     G_GREEN,
     G_R0,
     G_RED,
-    G_THETA0,
     G_U,
     G_UU,
     G_UY,
@@ -50,7 +49,6 @@ from .layout import (
     G_YY,
     GAUSSIAN,
     GREEN,
-    HALF,
     HALF_X,
     HALF_Y,
     K_REST,
@@ -106,7 +104,6 @@ from .vector import (
     lanes,
     load,
     maximum,
-    minimum,
     opaque,
     prefetch,
     splat,
@@ -118,13 +115,12 @@ from .vector import (
 )
 
 # Places in a shape: ring and arc of a Gaussian. SHARP: s above; LIMIT: the
-# power of two below which nothing is drawn; ARC: k.
-R0, SHARP, WIDTH, LIMIT, COS0, SIN0, COS_DELTA, ARC = range(8)
+# power of two below which nothing is drawn; ARC_U, ARC_Y, LEVEL: b_x, b_s and m, over ln 2.
+R0, SHARP, WIDTH, LIMIT, ARC_U, ARC_Y, LEVEL = range(7)
 SHAPE = 8
 
-PROFILE_MIN, APEX2 = np.float32(rendering.PROFILE_MIN), np.float32(rendering.ARC_APEX**2)
+PROFILE_MIN = np.float32(rendering.PROFILE_MIN)
 TWO_LN2 = np.float32(2 * math.log(2))
-LOG2_E = np.float32(1 / math.log(2))
 RADIUS_MIN = np.float32(1e-6)
 RADIUS2_MIN = np.float32(1e-12)
 
@@ -133,13 +129,19 @@ RADIUS2_MIN = np.float32(1e-12)
 
 
 @inlined
-def _reach(opacity, ring, r0, w, add):
-    """Mahalanobis radius beyond which nothing is drawn; negative if nothing is at all."""
+def _powers(opacity, add):
+    """How many times a peak can be halved until nothing is drawn; negative if nothing is at all."""
     share = 4096.0 if add else opacity * 255.0
-    if share < 1.0:
-        return -1.0
-    radius = math.sqrt(2.0 * math.log(share))
-    return r0 + abs(w) * radius if ring else radius
+    return math.log(share) / math.log(2.0) if share >= 1.0 else -1.0
+
+
+@inlined
+def _strength(arcs, i, xx, xy, yy):
+    """beta of `arc_strengths` of `..rendering`, or 0 where there are no arcs."""
+    if arcs.size == 0:
+        return 0.0
+    x, y = np.float64(arcs[3 * i]), np.float64(arcs[3 * i + 1])
+    return math.sqrt(max(xx * x * x + 2.0 * xy * x * y + yy * y * y, 0.0))
 
 
 @inlined
@@ -166,9 +168,11 @@ def prepare(
         determinant = xx * yy - xy * xy
         opacity = np.float64(opacities[i]) if add else min(np.float64(opacities[i]), rendering.OPACITY_MAX)
         r0, w = (np.float64(rings[2 * i]), np.float64(rings[2 * i + 1])) if rings.size > 0 else (0.0, 1.0)
-        reach = _reach(opacity, rings.size > 0, r0, w, add)
+        powers = _powers(opacity, add)
+        # Mahalanobis; see `levelled` and `extent` of `..rendering`.
+        reach = r0 + w * w * _strength(arcs, i, xx, xy, yy) + abs(w) * math.sqrt(2.0 * math.log(2.0) * max(powers, 0.0))
         keys[i], bounds[i] = NOWHERE, 0
-        if not (determinant > 0 and xx > 0 and reach >= 0):
+        if not (determinant > 0 and xx > 0 and powers >= 0 and reach >= 0):
             continue
         x, y, k = np.float64(centres[2 * i]), np.float64(centres[2 * i + 1]), -xy / yy
         major, minor = half * yy / determinant, half / yy
@@ -187,7 +191,7 @@ def prepare(
         records[at + BLUE], records[at + DEPTH] = gain * colours[3 * i + 2], 0.0
         records[at + REACH] = half * reach * reach - MARGIN
         records[at + HALF_X], records[at + HALF_Y] = half_x, half_y
-        _write_shape(shapes, i, r0, w, reach - r0, arcs)
+        _write_shape(shapes, i, r0, w, powers, k, arcs)
         columns = _tiles(x, half_x + 0.5, width, TILE_SHIFT_X)
         keys[i], bounds[i] = i, columns * _tiles(y, half_y + 0.5, height, TILE_SHIFT_Y)
     for chunk in range(chunk_bounds.size):
@@ -196,14 +200,15 @@ def prepare(
 
 
 @inlined
-def _write_shape(shapes, i, r0, w, reach, arcs):
+def _write_shape(shapes, i, r0, w, powers, k, arcs):
     at = i * SHAPE
     shapes[at + R0], shapes[at + WIDTH] = r0, w
     shapes[at + SHARP] = 0.5 / (math.log(2.0) * w * w)
-    shapes[at + LIMIT] = shapes[at + SHARP] * reach * reach + MARGIN
+    shapes[at + LIMIT] = powers + MARGIN
     if arcs.size > 0:
-        shapes[at + COS0], shapes[at + SIN0] = math.cos(np.float64(arcs[3 * i])), math.sin(np.float64(arcs[3 * i]))
-        shapes[at + COS_DELTA], shapes[at + ARC] = arcs[3 * i + 1], arcs[3 * i + 2]
+        x, y, m = np.float64(arcs[3 * i]), np.float64(arcs[3 * i + 1]), np.float64(arcs[3 * i + 2])
+        shapes[at + ARC_U], shapes[at + ARC_Y] = x / math.log(2.0), (y - k * x) / math.log(2.0)
+        shapes[at + LEVEL] = m / math.log(2.0)
 
 
 # --- profiles --------------------------------------------------------------------------------------------
@@ -225,17 +230,12 @@ def _distance(records, at, u, dy):
 
 
 @inlined
-def _angle(shapes, shape, dx, dy):
-    """Cosine of the angle from theta0, and the inverse of the distance, px (kept from zero)."""
-    inverse = ONE / sqrt(fma(dx, dx, dy * dy + APEX2))
-    return fma(dx, get(shapes, shape + COS0), dy * get(shapes, shape + SIN0)) * inverse, inverse
-
-
-@inlined
-def _window(shapes, shape, cosine):
-    """The sigmoid of an arc."""
-    x = (cosine - get(shapes, shape + COS_DELTA)) * get(shapes, shape + ARC)
-    return ONE / (exp2(minimum(x * -LOG2_E, np.float32(120))) + ONE)
+def _halvings(shapes, shape, z, u, dy, arcs):
+    """-log2 G, z = r - r0."""
+    if not arcs:
+        return z * z * get(shapes, shape + SHARP)
+    level = get(shapes, shape + LEVEL) - get(shapes, shape + ARC_Y) * dy
+    return fma(z * z, get(shapes, shape + SHARP), level - u * get(shapes, shape + ARC_U))
 
 
 # --- forward ---------------------------------------------------------------------------------------------
@@ -274,17 +274,13 @@ def _add_plain(state, records, at, left, top, first, end, start):
 def _draw_shaped(state, records, at, shapes, shape, left, top, first, end, arcs, add):
     """A ring or arc, rows first .. end; rows that it does not reach cost little."""
     start, y, k = _start(records, at, left, top + first)
-    dx = lanes() + (np.float32(left) + HALF - get(records, at + X))
-    r0, sharp, limit = get(shapes, shape + R0), get(shapes, shape + SHARP), get(shapes, shape + LIMIT)
+    r0, limit = get(shapes, shape + R0), get(shapes, shape + LIMIT)
     row, one = first, opaque(1)
     while row < end:
-        dy = np.float32(y)
-        z = _distance(records, at, lanes() + np.float32(start), dy) - r0
-        power = z * z * sharp
+        dy, u = np.float32(y), lanes() + np.float32(start)
+        power = _halvings(shapes, shape, _distance(records, at, u, dy) - r0, u, dy, arcs)
         if any_of(power <= limit):
             e = exp2(-power)
-            if arcs:
-                e = e * _window(shapes, shape, _angle(shapes, shape, dx, dy)[0])
             if add:
                 _add_row(state, row * ROW, e, records, at)
             else:
@@ -416,24 +412,18 @@ def _plain_backward(state, records, at, left, top, first, end, start):
 def _shaped_backward(state, records, at, shapes, shape, left, top, first, end, arcs, add):
     """The row of gradients of a ring or arc."""
     start, y, k = _start(records, at, left, top + first)
-    dx = lanes() + (np.float32(left) + HALF - get(records, at + X))
-    r0, sharp, limit = get(shapes, shape + R0), get(shapes, shape + SHARP), get(shapes, shape + LIMIT)
+    r0, limit = get(shapes, shape + R0), get(shapes, shape + LIMIT)
     zero = splat(ZERO)
     sums, colours, mass = (zero, zero, zero, zero, zero), (zero, zero, zero), zero
-    d_r0, d_w, arc_x, arc_y, d_theta, d_cos, d_k = zero, zero, zero, zero, zero, zero, zero
+    d_r0, d_w, arc_u, arc_y = zero, zero, zero, zero
     row, one = first, opaque(1)
     while row < end:
         dy, u = np.float32(y), lanes() + np.float32(start)
         r = _distance(records, at, u, dy)
         z = r - r0
-        power = z * z * sharp
+        power = _halvings(shapes, shape, z, u, dy, arcs)
         if any_of(power <= limit):
             e = exp2(-power)
-            cosine, inverse, window = zero, zero, zero
-            if arcs:
-                cosine, inverse = _angle(shapes, shape, dx, dy)
-                window = _window(shapes, shape, cosine)
-                e = e * window
             if add:
                 g, w = _add_gradient(state, row * ROW_BACKWARD, e, records, at)
             else:
@@ -445,22 +435,15 @@ def _shaped_backward(state, records, at, shapes, shape, left, top, first, end, a
             d_r0, d_w = d_r0 + gz, fma(gz, z, d_w)
             sums = _add_moments(sums, where(r > RADIUS_MIN, gz / r, ZERO), u, dy)
             if arcs:
-                off = g * (ONE - window)
-                d_k = fma(off, cosine - get(shapes, shape + COS_DELTA), d_k)
-                d_cos = d_cos + off
-                off = off * inverse
-                d_theta = fma(off, dy * get(shapes, shape + COS0) - dx * get(shapes, shape + SIN0), d_theta)
-                across = cosine * inverse
-                arc_x = fma(off, across * dx - get(shapes, shape + COS0), arc_x)
-                arc_y = fma(off, across * dy - get(shapes, shape + SIN0), arc_y)
+                arc_u, arc_y = fma(g, u, arc_u), fma(g, dy, arc_y)
         row += one
         start += k
         y += 1.0
-    slope, arc = sharp * TWO_LN2, get(shapes, shape + ARC)  # 1 / w², k
+    slope = get(shapes, shape + SHARP) * TWO_LN2  # 1 / w²
     return totals((
         sums[0] * slope, sums[1] * slope, sums[2] * slope, sums[3] * slope, sums[4] * slope, mass,
         colours[0], colours[1], colours[2], d_r0 * slope, d_w * (slope / get(shapes, shape + WIDTH)),
-        arc_x * arc, arc_y * arc, d_theta * arc, d_cos * -arc, d_k,
+        arc_u, arc_y,
     ))  # fmt: skip
 
 
@@ -530,7 +513,7 @@ def _add_rows(gradients, first, count, row):
 
 @kernel
 def finish(
-    row, covariances, opacities, colours, gradients, firsts, counts, add,
+    row, covariances, opacities, colours, arcs, gradients, firsts, counts, add,
     d_centres, d_covariances, d_opacities, d_colours, d_rings, d_arcs,
 ):  # fmt: skip
     """Gradients of the inputs from the rows; see `projection` for the moments. d_rings, d_arcs may be empty.
@@ -563,7 +546,7 @@ def finish(
         if d_rings.size > 0:
             d_rings[2 * i], d_rings[2 * i + 1] = row[G_R0], row[G_WIDTH]
         if d_arcs.size > 0:
-            d_centres[2 * i] += row[G_ARC_X]
-            d_centres[2 * i + 1] += row[G_ARC_Y]
-            for c in range(3):
-                d_arcs[3 * i + c] = row[G_THETA0 + c]
+            d_centres[2 * i] -= row[G] * arcs[3 * i]
+            d_centres[2 * i + 1] -= row[G] * arcs[3 * i + 1]
+            d_arcs[3 * i], d_arcs[3 * i + 1] = row[G_ARC_U] - k * row[G_ARC_Y], row[G_ARC_Y]
+            d_arcs[3 * i + 2] = -row[G]

@@ -20,7 +20,7 @@ CHUNK = 1024
 # A row of gradients for each pair of Gaussian and tile: sums of g u, g d_y, g u², g u d_y, g d_y², g; then those of
 # colour and depth, or of ring and arc (`flare`).
 G_U, G_Y, G_UU, G_UY, G_YY, G, G_RED, G_GREEN, G_BLUE, G_DEPTH = range(10)
-G_R0, G_WIDTH, G_ARC_X, G_ARC_Y, G_THETA0, G_COS_DELTA, G_ARC = range(9, 16)
+G_R0, G_WIDTH, G_ARC_U, G_ARC_Y = range(9, 13)
 
 # An entry of a tile, int32: which Gaussian, first row and end row within the tile, slot of its row of gradients.
 GAUSSIAN, FIRST_ROW, END_ROW, SLOT, ENTRY = 0, 1, 2, 3, 4

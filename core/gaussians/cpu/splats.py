@@ -76,8 +76,8 @@ class _Splat(torch.autograd.Function):
             )  # fmt: skip
         gradients = [None if t is None else torch.empty_like(t, memory_format=torch.contiguous_format) for t in inputs]
         flare.finish(
-            np.empty(layout.RECORD, np.float32), flat(covariances), flat(opacities), flat(colours), rows,
-            bins.firsts, bins.counts, add,
+            np.empty(layout.RECORD, np.float32), flat(covariances), flat(opacities), flat(colours),
+            EMPTY if arcs is None else flat(arcs), rows, bins.firsts, bins.counts, add,
             *(EMPTY if t is None else flat(t) for t in gradients),
         )  # fmt: skip
         return (*gradients, None, None)

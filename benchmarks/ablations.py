@@ -111,6 +111,7 @@ def experiments(length: Length) -> list[Experiment]:
     made = of("form", {
         "ours": ours(length),
         "without rings": ours(length, flare__form__rings=False),
+        "with arcs": ours(length, flare__form__arcs=True),
         "without static offsets": ours(length, flare__form__static_offset=False),
         "without latent": ours(length, flare__form__latent=0),
         "without plane offsets": ours(length, flare__form__plane_offset=False),
@@ -145,6 +146,7 @@ def experiments(length: Length) -> list[Experiment]:
     many = {"flare.count": 900, "flare.density.most": 900}  # of each light, from the beginning to the end
     alone = changed(ours(length), {**many, "flare.occlusion": False})
     made += [Experiment("known", "ours", alone, known_scene=True),
+             Experiment("known", "with arcs", changed(alone, {"flare.form.arcs": True}), known_scene=True),
              Experiment("known", "without rings", changed(alone, {"flare.form.rings": False}), known_scene=True),
              Experiment("known", "the paper's", changed(papers(length), many), known_scene=True)]
     made += [Experiment("extrapolation", "every n-th view", ours(length)),

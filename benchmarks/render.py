@@ -31,7 +31,7 @@ from core.fit.run import Run
 from core.flare.compositing import Blend, composite, joined
 from core.flare.deformation import QueryRange
 from core.flare.model import OURS, PAPER, FlareForm, FlareModel, LightFlare
-from core.flare.placement import PlaneGaussians, pixels
+from core.flare.placement import PlaneGaussians, pixels, slopes
 from core.gaussians import SceneGaussians, kernels, splat
 
 SIZES = ((1920, 1080), (3840, 2160))
@@ -100,8 +100,8 @@ def stages(
 
     def raster(resolution: str) -> Callable[[], object]:
         return lambda: splat(
-            *placed, flare.opacities, flare.colours, width, height, rings=flare.rings, blend=fitted.blend,
-            resolution=resolution, kernels=kernel_set,  # type: ignore[arg-type]
+            *placed, flare.opacities, flare.colours, width, height, rings=flare.rings, arcs=arcs,
+            blend=fitted.blend, resolution=resolution, kernels=kernel_set,  # type: ignore[arg-type]
         )  # fmt: skip
 
     def rendered() -> Tensor:
@@ -109,6 +109,7 @@ def stages(
 
     flare = deformed()
     placed = pixels(flare, intrinsics)
+    arcs = None if flare.arcs is None else slopes(flare.arcs, placed[1], intrinsics)
     behind, front = rendered(), splat(
         *placed, flare.opacities, flare.colours, width, height, blend=fitted.blend, kernels=kernel_set  # type: ignore[arg-type]
     )

@@ -87,5 +87,5 @@ def as_tensors(one: LookGaussians) -> PlaneGaussians:
     """A look's Gaussians as the rasterizer takes them."""
     means, covariances, opacities, colours = (
         torch.from_numpy(part).float() for part in (one.means, one.covariances, one.opacities, one.colours))
-    return PlaneGaussians(means, covariances, opacities, colours,
-                          None if one.rings is None else torch.from_numpy(one.rings).float())
+    rings, arcs = (None if part is None else torch.from_numpy(part).float() for part in (one.rings, one.arcs))
+    return PlaneGaussians(means, covariances, opacities, colours, rings, arcs)

@@ -44,6 +44,7 @@ class FlareRates:
     rotation: float = 1e-3
     offset: float = 1e-3
     ring: float = 5e-3
+    arc: float = 5e-3
     latent: float = 5e-3
     settled: float = 1.0
 
@@ -176,6 +177,7 @@ class FitSettings:
             (0 <= self.split.plain <= 1, "split.plain must lie between 0 and 1"),
             (0 <= self.split.sh_degree <= 3, "split.sh_degree must lie between 0 and 3"),
             (self.mode != "2d" or not self.flare.form.line, "mode 2d needs a form without the line"),
+            (self.flare.form.consistent, "a form with arcs needs rings, and ellipses instead of solid Gaussians"),
         )
         for good, sentence in checks:
             if not good:
@@ -237,7 +239,7 @@ def _shortened(settings: FitSettings, count: int, most: int) -> FitSettings:
     density = replace(settings.flare.density, start=max(round(length * (begin + 0.1)), every),
                       stop=round(length * (begin * 0.6 + 0.6)), every=every, clone_ratio=0.1)
     rates = replace(settings.flare.rates, network=1e-3, grids=5e-3, position=1.6e-3, position_final=1.6e-5,
-                    features=1e-2, scale=0.02, rotation=5e-3, ring=2e-2, settled=SETTLED)
+                    features=1e-2, scale=0.02, rotation=5e-3, ring=2e-2, arc=2e-2, settled=SETTLED)
     classic = replace(settings.scene.classic, start=round(length * 0.05), stop=round(length * 0.6),
                       every=max(round(length / 50), 20), reset_every=10 * length, cap=most)
     scene = replace(settings.scene, classic=classic, sh_every=max(round(length / 6), 1),

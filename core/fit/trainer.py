@@ -300,7 +300,7 @@ def _flare_optimisers(flare: FlareModel | None, settings: FitSettings) -> tuple[
     of_gaussians = {
         "positions": rates.position, "log_scales": rates.scale, "rotations": rates.rotation,
         "opacity_logits": rates.opacity, "sh": rates.features, "offsets": rates.offset, "rings": rates.ring,
-        "latent": rates.latent,
+        "arcs": rates.arc, "latent": rates.latent,
     }
     dense: dict[str, Parameter] = {}
     tables: list[Parameter] = []

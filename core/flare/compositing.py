@@ -32,8 +32,9 @@ def splat_flare(gaussians: PlaneGaussians, intrinsics: Tensor, width: int, heigh
     The colour is in display space for `over` and scene-linear for `add`.
     """
     centres, covariances = placement.pixels(gaussians, intrinsics)
+    arcs = None if gaussians.arcs is None else placement.slopes(gaussians.arcs, covariances, intrinsics)
     return splat(centres, covariances, gaussians.opacities, gaussians.colours, width, height,
-                 rings=gaussians.rings, blend=blend, kernels=kernels, resolution=resolution)
+                 rings=gaussians.rings, arcs=arcs, blend=blend, kernels=kernels, resolution=resolution)
 
 
 def joined(flares: Mapping[str, PlaneGaussians]) -> PlaneGaussians | None:
@@ -41,17 +42,17 @@ def joined(flares: Mapping[str, PlaneGaussians]) -> PlaneGaussians | None:
     sets = list(flares.values())
     if not sets:
         return None
-    rings = None
-    if any(gaussians.rings is not None for gaussians in sets):
-        rings = torch.cat([_rings_of(gaussians) for gaussians in sets])
     means, covariances, opacities, colours = (torch.cat(parts) for parts in zip(*(s[:4] for s in sets), strict=True))
-    return PlaneGaussians(means, covariances, opacities, colours, rings)
+    return PlaneGaussians(means, covariances, opacities, colours,
+                          _joined([(one.rings, len(one.means)) for one in sets], means.new_tensor([0.0, 1.0])),
+                          _joined([(one.arcs, len(one.means)) for one in sets], means.new_zeros(2)))
 
 
-def _rings_of(gaussians: PlaneGaussians) -> Tensor:
-    if gaussians.rings is not None:
-        return gaussians.rings
-    return gaussians.means.new_tensor([0.0, 1.0]).repeat(len(gaussians.means), 1)  # a plain Gaussian
+def _joined(parts: list[tuple[Tensor | None, int]], plain: Tensor) -> Tensor | None:
+    """Rows of all parts, `plain` for each of those that have none; None if none has."""
+    if all(rows is None for rows, _ in parts):
+        return None
+    return torch.cat([plain.expand(count, -1) if rows is None else rows for rows, count in parts])
 
 
 def composite(scene: Tensor, flare: Splats | None, blend: Blend) -> Tensor:

@@ -131,7 +131,7 @@ def _unpacked(description: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> 
         low, high, reach = (_triple(light["range"][key]) for key in ("camera_low", "camera_high", "light_high"))
         form = FlareForm(**light["form"])
         if not (form.sh_degree in range(4) and 1 <= form.levels <= 16 and 1 <= form.base <= 256
-                and 0 <= form.latent <= 64):
+                and 0 <= form.latent <= 64 and form.consistent):
             raise ValueError("a light's form makes no sense")
         flares.append(LightFlare(form, QueryRange(low, high, reach), count, torch.Generator()))
         names.append(str(light["name"]))

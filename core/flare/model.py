@@ -37,6 +37,8 @@ class FlareForm:
     sh_degree         of the colour's view dependence, 0 to 3 (solid only)
     static_offset     a learned 2D offset of each Gaussian, the same in all views
     rings             the radial profile exp(-(r - r0)^2 / (2 w^2)) (METHOD, section 5)
+    arcs              one side of it brighter, by exp(b·d): rings of which the lens's barrel hides a part (ellipses with
+                      rings only)
     latent            width of a per-Gaussian code that the network sees
     levels, base      of the hash grids: how many, and the resolution of the coarsest. Fine cells hold a view
                       each, and learn nothing about the views between
@@ -52,6 +54,12 @@ class FlareForm:
     latent: int = 0
     levels: int = 16
     base: int = 16
+    arcs: bool = False
+
+    @property
+    def consistent(self) -> bool:
+        """Whether its parts go together."""
+        return self.rings and not self.solid if self.arcs else True
 
 
 PAPER = FlareForm()
@@ -85,7 +93,8 @@ class LightFlare(nn.Module):
 
     `gaussians` holds one row for each Gaussian: positions (n, 1) along the line or (n, 2) on the plane,
     log_scales (n, 3 | 2), rotations (n, 4) quaternions or (n, 2) directions, opacity_logits (n, 1),
-    sh (n, k * 3), and where the form has them offsets (n, 2), rings (n, 2) as r0 and log w, latent (n, d).
+    sh (n, k * 3), and where the form has them offsets (n, 2), rings (n, 2) as r0 and log w, arcs (n, 2) in deviations
+    along the axes, latent (n, d).
     """
 
     def __init__(self, form: FlareForm, query_range: QueryRange, count: int, generator: torch.Generator,
@@ -133,9 +142,14 @@ class LightFlare(nn.Module):
             covariances = placement.covariance_of_solid(means, scales, rotations)
         else:
             covariances = placement.covariance_of_ellipse(scales, rotations)
-        return PlaneGaussians(means, covariances, deformed("opacity_logits").sigmoid()[:, 0],
-                              self._colours(deformed("sh"), means, view.rotation),
-                              _rings(deformed("rings")) if form.rings else None)
+        opacities, rings, arcs = deformed("opacity_logits").sigmoid()[:, 0], None, None
+        if form.rings:
+            rings = _rings(deformed("rings"))
+        if form.arcs and rings is not None:
+            opacities = opacities * placement.opacity_gain(deformed("arcs"), rings)
+            arcs = placement.arcs_of_ellipse(deformed("arcs"), scales, rotations)
+        return PlaneGaussians(means, covariances, opacities, self._colours(deformed("sh"), means, view.rotation),
+                              rings, arcs)
 
     def _colours(self, sh: Tensor, means: Tensor, rotation: Tensor) -> Tensor:
         rays = torch.cat([means, torch.ones_like(means[:, :1])], -1)
@@ -176,6 +190,8 @@ def _canonical(form: FlareForm, count: int, opacity: float, generator: torch.Gen
         rows["rings"] = torch.zeros(count, 2)
         # A disc finds the way to a ring through worse pictures; so some begin as rings, of three deviations' radius.
         rows["rings"][::RING_EVERY] = torch.tensor([3.0, math.log(0.5)])
+    if form.arcs:
+        rows["arcs"] = torch.zeros(count, 2)
     if form.latent:
         rows["latent"] = 0.1 * torch.randn(count, form.latent, generator=generator)
     return rows

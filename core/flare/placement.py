@@ -13,14 +13,20 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from ..gaussians.rendering import STRENGTH2_MIN
+
 PLANE_DEPTH = 0.21  # just past 3DGS's near plane of 0.2 (paper, appendix)
+
+ARC_SOFT = 0.1
+"""Strength of an arc at which its opacity begins to be that of the brightest place; see `opacity_gain`."""
 
 
 class PlaneGaussians(NamedTuple):
     """Gaussians on the normalised plane, ready to be splatted.
 
     means (n, 2), covariances (n, 3) as xx, xy, yy, opacities (n,) in 0..1, colours (n, 3), and rings
-    (n, 2) as r0 and w in Mahalanobis radii (METHOD section 5) or None.
+    (n, 2) as r0 and w in Mahalanobis radii (METHOD section 5) or None. arcs (n, 2) or None: the way covariance b from
+    the mean towards the side that exp(b·d) makes brighter; a vector of the plane, which is scaled and turned as it is.
     """
 
     means: Tensor
@@ -28,6 +34,7 @@ class PlaneGaussians(NamedTuple):
     opacities: Tensor
     colours: Tensor
     rings: Tensor | None = None
+    arcs: Tensor | None = None
 
 
 def on_line(mu: Tensor, light: Tensor) -> Tensor:
@@ -58,6 +65,26 @@ def covariance_of_ellipse(log_scales: Tensor, directions: Tensor) -> Tensor:
     return torch.stack([a * c * c + b * s * s, (a - b) * c * s, a * s * s + b * c * c], -1)
 
 
+def arcs_of_ellipse(arcs: Tensor, log_scales: Tensor, directions: Tensor) -> Tensor:
+    """(n, 2) on the plane of arcs (n, 2) in deviations along the axes: R diag(s) a, so that |a| is the strength beta
+    whatever the size."""
+    axis = functional.normalize(directions, dim=-1, eps=1e-12)
+    along, aside = (arcs * log_scales.exp()).unbind(-1)
+    return along[:, None] * axis + aside[:, None] * torch.stack([-axis[:, 1], axis[:, 0]], -1)
+
+
+def opacity_gain(arcs: Tensor, rings: Tensor) -> Tensor:
+    """(n,) by which opacities are multiplied so that they are smooth in arcs (n, 2), in deviations, at zero.
+
+    A profile that keeps its peak loses r0 beta from its mean logarithm, and beta has a kink at zero. There the strength
+    below stands for it, which is quadratic at first and beta soon: an opacity is that of the brightest place, but for
+    3 % of r0 at most.
+    """
+    squared = arcs.square().sum(-1)
+    beta = squared.clamp(min=STRENGTH2_MIN).sqrt()
+    return torch.exp(rings[:, 0] * (beta - squared * (squared + ARC_SOFT**2).rsqrt()))
+
+
 def rotation_matrices(quaternions: Tensor) -> Tensor:
     """(n, 4) wxyz, any length but zero, to (n, 3, 3)."""
     w, x, y, z = functional.normalize(quaternions, dim=-1, eps=1e-12).unbind(-1)
@@ -76,3 +103,15 @@ def pixels(gaussians: PlaneGaussians, intrinsics: Tensor, dilation: float = 0.3)
     stretch = torch.stack([fx * fx, fx * fy, fy * fy])
     low_pass = torch.tensor([dilation, 0.0, dilation], dtype=stretch.dtype, device=stretch.device)
     return gaussians.means * focal + centre, gaussians.covariances * stretch + low_pass
+
+
+def slopes(arcs: Tensor, covariances: Tensor, intrinsics: Tensor) -> Tensor:
+    """b (n, 2), px^-1, of arcs (n, 2) on the plane, for Gaussians of these covariances (n, 3), px^2, under intrinsics.
+
+    With the low-pass in the covariance it is exact for a plain Gaussian, whose mean an arc shifts: the shift stays.
+    In double precision, for needles.
+    """
+    x, y = (arcs * intrinsics.diagonal()[:2]).double().unbind(-1)
+    xx, xy, yy = covariances.double().unbind(-1)
+    determinant = (xx * yy - xy * xy).clamp(min=1e-12)
+    return (torch.stack([yy * x - xy * y, xx * y - xy * x], -1) / determinant[:, None]).to(arcs.dtype)

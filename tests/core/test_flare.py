@@ -25,6 +25,7 @@ from core.flare.file import FlareFile, TrainingCamera
 from core.flare.model import OURS, PAPER, FlareForm, FlareModel, LightFlare, ViewOfLight
 from core.gaussians import Splats, rasterization
 from core.gaussians.optimiser import Adam
+from core.gaussians.rendering import arc_strengths
 from tests.core.flared import cameras
 
 RANGE = QueryRange((-1.0, -1.0, -5.0), (1.0, 1.0, -3.0), (0.5, 0.5, 0.7))
@@ -93,12 +94,68 @@ def test_an_ellipse_has_its_axes() -> None:
 
 
 def test_resolution_and_focal_length_move_the_flare_as_a_lens_would() -> None:
-    gaussians = next(iter(some_flare()(pose()).values()))
+    gaussians = next(iter(some_flare(replace(OURS, arcs=True))(pose()).values()))
     small, large = (torch.tensor([[f, 0, f / 3], [0, f, f / 4], [0, 0, 1.0]]) for f in (100.0, 200.0))
     centres, covariances = placement.pixels(gaussians, small, dilation=0)
     twice, wide = placement.pixels(gaussians, large, dilation=0)
     assert torch.allclose(twice, 2 * centres, atol=1e-4)
     assert torch.allclose(wide, 4 * covariances, rtol=1e-5)
+    slopes = [placement.slopes(gaussians.arcs, found, k) for found, k in ((covariances, small), (wide, large))]
+    assert slopes[0].abs().max() > 0.01 and torch.allclose(2 * slopes[1], slopes[0], rtol=1e-4, atol=1e-5)
+
+
+def test_an_arc_goes_along_with_its_gaussian() -> None:
+    """|a| is the strength at every size and angle, and the bright side turns with the axes."""
+    a, k = torch.tensor([[0.9, -1.2]]), torch.eye(3)
+    found = []
+    for size, angle in ((1.0, 0.0), (5.0, 0.0), (1.0, 2.0)):
+        log_scales = (size * torch.tensor([[0.3, 0.1]])).log()
+        axis = torch.tensor([[math.cos(angle), math.sin(angle)]])
+        covariance = placement.covariance_of_ellipse(log_scales, axis)
+        way = placement.arcs_of_ellipse(a, log_scales, axis)
+        assert arc_strengths(covariance, placement.slopes(way, covariance, k)).item() == pytest.approx(1.5, rel=1e-4)
+        found.append(way[0])
+    assert torch.allclose(found[1], 5 * found[0])
+    c, s = math.cos(2.0), math.sin(2.0)
+    assert torch.allclose(found[2], torch.tensor([[c, -s], [s, c]]) @ found[0])
+
+
+def test_a_pictures_sampling_leaves_the_shift_of_an_arc() -> None:
+    """What the low-pass blurs moves no less far: the plain Gaussian of the shifted mean is the same picture."""
+    means, covariances = torch.tensor([[0.01, 0.02]]), torch.tensor([[2e-4, 5e-5, 1e-4]])
+    way = torch.tensor([[0.015, -0.01]])
+    k = torch.tensor([[60.0, 0, 16], [0, 66.0, 12], [0, 0, 1]])
+    rest = covariances, torch.full((1,), 0.5), torch.ones(1, 3)
+    arc = placement.PlaneGaussians(means, *rest, torch.tensor([[0.0, 1.0]]), way)
+    pictures = [splat_flare(one, k, 32, 24, "add", kernels="torch").colour
+                for one in (arc, placement.PlaneGaussians(means + way, *rest))]
+    assert torch.allclose(*pictures, atol=1e-5)
+
+
+def test_opacities_are_smooth_where_an_arc_begins() -> None:
+    """Through zero the picture's gradient does not jump, as it would with the peak kept at one."""
+    covariance, rings = torch.tensor([[2e-3, 0.0, 2e-3]]), torch.tensor([[3.0, 0.4]])
+    k = torch.tensor([[100.0, 0, 20], [0, 100.0, 20], [0, 0, 1]])
+
+    def total(strength: float) -> float:
+        a = torch.tensor([[strength, 0.0]])
+        gain = placement.opacity_gain(a, rings)
+        way = placement.arcs_of_ellipse(a, 0.5 * covariance[:, :1].log().repeat(1, 2), torch.tensor([[1.0, 0.0]]))
+        one = placement.PlaneGaussians(torch.zeros(1, 2), covariance, 0.1 * gain, torch.ones(1, 3), rings, way)
+        return float(splat_flare(one, k, 40, 40, "add", kernels="torch").colour.sum())
+
+    none = total(0.0)
+    assert total(1e-3) == pytest.approx(none, rel=1e-3)  # 3e-3 of it if the peak were kept
+    assert float(placement.opacity_gain(torch.tensor([[2.0, 0.0]]), rings)) == pytest.approx(1, abs=0.01)
+
+
+def test_sets_with_and_without_arcs_are_joined() -> None:
+    model = some_flare(replace(OURS, arcs=True), lights=2)
+    first, second = model(pose()).values()
+    plain = second._replace(arcs=None)
+    whole = joined({"a": first, "b": plain})
+    assert whole is not None and torch.equal(whole.arcs[:40], first.arcs) and not whole.arcs[40:].any()
+    assert joined({"b": plain}).arcs is None
 
 
 # ---- lights ---------------------------------------------------------------------------------------
@@ -113,7 +170,8 @@ def test_a_light_behind_the_camera_has_no_flare() -> None:
 
 
 @pytest.mark.parametrize("form", [PAPER, OURS, replace(PAPER, line=False), replace(PAPER, light_correction=False),
-                                  replace(PAPER, plane_offset=False), replace(OURS, latent=0, rings=False)])
+                                  replace(PAPER, plane_offset=False), replace(OURS, latent=0, rings=False),
+                                  replace(OURS, arcs=True)])
 def test_every_form_gives_finite_gaussians_and_gradients(form: FlareForm) -> None:
     model = some_flare(form)
     gaussians = model(pose())["lamp 0"]
@@ -122,6 +180,7 @@ def test_every_form_gives_finite_gaussians_and_gradients(form: FlareForm) -> Non
     assert gaussians.colours.shape == (40, 3) and (gaussians.colours >= 0).all()
     assert ((gaussians.opacities > 0) & (gaussians.opacities < 1)).all()
     assert (gaussians.rings is not None) == form.rings
+    assert (gaussians.arcs is not None) == form.arcs
     sum((part**2).sum() for part in gaussians if part is not None).backward()
     for name, parameter in model.named_parameters():
         unused = "correction" in name and not (form.light_correction and form.line)

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from ..core.errors import FitFlareError
 from ..core.look import PlaneGaussians, pixels
 from ..core.look.drawing import OPACITY_MAX, reach
-from ..core.look.plane import joined
+from ..core.look.plane import arc_level, joined, ways
 from . import cameras, looks
 
 LEVELS = (1, 2, 4, 8, 16)
@@ -95,21 +95,23 @@ def frame_in(context: Any, scene: Any, camera: Any) -> Frame | None:
 @dataclass(frozen=True)
 class Quads:
     """Vertices of n quads: place (4n, 2) in the window's pixels, local (4n, 2) in Mahalanobis radii, light
-    (4n, 3) at the peak, ring (4n, 3) r0, w and opacity, and the triangles (2n, 3)."""
+    (4n, 3) at the peak, ring (4n, 3) r0, w and opacity, arc (4n, 3) in the unit of local and its level, and the
+    triangles (2n, 3)."""
 
     place: Floats
     local: Floats
     light: Floats
     ring: Floats
+    arc: Floats
     triangles: NDArray[np.uint32]
 
 
 _CORNERS = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], np.float32)
 
 
-def quads(centres: Floats, covariances: Floats, radii: Floats, light: Floats, ring: Floats) -> Quads:
+def quads(centres: Floats, covariances: Floats, radii: Floats, light: Floats, ring: Floats, arcs: Floats) -> Quads:
     """Quads round ellipses: centres (n, 2), covariances (n, 3) px², radii (n,) Mahalanobis, light (n, 3), ring
-    (n, 3); in their order."""
+    (n, 3), arcs (n, 2) px; in their order."""
     xx, xy, yy = covariances.T
     half, root = (xx + yy) / 2, np.sqrt(((xx - yy) / 2) ** 2 + xy * xy)
     long, short = np.sqrt(np.maximum(half + root, 0)), np.sqrt(np.maximum(half - root, 0))
@@ -119,11 +121,15 @@ def quads(centres: Floats, covariances: Floats, radii: Floats, light: Floats, ri
     side = np.stack([-axis[:, 1], axis[:, 0]], -1)
     place = (centres[:, None] + local[..., :1] * (long[:, None] * axis)[:, None]
              + local[..., 1:] * (short[:, None] * side)[:, None])
+    axes = np.stack([axis / np.maximum(long, 1e-6)[:, None], side / np.maximum(short, 1e-6)[:, None]], 1)
+    own = np.einsum("nax,nx->na", axes, arcs)
+    arc = np.concatenate([own, arc_level(np.hypot(*own.T), ring[:, :2])[:, None]], -1)
     count = len(centres)
     index = 4 * np.arange(count, dtype=np.uint32)[:, None, None]
     triangles = (index + np.array([[0, 1, 2], [0, 2, 3]], np.uint32)).reshape(-1, 3)
     return Quads(place.reshape(-1, 2).astype(np.float32), local.reshape(-1, 2).astype(np.float32),
                  np.repeat(light, 4, 0).astype(np.float32), np.repeat(ring, 4, 0).astype(np.float32),
+                 np.repeat(arc, 4, 0).astype(np.float32),
                  np.ascontiguousarray(triangles, np.uint32))
 
 
@@ -150,7 +156,7 @@ def inside(centres: Floats, covariances: Floats, radii: Floats, width: int, heig
 def levels(gaussians: PlaneGaussians, window: Window, blend: str) -> dict[int, Quads]:
     """Quads by level (a divisor of the size), those of the level in its own pixels; in drawing order."""
     centres, covariances = pixels(gaussians, window.intrinsics)
-    radii = reach(gaussians, blend)
+    radii, arcs = reach(gaussians, blend), ways(gaussians, window.intrinsics)
     rows = np.flatnonzero(inside(centres, covariances, radii, window.width, window.height))
     opacities = gaussians.opacities if blend == "add" else np.minimum(gaussians.opacities, OPACITY_MAX)
     rings = gaussians.rings
@@ -167,7 +173,7 @@ def levels(gaussians: PlaneGaussians, window: Window, blend: str) -> dict[int, Q
         own = rows[chosen[rows] == number]
         if len(own):
             made[divisor] = quads(centres[own] / divisor, covariances[own] / divisor**2, radii[own], light[own],
-                                  ring[own])
+                                  ring[own], arcs[own] / divisor)
     return made
 
 
@@ -187,6 +193,7 @@ def _gaussian_shader() -> Any:
     flow.smooth("VEC2", "at")
     flow.flat("VEC3", "shine")
     flow.flat("VEC3", "hollow")
+    flow.flat("VEC3", "bend")
     info = gpu.types.GPUShaderCreateInfo()
     info.push_constant("VEC2", "size")
     info.push_constant("FLOAT", "covers")
@@ -194,16 +201,17 @@ def _gaussian_shader() -> Any:
     info.vertex_in(1, "VEC2", "local")
     info.vertex_in(2, "VEC3", "light")
     info.vertex_in(3, "VEC3", "ring")
+    info.vertex_in(4, "VEC3", "arc")
     info.vertex_out(flow)
     info.fragment_out(0, "VEC4", "result")
     info.vertex_source("void main() {\n"
-                       "  at = local; shine = light; hollow = ring;\n"
+                       "  at = local; shine = light; hollow = ring; bend = arc;\n"
                        "  vec2 ndc = place / size * 2.0 - 1.0;\n"
                        "  gl_Position = vec4(ndc.x, -ndc.y, 0.0, 1.0);\n"
                        "}\n")
     info.fragment_source("void main() {\n"
                          "  float away = (sqrt(max(dot(at, at), 1e-12)) - hollow.x) / hollow.y;\n"
-                         "  float profile = exp(-0.5 * away * away);\n"
+                         "  float profile = exp(dot(bend.xy, at) - bend.z - 0.5 * away * away);\n"
                          "  float alpha = covers > 0.5 ? profile * hollow.z : 1.0;\n"
                          "  if (covers > 0.5 ? alpha < 1.0 / 255.0 : profile < 1.0 / 4096.0) { discard; }\n"
                          "  result = vec4(shine * profile, alpha);\n"
@@ -272,10 +280,10 @@ def _batch(made: Quads) -> Any:
     import gpu
 
     form = gpu.types.GPUVertFormat()
-    for name, size in (("place", 2), ("local", 2), ("light", 3), ("ring", 3)):
+    for name, size in (("place", 2), ("local", 2), ("light", 3), ("ring", 3), ("arc", 3)):
         form.attr_add(id=name, comp_type="F32", len=size, fetch_mode="FLOAT")
     buffer = gpu.types.GPUVertBuf(form, len(made.place))
-    for name in ("place", "local", "light", "ring"):
+    for name in ("place", "local", "light", "ring", "arc"):
         buffer.attr_fill(name, np.ascontiguousarray(getattr(made, name)))
     triangles = gpu.types.GPUIndexBuf(type="TRIS", seq=made.triangles)
     return gpu.types.GPUBatch(type="TRIS", buf=buffer, elem=triangles)

@@ -12,7 +12,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .plane import Floats, PlaneGaussians, joined, pixels
+from .plane import Floats, PlaneGaussians, arc_level, joined, pixels, strengths, ways
 
 PROFILE_MIN = 1 / 4096  # added light below this share of its peak is left out (core/gaussians/rendering.py)
 ALPHA_MIN = 1 / 255
@@ -27,7 +27,8 @@ def reach(gaussians: PlaneGaussians, blend: str = "add") -> Floats:
         peaks = np.minimum(gaussians.opacities, OPACITY_MAX)
         radius = np.sqrt(2 * np.log(np.maximum(peaks / ALPHA_MIN, 1)))
     if gaussians.rings is not None:
-        radius = np.maximum(gaussians.rings[:, 0] + gaussians.rings[:, 1] * radius, 0)
+        r0, w = gaussians.rings.T
+        radius = np.maximum(r0 + w * radius + w * w * gaussians.strengths, 0)
     return np.asarray(radius, np.float32)
 
 
@@ -43,13 +44,14 @@ def draw(flares: Iterable[PlaneGaussians], intrinsics: ArrayLike, width: int, he
         return picture
     left = np.ones((height, width), np.float32)
     centres, covariances = pixels(gaussians, intrinsics)
+    arcs = ways(gaussians, intrinsics)
     radii = reach(gaussians, blend)
     for number in range(len(gaussians)):
         box = _box(centres[number], covariances[number], float(radii[number]), width, height)
         if box is None:
             continue
         ring = None if gaussians.rings is None else gaussians.rings[number]
-        profile = _profile(centres[number], covariances[number], ring, box)
+        profile = _profile(centres[number], covariances[number], ring, arcs[number], box)
         rows, columns = slice(box[1], box[3]), slice(box[0], box[2])
         if blend == "add":
             profile = np.where(profile >= PROFILE_MIN, profile, 0) * gaussians.opacities[number]
@@ -76,7 +78,8 @@ def _box(centre: Floats, covariance: Floats, radius: float, width: int,
     return box if box[0] < box[2] and box[1] < box[3] else None
 
 
-def _profile(centre: Floats, covariance: Floats, ring: NDArray[Any] | None, box: tuple[int, int, int, int]) -> Floats:
+def _profile(centre: Floats, covariance: Floats, ring: NDArray[Any] | None, way: Floats,
+             box: tuple[int, int, int, int]) -> Floats:
     xx, xy, yy = covariance
     dx = np.arange(box[0], box[2], dtype=np.float32) + 0.5 - centre[0]
     dy = (np.arange(box[1], box[3], dtype=np.float32) + 0.5 - centre[1])[:, None]
@@ -84,4 +87,9 @@ def _profile(centre: Floats, covariance: Floats, ring: NDArray[Any] | None, box:
     if ring is None:
         return np.asarray(np.exp(-q / 2), np.float32)
     r0, w = ring
-    return np.asarray(np.exp(-((np.sqrt(np.maximum(q, 1e-12)) - r0) ** 2) / (2 * w * w)), np.float32)
+    halves = (np.sqrt(np.maximum(q, 1e-12)) - r0) ** 2 / (2 * w * w)
+    if way.any():
+        slope = np.array([yy * way[0] - xy * way[1], xx * way[1] - xy * way[0]]) / (xx * yy - xy * xy)
+        level = arc_level(strengths(way[None], covariance[None])[0], ring)
+        halves = halves - (slope[0] * dx + slope[1] * dy - level)
+    return np.asarray(np.exp(-halves), np.float32)

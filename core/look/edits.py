@@ -298,7 +298,7 @@ def _coloured(part: PlaneGaussians, edit: Edit, blend: str) -> PlaneGaussians:
 
 
 def _shaped(part: PlaneGaussians, edit: Edit, place: NDArray[Any], streak: bool) -> PlaneGaussians:
-    """Moved and turned as one: x' = c' + A (x - c), covariance' = A covariance A^T."""
+    """Moved and turned as one: x' = c' + A (x - c), covariance' = A covariance A^T, arc' = A arc."""
     length = edit.streak if streak else 1.0
     if (edit.scale, edit.spread, edit.rotation, length) == (1.0, 1.0, 0.0, 1.0):
         return part
@@ -317,7 +317,8 @@ def _shaped(part: PlaneGaussians, edit: Edit, place: NDArray[Any], streak: bool)
     covariances = np.stack([a * a * xx + 2 * a * b * xy + b * b * yy,
                             a * c * xx + (a * d + b * c) * xy + b * d * yy,
                             c * c * xx + 2 * c * d * xy + d * d * yy], -1)
-    return replace(part, means=means.astype(np.float32), covariances=covariances.astype(np.float32))
+    arcs = None if part.arcs is None else np.asarray(part.arcs @ affine.T, np.float32)
+    return replace(part, means=means.astype(np.float32), covariances=covariances.astype(np.float32), arcs=arcs)
 
 
 def _long_axis(part: PlaneGaussians, weights: Floats | NDArray[Any], centre: NDArray[Any]) -> NDArray[np.float64]:

@@ -18,7 +18,14 @@ from . import container, elements
 from .edits import LookEdits, edited
 from .elements import Element
 from .network import Floats, Network, QueryRange, frequency_encoding
-from .plane import PlaneGaussians, colours, covariance_of_ellipse, covariance_of_solid
+from .plane import (
+    PlaneGaussians,
+    arcs_of_ellipse,
+    colours,
+    covariance_of_ellipse,
+    covariance_of_solid,
+    opacity_gain,
+)
 
 VERSION = 1
 _KEY = "fit_flare"
@@ -41,6 +48,7 @@ class Form:
     latent: int = 0
     levels: int = 16
     base: int = 16
+    arcs: bool = False
 
 
 @dataclass(frozen=True)
@@ -148,11 +156,15 @@ class LightLook:
             opacities = 1 / (1 + np.exp(-(rows["opacity_logits"] + change["opacity_logits"])[:, 0]))
         rays = np.concatenate([means, np.ones_like(means[:, :1])], -1) @ view.rotation
         sh = (rows["sh"] + change["sh"]).reshape(len(means), -1, 3)
-        rings = None
+        rings = arcs = None
         if form.rings:
             raw = rows["rings"] + change["rings"]
             rings = np.stack([raw[:, 0], np.exp(np.clip(raw[:, 1], -3, 3))], -1)
-        return PlaneGaussians(means, covariances, opacities, colours(rays, sh, form.sh_degree), rings), light
+        if form.arcs and rings is not None:
+            own = rows["arcs"] + change["arcs"]
+            opacities = opacities * opacity_gain(own, rings)
+            arcs = arcs_of_ellipse(own, scales, rotations)
+        return PlaneGaussians(means, covariances, opacities, colours(rays, sh, form.sh_degree), rings, arcs), light
 
 
 class Look:
@@ -291,7 +303,7 @@ def _light(path: Path, number: int, entry: Mapping[str, Any], tensors: Mapping[s
     if not 0 <= count <= _MOST_GAUSSIANS or xyz.shape != (3,) or not np.isfinite(xyz).all():
         raise ValueError("a light's description makes no sense")
     if not (form.sh_degree in range(4) and 1 <= form.levels <= 16 and 1 <= form.base <= 256
-            and 0 <= form.latent <= 64):
+            and 0 <= form.latent <= 64 and (not form.arcs or (form.rings and not form.solid))):
         raise ValueError("a light's form makes no sense")
     own = {key[len(f"{number}."):]: value for key, value in tensors.items() if key.startswith(f"{number}.")}
     rows = {key[len("gaussians."):]: np.asarray(value, np.float32) for key, value in own.items()
@@ -307,7 +319,8 @@ def _widths(form: Form) -> dict[str, int]:
     """Columns of the canonical Gaussians by name (core.flare.model.LightFlare)."""
     widths = {"positions": 1 if form.line else 2, "log_scales": 3 if form.solid else 2,
               "rotations": 4 if form.solid else 2, "opacity_logits": 1, "sh": 3 * (form.sh_degree + 1) ** 2}
-    extra = {"offsets": (form.static_offset, 2), "rings": (form.rings, 2), "latent": (form.latent, form.latent)}
+    extra = {"offsets": (form.static_offset, 2), "rings": (form.rings, 2), "arcs": (form.arcs, 2),
+             "latent": (form.latent, form.latent)}
     return {**widths, **{name: width for name, (there, width) in extra.items() if there}}
 
 

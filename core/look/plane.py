@@ -16,6 +16,7 @@ Floats = NDArray[np.float32]
 
 PLANE_DEPTH = 0.21  # where solid Gaussians lie (core/flare/placement.py)
 DILATION = 0.3  # px², the low-pass of 3DGS
+ARC_SOFT = 0.1  # strength of an arc at which its opacity begins to be that of the brightest place
 
 C0 = 0.28209479177387814  # spherical harmonics with the signs and order of 3DGS
 C1 = 0.4886025119029199
@@ -28,7 +29,8 @@ class PlaneGaussians:
     """Gaussians on the normalised plane, ready to be drawn.
 
     means (n, 2), covariances (n, 3) as xx, xy, yy, opacities (n,) in 0..1 (any gain where light adds), colours
-    (n, 3) (linear where light adds, display values where it covers), rings (n, 2) as r0 and w or None.
+    (n, 3) (linear where light adds, display values where it covers), rings (n, 2) as r0 and w or None, arcs (n, 2) as
+    the way from the mean towards the brighter side, or None (core/flare/placement.py).
     """
 
     means: Floats
@@ -36,14 +38,23 @@ class PlaneGaussians:
     opacities: Floats
     colours: Floats
     rings: Floats | None = None
+    arcs: Floats | None = None
 
     def __len__(self) -> int:
         return len(self.means)
 
     def kept(self, rows: Any) -> PlaneGaussians:
         """The Gaussians of these rows (a mask or numbers)."""
-        rings = None if self.rings is None else self.rings[rows]
-        return PlaneGaussians(self.means[rows], self.covariances[rows], self.opacities[rows], self.colours[rows], rings)
+        rings, arcs = (None if part is None else part[rows] for part in (self.rings, self.arcs))
+        return PlaneGaussians(self.means[rows], self.covariances[rows], self.opacities[rows], self.colours[rows], rings,
+                              arcs)
+
+    @property
+    def strengths(self) -> Floats:
+        """(n,) of the arcs, 0 for none: how many deviations each points away."""
+        if self.arcs is None:
+            return np.zeros(len(self), np.float32)
+        return strengths(self.arcs, self.covariances)
 
     @property
     def energy(self) -> Floats:
@@ -54,6 +65,8 @@ class PlaneGaussians:
         if self.rings is not None:  # a ring's area: radius times width, that of the plain profile for r0 = 0
             r0, w = self.rings.T
             area = area * (w * w + np.sqrt(np.pi / 2) * np.maximum(r0, 0) * w)
+            turned = np.clip(np.maximum(r0, 0) * self.strengths.astype(np.float64), 0, 500)  # what an arc leaves of it
+            area = area * np.i0(turned) * np.exp(-turned)
         return np.asarray(self.opacities * area * luminance, np.float32)
 
 
@@ -75,6 +88,27 @@ def covariance_of_ellipse(log_scales: Floats, directions: Floats) -> Floats:
     c, s = (directions / np.maximum(np.linalg.norm(directions, axis=-1, keepdims=True), 1e-12)).T
     a, b = np.exp(2 * log_scales).T
     return np.stack([a * c * c + b * s * s, (a - b) * c * s, a * s * s + b * c * c], -1)
+
+
+def arcs_of_ellipse(arcs: Floats, log_scales: Floats, directions: Floats) -> Floats:
+    """(n, 2) on the plane of arcs (n, 2) in deviations along the axes."""
+    axis = directions / np.maximum(np.linalg.norm(directions, axis=-1, keepdims=True), 1e-12)
+    along, aside = (arcs * np.exp(log_scales)).T
+    return along[:, None] * axis + aside[:, None] * np.stack([-axis[:, 1], axis[:, 0]], -1)
+
+
+def opacity_gain(arcs: Floats, rings: Floats) -> Floats:
+    """(n,) by which opacities are multiplied so that they are smooth in arcs (n, 2), in deviations, at zero."""
+    squared = (arcs * arcs).sum(-1)
+    return np.asarray(np.exp(rings[:, 0] * (np.sqrt(squared) - squared / np.sqrt(squared + ARC_SOFT**2))), np.float32)
+
+
+def strengths(arcs: Floats, covariances: Floats) -> Floats:
+    """(n,) lengths of arcs (n, 2) in deviations of covariances (n, 3); in double precision, for needles."""
+    xx, xy, yy = covariances.T.astype(np.float64)
+    x, y = arcs.T.astype(np.float64)
+    squared = (yy * x * x - 2 * xy * x * y + xx * y * y) / np.maximum(xx * yy - xy * xy, 1e-30)
+    return np.asarray(np.sqrt(np.maximum(squared, 0)), np.float32)
 
 
 def colours(rays: Floats, sh: Floats, degree: int) -> Floats:
@@ -103,15 +137,34 @@ def pixels(gaussians: PlaneGaussians, intrinsics: ArrayLike, dilation: float = D
     return gaussians.means * focal + centre, gaussians.covariances * stretch + low_pass
 
 
+def ways(gaussians: PlaneGaussians, intrinsics: ArrayLike) -> Floats:
+    """(n, 2) arcs in pixels under intrinsics (3, 3), 0 for none: the slope of the profile's logarithm is the inverse
+    covariance (of `pixels`) times this."""
+    if gaussians.arcs is None:
+        return np.zeros_like(gaussians.means)
+    return gaussians.arcs * np.asarray(intrinsics, np.float32).diagonal()[:2]
+
+
+def arc_level(strength: Any, ring: Any) -> Any:
+    """m, the logarithm of what an arc of this strength makes of a profile's peak, ring (n, 2); see `levelled` in
+    core/gaussians/rendering.py."""
+    r0, w = np.asarray(ring).T
+    return strength * (r0 + strength * w * w / 2)
+
+
 def joined(sets: Sequence[PlaneGaussians]) -> PlaneGaussians | None:
-    """Several sets as one; None where there are none. Sets without rings get plain ones beside sets with."""
+    """Several sets as one; None where there are none. Sets without rings or arcs get plain ones beside sets with."""
     if not sets:
         return None
-    rings = None
-    if any(one.rings is not None for one in sets):
-        rings = np.concatenate([np.tile(np.array([0, 1], np.float32), (len(one), 1)) if one.rings is None else one.rings
-                                for one in sets])
+
+    def extra(name: str, plain: Sequence[float]) -> Floats | None:
+        parts = [getattr(one, name) for one in sets]
+        if all(part is None for part in parts):
+            return None
+        return np.concatenate([np.tile(np.array(plain, np.float32), (len(one), 1)) if part is None else part
+                               for one, part in zip(sets, parts, strict=True)])
+
     means, covariances, opacities, shown = (
         np.concatenate([getattr(one, name) for one in sets])
         for name in ("means", "covariances", "opacities", "colours"))
-    return PlaneGaussians(means, covariances, opacities, shown, rings)
+    return PlaneGaussians(means, covariances, opacities, shown, extra("rings", (0, 1)), extra("arcs", (0, 0)))

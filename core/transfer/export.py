@@ -25,11 +25,14 @@ _FLAT = 1e-4  # thickness along the axis, share of the depth: next to nothing in
 _MOST_OPAQUE = 0.99
 
 
-def flare_scene(flares: Mapping[str, PlaneGaussians], camera: Camera) -> tuple[SceneGaussians, NDArray[np.float32]]:
+def flare_scene(
+    flares: Mapping[str, PlaneGaussians], camera: Camera
+) -> tuple[SceneGaussians, dict[str, NDArray[np.float32]]]:
     """One frame's flare as 3D Gaussians of the world, just before the camera (paper, "Flare Representation").
 
-    They are flat, face the camera at depth 0.21, and project to what the look shows. Returned beside them:
-    rings (n, 2) as r0 and w, (0, 1) for a plain Gaussian, which 3DGS itself has no word for.
+    They are flat, face the camera at depth 0.21, and project to what the look shows. Returned beside them, which 3DGS
+    itself has no word for, (n,) each: ring_r0 and ring_w, 0 and 1 for a plain Gaussian; and of a flare with arcs arc_0
+    and arc_1, in deviations along the first and second axis.
     """
     whole = joined(list(flares.values())) or _nothing()
     n = len(whole)
@@ -57,7 +60,11 @@ def flare_scene(flares: Mapping[str, PlaneGaussians], camera: Camera) -> tuple[S
     scene = SceneGaussians(tensor(means), tensor(np.log(scales)), tensor(quaternions),
                            tensor(np.log(opacities / (1 - opacities))), sh)
     rings = np.tile(np.array([0.0, 1.0], np.float32), (n, 1)) if whole.rings is None else whole.rings
-    return scene, np.asarray(rings, np.float32)
+    more = {"ring_r0": rings[:, 0], "ring_w": rings[:, 1]}
+    if whole.arcs is not None:
+        own = np.einsum("nxa,nx->na", axes, whole.arcs) / np.sqrt(np.maximum(variances, 1e-14))
+        more |= {"arc_0": own[:, 0], "arc_1": own[:, 1]}
+    return scene, {name: np.asarray(values, np.float32) for name, values in more.items()}
 
 
 def _nothing() -> PlaneGaussians:
@@ -65,12 +72,13 @@ def _nothing() -> PlaneGaussians:
 
 
 def write_flare_ply(path: Path | str, flares: Mapping[str, PlaneGaussians], camera: Camera, blend: str) -> None:
-    """One frame's flare as a 3DGS PLY; `ring_r0` and `ring_w` besides, and what they mean in the header."""
-    scene, rings = flare_scene(flares, camera)
-    write_ply(path, scene, extra={"ring_r0": rings[:, 0], "ring_w": rings[:, 1]}, comments=(
+    """One frame's flare as a 3DGS PLY; what `flare_scene` has besides, and what it means in the header."""
+    scene, more = flare_scene(flares, camera)
+    arcs = "" if "arc_0" not in more else ", times exp(arc_0 u + arc_1 v) and one at its peak, r^2 = u^2 + v^2"
+    write_ply(path, scene, extra=more, comments=(
         "Fit Flare: the flare of one frame, as its camera sees it",
         "light adds, colours are scene-linear" if blend == "add" else "light covers, colours are display values",
-        "profile exp(-(r - ring_r0)^2 / (2 ring_w^2)), r the Mahalanobis distance",
+        f"profile exp(-(r - ring_r0)^2 / (2 ring_w^2)){arcs}, r the Mahalanobis distance",
         f"lights {' '.join(flares)}"))
 
 
@@ -81,7 +89,8 @@ def preset(look: Look, view: Mapping[str, ViewOfLight], edits: LookEdits | None 
     centre, 2 at the mirror image: 1 - mu), `aside` across it, `size` (standard deviations along its long and
     short axis, as shares of the picture's width), `rotation` of the long axis (degrees from the axis through
     the light, clockwise), `colour` (linear Rec. 709, brightest channel 1), `intensity` (linear light at its
-    brightest), `shape` (glow, disc, ring or streak), and for a ring its `radius` and `thickness` in the same unit.
+    brightest), `shape` (glow, disc, ring or streak), and for a ring its `radius` and `thickness` in the same unit, and
+    where one side is brighter `arc`: `towards` which (degrees, as `rotation`), and `share`, the other side's light.
     """
     width = look.camera.width / look.camera.fx  # of the picture, on the normalised plane
     lights = []
@@ -130,4 +139,8 @@ def _part(seen: PlaneGaussians, row: int, light: NDArray[np.float64], width: flo
                      "thickness": [w * float(long), w * float(short)]}
         elif r0 != 0 or w != 1:  # its own profile, as a plain one of about its width
             part["size"] = [(max(r0, 0) + w) * float(long), (max(r0, 0) + w) * float(short)]
+        if seen.arcs is not None and seen.arcs[row].any():
+            x, y = (float(value) for value in seen.arcs[row])
+            towards = math.degrees(math.atan2(axis[0] * y - axis[1] * x, axis[0] * x + axis[1] * y))
+            part["arc"] = {"towards": towards, "share": math.exp(-2 * max(r0, 0) * float(seen.strengths[row]))}
     return part

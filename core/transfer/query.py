@@ -153,5 +153,5 @@ def _mixed(parts: Sequence[PlaneGaussians], weights: Sequence[float]) -> PlaneGa
         return np.asarray(sum(weight * getattr(part, name) for part, weight in zip(parts, weights, strict=True)),
                           np.float32)
 
-    rings = None if parts[0].rings is None else mean("rings")
-    return PlaneGaussians(mean("means"), mean("covariances"), mean("opacities"), mean("colours"), rings)
+    rings, arcs = (None if getattr(parts[0], name) is None else mean(name) for name in ("rings", "arcs"))
+    return PlaneGaussians(mean("means"), mean("covariances"), mean("opacities"), mean("colours"), rings, arcs)

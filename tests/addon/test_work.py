@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -30,11 +31,12 @@ def a_flare(path: Path) -> Path:
     place = cameras(5)
     seen = torch.tensor(np.array([camera.normalised(LIGHT)[0][0] for camera in place])).float()
     reach = QueryRange.of(torch.tensor(np.array([camera.position for camera in place])).float(), seen)
-    light = LightFlare(OURS, reach, 60, generator)
+    light = LightFlare(replace(OURS, arcs=True), reach, 60, generator)
     with torch.no_grad():
         light.gaussians["opacity_logits"] += 2
         light.gaussians["sh"] += torch.rand(light.gaussians["sh"].shape, generator=generator)
         light.gaussians["log_scales"] += torch.randn(light.gaussians["log_scales"].shape, generator=generator)
+        light.gaussians["arcs"] += 0.5 * torch.randn(60, 2, generator=generator)
     model = FlareModel(["lamp"], torch.tensor(LIGHT[None]), [light])
     flare_file.save(path, FlareFile(model, "add", TrainingCamera(WIDTH, HEIGHT, 70.0, 70.0, 33.0, 19.5)))
     return path

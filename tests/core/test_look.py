@@ -18,7 +18,7 @@ from core.flare.file import FlareFile, TrainingCamera
 from core.flare.model import OURS, PAPER, FlareForm, FlareModel
 from core.look import Edit, KeyedEdits, LookEdits, PlaneGaussians, draw, list_elements, read
 from core.look import elements as grouping
-from core.look.container import read_tensors
+from core.look.container import read_tensors, rewritten
 from core.look.edits import edited
 from core.look.shot import PlacedLight, Shot, ShotFrame, evaluate
 from tests.core.flared import cameras
@@ -26,7 +26,7 @@ from tests.core.test_flare import pose, some_flare
 
 FORMS = {"paper": PAPER, "ours": OURS, "plane": replace(PAPER, line=False, plane_offset=False),
          "bare": replace(PAPER, light_correction=False, plane_offset=False, sh_degree=1),
-         "small": replace(OURS, levels=6)}
+         "small": replace(OURS, levels=6), "arcs": replace(OURS, arcs=True)}
 SMALL = FORMS["small"]
 CAMERA = TrainingCamera(64, 40, 70.0, 70.0, 33.0, 19.5)
 
@@ -48,15 +48,20 @@ def test_it_evaluates_as_torch_does(name: str, tmp_path: Path) -> None:
         shown = look.evaluate(cameras(3)[number].world_to_camera)
         assert list(shown) == list(expected)
         for light, gaussians in expected.items():
-            for field in ("means", "covariances", "opacities", "colours", "rings"):
+            for field in ("means", "covariances", "opacities", "colours", "rings", "arcs"):
                 theirs = getattr(gaussians, field)
                 if theirs is not None:
                     np.testing.assert_allclose(getattr(shown[light], field), theirs.numpy(), rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize("blend", ["add", "over"])
-def test_it_draws_as_the_rasterizer_does(blend: str, tmp_path: Path) -> None:
-    model = saved(tmp_path / "a.flare", SMALL, 1, blend)
+@pytest.mark.parametrize("form", ["small", "arcs"])
+def test_it_draws_as_the_rasterizer_does(form: str, blend: str, tmp_path: Path) -> None:
+    model = saved(tmp_path / "a.flare", FORMS[form], 1, blend)
+    if form == "arcs":
+        with torch.no_grad():
+            model.lights[0].gaussians["arcs"] += torch.randn(40, 2, generator=torch.Generator().manual_seed(5))
+        flare_file.save(tmp_path / "a.flare", FlareFile(model, blend, CAMERA))  # type: ignore[arg-type]
     camera = cameras(3)[1]
     with torch.no_grad():
         expected = splat_flare(next(iter(model(pose(1)).values())), torch.from_numpy(camera.intrinsics).float(), 64, 40,
@@ -269,6 +274,35 @@ def test_rotation_turns_an_element_about_its_centre() -> None:
     np.testing.assert_array_equal(turned.means[0], before.means[0])
     apart = turned.means[2] - turned.means[1]
     np.testing.assert_allclose(apart, [0, 0.012], atol=1e-6)  # x towards y: clockwise, since y runs down
+
+
+def test_arcs_are_scaled_and_turned_with_their_gaussians() -> None:
+    """The edited look drawn is the look drawn and turned: a quarter, about the middle of a square picture."""
+    one = plane([0.0], ring=3.0)
+    one = replace(one, arcs=np.array([[0.02, 0.01]], np.float32))
+    elements = grouping.group(one, np.zeros(1, np.float32))
+    intrinsics = np.array([[100.0, 0, 20], [0, 100, 20], [0, 0, 1]])
+    turned = edited(one, "lamp", LIGHT, elements, LookEdits(Edit(rotation=90)), "add")
+    expected = np.rot90(draw([one], intrinsics, 40, 40), -1)
+    assert np.abs(expected - draw([one], intrinsics, 40, 40)).max() > 0.1
+    np.testing.assert_allclose(draw([turned], intrinsics, 40, 40), expected, atol=1e-5)
+    large = edited(one, "lamp", LIGHT, elements, LookEdits(Edit(scale=2)), "add")
+    np.testing.assert_allclose(large.strengths, one.strengths, rtol=1e-5)
+    assert one.strengths[0] == pytest.approx(5**0.5 / 2, rel=1e-5)
+    # What a ring loses to an arc it loses in its energy, too; a plain Gaussian is only shifted.
+    assert one.energy[0] < 0.5 * replace(one, arcs=None).energy[0]
+    assert plane([0.0]).energy[0] == pytest.approx(replace(plane([0.0]), arcs=one.arcs).energy[0], rel=1e-5)
+
+
+def test_arcs_need_rings(tmp_path: Path) -> None:
+    saved(tmp_path / "a.flare", FORMS["arcs"], 1)
+    _, metadata = read_tensors(tmp_path / "a.flare")
+    description = json.loads(metadata["fit_flare"])
+    description["lights"][0]["form"]["rings"] = False
+    rewritten(tmp_path / "a.flare", tmp_path / "b.flare", {"fit_flare": json.dumps(description)})
+    for reader in (read, flare_file.load):
+        with pytest.raises(FlareFileError, match="is damaged"):
+            reader(tmp_path / "b.flare")
 
 
 def test_streaks_alone_are_lengthened() -> None:

@@ -13,8 +13,9 @@ import torch
 from core.flare.model import OURS, PAPER
 from core.gaussians import rasterization
 from core.gaussians.ply import read_ply
+from core.gaussians.projection import rotation_matrices
 from core.look import PlaneGaussians, ViewOfLight, draw, read
-from core.transfer.export import preset, write_flare_ply, write_preset
+from core.transfer.export import flare_scene, preset, write_flare_ply, write_preset
 from tests.core.flared import cameras
 from tests.core.test_look import saved
 
@@ -51,6 +52,21 @@ def test_rings_stand_beside_the_gaussians(tmp_path: Path) -> None:
     np.testing.assert_array_equal(table[:, 62:], next(iter(seen.values())).rings)
 
 
+def test_arcs_stand_beside_the_gaussians_too(tmp_path: Path) -> None:
+    """In the Gaussians' own axes: exp(arc_0 u + arc_1 v) of the PLY's u and v is exp(b·d) of the plane's d."""
+    saved(tmp_path / "a.flare", replace(OURS, arcs=True), 1)
+    look, camera = read(tmp_path / "a.flare"), cameras(3)[1]
+    seen = next(iter(look.evaluate(camera.world_to_camera).values()))
+    scene, more = flare_scene({"lamp": seen}, camera)
+    assert list(more) == ["ring_r0", "ring_w", "arc_0", "arc_1"]
+    np.testing.assert_allclose(np.hypot(more["arc_0"], more["arc_1"]), seen.strengths, rtol=1e-3)
+    axes = rotation_matrices(scene.quaternions).detach().numpy()[:, :, :2]  # in the world
+    depth = (scene.means.detach().numpy() - camera.position) @ camera.world_to_camera[2, :3]
+    own = np.stack([more["arc_0"], more["arc_1"]], -1) * scene.scales.detach().numpy()[:, :2]
+    on_plane = (np.einsum("nxa,na->nx", axes, own) @ camera.world_to_camera[:2, :3].T) / depth[:, None]
+    np.testing.assert_allclose(on_plane, seen.arcs, atol=1e-4 * np.abs(seen.arcs).max())
+
+
 def test_a_flare_out_of_sight_is_an_empty_ply(tmp_path: Path) -> None:
     write_flare_ply(tmp_path / "flare.ply", {}, cameras(1)[0], "add")
     assert len(read_ply(tmp_path / "flare.ply")) == 0
@@ -68,7 +84,8 @@ def test_a_preset_says_where_and_how_bright(tmp_path: Path, monkeypatch: pytest.
     covariances = [turn @ np.diag(side**2) @ turn.T for side in sides]
     seen = PlaneGaussians(means, np.array([[c[0, 0], c[0, 1], c[1, 1]] for c in covariances], np.float32),
                           np.full(4, 0.5, np.float32), np.tile(np.array([2, 1, 0.5], np.float32), (4, 1)),
-                          np.array([[0, 1], [0, 1], [4, 0.5], [0, 1]], np.float32))
+                          np.array([[0, 1], [0, 1], [4, 0.5], [0, 1]], np.float32),
+                          np.stack([0 * light, 0 * light, 0.01 * np.array([-0.8, 0.6]), 0 * light]).astype(np.float32))
     monkeypatch.setattr(type(look.lights[0]), "evaluate", lambda *_arguments, **_options: seen)
     view = {look.names[0]: ViewOfLight(np.zeros(3, np.float32), np.eye(3, dtype=np.float32), light, 1.0)}
     write_preset(tmp_path / "a.json", look, view)
@@ -84,5 +101,7 @@ def test_a_preset_says_where_and_how_bright(tmp_path: Path, monkeypatch: pytest.
     np.testing.assert_allclose(parts[3]["size"], np.array([0.2, 0.01]) / width, rtol=1e-3)
     assert abs(parts[3]["rotation"]) < 0.1
     np.testing.assert_allclose(parts[2]["radius"], np.array([0.08, 0.08]) / width, rtol=1e-3)
+    assert [("arc" in part) for part in parts] == [False, False, True, False]
+    assert parts[2]["arc"] == pytest.approx({"towards": 90, "share": np.exp(-2 * 4 * 0.5)}, rel=1e-3)
     np.testing.assert_allclose(parts[0]["colour"], [1, 0.5, 0.25])
     assert parts[0]["intensity"] == pytest.approx(1.0)

@@ -166,9 +166,10 @@ def drawn(window):
             u = affine[0, 0] * (x - corner[0]) + affine[0, 1] * (y - corner[1])
             v = affine[1, 0] * (x - corner[0]) + affine[1, 1] * (y - corner[1])
             reach = quads.local[first + 1, 0]
-            away = np.hypot((2 * u - 1) * reach, (2 * v - 1) * reach)
-            r0, w, _ = quads.ring[first]
-            profile = np.exp(-0.5 * ((np.maximum(away, 1e-6) - r0) / w) ** 2)
+            p, q = (2 * u - 1) * reach, (2 * v - 1) * reach
+            (r0, w, _), (along, aside, log_peak) = quads.ring[first], quads.arc[first]
+            profile = np.exp(along * p + aside * q - log_peak
+                             - 0.5 * ((np.maximum(np.hypot(p, q), 1e-6) - r0) / w) ** 2)
             inside = (u >= 0) & (u <= 1) & (v >= 0) & (v <= 1) & (profile >= 1 / 4096)
             level += np.where(inside, profile, 0)[..., None] * quads.light[first]
         total += enlarged(level, divisor, window)

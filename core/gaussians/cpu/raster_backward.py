@@ -37,6 +37,7 @@ from .layout import (
     T_MIN,
     TILE_HEIGHT,
     TILE_WIDTH,
+    TWO,
     ZERO,
     K,
     X,
@@ -172,9 +173,9 @@ def _ordinary(state, records, at, left, top, first, end, start, with_depth):
         while row < stop:
             g, w = row_gradient(state, row * ROW, e, records, at, with_depth)
             colours = _add_colours(state, row * ROW, w, colours, with_depth)
-            gy = g * dy
-            m0, m1, m2 = m0 + g, m1 + gy, fma(gy, dy, m2)
-            dy += ONE
+            m0 = m0 + g
+            m1 = m1 + m0
+            m2 = m2 + m1
             e = e * r
             r = fma(r, step, r)
             row += one
@@ -182,7 +183,10 @@ def _ordinary(state, records, at, left, top, first, end, start, with_depth):
             break
         e, r, dy = start_run(records, at, left, top + row)
         stop = min(row + run, end)
-    mu, my, muu, muy, myy = moments(records, at, left, m0, m1, m2)
+    last = start[2] + np.float32(end - first)  # d_y beyond the last row: its d_y is less by 1, 2 ...
+    muy0 = m0 * last - m1
+    myy0 = m0 * (last * last) - m1 * (last * TWO + ONE) + m2 * TWO
+    mu, my, muu, muy, myy = moments(records, at, left, m0, muy0, myy0)
     return mu, my, muu, muy, myy, m0, colours
 
 

@@ -105,8 +105,8 @@ def _load_gradients(
 def row_gradient(state, at, e, records, record, with_depth):
     """g and w of one row, and the state after it."""
     t, s = load(state, at + T_PLANE), load(state, at + S_PLANE)
-    alpha = where((e >= ALPHA_MIN) & (t >= T_MIN), e, ZERO)
-    w = t * alpha
+    counts = (e >= ALPHA_MIN) & (t >= T_MIN)
+    w = where(counts, t * e, ZERO)
     vc = fma(load(state, at + V_RED), get(records, record + RED), load(state, at + V_ALPHA))
     vc = fma(load(state, at + V_GREEN), get(records, record + GREEN), vc)
     vc = fma(load(state, at + V_BLUE), get(records, record + BLUE), vc)
@@ -116,7 +116,7 @@ def row_gradient(state, at, e, records, record, with_depth):
     s = s - wvc
     store(state, at + S_PLANE, s)
     store(state, at + T_PLANE, t - w)
-    return wvc - s * (alpha / (ONE - alpha)), w
+    return wvc - s * where(counts, e / (ONE - e), ZERO), w
 
 
 @inlined
@@ -162,12 +162,13 @@ def moments(records, at, left, m0, m1, m2):
 
 @inlined
 def _ordinary(state, records, at, left, top, first, end, start, with_depth):
-    """The same by the recurrence, and by three sums a lane."""
+    """The same by the recurrence, and by three sums a lane: of g over the rows, of the first sum's values, and of the
+    second's, additions alone. A row that is j above the end counts in these 1, j and j (j + 1) / 2 times."""
     step, one, run = get(records, at + STEP), opaque(1), run_length(records, at)
     zero = splat(ZERO)
     m0, m1, m2 = zero, zero, zero
     colours = (zero, zero, zero, zero)
-    e, r, dy = start
+    e, r, top_dy = start
     row, stop = first, min(first + run, end)
     while True:
         while row < stop:
@@ -181,12 +182,12 @@ def _ordinary(state, records, at, left, top, first, end, start, with_depth):
             row += one
         if row >= end:
             break
-        e, r, dy = start_run(records, at, left, top + row)
+        e, r, _ = start_run(records, at, left, top + row)
         stop = min(row + run, end)
-    last = start[2] + np.float32(end - first)  # d_y beyond the last row: its d_y is less by 1, 2 ...
-    muy0 = m0 * last - m1
-    myy0 = m0 * (last * last) - m1 * (last * TWO + ONE) + m2 * TWO
-    mu, my, muu, muy, myy = moments(records, at, left, m0, muy0, myy0)
+    below = top_dy + np.float32(end - first)  # d_y of the row below the last; rows above it are 1, 2 ... less
+    m2 = m0 * (below * below) - m1 * (below * TWO + ONE) + m2 * TWO
+    m1 = m0 * below - m1
+    mu, my, muu, muy, myy = moments(records, at, left, m0, m1, m2)
     return mu, my, muu, muy, myy, m0, colours
 
 

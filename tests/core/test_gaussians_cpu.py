@@ -7,7 +7,10 @@ import os
 import subprocess
 import sys
 import textwrap
+import threading
+import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 from pathlib import Path
 
@@ -286,6 +289,21 @@ def test_an_error_in_any_thread_reaches_the_caller() -> None:
         threads.parallel(fail, 7)
     assert calls == [7, 7, 7]
     gradients(2)  # the threads are still there
+
+
+def test_calls_reach_threads_that_sleep_and_threads_that_look_out() -> None:
+    """Also from several callers at once, and when fewer threads are asked than before."""
+    def call(times: int, pause: float) -> None:
+        for number in range(times):
+            seen: list[int] = []
+            threads.parallel(lambda _, seen=seen: seen.append(threading.get_ident()), limit=1 + number % 3)
+            assert len(set(seen)) == len(seen) == 1 + number % 3
+            time.sleep(pause)
+
+    torch.set_num_threads(3)
+    with ThreadPoolExecutor() as pool:
+        for done in [pool.submit(call, *arguments) for arguments in ((300, 0.0), (100, 0.0), (20, 0.01))]:
+            done.result(60)
 
 
 def test_memory_is_used_again_but_never_while_in_use() -> None:

@@ -1,16 +1,20 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Runs a kernel on all threads at once.
 
-As many threads as torch uses (`torch.set_num_threads`). They wait on locks between calls and cost nothing
-meanwhile; a call takes about 15 microseconds to reach them, less than numba's own pools, which moreover
-allow one caller at a time. Kernels share the work out themselves: each takes the next piece from a counter
-(`vector.take_number`), and what a piece computes does not depend on who takes it.
+As many threads as torch uses (`torch.set_num_threads`). Kernels share the work out themselves: each takes the next
+piece from a counter (`vector.take_number`), and what a piece computes does not depend on who takes it.
+
+An iteration makes a call every few tenths of a millisecond. To wake a thread that sleeps takes 50 microseconds, since
+it then has to wait for the interpreter too. So a worker that is done looks out for the next call for a moment before
+it goes to sleep, in machine code, without the interpreter; and the sign that it looks for is that the call's counter
+moves: then the caller's kernel is running, and the interpreter is free. In the same way the caller looks out for the
+workers' word that they are done.
 """
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable
-from queue import SimpleQueue
 from typing import Any
 
 import numpy as np
@@ -18,6 +22,12 @@ import torch
 
 from . import buffers
 from .buffers import Array
+from .lookout import look_for, look_out_after
+
+TURNS = 1 << 14
+"""For how long a thread looks out before it sleeps: some tenths of a millisecond."""
+NAP = 1e-4
+"""Seconds that a caller sleeps between two looks at workers that take longer."""
 
 
 class _Scratch(threading.local):
@@ -33,36 +43,85 @@ class _Scratch(threading.local):
 
 
 _scratch = _Scratch()
+_Call = tuple[Callable[..., Any], int, tuple[Any, ...]]
 
 
 class _Worker:
     """A thread that waits for a call, makes it, and waits for the next."""
 
-    def __init__(self, number: int) -> None:
-        self._calls: SimpleQueue[tuple[Callable[..., Any], int, tuple[Any, ...]]] = SimpleQueue()
-        self._results: SimpleQueue[BaseException | None] = SimpleQueue()
-        threading.Thread(target=self._run, name=f"kernels-{number}", daemon=True).start()
+    def __init__(self, counters: Array) -> None:
+        self._counters = counters
+        self._call: _Call | None = None
+        self._number = 0
+        self._done = np.zeros(1, np.int64)
+        self._error: BaseException | None = None
+        self._asleep = False
+        self._state = threading.Lock()  # of _call and _asleep
+        self._alarm = threading.Semaphore(0)
+        threading.Thread(target=self._run, name="kernels", daemon=True).start()
 
-    def start(self, function: Callable[..., Any], scratch: int, arguments: tuple[Any, ...]) -> None:
-        self._calls.put((function, scratch, arguments))
+    def start(self, number: int, call: _Call) -> None:
+        """Hands call `number` over."""
+        self._number = number
+        with self._state:
+            self._call = call
+            asleep, self._asleep = self._asleep, False
+        if asleep:
+            self._alarm.release()
 
     def wait(self) -> BaseException | None:
-        return self._results.get()
+        """Until the call is done; the error that it ended with."""
+        while not look_for(self._done, self._number, TURNS):
+            time.sleep(NAP)
+        error, self._error = self._error, None
+        return error
 
     def _run(self) -> None:
         torch.set_flush_denormal(True)  # a register of the thread
         while True:
-            function, scratch, arguments = self._calls.get()
+            number = self._number
+            look_out_after(self._done, number, self._counters[(number + 1) % 2], TURNS)
+            with self._state:
+                asleep = self._asleep = self._call is None
+            if asleep:
+                self._alarm.acquire()
+            assert self._call is not None
+            call, self._call = self._call, None
             try:
-                _call(function, scratch, arguments)
+                _call(*call)
             except BaseException as error:
-                self._results.put(error)
-            else:
-                self._results.put(None)
-            del function, arguments
+                self._error = error
+            del call
 
 
-_idle: list[_Worker] = []
+class _Team:
+    """The workers of a caller. Calls have numbers; odd and even ones have a counter each."""
+
+    def __init__(self) -> None:
+        self._workers: list[_Worker] = []
+        self._number = 0
+        self._counters = np.zeros((2, buffers.LINE // 8), np.int64)
+
+    def call(self, function: Callable[..., Any], scratch: int, arguments: tuple[Any, ...], count: int) -> None:
+        """On the caller's thread and count - 1 workers."""
+        while len(self._workers) < count - 1:
+            self._workers.append(_Worker(self._counters))
+        self._number += 1
+        self._counters[(self._number + 1) % 2] = 0  # workers look at it once they are done with this one
+        call = (function, scratch, (self._counters[self._number % 2], *arguments))
+        workers = self._workers[: count - 1]
+        for worker in workers:
+            worker.start(self._number, call)
+        try:
+            _call(*call)
+        finally:
+            errors = [worker.wait() for worker in workers]
+        for error in errors:
+            if error is not None:
+                raise error
+
+
+_idle: list[_Team] = []
 
 
 def _call(function: Callable[..., Any], scratch: int, arguments: tuple[Any, ...]) -> None:
@@ -73,26 +132,17 @@ def _call(function: Callable[..., Any], scratch: int, arguments: tuple[Any, ...]
 def parallel(function: Callable[..., Any], *arguments: Any, scratch: int = 0, limit: int | None = None) -> None:
     """Calls function(counter, *arguments) on every thread, on at most `limit` of them, and waits for all.
 
-    counter: an int64 array of one element, 0, the same for all threads. scratch: how many float32 of memory
-    of its own a thread needs; passed after the counter, unless 0.
+    counter: an int64 array whose first element is 0 at first, the same for all threads. scratch: how many float32 of
+    memory of its own a thread needs; passed after the counter, unless 0.
     """
     count = torch.get_num_threads() if limit is None else max(1, min(limit, torch.get_num_threads()))
     if not getattr(function, "overloads", True):  # compile here, not on all threads at once
         count = 1
-    workers = []
-    for number in range(1, count):
-        try:
-            workers.append(_idle.pop())
-        except IndexError:
-            workers.append(_Worker(number))
-    call = (np.zeros(1, np.int64), *arguments)
-    for worker in workers:
-        worker.start(function, scratch, call)
     try:
-        _call(function, scratch, call)
+        team = _idle.pop()
+    except IndexError:
+        team = _Team()
+    try:
+        team.call(function, scratch, arguments, count)
     finally:
-        errors = [worker.wait() for worker in workers]
-        _idle.extend(workers)
-    for error in errors:
-        if error is not None:
-            raise error
+        _idle.append(team)

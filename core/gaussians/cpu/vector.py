@@ -11,6 +11,7 @@ Products and sums may fuse (one rounding instead of two) where the machine can; 
 from __future__ import annotations
 
 import operator
+import platform
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -41,6 +42,8 @@ _LLVM = {
     "bool": ir.VectorType(ir.IntType(1), LANES),
 }
 _FUSE = ("contract",)
+_PAUSE = "llvm.x86.sse2.pause" if platform.machine().lower() in ("x86_64", "amd64") else ""
+"""What tells the processor that a loop only waits, where it can be told."""
 
 
 @register_model(Vector)
@@ -282,6 +285,32 @@ def take(typing_context, totals, place, amount):  # noqa: ARG001
         return builder.atomic_rmw("add", address, args[2], "monotonic")
 
     return types.int64(totals, types.int64, types.int64), emit
+
+
+@intrinsic
+def glance(typing_context, array):  # noqa: ARG001
+    """The first element of an int64 array, which another thread may change meanwhile; what that thread had written
+    before is seen afterwards."""
+
+    def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
+        if _PAUSE:
+            _call(builder, _PAUSE, ir.VoidType(), [])
+        address = _address(context, builder, sig.args[0], args[0], ir.Constant(ir.IntType(64), 0))
+        return builder.load_atomic(address, "acquire", 8)
+
+    return types.int64(array), emit
+
+
+@intrinsic
+def announce(typing_context, array, number):  # noqa: ARG001
+    """Writes the first element of an int64 array, for `glance`."""
+
+    def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
+        address = _address(context, builder, sig.args[0], args[0], ir.Constant(ir.IntType(64), 0))
+        builder.store_atomic(args[1], address, "release", 8)
+        return context.get_dummy_value()
+
+    return types.none(array, types.int64), emit
 
 
 @intrinsic

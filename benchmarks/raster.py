@@ -162,7 +162,9 @@ class Iteration:
             )  # fmt: skip
             picture = over(laid, picture)
         self.optimiser.zero_grad()
-        l1_ssim(picture, self.target, 0.8, kernels=self.fused).backward()  # type: ignore[arg-type]
+        loss = l1_ssim(picture, self.target, 0.8, kernels=self.fused)  # type: ignore[arg-type]
+        with self.optimiser.stepping():  # as the trainer does where the scene is rendered once
+            loss.backward()
         self.optimiser.step()
 
 
@@ -221,9 +223,8 @@ STAGES = {
     "tiles and depth order": ("list_in_order", "scatter"),
     "raster, forward": ("raster",),
     "raster, backward": ("raster_backward",),
-    "projection, backward": ("project_backward",),
+    "projection, backward, and Adam": ("project_backward", "_advance_all"),
     "loss": ("compare", "gradient"),
-    "Adam": ("_advance_all",),
 }
 STAGE_JOBS = (ITERATION_JOBS[0], ITERATION_JOBS[3])
 

@@ -10,6 +10,7 @@ All randomness is a function of (seed, iteration): a resumed fit goes on as if i
 from __future__ import annotations
 
 import math
+from contextlib import nullcontext
 from typing import Any
 
 import torch
@@ -100,7 +101,8 @@ class Trainer:
             pose = torch.from_numpy(targets.camera.world_to_camera)
             loss = loss + settings.flare.steady * self.flare.corrections(pose).square().sum()
         if loss.requires_grad:  # a frozen scene without a light in front of the camera teaches nothing
-            loss.backward()
+            with self.scene_adam.stepping() if self._rendered_once else nullcontext():
+                loss.backward()
         if self.scene_is_fitted:
             self.strategy.observe(scene)
         for optimiser in (self.scene_adam if self.scene_is_fitted else None, self.flare_adam, self.grid_adam):
@@ -112,6 +114,14 @@ class Trainer:
             self._keep_neighbours_together()
         self._change_flare_density()
         return figures
+
+    @property
+    def _rendered_once(self) -> bool:
+        """Whether all that the scene learns in an iteration comes from one rendering, so that the backward pass may
+        take its steps."""
+        settings = self.settings
+        return (self.scene_is_fitted and settings.scene.strategy == "classic"
+                and settings.flare.occluded_by_scene is None)
 
     def _view(self) -> View:
         """Every view once in an order of its own for each round, a function of seed and iteration."""

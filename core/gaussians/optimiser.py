@@ -11,7 +11,8 @@ with their moments, as densification asks; and the fused CPU kernel where there 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any, Literal, NamedTuple
 
 import torch
@@ -57,10 +58,42 @@ class Adam:
         self.moments = {name: _zeros(p) for name, p in self.parameters.items()}
         self.steps = dict.fromkeys(self.parameters, 0)
 
+    @property
+    def _options(self) -> dict[str, Any]:
+        return {"beta1": self.betas[0], "beta2": self.betas[1], "epsilon": self.epsilon}
+
+    @contextmanager
+    def stepping(self) -> Iterator[None]:
+        """Within it the backward pass may step the parameters of a scene itself, all of them together, as soon as it
+        has their gradients, which then need not be written. The CPU kernels do so.
+
+        The steps are the same; those gradients stay None, and `step` is for what is left. Only for a scene that gets
+        its whole gradient from one `rasterization`: raises RunError if more comes after the steps.
+        """
+        cpu, steps = None, {}
+        for name, rate in self.rates.items():
+            parameter = self.parameters[name]
+            if found := self._kernels_for(parameter):
+                cpu = found
+                steps[name] = cpu.Step(parameter, None, *self.moments[name], self.steps[name] + 1, rate)
+        if cpu is None:
+            yield
+            return
+        with cpu.offered(steps, **self._options) as offers:
+            yield
+        for name in offers.taken:
+            self.steps[name] += 1
+            if self.parameters[name].grad is not None:
+                raise RunError(f"{name} got a gradient after its step: the scene was rendered twice.")
+
+    def _kernels_for(self, parameter: Tensor) -> Any:
+        """The fused kernels if they can step this parameter, else None."""
+        return fused(parameter) if self.kernels == "auto" and parameter.is_contiguous() else None
+
     @torch.no_grad()
     def step(self) -> None:
         """Moves every parameter that has a gradient and a rate."""
-        options: dict[str, Any] = {"beta1": self.betas[0], "beta2": self.betas[1], "epsilon": self.epsilon}
+        options = self._options
         cpu, together = None, []
         for name, rate in self.rates.items():
             parameter = self.parameters[name]
@@ -69,7 +102,7 @@ class Adam:
             self.steps[name] += 1
             data = parameter.data
             values = (data, parameter.grad.contiguous(), *self.moments[name], self.steps[name], rate)
-            found = fused(data) if self.kernels == "auto" and data.is_contiguous() else None
+            found = self._kernels_for(data)
             if found is None:
                 adam_step(*values, **options)
             else:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from contextlib import nullcontext
 from itertools import pairwise
 
 import numpy as np
@@ -14,7 +15,7 @@ from torch import Tensor
 
 from core.capture import Camera, PointCloud
 from core.errors import RunError, SettingsError
-from core.gaussians import Adam, Rendering, SceneGaussians, l1_ssim, ssim
+from core.gaussians import Adam, Rendering, SceneGaussians, kernels, l1_ssim, ssim
 from core.gaussians.densification import Classic, ClassicSettings, Mcmc, McmcSettings, shared
 from core.gaussians.ordering import morton_order, nearest_distances
 from core.gaussians.scene import learning_rates, means_rate, scene_extent, sh_degree_at
@@ -206,6 +207,48 @@ def test_schedules() -> None:
     poses = [np.eye(4) for _ in range(2)]
     poses[0][0, 3], poses[1][0, 3] = 3.0, -3.0
     assert scene_extent([Camera(4, 4, 4.0, 4.0, 2.0, 2.0, pose) for pose in poses]) == pytest.approx(3.3)
+
+
+CAMERA = Camera(36, 28, 40.0, 40.0, 18.0, 14.0, np.array([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 4], [0, 0, 0, 1]]))
+
+
+@pytest.mark.parametrize("n", [10, 60, 1029, 1060, 2100])
+def test_steps_during_the_backward_pass_are_the_same(n: int) -> None:
+    """Chunks of Gaussians of which the last is short, and numbers too few for a vector, which are not stepped there."""
+    target = torch.rand(28, 36, 3, generator=torch.Generator().manual_seed(1))
+
+    def trained(early: bool) -> tuple[SceneGaussians, Adam]:
+        scene, optimiser = some_scene(n)
+        optimiser.zero_grad()
+        for degree in (1, 3, 3):
+            loss = l1_ssim(scene.render(CAMERA, degree).colour, target, 0.8)
+            with optimiser.stepping() if early else nullcontext():
+                loss.backward()
+            optimiser.step()
+            optimiser.zero_grad()
+        return scene, optimiser
+
+    (scene, optimiser), (other, later) = trained(True), trained(False)
+    assert optimiser.steps == later.steps == dict.fromkeys(later.steps, 4)
+    for name, parameter in other.named_parameters():
+        # equal but for what the last numbers round to: a gradient of nothing has a sign, and Adam goes by it
+        assert torch.allclose(dict(scene.named_parameters())[name], parameter, atol=1e-5), name
+        for a, b in zip(optimiser.moments[name], later.moments[name], strict=True):
+            assert torch.allclose(a, b, rtol=1e-4, atol=1e-9), name
+
+
+@pytest.mark.skipif(not kernels.available("cpu"), reason="the CPU kernels step early")
+def test_a_gradient_after_its_step_is_refused() -> None:
+    scene, optimiser = some_scene(100)
+    optimiser.zero_grad()
+    with optimiser.stepping():
+        scene.render(CAMERA).colour.sum().backward()
+    assert all(parameter.grad is None for parameter in scene.parameters())
+    before = scene.means.clone()
+    optimiser.step()  # has nothing left to do
+    assert torch.equal(scene.means, before)
+    with pytest.raises(RunError, match="rendered twice"), optimiser.stepping():
+        (scene.render(CAMERA).colour.sum() + scene.render(CAMERA).colour.sum()).backward()
 
 
 # Densification

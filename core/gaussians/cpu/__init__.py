@@ -9,8 +9,8 @@ from __future__ import annotations
 
 from .layers import enlarged, over
 from .loss import l1_ssim
-from .optimiser import Step, adam_steps
+from .optimiser import Step, adam_steps, offered
 from .scene import rasterize_scene
 from .splats import splat
 
-__all__ = ["Step", "adam_steps", "enlarged", "l1_ssim", "over", "rasterize_scene", "splat"]
+__all__ = ["Step", "adam_steps", "enlarged", "l1_ssim", "offered", "over", "rasterize_scene", "splat"]

@@ -1,91 +1,189 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Steps of Adam, in one pass over parameters, gradients and moments (the definition is `..optimiser`)."""
+"""Steps of Adam, in one pass over parameters, gradients and moments (the definition is `..optimiser`).
+
+It takes as long as memory takes to read and write them. The gradients of a scene come from the projection's backward
+pass, some Gaussians at a time: steps that were `offered` are taken there and then, while the gradients are in the
+cache, so that those are neither written to memory nor read again.
+"""
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
 from torch import Tensor
 
 from .buffers import Array
-from .compilation import kernel
+from .compilation import inlined, kernel
 from .threads import parallel
-from .tiles import flat
-from .vector import LANES, fma, load, sqrt, store, take_number
+from .tiles import EMPTY, flat
+from .vector import LANES, fma, get, load, sqrt, store, take_number
 
 PIECE = 1 << 13
 """Least number of values to a piece of work."""
 
 
-@kernel
-def advance(counter, parameter, gradient, first, second, rates, piece, beta1, new1, beta2, new2, root, epsilon):
-    """All flat. rates: repeats along the parameter, a multiple of 16 long, bias correction included; piece: a
-    multiple of its length. new: 1 - beta; root: 1 / sqrt(1 - beta2^t)."""
+CONSTANTS = 7
+
+
+@inlined
+def constants_of(constants):
+    """What `move` needs: beta1, 1 - beta1, beta2, 1 - beta2, 1 / (1 - beta1^t), 1 / sqrt(1 - beta2^t), epsilon."""
+    c = constants
+    return get(c, 0), get(c, 1), get(c, 2), get(c, 3), get(c, 4), get(c, 5), get(c, 6)
+
+
+@inlined
+def move(parameter, first, second, at, gradient, rate, constants):
+    """A step of 16 numbers at a flat index."""
+    beta1, new1, beta2, new2, scale, root, epsilon = constants
+    m = fma(load(first, at), beta1, gradient * new1)
+    v = fma(load(second, at), beta2, gradient * gradient * new2)
+    store(first, at, m)
+    store(second, at, v)
+    store(parameter, at, load(parameter, at) - rate * scale * m / fma(sqrt(v), root, epsilon))
+
+
+@inlined
+def move_all(parameter, gradient, first, second, rates, constants):
+    """A step of all numbers of a parameter; rates: repeats along it, a multiple of 16 long."""
     n, period = parameter.size, rates.size
+    place, whole = 0, n - n % LANES
+    for i in range(0, whole, LANES):
+        move(parameter, first, second, i, load(gradient, i), load(rates, place), constants)
+        place += LANES
+        if place == period:
+            place = 0
+    beta1, new1, beta2, new2, scale, root, epsilon = constants
+    for i in range(whole, n):
+        g = gradient[i]
+        first[i] = first[i] * beta1 + g * new1
+        second[i] = second[i] * beta2 + g * g * new2
+        parameter[i] -= rates[i % period] * scale * first[i] / (math.sqrt(second[i]) * root + epsilon)
+
+
+@kernel
+def advance(counter, parameter, gradient, first, second, rates, piece, constants):
+    """All flat. rates: as for `move_all`; piece: a multiple of its length."""
     while True:
         start = take_number(counter) * piece
-        if start >= n:
+        end = min(start + piece, parameter.size)
+        if start >= end:
             break
-        end = min(start + piece, n)
-        whole = end - (end - start) % LANES
-        place = 0
-        for i in range(start, whole, LANES):
-            g = load(gradient, i)
-            m = fma(load(first, i), beta1, g * new1)
-            v = fma(load(second, i), beta2, g * g * new2)
-            store(first, i, m)
-            store(second, i, v)
-            store(parameter, i, load(parameter, i) - load(rates, place) * m / fma(sqrt(v), root, epsilon))
-            place += LANES
-            if place == period:
-                place = 0
-        for i in range(whole, end):
-            g = gradient[i]
-            first[i] = first[i] * beta1 + g * new1
-            second[i] = second[i] * beta2 + g * g * new2
-            parameter[i] -= rates[(i - start) % period] * first[i] / (math.sqrt(second[i]) * root + epsilon)
+        move_all(
+            parameter[start:end], gradient[start:end], first[start:end], second[start:end], rates,
+            constants_of(constants),
+        )  # fmt: skip
 
 
 class Step(NamedTuple):
     """What a step of a parameter is made of; see `..optimiser`. Parameter and moments are contiguous float32, and are
-    changed in place."""
+    changed in place. gradient: None if the step is `offered`."""
 
     parameter: Tensor
-    gradient: Tensor
+    gradient: Tensor | None
     first: Tensor
     second: Tensor
     step: int
     rate: float | Tensor
 
 
+class Moves(NamedTuple):
+    """Steps of some parameters, as kernels take them: flat arrays, and the numbers of `constants_of` by rows."""
+
+    first: tuple[Array, ...]
+    second: tuple[Array, ...]
+    rates: tuple[Array, ...]
+    constants: Array
+
+
+SCENE = 5
+"""How many parameters a scene has."""
+NO_MOVES = Moves((EMPTY,) * SCENE, (EMPTY,) * SCENE, (EMPTY,) * SCENE, np.empty((SCENE, CONSTANTS), np.float32))
+
+
+class Offers:
+    """Steps that a backward pass may take in place of writing the gradients."""
+
+    def __init__(self, steps: Mapping[str, Step], beta1: float, beta2: float, epsilon: float) -> None:
+        self._steps = {id(step.parameter): (name, step) for name, step in steps.items()}
+        self._options = (beta1, beta2, epsilon)
+        self.taken: set[str] = set()
+
+    def take(self, parameters: Sequence[Tensor]) -> Moves | None:
+        """The steps of these parameters, now the caller's to take; None unless all are on offer."""
+        found = [self._steps.get(id(parameter)) for parameter in parameters]
+        if any(entry is None or entry[0] in self.taken for entry in found):
+            return None
+        self.taken.update(entry[0] for entry in found if entry is not None)
+        steps = [entry[1] for entry in found if entry is not None]
+        return Moves(
+            tuple(flat(step.first) for step in steps), tuple(flat(step.second) for step in steps),
+            tuple(_rates(step.rate) for step in steps), np.stack([_constants(step, *self._options) for step in steps]),
+        )  # fmt: skip
+
+
+_offers: list[Offers] = []
+
+
+@contextmanager
+def offered(steps: Mapping[str, Step], *, beta1: float, beta2: float, epsilon: float) -> Iterator[Offers]:
+    """Within it, a backward pass that finds all gradients of a scene may take the steps."""
+    offers = Offers(steps, beta1, beta2, epsilon)
+    _offers.append(offers)
+    try:
+        yield offers
+    finally:
+        _offers.remove(offers)
+
+
+def take_offers(parameters: Sequence[Tensor]) -> Moves | None:
+    """The steps of a scene's parameters if they are on offer, to be taken by the caller."""
+    for offers in _offers:
+        if moves := offers.take(parameters):
+            return moves
+    return None
+
+
 def adam_steps(steps: Sequence[Step], *, beta1: float, beta2: float, epsilon: float) -> None:
     """A step of each of some parameters. They do not wait for each other: a thread that finds no more of one goes on
     with the next."""
-    calls = [_arguments(*step, beta1, beta2, epsilon) for step in steps]
+    calls = [_arguments(step, beta1, beta2, epsilon) for step in steps]
     pieces = sum(-(-call[1].size // call[6]) for call in calls)
     parallel(_advance_all, calls, limit=pieces if advance.overloads else 1)  # compiled by one thread
 
 
-def _advance_all(_: Array, calls: Sequence[tuple[Any, ...]]) -> None:
-    for call in calls:
-        advance(*call)
+def _advance_all(counter: Array, calls: Sequence[tuple[Any, ...]]) -> None:
+    for number, call in enumerate(calls):
+        advance(call[0] if number else counter, *call[1:])
 
 
-def _arguments(
-    parameter: Tensor, gradient: Tensor, first: Tensor, second: Tensor, step: int, rate: float | Tensor,
-    beta1: float, beta2: float, epsilon: float,
-) -> tuple[Any, ...]:  # fmt: skip
+def _rates(rate: float | Tensor) -> Array:
+    """A multiple of 16 numbers that repeat along the parameter."""
+    if not isinstance(rate, Tensor):
+        return _constant_rates(rate)
+    row = flat(rate)
+    return np.tile(row, math.lcm(row.size, LANES) // row.size) if row.size % LANES else row
+
+
+@lru_cache(256)
+def _constant_rates(rate: float) -> Array:
+    return np.full(LANES, rate, np.float32)
+
+
+def _constants(step: Step, beta1: float, beta2: float, epsilon: float) -> Array:
+    """See `constants_of`."""
+    unbiased = 1 / (1 - beta1**step.step), 1 / math.sqrt(1 - beta2**step.step)
+    return np.array([beta1, 1 - beta1, beta2, 1 - beta2, *unbiased, epsilon], np.float32)
+
+
+def _arguments(step: Step, beta1: float, beta2: float, epsilon: float) -> tuple[Any, ...]:
     """Of `advance`, with a counter of its own."""
-    row = flat(rate) if isinstance(rate, Tensor) else np.full(LANES, rate, np.float32)
-    if row.size % LANES:
-        row = np.tile(row, math.lcm(row.size, LANES) // row.size)
-    rates = row / np.float32(1 - beta1**step)
+    assert step.gradient is not None
+    rates = _rates(step.rate)
     piece = -(-PIECE // rates.size) * rates.size
-    root = 1 / math.sqrt(1 - beta2**step)
-    return (
-        np.zeros(1, np.int64), flat(parameter), flat(gradient), flat(first), flat(second), rates, piece,
-        np.float32(beta1), np.float32(1 - beta1), np.float32(beta2), np.float32(1 - beta2), np.float32(root),
-        np.float32(epsilon),
-    )  # fmt: skip
+    arrays = (flat(t) for t in (step.parameter, step.gradient, step.first, step.second))
+    return np.zeros(1, np.int64), *arrays, rates, piece, _constants(step, beta1, beta2, epsilon)

@@ -57,6 +57,7 @@ from .layout import (
     ZERO,
     G,
 )
+from .optimiser import constants_of, move_all
 from .vector import (
     LANES,
     any_of,
@@ -94,6 +95,10 @@ SLOPES = 9
 TURNED = harmonics.ROWS * LANES
 SQUARE = LANES * LANES
 SCRATCH = TURNED + SQUARE + CAMERA_SUMS * LANES
+ROOM = CHUNK + LANES
+"""For the Gaussians of a chunk."""
+STEP_SCRATCH = SCRATCH + ROOM * (11 + harmonics.ROWS)
+"""With their gradients: 3 numbers for the mean, 4, 3 and 1 for shape and opacity, and the harmonics'."""
 
 H = np.float32(-0.5 / math.log(2))
 TWO_LN2 = np.float32(2 * math.log(2))
@@ -461,8 +466,9 @@ def _offset_gradient(d_colour, slopes):
 @inlined
 def _project_block_backward(
     means, quats, scales, opacities, sh_width, degree, raw, camera, records, colour_slopes, first, fresh, fields,
-    turned, rows, d_means, d_quats, d_scales, d_opacities, d_sh, d_centres, sums, with_camera,
+    turned, rows, d_means, d_quats, d_scales, d_opacities, d_sh, row, soon, d_centres, sums, with_camera,
 ):  # fmt: skip
+    """Gradients of the 16 Gaussians from `first` on, written from `row` on; soon: those of sh are read soon."""
     mean, scale = _load3(means, first), _load_scales(scales, first, raw)
     px, py, pz = _seen(camera, mean)
     before = pz > camera[NEAR]
@@ -482,7 +488,7 @@ def _project_block_backward(
     free = (opacity <= OPACITY_MAX) & (opacity >= ALPHA_MIN)
     # G is the gradient by ln opacity; by the logit it is 1 - opacity times as large
     d_opacity = fields[G] * (ONE - opacity) if raw else fields[G] / where(free, opacity, ONE)
-    store(d_opacities, first, where(free, d_opacity, ZERO))
+    store(d_opacities, row, where(free, d_opacity, ZERO))
 
     # covariance -> a, b -> V, scales, slopes, depth
     da = _sum(_scaled(d_xx * TWO, a), d_xy, b)
@@ -497,12 +503,12 @@ def _project_block_backward(
         fma(na[1], v[0][1], fma(nb[1], v[1][1], n2[1] * v[2][1])),
         fma(na[2], v[0][2], fma(nb[2], v[1][2], n2[2] * v[2][2])),
     )
-    _store3(d_scales, first, _times(d_scale, scale) if raw else d_scale)
+    _store3(d_scales, row, _times(d_scale, scale) if raw else d_scale)
     dv = (_times(na, scale), _times(nb, scale), _times(n2, scale))
     gw, gx, gy, gz = _rotation_backward(qw, qx, qy, qz, _turned_back(camera, dv))
     along = fma(gw, qw, _dot((gx, gy, gz), (qx, qy, qz)))
     along = where(inverse_norm < np.float32(1e8), along, ZERO)  # shorter quaternions were scaled by a constant
-    _store4(d_quats, first, (
+    _store4(d_quats, row, (
         (gw - qw * along) * inverse_norm, (gx - qx * along) * inverse_norm,
         (gy - qy * along) * inverse_norm, (gz - qz * along) * inverse_norm,
     ))  # fmt: skip
@@ -523,14 +529,14 @@ def _project_block_backward(
     )
     direction, _ = _direction(mean, camera)
     harmonics.coefficients_backward(degree, direction[0], direction[1], direction[2], d_colour, rows, turned)
-    harmonics.scatter(turned, first, sh_width, d_sh)
+    harmonics.scatter(turned, row, sh_width, d_sh, soon)
     offset = _offset_gradient(d_colour, colour_slopes)
     d_mean = (
         fma(dp[0], camera[0], fma(dp[1], camera[3], fma(dp[2], camera[6], offset[0]))),
         fma(dp[0], camera[1], fma(dp[1], camera[4], fma(dp[2], camera[7], offset[1]))),
         fma(dp[0], camera[2], fma(dp[1], camera[5], fma(dp[2], camera[8], offset[2]))),
     )
-    _store3(d_means, first, d_mean)
+    _store3(d_means, row, d_mean)
     if with_camera:
         intrinsics = (fma(dx, slopes[0], a_da / camera[FX]), fma(dy, slopes[1], b_db / camera[FY]), dx, dy)
         _camera_sums(sums, fresh, mean, q, dv, dp, offset, intrinsics)
@@ -538,34 +544,54 @@ def _project_block_backward(
 
 @kernel
 def project_backward(
-    counter, scratch, means, quats, scales, opacities, sh_width, degree, raw, camera, records, slopes,
-    gradients, slots, counts,
-    d_means, d_quats, d_scales, d_opacities, d_sh, d_centres, d_camera, with_camera,
+    counter, scratch, parameters, sh_width, degree, raw, camera, records, slopes, gradients, slots, counts,
+    d_parameters, d_centres, d_camera, with_camera, first_moments, second_moments, rates, constants,
 ):  # fmt: skip
     """Gradients of all inputs from the rasterizer's rows.
 
+    parameters: means, quats, scales, opacities and, to be stepped, sh; d_parameters: the gradients of all five. If
+    those are empty, the parameters take a step by them instead (`optimiser.Moves`), chunk by chunk.
     gradients: one row for each pair of Gaussian and tile; those of Gaussian i are counts[i] rows from
     slots[i] on. d_camera: sums of each chunk, (chunks, CAMERA_SUMS), if with_camera.
     """
+    means, quats, scales, opacities, _ = parameters
     n = opacities.size
     turned, rows, sums = scratch[:TURNED], scratch[TURNED : TURNED + SQUARE], scratch[TURNED + SQUARE : SCRATCH]
-    while True:
-        chunk = take_number(counter)
-        start, end = chunk * CHUNK, min(chunk * CHUNK + CHUNK, n)
-        if start >= n:
+    stepping = d_parameters[0].size == 0
+    here = d_parameters
+    if stepping:
+        room = scratch[SCRATCH:]
+        here = (
+            room[: 3 * ROOM], room[3 * ROOM : 7 * ROOM], room[7 * ROOM : 10 * ROOM], room[10 * ROOM : 11 * ROOM],
+            room[11 * ROOM :],
+        )  # fmt: skip
+    d_means, d_quats, d_scales, d_opacities, d_sh = here
+    chunks = max(1, n // CHUNK + np.int64(n % CHUNK >= LANES))  # fewer than 16 go with those before
+    while True:  # last to first: what is stepped last is what the next iteration asks for first
+        chunk = chunks - 1 - take_number(counter)
+        if chunk < 0:
             break
+        start, end = chunk * CHUNK, (chunk + 1) * CHUNK if chunk < chunks - 1 else n
         if with_camera:
             for i in range(0, CAMERA_SUMS * LANES, LANES):
                 store(sums, i, splat(ZERO))
         for block in range(start, end, LANES):
-            first = min(block, n - LANES)
+            first = min(block, end - LANES)
             fields = _gathered(gradients, slots, counts, first, rows)
             fresh = lanes() >= np.float32(block - first)
             _project_block_backward(
                 means, quats, scales, opacities, sh_width, degree, raw, camera, records, slopes[block * SLOPES :],
-                first, fresh, fields, turned, rows,
-                d_means, d_quats, d_scales, d_opacities, d_sh, d_centres, sums, with_camera,
+                first, fresh, fields, turned, rows, d_means, d_quats, d_scales, d_opacities, d_sh,
+                first - start if stepping else first, stepping, d_centres, sums, with_camera,
             )  # fmt: skip
+        if stepping:
+            for i in range(len(parameters)):
+                width = parameters[i].size // n
+                low, high = start * width, end * width
+                move_all(
+                    parameters[i][low:high], here[i], first_moments[i][low:high], second_moments[i][low:high], rates[i],
+                    constants_of(constants[i]),
+                )  # fmt: skip
         if with_camera:
             for i in range(CAMERA_SUMS):
                 total = ZERO

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ..rendering import Rendering
-from . import buffers, layout, projection, raster_backward, raster_forward
+from . import buffers, layout, optimiser, projection, raster_backward, raster_forward
 from .buffers import Array
 from .threads import parallel
 from .tiles import EMPTY, Grid, bin_gaussians, flat
@@ -92,17 +92,22 @@ class _Rasterize(torch.autograd.Function):
             raster_backward.raster_backward, bins.entries, bins.starts, ends, records, behind, w, h, frame.tiles_x,
             *pictures, v_image, v_alpha, v_depth, rows, scratch=raster_backward.SCRATCH,
         )  # fmt: skip
-        gradients, gradients_flat = zip(
-            *(buffers.pair(*t.shape) for t in (means, quats, scales, opacities, sh)), strict=True
-        )
+        parameters = (means, quats, scales, opacities, sh)
+        moves = optimiser.take_offers(parameters)
+        if moves is None:
+            gradients, gradients_flat = zip(*(buffers.pair(*t.shape) for t in parameters), strict=True)
+        else:
+            gradients, gradients_flat = (None,) * len(parameters), (EMPTY,) * len(parameters)
         # the first time the kernel writes them where they belong; a second backward adds to them
         first, ctx.first = ctx.first, False
         d_centres = flat(ctx.centre_gradients) if first else buffers.empty(2 * n)
         with_camera = ctx.needs_input_grad[5] or ctx.needs_input_grad[6]
         sums = np.zeros((-(-n // layout.CHUNK), projection.CAMERA_SUMS), np.float32)
         parallel(
-            projection.project_backward, *given, sh.shape[1] * 3, frame.sh_degree, frame.raw, camera, records, slopes,
-            rows, bins.firsts, bins.counts, *gradients_flat, d_centres, sums, with_camera, scratch=projection.SCRATCH,
+            projection.project_backward, (*given, flat(sh) if moves else EMPTY), sh.shape[1] * 3, frame.sh_degree,
+            frame.raw, camera, records, slopes, rows, bins.firsts, bins.counts, gradients_flat, d_centres, sums,
+            with_camera, *(moves or optimiser.NO_MOVES),
+            scratch=projection.STEP_SCRATCH if moves else projection.SCRATCH,
         )  # fmt: skip
         if not first:
             flat(ctx.centre_gradients)[:] += d_centres

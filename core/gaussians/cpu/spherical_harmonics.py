@@ -47,14 +47,14 @@ def gather(sh, first, width, used, turned):
 
 
 @inlined
-def scatter(turned, first, width, sh):
-    """The inverse: writes all `width` numbers of 16 Gaussians."""
+def scatter(turned, first, width, sh, soon):
+    """The inverse: writes all `width` numbers of 16 Gaussians; past the caches unless they are read soon."""
     one = opaque(1)
     column = 0
     while column < width:
         if column + LANES <= width:
             rows = load_rows(turned, column * LANES, LANES)
-            if width == ROWS:
+            if width == ROWS and not soon:
                 stream_rows(sh, first * width + column, width, transpose(rows))
             else:
                 store_rows(sh, first * width + column, width, transpose(rows))

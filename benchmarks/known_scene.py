@@ -16,6 +16,7 @@ from core.flare.compositing import composite, decode
 from core.gaussians.loss import l1_ssim
 from core.metrics.evaluation import out_of_range
 from core.metrics.pictures import psnr, relative_l2
+from core.pictures import srgb_from_linear
 
 
 class KnownScene(Trainer):
@@ -43,8 +44,9 @@ class KnownScene(Trainer):
 
 @torch.no_grad()
 def score(trainer: Trainer, views: Sequence[View]) -> dict[str, Any]:
-    """Means over views: the flare as |composite - scene| in display space, and the linear layer itself where the
-    camera did not clip, against the exact one."""
+    """Means over views: the flare as |composite - scene| in display space, against that of the exact layers where the
+    capture has them (of frames and flare-free frames, whose noise is no error of a fit's, where it has not), and the
+    linear layer itself where the camera did not clip, against the exact one."""
     display, linear, relative = [], [], []
     for view in views:
         targets = trainer.frames.targets(view)
@@ -53,10 +55,14 @@ def score(trainer: Trainer, views: Sequence[View]) -> dict[str, Any]:
         if flare is None:
             continue
         picture = composite(targets.removed, flare, trainer.settings.blend)
-        display.append(psnr((picture - targets.removed).abs().numpy(), (targets.frame - targets.removed).abs().numpy()))
-        truth = trainer.capture.truth_flare(view, targets.camera.size)
-        if truth is None:
+        shown = (picture - targets.removed).abs().numpy()
+        scene, truth = (exact(view, targets.camera.size) for exact in (trainer.capture.truth_scene,
+                                                                       trainer.capture.truth_flare))
+        if scene is None or truth is None:
+            display.append(psnr(shown, (targets.frame - targets.removed).abs().numpy()))
             continue
+        with_flare = srgb_from_linear(scene.linear() + truth.linear()).clip(0, 1)
+        display.append(psnr(shown, np.abs(with_flare - srgb_from_linear(scene.linear()).clip(0, 1))))
         keep = ~out_of_range(trainer.capture, view, targets.camera.size)
         found = flare.colour if trainer.settings.blend == "add" else decode(picture) - decode(targets.removed)
         linear.append(psnr(found.numpy(), truth.linear(), keep))

@@ -12,7 +12,7 @@ Layers are scene-linear whichever way was fitted, and scene + flare = composite 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -61,7 +61,8 @@ def composite(scene: Tensor, flare: Splats | None, blend: Blend) -> Tensor:
         return scene
     if blend == "over":
         return over(flare, scene)
-    return clip_through(encode(decode(clip_through(scene)) + flare.colour))
+    added: Tensor = _LightAdded.apply(scene, flare.colour)
+    return added
 
 
 def decode(display: Tensor) -> Tensor:
@@ -75,22 +76,33 @@ def encode(linear: Tensor) -> Tensor:
                        1.055 * linear.clamp_min(0.0031308) ** (1 / 2.4) - 0.055)
 
 
-class _ClipThrough(torch.autograd.Function):
-    @staticmethod
-    def forward(_ctx: object, values: Tensor) -> Tensor:
-        return values.clamp(0, 1)
+class _LightAdded(torch.autograd.Function):
+    """encode(decode(scene) + light), clipped to 0..1 on the way in and out, with the gradient passed on as it is.
 
-    @staticmethod
-    def backward(_ctx: object, gradient: Tensor) -> Tensor:
-        return gradient
-
-
-def clip_through(values: Tensor) -> Tensor:
-    """Clip to 0..1, with the gradient passed on as it is.
-
-    A pixel that is too bright must be able to come down again; the true gradient of a clip is zero there.
+    A pixel that is too bright must be able to come down again; the true gradient of a clip is zero there. The slopes
+    of both curves come of the powers that the curves are made of: autograd would take those a second time.
     """
-    return _ClipThrough.apply(values)
+
+    @staticmethod
+    def forward(ctx: Any, scene: Tensor, light: Tensor) -> Tensor:
+        display = scene.clamp(0, 1)
+        base = (display + 0.055) / 1.055
+        power = base**1.4
+        low = display <= 0.04045
+        total = torch.where(low, display / 12.92, base * power).add_(light)
+        within = power.mul_(2.4 / 1.055).masked_fill_(low, 1 / 12.92) if ctx.needs_input_grad[0] else None
+        bright = total.clamp_min(0.0031308)
+        power = bright ** (1 / 2.4)
+        dim = total <= 0.0031308
+        shown = torch.where(dim, total * 12.92, power * 1.055 - 0.055).clamp_(0, 1)
+        ctx.save_for_backward(within, power.mul_(1.055 / 2.4).div_(bright).masked_fill_(dim, 12.92))
+        return shown
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, Tensor]:
+        within, slope = ctx.saved_tensors
+        of_light = gradient * slope
+        return None if within is None else of_light * within, of_light
 
 
 class Layers(NamedTuple):

@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -79,8 +80,9 @@ def visible_share(scene: SceneGaussians, camera: Tensor, light: Tensor, settings
     # The disk's edge, two deviations of the window, is the picture's edge.
     focal = half / (2 * settings.radius)
     intrinsics = torch.tensor([[focal, 0, half], [0, focal, half], [0, 0, 1]])
+    colourless = scene.sh.new_zeros(len(chosen), 1, 3)  # the colours' gradient would be the dearest part
     alpha = rasterization(scene.means[chosen], scene.quaternions[chosen], scene.log_scales[chosen].exp(),
-                          scene.opacity_logits[chosen].sigmoid(), scene.sh[chosen, :1], pose, intrinsics, size, size,
+                          scene.opacity_logits[chosen].sigmoid(), colourless, pose, intrinsics, size, size,
                           near=1e-3 * distance, depth=False, kernels=kernels).alpha
     offset = torch.arange(size) + 0.5 - half
     window = torch.exp(-0.5 * (offset / (half / 2)) ** 2)
@@ -88,14 +90,16 @@ def visible_share(scene: SceneGaussians, camera: Tensor, light: Tensor, settings
     return ((1 - alpha) * weights).sum() / weights.sum()
 
 
-@torch.no_grad()
 def _before(scene: SceneGaussians, pose: Tensor, distance: float, settings: VisibilitySettings) -> Tensor:
-    """Rows of the Gaussians between camera and light that may touch the small picture."""
-    local = scene.means @ pose[:3, :3].T + pose[:3, 3]
-    depth, aside = local[:, 2], local[:, :2].norm(dim=-1)
-    reach = 3 * scene.log_scales.amax(-1).exp()
+    """Rows of the Gaussians between camera and light that may touch the small picture. By numpy, which has a third of
+    torch's cost on columns of three."""
+    means, scales, rigid = (part.detach().cpu().numpy() for part in (scene.means, scene.log_scales, pose))
+    x, y, depth = (means @ rigid[:3, :3].T + rigid[:3, 3]).T
+    reach = 3 * np.exp(np.maximum(np.maximum(scales[:, 0], scales[:, 1]), scales[:, 2]))
     between = (depth > 1e-3 * distance) & (depth < (1 - settings.margin) * distance)
-    return (between & (aside < depth * settings.radius * 4 + reach)).nonzero()[:, 0]
+    aside = np.sqrt(x * x + y * y)
+    rows = np.flatnonzero(between & (aside < depth * settings.radius * 4 + reach))
+    return torch.from_numpy(rows).to(scene.means.device)
 
 
 def _looking_along(position: Tensor, forward: Tensor) -> Tensor:

@@ -420,3 +420,22 @@ def test_other_safetensors_and_nan_are_refused(saved: Path) -> None:
 def test_cameras_of_the_tests_look_at_the_light() -> None:
     assert all(isinstance(camera, Camera) for camera in cameras(2))
     assert all(ViewOfLight.of(pose(i), torch.tensor([0.3, -0.6, 1.5])).depth > 0 for i in range(3))
+
+
+@pytest.mark.parametrize("taught", [True, False])
+def test_light_is_added_with_the_gradients_of_its_definition(taught: bool) -> None:
+    """Within 0..1 those of autograd; where the picture is clipped, those of the curves without the clip."""
+    generator = torch.Generator().manual_seed(0)
+    scene = (torch.rand(6, 8, 3, generator=generator, dtype=torch.float64) ** 3 * 1.2 - 0.1).requires_grad_(taught)
+    light = (torch.rand(6, 8, 3, generator=generator, dtype=torch.float64) ** 6).requires_grad_()
+    wanted = torch.randn(6, 8, 3, generator=generator, dtype=torch.float64)
+    inputs = (scene, light) if taught else (light,)
+    picture = composite(scene, Splats(light, torch.ones(6, 8)), "add")
+    plain = encode(decode(scene.clamp(0, 1)) + light)
+    assert (plain > 1).any() and (scene < 0).any() and (scene > 1).any()
+    torch.testing.assert_close(picture, plain.clamp(0, 1))
+    found = torch.autograd.grad(picture, inputs, wanted)
+    inner = scene.detach().clamp(0, 1).requires_grad_()
+    expected = torch.autograd.grad(encode(decode(inner) + light), (inner, light) if taught else (light,), wanted)
+    for a, b in zip(found, expected, strict=True):
+        torch.testing.assert_close(a, b)

@@ -78,6 +78,13 @@ class Camera:
         plane, depth = self.normalised(xyz)
         return plane * (self.fx, self.fy) + (self.cx, self.cy), depth
 
+    def jacobian(self, xyz: ArrayLike) -> Floats:
+        """(2, 3): how the pixel of a world point (3,) in front of the camera moves with the point."""
+        rotation = self.world_to_camera[:3, :3]
+        x, y, z = rotation @ np.asarray(xyz, np.float64) + self.world_to_camera[:3, 3]
+        lens = np.array([[self.fx, 0, -self.fx * x / z], [0, self.fy, -self.fy * y / z]]) / z
+        return np.asarray(lens @ rotation)
+
     def rays(self, pixels: ArrayLike) -> Floats:
         """Pixels (n, 2) to unit directions (n, 3) in world coordinates, from `position`."""
         plane = (np.asarray(pixels, np.float64).reshape(-1, 2) - (self.cx, self.cy)) / (self.fx, self.fy)

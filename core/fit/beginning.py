@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
-from torch import Tensor
 
-from ..capture import Camera, Capture, View
+from ..capture import Capture, View
 from ..errors import CaptureError
 from ..flare.deformation import QueryRange
 from ..flare.model import FlareModel, LightFlare, ViewOfLight
 from ..gaussians.ply import read_ply
 from ..gaussians.scene import SceneGaussians
 from ..lights.snap import Sight, sight, snapped
+from ..pictures import Picture
 from .frames import Frames
 from .settings import FitSettings
 from .sky import with_sky
@@ -64,24 +63,18 @@ def first_flare(capture: Capture, views: tuple[View, ...], frames: Frames, setti
 def _sights(views: tuple[View, ...], frames: Frames) -> list[Sight]:
     """Of some of the views with flare-free frames, small, which is all that placing lights takes. The frames are those
     that the fit looks at, so that none is decoded twice."""
-    targets = (frames.targets(view) for view in views[:: max(len(views) // SNAP_VIEWS, 1)])
-    return [sight(_small(one.camera), _shrunk(one.frame, one.camera), _shrunk(one.removed, one.camera))
-            for one in targets if one.removed is not None]
+    found = []
+    for view in views[:: max(len(views) // SNAP_VIEWS, 1)]:
+        camera, frame, removed = frames.targets(view)
+        if removed is not None:
+            width = min(SNAP_WIDTH, camera.width)
+            small = camera.scaled(width, max(round(camera.height * width / camera.width), 1))
+            shrunk = (Picture(part.numpy(), "srgb").resized(*small.size).display() for part in (frame, removed))
+            found.append(sight(small, *shrunk))
+    return found
 
 
-def _small(camera: Camera) -> Camera:
-    width = min(SNAP_WIDTH, camera.width)
-    return camera.scaled(width, max(round(camera.height * width / camera.width), 1))
-
-
-def _shrunk(display: Tensor, camera: Camera) -> NDArray[np.float32]:
-    """Display values at the size of `_small`, by the mean over areas of about their light."""
-    import cv2
-
-    return np.sqrt(cv2.resize(np.square(display.numpy()), _small(camera).size, interpolation=cv2.INTER_AREA))
-
-
-def said_of_lights(capture: Capture, flare: FlareModel) -> tuple[str, ...]:
+def moved_lights(capture: Capture, flare: FlareModel) -> tuple[str, ...]:
     """A sentence for each light that is not where the capture has it."""
     away = [float(np.linalg.norm(xyz - light.xyz)) for light, xyz in
             zip(capture.lights, flare.positions.numpy(), strict=True)]

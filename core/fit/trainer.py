@@ -28,7 +28,7 @@ from ..gaussians.densification import Classic, Mcmc, Strategy
 from ..gaussians.loss import l1_ssim
 from ..gaussians.optimiser import Adam
 from ..gaussians.ordering import morton_order
-from .beginning import first_flare, first_scene, said_of_lights
+from .beginning import first_flare, first_scene, moved_lights
 from .checkpoint import State
 from .frames import Frames, Targets
 from .rendering import render_flare
@@ -60,7 +60,7 @@ class Trainer:
                                "or fit with --mode unsup.")
         self.scene = first_scene(capture, settings, self.views, self.frames)
         self.flare = None if settings.mode == "3dgs" else first_flare(capture, self.views, self.frames, settings)
-        self.says = () if self.flare is None else said_of_lights(capture, self.flare)
+        self.says = () if self.flare is None else moved_lights(capture, self.flare)
         self.extent = capture.extent
         self.scene_adam = Adam(dict(self.scene.named_parameters()), self._scene_rates())
         self.strategy = self._strategy()

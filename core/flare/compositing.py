@@ -79,30 +79,36 @@ def encode(linear: Tensor) -> Tensor:
 class _LightAdded(torch.autograd.Function):
     """encode(decode(scene) + light), clipped to 0..1 on the way in and out, with the gradient passed on as it is.
 
-    A pixel that is too bright must be able to come down again; the true gradient of a clip is zero there. The slopes
-    of both curves come of the powers that the curves are made of: autograd would take those a second time.
+    A pixel that is too bright must be able to come down again; the true gradient of a clip is zero there.
     """
 
     @staticmethod
     def forward(ctx: Any, scene: Tensor, light: Tensor) -> Tensor:
-        display = scene.clamp(0, 1)
-        base = (display + 0.055) / 1.055
-        power = base**1.4
-        low = display <= 0.04045
-        total = torch.where(low, display / 12.92, base * power).add_(light)
-        within = power.mul_(2.4 / 1.055).masked_fill_(low, 1 / 12.92) if ctx.needs_input_grad[0] else None
-        bright = total.clamp_min(0.0031308)
-        power = bright ** (1 / 2.4)
-        dim = total <= 0.0031308
-        shown = torch.where(dim, total * 12.92, power * 1.055 - 0.055).clamp_(0, 1)
-        ctx.save_for_backward(within, power.mul_(1.055 / 2.4).div_(bright).masked_fill_(dim, 12.92))
-        return shown
+        linear, within = _decoded(scene.clamp(0, 1))
+        shown, slope = _encoded(linear.add_(light))
+        ctx.save_for_backward(within if ctx.needs_input_grad[0] else None, slope)
+        return shown.clamp_(0, 1)
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, Tensor]:
         within, slope = ctx.saved_tensors
         of_light = gradient * slope
         return None if within is None else of_light * within, of_light
+
+
+def _decoded(display: Tensor) -> tuple[Tensor, Tensor]:
+    """`decode` and its slope, which the same power gives: autograd would take another."""
+    base = (display + 0.055) / 1.055
+    power, low = base**1.4, display <= 0.04045
+    return torch.where(low, display / 12.92, base * power), power.mul_(2.4 / 1.055).masked_fill_(low, 1 / 12.92)
+
+
+def _encoded(linear: Tensor) -> tuple[Tensor, Tensor]:
+    """`encode` and its slope, likewise."""
+    bright, low = linear.clamp_min(0.0031308), linear <= 0.0031308
+    power = bright ** (1 / 2.4)
+    shown = torch.where(low, linear * 12.92, power * 1.055 - 0.055)
+    return shown, power.mul_(1.055 / 2.4).div_(bright).masked_fill_(low, 12.92)
 
 
 class Layers(NamedTuple):

@@ -59,7 +59,7 @@ class FlareForm:
     @property
     def consistent(self) -> bool:
         """Whether its parts go together."""
-        return self.rings and not self.solid if self.arcs else True
+        return not self.arcs or (self.rings and not self.solid)
 
 
 PAPER = FlareForm()

@@ -70,12 +70,12 @@ def _climbed(sights: Sequence[Sight], places: Floats, loose: NDArray[np.bool_], 
     for window in windows:
         for _ in range(STEPS):
             farthest = 0.0
-            for light, seen in enumerate(_look(sights, places, window)):
+            for light, seen in enumerate(_observe(sights, places, window)):
                 if not loose[light] or len(seen) < 2:
                     continue
                 step = _step(seen)
                 places[light] += step
-                farthest = max(farthest, *(float(np.linalg.norm(look.slope @ step)) for look in seen))
+                farthest = max(farthest, *(float(np.linalg.norm(one.slope @ step)) for one in seen))
             if farthest < 0.05:
                 break
     return places
@@ -83,18 +83,18 @@ def _climbed(sights: Sequence[Sight], places: Floats, loose: NDArray[np.bool_], 
 
 def _on_peaks(sights: Sequence[Sight], places: Floats) -> NDArray[np.bool_]:
     """(n,) which lights sit on a peak of brightness."""
-    fine, wide = (_look(sights, places, window) for window in (FINE, 2 * FINE))
+    fine, wide = (_observe(sights, places, window) for window in (FINE, 2 * FINE))
     found = np.zeros(len(places), bool)
     for light, (near, about) in enumerate(zip(fine, wide, strict=True)):
         if near:
-            brightness = np.array([look.brightness for look in near])
-            aside = np.array([np.linalg.norm(look.aside) for look in near]) @ brightness / brightness.sum()
-            peak = brightness.mean() / np.mean([look.brightness for look in about])
+            brightness = np.array([one.brightness for one in near])
+            aside = np.array([np.linalg.norm(one.aside) for one in near]) @ brightness / brightness.sum()
+            peak = brightness.mean() / np.mean([one.brightness for one in about])
             found[light] = peak > PEAK and aside < RESTLESS * FINE * sights[0].camera.width
     return found
 
 
-class _Look(NamedTuple):
+class _Observation(NamedTuple):
     """What one view says of a light: mean brightness under its window; the mean of where it is, from the window's own
     (2,), pixels; and how the pixel moves with the light (2, 3)."""
 
@@ -103,19 +103,19 @@ class _Look(NamedTuple):
     slope: Floats
 
 
-def _step(seen: Sequence[_Look]) -> Floats:
+def _step(seen: Sequence[_Observation]) -> Floats:
     """(3,) in the world, that brings a light nearest to where its views see the most; dim views count less."""
-    brightness = np.array([look.brightness for look in seen])
+    brightness = np.array([one.brightness for one in seen])
     weights = np.minimum(brightness / np.quantile(brightness, 0.75), 1)
-    slopes, asides = np.stack([look.slope for look in seen]), np.stack([look.aside for look in seen])
+    slopes, asides = np.stack([one.slope for one in seen]), np.stack([one.aside for one in seen])
     curvature = np.einsum("v,vij,vik->jk", weights, slopes, slopes)
     pull = np.einsum("v,vij,vi->j", weights, slopes, asides)
     return np.asarray(np.linalg.solve(curvature + STIFF * np.trace(curvature) / 3 * np.eye(3), pull))
 
 
-def _look(sights: Sequence[Sight], places: Floats, window: float) -> list[list[_Look]]:
+def _observe(sights: Sequence[Sight], places: Floats, window: float) -> list[list[_Observation]]:
     """By light, the views that see anything under its window, a deviation in parts of the frame's width."""
-    found: list[list[_Look]] = [[] for _ in places]
+    found: list[list[_Observation]] = [[] for _ in places]
     for camera, flare in sights:
         height, width = flare.shape
         deviation = window * width
@@ -134,17 +134,9 @@ def _look(sights: Sequence[Sight], places: Floats, window: float) -> list[list[_
             # Less the window's own mean, which the frame's edge and the other lights' windows draw aside.
             aside = [(weights.sum(axis) @ where) / total - (own.sum(axis) @ where) / whole
                      for axis, where in ((0, across), (1, down))]
-            found[light].append(_Look(float(total) / (2 * np.pi * deviation**2), np.array(aside),
-                                      _slope(camera, places[light])))
+            found[light].append(_Observation(float(total) / (2 * np.pi * deviation**2), np.array(aside),
+                                             camera.jacobian(places[light])))
     return found
-
-
-def _slope(camera: Camera, place: Floats) -> Floats:
-    """(2, 3): how the pixel of a point in front of the camera moves with it."""
-    rotation = camera.world_to_camera[:3, :3]
-    x, y, z = rotation @ place + camera.world_to_camera[:3, 3]
-    lens = np.array([[camera.fx, 0, -camera.fx * x / z], [0, camera.fy, -camera.fy * y / z]]) / z
-    return np.asarray(lens @ rotation)
 
 
 def _together(sights: Sequence[Sight], places: Floats) -> NDArray[np.bool_]:

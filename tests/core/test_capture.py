@@ -227,6 +227,13 @@ def test_without_frames(tmp_path: Path) -> None:
         capture.frame(capture.views[0])
 
 
+def test_how_a_pixel_moves_with_its_point() -> None:
+    camera, point = orbit(3)[1], np.array([0.2, -0.1, 0.3])
+    moved = [(camera.project(point + step)[0][0] - camera.project(point - step)[0][0]) / 2e-5
+             for step in 1e-5 * np.eye(3)]
+    np.testing.assert_allclose(camera.jacobian(point), np.transpose(moved), rtol=1e-5, atol=1e-5)
+
+
 def test_extent_and_camera() -> None:
     camera = Camera(100, 50, 80, 90, 48, 26, look_at((1.0, 2.0, -3.0), (0.5, 0.0, 2.0)))
     np.testing.assert_allclose(camera.position, (1, 2, -3), atol=1e-12)

@@ -291,7 +291,7 @@ def test_an_error_in_any_thread_reaches_the_caller() -> None:
     gradients(2)  # the threads are still there
 
 
-def test_calls_reach_threads_that_sleep_and_threads_that_look_out() -> None:
+def test_calls_reach_threads_that_sleep_and_threads_that_spin() -> None:
     """Also from several callers at once, and when fewer threads are asked than before."""
     def call(times: int, pause: float) -> None:
         for number in range(times):

@@ -9,8 +9,9 @@ from __future__ import annotations
 
 from .layers import enlarged, over
 from .loss import l1_ssim
-from .optimiser import Step, adam_steps, offered
+from .optimiser import Step, adam_steps
 from .scene import rasterize_scene
 from .splats import splat
+from .stepping import offered
 
 __all__ = ["Step", "adam_steps", "enlarged", "l1_ssim", "offered", "over", "rasterize_scene", "splat"]

@@ -1,15 +1,12 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Steps of Adam, in one pass over parameters, gradients and moments (the definition is `..optimiser`).
 
-It takes as long as memory takes to read and write them. The gradients of a scene come from the projection's backward
-pass, some Gaussians at a time: steps that were `offered` are taken there and then, while the gradients are in the
-cache, so that those are neither written to memory nor read again.
+It takes as long as memory takes to read and write them; `stepping` saves a part of that.
 """
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -19,14 +16,13 @@ from torch import Tensor
 from .buffers import Array
 from .compilation import inlined, kernel
 from .threads import parallel
-from .tiles import EMPTY, flat
+from .tiles import flat
 from .vector import LANES, fma, get, load, sqrt, store, take_number
 
 PIECE = 1 << 13
 """Least number of values to a piece of work."""
-
-
 CONSTANTS = 7
+"""How many `constants_of` gives."""
 
 
 @inlined
@@ -81,7 +77,7 @@ def advance(counter, parameter, gradient, first, second, rates, piece, constants
 
 class Step(NamedTuple):
     """What a step of a parameter is made of; see `..optimiser`. Parameter and moments are contiguous float32, and are
-    changed in place. gradient: None if the step is `offered`."""
+    changed in place. gradient: None if the backward pass takes the step (`stepping`)."""
 
     parameter: Tensor
     gradient: Tensor | None
@@ -89,63 +85,6 @@ class Step(NamedTuple):
     second: Tensor
     step: int
     rate: float | Tensor
-
-
-class Moves(NamedTuple):
-    """Steps of some parameters, as kernels take them: flat arrays, and the numbers of `constants_of` by rows."""
-
-    first: tuple[Array, ...]
-    second: tuple[Array, ...]
-    rates: tuple[Array, ...]
-    constants: Array
-
-
-SCENE = 5
-"""How many parameters a scene has."""
-NO_MOVES = Moves((EMPTY,) * SCENE, (EMPTY,) * SCENE, (EMPTY,) * SCENE, np.empty((SCENE, CONSTANTS), np.float32))
-
-
-class Offers:
-    """Steps that a backward pass may take in place of writing the gradients."""
-
-    def __init__(self, steps: Mapping[str, Step], beta1: float, beta2: float, epsilon: float) -> None:
-        self._steps = {id(step.parameter): (name, step) for name, step in steps.items()}
-        self._options = (beta1, beta2, epsilon)
-        self.taken: set[str] = set()
-
-    def take(self, parameters: Sequence[Tensor]) -> Moves | None:
-        """The steps of these parameters, now the caller's to take; None unless all are on offer."""
-        found = [self._steps.get(id(parameter)) for parameter in parameters]
-        if any(entry is None or entry[0] in self.taken for entry in found):
-            return None
-        self.taken.update(entry[0] for entry in found if entry is not None)
-        steps = [entry[1] for entry in found if entry is not None]
-        return Moves(
-            tuple(flat(step.first) for step in steps), tuple(flat(step.second) for step in steps),
-            tuple(_rates(step.rate) for step in steps), np.stack([_constants(step, *self._options) for step in steps]),
-        )  # fmt: skip
-
-
-_offers: list[Offers] = []
-
-
-@contextmanager
-def offered(steps: Mapping[str, Step], *, beta1: float, beta2: float, epsilon: float) -> Iterator[Offers]:
-    """Within it, a backward pass that finds all gradients of a scene may take the steps."""
-    offers = Offers(steps, beta1, beta2, epsilon)
-    _offers.append(offers)
-    try:
-        yield offers
-    finally:
-        _offers.remove(offers)
-
-
-def take_offers(parameters: Sequence[Tensor]) -> Moves | None:
-    """The steps of a scene's parameters if they are on offer, to be taken by the caller."""
-    for offers in _offers:
-        if moves := offers.take(parameters):
-            return moves
-    return None
 
 
 def adam_steps(steps: Sequence[Step], *, beta1: float, beta2: float, epsilon: float) -> None:
@@ -161,7 +100,7 @@ def _advance_all(counter: Array, calls: Sequence[tuple[Any, ...]]) -> None:
         advance(call[0] if number else counter, *call[1:])
 
 
-def _rates(rate: float | Tensor) -> Array:
+def rates_of(rate: float | Tensor) -> Array:
     """A multiple of 16 numbers that repeat along the parameter."""
     if not isinstance(rate, Tensor):
         return _constant_rates(rate)
@@ -174,7 +113,7 @@ def _constant_rates(rate: float) -> Array:
     return np.full(LANES, rate, np.float32)
 
 
-def _constants(step: Step, beta1: float, beta2: float, epsilon: float) -> Array:
+def constants_for(step: Step, beta1: float, beta2: float, epsilon: float) -> Array:
     """See `constants_of`."""
     unbiased = 1 / (1 - beta1**step.step), 1 / math.sqrt(1 - beta2**step.step)
     return np.array([beta1, 1 - beta1, beta2, 1 - beta2, *unbiased, epsilon], np.float32)
@@ -183,7 +122,7 @@ def _constants(step: Step, beta1: float, beta2: float, epsilon: float) -> Array:
 def _arguments(step: Step, beta1: float, beta2: float, epsilon: float) -> tuple[Any, ...]:
     """Of `advance`, with a counter of its own."""
     assert step.gradient is not None
-    rates = _rates(step.rate)
+    rates = rates_of(step.rate)
     piece = -(-PIECE // rates.size) * rates.size
     arrays = (flat(t) for t in (step.parameter, step.gradient, step.first, step.second))
-    return np.zeros(1, np.int64), *arrays, rates, piece, _constants(step, beta1, beta2, epsilon)
+    return np.zeros(1, np.int64), *arrays, rates, piece, constants_for(step, beta1, beta2, epsilon)

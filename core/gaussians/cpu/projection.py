@@ -550,7 +550,7 @@ def project_backward(
     """Gradients of all inputs from the rasterizer's rows.
 
     parameters: means, quats, scales, opacities and, to be stepped, sh; d_parameters: the gradients of all five. If
-    those are empty, the parameters take a step by them instead (`optimiser.Moves`), chunk by chunk.
+    those are empty, the parameters take a step by them instead (`stepping.Moves`), chunk by chunk.
     gradients: one row for each pair of Gaussian and tile; those of Gaussian i are counts[i] rows from
     slots[i] on. d_camera: sums of each chunk, (chunks, CAMERA_SUMS), if with_camera.
     """

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ..rendering import Rendering
-from . import buffers, layout, optimiser, projection, raster_backward, raster_forward
+from . import buffers, layout, projection, raster_backward, raster_forward, stepping
 from .buffers import Array
 from .threads import parallel
 from .tiles import EMPTY, Grid, bin_gaussians, flat
@@ -93,7 +93,7 @@ class _Rasterize(torch.autograd.Function):
             *pictures, v_image, v_alpha, v_depth, rows, scratch=raster_backward.SCRATCH,
         )  # fmt: skip
         parameters = (means, quats, scales, opacities, sh)
-        moves = optimiser.take_offers(parameters)
+        moves = stepping.take_offers(parameters)
         if moves is None:
             gradients, gradients_flat = zip(*(buffers.pair(*t.shape) for t in parameters), strict=True)
         else:
@@ -106,7 +106,7 @@ class _Rasterize(torch.autograd.Function):
         parallel(
             projection.project_backward, (*given, flat(sh) if moves else EMPTY), sh.shape[1] * 3, frame.sh_degree,
             frame.raw, camera, records, slopes, rows, bins.firsts, bins.counts, gradients_flat, d_centres, sums,
-            with_camera, *(moves or optimiser.NO_MOVES),
+            with_camera, *(moves or stepping.NO_MOVES),
             scratch=projection.STEP_SCRATCH if moves else projection.SCRATCH,
         )  # fmt: skip
         if not first:

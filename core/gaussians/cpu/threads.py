@@ -5,10 +5,9 @@ As many threads as torch uses (`torch.set_num_threads`). Kernels share the work 
 piece from a counter (`vector.take_number`), and what a piece computes does not depend on who takes it.
 
 An iteration makes a call every few tenths of a millisecond. To wake a thread that sleeps takes 50 microseconds, since
-it then has to wait for the interpreter too. So a worker that is done looks out for the next call for a moment before
-it goes to sleep, in machine code, without the interpreter; and the sign that it looks for is that the call's counter
-moves: then the caller's kernel is running, and the interpreter is free. In the same way the caller looks out for the
-workers' word that they are done.
+it then has to wait for the interpreter too. So a worker that is done spins for a moment before it goes to sleep
+(`spin`), until the next call's counter moves: then the caller's kernel is running, and the interpreter is free. In the
+same way the caller spins until the workers say that they are done.
 """
 from __future__ import annotations
 
@@ -22,10 +21,10 @@ import torch
 
 from . import buffers
 from .buffers import Array
-from .lookout import look_for, look_out_after
+from .spin import finish_and_spin, spin_until
 
-TURNS = 1 << 14
-"""For how long a thread looks out before it sleeps: some tenths of a millisecond."""
+SPINS = 1 << 14
+"""Looks at a number before a thread sleeps: some tenths of a millisecond."""
 NAP = 1e-4
 """Seconds that a caller sleeps between two looks at workers that take longer."""
 
@@ -71,7 +70,7 @@ class _Worker:
 
     def wait(self) -> BaseException | None:
         """Until the call is done; the error that it ended with."""
-        while not look_for(self._done, self._number, TURNS):
+        while not spin_until(self._done, self._number, SPINS):
             time.sleep(NAP)
         error, self._error = self._error, None
         return error
@@ -80,7 +79,7 @@ class _Worker:
         torch.set_flush_denormal(True)  # a register of the thread
         while True:
             number = self._number
-            look_out_after(self._done, number, self._counters[(number + 1) % 2], TURNS)
+            finish_and_spin(self._done, number, self._counters[(number + 1) % 2], SPINS)
             with self._state:
                 asleep = self._asleep = self._call is None
             if asleep:

@@ -288,7 +288,7 @@ def take(typing_context, totals, place, amount):  # noqa: ARG001
 
 
 @intrinsic
-def glance(typing_context, array):  # noqa: ARG001
+def load_acquire(typing_context, array):  # noqa: ARG001
     """The first element of an int64 array, which another thread may change meanwhile; what that thread had written
     before is seen afterwards."""
 
@@ -302,8 +302,8 @@ def glance(typing_context, array):  # noqa: ARG001
 
 
 @intrinsic
-def announce(typing_context, array, number):  # noqa: ARG001
-    """Writes the first element of an int64 array, for `glance`."""
+def store_release(typing_context, array, number):  # noqa: ARG001
+    """Writes the first element of an int64 array, for `load_acquire`."""
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
         address = _address(context, builder, sig.args[0], args[0], ir.Constant(ir.IntType(64), 0))

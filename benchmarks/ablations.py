@@ -49,7 +49,7 @@ from core.fit import fit
 from core.fit.frames import Frames
 from core.fit.rendering import render
 from core.fit.run import Run, ViewLayers
-from core.fit.settings import FitSettings, changed, preset
+from core.fit.settings import FitSettings, Preset, changed, preset
 from core.gaussians.scene import SceneGaussians
 from core.metrics.evaluation import evaluate
 from core.progress import Progress, TerminalProgress
@@ -90,6 +90,10 @@ class Experiment:
         """The same for two experiments that are the same fit."""
         made = {**asdict(self), "study": "", "name": ""}
         return hashlib.sha256(json.dumps(made, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def _seeded(seed: int, name: Preset, **form: Any) -> FitSettings:
+    return replace(preset(name, **form), seed=seed)
 
 
 def ours(length: Length, mode: str = "default", **changes: Any) -> FitSettings:
@@ -375,6 +379,7 @@ def main() -> None:
     parser.add_argument("--variants", nargs="+", metavar="NAME", help="of the studies' rows; all by default")
     parser.add_argument("--preset", choices=("draft", "standard", "high"), default="draft")
     parser.add_argument("--iterations", type=int, help="of each fit, with every schedule stretched to it")
+    parser.add_argument("--seed", type=int, default=0, help="of every fit (default 0)")
     parser.add_argument("--width", type=int, default=240, help="of the frames; 0: as filmed (default 240)")
     parser.add_argument("--finished", action="store_true", help="write down what is finished, and fit nothing")
     parser.add_argument("--out", type=Path, default=report.ROOT / "build" / "ablations")
@@ -383,9 +388,10 @@ def main() -> None:
     results: Results = {}
     wanted: Callable[[Experiment], bool] = lambda one: (  # noqa: E731
         (not words.only or one.study in words.only) and (not words.variants or one.name in words.variants))
-    length = partial(preset, words.preset, iterations=words.iterations)
+    length = partial(_seeded, words.seed, words.preset, iterations=words.iterations)
     made = length()
-    section = f"ablations-{words.preset}-{made.iterations}-{words.width}"
+    seed = f"-seed-{words.seed}" if words.seed else ""
+    section = f"ablations-{words.preset}-{made.iterations}-{words.width}{seed}"
     progress = TerminalProgress()
     for experiment in filter(wanted, experiments(length)):
         for capture in words.captures:
@@ -397,6 +403,7 @@ def main() -> None:
             results.setdefault(experiment.study, {}).setdefault(experiment.name, {})[capture.name] = scores
     progress.close()
     size = f"{words.width} pixels wide" if words.width else "at the size of the frames"
+    size += f", seed {words.seed}" if words.seed else ""
     text = write(results, section, f"Preset {words.preset} of {made.iterations} iterations, {size}", words.document)
     sys.stdout.write(text + "\n")
 

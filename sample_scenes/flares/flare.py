@@ -135,5 +135,14 @@ LOOKS: dict[str, Look] = {
                    rings=(Ring(gain=0.28, radius=0.20, width=0.025), Ring(gain=0.22, radius=0.09, width=0.09,
                           dispersion=0.2, lean=0.2), Ring(gain=0.16, radius=0.13, width=0.06, follow=-0.7, grow=0.15,
                           lean=0.8, dispersion=0.5))),
+    "rimmed": Look("US4099850", stop_down=0.55, blades=7, turn=5.0, seed=34,
+                   coating=(0.56, 0.47, 0.62, 0.51), ghosts=GhostSettings(count=6, gain=250.0),
+                   starburst=Starburst(gain=120.0, peak=5.0), glare=Glare(0.12, 0.025, 1.3, 0.01, 0.3, 0.001),
+                   rings=(Ring(gain=0.30, radius=0.20, width=0.03, dispersion=0.12, lean=0.3),
+                          Ring(gain=0.26, radius=0.09, width=0.05, dispersion=0.1, lean=0.2),
+                          Ring(gain=0.22, radius=0.13, width=0.035, follow=-0.7, grow=0.15, lean=0.5,
+                               dispersion=0.15),
+                          Ring(gain=0.20, radius=0.055, width=0.06, follow=0.45, lean=0.2, dispersion=0.1),
+                          Ring(gain=0.14, radius=0.27, width=0.025, follow=-0.3, grow=-0.1, dispersion=0.1))),
 }
 """Looks by name, one for each sample capture."""

@@ -6,4 +6,4 @@ from ..description import SceneDescription
 from . import desk, gallery, garden, street, studio
 
 SCENES: dict[str, SceneDescription] = {scene.name: scene for scene in (
-    desk.DESK, street.STREET, gallery.GALLERY, garden.GARDEN, studio.STUDIO)}
+    desk.DESK, street.STREET, gallery.GALLERY, garden.GARDEN, garden.RIMS, studio.STUDIO)}

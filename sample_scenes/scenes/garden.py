@@ -2,6 +2,8 @@
 """A garden at dusk with one lamp between columns, through a lens whose flare is mostly rings."""
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from ..description import Array, LightSource, Pinhole, SceneDescription, looking_at
@@ -76,3 +78,6 @@ def build(scene: SceneDescription) -> None:
 GARDEN = SceneDescription(
     name="garden", seed=63, first=0, views=40, camera=Pinhole(480, 270, 440.0, 440.0, 236.9, 137.4), path=path,
     build=build, samples=24, lights=(LAMP,), lens="ringed")
+
+RIMS = replace(GARDEN, name="rims", lens="rimmed")
+"""The same views through a lens of thin rings: those of the garden's are broad bands of colours."""

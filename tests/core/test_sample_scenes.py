@@ -209,10 +209,12 @@ def test_an_anamorphic_lens_draws_its_ghosts_and_streak_along_x() -> None:
 
 
 def test_every_scene_has_a_look_and_a_lens_of_its_own() -> None:
-    assert len({scene.seed for scene in SCENES.values()}) == len(SCENES) >= 4
+    own = {name: scene for name, scene in SCENES.items() if name != "rims"}  # the garden again, under other rings
+    assert len({scene.seed for scene in own.values()}) == len(own) >= 4
     # The studio is what the desk's flare is put on to, so it has the desk's lens.
-    lenses = [LOOKS[scene.lens].lens for name, scene in SCENES.items() if name != "studio"]
+    lenses = [LOOKS[scene.lens].lens for name, scene in own.items() if name != "studio"]
     assert len(set(lenses)) == len(lenses) and set(lenses) <= set(LENSES)
+    assert len({scene.lens for scene in SCENES.values()}) == len(LOOKS) == len(SCENES) - 1
     for scene in SCENES.values():
         np.testing.assert_allclose(np.linalg.det(scene.poses[:, :3, :3]), 1.0)
         assert scene.views == len(scene.poses) == len(set(scene.stems))

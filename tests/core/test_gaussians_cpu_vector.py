@@ -94,6 +94,18 @@ def test_rows() -> None:
     np.testing.assert_array_equal(found[384:448].reshape(4, 16), turned[:4])
 
 
+def test_shifts_and_products() -> None:
+    def body(out, a, b):  # type: ignore[no-untyped-def]
+        x, y = v.load(a, 0), v.load(b, 0)
+        v.store_rows(out, 0, 16, (v.shifted(x, y, 0), v.shifted(x, y, 5), v.shifted(x, y, 15), v.shifted(x, y, 16)))
+        v.store_rows(out, 64, 16, v.products((x, y, x), (y, y, x)))
+
+    found = run(body, A, B, size=112).reshape(7, 16)
+    both = np.concatenate([A, B])
+    np.testing.assert_array_equal(found[:4], [both[n : n + 16] for n in (0, 5, 15, 16)])
+    np.testing.assert_array_equal(found[4:], [A * B, B * B, A * A])
+
+
 @pytest.mark.parametrize("count", [1, 2, 7, 8, 9, 10, 16])
 def test_sums_of_many_vectors_at_once(count: int) -> None:
     vectors = "".join(f"v.load(a, {16 * i}), " for i in range(count))

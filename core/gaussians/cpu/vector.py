@@ -251,18 +251,23 @@ def stream_rows(typing_context, array, index, stride, rows):  # noqa: ARG001
     return types.none(array, types.int64, types.int64, rows), emit
 
 
-@intrinsic
-def prefetch(typing_context, array, index):  # noqa: ARG001
-    """Asks for the cache line of a flat index, to be read or written soon; any index is safe."""
+def _asks_for(write: bool, purpose: str) -> Any:
+    def prefetch(typing_context, array, index):  # noqa: ARG001
+        def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
+            address = _address(context, builder, sig.args[0], *args)
+            address = builder.bitcast(address, ir.IntType(8).as_pointer())
+            flags = [ir.Constant(_INT, flag) for flag in (int(write), 3, 1)]  # keep in all caches, data
+            _call(builder, "llvm.prefetch.p0", ir.VoidType(), [address, *flags])
+            return context.get_dummy_value()
 
-    def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
-        address = _address(context, builder, sig.args[0], *args)
-        address = builder.bitcast(address, ir.IntType(8).as_pointer())
-        flags = [ir.Constant(_INT, flag) for flag in (0, 3, 1)]  # to read, keep in all caches, data
-        _call(builder, "llvm.prefetch.p0", ir.VoidType(), [address, *flags])
-        return context.get_dummy_value()
+        return types.none(array, types.int64), emit
 
-    return types.none(array, types.int64), emit
+    prefetch.__doc__ = f"Asks for the cache line of a flat index, to be {purpose} soon; any index is safe."
+    return intrinsic(prefetch)
+
+
+prefetch = _asks_for(False, "read")
+prefetch_to_write = _asks_for(True, "written, and so for it to be this core's alone,")
 
 
 @intrinsic
@@ -278,11 +283,12 @@ def take_number(typing_context, counter):  # noqa: ARG001
 
 @intrinsic
 def take(typing_context, totals, place, amount):  # noqa: ARG001
-    """Adds an amount to an element of an int64 array and returns what it was: a stretch of one's own."""
+    """Adds an amount to an element of an int64 array and returns what it was: a stretch of one's own, or a place in
+    a row; what those before it had written is seen afterwards."""
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
         address = _address(context, builder, sig.args[0], args[0], args[1])
-        return builder.atomic_rmw("add", address, args[2], "monotonic")
+        return builder.atomic_rmw("add", address, args[2], "acq_rel")
 
     return types.int64(totals, types.int64, types.int64), emit
 
@@ -521,6 +527,30 @@ def totals(typing_context, vectors):  # noqa: ARG001
         return _shuffle(builder, low, high, range(LANES))
 
     return FLOATS(vectors), emit
+
+
+@intrinsic(prefer_literal=True)
+def shifted(typing_context, a, b, count):  # noqa: ARG001
+    """The lanes of a from `count` on, a constant within 0 .. 16, and after them the first of b."""
+    if not isinstance(count, types.IntegerLiteral):
+        return None
+
+    def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:  # noqa: ARG001
+        first = count.literal_value
+        return _shuffle(builder, args[0], args[1], range(first, first + LANES))
+
+    return FLOATS(FLOATS, FLOATS, count), emit
+
+
+@intrinsic
+def products(typing_context, a, b):  # noqa: ARG001
+    """The products of two tuples of as many vectors, one by one."""
+
+    def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:  # noqa: ARG001
+        pairs = [[builder.extract_value(side, i) for side in args] for i in range(len(a))]
+        return _pack(context, builder, [builder.fmul(*pair, flags=_FUSE) for pair in pairs])
+
+    return types.UniTuple(FLOATS, len(a))(a, b), emit
 
 
 @intrinsic

@@ -59,6 +59,7 @@ from .vector import (
     minimum,
     opaque,
     prefetch,
+    prefetch_to_write,
     splat,
     sqrt,
     take,
@@ -79,6 +80,8 @@ CLASSES = 1 << 10
 PER_GAUSSIAN = 2
 """What it takes to sort and look at a Gaussian, in tiles to list."""
 LISTED = 3
+NEXT_LINE = 32
+"""Numbers beyond an entry that lie on a cache line which its tile will ask for later."""
 NOWHERE = 0x7F800000
 """The key of what is not drawn: the bits of infinity, above those of every depth."""
 SLACK = np.float32(0.02)
@@ -118,8 +121,8 @@ def _crossing(half_x, square, bend, lean, x):
 @inlined
 def few_tiles(x, y, half_x, half_y, major, k, minor, reach, visible, width, height):
     """What 16 Gaussians meet, by the fields of their records. Of those with two columns and rows of tiles at most the
-    first tile, -1 for the others; and by column, the left one's 13 bits lowest, first and end pixel row, counted from
-    the first tile's: 6 and 7 bits, 0 if none."""
+    first tile, -1 for the others; and by column, the left one's COLUMN_BITS lowest, first and end pixel row, counted
+    from the first tile's: FIRST_BITS and END_BITS, 0 if none."""
     wide = half_x + SLACK
     column = to_ints(maximum(x - wide, ZERO)) >> TILE_SHIFT_X
     columns = (to_ints(minimum(x + wide, splat(np.float32(width - 1)))) >> TILE_SHIFT_X) - column
@@ -348,8 +351,8 @@ def _list_part(
         far = _number_of(get(pairs, _least(j + AHEAD, end - 1)))  # the walk jumps about in memory
         prefetch(tiles, far)
         prefetch(rows, far)
-        prefetch(firsts, far)
-        prefetch(bounds, far)
+        prefetch_to_write(firsts, far)
+        prefetch_to_write(bounds, far)
         i = _number_of(get(pairs, j))
         slot, before, tile = starts[i // CHUNK] + get(firsts, i), place, np.int64(get(tiles, i))
         if tile >= 0:
@@ -422,5 +425,6 @@ def scatter(counter, listed, spans, places, entries):
             tile = word >> (2 * ROW_BITS)
             to = of_part[tile] * ENTRY
             of_part[tile] += 1
+            prefetch_to_write(entries, to + NEXT_LINE)
             entries[to + GAUSSIAN], entries[to + SLOT] = get(listed, at), get(listed, at + 1)
             entries[to + FIRST_ROW], entries[to + END_ROW] = (word >> ROW_BITS) & ROW_MASK, (word & ROW_MASK) + 1

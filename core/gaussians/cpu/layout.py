@@ -7,7 +7,7 @@ import numpy as np
 from .. import rendering
 
 # A tile is one vector wide.
-TILE_SHIFT_X, TILE_SHIFT_Y = 4, 5
+TILE_SHIFT_X, TILE_SHIFT_Y = 4, 6
 TILE_WIDTH, TILE_HEIGHT = 1 << TILE_SHIFT_X, 1 << TILE_SHIFT_Y
 
 # A record of 16 float32, a cache line, for each Gaussian; `projection` says what its fields are.

@@ -61,7 +61,7 @@ from .vector import (
     lanes,
     load,
     opaque,
-    prefetch,
+    prefetch_to_write,
     splat,
     store,
     take_number,
@@ -71,7 +71,7 @@ from .vector import (
 
 # The state of a tile after T: what is left behind, and the gradients of the pixels.
 S_PLANE, V_RED, V_GREEN, V_BLUE, V_ALPHA, V_DEPTH, MEAN_DEPTH = (i * TILE_WIDTH for i in range(1, 8))
-ROW = 8 * TILE_WIDTH
+ROW = 9 * TILE_WIDTH  # an odd number of cache lines, so that rows fall into all sets of the cache
 STATE = ROW * TILE_HEIGHT
 EDGE = 3 * TILE_WIDTH
 SCRATCH = STATE + 6 * EDGE
@@ -249,7 +249,7 @@ def _tile_backward(entries, begin, used, end, records, left, top, state, gradien
         for e in range(begin, used):
             at, first, last, start = coming
             coming = next_entry(entries, e + 1, end, records, left, top)
-            prefetch(gradients, get(entries, min(e + AHEAD, end - 1) * ENTRY + SLOT) * RECORD)
+            prefetch_to_write(gradients, get(entries, min(e + AHEAD, end - 1) * ENTRY + SLOT) * RECORD)
             row = _gradient_row(state, records, at, left, top, first, last, start, with_depth)
             store(gradients, get(entries, e * ENTRY + SLOT) * RECORD, row)
     for e in range(used, end):

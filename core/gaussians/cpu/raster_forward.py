@@ -73,7 +73,7 @@ POWER_MIN = np.float32(-126)
 DEPTH_ALPHA_MIN = np.float32(rendering.ALPHA_MIN / 2)
 # The state of a tile, row by row: the vectors of a row.
 T_PLANE, RED_PLANE, GREEN_PLANE, BLUE_PLANE, DEPTH_PLANE, MEDIAN_PLANE = (i * TILE_WIDTH for i in range(6))
-ROW = 6 * TILE_WIDTH
+ROW = 7 * TILE_WIDTH  # an odd number of cache lines, so that rows fall into all sets of the cache
 STATE = ROW * TILE_HEIGHT
 
 

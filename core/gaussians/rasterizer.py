@@ -121,7 +121,7 @@ def _count(tensor: Tensor, width: int, name: str) -> int:
 
 
 def _expect(tensor: Tensor, shape: tuple[int, ...], name: str) -> None:
-    if tuple(tensor.shape) != shape:
+    if tensor.shape != shape:
         raise SettingsError(f"{name} has the shape {tuple(tensor.shape)}, but must be {shape}.")
 
 

@@ -113,10 +113,11 @@ def _constant_rates(rate: float) -> Array:
     return np.full(LANES, rate, np.float32)
 
 
-def constants_for(step: Step, beta1: float, beta2: float, epsilon: float) -> Array:
-    """See `constants_of`."""
-    unbiased = 1 / (1 - beta1**step.step), 1 / math.sqrt(1 - beta2**step.step)
-    return np.array([beta1, 1 - beta1, beta2, 1 - beta2, *unbiased, epsilon], np.float32)
+@lru_cache(256)
+def constants_for(step: int, beta1: float, beta2: float, epsilon: float) -> tuple[float, ...]:
+    """See `constants_of`; step: from 1."""
+    unbiased = 1 / (1 - beta1**step), 1 / math.sqrt(1 - beta2**step)
+    return beta1, 1 - beta1, beta2, 1 - beta2, *unbiased, epsilon
 
 
 def _arguments(step: Step, beta1: float, beta2: float, epsilon: float) -> tuple[Any, ...]:
@@ -125,4 +126,5 @@ def _arguments(step: Step, beta1: float, beta2: float, epsilon: float) -> tuple[
     rates = rates_of(step.rate)
     piece = -(-PIECE // rates.size) * rates.size
     arrays = (flat(t) for t in (step.parameter, step.gradient, step.first, step.second))
-    return np.zeros(1, np.int64), *arrays, rates, piece, constants_for(step, beta1, beta2, epsilon)
+    constants = np.array(constants_for(step.step, beta1, beta2, epsilon), np.float32)
+    return np.zeros(1, np.int64), *arrays, rates, piece, constants

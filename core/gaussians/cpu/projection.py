@@ -372,11 +372,11 @@ def _colour_slopes(turned, degree, direction, inverse_distance, out):
 @kernel
 def project(
     counter, scratch, means, quats, scales, opacities, sh, sh_width, degree, raw, camera, width, height,
-    records, centres, radii, depths, bounds, tiles, tile_rows, firsts, chunk_bounds, slopes,
+    records, centres, radii, depths, bounds, tiles, tile_rows, firsts, chunk_bounds, d_centres, slopes,
 ):  # fmt: skip
     """Writes a record, the centre, the radius, the depth (infinite for what is not seen), a bound on the number of
     tiles and what `few_tiles` says of them for each of n >= 16 Gaussians; firsts, chunk_bounds: sums of the bounds
-    within and over chunks (`binning`).
+    within and over chunks (`binning`). d_centres: zeros, until the backward pass.
     slopes: gradients of the colours by the means, 9 vectors a block of 16; empty where no gradients are wanted.
     raw: scales are logarithms and opacities logits."""
     n = opacities.size
@@ -393,6 +393,7 @@ def project(
                 records, centres, radii, depths, bounds, tiles, tile_rows, slopes[block * SLOPES :],
             )  # fmt: skip
         chunk_bounds[chunk] = number_slots(bounds, start, end, firsts)
+        d_centres[2 * start : 2 * end] = ZERO
 
 
 @inlined

@@ -44,8 +44,9 @@ class _Rasterize(torch.autograd.Function):
         projection.describe_camera(
             flat(world_to_camera), flat(intrinsics), w, h, frame.near, frame.dilation, camera
         )
-        records, depths_of = buffers.empty(n * layout.RECORD), buffers.empty(n)
-        bounds, firsts, tiles, tile_rows = (buffers.empty(n, np.int32) for _ in range(4))
+        records, depths_of, bounds, firsts, tiles, tile_rows = buffers.parts(
+            (n * layout.RECORD, np.float32), (n, np.float32), *[(n, np.int32)] * 4
+        )
         centres, centres_flat = buffers.pair(n, 2)
         radii, radii_flat = buffers.pair(n)
         given = [flat(t) for t in (means, quats, scales, opacities)]
@@ -55,7 +56,7 @@ class _Rasterize(torch.autograd.Function):
         parallel(
             projection.project, *given, flat(sh), sh.shape[1] * 3,
             frame.sh_degree, frame.raw, camera, w, h, records, centres_flat, radii_flat, depths_of, bounds, tiles,
-            tile_rows, firsts, chunk_bounds, slopes, scratch=projection.SCRATCH,
+            tile_rows, firsts, chunk_bounds, flat(centre_gradients), slopes, scratch=projection.SCRATCH,
         )  # fmt: skip
         bins = bin_gaussians(records, depths_of.view(np.uint32), tiles, tile_rows, bounds, firsts, chunk_bounds, frame)
 
@@ -102,7 +103,7 @@ class _Rasterize(torch.autograd.Function):
         first, ctx.first = ctx.first, False
         d_centres = flat(ctx.centre_gradients) if first else buffers.empty(2 * n)
         with_camera = ctx.needs_input_grad[5] or ctx.needs_input_grad[6]
-        sums = np.zeros((-(-n // layout.CHUNK), projection.CAMERA_SUMS), np.float32)
+        sums = np.zeros((-(-n // layout.CHUNK) if with_camera else 0, projection.CAMERA_SUMS), np.float32)
         parallel(
             projection.project_backward, (*given, flat(sh) if moves else EMPTY), sh.shape[1] * 3, frame.sh_degree,
             frame.raw, camera, records, slopes, rows, bins.firsts, bins.counts, gradients_flat, d_centres, sums,
@@ -147,8 +148,7 @@ def rasterize_scene(
         ]
     if background is None:
         background = _BLACK
-    centre_gradients, zeros = buffers.pair(len(inputs[0]), 2)
-    zeros.fill(0)
+    centre_gradients, _ = buffers.pair(len(inputs[0]), 2)
     frame = _Frame(width, height, sh_degree, near, dilation, depth, raw)
     image, alpha, depths, median = _Rasterize.apply(
         *inputs, _single(world_to_camera), _single(intrinsics), background, frame, centre_gradients

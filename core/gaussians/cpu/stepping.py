@@ -50,7 +50,7 @@ class Offers:
         return Moves(
             tuple(flat(step.first) for step in steps), tuple(flat(step.second) for step in steps),
             tuple(rates_of(step.rate) for step in steps),
-            np.stack([constants_for(step, *self._options) for step in steps]),
+            np.array([constants_for(step.step, *self._options) for step in steps], np.float32),
         )  # fmt: skip
 
 

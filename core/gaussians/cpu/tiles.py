@@ -13,7 +13,7 @@ from .buffers import Array
 from .threads import parallel
 
 EMPTY = np.empty(0, np.float32)
-PARTS_MAX, SAMPLE = 8, 4096
+PARTS_MAX, SAMPLE = 8, 2048
 """Parts of the Gaussians that are sorted apart, and how many of them are asked where to cut."""
 
 
@@ -46,7 +46,7 @@ class Bins:
 
 def flat(tensor: Tensor) -> Array:
     """The numbers of a float32 tensor, as one contiguous row; the same memory if they are."""
-    return tensor.detach().numpy().ravel()
+    return (tensor.detach() if tensor.requires_grad else tensor).numpy().ravel()
 
 
 def bin_gaussians(

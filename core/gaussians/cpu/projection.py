@@ -12,8 +12,8 @@ xx yy - xy² suffers for needles. For the same reason a record does not hold the
     q / (-2 ln 2) = A (d_x + k d_y)² + D d_y²,   k = -xy / yy,  A = h yy / det,  D = h / yy,  h = -1 / (2 ln 2)
 
 so alpha = opacity 2^(A u² + D d_y²), u = d_x + k d_y. From one pixel row to the next the exponent's second
-difference is 2 C with C = A k² + D; `step` = 2^(2 C) - 1 and `run` = sqrt(-32 / C), the rows over which e falls
-from its peak to 2^-32, serve the recurrence of the rasterizer.
+difference is 2 C with C = A k² + D; `step` = 2^(2 C) - 1 and `run` = sqrt(-40 / C), the rows over which e falls
+from its peak to 2^-40, serve the recurrence of the rasterizer.
 
 Scales and opacities may come as logarithms and logits, the form in which they are optimised (`raw`).
 
@@ -109,7 +109,7 @@ MARGIN = np.float32(1e-4)
 NORM2_MIN = np.float32(1e-16)
 TINY = np.float32(1e-24)
 LARGEST, INFINITY = np.float32(1e30), np.float32(np.inf)
-RUN_POWERS, RUN_MAX = np.float32(32), np.float32(32)
+RUN_POWERS, RUN_MAX = np.float32(40), np.float32(32)
 """Powers of two, and rows, over which a recurrence runs (see `raster_forward`): rounding adds up."""
 
 

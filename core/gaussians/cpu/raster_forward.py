@@ -8,7 +8,7 @@ One vector is a row of a tile. For the rows of an entry, with e = opacity 2^(A u
 
 From row to row e follows a recurrence instead of an exponential each: e' = e r, r' = r + r step, where
 r = 2^(A (2 u k + k²) + D (2 d_y + 1)) and step = 2^(2 C) - 1, small and exact where rows are many. It starts
-anew after `run` rows, over which e changes by 32 powers of two, so that neither its start is lost below the
+anew after `run` rows, over which e changes by 40 powers of two, so that neither its start is lost below the
 smallest float, nor its precision. Where runs would be too short for it (needles), e is computed for each row.
 """
 from __future__ import annotations

@@ -121,14 +121,18 @@ class SplitSettings:
     scene is fitted alone first, until every view was looked at `rounds` times (a third of the iterations at most), to
     what the frames agree on from below: where a frame is brighter than the scene, that counts for `excess` of what it
     counts where it is darker. Longer, and it takes up the glow about the lights; shorter, and the flare takes walls.
-    From then on both are fitted to the frames, and the same holds the scene down with `weight`. `sh_degree`: of the
-    scene's colours for the share `plain` of the iterations, since they could follow a flare if they were free to change
-    with the direction. `sky`: points far away to begin with.
+    From then on both are fitted to the frames, the scene besides from below with `weight`, in the end only where it is
+    brighter than a frame; and its light costs `glow` near where a light is seen, half of that at `reach` of the width
+    beside: what could be either's is the flare's. `sh_degree`: of the scene's colours for the share `plain` of the
+    iterations, since they could follow a flare if they were free to change with the direction. `sky`: points far away
+    to begin with.
     """
 
     rounds: int = 2
     excess: float = 0.25
     weight: float = 0.05
+    glow: float = 0.05
+    reach: float = 0.05
     sh_degree: int = 1
     plain: float = 0.7
     sky: bool = True
@@ -173,7 +177,8 @@ class FitSettings:
             (not self.scene.frozen or bool(self.scene.start), "a frozen scene needs a PLY to start from"),
             (self.split.rounds >= 0, "split.rounds must not be negative"),
             (0 <= self.split.excess <= 1, "split.excess must lie between 0 and 1"),
-            (self.split.weight >= 0, "split.weight must not be negative"),
+            (self.split.weight >= 0 and self.split.glow >= 0, "split.weight and split.glow must not be negative"),
+            (self.split.reach > 0, "split.reach must be positive"),
             (0 <= self.split.plain <= 1, "split.plain must lie between 0 and 1"),
             (0 <= self.split.sh_degree <= 3, "split.sh_degree must lie between 0 and 3"),
             (self.mode != "2d" or not self.flare.form.line, "mode 2d needs a form without the line"),

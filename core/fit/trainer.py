@@ -33,6 +33,7 @@ from .checkpoint import State
 from .frames import Frames, Targets
 from .rendering import render_flare
 from .settings import FitSettings
+from .splitting import scene_begins, scene_beside_flare
 
 TABLE = "table.weight"
 CLEAR_EVERY = 50
@@ -90,9 +91,9 @@ class Trainer:
             figures["scene_loss"] = float(scene_loss.detach())
             loss = loss + scene_loss
         elif settings.mode == "split" and self.scene_is_fitted:
-            scene_loss = from_below(scene.colour, targets.frame, settings.split.excess)
+            scene_loss = self._split_loss(targets, scene.colour, alone)
             figures["scene_loss"] = float(scene_loss.detach())
-            loss = loss + scene_loss * (1 if alone else settings.split.weight)
+            loss = loss + scene_loss
         if not all(map(math.isfinite, figures.values())):
             raise RunError(f"The fit diverged at iteration {self.iteration}; start it anew with lower learning rates.")
         if self.scene_is_fitted:
@@ -183,6 +184,13 @@ class Trainer:
             # Input minus the flare as reconstructed so far: the composite's gain over the scene.
             return (targets.frame - (picture - scene).detach()).clamp(0, 1)
         return None
+
+    def _split_loss(self, targets: Targets, scene: Tensor, alone: bool) -> Tensor:
+        if alone or self.flare is None:
+            return scene_begins(scene, targets, self.settings.split)
+        discs = self._sources(targets, targets.frame)
+        progress = self.iteration / self.settings.iterations
+        return scene_beside_flare(scene, targets, self.flare.positions.numpy(), discs, self.settings.split, progress)
 
     def _sh_degree(self) -> int:
         if self.settings.scene.start:
@@ -282,13 +290,6 @@ class Trainer:
                 self.grid_adam.load_state_dict({"state": moments, "param_groups": groups})
         except (KeyError, RuntimeError, TypeError) as problem:
             raise RunError(f"The checkpoint does not fit this fit ({problem}); start it anew.") from problem
-
-
-def from_below(scene: Tensor, frame: Tensor, excess: float) -> Tensor:
-    """Mean |scene - frame|, of which what the frame has more counts for `excess`: fitted to several frames, their
-    excess / (1 + excess) quantile."""
-    more = frame - scene
-    return torch.where(more > 0, more * excess, -more).mean()
 
 
 def _load_parameters(parameters: dict[str, Parameter], state: State) -> None:

@@ -22,9 +22,10 @@ from core.capture import Capture, Light
 from core.errors import Cancelled, CaptureError, FlareFileError, RunError
 from core.fit import FitSettings, Run, fit, preset
 from core.fit.frames import Frames
-from core.fit.settings import changed
+from core.fit.settings import SplitSettings, changed
 from core.fit.sky import COUNT, with_sky
-from core.fit.trainer import Trainer, from_below
+from core.fit.splitting import from_below, nearness, scene_beside_flare
+from core.fit.trainer import Trainer
 from core.pictures import read_picture, write_png
 from core.progress import Progress
 from tests.core.flared import flared_capture
@@ -222,6 +223,29 @@ def test_what_frames_agree_on_from_below_is_a_quantile() -> None:
     assert levels[costs.argmin()] == pytest.approx(0.2, abs=0.01)
     evenly = torch.stack([from_below(level.expand(5, 1), frames, excess=1.0) for level in levels])
     assert torch.allclose(evenly, (levels[:, None] - frames[:, 0]).abs().mean(-1), atol=1e-6)
+
+
+def test_what_could_be_either_is_the_flare_s_but_a_light_s_own_disc(capture: Capture) -> None:
+    view = capture.views[0]
+    targets, lights = Frames(capture).targets(view), np.array([light.xyz for light in capture.lights])
+    (x, y), = view.camera.project(lights)[0].astype(int)
+    near = nearness(targets.camera, lights, 0.05)
+    assert near[y, x] > 0.9 and near[y, x] == near.max() and near.min() < 0.05
+    half = round(0.05 * targets.camera.width)
+    assert near[y, x + half if x + half < near.shape[1] else x - half] == pytest.approx(0.5, abs=0.15)
+    discs = torch.zeros(near.shape, dtype=torch.bool)
+    discs[y, x] = True
+
+    def slope(scene: torch.Tensor) -> torch.Tensor:
+        scene = scene.clone().requires_grad_()
+        scene_beside_flare(scene, targets, lights, discs, SplitSettings(), progress=1.0).backward()
+        assert scene.grad is not None
+        return scene.grad.sum(-1)
+
+    darker, brighter = slope(targets.frame - 0.1), slope(targets.frame + 0.1)
+    assert (darker[~discs] > 0).all(), "what the frame has more is the flare's, and costs the scene near the light"
+    assert darker[discs].item() < 0 < brighter[discs].item(), "but the disc is the scene's"
+    assert (brighter[~discs] > darker[~discs] * 1.5).all(), "no frame is darker than the scene"
 
 
 def test_a_sky_lies_about_the_points_in_colours_that_the_frames_have(capture: Capture) -> None:

@@ -1,0 +1,60 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What teaches the scene of a mode `split` fit, which has no flare-free frames.
+
+Frame = encode(scene + flare) leaves open who takes what both could make. Two things decide. A flare only adds light,
+so no frame is darker than the scene. And what both could make is the flare's: above all the glow about a light, which
+moves with the light as a part of the scene there would. The light's own disc is the scene's.
+"""
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from torch import Tensor
+
+from ..capture import Camera
+from .frames import Targets
+from .settings import SplitSettings
+
+
+def scene_begins(scene: Tensor, targets: Targets, settings: SplitSettings) -> Tensor:
+    """Loss of a scene (height, width, 3) of display values that is fitted alone: what the frames agree on from below.
+    """
+    return from_below(scene, targets.frame, settings.excess)
+
+
+def scene_beside_flare(scene: Tensor, targets: Targets, lights: ArrayLike, discs: Tensor | None,
+                       settings: SplitSettings, progress: float) -> Tensor:
+    """Loss of a scene (height, width, 3) of display values that is fitted with the flare, besides that of the two
+    together. lights: (n, 3), world. discs: (height, width), the lights' own clipped pixels, if they are told.
+
+    progress: of the fit, 0..1. Until its middle the scene, which is still to be found, is less and less drawn up to
+    brighter frames, and more and more held down near the lights.
+    """
+    settled = min(2 * progress, 1.0)
+    loss = settings.weight * from_below(scene, targets.frame, settings.excess * (1 - settled))
+    near = torch.from_numpy(nearness(targets.camera, lights, settings.reach))
+    loss = loss + settings.glow * settled * (scene * near[..., None]).mean()
+    if discs is not None:
+        loss = loss + ((scene - targets.frame).abs() * discs[..., None]).mean()
+    return loss
+
+
+def from_below(scene: Tensor, frame: Tensor, excess: float) -> Tensor:
+    """Mean |scene - frame|, of which what the frame has more counts for `excess`: fitted to several frames, their
+    excess / (1 + excess) quantile."""
+    more = frame - scene
+    return torch.where(more > 0, more * excess, -more).mean()
+
+
+def nearness(camera: Camera, lights: ArrayLike, reach: float) -> NDArray[np.float32]:
+    """(height, width): 1 where a light (n, 3), world, is seen, a half at `reach` of the width beside."""
+    pixels, depth = camera.project(lights)
+    across = np.arange(camera.width, dtype=np.float32) + np.float32(0.5)
+    down = np.arange(camera.height, dtype=np.float32)[:, None] + np.float32(0.5)
+    near = np.zeros((camera.height, camera.width), np.float32)
+    for (x, y), z in zip(pixels.astype(np.float32), depth, strict=True):
+        if z > 0:
+            squared = ((across - x) ** 2 + (down - y) ** 2) / np.float32((reach * camera.width) ** 2)
+            near = np.maximum(near, 1 / (1 + squared))
+    return near

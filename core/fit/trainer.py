@@ -23,7 +23,7 @@ from ..errors import CaptureError, RunError
 from ..flare.compositing import composite
 from ..flare.density import clone_and_prune
 from ..flare.model import FlareModel
-from ..flare.visibility import clear_shares
+from ..flare.visibility import clear_shares, visible_share
 from ..gaussians.densification import Classic, Mcmc, Strategy
 from ..gaussians.loss import l1_ssim
 from ..gaussians.optimiser import Adam
@@ -40,6 +40,10 @@ CLEAR_EVERY = 50
 """Iterations between two looks at how much of the lights the scene leaves (`visibility.clear_shares`)."""
 CLEAR_VIEWS = 40
 """About as many views are asked."""
+
+
+COVERED, LEAST_SHARE = 1e-4, 1e-6
+"""Weight of the loss of a covered light, about that of the pixels that show it; and what is added to its share."""
 
 
 class Trainer:
@@ -101,6 +105,9 @@ class Trainer:
         if flare is not None and self.flare is not None and settings.flare.steady:
             pose = torch.from_numpy(targets.camera.world_to_camera)
             loss = loss + settings.flare.steady * self.flare.corrections(pose).square().sum()
+        covered = self._covered(targets)
+        if covered is not None:
+            loss = loss + covered
         if loss.requires_grad:  # a frozen scene without a light in front of the camera teaches nothing
             with self.scene_adam.stepping() if self._rendered_once else nullcontext():
                 loss.backward()
@@ -138,6 +145,23 @@ class Trainer:
         poses = [torch.from_numpy(view.camera.world_to_camera) for view in self.views]
         chosen = poses[:: max(len(poses) // CLEAR_VIEWS, 1)]
         self.flare.clear.copy_(clear_shares(self.scene, self.flare, chosen, visibility, self.settings.kernels))
+
+    def _covered(self, targets: Targets) -> Tensor | None:
+        """A loss where the scene hides a light from everywhere that the frame shows, until it lets some of it through:
+        what is learned of a sky stands anywhere before the sun. None where there is nothing of the kind.
+
+        The logarithm, since of many layers each alone would change next to nothing.
+        """
+        visibility = self.settings.flare.occluded_by_scene
+        if self.flare is None or visibility is None or not self.scene_is_fitted or bool((self.flare.clear > 0).all()):
+            return None
+        eye = torch.from_numpy(targets.camera.position)
+        logarithms = []
+        for light in self.flare.positions[self.flare.clear <= 0]:
+            if clipped_discs(targets.frame.numpy(), targets.camera, light[None].numpy()).any():
+                share = visible_share(self.scene, eye, light, visibility, self.settings.kernels)
+                logarithms.append((share + LEAST_SHARE).log())
+        return -COVERED * torch.stack(logarithms).sum() if logarithms else None
 
     @property
     def _supervised(self) -> bool:

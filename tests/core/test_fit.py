@@ -248,6 +248,26 @@ def test_what_could_be_either_is_the_flare_s_but_a_light_s_own_disc(capture: Cap
     assert (brighter[~discs] > darker[~discs] * 1.5).all(), "no frame is darker than the scene"
 
 
+def test_a_light_that_frames_show_is_uncovered_where_the_scene_hides_it_from_everywhere(capture: Capture) -> None:
+    trainer = Trainer(capture, quick(**{"flare.occlusion": True}))
+    assert trainer.flare is not None
+    targets = trainer.frames.targets(trainer.views[0])
+    white = targets._replace(frame=torch.ones_like(targets.frame))
+    with torch.no_grad():  # as if everything stood before the light, in layers that each hide it
+        camera, light = torch.from_numpy(targets.camera.position).float(), trainer.flare.positions[0].float()
+        along = torch.linspace(0.3, 0.7, len(trainer.scene.means))[:, None]
+        trainer.scene.means.copy_(camera + along * (light - camera))
+        trainer.scene.opacity_logits.fill_(3.0)
+    assert trainer._covered(white) is None, "as long as some views see the light"
+    trainer.flare.clear.zero_()
+    assert trainer._covered(targets._replace(frame=torch.zeros_like(targets.frame))) is None, "nothing says it is seen"
+    loss = trainer._covered(white)
+    assert loss is not None
+    loss.backward()
+    slopes = trainer.scene.opacity_logits.grad
+    assert slopes is not None and (slopes >= 0).all() and (slopes > 0).any()
+
+
 def test_a_sky_lies_about_the_points_in_colours_that_the_frames_have(capture: Capture) -> None:
     views, frames = capture.views, Frames(capture)
     found = with_sky(capture, views, frames)

@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,7 +25,9 @@ pytest.importorskip("numba")
 from core.gaussians import loss as definition
 from core.gaussians import optimiser as plain_optimiser
 from core.gaussians import rasterization, splat
-from core.gaussians.cpu import Step, adam_steps, binning, buffers, compilation, l1_ssim, threads
+from core.gaussians.cpu import Step, adam_steps, binning, buffers, compilation, l1_ssim, layout, threads
+from core.gaussians.cpu import scene as rendering
+from core.gaussians.cpu.tiles import bin_gaussians
 
 ROOT = Path(__file__).parents[2]
 SIZE = (70, 45)
@@ -381,3 +384,42 @@ def test_adam(shape: tuple[int, ...], rate: float | Tensor) -> None:
     assert torch.allclose(other, torch.tensor(-2.0))
     assert (values - exact).abs().max() < 3e-6
     assert (moments[0] - exact_moments[0]).abs().max() < 1e-6
+
+
+def test_ellipses_far_larger_than_the_picture_are_listed_within_their_rows(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Their edges are known to a pixel at best, and one row above the first one's tile was a tile below the picture."""
+    width, height, count = 240, 135, 20_000
+    random = np.random.default_rng(0)
+    records, met = np.empty(0), np.empty(0, int)
+
+    def listed(*given: Any) -> Any:
+        nonlocal records, met
+        records, tiles, rows, bounds, grid = (given[0].reshape(-1, layout.RECORD).astype(float), given[2], given[3],
+                                              given[4].copy(), given[-1])
+        packed = rows.astype(np.int64)
+        ends = (packed >> binning.FIRST_BITS) & binning.END_MASK, packed >> (binning.COLUMN_BITS + binning.FIRST_BITS)
+        two = np.maximum(*ends) > layout.TILE_HEIGHT
+        few = tiles >= 0
+        assert (packed[few] >= 0).all()
+        assert (tiles[few & two] + grid.tiles_x < grid.tiles).all()
+        bins = bin_gaussians(*given)
+        met = np.flatnonzero(few)
+        assert (bins.counts <= bounds)[given[1] < binning.NOWHERE].all()
+        return bins
+
+    monkeypatch.setattr(rendering, "bin_gaussians", listed)
+    intrinsics = torch.tensor([[100.0, 0, width / 2], [0, 100.0, height / 2], [0, 0, 1]])
+    scales = np.exp(random.uniform(np.log(0.01), np.log(1e4), (count, 3)))
+    quats, opacities = random.normal(size=(count, 4)), random.uniform(0.05, 1, count)
+    means = np.concatenate([random.normal(size=(count, 2)) * scales.max(1)[:, None], np.ones((count, 1))], 1)
+    first_row, reach = random.choice([64.0, 128.0], count), random.uniform(1, 30, count)
+    first_row += random.uniform(-0.3, 3, count)
+    for _ in range(3):  # moved until they just reach into the picture, from the side and from below
+        tensors = [torch.tensor(part, dtype=torch.float32) for part in (means, quats, scales, opacities)]
+        rasterization(*tensors, torch.zeros(count, 1, 3), torch.eye(4), intrinsics, width, height, depth=False,
+                      kernels="cpu")
+        x, y, half_x, half_y = records[:, [layout.X, layout.Y, layout.HALF_X, layout.HALF_Y]].T
+        seen = np.isfinite(half_x + half_y)
+        means[seen, 0] += (reach - x - half_x)[seen] / 100
+        means[seen, 1] += (first_row - y + half_y)[seen] / 100
+    assert len(met) > 1000

@@ -8,7 +8,9 @@ offset of the column's edge from the centre, and the record's A, k, D, C and rea
 
     A (X + k y)² + D y² = t   at   y = (-A k X ± sqrt(C t - A D X²)) / C
 
-and the extreme points of the whole ellipse, y = ± half_y, lie at X = ∓ k half_y.
+and the extreme points of the whole ellipse, y = ± half_y, lie at X = ∓ k half_y. Of an ellipse far larger than the
+picture the root loses all its digits, so y is kept within ± half_y: nothing is listed beyond the rows that were
+counted for it.
 
 Gaussians have a key, by which they are drawn, lowest first: the bits of the depth, which sort as it does, or their
 number. `list_in_order` cuts the range of keys into parts of about equal work, one to a thread at a time. A part
@@ -140,9 +142,10 @@ def few_tiles(x, y, half_x, half_y, major, k, minor, reach, visible, width, heig
     one = columns < 1
     low = where(one | ((left <= tip) & (tip <= middle)), -half_y, minimum(low0, low1))
     high = where(one | ((left <= -tip) & (-tip <= middle)), half_y, maximum(high0, high1))
-    of_left = _packed_rows(y, low, high, height, row << TILE_SHIFT_Y)
+    of_left = _packed_rows(y, maximum(low, -half_y), minimum(high, half_y), height, row << TILE_SHIFT_Y)
     low = where((middle <= tip) & (tip <= right), -half_y, minimum(low1, low2))
     high = where((middle <= -tip) & (-tip <= right), half_y, maximum(high1, high2))
+    low, high = maximum(low, -half_y), minimum(high, half_y)
     of_right = where(one, 0, _packed_rows(y, low, high, height, row << TILE_SHIFT_Y))
     few = visible & (columns < 2) & (rows < 2)
     tiles_x = (width + TILE_WIDTH - 1) >> TILE_SHIFT_X
@@ -227,8 +230,8 @@ def _list_gaussian(records, i, width, height, tiles_x, slots_ahead, listed, plac
     while column <= last_column:
         right = left + np.float32(TILE_WIDTH)
         low1, high1 = _crossing(extent, square, bend, lean, right)
-        low = -half_y if left <= tip <= right else _least(low0, low1)
-        high = half_y if left <= -tip <= right else _most(high0, high1)
+        low = -half_y if left <= tip <= right else _most(_least(low0, low1), -half_y)
+        high = half_y if left <= -tip <= right else _least(_most(high0, high1), half_y)
         top, bottom = _pixel_rows(y, low, high, height)
         place = _write_column(column, top, bottom, tiles_x, i, slots_ahead, listed, place, numbers)
         left, low0, high0 = right, low1, high1

@@ -209,11 +209,18 @@ def test_every_mode_runs_and_renders(tmp_path: Path, capture: Capture, mode: Any
 def test_scene_and_flare_come_apart_without_a_flare_free_frame(tmp_path: Path, capture: Capture) -> None:
     bare = tmp_path / "bare"
     shutil.copytree(capture.folder, bare, ignore=shutil.ignore_patterns("removed", "truth"))
-    settings = changed(quick(400), {"mode": "split", "flare.density.stop": 120})
-    found, empty = flare_psnr(fit(Capture.open(bare), settings, tmp_path / "run"), capture)
-    assert found > empty + 4, (found, empty)
-    settings = changed(settings, {"mode": "unsup"})
-    assert found > flare_psnr(fit(Capture.open(bare), settings, tmp_path / "unsup"), capture)[0] + 2
+
+    def found(mode: str) -> tuple[float, float]:
+        """Means of three seeds, between which fits this short and small differ by more than a dB."""
+        fits = []
+        for seed in range(3):
+            settings = changed(quick(400), {"mode": mode, "flare.density.stop": 120, "seed": seed})
+            fits.append(flare_psnr(fit(Capture.open(bare), settings, tmp_path / f"{mode} {seed}"), capture))
+        return float(np.mean([one for one, _ in fits])), fits[0][1]
+
+    split, empty = found("split")
+    unsup, _ = found("unsup")
+    assert split > empty + 4 and split > unsup + 1.5, (split, unsup, empty)
 
 
 def test_what_frames_agree_on_from_below_is_a_quantile() -> None:

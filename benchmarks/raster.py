@@ -224,7 +224,7 @@ STAGES = {
     "raster, forward": ("raster",),
     "raster, backward": ("raster_backward",),
     "projection, backward, and Adam": ("project_backward", "_advance_all"),
-    "loss": ("compare",),
+    "loss": ("loss_and_gradient",),
 }
 STAGE_JOBS = (ITERATION_JOBS[0], ITERATION_JOBS[3])
 

@@ -33,6 +33,7 @@ from core.files import read_json, write_json
 from core.fit.run import FLARE, Run
 from core.look import Look, ViewOfLight, read
 from core.look.shot import PlacedLight, Shot, ShotFrame
+from core.metrics.evaluation import displayed_flare
 from core.pictures import srgb_from_linear, write_png
 from core.transfer.target import Target, of_capture, of_shot
 from core.transfer.transfer import Transfer, TransferSettings
@@ -131,11 +132,6 @@ def psnr(first: Pixels, second: Pixels) -> float:
     return float(-10 * np.log10(max(float(((first - second) ** 2).mean()), 1e-12)))
 
 
-def shown(scene: Pixels, flare: Pixels) -> Pixels:
-    """What a flare adds to a picture in display space."""
-    return srgb_from_linear(np.clip(scene + flare, 0, 1)) - srgb_from_linear(np.clip(scene, 0, 1))
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run", type=Path)
@@ -175,9 +171,10 @@ def main() -> None:
         inside = all(is_inside(ranges[light.source], ViewOfLight.of(camera.world_to_camera, light.xyz),
                                float(np.linalg.norm(camera.position - light.xyz))) for light in truth.shot.lights)
         clipped = np.clip(scene + exact, 0, 1), np.clip(scene + ours, 0, 1)
+        shown = displayed_flare(scene + exact, scene)
         rows.append({"frame": truth.shot.frame, "inside": inside, "shares": [one.share for one in truth.shot.lights],
-                     "flare": psnr(shown(scene, exact), shown(scene, ours)), "flare_linear": psnr(*clipped),
-                     "empty": psnr(shown(scene, exact), 0 * exact)})
+                     "flare": psnr(shown, displayed_flare(scene + ours, scene)), "flare_linear": psnr(*clipped),
+                     "empty": psnr(shown, 0 * shown)})
         if index % max(len(truths) // 6, 1) == 0:
             pictures.append(np.concatenate([srgb_from_linear(part) for part in clipped], 1))
         print(f"frame {rows[-1]['frame']:3}  inside {inside!s:5}  shares "

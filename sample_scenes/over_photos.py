@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from core.capture import Capture, View
+from core.capture import Capture
 from core.errors import FitFlareError
 from core.files import write_json
 from core.pictures import linear_from_srgb, read_picture, srgb_from_linear, write_png
@@ -36,8 +36,8 @@ def add_flares(capture: Capture, out: Path, look: Look, light: NDArray[np.float6
         frame, clean, layer = (out / "images" / f"{stem}.png", out / "removed" / f"{stem}.png",
                                out / "truth" / "flare" / f"{stem}.exr")
         if not (frame.is_file() and clean.is_file() and layer.is_file()):
-            camera = view.camera.scaled(*_size(view, width))
-            photo = np.round(capture.frame(view, _size(view, width)).display() * 255) / np.float32(255)
+            camera = view.camera.scaled(width)
+            photo = np.round(capture.frame(view, camera.size).display() * 255) / np.float32(255)
             pose = view.camera.world_to_camera
             flare = render_flare(look, camera, pose[:3, :3] @ light + pose[:3, 3], colour=colour,
                                  intensity=intensity)
@@ -50,17 +50,13 @@ def add_flares(capture: Capture, out: Path, look: Look, light: NDArray[np.float6
     _write_model(capture, out / "sparse" / "0", width)
 
 
-def _size(view: View, width: int) -> tuple[int, int]:
-    return width, round(width * view.camera.height / view.camera.width)
-
-
 def _write_model(capture: Capture, folder: Path, width: int) -> None:
     """Cameras at the new size and the capture's points, as a COLMAP model."""
     import pycolmap
 
     model = pycolmap.Reconstruction()
     for number, view in enumerate(capture.views, 1):
-        camera = view.camera.scaled(*_size(view, width))
+        camera = view.camera.scaled(width)
         model.add_camera_with_trivial_rig(pycolmap.Camera(
             model="PINHOLE", width=camera.width, height=camera.height, camera_id=number,
             params=[camera.fx, camera.fy, camera.cx, camera.cy]))

@@ -93,9 +93,7 @@ class BakeSettings:
 
     def scaled(self, camera: Camera) -> Camera:
         """A frame's camera at the size asked for."""
-        if not self.width:
-            return camera
-        return camera.scaled(self.width, self.height or max(round(self.width * camera.height / camera.width), 1))
+        return camera.scaled(self.width, self.height) if self.width else camera
 
 
 def bake(renderer: Renderer, frames: Sequence[Frame], cameras: Mapping[str, Camera], out: Path | str,

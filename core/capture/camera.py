@@ -55,8 +55,9 @@ class Camera:
         """(3,) unit viewing direction in world coordinates."""
         return self.world_to_camera[2, :3].copy()
 
-    def scaled(self, width: int, height: int) -> Camera:
-        """The same view at another size in pixels."""
+    def scaled(self, width: int, height: int | None = None) -> Camera:
+        """The same view at another size in pixels; without a height the proportions stay."""
+        height = height or max(round(self.height * width / self.width), 1)
         x, y = width / self.width, height / self.height
         return replace(self, width=width, height=height,
                        fx=self.fx * x, cx=self.cx * x, fy=self.fy * y, cy=self.cy * y)

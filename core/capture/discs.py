@@ -16,11 +16,18 @@ WHITE = 0.93
 def clipped_discs(display: NDArray[np.float32], camera: Camera, lights: ArrayLike) -> NDArray[np.bool_]:
     """(height, width): which pixels of a picture of display values (height, width, 3) are clipped and so near to where
     one of the lights (n, 3), world coordinates, is seen that they are the light's own."""
-    height, width = display.shape[:2]
-    pixels, depth = camera.project(lights)
-    across, down = np.arange(width) + 0.5, np.arange(height)[:, None] + 0.5
-    near = np.zeros((height, width), bool)
-    for (x, y), z in zip(pixels, depth, strict=True):
-        if z > 0:
-            near |= (across - x) ** 2 + (down - y) ** 2 < (SOURCE * width) ** 2
+    near = squared_distances(camera, lights) < SOURCE**2
     return np.asarray(near & (display >= WHITE).all(-1))
+
+
+def squared_distances(camera: Camera, lights: ArrayLike) -> NDArray[np.float32]:
+    """(height, width): each pixel's distance to the nearest place where one of the lights (n, 3), world coordinates,
+    is seen, in widths of the frame, squared; infinite where none is in front of the camera."""
+    pixels, depth = camera.project(lights)
+    across = np.arange(camera.width, dtype=np.float32) + np.float32(0.5)
+    down = np.arange(camera.height, dtype=np.float32)[:, None] + np.float32(0.5)
+    squared = np.full((camera.height, camera.width), np.inf, np.float32)
+    for (x, y), z in zip(pixels.astype(np.float32), depth, strict=True):
+        if z > 0:
+            squared = np.minimum(squared, (across - x) ** 2 + (down - y) ** 2)
+    return squared / np.float32(camera.width**2)

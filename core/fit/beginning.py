@@ -67,8 +67,7 @@ def _sights(views: tuple[View, ...], frames: Frames) -> list[Sight]:
     for view in views[:: max(len(views) // SNAP_VIEWS, 1)]:
         camera, frame, removed = frames.targets(view)
         if removed is not None:
-            width = min(SNAP_WIDTH, camera.width)
-            small = camera.scaled(width, max(round(camera.height * width / camera.width), 1))
+            small = camera.scaled(min(SNAP_WIDTH, camera.width))
             shrunk = (Picture(part.numpy(), "srgb").resized(*small.size).display() for part in (frame, removed))
             found.append(sight(small, *shrunk))
     return found

@@ -44,7 +44,7 @@ class Frames:
         camera = view.camera
         if not self._width or camera.width <= self._width:
             return camera
-        return camera.scaled(self._width, max(round(camera.height * self._width / camera.width), 1))
+        return camera.scaled(self._width)
 
     def targets(self, view: View) -> Targets:
         """Camera, frame and flare-free frame of a view."""

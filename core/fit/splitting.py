@@ -13,14 +13,9 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from ..capture import Camera
+from ..capture.discs import squared_distances
 from .frames import Targets
 from .settings import SplitSettings
-
-
-def scene_begins(scene: Tensor, targets: Targets, settings: SplitSettings) -> Tensor:
-    """Loss of a scene (height, width, 3) of display values that is fitted alone: what the frames agree on from below.
-    """
-    return from_below(scene, targets.frame, settings.excess)
 
 
 def scene_beside_flare(scene: Tensor, targets: Targets, lights: ArrayLike, discs: Tensor | None,
@@ -41,20 +36,12 @@ def scene_beside_flare(scene: Tensor, targets: Targets, lights: ArrayLike, discs
 
 
 def from_below(scene: Tensor, frame: Tensor, excess: float) -> Tensor:
-    """Mean |scene - frame|, of which what the frame has more counts for `excess`: fitted to several frames, their
-    excess / (1 + excess) quantile."""
+    """Mean |scene - frame|, display values (height, width, 3), of which what the frame has more counts for `excess`:
+    fitted to several frames, their excess / (1 + excess) quantile."""
     more = frame - scene
     return torch.where(more > 0, more * excess, -more).mean()
 
 
 def nearness(camera: Camera, lights: ArrayLike, reach: float) -> NDArray[np.float32]:
     """(height, width): 1 where a light (n, 3), world, is seen, a half at `reach` of the width beside."""
-    pixels, depth = camera.project(lights)
-    across = np.arange(camera.width, dtype=np.float32) + np.float32(0.5)
-    down = np.arange(camera.height, dtype=np.float32)[:, None] + np.float32(0.5)
-    near = np.zeros((camera.height, camera.width), np.float32)
-    for (x, y), z in zip(pixels.astype(np.float32), depth, strict=True):
-        if z > 0:
-            squared = ((across - x) ** 2 + (down - y) ** 2) / np.float32((reach * camera.width) ** 2)
-            near = np.maximum(near, 1 / (1 + squared))
-    return near
+    return 1 / (1 + squared_distances(camera, lights) / np.float32(reach**2))

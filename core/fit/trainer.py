@@ -23,7 +23,7 @@ from ..errors import CaptureError, RunError
 from ..flare.compositing import composite
 from ..flare.density import clone_and_prune
 from ..flare.model import FlareModel
-from ..flare.visibility import clear_shares, visible_share
+from ..flare.visibility import clear_shares, uncovering
 from ..gaussians.densification import Classic, Mcmc, Strategy
 from ..gaussians.loss import l1_ssim
 from ..gaussians.optimiser import Adam
@@ -33,17 +33,13 @@ from .checkpoint import State
 from .frames import Frames, Targets
 from .rendering import render_flare
 from .settings import FitSettings
-from .splitting import scene_begins, scene_beside_flare
+from .splitting import from_below, scene_beside_flare
 
 TABLE = "table.weight"
 CLEAR_EVERY = 50
 """Iterations between two looks at how much of the lights the scene leaves (`visibility.clear_shares`)."""
 CLEAR_VIEWS = 40
 """About as many views are asked."""
-
-
-COVERED, LEAST_SHARE = 1e-4, 1e-6
-"""Weight of the loss of a covered light, about that of the pixels that show it; and what is added to its share."""
 
 
 class Trainer:
@@ -147,21 +143,15 @@ class Trainer:
         self.flare.clear.copy_(clear_shares(self.scene, self.flare, chosen, visibility, self.settings.kernels))
 
     def _covered(self, targets: Targets) -> Tensor | None:
-        """A loss where the scene hides a light from everywhere that the frame shows, until it lets some of it through:
-        what is learned of a sky stands anywhere before the sun. None where there is nothing of the kind.
-
-        The logarithm, since of many layers each alone would change next to nothing.
-        """
+        """A loss where the scene hides a light from everywhere that the frame shows, until it lets some of it through.
+        None where there is nothing of the kind."""
         visibility = self.settings.flare.occluded_by_scene
         if self.flare is None or visibility is None or not self.scene_is_fitted or bool((self.flare.clear > 0).all()):
             return None
+        shown = [light for light in self.flare.positions[self.flare.clear <= 0]
+                 if clipped_discs(targets.frame.numpy(), targets.camera, light[None].numpy()).any()]
         eye = torch.from_numpy(targets.camera.position)
-        logarithms = []
-        for light in self.flare.positions[self.flare.clear <= 0]:
-            if clipped_discs(targets.frame.numpy(), targets.camera, light[None].numpy()).any():
-                share = visible_share(self.scene, eye, light, visibility, self.settings.kernels)
-                logarithms.append((share + LEAST_SHARE).log())
-        return -COVERED * torch.stack(logarithms).sum() if logarithms else None
+        return uncovering(self.scene, eye, shown, visibility, self.settings.kernels)
 
     @property
     def _supervised(self) -> bool:
@@ -211,7 +201,7 @@ class Trainer:
 
     def _split_loss(self, targets: Targets, scene: Tensor, alone: bool) -> Tensor:
         if alone or self.flare is None:
-            return scene_begins(scene, targets, self.settings.split)
+            return from_below(scene, targets.frame, self.settings.split.excess)
         discs = self._sources(targets, targets.frame)
         progress = self.iteration / self.settings.iterations
         return scene_beside_flare(scene, targets, self.flare.positions.numpy(), discs, self.settings.split, progress)

@@ -25,6 +25,8 @@ from .model import FlareModel
 LEAST_CLEAR = 0.01
 CLEAR_FROM = 0.9
 """Quantile of the views' shares that counts as clear: a light may be hidden in most of them."""
+COVERED, LEAST_SHARE = 1e-4, 1e-6
+"""Weight of the loss of a covered light, about that of the pixels that show it; and what is added to its share."""
 
 
 @dataclass(frozen=True)
@@ -64,6 +66,17 @@ def clear_shares(scene: SceneGaussians, model: FlareModel, poses: Sequence[Tenso
         found.append(shares.quantile(CLEAR_FROM))
     least = torch.stack(found).clamp(max=1)
     return least.masked_fill(least < LEAST_CLEAR, 0)
+
+
+def uncovering(scene: SceneGaussians, camera: Tensor, lights: Sequence[Tensor], settings: VisibilitySettings,
+               kernels: Kernels = "auto") -> Tensor | None:
+    """Loss of a scene that hides lights (3,) from a camera at `camera` (3,) that shows them: it thins what stands
+    before them, such as a sky, of which pictures do not say how far it is. None without a light.
+
+    The logarithm of the shares, since of many layers each alone would change next to nothing.
+    """
+    shares = [visible_share(scene, camera, light, settings, kernels) for light in lights]
+    return -COVERED * (torch.stack(shares) + LEAST_SHARE).log().sum() if shares else None
 
 
 def visible_share(scene: SceneGaussians, camera: Tensor, light: Tensor, settings: VisibilitySettings | None = None,

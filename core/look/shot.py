@@ -118,8 +118,8 @@ class Shot:
         """The same at another size in pixels; without a height the proportions stay."""
         if not width:
             return self
-        return replace(self, frames=tuple(replace(one, camera=one.camera.scaled(
-            width, height or max(round(width * one.camera.height / one.camera.width), 1))) for one in self.frames))
+        return replace(self, frames=tuple(replace(one, camera=one.camera.scaled(width, height))
+                                          for one in self.frames))
 
 
 def _frame(entry: Mapping[str, Any], data: Mapping[str, Any]) -> ShotFrame:

@@ -84,7 +84,7 @@ def score_view(composite: Array, scene: Array, frame: Picture, scene_reference: 
     scores = {"composite": _picture_scores(shown, filmed)}
     if scene_reference is not None:
         reference = scene_reference.display()
-        flare, flare_reference = np.abs(shown - clean), np.abs(filmed - reference)
+        flare, flare_reference = displayed_flare(composite, scene), np.abs(filmed - reference)
         scores["scene"] = _picture_scores(clean, reference)
         scores["flare"] = {**_picture_scores(flare, flare_reference),
                            "empty_psnr": psnr(np.zeros_like(flare), flare_reference)}
@@ -129,6 +129,12 @@ def _reduced(mask: NDArray[np.bool_], full: tuple[int, int], size: tuple[int, in
     import cv2
 
     return np.asarray(cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA), np.float32) > 0
+
+
+def displayed_flare(composite: Array, scene: Array) -> Array:
+    """|composite - scene| in display values (height, width, 3), of scene-linear layers: a flare as the paper measures
+    it."""
+    return np.abs(_display(composite) - _display(scene))
 
 
 def _display(linear: Array) -> Array:

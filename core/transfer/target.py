@@ -216,12 +216,8 @@ def sized(target: Target, width: int | None, height: int | None) -> Target:
     """The same at another size in pixels; without a height the proportions stay."""
     if not width:
         return target
-
-    def smaller(camera: Camera) -> Camera:
-        return camera.scaled(width, height or max(round(width * camera.height / camera.width), 1))
-
-    return replace(target, frames=tuple(replace(one, shot=replace(one.shot, camera=smaller(one.shot.camera)))
-                                        for one in target.frames))
+    return replace(target, frames=tuple(
+        replace(one, shot=replace(one.shot, camera=one.shot.camera.scaled(width, height))) for one in target.frames))
 
 
 def background(one: TargetFrame, size: tuple[int, int]) -> NDArray[np.float32] | None:

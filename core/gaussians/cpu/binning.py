@@ -142,11 +142,10 @@ def few_tiles(x, y, half_x, half_y, major, k, minor, reach, visible, width, heig
     one = columns < 1
     low = where(one | ((left <= tip) & (tip <= middle)), -half_y, minimum(low0, low1))
     high = where(one | ((left <= -tip) & (-tip <= middle)), half_y, maximum(high0, high1))
-    of_left = _packed_rows(y, maximum(low, -half_y), minimum(high, half_y), height, row << TILE_SHIFT_Y)
+    of_left = _packed_rows(y, half_y, low, high, height, row << TILE_SHIFT_Y)
     low = where((middle <= tip) & (tip <= right), -half_y, minimum(low1, low2))
     high = where((middle <= -tip) & (-tip <= right), half_y, maximum(high1, high2))
-    low, high = maximum(low, -half_y), minimum(high, half_y)
-    of_right = where(one, 0, _packed_rows(y, low, high, height, row << TILE_SHIFT_Y))
+    of_right = where(one, 0, _packed_rows(y, half_y, low, high, height, row << TILE_SHIFT_Y))
     few = visible & (columns < 2) & (rows < 2)
     tiles_x = (width + TILE_WIDTH - 1) >> TILE_SHIFT_X
     return where(few, row * tiles_x + column, -1), where(few, of_left | (of_right << COLUMN_BITS), 0)
@@ -170,8 +169,9 @@ def _crossings(half_x, square, bend, lean, x):
 
 
 @inlined
-def _packed_rows(y, low, high, height, base):
-    first, last = _rows_between(y, low, high, height)
+def _packed_rows(y, half_y, low, high, height, base):
+    """First and end of the pixel rows that y + low .. y + high meets, within the ellipse's own; 0 if none."""
+    first, last = _rows_between(y, maximum(low, -half_y), minimum(high, half_y), height)
     return where(first <= last, (first - base) | ((last + 1 - base) << FIRST_BITS), 0)
 
 

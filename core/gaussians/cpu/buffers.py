@@ -92,7 +92,7 @@ def empty(count: int, dtype: npt.DTypeLike = np.float32) -> Array:
     return array
 
 
-def parts(*wanted: tuple[int, type[np.generic]]) -> list[Array]:
+def empties(*wanted: tuple[int, type[np.generic]]) -> list[Array]:
     """Several flat arrays, of counts and types, that are given back together: one loan is cheaper than many."""
     sizes = [-(-count * np.dtype(kind).itemsize // LINE) * LINE for count, kind in wanted]
     block, arrays, first = empty(sum(sizes), np.uint8), [], 0

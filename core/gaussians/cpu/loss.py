@@ -208,7 +208,7 @@ def _gradient(x, y, before, here, after, band, length, height, by_l1, by_similar
 
 
 @kernel
-def compare(counter, scratch, x, y, mu_y, s_y, width, height, lam, pieces, done, sums, value, out):
+def loss_and_gradient(counter, scratch, x, y, mu_y, s_y, width, height, lam, pieces, done, sums, value, out):
     """value (1,): the loss; out: its gradient by x, unless empty. pieces: of the picture, each the work of a thread;
     done (1,): 0, counts them; sums (h, 2): workspace."""
     length = STEP * width
@@ -306,8 +306,9 @@ class _L1Ssim(torch.autograd.Function):
         if ctx.needs_input_grad[0]:
             ctx.gradient, gradient = buffers.pair(height, width, 3)
         parallel(
-            compare, flat(image), flat(target), mu_y, s_y, width, height, np.float32(lam), torch.get_num_threads(),
-            np.zeros(1, np.int64), np.empty((height, 2)), value, gradient, scratch=_scratch_size(width),
+            loss_and_gradient, flat(image), flat(target), mu_y, s_y, width, height, np.float32(lam),
+            torch.get_num_threads(), np.zeros(1, np.int64), np.empty((height, 2)), value, gradient,
+            scratch=_scratch_size(width),
         )  # fmt: skip
         return torch.from_numpy(value.reshape(()))
 

@@ -44,7 +44,7 @@ class _Rasterize(torch.autograd.Function):
         projection.describe_camera(
             flat(world_to_camera), flat(intrinsics), w, h, frame.near, frame.dilation, camera
         )
-        records, depths_of, bounds, firsts, tiles, tile_rows = buffers.parts(
+        records, depths_of, bounds, firsts, tiles, tile_rows = buffers.empties(
             (n * layout.RECORD, np.float32), (n, np.float32), *[(n, np.int32)] * 4
         )
         centres, centres_flat = buffers.pair(n, 2)

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What fits make of a view's flare, as a picture: `python benchmarks/strip.py CAPTURE VIEW RUN ... --out FILE`.
+"""What fits make of a view's flare, as a picture.
+
+    python benchmarks/flares_side_by_side.py CAPTURE VIEW RUN ... --out PNG
 
 First row: the frame, the exact flare. Then a row for each run: its flare, and twice its difference from the exact one
 on grey. The flare is |frame - scene|, display values, as the paper measures it.
@@ -17,21 +19,15 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from core.capture import Capture
 from core.errors import CaptureError
-from core.files import atomic_path
 from core.fit.frames import Frames
 from core.fit.run import Run
-from core.pictures import srgb_from_linear
+from core.metrics.evaluation import displayed_flare
+from core.pictures import write_png
 
 Pixels = NDArray[np.float32]
 
 
-def flare_of(scene: Pixels, flare: Pixels) -> Pixels:
-    """Display values of scene + flare, linear (h, w, 3), less those of the scene."""
-    both, alone = (srgb_from_linear(np.clip(part, 0, 1)) for part in (scene + flare, scene))
-    return np.asarray(both - alone, np.float32)
-
-
-def strip(capture: Capture, name: str, runs: list[Run]) -> Pixels:
+def side_by_side(capture: Capture, name: str, runs: list[Run]) -> Pixels:
     """The picture, display values (h, w, 3). Raises CaptureError where the capture lacks the view or its layers."""
     view = next((one for one in capture.views if Path(one.name).stem == Path(name).stem), None)
     if view is None:
@@ -40,29 +36,24 @@ def strip(capture: Capture, name: str, runs: list[Run]) -> Pixels:
     scene, flare = capture.truth_scene(view, camera.size), capture.truth_flare(view, camera.size)
     if scene is None or flare is None:
         raise CaptureError(f"{capture.folder} has no exact layers (truth/); give a sample capture.")
-    exact = flare_of(scene.linear(), flare.linear())
+    exact = displayed_flare(scene.linear() + flare.linear(), scene.linear())
     rows = [[capture.frame(view, camera.size).display(), exact]]
     for run in runs:
         layers = run.render(camera)
-        found = flare_of(layers.scene, sum(layers.flare_by_light.values(), np.zeros_like(layers.scene)))
+        found = displayed_flare(sum(layers.flare_by_light.values(), layers.scene), layers.scene)
         rows.append([found, 0.5 + 2 * (found - exact)])
     return np.clip(np.concatenate([np.concatenate(row, 1) for row in rows]), 0, 1)
 
 
 def main() -> None:
     """See the module's head."""
-    import cv2
-
     parser = argparse.ArgumentParser(description="A view's exact flare and that of fits.")
     parser.add_argument("capture", type=Path)
     parser.add_argument("view")
     parser.add_argument("runs", type=Path, nargs="+", metavar="RUN")
     parser.add_argument("--out", type=Path, required=True)
     words = parser.parse_args()
-    picture = strip(Capture.open(words.capture), words.view, [Run.open(run) for run in words.runs])
-    data = cv2.imencode(words.out.suffix, np.round(picture[..., ::-1] * 255).astype(np.uint8))[1]
-    with atomic_path(words.out) as temporary:
-        data.tofile(temporary)
+    write_png(words.out, side_by_side(Capture.open(words.capture), words.view, [Run.open(run) for run in words.runs]))
 
 
 if __name__ == "__main__":

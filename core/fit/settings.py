@@ -121,6 +121,9 @@ class SplitSettings:
     scene is fitted alone first, until every view was looked at `rounds` times (a third of the iterations at most), to
     what the frames agree on from below: where a frame is brighter than the scene, that counts for `excess` of what it
     counts where it is darker. Longer, and it takes up the glow about the lights; shorter, and the flare takes walls.
+    So it is asked then whether the scene has been found: flares only add, but errors go both ways. Where the square of
+    what the frames have more than the scene is less than `found` times that of what they have less, the scene goes on
+    alone to a third of the iterations, and `excess_unfound` counts instead of `excess`.
     From then on both are fitted to the frames, the scene besides from below with `weight`, in the end only where it is
     brighter than a frame; and its light costs `glow` near where a light is seen, half of that at `reach` of the width
     beside: what could be either's is the flare's. `sh_degree`: of the scene's colours for the share `plain` of the
@@ -130,6 +133,8 @@ class SplitSettings:
 
     rounds: int = 2
     excess: float = 0.25
+    found: float = 22.0
+    excess_unfound: float = 0.5
     weight: float = 0.05
     glow: float = 0.05
     reach: float = 0.05
@@ -176,7 +181,9 @@ class FitSettings:
             (self.seed >= 0, "seed must not be negative"),
             (not self.scene.frozen or bool(self.scene.start), "a frozen scene needs a PLY to start from"),
             (self.split.rounds >= 0, "split.rounds must not be negative"),
-            (0 <= self.split.excess <= 1, "split.excess must lie between 0 and 1"),
+            (0 <= self.split.excess <= 1 and 0 <= self.split.excess_unfound <= 1,
+             "split.excess and split.excess_unfound must lie between 0 and 1"),
+            (self.split.found >= 0, "split.found must not be negative"),
             (self.split.weight >= 0 and self.split.glow >= 0, "split.weight and split.glow must not be negative"),
             (self.split.reach > 0, "split.reach must be positive"),
             (0 <= self.split.plain <= 1, "split.plain must lie between 0 and 1"),

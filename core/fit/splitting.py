@@ -7,6 +7,8 @@ moves with the light as a part of the scene there would. The light's own disc is
 """
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
@@ -19,15 +21,16 @@ from .settings import SplitSettings
 
 
 def scene_beside_flare(scene: Tensor, targets: Targets, lights: ArrayLike, discs: Tensor | None,
-                       settings: SplitSettings, progress: float) -> Tensor:
+                       settings: SplitSettings, excess: float, progress: float) -> Tensor:
     """Loss of a scene (height, width, 3) of display values that is fitted with the flare, besides that of the two
     together. lights: (n, 3), world. discs: (height, width), the lights' own clipped pixels, if they are told.
+    excess: see `from_below`.
 
     progress: of the fit, 0..1. Until its middle the scene, which is still to be found, is less and less drawn up to
     brighter frames, and more and more held down near the lights.
     """
     settled = min(2 * progress, 1.0)
-    loss = settings.weight * from_below(scene, targets.frame, settings.excess * (1 - settled))
+    loss = settings.weight * from_below(scene, targets.frame, excess * (1 - settled))
     near = torch.from_numpy(nearness(targets.camera, lights, settings.reach))
     loss = loss + settings.glow * settled * (scene * near[..., None]).mean()
     if discs is not None:
@@ -40,6 +43,16 @@ def from_below(scene: Tensor, frame: Tensor, excess: float) -> Tensor:
     fitted to several frames, their excess / (1 + excess) quantile."""
     more = frame - scene
     return torch.where(more > 0, more * excess, -more).mean()
+
+
+def is_found(residuals: Iterable[Tensor], times: float) -> bool:
+    """Whether what frames have more than the scene, squared, is so many times what they have less: mostly flare, then.
+    residuals: frame - scene (height, width, 3) of some views, display values."""
+    more = less = 0.0
+    for residual in residuals:
+        more += float(residual.clamp(min=0).square().mean())
+        less += float(residual.clamp(max=0).square().mean())
+    return more >= times * less
 
 
 def nearness(camera: Camera, lights: ArrayLike, reach: float) -> NDArray[np.float32]:

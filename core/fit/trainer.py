@@ -33,13 +33,13 @@ from .checkpoint import State
 from .frames import Frames, Targets
 from .rendering import render_flare
 from .settings import FitSettings
-from .splitting import from_below, scene_beside_flare
+from .splitting import from_below, is_found, scene_beside_flare
 
 TABLE = "table.weight"
 CLEAR_EVERY = 50
 """Iterations between two looks at how much of the lights the scene leaves (`visibility.clear_shares`)."""
-CLEAR_VIEWS = 40
-"""About as many views are asked."""
+ASKED = 40
+"""About as many views are asked there, and for whether a scene has been found (`splitting.is_found`)."""
 
 
 class Trainer:
@@ -63,6 +63,9 @@ class Trainer:
         self.flare = None if settings.mode == "3dgs" else first_flare(capture, self.views, self.frames, settings)
         self.says = () if self.flare is None else moved_lights(capture, self.flare)
         self.extent = capture.extent
+        self._third = settings.iterations // 3
+        self._first_rounds = min(settings.split.rounds * len(self.views), self._third)
+        self._alone_until = self._first_rounds
         self.scene_adam = Adam(dict(self.scene.named_parameters()), self._scene_rates())
         self.strategy = self._strategy()
         self.flare_adam, self.grid_adam = _flare_optimisers(self.flare, settings)
@@ -116,7 +119,8 @@ class Trainer:
         if self.scene_is_fitted:
             self.strategy.update(self.iteration)
             self._keep_neighbours_together()
-        self._change_flare_density()
+        if not alone:
+            self._change_flare_density()
         return figures
 
     @property
@@ -139,7 +143,7 @@ class Trainer:
         if self.flare is None or visibility is None or self.iteration % CLEAR_EVERY != 1:
             return
         poses = [torch.from_numpy(view.camera.world_to_camera) for view in self.views]
-        chosen = poses[:: max(len(poses) // CLEAR_VIEWS, 1)]
+        chosen = poses[:: max(len(poses) // ASKED, 1)]
         self.flare.clear.copy_(clear_shares(self.scene, self.flare, chosen, visibility, self.settings.kernels))
 
     def _covered(self, targets: Targets) -> Tensor | None:
@@ -161,9 +165,21 @@ class Trainer:
     def _scene_alone(self, targets: Targets) -> bool:
         """Whether the scene is fitted alone as yet, so that it hides lights by the time their flares are fitted."""
         if self.settings.mode == "split":
-            return self.iteration <= min(self.settings.split.rounds * len(self.views), self.settings.iterations // 3)
+            if self.iteration == self._first_rounds + 1 and not self._scene_is_found():
+                self._alone_until = self._third
+            return self.iteration <= self._alone_until
         begun = self.iteration > self.settings.flare.begin * self.settings.iterations
         return self._supervised and self.scene_is_fitted and targets.removed is not None and not begun
+
+    @torch.no_grad()
+    def _scene_is_found(self) -> bool:
+        """Whether the scene is so far that what the frames have more than it is mostly flare."""
+        def missing(targets: Targets) -> Tensor:
+            return targets.frame - self.scene.render(targets.camera, sh_degree=self._sh_degree(), depth=False,
+                                                     kernels=self.settings.kernels).colour
+
+        asked = self.views[:: max(len(self.views) // ASKED, 1)]
+        return is_found((missing(self.frames.targets(view)) for view in asked), self.settings.split.found)
 
     def _behind_flare(self, targets: Targets, scene: Tensor) -> Tensor:
         """What the flare is put before: the flare-free frame while both are fitted apart, then the scene.
@@ -200,11 +216,13 @@ class Trainer:
         return None
 
     def _split_loss(self, targets: Targets, scene: Tensor, alone: bool) -> Tensor:
+        split = self.settings.split
+        excess = split.excess if self._alone_until == self._first_rounds else split.excess_unfound
         if alone or self.flare is None:
-            return from_below(scene, targets.frame, self.settings.split.excess)
+            return from_below(scene, targets.frame, excess)
         discs = self._sources(targets, targets.frame)
         progress = self.iteration / self.settings.iterations
-        return scene_beside_flare(scene, targets, self.flare.positions.numpy(), discs, self.settings.split, progress)
+        return scene_beside_flare(scene, targets, self.flare.positions.numpy(), discs, split, excess, progress)
 
     def _sh_degree(self) -> int:
         if self.settings.scene.start:
@@ -279,7 +297,8 @@ class Trainer:
 
     def state(self) -> State:
         """All that a resumed fit needs, as `checkpoint.save` takes it."""
-        state: State = {"iteration": self.iteration, "scene": dict(self.scene.state_dict()),
+        state: State = {"iteration": self.iteration, "alone_until": self._alone_until,
+                        "scene": dict(self.scene.state_dict()),
                         "scene_adam": self.scene_adam.state_dict(), "strategy": self.strategy.state_dict()}
         if self.flare is not None and self.flare_adam is not None and self.grid_adam is not None:
             state["flare"] = dict(self.flare.state_dict())
@@ -290,7 +309,7 @@ class Trainer:
     def load_state(self, state: State) -> None:
         """Go on from a state. Raises RunError where it does not fit the capture and settings."""
         try:
-            self.iteration = int(state["iteration"])
+            self.iteration, self._alone_until = int(state["iteration"]), int(state["alone_until"])
             _load_parameters(dict(self.scene.named_parameters()), state["scene"])
             self.scene_adam.load_state_dict(state["scene_adam"])
             self.strategy.load_state_dict(state["strategy"])

@@ -2,6 +2,7 @@
 """A fit separates a known flare, goes on after any stop as if there had been none, and refuses bad captures."""
 from __future__ import annotations
 
+import copy
 import json
 import os
 import random
@@ -24,7 +25,7 @@ from core.fit import FitSettings, Run, fit, preset
 from core.fit.frames import Frames
 from core.fit.settings import SplitSettings, changed
 from core.fit.sky import COUNT, with_sky
-from core.fit.splitting import from_below, nearness, scene_beside_flare
+from core.fit.splitting import from_below, is_found, nearness, scene_beside_flare
 from core.fit.trainer import Trainer
 from core.pictures import read_picture, write_png
 from core.progress import Progress
@@ -232,6 +233,37 @@ def test_what_frames_agree_on_from_below_is_a_quantile() -> None:
     assert torch.allclose(evenly, (levels[:, None] - frames[:, 0]).abs().mean(-1), atol=1e-6)
 
 
+def test_a_scene_is_found_once_what_frames_have_more_is_mostly_flare() -> None:
+    errors = torch.randn(4, 20, 30, 3, generator=torch.Generator().manual_seed(0)) * 0.02
+    flare = torch.zeros(20, 30, 3)
+    flare[5:15, 5:15] = 0.3
+    assert not is_found(errors, times=5)
+    assert is_found(errors + flare, times=5)
+    assert not is_found(errors - flare, times=0.1)
+    assert is_found(iter(()), times=5), "nothing is missing where there is nothing"
+
+
+def test_a_scene_that_is_not_found_goes_on_alone(capture: Capture) -> None:
+    def alone(found: float) -> int:
+        """Iterations until the flare is first fitted, through a state that is taken up in the middle of it."""
+        settings = changed(quick(120), {"mode": "split", "split.rounds": 1, "split.found": found})
+        trainer, steps = Trainer(capture, settings), 0
+        assert trainer.flare is not None
+        before = {name: value.clone() for name, value in trainer.flare.named_parameters()}
+        while all(torch.equal(value, before[name]) for name, value in trainer.flare.named_parameters()):
+            trainer.step()
+            steps += 1
+            if steps == len(trainer.views) + 5:
+                state = copy.deepcopy(trainer.state())
+                trainer = Trainer(capture, settings)
+                trainer.load_state(state)
+                assert trainer.flare is not None
+        return steps - 1
+
+    assert alone(found=0.0) == len(Trainer(capture, quick(120)).views)
+    assert alone(found=1e9) == 40
+
+
 def test_what_could_be_either_is_the_flare_s_but_a_light_s_own_disc(capture: Capture) -> None:
     view = capture.views[0]
     targets, lights = Frames(capture).targets(view), np.array([light.xyz for light in capture.lights])
@@ -245,7 +277,7 @@ def test_what_could_be_either_is_the_flare_s_but_a_light_s_own_disc(capture: Cap
 
     def slope(scene: torch.Tensor) -> torch.Tensor:
         scene = scene.clone().requires_grad_()
-        scene_beside_flare(scene, targets, lights, discs, SplitSettings(), progress=1.0).backward()
+        scene_beside_flare(scene, targets, lights, discs, SplitSettings(), excess=0.25, progress=1.0).backward()
         assert scene.grad is not None
         return scene.grad.sum(-1)
 

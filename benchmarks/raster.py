@@ -30,19 +30,21 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 START = time.perf_counter()
-# As headless/run.py has it: torch's threads that spin while they wait would take a core from the kernels.
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-import torch  # noqa: E402
-from torch import Tensor  # noqa: E402
+from core.environment import prepare
 
-from benchmarks import opensplat, report, workload  # noqa: E402
-from benchmarks.report import milliseconds, table  # noqa: E402
-from benchmarks.timing import medians, on_threads, once, threads  # noqa: E402
-from core.gaussians import Adam, SceneGaussians, kernels, l1_ssim, over, rasterization, splat  # noqa: E402
-from core.gaussians.scene import learning_rates  # noqa: E402
-from core.gaussians.spherical_harmonics import colours  # noqa: E402
+prepare()
+
+import torch
+from torch import Tensor
+
+from benchmarks import opensplat, report, workload
+from benchmarks.report import milliseconds, table
+from benchmarks.timing import medians, on_threads, once, threads
+from core.gaussians import Adam, SceneGaussians, kernels, l1_ssim, over, rasterization, splat
+from core.gaussians.scene import learning_rates
+from core.gaussians.spherical_harmonics import colours
 
 Engine = Callable[..., Tensor]
 DOCUMENT = report.ROOT / "docs" / "engine.md"

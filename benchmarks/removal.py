@@ -31,12 +31,12 @@ import numpy as np
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
-from core.metrics.pictures import psnr  # noqa: E402
-from core.pictures import read_picture, write_exr, write_png  # noqa: E402
-from core.progress import Progress  # noqa: E402
-from core.removal.batch import remove_all  # noqa: E402
-from core.removal.inference import WORKING_SIZE, Remover  # noqa: E402
-from core.removal.plates import read_plate  # noqa: E402
+from core.metrics.pictures import psnr
+from core.pictures import read_picture, write_exr, write_png
+from core.progress import Progress
+from core.removal.batch import remove_all
+from core.removal.inference import WORKING_SIZE, Remover
+from core.removal.plates import read_plate
 
 SHOWN = 3
 """Frames on a sheet of the sample."""

@@ -10,14 +10,16 @@ rasterization, 10.79 ms a frame; 3.9, 6.8 and 11.1 ms deformation for one, two a
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as headless/run.py has it, before torch is loaded
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from core.environment import prepare
+
+prepare()
 
 import numpy as np
 import torch

@@ -18,10 +18,6 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = "fit_flare"
 
-# Threads of torch that wait for work sleep rather than spin: where other programs want the cores too, a fit
-# otherwise takes several times as long. OpenMP reads this once, when torch is loaded.
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-
 
 def load() -> str:
     """Make this tree importable as a package and return its name: an enabled extension's own, or PACKAGE."""
@@ -57,4 +53,6 @@ def leave(status: int) -> None:
 
 
 if __name__ == "__main__":
-    leave(importlib.import_module(f"{load()}.headless.cli").main(words()))
+    package = load()
+    importlib.import_module(f"{package}.core.environment").prepare()
+    leave(importlib.import_module(f"{package}.headless.cli").main(words()))

@@ -32,9 +32,9 @@ from typing import Literal, NamedTuple
 START = time.perf_counter()
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from core.environment import prepare
+from core.torch_environment import prepare_for_torch
 
-prepare()
+prepare_for_torch()
 
 import torch
 from torch import Tensor

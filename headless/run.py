@@ -54,5 +54,5 @@ def leave(status: int) -> None:
 
 if __name__ == "__main__":
     package = load()
-    importlib.import_module(f"{package}.core.environment").prepare()
+    importlib.import_module(f"{package}.core.torch_environment").prepare_for_torch()
     leave(importlib.import_module(f"{package}.headless.cli").main(words()))

@@ -14,8 +14,8 @@ WHITE = 0.93
 
 
 def clipped_discs(display: NDArray[np.float32], camera: Camera, lights: ArrayLike) -> NDArray[np.bool_]:
-    """(height, width): which pixels of a picture of display values (height, width, 3) are clipped and so near to where
-    one of the lights (n, 3), world coordinates, is seen that they are the light's own."""
+    """(height, width): which pixels of the camera's picture, display values (height, width, 3), are clipped and so near
+    to where one of the lights (n, 3), world coordinates, is seen that they are the light's own."""
     near = squared_distances(camera, lights) < SOURCE**2
     return np.asarray(near & (display >= WHITE).all(-1))
 

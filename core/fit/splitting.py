@@ -20,6 +20,32 @@ from .frames import Targets
 from .settings import SplitSettings
 
 
+class HeadStart:
+    """How long the scene of a mode `split` fit is fitted alone, and how much brighter frames count for it.
+
+    views: that are fitted. until: the last iteration of the scene alone, which `goes_on` puts off.
+    """
+
+    def __init__(self, settings: SplitSettings, views: int, iterations: int) -> None:
+        self._settings = settings
+        self._longest = iterations // 3
+        self._rounds_end = min(settings.rounds * views, self._longest)
+        self.until = self._rounds_end
+
+    def asks_before(self, iteration: int) -> bool:
+        """Whether this iteration, which would be the flare's first, waits for an answer of `is_found`."""
+        return iteration == self._rounds_end + 1 <= self._longest
+
+    def goes_on(self) -> None:
+        """The scene has not been found."""
+        self.until = self._longest
+
+    @property
+    def excess(self) -> float:
+        """See `from_below`."""
+        return self._settings.excess if self.until == self._rounds_end else self._settings.excess_unfound
+
+
 def scene_beside_flare(scene: Tensor, targets: Targets, lights: ArrayLike, discs: Tensor | None,
                        settings: SplitSettings, excess: float, progress: float) -> Tensor:
     """Loss of a scene (height, width, 3) of display values that is fitted with the flare, besides that of the two

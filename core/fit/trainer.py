@@ -33,7 +33,7 @@ from .checkpoint import State
 from .frames import Frames, Targets
 from .rendering import render_flare
 from .settings import FitSettings
-from .splitting import from_below, is_found, scene_beside_flare
+from .splitting import HeadStart, from_below, is_found, scene_beside_flare
 
 TABLE = "table.weight"
 CLEAR_EVERY = 50
@@ -63,9 +63,7 @@ class Trainer:
         self.flare = None if settings.mode == "3dgs" else first_flare(capture, self.views, self.frames, settings)
         self.says = () if self.flare is None else moved_lights(capture, self.flare)
         self.extent = capture.extent
-        self._third = settings.iterations // 3
-        self._first_rounds = min(settings.split.rounds * len(self.views), self._third)
-        self._alone_until = self._first_rounds
+        self._head_start = HeadStart(settings.split, len(self.views), settings.iterations)
         self.scene_adam = Adam(dict(self.scene.named_parameters()), self._scene_rates())
         self.strategy = self._strategy()
         self.flare_adam, self.grid_adam = _flare_optimisers(self.flare, settings)
@@ -81,6 +79,7 @@ class Trainer:
         self._set_rates()
         scene = self.scene.render(targets.camera, sh_degree=self._sh_degree(), depth=False, kernels=settings.kernels)
         self._look_for_lights()
+        self._look_for_scene()
         alone = self._scene_alone(targets)
         flare = None if alone else render_flare(self.flare, settings.blend, targets.camera, settings.kernels,
                                                 scene=self.scene, visibility=settings.flare.occluded_by_scene)
@@ -119,7 +118,7 @@ class Trainer:
         if self.scene_is_fitted:
             self.strategy.update(self.iteration)
             self._keep_neighbours_together()
-        if not alone:
+        if not alone:  # Gaussians that nothing has taught are neither many nor faint
             self._change_flare_density()
         return figures
 
@@ -146,6 +145,20 @@ class Trainer:
         chosen = poses[:: max(len(poses) // ASKED, 1)]
         self.flare.clear.copy_(clear_shares(self.scene, self.flare, chosen, visibility, self.settings.kernels))
 
+    @torch.no_grad()
+    def _look_for_scene(self) -> None:
+        """Mode `split` leaves a scene alone for longer that is not found yet when the flare is due."""
+        if self.settings.mode != "split" or not self._head_start.asks_before(self.iteration):
+            return
+
+        def missing(targets: Targets) -> Tensor:
+            return targets.frame - self.scene.render(targets.camera, sh_degree=self._sh_degree(), depth=False,
+                                                     kernels=self.settings.kernels).colour
+
+        asked = self.views[:: max(len(self.views) // ASKED, 1)]
+        if not is_found((missing(self.frames.targets(view)) for view in asked), self.settings.split.found):
+            self._head_start.goes_on()
+
     def _covered(self, targets: Targets) -> Tensor | None:
         """A loss where the scene hides a light from everywhere that the frame shows, until it lets some of it through.
         None where there is nothing of the kind."""
@@ -165,21 +178,9 @@ class Trainer:
     def _scene_alone(self, targets: Targets) -> bool:
         """Whether the scene is fitted alone as yet, so that it hides lights by the time their flares are fitted."""
         if self.settings.mode == "split":
-            if self.iteration == self._first_rounds + 1 and not self._scene_is_found():
-                self._alone_until = self._third
-            return self.iteration <= self._alone_until
+            return self.iteration <= self._head_start.until
         begun = self.iteration > self.settings.flare.begin * self.settings.iterations
         return self._supervised and self.scene_is_fitted and targets.removed is not None and not begun
-
-    @torch.no_grad()
-    def _scene_is_found(self) -> bool:
-        """Whether the scene is so far that what the frames have more than it is mostly flare."""
-        def missing(targets: Targets) -> Tensor:
-            return targets.frame - self.scene.render(targets.camera, sh_degree=self._sh_degree(), depth=False,
-                                                     kernels=self.settings.kernels).colour
-
-        asked = self.views[:: max(len(self.views) // ASKED, 1)]
-        return is_found((missing(self.frames.targets(view)) for view in asked), self.settings.split.found)
 
     def _behind_flare(self, targets: Targets, scene: Tensor) -> Tensor:
         """What the flare is put before: the flare-free frame while both are fitted apart, then the scene.
@@ -216,13 +217,13 @@ class Trainer:
         return None
 
     def _split_loss(self, targets: Targets, scene: Tensor, alone: bool) -> Tensor:
-        split = self.settings.split
-        excess = split.excess if self._alone_until == self._first_rounds else split.excess_unfound
+        excess = self._head_start.excess
         if alone or self.flare is None:
             return from_below(scene, targets.frame, excess)
         discs = self._sources(targets, targets.frame)
         progress = self.iteration / self.settings.iterations
-        return scene_beside_flare(scene, targets, self.flare.positions.numpy(), discs, split, excess, progress)
+        return scene_beside_flare(scene, targets, self.flare.positions.numpy(), discs, self.settings.split, excess,
+                                  progress)
 
     def _sh_degree(self) -> int:
         if self.settings.scene.start:
@@ -297,7 +298,7 @@ class Trainer:
 
     def state(self) -> State:
         """All that a resumed fit needs, as `checkpoint.save` takes it."""
-        state: State = {"iteration": self.iteration, "alone_until": self._alone_until,
+        state: State = {"iteration": self.iteration, "alone_until": self._head_start.until,
                         "scene": dict(self.scene.state_dict()),
                         "scene_adam": self.scene_adam.state_dict(), "strategy": self.strategy.state_dict()}
         if self.flare is not None and self.flare_adam is not None and self.grid_adam is not None:
@@ -309,7 +310,7 @@ class Trainer:
     def load_state(self, state: State) -> None:
         """Go on from a state. Raises RunError where it does not fit the capture and settings."""
         try:
-            self.iteration, self._alone_until = int(state["iteration"]), int(state["alone_until"])
+            self.iteration, self._head_start.until = int(state["iteration"]), int(state["alone_until"])
             _load_parameters(dict(self.scene.named_parameters()), state["scene"])
             self.scene_adam.load_state_dict(state["scene_adam"])
             self.strategy.load_state_dict(state["strategy"])

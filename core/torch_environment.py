@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What torch reads from the environment once, when it is loaded."""
+"""The environment variables that torch reads once, when it is loaded."""
 from __future__ import annotations
 
 import os
 
 
-def prepare() -> None:
+def prepare_for_torch() -> None:
     """Before torch is imported. What the user has set stays.
 
     Threads of torch that wait for work sleep rather than spin: where other programs, or our own kernels, want the cores

@@ -12,7 +12,8 @@ ROOT = Path(__file__).resolve().parents[2]
 
 def test_it_is_prepared_without_torch_and_what_the_user_has_set_stays() -> None:
     script = ("import os, sys; from core.torch_environment import prepare_for_torch; prepare_for_torch(); "
-              "assert 'torch' not in sys.modules; print(os.environ['OMP_WAIT_POLICY'], os.environ['THP_MEM_ALLOC_ENABLE'])")
+              "assert 'torch' not in sys.modules; "
+              "print(os.environ['OMP_WAIT_POLICY'], os.environ['THP_MEM_ALLOC_ENABLE'])")
     given = {name: value for name, value in os.environ.items() if name != "THP_MEM_ALLOC_ENABLE"}
     found = subprocess.run([sys.executable, "-c", script], cwd=ROOT, env={**given, "OMP_WAIT_POLICY": "ACTIVE"},
                            capture_output=True, text=True, check=True)

@@ -41,6 +41,7 @@ from torch import Tensor
 
 from benchmarks import opensplat, report, workload
 from benchmarks.report import milliseconds, table
+from benchmarks.resident import held, held_at_most
 from benchmarks.timing import medians, on_threads, once, threads
 from core.gaussians import Adam, SceneGaussians, kernels, l1_ssim, over, rasterization, splat
 from core.gaussians.scene import learning_rates
@@ -443,18 +444,11 @@ def probe(what: str, name: str) -> dict[str, float]:
         return {"import": imported, "first": times[0], "second": times[1]}
     if what == "both":
         return medians({"both": Raster(job, our_engine(name), name, "cpu").both}, 5)
-    import psutil
-
-    if sys.platform == "win32":
-        raise SystemExit("Peak memory is measured on Linux and macOS.")
-    import resource
-
-    kibibytes = 1024 if sys.platform == "darwin" else 1
-    before = psutil.Process().memory_info().rss / 1e6
+    before = held()
     iteration = Iteration(job, name)
     for _ in range(5):
         iteration.step()
-    return {"before": before, "peak": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / kibibytes * 1024 / 1e6}
+    return {"before": before, "peak": held_at_most()}
 
 
 def _count(threads: int) -> str:

@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import resource
 import subprocess
 import sys
 import tempfile
@@ -31,6 +30,7 @@ import numpy as np
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
+from benchmarks.resident import held_at_most
 from core.metrics.pictures import psnr
 from core.pictures import read_picture, write_exr, write_png
 from core.progress import Progress
@@ -65,7 +65,7 @@ def one(path: Path, size: int, weights: Path | None) -> None:
     first = time.perf_counter()
     remove_all([path], path.parent / "out", remover, Progress(), overwrite=True)
     print(json.dumps({"load_s": loaded - began, "first_s": first - loaded, "again_s": time.perf_counter() - first,
-                      "peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024}))
+                      "peak_mb": held_at_most()}))
 
 
 def speed(weights: Path | None) -> None:

@@ -24,6 +24,13 @@ TEACHES = 0.2
 
 RING_EVERY = 4
 """One in so many Gaussians is a ring at first, where the form has them."""
+SIZES = 0.01, 0.06
+"""Standard deviations of Gaussians at first, in the normalised plane (a 50 mm frame is about 0.7 wide)."""
+RING_RADII = 3.0, 8.5
+"""r0 of rings at first, in standard deviations, from the smallest to the largest: up to half of the plane. A ring that
+none lies near is not found; and thin ones, unlike larger Gaussians, leave the frame free."""
+RING_WIDTH = 0.5
+"""w of rings at first, in standard deviations."""
 
 
 @dataclass(frozen=True)
@@ -162,16 +169,13 @@ def _rings(raw: Tensor) -> Tensor:
 
 
 def _canonical(form: FlareForm, count: int, opacity: float, generator: torch.Generator) -> dict[str, Tensor]:
-    """`count` Gaussians spread along the line, small enough to leave most of the frame free.
-
-    Sizes are log-uniform from 0.01 to 0.06 of the normalised plane (a 50 mm frame is about 0.7 wide).
-    """
-
-    def uniform(low: float, high: float, *shape: int) -> Tensor:
-        return low + (high - low) * torch.rand(shape, generator=generator)
-
-    positions = torch.linspace(-1.2, 1.4, count)[:, None] if form.line else uniform(-0.5, 0.5, count, 2)
-    size = uniform(math.log(0.01), math.log(0.06), count, 1)
+    """`count` Gaussians spread along the line, small enough to leave most of the frame free; SIZES are log-uniform."""
+    if form.line:
+        positions = torch.linspace(-1.2, 1.4, count)[:, None]
+    else:
+        positions = torch.rand(count, 2, generator=generator) - 0.5
+    share = torch.rand(count, 1, generator=generator)
+    size = _log_between(*SIZES, share)
     if form.solid:
         log_scales = (size + math.log(placement.PLANE_DEPTH)).repeat(1, 3)
         rotations = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1)
@@ -187,14 +191,20 @@ def _canonical(form: FlareForm, count: int, opacity: float, generator: torch.Gen
     if form.static_offset:
         rows["offsets"] = torch.zeros(count, 2)
     if form.rings:
+        # A disc finds the way to a ring through worse pictures; so some begin as rings.
         rows["rings"] = torch.zeros(count, 2)
-        # A disc finds the way to a ring through worse pictures; so some begin as rings, of three deviations' radius.
-        rows["rings"][::RING_EVERY] = torch.tensor([3.0, math.log(0.5)])
+        rows["rings"][::RING_EVERY, 0] = _log_between(*RING_RADII, share[::RING_EVERY, 0]).exp()
+        rows["rings"][::RING_EVERY, 1] = math.log(RING_WIDTH)
     if form.arcs:
         rows["arcs"] = torch.zeros(count, 2)
     if form.latent:
         rows["latent"] = 0.1 * torch.randn(count, form.latent, generator=generator)
     return rows
+
+
+def _log_between(low: float, high: float, share: Tensor) -> Tensor:
+    """Logarithm of what lies a share (0..1) of the way from low to high, by ratio."""
+    return math.log(low) + (math.log(high) - math.log(low)) * share
 
 
 class FlareModel(nn.Module):

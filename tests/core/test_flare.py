@@ -52,6 +52,19 @@ def pose(number: int = 0) -> Tensor:
     return torch.from_numpy(cameras(3)[number].world_to_camera)
 
 
+# ---- beginning ------------------------------------------------------------------------------------
+
+
+def test_rings_at_first_are_of_all_sizes_and_thin() -> None:
+    """Of a lens's ghosts some are as wide as half the frame, and a ring is found only from near by."""
+    flare = LightFlare(OURS, RANGE, 400, random_(2)).gaussians
+    scales, r0 = flare["log_scales"].detach()[:, 0].exp(), flare["rings"].detach()[:, 0]
+    radii = (scales * r0)[r0 > 0].sort().values
+    assert radii[0] < 0.04 and radii[-1] > 0.45
+    assert (radii[1:] / radii[:-1]).max() < 1.3
+    assert scales.max() <= 0.061
+
+
 # ---- placement ------------------------------------------------------------------------------------
 
 

@@ -61,7 +61,7 @@ def reflectance(cosine: float, n0: float, n2: float, wavelength: float, coating:
             r12 = (n2 * c1 - n1 * c2) / (n2 * c1 + n1 * c2)
         both = r01 * r12
         total += (r01 * r01 + r12 * r12 + 2.0 * both * wave) / (1.0 + both * both + 2.0 * both * wave)
-    return 0.5 * total
+    return max(0.5 * total, 0.0)  # where the two waves cancel, rounding falls on either side of nothing
 
 
 @njit(cache=True)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -99,6 +99,7 @@ def test_reflectance_at_normal_incidence_and_of_a_quarter_wave() -> None:
 # The rasterizers let torch flush subnormal numbers, in this process too: hypothesis must not ask for any.
 @given(*(st.floats(low, high, allow_subnormal=False)
          for low, high in ((0.01, 1), (1.0, 2.0), (1.0, 2.0), (0.4, 0.7), (0, 0.8))))
+@example(cosine=0.21875, n0=1.0, n2=1.0, wavelength=0.5, coating=1.1754943508222875e-38)
 def test_reflectance_is_a_share_and_the_same_both_ways(
         cosine: float, n0: float, n2: float, wavelength: float, coating: float) -> None:
     there = reflectance(cosine, n0, n2, wavelength, coating)

@@ -17,9 +17,9 @@ from typing import NamedTuple
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from core.torch_environment import prepare_for_torch
+from core.numeric_environment import prepare_for_numpy_and_torch
 
-prepare_for_torch()
+prepare_for_numpy_and_torch()
 
 import numpy as np
 import torch

@@ -54,5 +54,5 @@ def leave(status: int) -> None:
 
 if __name__ == "__main__":
     package = load()
-    importlib.import_module(f"{package}.core.torch_environment").prepare_for_torch()
+    importlib.import_module(f"{package}.core.numeric_environment").prepare_for_numpy_and_torch()
     leave(importlib.import_module(f"{package}.headless.cli").main(words()))

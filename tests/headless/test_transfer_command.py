@@ -143,9 +143,8 @@ def test_on_to_a_blend_its_objects_hide_the_light(run: Run, made: Path, blend: P
     assert most[0] > 0
     assert most[4] == 0
     assert max(abs(np.diff(most))) < 0.9 * max(most)
-    # A chunk alone, as a farm makes it, is the same: its neighbours are looked at too. As many jobs, so that each has
-    # as many threads, which the last bit of a sum may depend on.
-    run("transfer", made, "--to", blend, "--out", tmp_path / "part", "--frames", "3-4", "--jobs", "2", "--float")
+    # A chunk alone, as a farm makes it, is the same: its neighbours are looked at too.
+    run("transfer", made, "--to", blend, "--out", tmp_path / "part", "--frames", "4-4", "--float")
     assert (tmp_path / "part" / "layers.0004.exr").read_bytes() == (out / "layers.0004.exr").read_bytes()
 
 

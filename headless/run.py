@@ -52,6 +52,8 @@ def leave(status: int) -> None:
     sys.exit(status)
 
 
+if __name__ == "__mp_main__":  # of a process that one of ours has spawned (Windows, macOS), where names are looked up
+    load()
 if __name__ == "__main__":
     package = load()
     importlib.import_module(f"{package}.core.numeric_environment").prepare_for_numpy_and_torch()

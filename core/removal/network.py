@@ -117,21 +117,19 @@ class Attention(nn.Module):
 
 
 class RemovalNetwork(nn.Module):
-    """widths: planes of each of the LEVELS levels, from the finest; the coarsest two are multiples of HEADS."""
+    """widths: planes of each of the LEVELS levels, from the finest; the coarsest two are multiples of HEADS.
+    blocks: of each level on the way down; one each on the way up."""
 
     HEADS = 4
-    BLOCKS = (0, 1, 1, 2, 2)
-    """On the way down, of each level; one each on the way up."""
 
-    def __init__(self, widths: tuple[int, ...]) -> None:
+    def __init__(self, widths: tuple[int, ...], blocks: tuple[int, ...]) -> None:
         super().__init__()
-        self.widths = tuple(widths)
         planes = (3 * CELL**2 + SHOWN, *(SHOWN for _ in widths[1:]))
         self.see = nn.ModuleList(nn.Conv2d(a, b, 3, padding=1) for a, b in zip(planes, widths, strict=True))
         self.down = nn.ModuleList(nn.Conv2d(a, b, 2, stride=2) for a, b in pairwise(widths))
         self.up = nn.ModuleList(nn.Conv2d(b, a, 1) for a, b in pairwise(widths))
         self.enter = nn.ModuleList(nn.Sequential(*(Block(width) for _ in range(count)))
-                                   for width, count in zip(widths, self.BLOCKS, strict=True))
+                                   for width, count in zip(widths, blocks, strict=True))
         self.leave = nn.ModuleList(Block(width) for width in widths)
         self.attention = nn.ModuleList(Attention(width, self.HEADS) for width in widths[-2:])
         self.head = nn.Conv2d(widths[0], 6 * CELL**2, 1)

@@ -20,7 +20,7 @@ Random = np.random.Generator
 
 
 class Layers(NamedTuple):
-    """A flare on the square canvas, as `synthesis.layers.Flare` has it, in any float type."""
+    """A flare on the square canvas, as `synthesis.layers.Flare` has it: float32 where it is drawn."""
 
     rest: NDArray[Any]
     glare: NDArray[Any]
@@ -95,7 +95,7 @@ def _placed(random: Random, layers: Layers, width: int, height: int,
     shift = random.normal(0, 0.01 if random.random() < 0.8 else 0.25, 2) * half
     offset = np.array([width / 2, height / 2]) + shift - linear @ np.array([size / 2, size / 2])
     matrix = np.concatenate([linear, offset[:, None]], 1)
-    rest, glare, light = (cv2.warpAffine(np.asarray(layer, np.float32), matrix, (width, height),
+    rest, glare, light = (cv2.warpAffine(layer, matrix, (width, height),
                                          flags=cv2.INTER_LINEAR)
                           for layer in (layers.rest, layers.glare, layers.light))
     if random.random() < 0.25:

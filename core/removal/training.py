@@ -7,7 +7,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,15 +17,16 @@ from ..errors import Cancelled, RunError
 from ..progress import Progress
 from . import weights
 from .backgrounds import Backgrounds
-from .bank import Mixed, OneFlare, OwnFlares, SynthesisBank
+from .bank import OneFlare, OwnFlares
+from .batches import Batch, Batches, drawn_ahead, processes_here
 from .network import RemovalNetwork
-from .pairs import Bank, Pair, pair
-from .recipe import Recipe, as_dict, from_dict
+from .pairs import Pair, pair
+from .recipe import Recipe, as_dict
 from .synthesis.layers import CLASSES
 from .synthesis.prescription import Prescription
 
 CHECKPOINT, WEIGHTS, LOG = "checkpoint.safetensors", "removal.safetensors", "training.jsonl"
-CHECK_EVERY = 500
+CHECK_EVERY = 1000
 CHECK_SEED = 20_000
 CHECKS = 64
 CHECK_SIZE, CHECK_CANVAS = (256, 160), 288
@@ -41,63 +42,25 @@ def device() -> torch.device:
     return torch.device("cuda" if torch.cuda.is_available() else "cpu")
 
 
-class Batch(NamedTuple):
-    """Frames, scenes and gentle pictures (n, 3, h, w), display values 0..1."""
-
-    frame: Tensor
-    scene: Tensor
-    gentle: Tensor
-
-
-def batch_of(pairs: Sequence[Pair]) -> Batch:
-    """Pairs of one size as tensors."""
-    parts = zip(*((one.frame, one.scene, one.gentle) for one in pairs), strict=True)
-    return Batch(*(torch.from_numpy(np.stack(part)).permute(0, 3, 1, 2).contiguous() for part in parts))
-
-
 class Trainer:
-    """Network, optimiser and flares at an iteration; what a step sees is a function of seed and iteration."""
+    """Network and optimiser at an iteration."""
 
-    def __init__(self, recipe: Recipe, backgrounds: Backgrounds, lenses: Sequence[Prescription],
-                 own: OwnFlares | None = None) -> None:
+    def __init__(self, recipe: Recipe) -> None:
         self.recipe, self.iteration = recipe, 0
         self.device = device()
-        self._backgrounds = backgrounds
-        self._made = SynthesisBank(recipe.seed, recipe.bank, recipe.canvas, lenses)
-        self._bank: Bank = Mixed(self._made, own, recipe.own_share) if own else self._made
         torch.manual_seed(recipe.seed)
-        self.network = RemovalNetwork(recipe.widths).to(self.device)
+        self.network = RemovalNetwork(recipe.widths, recipe.blocks).to(self.device)
         self.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # twice as fast here
         self.optimiser = torch.optim.AdamW(self.network.parameters(), recipe.learning_rate,
-                                           weight_decay=recipe.decay)
+                                           weight_decay=recipe.decay, fused=True)
         self.averaged = {name: value.detach().clone() for name, value in self.network.state_dict().items()}
 
-    def fill(self, progress: Progress) -> None:
-        """Make the flares that this iteration has at hand."""
-        goal = self._serial(self.iteration)
-        first = max(goal - len(self._made), 0)
-        progress.stage("flares", goal - first)
-        for number in range(first, goal):
-            self._made.renew_to(number + 1)
-            progress.advance()
-
-    def _serial(self, iteration: int) -> int:
-        return len(self._made) + iteration // self.recipe.renew_every
-
-    def draw(self, iteration: int) -> Batch:
-        """The pictures of an iteration, under the flares at hand."""
-        random = np.random.default_rng((self.recipe.seed, iteration))
-        size = self.recipe.frame_size(random, iteration)
-        return batch_of([pair(random, self._bank, self._backgrounds, *size, clean=self.recipe.clean)
-                         for _ in range(self.recipe.stage(iteration)[1])])
-
-    def step(self) -> dict[str, float]:
+    def step(self, batch: Batch) -> dict[str, float]:
         """One iteration; its figures."""
         recipe = self.recipe
-        self._made.renew_to(self._serial(self.iteration))
         for group in self.optimiser.param_groups:
             group["lr"] = recipe.rate(self.iteration)
-        loss, figures = self.loss(self.draw(self.iteration))
+        loss, figures = self.loss(batch)
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()
         torch.nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
@@ -105,8 +68,7 @@ class Trainer:
         # The first steps' weights are not worth keeping for as long as later ones'.
         kept = min(recipe.average, (self.iteration + 1) / (self.iteration + 10))
         with torch.no_grad():
-            for name, value in self.network.state_dict().items():
-                self.averaged[name].lerp_(value, 1 - kept)
+            torch._foreach_lerp_(list(self.averaged.values()), list(self.network.state_dict().values()), 1 - kept)
         self.iteration += 1
         return figures
 
@@ -115,7 +77,7 @@ class Trainer:
         one: at first strong flares lead, which are learned sooner, in the end faint ones count as much, and what
         is told where there is none counts for more. Over the last `polish` of a training the logarithm of the
         error, which is the picture's PSNR. At half the weight the same of the gentle part."""
-        frame, scene, gentle = (part.to(self.device) for part in batch)
+        frame, scene, gentle = (torch.from_numpy(part).permute(0, 3, 1, 2).to(self.device) for part in batch)
         with torch.autocast(self.device.type, dtype=torch.bfloat16):
             told = self.network(frame)
         goal = frame - scene
@@ -135,7 +97,7 @@ class Trainer:
     @torch.no_grad()
     def check(self, pairs: Mapping[str, Sequence[Pair]]) -> dict[str, float]:
         """PSNR gained over the untouched frame, dB, by class and on average, by the averaged weights."""
-        network = RemovalNetwork(self.recipe.widths)
+        network = RemovalNetwork(self.recipe.widths, self.recipe.blocks)
         network.load_state_dict({name: value.cpu() for name, value in self.averaged.items()})
         gains: dict[str, float] = {}
         for kind, some in pairs.items():
@@ -190,12 +152,13 @@ def checks(backgrounds: Backgrounds, lenses: Sequence[Prescription], count: int 
 
 def train(recipe: Recipe, folder: Path | str, backgrounds: Backgrounds, lenses: Sequence[Prescription], *,
           tests: tuple[Backgrounds, Sequence[Prescription]] | None = None, own: OwnFlares | None = None,
-          resume: bool = False, start: Path | None = None, save_every_s: float = 300,
+          resume: bool = False, start: Path | None = None, save_every_s: float = 300, processes: int | None = None,
           progress: Progress | None = None) -> Path:
     """Train in `folder` and give the path of the weights (safetensors, fp16).
 
     With `resume` a training in the folder goes on, by the given recipe from there on. `start`:
-    weights to begin with. `tests`: backgrounds and lenses kept out, for the checks in the log.
+    weights to begin with. `tests`: backgrounds and lenses kept out, for the checks in the log. `processes` draw the
+    pictures, which are the same by any number.
     Raises RunError, SettingsError, and Cancelled when asked to stop (after a checkpoint).
     """
     progress, folder = progress or Progress(), Path(folder)
@@ -207,24 +170,25 @@ def train(recipe: Recipe, folder: Path | str, backgrounds: Backgrounds, lenses: 
     iteration = 0
     if path.exists():
         state, kept = weights.read(path)
-        given = from_dict(json.loads(kept["recipe"]))
-        recipe = replace(recipe, widths=given.widths, seed=given.seed)
+        recipe = replace(recipe, seed=json.loads(kept["recipe"])["seed"])
         iteration = int(kept["iteration"])
     elif start is not None:
         state, kept = weights.read(start)
-        given = from_dict(json.loads(kept["recipe"]))
-        recipe = replace(recipe, widths=given.widths)
-    trainer = Trainer(recipe, backgrounds, lenses, own)
+    if state:
+        widths, blocks = weights.form(kept)
+        recipe = replace(recipe, widths=widths, blocks=blocks)
+    trainer = Trainer(recipe)
     if state:
         trainer.load_state(state, iteration)
-    trainer.fill(progress)
+    batches = drawn_ahead(Batches(recipe, backgrounds, lenses, own), iteration, recipe.iterations,
+                          processes_here() if processes is None else processes)
     held_out = checks(*tests) if tests else {}
     progress.stage("train", recipe.iterations, trainer.iteration)
     saved, began, first = time.monotonic(), time.monotonic(), trainer.iteration
     sums: dict[str, float] = {}
     try:
         while trainer.iteration < recipe.iterations:
-            figures = trainer.step()
+            figures = trainer.step(next(batches))
             sums = {name: sums.get(name, 0.0) + value for name, value in figures.items()}
             here = trainer.iteration
             if here % CHECK_EVERY == 0 or here == recipe.iterations:

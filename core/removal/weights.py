@@ -6,13 +6,13 @@ import json
 from collections.abc import Mapping
 from functools import lru_cache
 from pathlib import Path
+from typing import NamedTuple
 
 from torch import Tensor
 
-from ..errors import RunError, SettingsError
+from ..errors import RunError
 from ..files import atomic_path
 from .network import RemovalNetwork
-from .recipe import from_dict
 
 IN_THE_BOX = Path(__file__).parent / "box" / "removal.safetensors"
 
@@ -41,14 +41,26 @@ def read(path: Path | str) -> tuple[dict[str, Tensor], dict[str, str]]:
         raise RunError(f"{path} is damaged ({problem}); get it again.") from problem
 
 
+class Form(NamedTuple):
+    """What RemovalNetwork is made with."""
+
+    widths: tuple[int, ...]
+    blocks: tuple[int, ...]
+
+
+def form(about: Mapping[str, str]) -> Form:
+    """Of the recipe in a header, the rest of which may be of an older program."""
+    recipe = json.loads(about["recipe"])
+    return Form(tuple(recipe["widths"]), tuple(recipe["blocks"]))
+
+
 @lru_cache(maxsize=2)
 def load(path: Path = IN_THE_BOX) -> RemovalNetwork:
     """The network of a weights file, on the processor, ready to tell flares. Raises RunError."""
     tensors, about = read(path)
     try:
-        recipe = from_dict(json.loads(about["recipe"]))
-        network = RemovalNetwork(recipe.widths)
+        network = RemovalNetwork(*form(about))
         network.load_state_dict({name: value.float() for name, value in tensors.items()})
-    except (KeyError, ValueError, RuntimeError, SettingsError) as problem:
+    except (KeyError, ValueError, TypeError, RuntimeError) as problem:
         raise RunError(f"{path} holds no weights of the removal network; train it with train-removal.") from problem
     return network.eval()

@@ -38,6 +38,9 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--lpips", type=Path, metavar="DIR",
                         help="for diffusion: weights of LPIPS, which then is a part of the loss")
     parser.add_argument("--threads", type=int, metavar="N", help="processor threads (default: all)")
+    parser.add_argument("--processes", type=int, metavar="N",
+                        help="that draw pictures ahead, which are the same by any number; 0: none besides this one "
+                             "(default: one, with a GPU up to eight)")
 
 
 def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
@@ -72,7 +75,7 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     progress.say(f"{len(backgrounds.photos)} photographs, {len(backgrounds.maps)} environment maps, {len(train_on)} "
                  f"lenses, {len(own) if own else 'no'} flares of your own.")
     path = train(recipe, words.out, backgrounds, train_on, tests=tests, own=own, resume=words.resume, start=start,
-                 progress=progress)
+                 processes=words.processes, progress=progress)
     progress.say(f"The weights are in {path}; use them with `remove --weights`.")
     return {"weights": str(path)}
 

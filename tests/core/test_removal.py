@@ -29,7 +29,7 @@ TINY = Recipe(widths=(8, 8, 8, 8, 8))
 def network_file(path: Path, seed: int = 0, bias: float = 0.0) -> Path:
     """A small network of random weights; `bias` makes it see flare everywhere (> 0) or nowhere (< 0)."""
     torch.manual_seed(seed)
-    network = RemovalNetwork(TINY.widths)
+    network = RemovalNetwork(TINY.widths, TINY.blocks)
     with torch.no_grad():
         network.head.weight.mul_(0.1)
         network.head.bias[:3] = bias
@@ -86,14 +86,14 @@ def test_every_level_sees_the_frame_turned_about_its_middle_and_its_darkest_valu
 
 @pytest.mark.parametrize("size", [(32, 32), (64, 128)])
 def test_the_network_is_fully_convolutional(size: tuple[int, int]) -> None:
-    told = RemovalNetwork(TINY.widths)(torch.rand(2, 3, *size))
+    told = RemovalNetwork(TINY.widths, TINY.blocks)(torch.rand(2, 3, *size))
     assert told.flare.shape == told.gentle.shape == (2, 3, *size)
 
 
 def test_what_is_far_away_counts() -> None:
     """A light in one corner may have its ghost in the other."""
     torch.manual_seed(3)
-    network = RemovalNetwork(TINY.widths)
+    network = RemovalNetwork(TINY.widths, TINY.blocks)
     for parameter in network.parameters():
         torch.nn.init.normal_(parameter, std=0.3)
     frame = torch.full((1, 3, 96, 96), 0.2, requires_grad=True)
@@ -103,7 +103,7 @@ def test_what_is_far_away_counts() -> None:
 
 
 def test_weights_keep_their_recipe_and_damage_is_told(tmp_path: Path, everywhere: Path) -> None:
-    assert weights.load(everywhere).widths == TINY.widths
+    assert [see.out_channels for see in weights.load(everywhere).see] == list(TINY.widths)
     with pytest.raises(RunError, match="missing"):
         weights.read(tmp_path / "none.safetensors")
     (tmp_path / "bad.safetensors").write_bytes(b"no weights")

@@ -147,14 +147,18 @@ def test_a_share_of_the_pairs_is_clean() -> None:
 
 def test_a_bank_is_renewed_as_if_never_stopped() -> None:
     through, later = (SynthesisBank(4, 3, SIZE, lenses.built_in()) for _ in range(2))
-    for serial in range(3, 6):
-        through.renew_to(serial)
-    assert later.renew_to(5) == 3
+    for end in range(3, 6):
+        through.renew_to(end)
+        for seed in range(6):
+            through.draw(np.random.default_rng(seed))
+    later.renew_to(5)
     for seed in range(6):
         a, b = (bank.draw(np.random.default_rng(seed)) for bank in (through, later))
         assert np.array_equal(a.rest, b.rest)
-    with pytest.raises(SettingsError, match="empty"):
-        SynthesisBank(4, 3, SIZE, []).draw(np.random.default_rng(0))
+    drawn = [{float(bank.draw(np.random.default_rng(seed)).rest.sum()) for seed in range(20)}
+             for bank in (through, SynthesisBank(4, 3, SIZE, lenses.built_in()))]
+    assert [len(some) for some in drawn] == [3, 3]
+    assert len(drawn[0] & drawn[1]) == 1, "of the flares 0 to 2, two made way for 3 and 4"
 
 
 def test_own_flares_with_their_lights(tmp_path: Path) -> None:

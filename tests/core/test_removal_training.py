@@ -15,18 +15,23 @@ from core.pictures import Pixels, write_png
 from core.progress import Progress
 from core.removal import evaluation, training, weights
 from core.removal.backgrounds import Backgrounds
+from core.removal.batches import Batches
 from core.removal.recipe import Recipe, as_dict, from_dict
 from core.removal.synthesis.prescription import built_in
 
 torch.set_num_threads(1)  # small tensors, on which threads only wait for each other
 
 WIDTHS = (8, 8, 8, 8, 8)
-RECIPE = Recipe(iterations=4, stages=((0.5, 64, 2), (1.0, 96, 1)), widths=WIDTHS, bank=2, canvas=64)
+RECIPE = Recipe(iterations=4, stages=((0.5, 64, 64), (1.0, 64, 96)), pixels=8000, widths=WIDTHS, bank=2, canvas=64)
 
 
 def backgrounds() -> Backgrounds:
     x, y = np.meshgrid(np.linspace(0, 150, 300), np.linspace(20, 100, 200))
     return Backgrounds([np.stack([x, y, 120 - y], -1).astype(np.uint8)], [])
+
+
+def widths_of(path: Path) -> tuple[int, ...]:
+    return tuple(see.out_channels for see in weights.load(path).see)  # type: ignore[union-attr, misc]
 
 
 class StopAfter(Progress):
@@ -45,25 +50,25 @@ class StopAfter(Progress):
 
 
 def test_a_training_that_was_stopped_goes_on_as_if_it_was_not(tmp_path: Path) -> None:
-    whole = training.train(RECIPE, tmp_path / "whole", backgrounds(), built_in())
+    whole = training.train(RECIPE, tmp_path / "whole", backgrounds(), built_in(), processes=0)
     with pytest.raises(Cancelled):
-        training.train(RECIPE, tmp_path / "parts", backgrounds(), built_in(), progress=StopAfter(2))
+        training.train(RECIPE, tmp_path / "parts", backgrounds(), built_in(), processes=1,
+                       progress=StopAfter(2))
     with pytest.raises(RunError, match="--resume"):
         training.train(RECIPE, tmp_path / "parts", backgrounds(), built_in())
-    parts = training.train(RECIPE, tmp_path / "parts", backgrounds(), built_in(), resume=True)
+    parts = training.train(RECIPE, tmp_path / "parts", backgrounds(), built_in(), resume=True, processes=1)
     a, b = weights.read(whole)[0], weights.read(parts)[0]
     assert a.keys() == b.keys()
     for name in a:
         assert a[name].dtype == torch.float16
         torch.testing.assert_close(a[name], b[name], atol=1e-3, rtol=1e-2)
-    assert weights.load(whole).widths == RECIPE.widths
+    assert widths_of(whole) == RECIPE.widths
 
 
 def test_a_handful_of_pairs_is_learned() -> None:
-    recipe = Recipe(stages=((1.0, 64, 4),), widths=(16, 16, 16, 16, 16), bank=2, canvas=64, clean=0)
-    trainer = training.Trainer(recipe, backgrounds(), built_in())
-    trainer.fill(Progress())
-    batch = trainer.draw(0)
+    recipe = Recipe(stages=((1.0, 64, 64),), pixels=16_384, widths=(16, 16, 16, 16, 16), bank=2, canvas=64, clean=0)
+    trainer = training.Trainer(recipe)
+    batch = Batches(recipe, backgrounds(), built_in())[0]
     figures = {}
     for _ in range(120):
         for group in trainer.optimiser.param_groups:
@@ -76,27 +81,33 @@ def test_a_handful_of_pairs_is_learned() -> None:
 
 
 def test_stages_of_a_training() -> None:
-    recipe = Recipe(iterations=100, stages=((0.5, 64, 2), (1.0, 128, 1)), widths=WIDTHS, bank=2, canvas=64)
-    assert [recipe.stage(at) for at in (0, 49, 50, 99, 200)] == [(64, 2), (64, 2), (128, 1), (128, 1), (128, 1)]
-    trainer = training.Trainer(recipe, backgrounds(), built_in())
-    trainer.fill(Progress())
-    early, late = trainer.draw(3), trainer.draw(70)
-    assert len(early.frame) == 2 and len(late.frame) == 1
-    assert max(early.frame.shape[2:]) < max(late.frame.shape[2:])
-    torch.testing.assert_close(trainer.draw(3).frame, early.frame, atol=0, rtol=0)
+    recipe = Recipe(iterations=100, stages=((0.5, 64, 96), (1.0, 160, 256)), pixels=40_000, bank=2, canvas=64)
+    assert [recipe.stage(at) for at in (0, 49, 50, 200)] == [(64, 96), (64, 96), (160, 256), (160, 256)]
+    for at in range(100):
+        count, width, height = recipe.frames(np.random.default_rng(at), at)
+        least, most = recipe.stage(at)
+        assert least - 16 <= max(width, height) <= most + 16
+        assert width % 32 == height % 32 == 0 and min(width, height) >= 64
+        assert count == max(round(40_000 / (width * height)), 1)
+    batches = Batches(recipe, backgrounds(), built_in())
+    early, late = batches[3], batches[70]
+    assert early.frame.shape == early.scene.shape == early.gentle.shape
+    assert len(early.frame) > len(late.frame) >= 1
+    assert max(early.frame.shape[1:3]) < max(late.frame.shape[1:3])
+    assert np.array_equal(batches[3].frame, early.frame)
 
 
 def test_going_on_from_weights(tmp_path: Path) -> None:
-    first = training.train(RECIPE, tmp_path / "first", backgrounds(), built_in())
-    second = training.train(RECIPE, tmp_path / "second", backgrounds(), built_in(), start=first)
+    first = training.train(RECIPE, tmp_path / "first", backgrounds(), built_in(), processes=0)
+    second = training.train(RECIPE, tmp_path / "second", backgrounds(), built_in(), start=first, processes=0)
     assert weights.read(second)[1]["iteration"] == "4"
     other = Recipe(**{**RECIPE.__dict__, "widths": (16, 8, 8, 8, 8)})
-    third = training.train(other, tmp_path / "third", backgrounds(), built_in(), start=first)
-    assert weights.load(third).widths == RECIPE.widths, "the network is that of the weights"
+    third = training.train(other, tmp_path / "third", backgrounds(), built_in(), start=first, processes=0)
+    assert widths_of(third) == RECIPE.widths, "the network is that of the weights"
 
 
 def test_the_log_has_figures_and_checks(tmp_path: Path) -> None:
-    training.train(RECIPE, tmp_path, backgrounds(), built_in(), tests=(backgrounds(), built_in()))
+    training.train(RECIPE, tmp_path, backgrounds(), built_in(), tests=(backgrounds(), built_in()), processes=0)
     (line,) = [json.loads(text) for text in (tmp_path / training.LOG).read_text(encoding="utf-8").splitlines()]
     assert line["iteration"] == 4
     assert {"error", "untouched", "gain_db"} <= line.keys()
@@ -113,10 +124,13 @@ def test_recipes(tmp_path: Path) -> None:
         from_dict({"speed": 1})
     with pytest.raises(SettingsError, match="5 levels"):
         Recipe(widths=())
-    with pytest.raises(SettingsError, match="stages"):
-        Recipe(stages=((1.0, 32, 1),))
-    sizes = [recipe.frame_size(np.random.default_rng(k), 20 * k) for k in range(50)]
-    assert all(side % 32 == 0 and side >= 64 for size in sizes for side in size)
+    with pytest.raises(SettingsError, match="5 levels"):
+        Recipe(blocks=(1, 1))
+    for stage in ((1.0, 32, 64), (1.0, 96, 64), (1.0, 96)):
+        with pytest.raises(SettingsError, match="stages"):
+            Recipe(stages=(stage,))  # type: ignore[arg-type]
+    with pytest.raises(SettingsError, match="one iteration, pixel and flare"):
+        Recipe(pixels=0)
 
 
 # Scores.

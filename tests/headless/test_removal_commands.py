@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +14,9 @@ import torch
 from fit_flare.core.pictures import read_picture, write_png
 from fit_flare.headless import cli
 
-SMALL = ("--set", "widths=[8,8,8,8,8]", "--set", "stages=[[1.0,64,1]]", "--set", "bank=2", "--set", "canvas=64")
+RUN = Path(__file__).resolve().parents[2] / "headless" / "run.py"
+SMALL = [word for change in ("widths=[8,8,8,8,8]", "stages=[[1.0,64,64]]", "pixels=1", "bank=2", "canvas=64")
+         for word in ("--set", change)]
 
 
 @pytest.fixture(scope="module")
@@ -28,7 +32,8 @@ def test_training_is_stopped_by_its_length_and_goes_on(backgrounds: Path, tmp_pa
                                                        capsys: pytest.CaptureFixture[str]) -> None:
     torch.set_num_threads(1)
     words = ["train-removal", "--backgrounds", str(backgrounds), "--out", str(tmp_path / "made"), *SMALL]
-    assert cli.main([*words, "--iterations", "2"]) == 0
+    subprocess.run([sys.executable, RUN, *words, "--iterations", "2"], check=True)  # another process draws
+    words += ["--processes", "0"]
     assert cli.main([*words, "--iterations", "3"]) == 1
     assert "--resume" in capsys.readouterr().err
     assert cli.main([*words, "--iterations", "3", "--resume"]) == 0

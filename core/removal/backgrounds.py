@@ -30,24 +30,45 @@ def kept_for_test(name: str) -> bool:
 
 @dataclass(frozen=True)
 class Backgrounds:
-    """Decoded pictures: photos as uint8 (h, w, 3) display values, maps as float16 equirectangular light."""
+    """Decoded pictures: photos as uint8 (h, w, 3) display values, maps as float16 equirectangular light.
+
+    varied: for training, to which few pictures are to look like many: some are filmed sideways or under coloured
+    light, some meet another or are seen through its reflection.
+    """
 
     photos: Sequence[NDArray[np.uint8]]
     maps: Sequence[NDArray[np.float16]]
+    varied: bool = False
 
     def draw(self, random: Random, width: int, height: int, gamma: float) -> Pixels:
         """(height, width, 3) linear light: a random window of a random picture, at a random scale; one in eight out
         of focus, so that what is bright and soft is no flare for that alone."""
+        scene = (self._varied if self.varied else self._filmed)(random, width, height, gamma)
+        return _defocused(random, scene) if random.random() < 0.125 else scene
+
+    def _filmed(self, random: Random, width: int, height: int, gamma: float) -> Pixels:
         photos = len(self.photos)
         share = len(self.maps) * 3 / (photos + len(self.maps) * 3)
         if random.random() < share:
-            scene = _view(random, self.maps[int(random.integers(len(self.maps)))], width, height)
-        else:
-            scene = _window(random, self.photos[int(random.integers(photos))], width, height, gamma)
-        return _defocused(random, scene) if random.random() < 0.125 else scene
+            return _view(random, self.maps[int(random.integers(len(self.maps)))], width, height)
+        return _window(random, self.photos[int(random.integers(photos))], width, height, gamma)
+
+    def _varied(self, random: Random, width: int, height: int, gamma: float) -> Pixels:
+        scene = self._turned(random, width, height, gamma)
+        if random.random() < 0.25:
+            scene = _joined(random, scene, self._turned(random, width, height, gamma))
+        if random.random() < 0.2:
+            scene = scene * np.exp(random.normal(0, 0.35, 3)).astype(np.float32)
+        return scene
+
+    def _turned(self, random: Random, width: int, height: int, gamma: float) -> Pixels:
+        if random.random() < 0.15:
+            return np.ascontiguousarray(self._filmed(random, height, width, gamma).swapaxes(0, 1))
+        return self._filmed(random, width, height, gamma)
 
 
-def read_backgrounds(folders: Iterable[Path | str], part: Part = "all", longest: int = 720) -> Backgrounds:
+def read_backgrounds(folders: Iterable[Path | str], part: Part = "all", longest: int = 720, *,
+                     varied: bool = False) -> Backgrounds:
     """Read every photograph and environment map below the folders, photographs reduced to `longest` pixels.
 
     Environment maps are .hdr, or .exr twice as wide as high. Raises SettingsError where nothing is found.
@@ -76,7 +97,7 @@ def read_backgrounds(folders: Iterable[Path | str], part: Part = "all", longest:
     if not photos and not maps:
         raise SettingsError(f"There are no pictures in {', '.join(looked) or 'no folder'}; name a folder of clean "
                             "photographs or environment maps.")
-    return Backgrounds(photos, maps)
+    return Backgrounds(photos, maps, varied)
 
 
 def _environment(path: Path) -> NDArray[np.float16] | None:
@@ -140,6 +161,21 @@ def _view(random: Random, light: NDArray[np.float16], width: int, height: int) -
                      cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
     exposure = math.exp(random.normal(math.log(0.18), 0.5)) / max(float(np.median(seen)), 1e-4)
     return np.asarray(seen * min(exposure, 20.0), np.float32)
+
+
+def _joined(random: Random, scene: Pixels, other: Pixels) -> Pixels:
+    """One beside the other, with a sharp or a soft edge between them; or one as a pane of glass reflects it over the
+    other."""
+    height, width = scene.shape[:2]
+    if random.random() < 0.3:
+        share = np.float32(random.uniform(0.2, 0.8))
+        return scene * share + other * (1 - share)
+    angle, soft = random.uniform(0, 2 * math.pi), math.exp(random.uniform(math.log(0.005), math.log(0.3)))
+    x = np.linspace(-1, 1, width, dtype=np.float32)[None, :]
+    y = np.linspace(-1, 1, height, dtype=np.float32)[:, None]
+    beside = (x * np.float32(math.cos(angle)) + y * np.float32(math.sin(angle)) - random.uniform(-0.7, 0.7)) / soft
+    share_of = (1 / (1 + np.exp(-np.clip(beside, -30, 30)))).astype(np.float32)[..., None]
+    return np.asarray(scene + (other - scene) * share_of, np.float32)
 
 
 def _defocused(random: Random, scene: Pixels) -> Pixels:

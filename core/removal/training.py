@@ -76,23 +76,25 @@ class Trainer:
         """Of each picture the squared error in parts of the flare's own square to a power that rises from a half to
         one: at first strong flares lead, which are learned sooner, in the end faint ones count as much, and what
         is told where there is none counts for more. Over the last `polish` of a training the logarithm of the
-        error, which is the picture's PSNR. At half the weight the same of the gentle part."""
+        error in parts of that square, which is the picture's gain in PSNR; what a picture loses counts twice. At half
+        the weight the same of the gentle part."""
         frame, scene, gentle = (torch.from_numpy(part).permute(0, 3, 1, 2).to(self.device) for part in batch)
         with torch.autocast(self.device.type, dtype=torch.bfloat16):
             told = self.network(frame)
-        goal = frame - scene
-        before = goal.square().mean((1, 2, 3))
-        error = torch.stack([told.flare - goal, told.gentle - (frame - gentle)]).square().mean((2, 3, 4))
+        goals = torch.stack([frame - scene, frame - gentle])
+        before = goals.square().mean((2, 3, 4))
+        error = (torch.stack([told.flare, told.gentle]) - goals).square().mean((2, 3, 4))
         done = min(self.iteration / self.recipe.iterations, 1.0)
         faint = FAINT[0] * (FAINT[1] / FAINT[0]) ** max(4 * done - 3, 0.0)
         if done < 1 - self.recipe.polish:
-            left = error / (before + faint) ** (0.5 + 0.5 * done)
+            left = error / (before[0] + faint) ** (0.5 + 0.5 * done)
         else:
-            left = torch.log(error + UNSEEN)
+            left = torch.log((error + UNSEEN) / (before + UNSEEN))
+            left = left + left.clamp(min=0)
         loss = left[0].mean() + 0.5 * left[1].mean()
-        gain = 10 * torch.log10((before + UNSEEN) / (error[0].detach() + UNSEEN))
+        gain = 10 * torch.log10((before[0] + UNSEEN) / (error[0].detach() + UNSEEN))
         return loss, {"loss": float(loss.detach()), "error": float(error[0].detach().mean()),
-                      "untouched": float(before.mean()), "gain": float(gain.mean())}
+                      "untouched": float(before[0].mean()), "gain": float(gain.mean())}
 
     @torch.no_grad()
     def check(self, pairs: Mapping[str, Sequence[Pair]]) -> dict[str, float]:

@@ -62,7 +62,7 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     lenses = read_lenses(words.lenses, words.most_lenses) if words.lenses else []
     train_on = [lens for lens in lenses if not kept_for_test(lens.name)] + built_in()
     test_on = [lens for lens in lenses if kept_for_test(lens.name)] or built_in()
-    backgrounds = read_backgrounds(words.backgrounds, "train")
+    backgrounds = read_backgrounds(words.backgrounds, "train", varied=True)
     try:
         tests = read_backgrounds(words.backgrounds, "test"), test_on
     except SettingsError:

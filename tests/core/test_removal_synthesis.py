@@ -193,3 +193,28 @@ def test_backgrounds_of_folders(tmp_path: Path) -> None:
     drawn = read_backgrounds([tmp_path]).draw(np.random.default_rng(0), 48, 32, 2.2)
     assert drawn.shape == (32, 48, 3)
     assert drawn.dtype == np.float32
+
+
+def test_few_backgrounds_look_like_many() -> None:
+    ramp = np.broadcast_to(np.linspace(20, 240, 160)[None, :, None] * np.array([1, 0.5, 0.25]), (120, 160, 3))
+    plain, varied = (Backgrounds([ramp.astype(np.uint8)], [], varied) for varied in (False, True))
+
+    def drawn(some: Backgrounds) -> list[formation.Pixels]:
+        scenes = [some.draw(np.random.default_rng(seed), 48, 32, 2.0) for seed in range(60)]
+        assert all(scene.shape == (32, 48, 3) and scene.dtype == np.float32 and scene.min() >= 0 for scene in scenes)
+        return scenes
+
+    def sideways(scene: formation.Pixels) -> bool:
+        return bool(np.ptp(scene[..., 0], 0).mean() > np.ptp(scene[..., 0], 1).mean())
+
+    def tinted(scene: formation.Pixels) -> bool:
+        return abs(float(scene[..., 0].mean() / scene[..., 1].mean()) / 4 - 1) > 0.2
+
+    def straight(scene: formation.Pixels) -> bool:
+        rows, columns = (np.diff(scene[..., 0], axis=axis) for axis in (0, 1))
+        return bool(np.abs(rows).max() < 0.01 or np.abs(columns).max() < 0.01)
+
+    for scene in drawn(plain):
+        assert not sideways(scene) and not tinted(scene) and straight(scene)
+    for trait in (sideways, tinted, lambda scene: not straight(scene)):
+        assert 3 <= sum(map(trait, drawn(varied))) <= 40

@@ -29,9 +29,9 @@ Pixels = NDArray[np.float32]
 
 WORKING_SIZE = 256
 """Long side that the network sees: about what it was trained at last."""
-LEAST = 0.015
+LEAST = 0.01
 """What a flare adds to display values, below which there is none."""
-SURE = 0.02
+SURE = 0.004
 """Mean over the frame of what a flare adds, below which the network is not trusted at all; from twice as much on
 it is trusted whole. It tells small flares where there are none."""
 RADIUS, SMOOTHNESS = 1, 1e-3

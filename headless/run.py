@@ -52,7 +52,7 @@ def leave(status: int) -> None:
     sys.exit(status)
 
 
-if __name__ == "__mp_main__":  # of a process that one of ours has spawned (Windows, macOS), where names are looked up
+if __name__ == "__mp_main__":  # a process that one of ours has spawned, which looks up our modules by name
     load()
 if __name__ == "__main__":
     package = load()

@@ -174,8 +174,8 @@ def _joined(random: Random, scene: Pixels, other: Pixels) -> Pixels:
     x = np.linspace(-1, 1, width, dtype=np.float32)[None, :]
     y = np.linspace(-1, 1, height, dtype=np.float32)[:, None]
     beside = (x * np.float32(math.cos(angle)) + y * np.float32(math.sin(angle)) - random.uniform(-0.7, 0.7)) / soft
-    share_of = (1 / (1 + np.exp(-np.clip(beside, -30, 30)))).astype(np.float32)[..., None]
-    return np.asarray(scene + (other - scene) * share_of, np.float32)
+    of_other = (1 / (1 + np.exp(-np.clip(beside, -30, 30)))).astype(np.float32)[..., None]
+    return np.asarray(scene + (other - scene) * of_other, np.float32)
 
 
 def _defocused(random: Random, scene: Pixels) -> Pixels:

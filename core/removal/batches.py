@@ -14,7 +14,7 @@ from torch.utils.data import DataLoader, Dataset
 
 from .backgrounds import Backgrounds
 from .bank import Mixed, OwnFlares, SynthesisBank
-from .pairs import Bank, pair
+from .pairs import Bank, Pair, pair
 from .recipe import Recipe
 from .synthesis.prescription import Prescription
 
@@ -32,7 +32,7 @@ class Batch(NamedTuple):
 
 
 class Batches(Dataset[Batch]):
-    """The batch of every iteration."""
+    """The batch of every iteration, under the flares that are at hand then."""
 
     def __init__(self, recipe: Recipe, backgrounds: Backgrounds, lenses: Sequence[Prescription],
                  own: OwnFlares | None = None) -> None:
@@ -41,13 +41,16 @@ class Batches(Dataset[Batch]):
         self._bank: Bank = Mixed(self._made, own, recipe.own_share) if own else self._made
 
     def __getitem__(self, iteration: int) -> Batch:
-        recipe = self._recipe
-        self._made.renew_to(recipe.bank + iteration // recipe.renew_every)
-        random = np.random.default_rng((recipe.seed, iteration))
-        count, *size = recipe.frames(random, iteration)
-        pairs = [pair(random, self._bank, self._backgrounds, *size, clean=recipe.clean) for _ in range(count)]
+        random = np.random.default_rng((self._recipe.seed, iteration))
+        pairs = self.pairs(random, iteration, *self._recipe.frames(random, iteration))
         return Batch(*(np.stack(part) for part in zip(*((one.frame, one.scene, one.gentle) for one in pairs),
                                                       strict=True)))
+
+    def pairs(self, random: np.random.Generator, iteration: int, count: int, width: int, height: int) -> list[Pair]:
+        """So many of that size."""
+        self._made.renew_to(self._recipe.bank + iteration // self._recipe.renew_every)
+        return [pair(random, self._bank, self._backgrounds, width, height, clean=self._recipe.clean)
+                for _ in range(count)]
 
 
 def drawn_ahead(batches: Batches, first: int, end: int, processes: int) -> Iterator[Batch]:
@@ -56,7 +59,7 @@ def drawn_ahead(batches: Batches, first: int, end: int, processes: int) -> Itera
     loader = DataLoader(batches, batch_size=None, sampler=range(first, end), num_workers=processes,
                         prefetch_factor=AHEAD if processes else None,
                         collate_fn=_as_they_are,  # type: ignore[arg-type]  # of single samples, with batch_size=None
-                        worker_init_fn=_begin,
+                        worker_init_fn=_begin_process,
                         multiprocessing_context="spawn" if processes else None)  # OpenCV's threads survive no fork
     return iter(loader)
 
@@ -72,7 +75,7 @@ def _as_they_are(batch: Batch) -> Batch:
     return batch
 
 
-def _begin(_process: int) -> None:
+def _begin_process(_process: int) -> None:
     """A stop is for the training, which ends its processes; pictures are drawn on one thread each."""
     import cv2
 

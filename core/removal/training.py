@@ -170,15 +170,14 @@ def train(recipe: Recipe, folder: Path | str, backgrounds: Backgrounds, lenses: 
         raise RunError(f"{folder} holds a training already; go on with --resume, or choose another folder.")
     state: Mapping[str, Tensor] = {}
     iteration = 0
-    if path.exists():
-        state, kept = weights.read(path)
-        recipe = replace(recipe, seed=json.loads(kept["recipe"])["seed"])
-        iteration = int(kept["iteration"])
-    elif start is not None:
-        state, kept = weights.read(start)
-    if state:
-        widths, blocks = weights.form(kept)
+    source = path if path.exists() else start
+    if source is not None:
+        state, kept = weights.read(source)
+        widths, blocks = weights.form(source, kept)
         recipe = replace(recipe, widths=widths, blocks=blocks)
+        if source == path:
+            recipe = replace(recipe, seed=json.loads(kept["recipe"])["seed"])
+            iteration = int(kept["iteration"])
     trainer = Trainer(recipe)
     if state:
         trainer.load_state(state, iteration)

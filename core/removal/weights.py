@@ -48,19 +48,27 @@ class Form(NamedTuple):
     blocks: tuple[int, ...]
 
 
-def form(about: Mapping[str, str]) -> Form:
-    """Of the recipe in a header, the rest of which may be of an older program."""
-    recipe = json.loads(about["recipe"])
-    return Form(tuple(recipe["widths"]), tuple(recipe["blocks"]))
+def form(path: Path | str, about: Mapping[str, str]) -> Form:
+    """Of the recipe in the header of a file, the rest of which may be of an older program. Raises RunError."""
+    try:
+        recipe = json.loads(about["recipe"])
+        return Form(tuple(recipe["widths"]), tuple(recipe["blocks"]))
+    except (KeyError, ValueError, TypeError) as problem:
+        raise _foreign(path) from problem
+
+
+def _foreign(path: Path | str) -> RunError:
+    return RunError(f"{path} holds no weights of the removal network; train it with train-removal.")
 
 
 @lru_cache(maxsize=2)
 def load(path: Path = IN_THE_BOX) -> RemovalNetwork:
     """The network of a weights file, on the processor, ready to tell flares. Raises RunError."""
     tensors, about = read(path)
+    made_with = form(path, about)
     try:
-        network = RemovalNetwork(*form(about))
+        network = RemovalNetwork(*made_with)
         network.load_state_dict({name: value.float() for name, value in tensors.items()})
-    except (KeyError, ValueError, TypeError, RuntimeError) as problem:
-        raise RunError(f"{path} holds no weights of the removal network; train it with train-removal.") from problem
+    except (RuntimeError, TypeError, ValueError) as problem:
+        raise _foreign(path) from problem
     return network.eval()

@@ -86,8 +86,7 @@ def _diffusion(words: argparse.Namespace, recipe: Any, backgrounds: Any, lenses:
 
     from ...core.metrics.lpips import Lpips
     from ...core.removal import diffusion
-    from ...core.removal.bank import Mixed, SynthesisBank
-    from ...core.removal.pairs import pair
+    from ...core.removal.batches import Batches
 
     diffusion.need()
     if words.base is None:
@@ -95,12 +94,10 @@ def _diffusion(words: argparse.Namespace, recipe: Any, backgrounds: Any, lenses:
     perceptual = Lpips(words.lpips).distance if words.lpips else None
     if perceptual is None:
         progress.say("The loss is L2 alone: no folder with the weights of LPIPS was given (--lpips).")
-    made = SynthesisBank(recipe.seed, recipe.bank, recipe.canvas, lenses)
-    bank = Mixed(made, own, recipe.own_share) if own else made
+    batches = Batches(recipe, backgrounds, lenses, own)
 
     def draw(number: int) -> Any:
-        made.renew_to(recipe.bank + number // recipe.renew_every)
-        one = pair(np.random.default_rng((recipe.seed, number)), bank, backgrounds, 512, 512, clean=recipe.clean)
+        (one,) = batches.pairs(np.random.default_rng((recipe.seed, number)), number, 1, 512, 512)
         return one.frame, one.gentle if words.keep_glare else one.scene
 
     path = diffusion.train_diffusion(diffusion.DiffusionRemoval(words.base), words.out, draw,

@@ -104,6 +104,10 @@ def test_going_on_from_weights(tmp_path: Path) -> None:
     other = Recipe(**{**RECIPE.__dict__, "widths": (16, 8, 8, 8, 8)})
     third = training.train(other, tmp_path / "third", backgrounds(), built_in(), start=first, processes=0)
     assert widths_of(third) == RECIPE.widths, "the network is that of the weights"
+    tensors, _ = weights.read(first)
+    weights.write(tmp_path / "foreign.safetensors", tensors, {"recipe": "{}"})
+    with pytest.raises(RunError, match="holds no weights"):
+        training.train(RECIPE, tmp_path / "fourth", backgrounds(), built_in(), start=tmp_path / "foreign.safetensors")
 
 
 def test_the_log_has_figures_and_checks(tmp_path: Path) -> None:

@@ -2,55 +2,61 @@
 """What a training sees: the pictures of each iteration, a function of recipe and iteration, drawn ahead."""
 from __future__ import annotations
 
-import os
-import signal
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from torch.utils.data import DataLoader, Dataset
 
 from .backgrounds import Backgrounds
 from .bank import Mixed, OwnFlares, SynthesisBank
+from .learners import ALONE, Learner, begin_process
 from .pairs import Bank, Pair, pair
 from .recipe import Recipe
 from .synthesis.prescription import Prescription
 
 AHEAD = 16
 """Iterations that each process draws ahead, so that one that draws new flares holds nobody up."""
-MOST_PROCESSES = 8
 
 
 class Batch(NamedTuple):
-    """Frames, scenes and gentle pictures (n, height, width, 3), float32, display values 0..1."""
+    """Frames, scenes and gentle pictures (n, height, width, 3), float32, display values 0..1; which share they are
+    of all that an iteration has."""
 
     frame: NDArray[np.float32]
     scene: NDArray[np.float32]
     gentle: NDArray[np.float32]
+    share: float
 
 
 class Batches(Dataset[Batch]):
-    """The batch of every iteration, under the flares that are at hand then."""
+    """The batch of every iteration, under the flares that are at hand then; of several learners that of `learner`.
+
+    Each frame is a function of the recipe, the iteration and its number in it: together the learners have the same
+    frames, however many they are.
+    """
 
     def __init__(self, recipe: Recipe, backgrounds: Backgrounds, lenses: Sequence[Prescription],
-                 own: OwnFlares | None = None) -> None:
-        self._recipe, self._backgrounds = recipe, backgrounds
+                 own: OwnFlares | None = None, learner: Learner = ALONE) -> None:
+        self._recipe, self._backgrounds, self._learner = recipe, backgrounds, learner
         self._made = SynthesisBank(recipe.seed, recipe.bank, recipe.canvas, lenses)
         self._bank: Bank = Mixed(self._made, own, recipe.own_share) if own else self._made
 
     def __getitem__(self, iteration: int) -> Batch:
-        random = np.random.default_rng((self._recipe.seed, iteration))
-        pairs = self.pairs(random, iteration, *self._recipe.frames(random, iteration))
-        return Batch(*(np.stack(part) for part in zip(*((one.frame, one.scene, one.gentle) for one in pairs),
-                                                      strict=True)))
+        count, width, height = self._recipe.frames(np.random.default_rng((self._recipe.seed, iteration)), iteration)
+        mine = [self.pair(iteration, number, width, height)
+                for number in range(self._learner.rank, count, self._learner.count)]
+        none = np.zeros((0, height, width, 3), np.float32)
+        frame, scene, gentle = (np.stack([getattr(one, part) for one in mine]) if mine else none
+                                for part in ("frame", "scene", "gentle"))
+        return Batch(frame, scene, gentle, len(mine) / count)
 
-    def pairs(self, random: np.random.Generator, iteration: int, count: int, width: int, height: int) -> list[Pair]:
-        """So many of that size."""
+    def pair(self, iteration: int, number: int, width: int, height: int) -> Pair:
+        """A frame of an iteration, of that size."""
         self._made.renew_to(self._recipe.bank + iteration // self._recipe.renew_every)
-        return [pair(random, self._bank, self._backgrounds, width, height, clean=self._recipe.clean)
-                for _ in range(count)]
+        random = np.random.default_rng((self._recipe.seed, iteration, number + 1))  # to numpy, (1, 2) is (1, 2, 0)
+        return pair(random, self._bank, self._backgrounds, width, height, clean=self._recipe.clean)
 
 
 def drawn_ahead(batches: Batches, first: int, end: int, processes: int) -> Iterator[Batch]:
@@ -64,21 +70,10 @@ def drawn_ahead(batches: Batches, first: int, end: int, processes: int) -> Itera
     return iter(loader)
 
 
-def processes_here() -> int:
-    """One keeps the network of a processor busy; a graphics card learns faster than one draws."""
-    others = (os.cpu_count() or 1) - 1
-    return min(others, MOST_PROCESSES if torch.cuda.is_available() else 1)
-
-
 def _as_they_are(batch: Batch) -> Batch:
     """Not as tensors, which would be sent through shared memory: containers often have little of it."""
     return batch
 
 
 def _begin_process(_process: int) -> None:
-    """A stop is for the training, which ends its processes; pictures are drawn on one thread each."""
-    import cv2
-
-    cv2.setNumThreads(1)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    begin_process()

@@ -3,22 +3,25 @@
 from __future__ import annotations
 
 import json
+import os
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ..errors import Cancelled, RunError
+from ..errors import Cancelled, RunError, SettingsError
 from ..progress import Progress
 from . import weights
 from .backgrounds import Backgrounds
 from .bank import OneFlare, OwnFlares
-from .batches import Batch, Batches, drawn_ahead, processes_here
+from .batches import Batch, Batches, drawn_ahead
+from .learners import ALONE, Learner, add_up, shared
 from .network import RemovalNetwork
 from .pairs import Pair, pair
 from .recipe import Recipe, as_dict
@@ -33,8 +36,12 @@ CHECK_SIZE, CHECK_CANVAS = (256, 160), 288
 FAINT = (1e-3, 2e-4)
 """Mean square of a flare, to which the errors of fainter ones are compared: 30 dB, and from three quarters of a
 training on falling to 37 dB."""
+FIGURES = ("loss", "error", "untouched", "gain")
 UNSEEN = 3e-5
 """Mean square of an error that is not seen: 45 dB."""
+MOST_LEARNERS, MOST_PROCESSES = 4, 8
+"""Large frames are not many in an iteration; beside a graphics card more than these do not draw faster than it
+learns."""
 
 
 def device() -> torch.device:
@@ -42,11 +49,23 @@ def device() -> torch.device:
     return torch.device("cuda" if torch.cuda.is_available() else "cpu")
 
 
-class Trainer:
-    """Network and optimiser at an iteration."""
+def processes_here() -> int:
+    """A training is best shared among."""
+    return min(os.cpu_count() or 1, MOST_PROCESSES if torch.cuda.is_available() else MOST_LEARNERS)
 
-    def __init__(self, recipe: Recipe) -> None:
-        self.recipe, self.iteration = recipe, 0
+
+def _half_where_fast(on: torch.device) -> Any:
+    """bfloat16 on processors that have it: on others torch's convolutions take 9 times as long with it as without."""
+    if on.type == "cpu" and not torch.cpu.get_capabilities().get("avx512_bf16"):
+        return nullcontext()
+    return torch.autocast(on.type, dtype=torch.bfloat16)
+
+
+class Trainer:
+    """Network and optimiser at an iteration, of one of the learners."""
+
+    def __init__(self, recipe: Recipe, learner: Learner = ALONE) -> None:
+        self.recipe, self.iteration, self.learner = recipe, 0, learner
         self.device = device()
         torch.manual_seed(recipe.seed)
         self.network = RemovalNetwork(recipe.widths, recipe.blocks).to(self.device)
@@ -60,9 +79,8 @@ class Trainer:
         recipe = self.recipe
         for group in self.optimiser.param_groups:
             group["lr"] = recipe.rate(self.iteration)
-        loss, figures = self.loss(batch)
         self.optimiser.zero_grad(set_to_none=True)
-        loss.backward()
+        figures = self._learned(batch)
         torch.nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
         self.optimiser.step()
         # The first steps' weights are not worth keeping for as long as later ones'.
@@ -72,14 +90,31 @@ class Trainer:
         self.iteration += 1
         return figures
 
+    def _learned(self, batch: Batch) -> dict[str, float]:
+        """Set the gradients, and give the figures, of all learners' frames together."""
+        figures = dict.fromkeys(FIGURES, 0.0)
+        if batch.share:
+            loss, figures = self.loss(batch)
+            (loss * batch.share).backward()
+        if self.learner.count > 1:
+            of_all = torch.tensor([figures[name] * batch.share for name in FIGURES])
+            parameters = list(self.network.parameters())
+            for parameter in parameters:
+                if parameter.grad is None:
+                    parameter.grad = torch.zeros_like(parameter)
+            add_up([*(parameter.grad for parameter in parameters if parameter.grad is not None), of_all])
+            figures = dict(zip(FIGURES, of_all.tolist(), strict=True))
+        return figures
+
     def loss(self, batch: Batch) -> tuple[Tensor, dict[str, float]]:
         """Of each picture the squared error in parts of the flare's own square to a power that rises from a half to
         one: at first strong flares lead, which are learned sooner, in the end faint ones count as much, and what
         is told where there is none counts for more. Over the last `polish` of a training the logarithm of the
         error in parts of that square, which is the picture's gain in PSNR; what a picture loses counts twice. At half
         the weight the same of the gentle part."""
-        frame, scene, gentle = (torch.from_numpy(part).permute(0, 3, 1, 2).to(self.device) for part in batch)
-        with torch.autocast(self.device.type, dtype=torch.bfloat16):
+        frame, scene, gentle = (torch.from_numpy(part).permute(0, 3, 1, 2).to(self.device)
+                                for part in (batch.frame, batch.scene, batch.gentle))
+        with _half_where_fast(self.device):
             told = self.network(frame)
         goals = torch.stack([frame - scene, frame - gentle])
         before = goals.square().mean((2, 3, 4))
@@ -159,40 +194,80 @@ def train(recipe: Recipe, folder: Path | str, backgrounds: Backgrounds, lenses: 
     """Train in `folder` and give the path of the weights (safetensors, fp16).
 
     With `resume` a training in the folder goes on, by the given recipe from there on. `start`:
-    weights to begin with. `tests`: backgrounds and lenses kept out, for the checks in the log. `processes` draw the
-    pictures, which are the same by any number.
+    weights to begin with. `tests`: backgrounds and lenses kept out, for the checks in the log. `processes` share the
+    work, this one among them: the pictures are the same by any number, the weights but for rounding.
     Raises RunError, SettingsError, and Cancelled when asked to stop (after a checkpoint).
     """
     progress, folder = progress or Progress(), Path(folder)
+    processes = processes_here() if processes is None else processes
+    if processes < 1:
+        raise SettingsError(f"A training has at least one process, not {processes}.")
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / CHECKPOINT
     if path.exists() and not resume:
         raise RunError(f"{folder} holds a training already; go on with --resume, or choose another folder.")
-    state: Mapping[str, Tensor] = {}
-    iteration = 0
-    source = path if path.exists() else start
-    if source is not None:
-        state, kept = weights.read(source)
-        widths, blocks = weights.form(source, kept)
-        recipe = replace(recipe, widths=widths, blocks=blocks)
-        if source == path:
-            recipe = replace(recipe, seed=json.loads(kept["recipe"])["seed"])
-            iteration = int(kept["iteration"])
-    trainer = Trainer(recipe)
-    if state:
+    begin = Begin(recipe, path if path.exists() else start, path.exists(), backgrounds, lenses, own)
+    trainer = begin.trainer(ALONE)  # before others are asked: it may refuse
+    with shared(1 if torch.cuda.is_available() else processes, _learn, begin) as learner:
+        trainer.learner = learner
+        batches = drawn_ahead(begin.batches(trainer), trainer.iteration, trainer.recipe.iterations,
+                              processes - 1 if torch.cuda.is_available() else 0)
+        held_out = checks(*tests) if tests else {}
+        _run(trainer, batches, folder, held_out, save_every_s, progress)
+    return folder / WEIGHTS
+
+
+class Begin(NamedTuple):
+    """What every learner begins with: the same."""
+
+    recipe: Recipe
+    source: Path | None  # weights, or the checkpoint of the same training
+    goes_on: bool
+    backgrounds: Backgrounds
+    lenses: Sequence[Prescription]
+    own: OwnFlares | None
+
+    def trainer(self, learner: Learner) -> Trainer:
+        """Of the recipe, or that of the weights where they say otherwise. Raises RunError."""
+        if self.source is None:
+            return Trainer(self.recipe, learner)
+        state, about = weights.read(self.source)
+        widths, blocks = weights.form(self.source, about)
+        recipe = replace(self.recipe, widths=widths, blocks=blocks)
+        iteration = 0
+        if self.goes_on:
+            recipe = replace(recipe, seed=json.loads(about["recipe"])["seed"])
+            iteration = int(about["iteration"])
+        trainer = Trainer(recipe, learner)
         trainer.load_state(state, iteration)
-    batches = drawn_ahead(Batches(recipe, backgrounds, lenses, own), iteration, recipe.iterations,
-                          processes_here() if processes is None else processes)
-    held_out = checks(*tests) if tests else {}
-    progress.stage("train", recipe.iterations, trainer.iteration)
+        return trainer
+
+    def batches(self, trainer: Trainer) -> Batches:
+        """That the trainer's learner sees."""
+        return Batches(trainer.recipe, self.backgrounds, self.lenses, self.own, trainer.learner)
+
+
+def _learn(learner: Learner, begin: Begin) -> None:
+    """What the learners beside the first do."""
+    trainer = begin.trainer(learner)
+    batches = begin.batches(trainer)
+    while trainer.iteration < trainer.recipe.iterations:
+        trainer.step(batches[trainer.iteration])
+
+
+def _run(trainer: Trainer, batches: Iterator[Batch], folder: Path, held_out: Mapping[str, Sequence[Pair]],
+         save_every_s: float, progress: Progress) -> None:
+    """To the recipe's end, with log and checkpoints."""
+    iterations = trainer.recipe.iterations
+    progress.stage("train", iterations, trainer.iteration)
     saved, began, first = time.monotonic(), time.monotonic(), trainer.iteration
     sums: dict[str, float] = {}
     try:
-        while trainer.iteration < recipe.iterations:
+        while trainer.iteration < iterations:
             figures = trainer.step(next(batches))
             sums = {name: sums.get(name, 0.0) + value for name, value in figures.items()}
             here = trainer.iteration
-            if here % CHECK_EVERY == 0 or here == recipe.iterations:
+            if here % CHECK_EVERY == 0 or here == iterations:
                 line: dict[str, Any] = {"iteration": here, "seconds": round(time.monotonic() - began, 1),
                                         "pace": round((time.monotonic() - began) / (here - first), 3),
                                         **{name: round(value / CHECK_EVERY, 5) for name, value in sums.items()}}
@@ -209,7 +284,6 @@ def train(recipe: Recipe, folder: Path | str, backgrounds: Backgrounds, lenses: 
         _save(trainer, folder)
         raise
     _save(trainer, folder)
-    return folder / WEIGHTS
 
 
 def _save(trainer: Trainer, folder: Path) -> None:

@@ -39,8 +39,8 @@ def arguments(parser: argparse.ArgumentParser) -> None:
                         help="for diffusion: weights of LPIPS, which then is a part of the loss")
     parser.add_argument("--threads", type=int, metavar="N", help="processor threads (default: all)")
     parser.add_argument("--processes", type=int, metavar="N",
-                        help="that draw pictures ahead, which are the same by any number; 0: none besides this one "
-                             "(default: one, with a GPU up to eight)")
+                        help="to share the work among; beside a GPU all but one draw pictures (default: one for each "
+                             "processor core up to four, with a GPU up to eight)")
 
 
 def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
@@ -82,8 +82,6 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
 
 def _diffusion(words: argparse.Namespace, recipe: Any, backgrounds: Any, lenses: Any, own: Any,
                progress: Progress) -> dict[str, Any]:
-    import numpy as np
-
     from ...core.metrics.lpips import Lpips
     from ...core.removal import diffusion
     from ...core.removal.batches import Batches
@@ -97,7 +95,7 @@ def _diffusion(words: argparse.Namespace, recipe: Any, backgrounds: Any, lenses:
     batches = Batches(recipe, backgrounds, lenses, own)
 
     def draw(number: int) -> Any:
-        (one,) = batches.pairs(np.random.default_rng((recipe.seed, number)), number, 1, 512, 512)
+        one = batches.pair(number, 0, 512, 512)
         return one.frame, one.gentle if words.keep_glare else one.scene
 
     path = diffusion.train_diffusion(diffusion.DiffusionRemoval(words.base), words.out, draw,

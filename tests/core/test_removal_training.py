@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import multiprocessing
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,8 @@ from core.pictures import Pixels, write_png
 from core.progress import Progress
 from core.removal import evaluation, training, weights
 from core.removal.backgrounds import Backgrounds
-from core.removal.batches import Batches
+from core.removal.batches import Batches, drawn_ahead
+from core.removal.learners import ALONE, Learner, add_up, shared
 from core.removal.recipe import Recipe, as_dict, from_dict
 from core.removal.synthesis.prescription import built_in
 
@@ -50,19 +52,62 @@ class StopAfter(Progress):
 
 
 def test_a_training_that_was_stopped_goes_on_as_if_it_was_not(tmp_path: Path) -> None:
-    whole = training.train(RECIPE, tmp_path / "whole", backgrounds(), built_in(), processes=0)
+    whole = training.train(RECIPE, tmp_path / "whole", backgrounds(), built_in(), processes=1)
     with pytest.raises(Cancelled):
         training.train(RECIPE, tmp_path / "parts", backgrounds(), built_in(), processes=1,
                        progress=StopAfter(2))
     with pytest.raises(RunError, match="--resume"):
         training.train(RECIPE, tmp_path / "parts", backgrounds(), built_in())
-    parts = training.train(RECIPE, tmp_path / "parts", backgrounds(), built_in(), resume=True, processes=1)
+    parts = training.train(RECIPE, tmp_path / "parts", backgrounds(), built_in(), resume=True, processes=2)
     a, b = weights.read(whole)[0], weights.read(parts)[0]
     assert a.keys() == b.keys()
     for name in a:
         assert a[name].dtype == torch.float16
         torch.testing.assert_close(a[name], b[name], atol=1e-3, rtol=1e-2)
     assert widths_of(whole) == RECIPE.widths
+
+
+def test_learners_share_the_frames_of_one(tmp_path: Path) -> None:
+    alone = training.train(RECIPE, tmp_path / "alone", backgrounds(), built_in(), processes=1)
+    by_three = training.train(RECIPE, tmp_path / "three", backgrounds(), built_in(), processes=3)
+    logs = [json.loads((path.parent / training.LOG).read_text(encoding="utf-8")) for path in (alone, by_three)]
+    assert logs[0]["untouched"] == pytest.approx(logs[1]["untouched"], rel=1e-4), "the pictures are the same"
+    a, b = weights.read(alone)[0], weights.read(by_three)[0]
+    for name in a:
+        torch.testing.assert_close(a[name], b[name], atol=1e-3, rtol=1e-2)
+    assert torch.get_num_threads() == 1
+    assert not multiprocessing.active_children()
+
+    whole = Batches(RECIPE, backgrounds(), built_in())[0]
+    parts = [Batches(RECIPE, backgrounds(), built_in(), learner=Learner(rank, 3))[0] for rank in range(3)]
+    assert len(whole.frame) == 2
+    assert [len(part.frame) for part in parts] == [1, 1, 0]
+    assert [part.share for part in parts] == [0.5, 0.5, 0]
+    assert np.array_equal(whole.scene[1], parts[1].scene[0])
+
+
+def ends(_learner: Learner) -> None:
+    """A learner that ends at once."""
+
+
+def test_a_learner_that_is_no_more_is_told(tmp_path: Path) -> None:
+    with pytest.raises(RunError, match="ended before"), shared(2, ends):
+        for _ in range(100):
+            add_up([torch.zeros(1000)])
+    assert not multiprocessing.active_children()
+    with shared(1, ends) as learner:
+        assert learner == ALONE
+    with pytest.raises(SettingsError, match="at least one process"):
+        training.train(RECIPE, tmp_path, backgrounds(), built_in(), processes=0)
+
+
+def test_pictures_are_the_same_when_others_draw_them() -> None:
+    batches = Batches(RECIPE, backgrounds(), built_in())
+    here, ahead = (list(drawn_ahead(batches, 1, 4, processes)) for processes in (0, 2))
+    assert len(here) == len(ahead) == 3
+    for one, other in zip(here, ahead, strict=True):
+        assert np.array_equal(one.frame, other.frame)
+        assert np.array_equal(one.gentle, other.gentle)
 
 
 def test_a_handful_of_pairs_is_learned() -> None:
@@ -98,11 +143,11 @@ def test_stages_of_a_training() -> None:
 
 
 def test_going_on_from_weights(tmp_path: Path) -> None:
-    first = training.train(RECIPE, tmp_path / "first", backgrounds(), built_in(), processes=0)
-    second = training.train(RECIPE, tmp_path / "second", backgrounds(), built_in(), start=first, processes=0)
+    first = training.train(RECIPE, tmp_path / "first", backgrounds(), built_in(), processes=1)
+    second = training.train(RECIPE, tmp_path / "second", backgrounds(), built_in(), start=first, processes=1)
     assert weights.read(second)[1]["iteration"] == "4"
     other = Recipe(**{**RECIPE.__dict__, "widths": (16, 8, 8, 8, 8)})
-    third = training.train(other, tmp_path / "third", backgrounds(), built_in(), start=first, processes=0)
+    third = training.train(other, tmp_path / "third", backgrounds(), built_in(), start=first, processes=1)
     assert widths_of(third) == RECIPE.widths, "the network is that of the weights"
     tensors, _ = weights.read(first)
     weights.write(tmp_path / "foreign.safetensors", tensors, {"recipe": "{}"})
@@ -111,7 +156,7 @@ def test_going_on_from_weights(tmp_path: Path) -> None:
 
 
 def test_the_log_has_figures_and_checks(tmp_path: Path) -> None:
-    training.train(RECIPE, tmp_path, backgrounds(), built_in(), tests=(backgrounds(), built_in()), processes=0)
+    training.train(RECIPE, tmp_path, backgrounds(), built_in(), tests=(backgrounds(), built_in()), processes=1)
     (line,) = [json.loads(text) for text in (tmp_path / training.LOG).read_text(encoding="utf-8").splitlines()]
     assert line["iteration"] == 4
     assert {"error", "untouched", "gain_db"} <= line.keys()

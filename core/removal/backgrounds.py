@@ -33,7 +33,8 @@ class Backgrounds:
     """Decoded pictures: photos as uint8 (h, w, 3) display values, maps as float16 equirectangular light.
 
     varied: for training, to which few pictures are to look like many: some are filmed sideways or under coloured
-    light, some meet another or are seen through its reflection.
+    light, some meet another or are seen through its reflection, some hold windows, screens or lamps on a wet floor,
+    which are bright and no flare.
     """
 
     photos: Sequence[NDArray[np.uint8]]
@@ -59,6 +60,8 @@ class Backgrounds:
             scene = _joined(random, scene, self._turned(random, width, height, gamma))
         if random.random() < 0.2:
             scene = scene * np.exp(random.normal(0, 0.35, 3)).astype(np.float32)
+        if random.random() < 0.15:
+            scene = _with_bright_things(random, scene)
         return scene
 
     def _turned(self, random: Random, width: int, height: int, gamma: float) -> Pixels:
@@ -176,6 +179,40 @@ def _joined(random: Random, scene: Pixels, other: Pixels) -> Pixels:
     beside = (x * np.float32(math.cos(angle)) + y * np.float32(math.sin(angle)) - random.uniform(-0.7, 0.7)) / soft
     of_other = (1 / (1 + np.exp(-np.clip(beside, -30, 30)))).astype(np.float32)[..., None]
     return np.asarray(scene + (other - scene) * of_other, np.float32)
+
+
+def _with_bright_things(random: Random, scene: Pixels) -> Pixels:
+    """With panels, upright or in perspective, as windows, screens and signs are; or with what a floor or water shows
+    of lamps: long, upright, and broken up."""
+    import cv2
+
+    height, width = scene.shape[:2]
+    scene, size = scene.copy(), math.hypot(width, height)
+    on_floor = random.random() < 0.4
+    for _ in range(int(random.integers(1, 5))):
+        colour = np.exp(random.normal(0, 0.3, 3)).astype(np.float32) * np.float32(math.exp(random.uniform(-1.5, 1.5)))
+        x, y = random.uniform(0, width), random.uniform(0, height)
+        mask = np.zeros((height, width), np.float32)
+        if on_floor:
+            axes = np.array([math.exp(random.uniform(math.log(0.004), math.log(0.03))), 0.0]) * size
+            axes[1] = axes[0] * math.exp(random.uniform(math.log(2), math.log(12)))
+            rows, columns = np.mgrid[:height, :width].astype(np.float32)
+            mask = np.exp(-((columns - x) / axes[0]) ** 2 - ((rows - y) / axes[1]) ** 2).astype(np.float32)
+            waves = cv2.resize(random.random((max(height // int(random.integers(2, 12)), 1), 3)).astype(np.float32),
+                               (width, height), interpolation=cv2.INTER_LINEAR)
+            mask *= 1 - np.float32(random.uniform(0.4, 1)) * waves
+        else:
+            half = size * np.exp(random.uniform(math.log(0.01), math.log(0.15), 2))
+            corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * half * np.exp(random.normal(0, 0.15, (4, 2)))
+            sixteenths = ((corners + np.array([x, y])) * 16).astype(np.int32)
+            cv2.fillPoly(mask, [sixteenths], (1.0,), cv2.LINE_AA, 4)
+            if random.random() < 0.5:  # panes, or what a screen shows
+                cells = random.random(tuple(random.integers(1, 8, 2))).astype(np.float32)
+                mask *= 1 - np.float32(random.random()) * cv2.resize(cells, (width, height),
+                                                                     interpolation=cv2.INTER_NEAREST)
+        scene = scene + mask[..., None] * colour if on_floor else scene * (1 - mask[..., None]) + mask[..., None] * (
+            colour + 0.1 * scene)
+    return np.asarray(scene, np.float32)
 
 
 def _defocused(random: Random, scene: Pixels) -> Pixels:

@@ -18,7 +18,7 @@ from .canvas import Array, Point, Random, grid, tint, uniform_log
 from .prescription import Prescription
 
 CLASSES = ("scatter", "ghosts", "streak", "halo", "shimmer", "glare", "rings", "mixed")
-_SHARES = (0.16, 0.18, 0.12, 0.11, 0.09, 0.12, 0.07, 0.15)
+_SHARES = (0.13, 0.16, 0.18, 0.09, 0.09, 0.10, 0.06, 0.19)
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,10 @@ def _flare_of(random: Random, same: int, kind: str, place: Point, size: int, x: 
         elif part == "ghosts":
             rest += _exposed(random, _ghosts(lens, place, size, x, y, lenses), 0.02, 1.0)
         elif part == "streak":
-            rest += shapes.streak(lens, place, x, y) * uniform_log(random, 0.05, 3)
+            if lens.random() < 0.4:
+                rest += shapes.streak(lens, place, x, y) * uniform_log(random, 0.05, 3)
+            else:
+                rest += shapes.smear(lens, place, x, y) * uniform_log(random, 0.02, 1.2)
         elif part == "halo":
             rest += shapes.halo(lens, place, x, y) * uniform_log(random, 0.02, 0.5)
         elif part == "shimmer":

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Streaks, halos and rings, and the light sources themselves."""
+"""Streaks, smears, halos and rings, and the light sources themselves."""
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 
@@ -10,33 +11,60 @@ from .canvas import Array, Point, Random, colour_of, tint, uniform_log
 
 
 def streak(random: Random, light: Point, x: Array, y: Array) -> Array:
-    """Lines of light through the source: the long horizontal one of an anamorphic lens, or what a wiped
-    lens shows in any direction, one-sided or fanned."""
+    """The long level line of an anamorphic lens, or a few close to each other."""
     layer = np.zeros((*x.shape, 3), np.float32)
-    anamorphic = random.random() < 0.5
-    base = 0.0 if anamorphic else random.uniform(0, math.pi)
     blue = np.array([0.25, 0.6, 1.6], np.float32)
-    for number in range(1 if random.random() < 0.6 else int(random.integers(2, 7))):
-        angle = base + (random.normal(0, 0.02) if anamorphic else number * random.uniform(0.2, 1.6))
-        aside = random.normal(0, 0.01) if anamorphic and number else 0.0
+    for number in range(1 if random.random() < 0.6 else int(random.integers(2, 5))):
+        angle, aside = random.normal(0, 0.02), random.normal(0, 0.01) if number else 0.0
         dx, dy = x - light[0], y - light[1]
         along = dx * math.cos(angle) + dy * math.sin(angle)
         across = dy * math.cos(angle) - dx * math.sin(angle) - aside
         reach, width = uniform_log(random, 0.1, 2.5), uniform_log(random, 0.003, 0.05)
-        fan = random.uniform(0, 0.15) if not anamorphic and random.random() < 0.5 else 0.0
-        spread = width * (1 + fan * np.abs(along) / width)
-        form = random.random()
-        cross = np.exp(-(across / spread) ** 2) if form < 0.5 else 1 / (1 + (across / spread) ** 2) ** 1.5
+        cross = np.exp(-(across / width) ** 2) if random.random() < 0.5 else 1 / (1 + (across / width) ** 2) ** 1.5
         fall = np.exp(-np.abs(along) / reach) if random.random() < 0.5 else 1 / (1 + (along / reach * 2) ** 2)
-        if random.random() < 0.2:
-            fall *= 1 / (1 + np.exp(np.clip(-along * random.uniform(3, 40), -50, 50)))
-        if anamorphic and random.random() < 0.3:  # uneven along its length
+        if random.random() < 0.3:  # uneven along its length
             fall *= 1 + 0.4 * np.sin(along * random.uniform(4, 60) + random.uniform(0, 7))
-        colour = blue * tint(random, 0.2) if anamorphic and random.random() < 0.6 else tint(random, 0.6)
+        colour = blue * tint(random, 0.2) if random.random() < 0.6 else tint(random, 0.6)
         core = np.exp(-np.abs(along) / (0.3 * reach))[..., None]
         layer += (cross * fall * width ** -0.2 * random.uniform(0.3, 1))[..., None] * (
             colour * (1 - 0.6 * core) + 0.6 * core).astype(np.float32)
     return layer / max(float(layer.max()), 1e-9)
+
+
+def smear(random: Random, light: Point, x: Array, y: Array) -> Array:
+    """What wiped grease on the front glass shows, as most telephones do at night: beams across the marks, which
+    open as they go, of fine rays or even, on both sides of the light or on one; 1 at a quarter of the canvas' half."""
+    dx, dy = x - light[0], y - light[1]
+    r, angle = np.hypot(dx, dy), np.arctan2(dy, dx)
+    layer = np.zeros((*x.shape, 3), np.float32)
+    for number in range(1 if random.random() < 0.5 else int(random.integers(2, 6))):
+        towards = random.uniform(-math.pi, math.pi)
+        bend = random.normal(0, 0.12) if random.random() < 0.3 else 0.0
+        width, opening = uniform_log(random, 0.002, 0.04), uniform_log(random, 0.003, 0.15)
+        reach, power, end = uniform_log(random, 0.03, 1.5), random.uniform(0.7, 3), uniform_log(random, 0.25, 4)
+        other = 1.0 if random.random() < 0.6 else random.random() * (random.random() < 0.5)
+        form, level = random.random(), 1.0 if number == 0 else uniform_log(random, 0.1, 1)
+        fine = _uneven(random) if random.random() < 0.5 else None
+        colour = tint(random, 0.15) + (tint(random, 0.5) - 1) * np.clip(r / end, 0, 1)[..., None]
+        for turn, strength in ((0.0, level), (math.pi, level * other)):
+            off = angle - towards - turn - bend * r
+            off = np.arctan2(np.sin(off), np.cos(off))
+            spread = np.sqrt(width**2 + (opening * r) ** 2)
+            u = np.minimum(np.abs(off), 1.5) * r / spread
+            cross = np.exp(-(u**2)) if form < 0.4 else 1 / (1 + u**2) ** 1.5 if form < 0.7 else np.exp(-(u**4))
+            if fine is not None:
+                cross = cross * fine(off / max(opening, 0.01))
+            fall = (1 + (0.25 / reach) ** power) / (1 + (r / reach) ** power) * np.exp(-((r / end) ** 2))
+            layer += np.minimum(strength * cross * fall, 30)[..., None] * np.maximum(colour, 0.05).astype(np.float32)
+    return layer
+
+
+def _uneven(random: Random) -> Callable[[Array], Array]:
+    """Rays: a random brightness by the direction, mean about 1, of an opening's width on either side."""
+    count = int(random.integers(6, 60))
+    at, values = np.linspace(-2.5, 2.5, count), random.exponential(1, count) + random.uniform(0, 1)
+    values /= values.mean()
+    return lambda direction: np.interp(direction, at, values).astype(np.float32)
 
 
 def halo(random: Random, light: Point, x: Array, y: Array) -> Array:

@@ -14,6 +14,8 @@ from core.removal import formation, pairs
 from core.removal.backgrounds import Backgrounds, kept_for_test, read_backgrounds
 from core.removal.bank import Mixed, OwnFlares, SynthesisBank
 from core.removal.synthesis import prescription as lenses
+from core.removal.synthesis import shapes
+from core.removal.synthesis.canvas import grid
 from core.removal.synthesis.layers import CLASSES, Flare, flare
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -95,6 +97,18 @@ def test_a_flare_is_light_and_its_seed_alone(kind: str) -> None:
     assert one.whole.max() > 1e-3
     assert np.array_equal(one.whole, again.whole)
     assert not np.array_equal(one.whole, flare((3, 6), SIZE, lenses.built_in(), kind).whole)
+
+
+def test_a_smear_is_beams_from_the_light() -> None:
+    x, y = grid(SIZE)
+    turn = np.linspace(-np.pi, np.pi, 400)
+    for seed in range(12):
+        beams = shapes.smear(np.random.default_rng(seed), (0.1, -0.2), x, y).mean(-1)
+        circles = (np.array([0.1 + r * np.cos(turn), -0.2 + r * np.sin(turn)]) for r in (0.02, 0.25))
+        near, quarter = (beams[rows, columns] for columns, rows in (np.int32((at + 1) / 2 * SIZE) for at in circles))
+        assert near.max() >= quarter.max() * 0.99, "brightest at the light"
+        assert 0.1 < quarter.max() < 30
+        assert np.median(quarter) < 0.5 * quarter.max(), "in some directions"
 
 
 def test_flares_span_small_to_full_frame() -> None:
@@ -218,3 +232,12 @@ def test_few_backgrounds_look_like_many() -> None:
         assert not sideways(scene) and not tinted(scene) and straight(scene)
     for trait in (sideways, tinted, lambda scene: not straight(scene)):
         assert 3 <= sum(map(trait, drawn(varied))) <= 40
+
+
+def test_some_backgrounds_hold_bright_things_that_are_no_flare() -> None:
+    grey = Backgrounds([np.full((120, 160, 3), 60, np.uint8)], [], varied=True)
+    random = np.random.default_rng(5)
+    drawn = [grey.draw(random, 96, 64, 2.0) for _ in range(200)]
+    bright = [one for one in drawn if one.max() > 4 * np.median(one)]
+    assert 0.05 < len(bright) / len(drawn) < 0.2
+    assert all(np.isfinite(one).all() and one.min() >= 0 for one in drawn)

@@ -114,7 +114,8 @@ def _placed(random: Random, layers: Layers, width: int, height: int,
         near = np.maximum(near, np.exp(-((x - at[0]) ** 2 + (y - at[1]) ** 2) / np.float32((0.35 * half) ** 2)))
     red, green, blue = np.moveaxis(rest + glare, -1, 0)
     least = np.minimum(np.minimum(red, green), blue)
-    kept = np.clip((least * near - 0.7) / 0.8, 0, 1)[..., None]
+    # What a camera clips is white with flare and without.
+    kept = np.clip((least * near - 0.5) / 0.4, 0, 1)[..., None]
     kept = kept * kept * (3 - 2 * kept)
     kept_light: Pixels = np.maximum(light, (rest + glare) * kept)
     return rest * (1 - kept), glare * (1 - kept), kept_light

@@ -206,18 +206,18 @@ def train(recipe: Recipe, folder: Path | str, backgrounds: Backgrounds, lenses: 
     path = folder / CHECKPOINT
     if path.exists() and not resume:
         raise RunError(f"{folder} holds a training already; go on with --resume, or choose another folder.")
-    begin = Begin(recipe, path if path.exists() else start, path.exists(), backgrounds, lenses, own)
-    trainer = begin.trainer(ALONE)  # before others are asked: it may refuse
-    with shared(1 if torch.cuda.is_available() else processes, _learn, begin) as learner:
+    beginning = Beginning(recipe, path if path.exists() else start, path.exists(), backgrounds, lenses, own)
+    trainer = beginning.trainer(ALONE)  # before others are asked: it may refuse
+    with shared(1 if torch.cuda.is_available() else processes, _learn, beginning) as learner:
         trainer.learner = learner
-        batches = drawn_ahead(begin.batches(trainer), trainer.iteration, trainer.recipe.iterations,
+        batches = drawn_ahead(beginning.batches(trainer), trainer.iteration, trainer.recipe.iterations,
                               processes - 1 if torch.cuda.is_available() else 0)
         held_out = checks(*tests) if tests else {}
         _run(trainer, batches, folder, held_out, save_every_s, progress)
     return folder / WEIGHTS
 
 
-class Begin(NamedTuple):
+class Beginning(NamedTuple):
     """What every learner begins with: the same."""
 
     recipe: Recipe
@@ -247,10 +247,10 @@ class Begin(NamedTuple):
         return Batches(trainer.recipe, self.backgrounds, self.lenses, self.own, trainer.learner)
 
 
-def _learn(learner: Learner, begin: Begin) -> None:
+def _learn(learner: Learner, beginning: Beginning) -> None:
     """What the learners beside the first do."""
-    trainer = begin.trainer(learner)
-    batches = begin.batches(trainer)
+    trainer = beginning.trainer(learner)
+    batches = beginning.batches(trainer)
     while trainer.iteration < trainer.recipe.iterations:
         trainer.step(batches[trainer.iteration])
 
@@ -261,17 +261,17 @@ def _run(trainer: Trainer, batches: Iterator[Batch], folder: Path, held_out: Map
     iterations = trainer.recipe.iterations
     progress.stage("train", iterations, trainer.iteration)
     saved, began, first = time.monotonic(), time.monotonic(), trainer.iteration
-    sums: dict[str, float] = {}
+    told, sums = first, dict.fromkeys(FIGURES, 0.0)
     try:
         while trainer.iteration < iterations:
             figures = trainer.step(next(batches))
-            sums = {name: sums.get(name, 0.0) + value for name, value in figures.items()}
+            sums = {name: value + figures[name] for name, value in sums.items()}
             here = trainer.iteration
             if here % CHECK_EVERY == 0 or here == iterations:
                 line: dict[str, Any] = {"iteration": here, "seconds": round(time.monotonic() - began, 1),
                                         "pace": round((time.monotonic() - began) / (here - first), 3),
-                                        **{name: round(value / CHECK_EVERY, 5) for name, value in sums.items()}}
-                sums = {}
+                                        **{name: round(value / (here - told), 5) for name, value in sums.items()}}
+                told, sums = here, dict.fromkeys(FIGURES, 0.0)
                 if held_out:
                     line["gain_db"] = trainer.check(held_out)
                 with open(folder / LOG, "a", encoding="utf-8") as stream:

@@ -27,7 +27,7 @@ from .weights import IN_THE_BOX, load
 
 Pixels = NDArray[np.float32]
 
-WORKING_SIZE = 256
+WORKING_SIZE = 384
 """Long side that the network sees: about what it was trained at last."""
 LEAST = 0.01
 """What a flare adds to display values, below which there is none."""

@@ -23,7 +23,7 @@ class Recipe:
 
     seed: int = 1
     iterations: int = 15_000
-    stages: tuple[tuple[float, int, int], ...] = ((0.6, 96, 256), (1.0, 176, 272))
+    stages: tuple[tuple[float, int, int], ...] = ((0.5, 96, 256), (1.0, 208, 400))
     """Up to which share of the iterations; least and most pixels of a frame's long side."""
     pixels: int = 300_000          # of an iteration, all its frames together
     learning_rate: float = 4e-4
@@ -33,8 +33,8 @@ class Recipe:
     polish: float = 0.15           # of the iterations, the last of them, go for each picture's PSNR
     widths: tuple[int, ...] = (32, 48, 96, 128, 160)
     blocks: tuple[int, ...] = (0, 1, 2, 4, 4)
-    canvas: int = 256              # pixels a side of the flares' canvas
-    bank: int = 800                # flares at hand at a time
+    canvas: int = 384              # pixels a side of the flares' canvas
+    bank: int = 400                # flares at hand at a time, 2.7 MB each
     renew_every: int = 6           # iterations for each new flare
     own_share: float = 0.3         # of the user's own flares, where there are any
     clean: float = 0.12            # of the frames have no flare

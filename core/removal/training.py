@@ -32,7 +32,7 @@ CHECKPOINT, WEIGHTS, LOG = "checkpoint.safetensors", "removal.safetensors", "tra
 CHECK_EVERY = 1000
 CHECK_SEED = 20_000
 CHECKS = 64
-CHECK_SIZE, CHECK_CANVAS = (256, 160), 288
+CHECK_SIZE, CHECK_CANVAS = (384, 256), 448
 FAINT = (1e-3, 2e-4)
 """Mean square of a flare, to which the errors of fainter ones are compared: 30 dB, and from three quarters of a
 training on falling to 37 dB."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import multiprocessing
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -155,7 +156,8 @@ def test_going_on_from_weights(tmp_path: Path) -> None:
         training.train(RECIPE, tmp_path / "fourth", backgrounds(), built_in(), start=tmp_path / "foreign.safetensors")
 
 
-def test_the_log_has_figures_and_checks(tmp_path: Path) -> None:
+def test_the_log_has_figures_and_checks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(training, "checks", partial(training.checks, count=8))
     training.train(RECIPE, tmp_path, backgrounds(), built_in(), tests=(backgrounds(), built_in()), processes=1)
     (line,) = [json.loads(text) for text in (tmp_path / training.LOG).read_text(encoding="utf-8").splitlines()]
     assert line["iteration"] == 4

@@ -51,7 +51,7 @@ def shared(count: int, learn: Callable[..., None], *words: Any) -> Iterator[Lear
     spawning = multiprocessing.get_context("spawn")
     first, threads = Learner(0, count), torch.get_num_threads()
     with tempfile.TemporaryDirectory() as folder:
-        store = (Path(folder) / "store").as_uri()
+        store = str(Path(folder) / "store")
         begun = [spawning.Event() for _ in range(1, count)]
         others = [spawning.Process(target=_other, args=(Learner(rank, count), store, event, threads, learn, words),
                                    daemon=True)
@@ -73,8 +73,9 @@ def shared(count: int, learn: Callable[..., None], *words: Any) -> Iterator[Lear
             raise RunError(ENDED) from problem
         finally:
             for process in others:
-                process.kill()
-                process.join()
+                if process.pid is not None:  # it was started
+                    process.kill()
+                    process.join()
             if dist.is_initialized():
                 dist.destroy_process_group()
             torch.set_num_threads(threads)
@@ -113,5 +114,5 @@ def _join(learner: Learner, store: str, threads: int) -> None:
     torch.set_num_threads(max(threads // learner.count, 1))
     if sys.platform in LOOPBACK:
         os.environ.setdefault("GLOO_SOCKET_IFNAME", LOOPBACK[sys.platform])
-    dist.init_process_group("gloo", init_method=store, rank=learner.rank,
-                            world_size=learner.count, timeout=PATIENCE)
+    dist.init_process_group("gloo", store=dist.FileStore(store, learner.count),  # type: ignore[attr-defined]
+                            rank=learner.rank, world_size=learner.count, timeout=PATIENCE)

@@ -182,37 +182,44 @@ def _joined(random: Random, scene: Pixels, other: Pixels) -> Pixels:
 
 
 def _with_bright_things(random: Random, scene: Pixels) -> Pixels:
-    """With panels, upright or in perspective, as windows, screens and signs are; or with what a floor or water shows
-    of lamps: long, upright, and broken up."""
-    import cv2
-
-    height, width = scene.shape[:2]
-    scene, size = scene.copy(), math.hypot(width, height)
+    """With some panels, or with what a floor or water shows of some lamps."""
     on_floor = random.random() < 0.4
     for _ in range(int(random.integers(1, 5))):
-        colour = np.exp(random.normal(0, 0.3, 3)).astype(np.float32) * np.float32(math.exp(random.uniform(-1.5, 1.5)))
-        x, y = random.uniform(0, width), random.uniform(0, height)
-        mask = np.zeros((height, width), np.float32)
+        colour = np.exp(random.normal(0, 0.3, 3) + random.uniform(-1.5, 1.5)).astype(np.float32)
         if on_floor:
-            axes = np.array([math.exp(random.uniform(math.log(0.004), math.log(0.03))), 0.0]) * size
-            axes[1] = axes[0] * math.exp(random.uniform(math.log(2), math.log(12)))
-            rows, columns = np.mgrid[:height, :width].astype(np.float32)
-            mask = np.exp(-((columns - x) / axes[0]) ** 2 - ((rows - y) / axes[1]) ** 2).astype(np.float32)
-            waves = cv2.resize(random.random((max(height // int(random.integers(2, 12)), 1), 3)).astype(np.float32),
-                               (width, height), interpolation=cv2.INTER_LINEAR)
-            mask *= 1 - np.float32(random.uniform(0.4, 1)) * waves
+            scene = scene + _reflection(random, *scene.shape[:2])[..., None] * colour
         else:
-            half = size * np.exp(random.uniform(math.log(0.01), math.log(0.15), 2))
-            corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * half * np.exp(random.normal(0, 0.15, (4, 2)))
-            sixteenths = ((corners + np.array([x, y])) * 16).astype(np.int32)
-            cv2.fillPoly(mask, [sixteenths], (1.0,), cv2.LINE_AA, 4)
-            if random.random() < 0.5:  # panes, or what a screen shows
-                cells = random.random(tuple(random.integers(1, 8, 2))).astype(np.float32)
-                mask *= 1 - np.float32(random.random()) * cv2.resize(cells, (width, height),
-                                                                     interpolation=cv2.INTER_NEAREST)
-        scene = scene + mask[..., None] * colour if on_floor else scene * (1 - mask[..., None]) + mask[..., None] * (
-            colour + 0.1 * scene)
-    return np.asarray(scene, np.float32)
+            shown = _panel(random, *scene.shape[:2])[..., None]
+            scene = scene + (colour - scene) * shown
+    return scene
+
+
+def _reflection(random: Random, height: int, width: int) -> Pixels:
+    """(height, width) 0..1: of a lamp on a floor, long, upright, and broken up."""
+    import cv2
+
+    across = math.hypot(width, height) * math.exp(random.uniform(math.log(0.004), math.log(0.03)))
+    along = across * math.exp(random.uniform(math.log(2), math.log(12)))
+    x = (np.arange(width, dtype=np.float32)[None, :] - random.uniform(0, width)) / across
+    y = (np.arange(height, dtype=np.float32)[:, None] - random.uniform(0, height)) / along
+    waves = random.random((max(height // int(random.integers(2, 12)), 1), 3)).astype(np.float32)
+    waves = np.asarray(cv2.resize(waves, (width, height), interpolation=cv2.INTER_LINEAR), np.float32)
+    return np.asarray(np.exp(-(x**2) - y**2) * (1 - random.uniform(0.4, 1) * waves), np.float32)
+
+
+def _panel(random: Random, height: int, width: int) -> Pixels:
+    """(height, width) 0..1: a window, screen or sign, level or in perspective, of one pane or of several."""
+    import cv2
+
+    half = math.hypot(width, height) * np.exp(random.uniform(math.log(0.01), math.log(0.15), 2))
+    square = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+    corners = random.uniform(0, (width, height)) + square * half * np.exp(random.normal(0, 0.15, (4, 2)))
+    shown = np.zeros((height, width), np.float32)
+    cv2.fillPoly(shown, [(corners * 16).astype(np.int32)], (1.0,), cv2.LINE_AA, 4)  # in sixteenths of a pixel
+    if random.random() < 0.5:
+        panes = random.uniform(random.random(), 1, tuple(random.integers(1, 8, 2))).astype(np.float32)
+        shown *= cv2.resize(panes, (width, height), interpolation=cv2.INTER_NEAREST)
+    return shown
 
 
 def _defocused(random: Random, scene: Pixels) -> Pixels:

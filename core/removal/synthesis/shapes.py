@@ -38,25 +38,32 @@ def smear(random: Random, light: Point, x: Array, y: Array) -> Array:
     r, angle = np.hypot(dx, dy), np.arctan2(dy, dx)
     layer = np.zeros((*x.shape, 3), np.float32)
     for number in range(1 if random.random() < 0.5 else int(random.integers(2, 6))):
-        towards = random.uniform(-math.pi, math.pi)
-        bend = random.normal(0, 0.12) if random.random() < 0.3 else 0.0
-        width, opening = uniform_log(random, 0.002, 0.04), uniform_log(random, 0.003, 0.15)
-        reach, power, end = uniform_log(random, 0.03, 1.5), random.uniform(0.7, 3), uniform_log(random, 0.25, 4)
-        other = 1.0 if random.random() < 0.6 else random.random() * (random.random() < 0.5)
-        form, level = random.random(), 1.0 if number == 0 else uniform_log(random, 0.1, 1)
-        fine = _uneven(random) if random.random() < 0.5 else None
-        colour = tint(random, 0.15) + (tint(random, 0.5) - 1) * np.clip(r / end, 0, 1)[..., None]
-        for turn, strength in ((0.0, level), (math.pi, level * other)):
-            off = angle - towards - turn - bend * r
-            off = np.arctan2(np.sin(off), np.cos(off))
-            spread = np.sqrt(width**2 + (opening * r) ** 2)
-            u = np.minimum(np.abs(off), 1.5) * r / spread
-            cross = np.exp(-(u**2)) if form < 0.4 else 1 / (1 + u**2) ** 1.5 if form < 0.7 else np.exp(-(u**4))
-            if fine is not None:
-                cross = cross * fine(off / max(opening, 0.01))
-            fall = (1 + (0.25 / reach) ** power) / (1 + (r / reach) ** power) * np.exp(-((r / end) ** 2))
-            layer += np.minimum(strength * cross * fall, 30)[..., None] * np.maximum(colour, 0.05).astype(np.float32)
+        layer += _beam(random, r, angle, fainter=number > 0)
     return layer
+
+
+def _beam(random: Random, r: Array, angle: Array, *, fainter: bool) -> Array:
+    """One of a smear's, in polar coordinates about the light."""
+    towards = random.uniform(-math.pi, math.pi)
+    bend = random.normal(0, 0.12) if random.random() < 0.3 else 0.0
+    width, opening = uniform_log(random, 0.002, 0.04), uniform_log(random, 0.003, 0.15)
+    reach, power, end = uniform_log(random, 0.03, 1.5), random.uniform(0.7, 3), uniform_log(random, 0.25, 4)
+    other_side = 1.0 if random.random() < 0.6 else random.random() * (random.random() < 0.5)
+    form, level = random.random(), uniform_log(random, 0.1, 1) if fainter else 1.0
+    rays = _uneven(random) if random.random() < 0.5 else None
+    colour = tint(random, 0.15) + (tint(random, 0.5) - 1) * np.clip(r / end, 0, 1)[..., None]
+    fall = (1 + (0.25 / reach) ** power) / (1 + (r / reach) ** power) * np.exp(-((r / end) ** 2))
+    spread = np.sqrt(width**2 + (opening * r) ** 2)
+    light = np.zeros_like(r)
+    for turn, strength in ((0.0, level), (math.pi, level * other_side)):
+        off = angle - towards - turn - bend * r
+        off = np.arctan2(np.sin(off), np.cos(off))
+        u = np.minimum(np.abs(off), 1.5) * r / spread
+        cross = np.exp(-(u**2)) if form < 0.4 else 1 / (1 + u**2) ** 1.5 if form < 0.7 else np.exp(-(u**4))
+        if rays is not None:
+            cross = cross * rays(off / max(opening, 0.01))
+        light += np.minimum(strength * cross * fall, 30)
+    return np.asarray(light[..., None] * np.maximum(colour, 0.05), np.float32)
 
 
 def _uneven(random: Random) -> Callable[[Array], Array]:

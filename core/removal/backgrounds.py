@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from ..errors import SettingsError
 from .formation import Pixels
+from .synthesis.canvas import uniform_log
 
 Part = Literal["train", "test", "all"]
 Random = np.random.Generator
@@ -173,7 +174,7 @@ def _joined(random: Random, scene: Pixels, other: Pixels) -> Pixels:
     if random.random() < 0.3:
         share = np.float32(random.uniform(0.2, 0.8))
         return scene * share + other * (1 - share)
-    angle, soft = random.uniform(0, 2 * math.pi), math.exp(random.uniform(math.log(0.005), math.log(0.3)))
+    angle, soft = random.uniform(0, 2 * math.pi), uniform_log(random, 0.005, 0.3)
     x = np.linspace(-1, 1, width, dtype=np.float32)[None, :]
     y = np.linspace(-1, 1, height, dtype=np.float32)[:, None]
     beside = (x * np.float32(math.cos(angle)) + y * np.float32(math.sin(angle)) - random.uniform(-0.7, 0.7)) / soft
@@ -198,8 +199,8 @@ def _reflection(random: Random, height: int, width: int) -> Pixels:
     """(height, width) 0..1: of a lamp on a floor, long, upright, and broken up."""
     import cv2
 
-    across = math.hypot(width, height) * math.exp(random.uniform(math.log(0.004), math.log(0.03)))
-    along = across * math.exp(random.uniform(math.log(2), math.log(12)))
+    across = math.hypot(width, height) * uniform_log(random, 0.004, 0.03)
+    along = across * uniform_log(random, 2, 12)
     x = (np.arange(width, dtype=np.float32)[None, :] - random.uniform(0, width)) / across
     y = (np.arange(height, dtype=np.float32)[:, None] - random.uniform(0, height)) / along
     waves = random.random((max(height // int(random.integers(2, 12)), 1), 3)).astype(np.float32)
@@ -211,7 +212,7 @@ def _panel(random: Random, height: int, width: int) -> Pixels:
     """(height, width) 0..1: a window, screen or sign, level or in perspective, of one pane or of several."""
     import cv2
 
-    half = math.hypot(width, height) * np.exp(random.uniform(math.log(0.01), math.log(0.15), 2))
+    half = math.hypot(width, height) * np.array([uniform_log(random, 0.01, 0.15), uniform_log(random, 0.01, 0.15)])
     square = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
     corners = random.uniform(0, (width, height)) + square * half * np.exp(random.normal(0, 0.15, (4, 2)))
     shown = np.zeros((height, width), np.float32)
@@ -226,7 +227,7 @@ def _defocused(random: Random, scene: Pixels) -> Pixels:
     """Under a disc of 1 to 8 % of the width."""
     import cv2
 
-    radius = scene.shape[1] * math.exp(random.uniform(math.log(0.005), math.log(0.04)))
+    radius = scene.shape[1] * uniform_log(random, 0.005, 0.04)
     reach = math.ceil(radius)
     y, x = np.mgrid[-reach:reach + 1, -reach:reach + 1]
     disc = np.clip(radius + 0.5 - np.hypot(x, y), 0, 1).astype(np.float32)

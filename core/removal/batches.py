@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What a training sees: the pictures of each iteration, a function of recipe and iteration, drawn ahead."""
+"""What a training sees: the pictures of each iteration, a function of recipe and iteration; for a learner its share,
+beside a graphics card drawn ahead."""
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
@@ -65,7 +66,7 @@ def drawn_ahead(batches: Batches, first: int, end: int, processes: int) -> Itera
     loader = DataLoader(batches, batch_size=None, sampler=range(first, end), num_workers=processes,
                         prefetch_factor=AHEAD if processes else None,
                         collate_fn=_as_they_are,  # type: ignore[arg-type]  # of single samples, with batch_size=None
-                        worker_init_fn=_begin_process,
+                        worker_init_fn=begin_process,
                         multiprocessing_context="spawn" if processes else None)  # OpenCV's threads survive no fork
     return iter(loader)
 
@@ -73,7 +74,3 @@ def drawn_ahead(batches: Batches, first: int, end: int, processes: int) -> Itera
 def _as_they_are(batch: Batch) -> Batch:
     """Not as tensors, which would be sent through shared memory: containers often have little of it."""
     return batch
-
-
-def _begin_process(_process: int) -> None:
-    begin_process()

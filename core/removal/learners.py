@@ -27,6 +27,9 @@ LOOPBACK = {"linux": "lo", "darwin": "lo0"}
 PATIENCE = timedelta(minutes=10)
 """How long one waits for the others: they may have flares to make."""
 
+ENDED = ("A process of the training ended before it was through; where memory is short, go on with --resume and fewer "
+         "--processes.")
+
 
 @dataclass(frozen=True)
 class Learner:
@@ -81,10 +84,6 @@ def shared(count: int, learn: Callable[..., None], *words: Any) -> Iterator[Lear
             torch.set_num_threads(threads)
 
 
-ENDED = ("A process of the training ended before it was through; where memory is short, go on with --resume and fewer "
-         "--processes.")
-
-
 def add_up(tensors: Sequence[Tensor]) -> None:
     """Each becomes the sum of what the learners have, the same to the last bit for all of them."""
     flat = torch.cat([tensor.reshape(-1) for tensor in tensors])
@@ -93,8 +92,8 @@ def add_up(tensors: Sequence[Tensor]) -> None:
         tensor.copy_(part.view(tensor.shape))
 
 
-def begin_process() -> None:
-    """Of a process beside the first: a stop is for the first alone, which ends the others."""
+def begin_process(_number: int = 0) -> None:
+    """Of any process beside the first, that learns or draws: a stop is for the first alone, which ends the others."""
     import cv2
 
     cv2.setNumThreads(1)

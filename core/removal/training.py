@@ -1,19 +1,16 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Training of the network in the box: one iteration, its checks, its state, the run from begin to end."""
+"""A training of the network in the box from begin to end: shared among processes, logged, checked, kept."""
 from __future__ import annotations
 
 import json
 import os
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from ..errors import Cancelled, RunError, SettingsError
 from ..progress import Progress
@@ -21,159 +18,27 @@ from . import weights
 from .backgrounds import Backgrounds
 from .bank import OneFlare, OwnFlares
 from .batches import Batch, Batches, drawn_ahead
-from .learners import ALONE, Learner, add_up, shared
-from .network import RemovalNetwork
+from .learners import ALONE, Learner, shared
 from .pairs import Pair, pair
 from .recipe import Recipe, as_dict
 from .synthesis.layers import CLASSES
 from .synthesis.prescription import Prescription
+from .trainer import FIGURES, Trainer, device
 
 CHECKPOINT, WEIGHTS, LOG = "checkpoint.safetensors", "removal.safetensors", "training.jsonl"
 CHECK_EVERY = 1000
 CHECK_SEED = 20_000
 CHECKS = 64
 CHECK_SIZE, CHECK_CANVAS = (384, 256), 448
-FAINT = (1e-3, 2e-4)
-"""Mean square of a flare, to which the errors of fainter ones are compared: 30 dB, and from three quarters of a
-training on falling to 37 dB."""
-FIGURES = ("loss", "error", "untouched", "gain")
-UNSEEN = 3e-5
-"""Mean square of an error that is not seen: 45 dB."""
-MOST_LEARNERS, MOST_PROCESSES = 4, 8
-"""Large frames are not many in an iteration; beside a graphics card more than these do not draw faster than it
-learns."""
-
-
-def device() -> torch.device:
-    """The graphics card where there is one."""
-    return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+MOST_LEARNERS = 4
+"""Large frames are not many in an iteration."""
+MOST_BESIDE_A_CARD = 8
+"""More do not draw pictures faster than a graphics card learns from them."""
 
 
 def processes_here() -> int:
-    """A training is best shared among."""
-    return min(os.cpu_count() or 1, MOST_PROCESSES if torch.cuda.is_available() else MOST_LEARNERS)
-
-
-def _half_where_fast(on: torch.device) -> Any:
-    """bfloat16 on processors that have it: on others torch's convolutions take 9 times as long with it as without."""
-    if on.type == "cpu" and not torch.cpu.get_capabilities().get("avx512_bf16"):
-        return nullcontext()
-    return torch.autocast(on.type, dtype=torch.bfloat16)
-
-
-class Trainer:
-    """Network and optimiser at an iteration, of one of the learners."""
-
-    def __init__(self, recipe: Recipe, learner: Learner = ALONE) -> None:
-        self.recipe, self.iteration, self.learner = recipe, 0, learner
-        self.device = device()
-        torch.manual_seed(recipe.seed)
-        self.network = RemovalNetwork(recipe.widths, recipe.blocks).to(self.device)
-        self.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # twice as fast here
-        self.optimiser = torch.optim.AdamW(self.network.parameters(), recipe.learning_rate,
-                                           weight_decay=recipe.decay, fused=True)
-        self.averaged = {name: value.detach().clone() for name, value in self.network.state_dict().items()}
-
-    def step(self, batch: Batch) -> dict[str, float]:
-        """One iteration; its figures."""
-        recipe = self.recipe
-        for group in self.optimiser.param_groups:
-            group["lr"] = recipe.rate(self.iteration)
-        self.optimiser.zero_grad(set_to_none=True)
-        figures = self._learned(batch)
-        torch.nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
-        self.optimiser.step()
-        # The first steps' weights are not worth keeping for as long as later ones'.
-        kept = min(recipe.average, (self.iteration + 1) / (self.iteration + 10))
-        with torch.no_grad():
-            torch._foreach_lerp_(list(self.averaged.values()), list(self.network.state_dict().values()), 1 - kept)
-        self.iteration += 1
-        return figures
-
-    def _learned(self, batch: Batch) -> dict[str, float]:
-        """Set the gradients, and give the figures, of all learners' frames together."""
-        figures = dict.fromkeys(FIGURES, 0.0)
-        if batch.share:
-            loss, figures = self.loss(batch)
-            (loss * batch.share).backward()
-        if self.learner.count > 1:
-            of_all = torch.tensor([figures[name] * batch.share for name in FIGURES])
-            parameters = list(self.network.parameters())
-            for parameter in parameters:
-                if parameter.grad is None:
-                    parameter.grad = torch.zeros_like(parameter)
-            add_up([*(parameter.grad for parameter in parameters if parameter.grad is not None), of_all])
-            figures = dict(zip(FIGURES, of_all.tolist(), strict=True))
-        return figures
-
-    def loss(self, batch: Batch) -> tuple[Tensor, dict[str, float]]:
-        """Of each picture the squared error in parts of the flare's own square to a power that rises from a half to
-        one: at first strong flares lead, which are learned sooner, in the end faint ones count as much, and what
-        is told where there is none counts for more. Over the last `polish` of a training the logarithm of the
-        error in parts of that square, which is the picture's gain in PSNR; what a picture loses counts twice. At half
-        the weight the same of the gentle part."""
-        frame, scene, gentle = (torch.from_numpy(part).permute(0, 3, 1, 2).to(self.device)
-                                for part in (batch.frame, batch.scene, batch.gentle))
-        with _half_where_fast(self.device):
-            told = self.network(frame)
-        goals = torch.stack([frame - scene, frame - gentle])
-        before = goals.square().mean((2, 3, 4))
-        error = (torch.stack([told.flare, told.gentle]) - goals).square().mean((2, 3, 4))
-        done = min(self.iteration / self.recipe.iterations, 1.0)
-        faint = FAINT[0] * (FAINT[1] / FAINT[0]) ** max(4 * done - 3, 0.0)
-        if done < 1 - self.recipe.polish:
-            left = error / (before[0] + faint) ** (0.5 + 0.5 * done)
-        else:
-            left = torch.log((error + UNSEEN) / (before + UNSEEN))
-            left = left + left.clamp(min=0)
-        loss = left[0].mean() + 0.5 * left[1].mean()
-        gain = 10 * torch.log10((before[0] + UNSEEN) / (error[0].detach() + UNSEEN))
-        return loss, {"loss": float(loss.detach()), "error": float(error[0].detach().mean()),
-                      "untouched": float(before[0].mean()), "gain": float(gain.mean())}
-
-    @torch.no_grad()
-    def check(self, pairs: Mapping[str, Sequence[Pair]]) -> dict[str, float]:
-        """PSNR gained over the untouched frame, dB, by class and on average, by the averaged weights."""
-        network = RemovalNetwork(self.recipe.widths, self.recipe.blocks)
-        network.load_state_dict({name: value.cpu() for name, value in self.averaged.items()})
-        gains: dict[str, float] = {}
-        for kind, some in pairs.items():
-            values = []
-            for one in some:
-                frame, scene = (torch.from_numpy(part).permute(2, 0, 1)[None] for part in (one.frame, one.scene))
-                told = network(frame).flare.clamp(min=0)
-                after = ((frame - told).clamp(min=0) - scene).square().mean()
-                before = (frame - scene).square().mean()
-                values.append(float(10 * torch.log10((before + 1e-6) / (after + 1e-6))))
-            gains[kind] = round(float(np.mean(values)), 3)
-        gains["mean"] = round(float(np.mean(list(gains.values()))), 3)
-        return gains
-
-    def state(self) -> dict[str, Tensor]:
-        """Everything that a resumed training needs."""
-        state = {f"network.{name}": value for name, value in self.network.state_dict().items()}
-        state |= {f"averaged.{name}": value for name, value in self.averaged.items()}
-        for (name, _), moments in zip(self.network.named_parameters(), self.optimiser.state.values(), strict=False):
-            state |= {f"moment.{key}.{name}": moments[key] for key in ("exp_avg", "exp_avg_sq", "step")}
-        return {name: value.detach().cpu().contiguous() for name, value in state.items()}
-
-    def load_state(self, state: Mapping[str, Tensor], iteration: int) -> None:
-        """Go on from `state`, or from weights alone (then with fresh moments)."""
-        self.iteration = iteration
-        if not any(name.startswith("network.") for name in state):
-            state = {f"{part}.{name}": value for name, value in state.items() for part in ("network", "averaged")}
-        try:
-            self.network.load_state_dict({name.removeprefix("network."): value.float()
-                                          for name, value in state.items() if name.startswith("network.")})
-        except RuntimeError as problem:
-            raise RunError("The weights to go on from are of another network; give the recipe they were made "
-                           "with.") from problem
-        for name in self.averaged:
-            self.averaged[name] = state[f"averaged.{name}"].float().to(self.device)
-        for name, parameter in self.network.named_parameters():
-            if f"moment.step.{name}" in state:
-                moments = {key: state[f"moment.{key}.{name}"].to(self.device) for key in ("exp_avg", "exp_avg_sq")}
-                self.optimiser.state[parameter] = {**moments, "step": state[f"moment.step.{name}"]}
+    """How many processes a training is best shared among on this machine."""
+    return min(os.cpu_count() or 1, MOST_LEARNERS if device().type == "cpu" else MOST_BESIDE_A_CARD)
 
 
 def checks(backgrounds: Backgrounds, lenses: Sequence[Prescription], count: int = CHECKS) -> dict[str, list[Pair]]:
@@ -208,10 +73,10 @@ def train(recipe: Recipe, folder: Path | str, backgrounds: Backgrounds, lenses: 
         raise RunError(f"{folder} holds a training already; go on with --resume, or choose another folder.")
     beginning = Beginning(recipe, path if path.exists() else start, path.exists(), backgrounds, lenses, own)
     trainer = beginning.trainer(ALONE)  # before others are asked: it may refuse
-    with shared(1 if torch.cuda.is_available() else processes, _learn, beginning) as learner:
+    learners, drawing = (processes, 0) if trainer.device.type == "cpu" else (1, processes - 1)
+    with shared(learners, _learn, beginning) as learner:
         trainer.learner = learner
-        batches = drawn_ahead(beginning.batches(trainer), trainer.iteration, trainer.recipe.iterations,
-                              processes - 1 if torch.cuda.is_available() else 0)
+        batches = drawn_ahead(beginning.batches(trainer), trainer.iteration, trainer.recipe.iterations, drawing)
         held_out = checks(*tests) if tests else {}
         _run(trainer, batches, folder, held_out, save_every_s, progress)
     return folder / WEIGHTS

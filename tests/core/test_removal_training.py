@@ -21,6 +21,7 @@ from core.removal.batches import Batches, drawn_ahead
 from core.removal.learners import ALONE, Learner, add_up, shared
 from core.removal.recipe import Recipe, as_dict, from_dict
 from core.removal.synthesis.prescription import built_in
+from core.removal.trainer import Trainer
 
 torch.set_num_threads(1)  # small tensors, on which threads only wait for each other
 
@@ -113,7 +114,7 @@ def test_pictures_are_the_same_when_others_draw_them() -> None:
 
 def test_a_handful_of_pairs_is_learned() -> None:
     recipe = Recipe(stages=((1.0, 64, 64),), pixels=16_384, widths=(16, 16, 16, 16, 16), bank=2, canvas=64, clean=0)
-    trainer = training.Trainer(recipe)
+    trainer = Trainer(recipe)
     batch = Batches(recipe, backgrounds(), built_in())[0]
     figures = {}
     for _ in range(120):

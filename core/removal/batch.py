@@ -13,6 +13,7 @@ from ..files import remove_partial_of
 from ..pictures import SUFFIXES, write_exr
 from ..progress import Progress
 from .inference import Remover
+from .mattes import Mattes
 from .plates import read_plate, write_plate
 
 TOLD = 20  # failures that are spelled out in the last sentence
@@ -40,11 +41,12 @@ def plates_of(inputs: Iterable[Path]) -> list[tuple[Path, Path]]:
 
 
 def remove_all(inputs: Sequence[Path], folder: Path, remover: Remover, progress: Progress, *,
-               flare_folder: Path | None = None, overwrite: bool = False,
+               flare_folder: Path | None = None, mattes: Mattes | None = None, overwrite: bool = False,
                wanted: Container[Path] | None = None) -> dict[str, Any]:
-    """Clean every plate into `folder`; a plate whose result is there and newer is left as it is.
+    """Clean every plate into `folder`; a plate whose result is there, newer than it and its matte, is left as it is.
 
-    wanted: names below the output folder of those to be cleaned; None for all.
+    mattes: where the flares are; None to have them found anywhere. wanted: names below the output folder of those to be
+    cleaned; None for all.
 
     Raises SettingsError before anything is written, and FrameError after everything was tried, with a list of
     the plates that failed.
@@ -60,15 +62,17 @@ def remove_all(inputs: Sequence[Path], folder: Path, remover: Remover, progress:
     made = kept = 0
     for path, name in plates:
         flare = flare_folder / name.with_suffix(".exr") if flare_folder else None
-        if not overwrite and _is_newer(folder / name, path) and (flare is None or _is_newer(flare, path)):
-            kept += 1
-        else:
-            try:
-                _remove(path, folder / name, flare, remover)
+        results = [folder / name, *([flare] if flare else [])]
+        try:
+            sources = [path, *([mattes.path(name)] if mattes else [])]
+            if not overwrite and all(_is_newer(result, source) for result in results for source in sources):
+                kept += 1
+            else:
+                _remove(path, name, results, remover, mattes)
                 made += 1
-            except (FrameError, OSError, MemoryError) as problem:
-                failed.append(str(problem) or f"{path} does not fit into memory.")
-                progress.say(f"Left out: {failed[-1]}")
+        except (FrameError, OSError, MemoryError) as problem:
+            failed.append(str(problem) or f"{path} does not fit into memory.")
+            progress.say(f"Left out: {failed[-1]}")
         progress.advance()
     if kept:
         progress.say(f"{kept} plates were in {folder} already; --overwrite makes them again.")
@@ -79,14 +83,16 @@ def remove_all(inputs: Sequence[Path], folder: Path, remover: Remover, progress:
     return {"plates": str(folder), "made": made, "kept": kept}
 
 
-def _remove(path: Path, target: Path, flare_target: Path | None, remover: Remover) -> None:
-    for written in (target, *([flare_target] if flare_target is not None else [])):
-        remove_partial_of(written)  # of a task that was killed
+def _remove(path: Path, name: Path, results: Sequence[Path], remover: Remover, mattes: Mattes | None) -> None:
+    """results: the clean plate's path, and the flare's where it is wanted."""
+    for result in results:
+        remove_partial_of(result)  # of a task that was killed
     plate = read_plate(path)
-    codes, flare = remover.remove(plate)
-    write_plate(target, plate, codes)
-    if flare_target is not None:
-        write_exr(flare_target, {name: np.ascontiguousarray(flare[..., k]) for k, name in enumerate("RGB")})
+    height, width = plate.codes.shape[:2]
+    codes, flare = remover.remove(plate, mattes.read(name, width, height) if mattes else None)
+    write_plate(results[0], plate, codes)
+    for result in results[1:]:
+        write_exr(result, {channel: np.ascontiguousarray(flare[..., k]) for k, channel in enumerate("RGB")})
 
 
 def _is_newer(result: Path, source: Path) -> bool:

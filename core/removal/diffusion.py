@@ -199,12 +199,14 @@ class DiffusionRemover(Remover):
         self.model.eval()
 
     @torch.inference_mode()
-    def flare(self, display: Pixels) -> Pixels:
-        """Linear flare (of `network.GAMMA`) of display values whose sides are multiples of MULTIPLE."""
+    def flare(self, display: Pixels, *, marked: bool = False) -> Pixels:
+        """Linear flare (of `network.GAMMA`) of display values whose sides are multiples of MULTIPLE; `marked` as of
+        the network's."""
         frame = torch.from_numpy(np.ascontiguousarray(display.transpose(2, 0, 1)))[None]
         clean = self.model(frame).clamp(0, 1)
         flare = (frame**GAMMA - clean**GAMMA).clamp(min=0)
-        flare = flare * ((flare - 0.001) / 0.001).clamp(0, 1)
+        if not marked:
+            flare = flare * ((flare - 0.001) / 0.001).clamp(0, 1)
         return np.ascontiguousarray(flare[0].permute(1, 2, 0).numpy())
 
 

@@ -66,13 +66,19 @@ class Remover:
         self.network: RemovalNetwork = load(weights or IN_THE_BOX)
         self.working_size, self.keep_glare = working_size, keep_glare
 
-    def remove(self, plate: Plate) -> tuple[NDArray[Any], NDArray[np.float16]]:
-        """(codes without flare, in the plate's own type; the flare in linear light (height, width, 3))."""
-        found = self.find(plate.codes, plate.encoding, plate.top)
+    def remove(self, plate: Plate, matte: Pixels | None = None) -> tuple[NDArray[Any], NDArray[np.float16]]:
+        """(codes without flare, in the plate's own type; the flare in linear light (height, width, 3)).
+
+        matte: (height, width), 0..1, where someone has marked a flare: that share of it is taken there, and since it
+        is known that there is one, so little of it counts too as would be doubted otherwise.
+        """
+        found = self.find(plate.codes, plate.encoding, plate.top, marked=matte is not None)
         codes = plate.codes.copy()
         flare = np.zeros(plate.codes.shape, np.float16)
         if not found.empty:
             for rows, light in carried_up(found, plate.codes, plate.encoding, plate.top):
+                if matte is not None:
+                    light *= matte[rows, :, None]
                 codes[rows] = _less(plate.codes[rows], light, plate.encoding, plate.top)
                 flare[rows] = _taken(plate.codes[rows], codes[rows], light, plate.encoding, plate.top)
         return codes, flare
@@ -83,20 +89,24 @@ class Remover:
         clean = self.remove(Plate(Path("display.png"), codes, "srgb"))[0]
         return np.where(clean == codes, display, clean.astype(np.float32) / 65535)
 
-    def find(self, codes: NDArray[Any], encoding: Encoding, top: float = 1.0) -> FlareMap:
-        """The flare of a picture's codes (height, width, 3), at the working size."""
+    def find(self, codes: NDArray[Any], encoding: Encoding, top: float = 1.0, *, marked: bool = False) -> FlareMap:
+        """The flare of a picture's codes (height, width, 3), at the working size; `marked` as of `flare`."""
         small = self._seen(codes, encoding, top)
-        return _carrier(small, self.flare(small))
+        return _carrier(small, self.flare(small, marked=marked))
 
     @torch.inference_mode()
-    def flare(self, display: Pixels) -> Pixels:
-        """Linear flare of a picture of display values 0..1 at the network's size; exactly 0 where it is none."""
+    def flare(self, display: Pixels, *, marked: bool = False) -> Pixels:
+        """Linear flare of a picture of display values 0..1 at the network's size; exactly 0 where it is none.
+
+        marked: someone has seen a flare in it, so that whatever the network tells is one.
+        """
         frame = torch.from_numpy(np.ascontiguousarray(display.transpose(2, 0, 1)))[None]
         told = self.network(frame)
         added = (told.gentle if self.keep_glare else told.flare).clamp(min=0)
-        # A ramp from nothing to the whole, so that a faint flare has no rim.
-        added = added * ((added - LEAST) / LEAST).clamp(0, 1)
-        added = added * ((added.mean() - SURE) / max(SURE, 1e-9)).clamp(0, 1)
+        if not marked:
+            # A ramp from nothing to the whole, so that a faint flare has no rim.
+            added = added * ((added - LEAST) / LEAST).clamp(0, 1)
+            added = added * ((added.mean() - SURE) / max(SURE, 1e-9)).clamp(0, 1)
         light = torch.where(added > 0, flare_light(frame, added), 0.0)
         return np.ascontiguousarray(light[0].permute(1, 2, 0).numpy())
 

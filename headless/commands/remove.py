@@ -31,9 +31,12 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--frames", metavar="A-B",
                         help="frame numbers, such as 1-20,31, of those in the plates' names; all where not given")
     parser.add_argument("--flare", type=Path, metavar="DIR", help="write the flares too, as EXR in linear light")
+    parser.add_argument("--matte", type=Path, metavar="PICTURE_OR_DIR",
+                        help="where the flares are, white on black: one picture for all plates, or a folder with one "
+                             "for each, of its name; nothing is taken elsewhere, and what is faint is taken too")
     parser.add_argument("--keep-glare", action="store_true", help="leave the glow round the lights")
     parser.add_argument("--working-size", type=int, metavar="PIXELS",
-                        help="long side that the network sees (default 256, about what it was trained at)")
+                        help="long side that the network sees (default 384, about what it was trained at)")
     parser.add_argument("--weights", type=Path, metavar="FILE",
                         help="weights of train-removal's (default: those that come with the program)")
     parser.add_argument("--model", choices=("network", "diffusion"), default="network",
@@ -47,6 +50,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     from ...core.bake.frames import chosen, numbered
     from ...core.removal.batch import plates_of, remove_all
+    from ...core.removal.mattes import Mattes
 
     if (words.run is None) == (not words.plates):
         raise SettingsError("remove needs plates, or a fitted run with --run: the one or the other.")
@@ -62,7 +66,7 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
             progress.say(f"The clean plates are in {words.out}.")
             return {"plates": str(words.out)}
     return remove_all(words.plates, words.out, _remover(words), progress, flare_folder=words.flare,
-                      overwrite=words.overwrite, wanted=wanted)
+                      mattes=Mattes(words.matte) if words.matte else None, overwrite=words.overwrite, wanted=wanted)
 
 
 def _by_run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
@@ -71,7 +75,8 @@ def _by_run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     from ...core.fit import Run
     from ...core.removal.fitted import remove_fitted
 
-    if words.jobs != 1 or words.model != "network" or words.weights or words.working_size or words.keep_glare:
+    network = (words.weights, words.working_size, words.keep_glare, words.matte)
+    if words.jobs != 1 or words.model != "network" or any(network):
         raise SettingsError("--run takes away the flare that was fitted: of the other options only --out, --frames, "
                             "--flare and --overwrite go with it.")
     fitted = Run.open(words.run)
@@ -119,5 +124,6 @@ is kept to the last bit. A plate that cannot be read is told at the end, and doe
 
   run.py remove plate.exr --out clean
   run.py remove shots/sh010 --out clean/sh010 --flare flares/sh010 --keep-glare
+  run.py remove shots/sh010 --matte roto/sh010 --out clean/sh010        # where the artist says that they are
   run.py remove --run my_run --out clean          # what `fit` found, out of the frames it was fitted to""",
     arguments, (Step("remove", "engine", run),))

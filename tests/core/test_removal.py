@@ -19,8 +19,9 @@ from core.progress import Progress
 from core.removal import inference, weights
 from core.removal.batch import plates_of, remove_all
 from core.removal.inference import FlareMap, Remover, carried_up
+from core.removal.mattes import Mattes
 from core.removal.network import LEVELS, SHOWN, RemovalNetwork, flare_light, seen
-from core.removal.plates import read_plate, write_plate
+from core.removal.plates import Plate, read_plate, write_plate
 from core.removal.recipe import Recipe, as_dict
 
 TINY = Recipe(widths=(8, 8, 8, 8, 8))
@@ -119,7 +120,7 @@ def test_weights_keep_their_recipe_and_damage_is_told(tmp_path: Path, everywhere
 
 def test_a_flat_flare_is_taken_in_light(everywhere: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     remover = Remover(everywhere, working_size=64)
-    monkeypatch.setattr(remover, "flare", lambda display: np.full_like(display, 0.1))
+    monkeypatch.setattr(remover, "flare", lambda display, **_: np.full_like(display, 0.1))
     codes = np.full((300, 200, 3), 180, np.uint8)
     clean = np.asarray(_remove(remover, codes))
     expected = np.sqrt((180 / 255) ** 2 - 0.1) * 255
@@ -131,23 +132,26 @@ def test_edges_of_the_plate_stay_sharp(everywhere: Path, monkeypatch: pytest.Mon
     remover = Remover(everywhere, working_size=64)
     codes = np.full((512, 512, 3), 80, np.uint8)
     codes[:, 256:] = 255
-    monkeypatch.setattr(remover, "flare", lambda display: 0.1 * (display > 0.6).astype(np.float32))
+    monkeypatch.setattr(remover, "flare", lambda display, **_: 0.1 * (display > 0.6).astype(np.float32))
     clean = np.asarray(_remove(remover, codes)).astype(int)
     assert np.abs(clean[200:300, 240:256] - 80).max() <= 5, "what is beside the flare keeps its level up to the edge"
     assert (codes[200:300, 258:270].astype(int) - clean[200:300, 258:270]).min() >= 8
 
 
 def _remove(remover: Remover, codes: NDArray[np.generic]) -> NDArray[np.generic]:
-    from core.removal.plates import Plate
+    return remover.remove(plate_of(codes))[0]
 
-    return remover.remove(Plate(Path("plate.png"), codes, "srgb"))[0]
+
+def plate_of(codes: NDArray[np.generic]) -> Plate:
+    return Plate(Path("plate.png"), codes, "srgb")
 
 
 def test_where_the_flare_is_zero_the_plate_is_kept_to_the_last_bit(everywhere: Path,
                                                                    monkeypatch: pytest.MonkeyPatch) -> None:
     remover = Remover(everywhere, working_size=128)
 
-    def corner(display: NDArray[np.float32]) -> NDArray[np.float32]:
+    def corner(display: NDArray[np.float32], *, marked: bool) -> NDArray[np.float32]:
+        assert not marked
         flare = np.zeros_like(display)
         flare[:20, :20] = 0.05
         return flare
@@ -272,6 +276,76 @@ def test_the_flare_taken_is_what_plate_and_clean_plate_differ_by(tmp_path: Path,
     flare = read_exr(tmp_path / "flare" / "plate.exr")
     before, after = (read_picture(path).linear() for path in (tmp_path / "plate.png", tmp_path / "out" / "plate.png"))
     np.testing.assert_allclose(np.stack([flare[name] for name in "RGB"], -1), before - after, atol=1e-3)
+
+
+# Mattes.
+
+
+def _matte(path: Path, width: int, height: int, dtype: type = np.uint8) -> Path:
+    """White on the left half, black on the right."""
+    values = np.zeros((height, width), dtype)
+    values[:, :width // 2] = np.iinfo(dtype).max
+    path.parent.mkdir(exist_ok=True)
+    return write_codes(path, values)
+
+
+@pytest.mark.parametrize(("scale", "dtype"), [(1, np.uint8), (1, np.uint16), (2, np.uint8)])
+def test_flares_are_taken_where_the_matte_is_white_alone(tmp_path: Path, everywhere: Path, scale: int,
+                                                         dtype: type) -> None:
+    source = write_codes(tmp_path / "plate.png", picture())
+    matte = _matte(tmp_path / "matte.png", 90 // scale, 60 // scale, dtype)
+    remove_all([source], tmp_path / "out", Remover(everywhere, working_size=64), Progress(), mattes=Mattes(matte),
+               flare_folder=tmp_path / "flare")
+    clean, flare = cv2.imread(str(tmp_path / "out" / "plate.png")), read_exr(tmp_path / "flare" / "plate.exr")
+    difference = np.abs(clean.astype(int) - cv2.imread(str(source))).max(-1)
+    assert (difference[:, :44] > 0).mean() > 0.9, "black has nothing to take"
+    assert not difference[:, 46:].any()
+    assert not flare["R"][:, 46:].any()
+    assert (flare["R"][:, :44] > 0).mean() > 0.9
+
+
+def test_a_grey_matte_takes_a_part(everywhere: Path) -> None:
+    codes = np.full((60, 90, 3), 180, np.uint8)
+    plate = plate_of(codes)
+    remover = Remover(everywhere, working_size=64)
+    whole, half = (remover.remove(plate, np.full((60, 90), share, np.float32))[1].astype(np.float32).mean()
+                   for share in (1, 0.5))
+    assert abs(half / whole - 0.5) < 0.03
+
+
+def test_what_is_faint_is_taken_where_it_is_marked(tmp_path: Path) -> None:
+    faint = Remover(network_file(tmp_path / "faint.safetensors", bias=0.9 * inference.LEAST), working_size=64)
+    codes = np.full((60, 90, 3), 180, np.uint8)
+    assert np.array_equal(_remove(faint, codes), codes)
+    assert (faint.remove(plate_of(codes), np.ones((60, 90), np.float32))[0] < codes).mean() > 0.3
+
+
+def test_every_plate_has_its_own_matte(tmp_path: Path, everywhere: Path) -> None:
+    for name in ("a.png", "b.png", "c.png"):
+        (tmp_path / "in").mkdir(exist_ok=True)
+        write_codes(tmp_path / "in" / name, picture())
+    _matte(tmp_path / "mattes" / "a.png", 90, 60)
+    write_exr(tmp_path / "mattes" / "b.exr", {"Y": np.full((60, 90), np.nan)})
+    remover, mattes = Remover(everywhere, working_size=64), Mattes(tmp_path / "mattes")
+    with pytest.raises(FrameError, match=r"1 of 3 plates .*c\.png has no matte"):
+        remove_all([tmp_path / "in"], tmp_path / "out", remover, Progress(), mattes=mattes)
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["a.png", "b.png"]
+    assert np.array_equal(cv2.imread(str(tmp_path / "out" / "b.png")), cv2.imread(str(tmp_path / "in" / "b.png")))
+    os.utime(tmp_path / "mattes" / "a.png", (2e9, 2e9))
+    plates = [tmp_path / "in" / "a.png", tmp_path / "in" / "b.png"]
+    made = remove_all(plates, tmp_path / "out", remover, Progress(), mattes=mattes)
+    assert (made["made"], made["kept"]) == (1, 1), "a matte that was painted again"
+
+
+def test_mattes_that_make_no_sense(tmp_path: Path) -> None:
+    with pytest.raises(SettingsError, match="missing"):
+        Mattes(tmp_path / "none.png")
+    matte = Mattes(_matte(tmp_path / "mattes" / "a.png", 60, 60))
+    with pytest.raises(FrameError, match="another shape"):
+        matte.read(Path("a.png"), 90, 60)
+    _matte(tmp_path / "mattes" / "a.tif", 60, 60)
+    with pytest.raises(SettingsError, match="keep one"):
+        Mattes(tmp_path / "mattes")
 
 
 def bad_files(folder: Path) -> list[Path]:

@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Mattes: pictures in which an artist has marked where the flares of plates are, white on black."""
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import FrameError, SettingsError
+from ..pictures import SUFFIXES
+from .plates import read_plate
+
+ASPECT = 0.01
+"""By how much of it the aspect of a matte may differ from that of its plate: a smaller one has rounded sides."""
+
+
+class Mattes:
+    """One matte for all plates, or a folder with one for each, under the plate's name with any suffix."""
+
+    def __init__(self, given: Path) -> None:
+        """Raises SettingsError where there is nothing, or where a folder has two for one name."""
+        self.given = given
+        self._by_name: dict[Path, Path] | None = None
+        if given.is_dir():
+            self._by_name = _by_name(given, (path for path in sorted(given.rglob("*"))
+                                             if path.suffix.lower() in SUFFIXES and not path.name.startswith(".")))
+        elif not given.is_file():
+            raise SettingsError(f"{given} is missing; give a matte, or a folder with one for each plate.")
+
+    def path(self, name: Path) -> Path:
+        """Of the plate of that name below its folder. Raises FrameError where it has none."""
+        if self._by_name is None:
+            return self.given
+        found = self._by_name.get(name.with_suffix(""))
+        if found is None:
+            raise FrameError(f"{name} has no matte in {self.given}; add one (black, where no flare is to be taken).")
+        return found
+
+    def read(self, name: Path, width: int, height: int) -> NDArray[np.float32]:
+        """(height, width), 0..1: the brightest channel of the plate's matte. Raises FrameError for a damaged one, and
+        for one of another shape."""
+        import cv2
+
+        path = self.path(name)
+        matte = read_plate(path)
+        rows, columns = matte.codes.shape[:2]
+        if abs(columns * height / (rows * width) - 1) > ASPECT:
+            raise FrameError(f"{path} is {columns} x {rows} pixels, another shape than its plate of {width} x "
+                             f"{height}; make it for that plate.")
+        values = np.nan_to_num(matte.codes.max(-1).astype(np.float32) / np.float32(matte.top), nan=0.0, posinf=1.0)
+        if (columns, rows) != (width, height):
+            values = np.asarray(cv2.resize(values, (width, height), interpolation=cv2.INTER_LINEAR), np.float32)
+        return np.clip(values, 0, 1)
+
+
+def _by_name(folder: Path, paths: Iterable[Path]) -> dict[Path, Path]:
+    found: dict[Path, Path] = {}
+    for path in paths:
+        name = path.relative_to(folder).with_suffix("")
+        if name in found:
+            raise SettingsError(f"{found[name]} and {path} are both mattes for {name}; keep one of them.")
+        found[name] = path
+    return found

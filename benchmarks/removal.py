@@ -41,6 +41,7 @@ from core.progress import Progress
 from core.removal.batch import remove_all
 from core.removal.inference import WORKING_SIZE, Remover
 from core.removal.plates import read_plate
+from core.removal.steady import Sequences
 
 SHOWN = 3
 """Frames on a sheet of the sample."""
@@ -96,16 +97,19 @@ def speed(weights: Path | None) -> None:
 
 def sample(capture: Path, weights: Path | None, cleaned: Path | None, sheet: Path | None) -> None:
     """PSNR of every frame against the exact scene, and flicker."""
-    remover = Remover(weights) if cleaned is None else None
+    remover = Remover(weights)
     before: Any = None
     scores, flicker, rows = [], [], []
     paths = sorted((capture / "images").iterdir())
+    sequences = Sequences(remover, paths)
     for number, path in enumerate(paths):
         truth = read_picture(capture / "truth" / "scene" / f"{path.stem}.exr").display()
-        found = read_plate(path)
-        frame = found.codes.astype(np.float32) / 255
-        codes = remover.remove(found)[0] if remover else read_plate(_cleaned(cleaned or capture, path.stem)).codes
-        clean = codes.astype(np.float32) / 255
+        if cleaned is None:
+            found, told = sequences.read(path)
+            codes = remover.remove(found, told=told)[0]
+        else:
+            found, codes = read_plate(path), read_plate(_cleaned(cleaned, path.stem)).codes
+        frame, clean = found.codes.astype(np.float32) / 255, codes.astype(np.float32) / 255
         scores.append((psnr(frame, truth), psnr(clean, truth)))
         if number % max(len(paths) // SHOWN, 1) == 5:
             rows.append(np.concatenate([frame, clean, np.clip(truth, 0, 1)], 1))

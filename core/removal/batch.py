@@ -14,7 +14,8 @@ from ..pictures import SUFFIXES, write_exr
 from ..progress import Progress
 from .inference import Remover
 from .mattes import Mattes
-from .plates import read_plate, write_plate
+from .plates import write_plate
+from .steady import Sequences, by_number
 
 TOLD = 20  # failures that are spelled out in the last sentence
 
@@ -42,16 +43,17 @@ def plates_of(inputs: Iterable[Path]) -> list[tuple[Path, Path]]:
 
 def remove_all(inputs: Sequence[Path], folder: Path, remover: Remover, progress: Progress, *,
                flare_folder: Path | None = None, mattes: Mattes | None = None, overwrite: bool = False,
-               wanted: Container[Path] | None = None) -> dict[str, Any]:
+               wanted: Container[Path] | None = None, stills: bool = False) -> dict[str, Any]:
     """Clean every plate into `folder`; a plate whose result is there, newer than it and its matte, is left as it is.
 
     mattes: where the flares are; None to have them found anywhere. wanted: names below the output folder of those to be
-    cleaned; None for all.
+    cleaned; None for all. stills: each by itself, in place of in line with its neighbours.
 
     Raises SettingsError before anything is written, and FrameError after everything was tried, with a list of
     the plates that failed.
     """
     plates = plates_of(inputs)
+    sequences = Sequences(remover, [] if stills else [path for path, _ in plates])
     if wanted is not None:
         plates = [(path, name) for path, name in plates if name in wanted]
     for path, name in plates:
@@ -60,7 +62,7 @@ def remove_all(inputs: Sequence[Path], folder: Path, remover: Remover, progress:
     progress.stage("remove", len(plates))
     failed: list[str] = []
     made = kept = 0
-    for path, name in plates:
+    for path, name in sorted(plates, key=lambda plate: (plate[0].parent, by_number(plate[0]))):
         flare = flare_folder / name.with_suffix(".exr") if flare_folder else None
         results = [folder / name, *([flare] if flare else [])]
         try:
@@ -68,7 +70,7 @@ def remove_all(inputs: Sequence[Path], folder: Path, remover: Remover, progress:
             if not overwrite and all(_is_newer(result, source) for result in results for source in sources):
                 kept += 1
             else:
-                _remove(path, name, results, remover, mattes)
+                _remove(path, name, results, remover, sequences, mattes)
                 made += 1
         except (FrameError, OSError, MemoryError) as problem:
             failed.append(str(problem) or f"{path} does not fit into memory.")
@@ -83,13 +85,14 @@ def remove_all(inputs: Sequence[Path], folder: Path, remover: Remover, progress:
     return {"plates": str(folder), "made": made, "kept": kept}
 
 
-def _remove(path: Path, name: Path, results: Sequence[Path], remover: Remover, mattes: Mattes | None) -> None:
+def _remove(path: Path, name: Path, results: Sequence[Path], remover: Remover, sequences: Sequences,
+            mattes: Mattes | None) -> None:
     """results: the clean plate's path, and the flare's where it is wanted."""
     for result in results:
         remove_partial_of(result)  # of a task that was killed
-    plate = read_plate(path)
+    plate, told = sequences.read(path)
     height, width = plate.codes.shape[:2]
-    codes, flare = remover.remove(plate, mattes.read(name, width, height) if mattes else None)
+    codes, flare = remover.remove(plate, mattes.read(name, width, height) if mattes else None, told)
     write_plate(results[0], plate, codes)
     for result in results[1:]:
         write_exr(result, {channel: np.ascontiguousarray(flare[..., k]) for k, channel in enumerate("RGB")})

@@ -9,7 +9,8 @@ from ..errors import CaptureError
 from ..files import inside
 from ..progress import Progress
 from .inference import Remover
-from .plates import read_plate, write_plate
+from .plates import write_plate
+from .steady import Sequences
 
 REMOVED = "removed"
 UNFINISHED = "removed.unfinished"
@@ -27,14 +28,15 @@ def remove_from(capture: Capture, remover: Remover, progress: Progress) -> Path:
     if target.exists():
         raise CaptureError(f"{target} is there already; remove it, and the frames are cleaned again.")
     progress.stage("remove", len(capture.views))
+    sequences = Sequences(remover, [capture.frame_path(view) for view in capture.views])
     try:
         for view in capture.views:
             name = Path(view.name)
             result = inside(work, str(name.with_suffix(".png") if name.suffix.lower() in _LOSSY else name),
                             CaptureError)
             if not result.is_file():
-                plate = read_plate(capture.frame_path(view))
-                write_plate(result, plate, remover.remove(plate)[0])
+                plate, told = sequences.read(capture.frame_path(view))
+                write_plate(result, plate, remover.remove(plate, told=told)[0])
             progress.advance()
         work.rename(target)
     except OSError as problem:

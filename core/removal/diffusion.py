@@ -27,7 +27,6 @@ from ..errors import EngineError, RunError, SettingsError
 from ..pictures import Pixels
 from . import weights
 from .inference import WORKING_SIZE, Remover
-from .network import GAMMA
 
 PROMPT = "remove flares and keep the original image. High quality. Retain original colors"
 STEP = 199
@@ -191,6 +190,8 @@ class DiffusionTrainer:
 class DiffusionRemover(Remover):
     """Takes flares from plates by the diffusion model: what its answer lacks of the frame is the flare."""
 
+    sure = 0.0  # `SURE` is of the network in the box
+
     def __init__(self, base: Path | str, lora: Path | str, *, working_size: int = WORKING_SIZE) -> None:
         """lora: the file that `DiffusionRemoval.save` wrote. Raises EngineError, RunError."""
         self.working_size, self.keep_glare = working_size, False
@@ -199,15 +200,11 @@ class DiffusionRemover(Remover):
         self.model.eval()
 
     @torch.inference_mode()
-    def flare(self, display: Pixels, *, marked: bool = False) -> Pixels:
-        """Linear flare (of `network.GAMMA`) of display values whose sides are multiples of MULTIPLE; `marked` as of
-        the network's."""
+    def added(self, display: Pixels) -> Pixels:
+        """What a flare adds to display values whose sides are multiples of MULTIPLE."""
         frame = torch.from_numpy(np.ascontiguousarray(display.transpose(2, 0, 1)))[None]
-        clean = self.model(frame).clamp(0, 1)
-        flare = (frame**GAMMA - clean**GAMMA).clamp(min=0)
-        if not marked:
-            flare = flare * ((flare - 0.001) / 0.001).clamp(0, 1)
-        return np.ascontiguousarray(flare[0].permute(1, 2, 0).numpy())
+        added = (frame - self.model(frame).clamp(0, 1)).clamp(min=0)
+        return np.ascontiguousarray(added[0].permute(1, 2, 0).numpy())
 
 
 def train_diffusion(model: DiffusionRemoval, folder: Path | str, draw: Callable[[int], tuple[Pixels, Pixels]],

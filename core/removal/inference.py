@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -55,8 +55,18 @@ class FlareMap:
         return not (self.gain.any() or self.offset.any())
 
 
+class Told(NamedTuple):
+    """Of a plate the display values 0..1 that the network was shown (h, w, 3), and what a flare adds to them as it
+    told, not yet doubted."""
+
+    display: Pixels
+    added: Pixels
+
+
 class Remover:
     """The network of a weights file, ready for plates."""
+
+    sure = SURE
 
     def __init__(self, weights: Path | None = None, *, working_size: int = WORKING_SIZE,
                  keep_glare: bool = False) -> None:
@@ -66,13 +76,16 @@ class Remover:
         self.network: RemovalNetwork = load(weights or IN_THE_BOX)
         self.working_size, self.keep_glare = working_size, keep_glare
 
-    def remove(self, plate: Plate, matte: Pixels | None = None) -> tuple[NDArray[Any], NDArray[np.float16]]:
+    def remove(self, plate: Plate, matte: Pixels | None = None,
+               told: Told | None = None) -> tuple[NDArray[Any], NDArray[np.float16]]:
         """(codes without flare, in the plate's own type; the flare in linear light (height, width, 3)).
 
         matte: (height, width), 0..1, where someone has marked a flare: that share of it is taken there, and since it
-        is known that there is one, so little of it counts too as would be doubted otherwise.
+        is known that there is one, so little of it counts too as would be doubted otherwise. told: of the plate, where
+        that is known already (`steady.Sequences`).
         """
-        found = self.find(plate.codes, plate.encoding, plate.top, marked=matte is not None)
+        told = told or self.tell(plate)
+        found = _carrier(told.display, self.flare(told, marked=matte is not None))
         codes = plate.codes.copy()
         flare = np.zeros(plate.codes.shape, np.float16)
         if not found.empty:
@@ -89,31 +102,35 @@ class Remover:
         clean = self.remove(Plate(Path("display.png"), codes, "srgb"))[0]
         return np.where(clean == codes, display, clean.astype(np.float32) / 65535)
 
-    def find(self, codes: NDArray[Any], encoding: Encoding, top: float = 1.0, *, marked: bool = False) -> FlareMap:
-        """The flare of a picture's codes (height, width, 3), at the working size; `marked` as of `flare`."""
-        small = self._seen(codes, encoding, top)
-        return _carrier(small, self.flare(small, marked=marked))
+    def tell(self, plate: Plate) -> Told:
+        """What the network tells of a plate."""
+        display = self.shown(plate)
+        return Told(display, self.added(display))
 
     @torch.inference_mode()
-    def flare(self, display: Pixels, *, marked: bool = False) -> Pixels:
-        """Linear flare of a picture of display values 0..1 at the network's size; exactly 0 where it is none.
+    def added(self, display: Pixels) -> Pixels:
+        """What a flare adds to display values 0..1 (h, w, 3), h and w multiples of MULTIPLE."""
+        told = self.network(torch.from_numpy(np.ascontiguousarray(display.transpose(2, 0, 1)))[None])
+        added = (told.gentle if self.keep_glare else told.flare)[0].clamp(min=0)
+        return np.ascontiguousarray(added.permute(1, 2, 0).numpy())
 
-        marked: someone has seen a flare in it, so that whatever the network tells is one.
+    def flare(self, told: Told, *, marked: bool = False) -> Pixels:
+        """Linear flare (h, w, 3) of what was told; exactly 0 where there is none.
+
+        marked: someone has seen a flare there, so that whatever was told is one.
         """
-        frame = torch.from_numpy(np.ascontiguousarray(display.transpose(2, 0, 1)))[None]
-        told = self.network(frame)
-        added = (told.gentle if self.keep_glare else told.flare).clamp(min=0)
+        added = told.added
         if not marked:
             # A ramp from nothing to the whole, so that a faint flare has no rim.
-            added = added * ((added - LEAST) / LEAST).clamp(0, 1)
-            added = added * ((added.mean() - SURE) / max(SURE, 1e-9)).clamp(0, 1)
-        light = torch.where(added > 0, flare_light(frame, added), 0.0)
-        return np.ascontiguousarray(light[0].permute(1, 2, 0).numpy())
+            added = added * np.clip((added - LEAST) / LEAST, 0, 1)
+            added = added * np.clip((added.mean() - self.sure) / max(self.sure, 1e-9), 0, 1)
+        return np.where(added > 0, flare_light(told.display, added), np.float32(0))
 
-    def _seen(self, codes: NDArray[Any], encoding: Encoding, top: float) -> Pixels:
-        """The plate as the network sees it: display values, reduced, sides multiples of what it takes."""
+    def shown(self, plate: Plate) -> Pixels:
+        """Display values 0..1 of a plate as the network is shown it: reduced, sides multiples of what it takes."""
         import cv2
 
+        codes, encoding, top = plate.codes, plate.encoding, plate.top
         height, width = codes.shape[:2]
         scale = self.working_size / max(height, width)
         fit = [int(np.clip(round(side * scale / MULTIPLE), 2, max(self.working_size // MULTIPLE, 2))) * MULTIPLE

@@ -16,8 +16,10 @@ from __future__ import annotations
 from itertools import pairwise
 from typing import NamedTuple
 
+import numpy as np
 import torch
 import torch.nn.functional as F  # noqa: N812 - its name everywhere
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 CELL = 2
@@ -156,6 +158,6 @@ class RemovalNetwork(nn.Module):
         return Prediction(out[:, :3], out[:, :3] * torch.sigmoid(out[:, 3:] * 4))
 
 
-def flare_light(display: Tensor, added: Tensor) -> Tensor:
+def flare_light(display: NDArray[np.float32], added: NDArray[np.float32]) -> NDArray[np.float32]:
     """Linear flare (of GAMMA): what the frame's light has more than that of the clean display values."""
-    return display**GAMMA - (display - added).clamp(min=0) ** GAMMA
+    return np.asarray(display**GAMMA - np.maximum(display - added, 0) ** GAMMA, np.float32)

@@ -35,6 +35,9 @@ def arguments(parser: argparse.ArgumentParser) -> None:
                         help="where the flares are, white on black: one picture for all plates, or a folder with one "
                              "for each, of its name; nothing is taken elsewhere, and what is faint is taken too")
     parser.add_argument("--keep-glare", action="store_true", help="leave the glow round the lights")
+    parser.add_argument("--stills", action="store_true",
+                        help="clean each plate by itself, in place of in line with those before and after it in its "
+                             "folder")
     parser.add_argument("--working-size", type=int, metavar="PIXELS",
                         help="long side that the network sees (default 384, about what it was trained at)")
     parser.add_argument("--weights", type=Path, metavar="FILE",
@@ -66,7 +69,8 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
             progress.say(f"The clean plates are in {words.out}.")
             return {"plates": str(words.out)}
     return remove_all(words.plates, words.out, _remover(words), progress, flare_folder=words.flare,
-                      mattes=Mattes(words.matte) if words.matte else None, overwrite=words.overwrite, wanted=wanted)
+                      mattes=Mattes(words.matte) if words.matte else None, overwrite=words.overwrite, wanted=wanted,
+                      stills=words.stills)
 
 
 def _by_run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
@@ -75,7 +79,7 @@ def _by_run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     from ...core.fit import Run
     from ...core.removal.fitted import remove_fitted
 
-    network = (words.weights, words.working_size, words.keep_glare, words.matte)
+    network = (words.weights, words.working_size, words.keep_glare, words.matte, words.stills)
     if words.jobs != 1 or words.model != "network" or any(network):
         raise SettingsError("--run takes away the flare that was fitted: of the other options only --out, --frames, "
                             "--flare and --overwrite go with it.")

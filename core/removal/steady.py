@@ -1,0 +1,110 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Steadiness: what is told of a frame of a sequence, brought into line with what is told of the frames about it.
+
+A network that sees each frame by itself tells a little more now and a little less then, and the clean plates
+breathe. A flare moves; but blurred a little, a place that looks the same in two frames has the same flare in
+both. So what is told of a place is moved by what its blur differs from the mean over the frames about it, each
+weighted by how alike their blurs look there: a joint bilateral filter (Petschnigg et al. 2004, "Digital
+Photography with Flash and No-Flash Image Pairs") over time. Across a cut, or where a light comes out from
+behind something, nothing is alike, and every frame is left as it was told.
+"""
+from __future__ import annotations
+
+import re
+from collections import OrderedDict
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import FrameError
+from .inference import Remover, Told
+from .plates import Plate, read_plate
+
+Pixels = NDArray[np.float32]
+
+REACH = 4
+"""Frames to either side that count."""
+BLUR = 0.01
+"""Of the long side of what the network sees, the blur's standard deviation."""
+ALIKE = 0.06
+"""Display value by which places differ that count for e**-1 of one that is the same."""
+
+
+class Calm(NamedTuple):
+    """What was told of a frame, and the same blurred."""
+
+    told: Told
+    display: Pixels
+    added: Pixels
+
+
+def calm(told: Told) -> Calm:
+    """With the blurs of it."""
+    import cv2
+
+    deviation = BLUR * max(told.display.shape[:2])
+    display, added = (np.asarray(cv2.GaussianBlur(part, (0, 0), deviation), np.float32) for part in told)
+    return Calm(told, display, added)
+
+
+def steadied(here: Calm, about: Iterable[Calm]) -> Told:
+    """What was told of `here`, in line with the frames about it; those of another shape are passed over."""
+    total, weights = here.added, np.ones((*here.added.shape[:2], 1), np.float32)
+    for other in about:
+        if other.added.shape == here.added.shape:
+            apart = np.square(other.display - here.display).mean(-1, keepdims=True)
+            weight = np.exp(-apart / np.float32(ALIKE**2))
+            total, weights = total + weight * other.added, weights + weight
+    # In this order, so that without neighbours it is what was told to the last bit.
+    return Told(here.told.display, np.maximum(here.told.added + (total / weights - here.added), 0))
+
+
+class Sequences:
+    """Plates of which each is seen beside its neighbours: those of its folder, in the order of the numbers in their
+    names. What is told of a plate does not depend on which of the others are cleaned, or in what order."""
+
+    def __init__(self, remover: Remover, paths: Iterable[Path]) -> None:
+        self._remover = remover
+        self._beside: dict[Path, Sequence[Path]] = {}
+        folders: dict[Path, list[Path]] = {}
+        for path in paths:
+            folders.setdefault(path.parent, []).append(path)
+        for those in folders.values():
+            those.sort(key=by_number)
+            for at, path in enumerate(those):
+                self._beside[path] = those[max(at - REACH, 0):at] + those[at + 1:at + 1 + REACH]
+        self._kept: OrderedDict[Path, Calm | None] = OrderedDict()
+
+    def read(self, path: Path) -> tuple[Plate, Told]:
+        """The plate, and what is told of it.
+
+        Its neighbours are read before it, so that one plate is in memory at a time; each is told of once. Those that
+        cannot be read are passed over. Raises FrameError where the plate itself cannot.
+        """
+        about = [self._of(other) for other in self._beside.get(path, ())]
+        plate = read_plate(path)
+        here = self._kept.get(path) or self._keep(path, calm(self._remover.tell(plate)))
+        return plate, steadied(here, [other for other in about if other is not None])
+
+    def _of(self, path: Path) -> Calm | None:
+        if path in self._kept:
+            return self._kept[path]
+        try:
+            return self._keep(path, calm(self._remover.tell(read_plate(path))))
+        except (FrameError, OSError, MemoryError):
+            self._kept[path] = None
+            return None
+
+    def _keep(self, path: Path, found: Calm) -> Calm:
+        self._kept[path] = found
+        while len(self._kept) > 2 * REACH + 1:
+            self._kept.popitem(last=False)
+        return found
+
+
+def by_number(path: Path) -> list[tuple[int, str]]:
+    """A key that sorts paths by the numbers in their names: a2 before a10."""
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", path.name)]

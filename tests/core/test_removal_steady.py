@@ -1,0 +1,123 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Sequences: what is told of a frame is in line with what is told of those about it, and cuts stay cuts."""
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from core.progress import Progress
+from core.removal.batch import remove_all
+from core.removal.inference import Remover, Told
+from core.removal.plates import Plate
+from core.removal.steady import Sequences, by_number, calm, steadied
+
+Pixels = NDArray[np.float32]
+
+
+def scene(seed: int) -> Pixels:
+    """(48, 64, 3), smooth."""
+    coarse = np.random.default_rng(seed).uniform(0.1, 0.9, (4, 5, 3))
+    return np.asarray(cv2.resize(coarse, (64, 48), interpolation=cv2.INTER_LINEAR), np.float32)
+
+
+def told(display: Pixels, level: float) -> Told:
+    return Told(display, np.full_like(display, level))
+
+
+def test_what_wavers_is_calmed_and_its_detail_stays() -> None:
+    random = np.random.default_rng(0)
+    detail = random.uniform(0, 0.05, (48, 64, 3)).astype(np.float32)
+    levels = 0.2 + 0.05 * random.standard_normal(9)
+    frames = [calm(Told(scene(1), (level + detail).astype(np.float32))) for level in levels]
+    made = [steadied(here, [other for other in frames if other is not here]).added for here in frames]
+    assert np.std([one.mean() for one in made]) < 0.01 * np.std(levels)
+    np.testing.assert_allclose(made[3] - made[3].mean(), detail - detail.mean(), atol=2e-3)
+
+
+def test_a_cut_and_a_frame_of_another_shape_change_nothing() -> None:
+    here = calm(told(np.full((48, 64, 3), 0.1, np.float32), 0.05))
+    after = [calm(told(np.full((48, 64, 3), level, np.float32), 0.4)) for level in (0.5, 0.9)]
+    made = steadied(here, [*after, calm(told(scene(2)[:32, :32], 0.4))]).added
+    np.testing.assert_allclose(made, here.told.added, atol=1e-6)
+
+
+def test_a_flare_that_comes_out_is_not_drawn_into_the_frames_before() -> None:
+    """Where it lies frames differ; beside it they are alike, and are told alike."""
+    dark, lit = scene(3) * 0.3, scene(3) * 0.3
+    lit[10:30, 10:30] += 0.5
+    flare = np.zeros_like(lit)
+    flare[10:30, 10:30] = 0.5
+    made = steadied(calm(Told(dark, np.zeros_like(dark))), [calm(Told(lit, flare))]).added
+    assert made.max() < 0.1
+    assert made[12:28, 12:28].max() < 0.001
+    assert steadied(calm(Told(lit, flare)), [calm(Told(dark, np.zeros_like(dark)))]).added[12:28, 12:28].min() > 0.499
+
+
+def test_without_neighbours_it_is_what_was_told() -> None:
+    random = np.random.default_rng(0)
+    alone = Told(scene(4), random.random((48, 64, 3)).astype(np.float32) * random.integers(0, 2, (48, 64, 1)))
+    assert np.array_equal(steadied(calm(alone), []).added, alone.added)
+
+
+def test_names_go_by_their_numbers() -> None:
+    names = ["a10.png", "a2.png", "b1.png", "a.png", "10a.png", "9b.png"]
+    assert [path.name for path in sorted(map(Path, names), key=by_number)] == [
+        "9b.png", "10a.png", "a2.png", "a10.png", "a.png", "b1.png"]
+
+
+class Wavering(Remover):
+    """Tells every plate another flare, without a network, and counts what it is asked."""
+
+    def __init__(self) -> None:
+        self.working_size, self.keep_glare, self.asked = 64, False, 0
+
+    def tell(self, plate: Plate) -> Told:
+        self.asked += 1
+        return told(self.shown(plate), 0.1 + 0.02 * (int(plate.path.stem[1:]) % 3))
+
+
+@pytest.fixture
+def shot(tmp_path: Path) -> Path:
+    """Twelve equal frames, numbered without leading zeros; the sixth is damaged."""
+    folder = tmp_path / "shot"
+    folder.mkdir()
+    for number in range(1, 13):
+        cv2.imwrite(str(folder / f"f{number}.png"), (scene(5) * 255).astype(np.uint8))
+    (folder / "f6.png").write_bytes(b"no picture")
+    return folder
+
+
+def means(folder: Path) -> dict[str, float]:
+    return {path.stem: float(cv2.imread(str(path)).mean()) for path in folder.iterdir()}
+
+
+def test_a_sequence_is_steady_and_each_frame_is_told_of_once(shot: Path, tmp_path: Path) -> None:
+    remover = Wavering()
+    with pytest.raises(Exception, match=r"1 of 12 plates.*f6\.png"):
+        remove_all([shot], tmp_path / "out", remover, Progress())
+    assert remover.asked == 11
+    with pytest.raises(Exception, match=r"1 of 12"):
+        remove_all([shot], tmp_path / "stills", Wavering(), Progress(), stills=True)
+    steady, single = means(tmp_path / "out"), means(tmp_path / "stills")
+    assert len(steady) == len(single) == 11
+    assert np.std(list(steady.values())) < 0.35 * np.std(list(single.values()))
+
+
+def test_a_frame_is_the_same_whichever_others_are_cleaned(shot: Path, tmp_path: Path) -> None:
+    (shot / "f6.png").unlink()
+    remove_all([shot], tmp_path / "all", Wavering(), Progress())
+    for number in (1, 8):
+        remove_all([shot], tmp_path / "one", Wavering(), Progress(), wanted={Path(f"f{number}.png")})
+    for path in (tmp_path / "one").iterdir():
+        assert path.read_bytes() == (tmp_path / "all" / path.name).read_bytes()
+    assert len(list((tmp_path / "one").iterdir())) == 2
+
+
+def test_neighbours_are_those_of_the_folder(shot: Path) -> None:
+    remover = Wavering()
+    Sequences(remover, [shot / "f1.png", shot / "f2.png", shot.parent / "f3.png"]).read(shot / "f1.png")
+    assert remover.asked == 2

@@ -30,6 +30,7 @@ class Recipe:
     warm: int = 300
     decay: float = 1e-4            # of the weights, AdamW
     average: float = 0.9995        # of the weights that are kept, over iterations
+    begun: float = 0.0             # share, in the weights that are kept, of those that a training began with
     polish: float = 0.15           # of the iterations, the last of them, go for each picture's PSNR
     widths: tuple[int, ...] = (32, 48, 96, 128, 160)
     blocks: tuple[int, ...] = (0, 1, 2, 4, 4)
@@ -42,6 +43,8 @@ class Recipe:
     def __post_init__(self) -> None:
         if min(self.iterations, self.pixels, self.bank, self.renew_every, self.warm) < 1:
             raise SettingsError("A recipe needs at least one iteration, pixel and flare.")
+        if not 0 <= self.begun <= 1:
+            raise SettingsError("A recipe keeps a share from 0 to 1 of the weights that it began with.")
         if not 0 < self.learning_rate < 1 or not len(self.widths) == len(self.blocks) == LEVELS:
             raise SettingsError(f"A recipe needs a learning rate below 1, and widths and blocks of {LEVELS} levels.")
         if not self.stages or any(len(stage) != 3 or not 2 * MULTIPLE <= stage[1] <= stage[2] for stage in self.stages):

@@ -154,5 +154,5 @@ def _run(trainer: Trainer, batches: Iterator[Batch], folder: Path, held_out: Map
 def _save(trainer: Trainer, folder: Path) -> None:
     about = {"recipe": json.dumps(as_dict(trainer.recipe)), "iteration": str(trainer.iteration)}
     weights.write(folder / CHECKPOINT, trainer.state(), about)
-    half = {name: value.half().contiguous() for name, value in trainer.averaged.items()}
+    half = {name: value.half().contiguous() for name, value in trainer.kept().items()}
     weights.write(folder / WEIGHTS, half, about)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import multiprocessing
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -268,3 +269,20 @@ def test_lpips_with_weights_of_the_user(tmp_path: Path) -> None:
     assert measure(a, a) == 0
     near, far = (np.clip(a + amount, 0, 1).astype(np.float32) for amount in (0.02, 0.4))
     assert 0 < measure(a, near) < measure(a, far)
+
+
+def test_a_share_of_the_weights_begun_with_is_kept(tmp_path: Path) -> None:
+    first = training.train(RECIPE, tmp_path / "first", backgrounds(), built_in(), processes=1)
+    kept = {}
+    for share in (0.0, 0.5, 1.0):
+        folder, recipe = tmp_path / str(share), replace(RECIPE, begun=share, seed=2)
+        with pytest.raises(Cancelled):
+            training.train(recipe, folder, backgrounds(), built_in(), start=first, processes=1, progress=StopAfter(2))
+        training.train(recipe, folder, backgrounds(), built_in(), start=first, processes=1, resume=True)
+        kept[share] = weights.read(folder / training.WEIGHTS)[0]
+    begun = weights.read(first)[0]
+    assert any(not torch.equal(kept[0.0][name], value) for name, value in begun.items())
+    for name, value in begun.items():
+        assert torch.equal(kept[1.0][name], value)
+        torch.testing.assert_close(kept[0.5][name].float(), (value.float() + kept[0.0][name].float()) / 2, atol=1e-3,
+                                   rtol=1e-3)

@@ -14,9 +14,8 @@ peak is the process's resident memory. `full` is the network at the plate's own 
 that of the working size. Sample: PSNR in display values; flicker is the mean change of the error from one
 frame to the next, |(result - truth) of a frame - the same of the frame before|, beside that of the untouched
 frames. Clean: PSNR of the result against its input, not of a number where they are equal to the last bit.
-Matte: a twentieth of `count` synthesised pictures of every class, of held-out photographs and lenses, of another
-seed than eval-removal's; the matte is as an artist would rough it in, wide about all that the flare changes by a
-twentieth, with a soft rim.
+Matte: `count` synthesised pictures of every class, of held-out photographs and lenses and of another seed than
+eval-removal's; the matte is as an artist would rough it in, wide about all that the flare changes, with a soft rim.
 """
 from __future__ import annotations
 
@@ -26,6 +25,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -97,19 +97,13 @@ def speed(weights: Path | None) -> None:
 
 def sample(capture: Path, weights: Path | None, cleaned: Path | None, sheet: Path | None) -> None:
     """PSNR of every frame against the exact scene, and flicker."""
-    remover = Remover(weights)
     before: Any = None
     scores, flicker, rows = [], [], []
     paths = sorted((capture / "images").iterdir())
-    sequences = Sequences(remover, paths)
-    for number, path in enumerate(paths):
+    clean_codes = _by_network(paths, weights) if cleaned is None else _cleaned(paths, cleaned)
+    for number, (path, codes) in enumerate(zip(paths, clean_codes, strict=True)):
         truth = read_picture(capture / "truth" / "scene" / f"{path.stem}.exr").display()
-        if cleaned is None:
-            found, told = sequences.read(path)
-            codes = remover.remove(found, told=told)[0]
-        else:
-            found, codes = read_plate(path), read_plate(_cleaned(cleaned, path.stem)).codes
-        frame, clean = found.codes.astype(np.float32) / 255, codes.astype(np.float32) / 255
+        frame, clean = (part.astype(np.float32) / 255 for part in (read_plate(path).codes, codes))
         scores.append((psnr(frame, truth), psnr(clean, truth)))
         if number % max(len(paths) // SHOWN, 1) == 5:
             rows.append(np.concatenate([frame, clean, np.clip(truth, 0, 1)], 1))
@@ -129,8 +123,19 @@ def sample(capture: Path, weights: Path | None, cleaned: Path | None, sheet: Pat
         cv2.imwrite(str(sheet), (picture[..., ::-1] * 255 + 0.5).astype(np.uint8), [cv2.IMWRITE_JPEG_QUALITY, 88])
 
 
-def _cleaned(folder: Path, stem: str) -> Path:
-    return next(path for path in sorted(folder.iterdir()) if path.stem == stem)
+def _by_network(paths: list[Path], weights: Path | None) -> Iterator[Any]:
+    """Clean codes of the frames, as `remove` makes them of a folder."""
+    remover = Remover(weights)
+    sequences = Sequences(remover, paths)
+    for path in paths:
+        plate, told = sequences.read(path)
+        yield remover.remove(plate, told=told)[0]
+
+
+def _cleaned(paths: list[Path], folder: Path) -> Iterator[Any]:
+    """Codes of the frames that were cleaned before, under the same names with any suffix."""
+    there = {path.stem: path for path in folder.iterdir()}
+    return (read_plate(there[path.stem]).codes for path in paths)
 
 
 def clean_pictures(folders: list[Path], weights: Path | None) -> None:
@@ -154,16 +159,15 @@ def clean_pictures(folders: list[Path], weights: Path | None) -> None:
 
 def matte(folders: list[Path], lenses: Path | None, weights: Path | None, count: int) -> None:
     """What removal gains with a rough matte of the flare, and without."""
-    from core.removal.backgrounds import kept_for_test, read_backgrounds
-    from core.removal.evaluation import synthetic
+    from core.removal.backgrounds import read_backgrounds
+    from core.removal.evaluation import held_out, synthetic
     from core.removal.plates import Plate
-    from core.removal.synthesis.prescription import built_in, read_lenses
+    from core.removal.synthesis.prescription import read_lenses
 
     remover, size = Remover(weights), (480, 320)
-    held_out = [lens for lens in read_lenses(lenses) if kept_for_test(lens.name)] if lenses else []
+    backgrounds, unseen = read_backgrounds(folders, "test", max(size)), held_out(read_lenses(lenses) if lenses else [])
     gains = []
-    for case in synthetic(1001, max(count // 20, 1), read_backgrounds(folders, "test", max(size)),
-                          held_out or built_in(), size):
+    for case in synthetic(1001, count, backgrounds, unseen, size):
         frame, truth, _ = case.read()
         found = Plate(Path("frame.png"), (frame * 65535 + 0.5).astype(np.uint16), "srgb")
         results = [remover.remove(found, marked)[0] / found.top for marked in (None, _roughed_in(frame, truth))]
@@ -217,7 +221,7 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=WORKING_SIZE)
     parser.add_argument("--lenses", type=Path)
     parser.add_argument("--sheet", type=Path)
-    parser.add_argument("--count", type=int, default=400)
+    parser.add_argument("--count", type=int, help="pictures: of each class for matte (default 20), of coverage (400)")
     words = parser.parse_args()
     if words.what == "one":
         one(words.paths[0], words.size, words.weights)
@@ -228,9 +232,9 @@ def main() -> None:
     elif words.what == "clean":
         clean_pictures(words.paths, words.weights)
     elif words.what == "matte":
-        matte(words.paths, words.lenses, words.weights, words.count)
+        matte(words.paths, words.lenses, words.weights, words.count or 20)
     else:
-        coverage(words.sheet, words.count)
+        coverage(words.sheet, words.count or 400)
 
 
 if __name__ == "__main__":

@@ -10,11 +10,11 @@ import numpy as np
 
 from ..errors import FrameError, SettingsError
 from ..files import remove_partial_of
-from ..pictures import SUFFIXES, write_exr
+from ..pictures import write_exr
 from ..progress import Progress
 from .inference import Remover
 from .mattes import Mattes
-from .plates import write_plate
+from .plates import plates_below, write_plate
 from .steady import Sequences, by_number
 
 TOLD = 20  # failures that are spelled out in the last sentence
@@ -28,8 +28,7 @@ def plates_of(inputs: Iterable[Path]) -> list[tuple[Path, Path]]:
     found: dict[Path, Path] = {}
     for given in inputs:
         if given.is_dir():
-            files = [(path, path.relative_to(given)) for path in sorted(given.rglob("*"))
-                     if path.suffix.lower() in SUFFIXES and path.is_file() and not path.name.startswith(".")]
+            files = [(path, path.relative_to(given)) for path in plates_below(given)]
             if not files:
                 raise SettingsError(f"{given} holds no pictures; give a folder with PNG, JPEG, TIFF or EXR files.")
         else:

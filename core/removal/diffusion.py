@@ -190,7 +190,7 @@ class DiffusionTrainer:
 class DiffusionRemover(Remover):
     """Takes flares from plates by the diffusion model: what its answer lacks of the frame is the flare."""
 
-    sure = 0.0  # `SURE` is of the network in the box
+    sure = 0.0
 
     def __init__(self, base: Path | str, lora: Path | str, *, working_size: int = WORKING_SIZE) -> None:
         """lora: the file that `DiffusionRemoval.save` wrote. Raises EngineError, RunError."""

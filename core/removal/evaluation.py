@@ -21,6 +21,8 @@ from ..errors import FrameError, SettingsError
 from ..metrics.pictures import flip, psnr, ssim
 from ..pictures import SUFFIXES, Pixels, read_picture
 from ..progress import Progress
+from .backgrounds import kept_for_test
+from .synthesis.prescription import Prescription, built_in
 
 INPUTS = ("input", "flare", "blend")
 TRUTHS = ("gt", "target", "clean", "scene")
@@ -164,6 +166,11 @@ def worst_sheet(cases: Sequence[Case], clean: Callable[[Pixels], Pixels], scores
         cv2.putText(head, text, (4, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (0.9, 0.9, 0.9), 1, cv2.LINE_AA)
         strips += [head, np.concatenate(parts, 1)]
     return np.concatenate(strips, 0) if strips else np.zeros((20, 4 * width, 3), np.float32)
+
+
+def held_out(lenses: Iterable[Prescription]) -> list[Prescription]:
+    """Those that are kept from training, by name; the built-in ones where none is."""
+    return [lens for lens in lenses if kept_for_test(lens.name)] or built_in()
 
 
 def synthetic(seed: int, count: int, backgrounds: Any, lenses: Sequence[Any], size: tuple[int, int]) -> list[Case]:

@@ -21,12 +21,14 @@ from numpy.typing import NDArray
 
 from ..errors import SettingsError
 from ..pictures import Encoding, linear_from_srgb
-from .network import GAMMA, MULTIPLE, RemovalNetwork, flare_light
+from .network import MULTIPLE, RemovalNetwork
 from .plates import Plate
 from .weights import IN_THE_BOX, load
 
 Pixels = NDArray[np.float32]
 
+GAMMA = 2
+"""Of the light that flares are taken from display values in: the middle of what pictures are formed with, and cheap."""
 WORKING_SIZE = 384
 """Long side that the network sees: about what it was trained at last."""
 LEAST = 0.01
@@ -67,6 +69,7 @@ class Remover:
     """The network of a weights file, ready for plates."""
 
     sure = SURE
+    """`SURE` is the network's own; other models have another."""
 
     def __init__(self, weights: Path | None = None, *, working_size: int = WORKING_SIZE,
                  keep_glare: bool = False) -> None:
@@ -145,6 +148,11 @@ class Remover:
         return _display(np.asarray(small, np.float32))
 
 
+def flare_light(display: Pixels, added: Pixels) -> Pixels:
+    """Linear flare (of GAMMA): what the frame's light has more than that of the clean display values."""
+    return np.asarray(display**GAMMA - np.maximum(display - added, 0) ** GAMMA, np.float32)
+
+
 def _reduced(codes: NDArray[Any], encoding: Encoding, top: float, width: int, height: int) -> Pixels:
     """Clipped linear light by area, (height, width, 3), read in strips of whole working rows."""
     import cv2
@@ -171,7 +179,7 @@ def _light(codes: NDArray[Any], encoding: Encoding, top: float) -> Pixels:
 
 def _display(light: Pixels) -> Pixels:
     """What the network was trained on: light to the power of 1 / GAMMA, for files of either encoding, since the
-    sum of scene and flare is one of light as `network.GAMMA` has it."""
+    sum of scene and flare is one of light as `GAMMA` has it."""
     return np.power(np.clip(light, 0, 1), np.float32(1 / GAMMA)).astype(np.float32)
 
 

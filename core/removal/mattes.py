@@ -2,15 +2,13 @@
 """Mattes: pictures in which an artist has marked where the flares of plates are, white on black."""
 from __future__ import annotations
 
-from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FrameError, SettingsError
-from ..pictures import SUFFIXES
-from .plates import read_plate
+from .plates import plates_below, read_plate
 
 ASPECT = 0.01
 """By how much of it the aspect of a matte may differ from that of its plate: a smaller one has rounded sides."""
@@ -24,8 +22,7 @@ class Mattes:
         self.given = given
         self._by_name: dict[Path, Path] | None = None
         if given.is_dir():
-            self._by_name = _by_name(given, (path for path in sorted(given.rglob("*"))
-                                             if path.suffix.lower() in SUFFIXES and not path.name.startswith(".")))
+            self._by_name = _by_name(given)
         elif not given.is_file():
             raise SettingsError(f"{given} is missing; give a matte, or a folder with one for each plate.")
 
@@ -55,9 +52,10 @@ class Mattes:
         return np.clip(values, 0, 1)
 
 
-def _by_name(folder: Path, paths: Iterable[Path]) -> dict[Path, Path]:
+def _by_name(folder: Path) -> dict[Path, Path]:
+    """Every matte of the folder, by its name there without the suffix."""
     found: dict[Path, Path] = {}
-    for path in paths:
+    for path in plates_below(folder):
         name = path.relative_to(folder).with_suffix("")
         if name in found:
             raise SettingsError(f"{found[name]} and {path} are both mattes for {name}; keep one of them.")

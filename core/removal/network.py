@@ -16,10 +16,8 @@ from __future__ import annotations
 from itertools import pairwise
 from typing import NamedTuple
 
-import numpy as np
 import torch
 import torch.nn.functional as F  # noqa: N812 - its name everywhere
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
 CELL = 2
@@ -27,8 +25,6 @@ CELL = 2
 LEVELS = 5
 MULTIPLE = CELL * 2 ** (LEVELS - 1)
 """Height and width that the network takes are multiples of this."""
-GAMMA = 2
-"""Of the light that flares are taken from display values in: the middle of what pictures are formed with, and cheap."""
 
 
 class Prediction(NamedTuple):
@@ -156,8 +152,3 @@ class RemovalNetwork(nn.Module):
                 x = F.interpolate(self.up[level - 1](x), scale_factor=2, mode="nearest") + kept.pop()
         out = F.pixel_shuffle(self.head(x), CELL).float()
         return Prediction(out[:, :3], out[:, :3] * torch.sigmoid(out[:, 3:] * 4))
-
-
-def flare_light(display: NDArray[np.float32], added: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Linear flare (of GAMMA): what the frame's light has more than that of the clean display values."""
-    return np.asarray(display**GAMMA - np.maximum(display - added, 0) ** GAMMA, np.float32)

@@ -45,6 +45,12 @@ class Plate:
         return float(np.iinfo(self.codes.dtype).max) if self.codes.dtype.kind == "u" else 1.0
 
 
+def plates_below(folder: Path) -> list[Path]:
+    """The pictures in a folder and its folders, but for hidden ones, sorted by name."""
+    return [path for path in sorted(folder.rglob("*"))
+            if path.suffix.lower() in SUFFIXES and path.is_file() and not path.name.startswith(".")]
+
+
 def read_plate(path: Path | str) -> Plate:
     """Read PNG, JPEG, TIFF or EXR as it is stored. Floats that are not finite are kept.
 

@@ -43,7 +43,7 @@ class Trainer:
         self.optimiser = torch.optim.AdamW(self.network.parameters(), recipe.learning_rate,
                                            weight_decay=recipe.decay, fused=True)
         self.averaged = {name: value.detach().clone() for name, value in self.network.state_dict().items()}
-        self.begun: dict[str, Tensor] = {}
+        self.begun_with: dict[str, Tensor] = {}
 
     def step(self, batch: Batch) -> dict[str, float]:
         """One iteration; its figures."""
@@ -123,14 +123,14 @@ class Trainer:
     def kept(self) -> dict[str, Tensor]:
         """The weights to keep: averaged over iterations, and with the recipe's share of those that the training began
         with, which wins back what it has forgotten (Wortsman et al. 2022, "Robust fine-tuning of zero-shot models")."""
-        return {name: value.lerp(self.begun.get(name, value), self.recipe.begun)
+        return {name: value.lerp(self.begun_with.get(name, value), self.recipe.begun)
                 for name, value in self.averaged.items()}
 
     def state(self) -> dict[str, Tensor]:
         """Everything that a resumed training needs."""
         state = {f"network.{name}": value for name, value in self.network.state_dict().items()}
         state |= {f"averaged.{name}": value for name, value in self.averaged.items()}
-        state |= {f"begun.{name}": value for name, value in self.begun.items()}
+        state |= {f"begun.{name}": value for name, value in self.begun_with.items()}
         for (name, _), moments in zip(self.network.named_parameters(), self.optimiser.state.values(), strict=False):
             state |= {f"moment.{key}.{name}": moments[key] for key in ("exp_avg", "exp_avg_sq", "step")}
         return {name: value.detach().cpu().contiguous() for name, value in state.items()}
@@ -149,10 +149,10 @@ class Trainer:
         for name in self.averaged:
             self.averaged[name] = state[f"averaged.{name}"].float().to(self.device)
         if iteration:
-            self.begun = {name.removeprefix("begun."): value.float().to(self.device) for name, value in state.items()
-                          if name.startswith("begun.")}
+            self.begun_with = {name.removeprefix("begun."): value.float().to(self.device)
+                               for name, value in state.items() if name.startswith("begun.")}
         else:
-            self.begun = {name: value.clone() for name, value in self.averaged.items()}
+            self.begun_with = {name: value.clone() for name, value in self.averaged.items()}
         for name, parameter in self.network.named_parameters():
             if f"moment.step.{name}" in state:
                 moments = {key: state[f"moment.{key}.{name}"].to(self.device) for key in ("exp_avg", "exp_avg_sq")}

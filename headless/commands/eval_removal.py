@@ -59,8 +59,8 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
 
 def _cases(words: argparse.Namespace) -> Any:
     from ...core.removal import evaluation
-    from ...core.removal.backgrounds import kept_for_test, read_backgrounds
-    from ...core.removal.synthesis.prescription import built_in, read_lenses
+    from ...core.removal.backgrounds import read_backgrounds
+    from ...core.removal.synthesis.prescription import read_lenses
 
     if (words.pairs is None) == (words.synthetic is None):
         raise SettingsError("Give either a folder of pairs, or --synthetic with --backgrounds.")
@@ -69,8 +69,8 @@ def _cases(words: argparse.Namespace) -> Any:
     if words.synthetic < 1 or min(words.size) < 64:
         raise SettingsError("--synthetic wants one picture a class at least, of 64 pixels a side at least.")
     backgrounds = read_backgrounds(words.backgrounds, "all" if words.all_backgrounds else "test", max(words.size))
-    lenses = [lens for lens in read_lenses(words.lenses) if kept_for_test(lens.name)] if words.lenses else built_in()
-    return evaluation.synthetic(words.seed, words.synthetic, backgrounds, lenses or built_in(), tuple(words.size))
+    lenses = evaluation.held_out(read_lenses(words.lenses) if words.lenses else [])
+    return evaluation.synthetic(words.seed, words.synthetic, backgrounds, lenses, tuple(words.size))
 
 
 COMMAND = Command(

@@ -50,6 +50,7 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     from ...core.removal import weights
     from ...core.removal.backgrounds import kept_for_test, read_backgrounds
     from ...core.removal.bank import OwnFlares
+    from ...core.removal.evaluation import held_out
     from ...core.removal.synthesis.prescription import built_in, read_lenses
     from ...core.removal.training import train
 
@@ -61,7 +62,7 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     recipe = recipes.from_dict({**recipes.as_dict(recipes.Recipe()), **changes})
     lenses = read_lenses(words.lenses, words.most_lenses) if words.lenses else []
     train_on = [lens for lens in lenses if not kept_for_test(lens.name)] + built_in()
-    test_on = [lens for lens in lenses if kept_for_test(lens.name)] or built_in()
+    test_on = held_out(lenses)
     backgrounds = read_backgrounds(words.backgrounds, "train", varied=True)
     try:
         tests = read_backgrounds(words.backgrounds, "test"), test_on

@@ -18,9 +18,9 @@ from core.pictures import read_exr, read_picture, write_exr, write_png
 from core.progress import Progress
 from core.removal import inference, weights
 from core.removal.batch import plates_of, remove_all
-from core.removal.inference import FlareMap, Remover, Told, carried_up
+from core.removal.inference import FlareMap, Remover, Told, carried_up, flare_light
 from core.removal.mattes import Mattes
-from core.removal.network import LEVELS, SHOWN, RemovalNetwork, flare_light, seen
+from core.removal.network import LEVELS, SHOWN, RemovalNetwork, seen
 from core.removal.plates import Plate, read_plate, write_plate
 from core.removal.recipe import Recipe, as_dict
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from core.errors import FrameError
 from core.progress import Progress
 from core.removal.batch import remove_all
 from core.removal.inference import Remover, Told
@@ -97,10 +98,10 @@ def means(folder: Path) -> dict[str, float]:
 
 def test_a_sequence_is_steady_and_each_frame_is_told_of_once(shot: Path, tmp_path: Path) -> None:
     remover = Wavering()
-    with pytest.raises(Exception, match=r"1 of 12 plates.*f6\.png"):
+    with pytest.raises(FrameError, match=r"1 of 12 plates.*f6\.png"):
         remove_all([shot], tmp_path / "out", remover, Progress())
     assert remover.asked == 11
-    with pytest.raises(Exception, match=r"1 of 12"):
+    with pytest.raises(FrameError, match=r"1 of 12"):
         remove_all([shot], tmp_path / "stills", Wavering(), Progress(), stills=True)
     steady, single = means(tmp_path / "out"), means(tmp_path / "stills")
     assert len(steady) == len(single) == 11

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import SettingsError
+from . import variety
 from .formation import Pixels
 from .synthesis.canvas import uniform_log
 
@@ -33,9 +34,7 @@ def kept_for_test(name: str) -> bool:
 class Backgrounds:
     """Decoded pictures: photos as uint8 (h, w, 3) display values, maps as float16 equirectangular light.
 
-    varied: for training, to which few pictures are to look like many: some are filmed sideways or under coloured
-    light, some meet another or are seen through its reflection, some hold windows, screens or lamps on a wet floor,
-    which are bright and no flare.
+    varied: for training, to which few pictures are to look like many (`variety`).
     """
 
     photos: Sequence[NDArray[np.uint8]]
@@ -45,7 +44,10 @@ class Backgrounds:
     def draw(self, random: Random, width: int, height: int, gamma: float) -> Pixels:
         """(height, width, 3) linear light: a random window of a random picture, at a random scale; one in eight out
         of focus, so that what is bright and soft is no flare for that alone."""
-        scene = (self._varied if self.varied else self._filmed)(random, width, height, gamma)
+        def film(random: Random, width: int, height: int) -> Pixels:
+            return self._filmed(random, width, height, gamma)
+
+        scene = variety.varied(random, film, width, height) if self.varied else film(random, width, height)
         return _defocused(random, scene) if random.random() < 0.125 else scene
 
     def _filmed(self, random: Random, width: int, height: int, gamma: float) -> Pixels:
@@ -54,21 +56,6 @@ class Backgrounds:
         if random.random() < share:
             return _view(random, self.maps[int(random.integers(len(self.maps)))], width, height)
         return _window(random, self.photos[int(random.integers(photos))], width, height, gamma)
-
-    def _varied(self, random: Random, width: int, height: int, gamma: float) -> Pixels:
-        scene = self._turned(random, width, height, gamma)
-        if random.random() < 0.25:
-            scene = _joined(random, scene, self._turned(random, width, height, gamma))
-        if random.random() < 0.2:
-            scene = scene * np.exp(random.normal(0, 0.35, 3)).astype(np.float32)
-        if random.random() < 0.15:
-            scene = _with_bright_things(random, scene)
-        return scene
-
-    def _turned(self, random: Random, width: int, height: int, gamma: float) -> Pixels:
-        if random.random() < 0.15:
-            return np.ascontiguousarray(self._filmed(random, height, width, gamma).swapaxes(0, 1))
-        return self._filmed(random, width, height, gamma)
 
 
 def read_backgrounds(folders: Iterable[Path | str], part: Part = "all", longest: int = 720, *,
@@ -167,62 +154,6 @@ def _view(random: Random, light: NDArray[np.float16], width: int, height: int) -
     return np.asarray(seen * min(exposure, 20.0), np.float32)
 
 
-def _joined(random: Random, scene: Pixels, other: Pixels) -> Pixels:
-    """One beside the other, with a sharp or a soft edge between them; or one as a pane of glass reflects it over the
-    other."""
-    height, width = scene.shape[:2]
-    if random.random() < 0.3:
-        share = np.float32(random.uniform(0.2, 0.8))
-        return scene * share + other * (1 - share)
-    angle, soft = random.uniform(0, 2 * math.pi), uniform_log(random, 0.005, 0.3)
-    x = np.linspace(-1, 1, width, dtype=np.float32)[None, :]
-    y = np.linspace(-1, 1, height, dtype=np.float32)[:, None]
-    beside = (x * np.float32(math.cos(angle)) + y * np.float32(math.sin(angle)) - random.uniform(-0.7, 0.7)) / soft
-    of_other = (1 / (1 + np.exp(-np.clip(beside, -30, 30)))).astype(np.float32)[..., None]
-    return np.asarray(scene + (other - scene) * of_other, np.float32)
-
-
-def _with_bright_things(random: Random, scene: Pixels) -> Pixels:
-    """With some panels, or with what a floor or water shows of some lamps."""
-    on_floor = random.random() < 0.4
-    for _ in range(int(random.integers(1, 5))):
-        colour = np.exp(random.normal(0, 0.3, 3) + random.uniform(-1.5, 1.5)).astype(np.float32)
-        if on_floor:
-            scene = scene + _reflection(random, *scene.shape[:2])[..., None] * colour
-        else:
-            shown = _panel(random, *scene.shape[:2])[..., None]
-            scene = scene + (colour - scene) * shown
-    return scene
-
-
-def _reflection(random: Random, height: int, width: int) -> Pixels:
-    """(height, width) 0..1: of a lamp on a floor, long, upright, and broken up."""
-    import cv2
-
-    across = math.hypot(width, height) * uniform_log(random, 0.004, 0.03)
-    along = across * uniform_log(random, 2, 12)
-    x = (np.arange(width, dtype=np.float32)[None, :] - random.uniform(0, width)) / across
-    y = (np.arange(height, dtype=np.float32)[:, None] - random.uniform(0, height)) / along
-    waves = random.random((max(height // int(random.integers(2, 12)), 1), 3)).astype(np.float32)
-    waves = np.asarray(cv2.resize(waves, (width, height), interpolation=cv2.INTER_LINEAR), np.float32)
-    return np.asarray(np.exp(-(x**2) - y**2) * (1 - random.uniform(0.4, 1) * waves), np.float32)
-
-
-def _panel(random: Random, height: int, width: int) -> Pixels:
-    """(height, width) 0..1: a window, screen or sign, level or in perspective, of one pane or of several."""
-    import cv2
-
-    half = math.hypot(width, height) * np.array([uniform_log(random, 0.01, 0.15), uniform_log(random, 0.01, 0.15)])
-    square = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
-    corners = random.uniform(0, (width, height)) + square * half * np.exp(random.normal(0, 0.15, (4, 2)))
-    shown = np.zeros((height, width), np.float32)
-    cv2.fillPoly(shown, [(corners * 16).astype(np.int32)], (1.0,), cv2.LINE_AA, 4)  # in sixteenths of a pixel
-    if random.random() < 0.5:
-        panes = random.uniform(random.random(), 1, tuple(random.integers(1, 8, 2))).astype(np.float32)
-        shown *= cv2.resize(panes, (width, height), interpolation=cv2.INTER_NEAREST)
-    return shown
-
-
 def _defocused(random: Random, scene: Pixels) -> Pixels:
     """Under a disc of 1 to 8 % of the width."""
     import cv2
@@ -231,4 +162,5 @@ def _defocused(random: Random, scene: Pixels) -> Pixels:
     reach = math.ceil(radius)
     y, x = np.mgrid[-reach:reach + 1, -reach:reach + 1]
     disc = np.clip(radius + 0.5 - np.hypot(x, y), 0, 1).astype(np.float32)
-    return np.asarray(cv2.filter2D(scene, -1, disc / disc.sum(), borderType=cv2.BORDER_REFLECT), np.float32)
+    blurred = cv2.filter2D(scene, -1, disc / disc.sum(), borderType=cv2.BORDER_REFLECT)
+    return np.asarray(np.maximum(blurred, 0), np.float32)  # by Fourier transform, which rounds to either side

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -26,6 +27,7 @@ from .synthesis.prescription import Prescription
 from .trainer import FIGURES, Trainer, device
 
 CHECKPOINT, WEIGHTS, LOG = "checkpoint.safetensors", "removal.safetensors", "training.jsonl"
+GAIN = "gain_db"  # in the weights' header: of the check that they were kept for
 CHECK_EVERY = 1000
 CHECK_SEED = 20_000
 CHECKS = 64
@@ -59,8 +61,10 @@ def train(recipe: Recipe, folder: Path | str, backgrounds: Backgrounds, lenses: 
     """Train in `folder` and give the path of the weights (safetensors, fp16).
 
     With `resume` a training in the folder goes on, by the given recipe from there on. `start`:
-    weights to begin with. `tests`: backgrounds and lenses kept out, for the checks in the log. `processes` share the
-    work, this one among them: the pictures are the same by any number, the weights but for rounding.
+    weights to begin with. `tests`: backgrounds and lenses kept out, for the checks in the log; the weights given are
+    those of the best check then. Without them, and with flares of the user's own, which the checks have none of, they
+    are the last. `processes` share the work, this one among them: the
+    pictures are the same by any number, the weights but for rounding.
     Raises RunError, SettingsError, and Cancelled when asked to stop (after a checkpoint).
     """
     progress, folder = progress or Progress(), Path(folder)
@@ -78,7 +82,7 @@ def train(recipe: Recipe, folder: Path | str, backgrounds: Backgrounds, lenses: 
         trainer.learner = learner
         batches = drawn_ahead(beginning.batches(trainer), trainer.iteration, trainer.recipe.iterations, drawing)
         held_out = checks(*tests) if tests else {}
-        _run(trainer, batches, folder, held_out, save_every_s, progress)
+        _run(trainer, batches, folder, held_out, bool(held_out) and own is None, save_every_s, progress)
     return folder / WEIGHTS
 
 
@@ -121,15 +125,19 @@ def _learn(learner: Learner, beginning: Beginning) -> None:
 
 
 def _run(trainer: Trainer, batches: Iterator[Batch], folder: Path, held_out: Mapping[str, Sequence[Pair]],
-         save_every_s: float, progress: Progress) -> None:
-    """To the recipe's end, with log and checkpoints."""
+         chosen: bool, save_every_s: float, progress: Progress) -> None:
+    """To the recipe's end, with log and checkpoints; the weights are `chosen` by the checks, or the last."""
     iterations = trainer.recipe.iterations
     progress.stage("train", iterations, trainer.iteration)
     saved, began, first = time.monotonic(), time.monotonic(), trainer.iteration
     told, sums = first, dict.fromkeys(FIGURES, 0.0)
+    best = _best_of(folder) if chosen and first else None
     try:
         while trainer.iteration < iterations:
             figures = trainer.step(next(batches))
+            if not math.isfinite(figures["loss"]):
+                raise RunError(f"Iteration {trainer.iteration} of the training came to no number; go on from the last "
+                               f"checkpoint in {folder} with --resume and a lower learning_rate.")
             sums = {name: value + figures[name] for name, value in sums.items()}
             here = trainer.iteration
             if here % CHECK_EVERY == 0 or here == iterations:
@@ -139,20 +147,49 @@ def _run(trainer: Trainer, batches: Iterator[Batch], folder: Path, held_out: Map
                 told, sums = here, dict.fromkeys(FIGURES, 0.0)
                 if held_out:
                     line["gain_db"] = trainer.check(held_out)
+                    if chosen:
+                        best = _keep_better(trainer, folder, line["gain_db"]["mean"], best)
                 with open(folder / LOG, "a", encoding="utf-8") as stream:
                     stream.write(json.dumps(line) + "\n")
             if time.monotonic() - saved > save_every_s:
-                _save(trainer, folder)
+                _save(trainer, folder, best)
                 saved = time.monotonic()
             progress.advance(1, **figures)
     except Cancelled:
-        _save(trainer, folder)
+        _save(trainer, folder, best)
         raise
-    _save(trainer, folder)
+    _save(trainer, folder, best)
 
 
-def _save(trainer: Trainer, folder: Path) -> None:
-    about = {"recipe": json.dumps(as_dict(trainer.recipe)), "iteration": str(trainer.iteration)}
-    weights.write(folder / CHECKPOINT, trainer.state(), about)
+def _save(trainer: Trainer, folder: Path, best: float | None) -> None:
+    """The checkpoint; the weights too where there are none of a check. Those are better than the last, when a training
+    begins to know its photographs by heart."""
+    weights.write(folder / CHECKPOINT, trainer.state(), _about(trainer))
+    if best is None:
+        _write_kept(trainer, folder, _about(trainer))
+
+
+def _keep_better(trainer: Trainer, folder: Path, gain: float, best: float | None) -> float:
+    """Keep the weights when their check gains more than `best`, dB; the best gain then."""
+    if best is not None and gain <= best:
+        return best
+    _write_kept(trainer, folder, {**_about(trainer), GAIN: str(gain)})
+    return gain
+
+
+def _best_of(folder: Path) -> float | None:
+    """What the weights in the folder gained in their check, dB; None where they are of none, or not there."""
+    path = folder / WEIGHTS
+    if not path.exists():
+        return None
+    _, about = weights.read(path)
+    return float(about[GAIN]) if GAIN in about else None
+
+
+def _write_kept(trainer: Trainer, folder: Path, about: Mapping[str, str]) -> None:
     half = {name: value.half().contiguous() for name, value in trainer.kept().items()}
     weights.write(folder / WEIGHTS, half, about)
+
+
+def _about(trainer: Trainer) -> dict[str, str]:
+    return {"recipe": json.dumps(as_dict(trainer.recipe)), "iteration": str(trainer.iteration)}

@@ -18,7 +18,8 @@ from core.pictures import Pixels, write_png
 from core.progress import Progress
 from core.removal import evaluation, training, weights
 from core.removal.backgrounds import Backgrounds
-from core.removal.batches import Batches, drawn_ahead
+from core.removal.bank import OwnFlares
+from core.removal.batches import Batch, Batches, drawn_ahead
 from core.removal.learners import ALONE, Learner, add_up, shared
 from core.removal.recipe import Recipe, as_dict, from_dict
 from core.removal.synthesis.prescription import built_in
@@ -167,6 +168,49 @@ def test_the_log_has_figures_and_checks(tmp_path: Path, monkeypatch: pytest.Monk
     drawn = [Batches(RECIPE, backgrounds(), built_in())[at] for at in range(4)]
     untouched = [np.square(batch.frame - batch.scene).mean() for batch in drawn]
     assert line["untouched"] == pytest.approx(np.mean(untouched), abs=1e-5), "means since the last line"
+
+
+def test_the_weights_of_the_best_check_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    gains = {1: 1.0, 2: 2.5, 3: 2.0, 4: 2.5, 5: 3.0, 6: 0.0}
+    monkeypatch.setattr(training, "checks", lambda *_: {"streak": []})
+    monkeypatch.setattr(training, "CHECK_EVERY", 1)
+    monkeypatch.setattr(Trainer, "check", lambda trainer, _: {"mean": gains[trainer.iteration]})
+    train = partial(training.train, RECIPE, backgrounds=backgrounds(), lenses=built_in(), processes=1)
+    tests = backgrounds(), built_in()
+
+    def kept(folder: str) -> str:
+        return weights.read(tmp_path / folder / training.WEIGHTS)[1]["iteration"]
+
+    train(tmp_path / "whole", tests=tests)
+    assert kept("whole") == "2"
+    with pytest.raises(Cancelled):
+        train(tmp_path / "parts", tests=tests, progress=StopAfter(3))
+    assert weights.read(tmp_path / "parts" / training.CHECKPOINT)[1]["iteration"] == "3"
+    train(tmp_path / "parts", tests=tests, resume=True)
+    assert kept("parts") == "2", "what a part before had found is still the best"
+    longer = replace(RECIPE, iterations=6)
+    training.train(longer, tmp_path / "parts", backgrounds(), built_in(), tests=tests, resume=True, processes=1)
+    assert kept("parts") == "5"
+    train(tmp_path / "untested")
+    assert kept("untested") == "4"
+    write_png(tmp_path / "flares" / "one.png", np.full((48, 64, 3), 0.3))
+    train(tmp_path / "own", tests=tests, own=OwnFlares(tmp_path / "flares", RECIPE.canvas))
+    assert kept("own") == "4", "the checks have none of the user's flares"
+
+
+def test_a_training_that_comes_to_no_number_stops(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    step = Trainer.step
+
+    def broken(trainer: Trainer, batch: Batch) -> dict[str, float]:
+        figures = step(trainer, batch)
+        return figures if trainer.iteration < 3 else {**figures, "loss": float("nan")}
+
+    monkeypatch.setattr(Trainer, "step", broken)
+    with pytest.raises(RunError, match=r"Iteration 3 .* no number.*learning_rate"):
+        training.train(RECIPE, tmp_path, backgrounds(), built_in(), processes=1, save_every_s=0)
+    state, about = weights.read(tmp_path / training.CHECKPOINT)
+    assert about["iteration"] == "2", "what was saved last is whole"
+    assert all(torch.isfinite(value).all() for value in state.values())
 
 
 def test_recipes(tmp_path: Path) -> None:

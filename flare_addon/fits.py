@@ -156,9 +156,15 @@ def clean(scene: Any) -> Job:
 
 
 def cleaning(scene: Any, capture: Path) -> list[object]:
-    """The engine's words for it: a finished fit knows the flare of all frames, a network sees each frame by itself."""
-    plates = ["--run", folder_of(scene)] if state_of(scene) == "finished" else [capture / "images"]
-    return ["remove", *plates, "--out", capture / "removed"]
+    """The engine's words for it: a finished fit knows the flare of all frames, a network sees a few at a time, and by
+    a matte where there is one. What the engine itself has made before is made again."""
+    made = jobs.find(capture / "removal")
+    again = ["--overwrite"] if made is not None and made.state == "done" else []
+    if state_of(scene) == "finished":
+        return ["remove", "--run", folder_of(scene), "--out", capture / "removed", *again]
+    given = scene.fit_flare.matte
+    matte = ["--matte", Path(bpy.path.abspath(given))] if given else []
+    return ["remove", capture / "images", "--out", capture / "removed", *matte, *again]
 
 
 def cleaned(job: Job) -> None:

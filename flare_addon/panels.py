@@ -91,7 +91,7 @@ class FITFLARE_PT_fit(_Part, bpy.types.Panel):
         settings.prop(state, "width")
         capture = fits.capture_of(scene)
         if capture is not None and (state.mode == "split" or jobs.find(capture / "removal") is not None):
-            _cleaning(layout, capture, stage)
+            _cleaning(layout, state, capture, stage)
         if stage == "lost":
             lines(layout, f"The run's folder {folder} is gone: start a new fit.", "ERROR")
         elif stage == "resumable":
@@ -114,18 +114,24 @@ class FITFLARE_PT_fit(_Part, bpy.types.Panel):
             _reading(layout, folder)
 
 
-def _cleaning(layout: Any, capture: Any, stage: str) -> None:
-    """The frames without flare: made, being made, or to be made."""
+def _cleaning(layout: Any, state: Any, capture: Any, stage: str) -> None:
+    """The frames without flare: made, being made, or to be made; with a matte they can be made again."""
     job = jobs.find(capture / "removal")
     if job is not None and job.running:
         draw_progress(layout, job, "Clean frames")
         return
     if job is not None and job.state in ("failed", "stopped"):
         lines(layout, job.error, "ERROR" if job.state == "failed" else "INFO")
-    if not (capture / "removed").is_dir() or (job is not None and job.state != "done"):
+    there = (capture / "removed").is_dir() and (job is None or job.state == "done")
+    by_network = stage != "finished" and (not there or job is not None)
+    if not there:
         lines(layout, "The fit can take its flare out of the frames." if stage == "finished" else
               "No frames without flare: scene and flare are told apart by how they move.", "INFO")
-        layout.operator("fit_flare.clean_frames", icon="BRUSH_DATA")
+    if by_network:
+        layout.prop(state, "matte")
+    if not there or (by_network and state.matte):
+        layout.operator("fit_flare.clean_frames", text="Make Clean Frames Again" if there else "Make Clean Frames",
+                        icon="BRUSH_DATA")
 
 
 def _fitting(layout: Any, job: jobs.Job) -> None:

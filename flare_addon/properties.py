@@ -137,6 +137,10 @@ class FITFLARE_PG_scene(bpy.types.PropertyGroup):
                ("removed", "Without Flare", "The frames of removed/, to see the flare over a clean plate")),
         update=_footage)
 
+    matte: StringProperty(  # type: ignore[valid-type]
+        name="Matte", description="Where the flares are, white on black, roughly painted: a picture for all frames, or "
+        "a folder with one for each, of its name. Faint flares are taken too then, and nothing elsewhere. Empty has "
+        "them found", subtype="FILE_PATH", options=PATH)
     run: StringProperty(  # type: ignore[valid-type]
         name="Run", description="Folder of the fit: settings, checkpoint, preview and result", subtype="DIR_PATH",
         options=PATH)

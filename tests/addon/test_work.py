@@ -59,6 +59,9 @@ def test_a_finished_fit_cleans_the_frames(made: tuple[Any, Path]) -> None:
     facts, base = made
     images, removed = str(Path("capture") / "images"), str(Path("capture") / "removed")
     assert facts["cleaned by the network"] == ["remove", images, "--out", removed]
+    by_matte = ["remove", images, "--out", removed, "--matte", str(base / "roto")]
+    assert facts["cleaned by a matte"] == by_matte
+    assert facts["cleaned again"] == [*by_matte, "--overwrite"], "what the engine made, it makes again when it is asked"
     assert facts["cleaned by the fit"] == ["remove", "--run", str(base / "a run"), "--out", removed]
 
 

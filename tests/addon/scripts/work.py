@@ -6,6 +6,7 @@ import math
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import bpy
 import numpy as np
@@ -71,6 +72,11 @@ for kind, up, scale in (("animated", "Z", 1.0), ("each", "-Y", 2.5)):
 # ---- clean frames -----------------------------------------------------------------------------------
 fits = part("flare_addon.fits")
 facts["cleaned by the network"] = [str(word) for word in fits.cleaning(scene, Path("capture"))]
+scene.fit_flare.matte = str(Path(out) / "roto")
+facts["cleaned by a matte"] = [str(word) for word in fits.cleaning(scene, Path("capture"))]
+find, fits.jobs.find = fits.jobs.find, lambda _: SimpleNamespace(state="done")
+facts["cleaned again"] = [str(word) for word in fits.cleaning(scene, Path("capture"))]
+fits.jobs.find = find
 run = Path(out) / "a run"
 run.mkdir()
 (run / fits.FLARE).write_bytes(b"")

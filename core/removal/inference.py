@@ -33,9 +33,11 @@ WORKING_SIZE = 384
 """Long side that the network sees: about what it was trained at last."""
 LEAST = 0.01
 """What a flare adds to display values, below which there is none."""
-SURE = 0.004
+SURE = 0.003
 """Mean over the frame of what a flare adds, below which the network is not trusted at all; from twice as much on
 it is trusted whole. It tells small flares where there are none."""
+VIEWS = tuple((turns, mirrored) for turns in range(4) for mirrored in (False, True))
+"""Quarter turns, and whether mirrored then."""
 RADIUS, SMOOTHNESS = 1, 1e-3
 """Of the guided filter, at the working size."""
 CLIPPED = 0.97
@@ -110,12 +112,25 @@ class Remover:
         display = self.shown(plate)
         return Told(display, self.added(display))
 
-    @torch.inference_mode()
     def added(self, display: Pixels) -> Pixels:
-        """What a flare adds to display values 0..1 (h, w, 3), h and w multiples of MULTIPLE."""
+        """What a flare adds to display values 0..1 (h, w, 3), h and w multiples of MULTIPLE.
+
+        The frame is shown in all its quarter turns, and mirrored. A flare is one in every view; what is taken for one
+        in some alone seldom is. So it is the mean of what is told, less by how far the views are apart.
+        """
+        views = []
+        for turns, mirrored in VIEWS:
+            view = np.rot90(display, turns)
+            told = self._told(view[:, ::-1] if mirrored else view)
+            views.append(np.rot90(told[:, ::-1] if mirrored else told, -turns))
+        return np.maximum(np.mean(views, 0) - np.std(views, 0), 0)
+
+    @torch.inference_mode()
+    def _told(self, display: Pixels) -> Pixels:
+        """What the network tells of a view."""
         told = self.network(torch.from_numpy(np.ascontiguousarray(display.transpose(2, 0, 1)))[None])
         added = (told.gentle if self.keep_glare else told.flare)[0].clamp(min=0)
-        return np.ascontiguousarray(added.permute(1, 2, 0).numpy())
+        return np.asarray(added.permute(1, 2, 0).numpy())
 
     def flare(self, told: Told, *, marked: bool = False) -> Pixels:
         """Linear flare (h, w, 3) of what was told; exactly 0 where there is none.

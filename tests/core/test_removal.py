@@ -172,6 +172,40 @@ def test_a_network_that_sees_nothing_changes_nothing(nowhere: Path) -> None:
     assert np.array_equal(_remove(Remover(nowhere, working_size=64), codes), codes)
 
 
+@pytest.mark.parametrize(("turns", "mirrored"), [(2, False), (1, False), (0, True), (3, True)])
+def test_a_frame_that_is_turned_is_told_the_same(everywhere: Path, turns: int, mirrored: bool) -> None:
+    display = picture(64, 96, 1, np.float32)
+    view = np.rot90(display, turns)
+    view = view[:, ::-1] if mirrored else view
+    told = Remover(everywhere).added(np.ascontiguousarray(view))
+    back = np.rot90(told[:, ::-1] if mirrored else told, -turns)
+    upright = Remover(everywhere).added(display)
+    assert np.ptp(upright) > 1e-3
+    np.testing.assert_allclose(back, upright, atol=1e-5)
+
+
+def test_a_flare_in_some_views_alone_is_none(everywhere: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first of the eight views tells one on the right, and all of them one on the left."""
+    shown: list[tuple[int, ...]] = []
+
+    def told(_: Remover, view: NDArray[np.float32]) -> NDArray[np.float32]:
+        shown.append(view.shape)
+        added = np.zeros((*display.shape[:2], 3), np.float32)
+        added[:, :48] = 0.2
+        if len(shown) == 1:
+            added[:, 48:] = 0.6
+        turns, mirrored = inference.VIEWS[len(shown) - 1]
+        turned = np.rot90(added, turns)
+        return turned[:, ::-1] if mirrored else turned
+
+    display = np.full((32, 96, 3), 0.5, np.float32)
+    monkeypatch.setattr(Remover, "_told", told)
+    added = Remover(everywhere).added(display)
+    assert sorted(shown) == [(32, 96, 3)] * 4 + [(96, 32, 3)] * 4
+    np.testing.assert_allclose(added[:, :48], 0.2, atol=1e-6)
+    assert not added[:, 48:].any()
+
+
 def test_rows_are_worked_on_apart_without_a_seam(monkeypatch: pytest.MonkeyPatch) -> None:
     random = np.random.default_rng(1)
     found = FlareMap(random.random((32, 64, 3), np.float32) * 0.1, random.random((32, 64, 3), np.float32) * 0.2)

@@ -33,11 +33,11 @@ WORKING_SIZE = 384
 """Long side that the network sees: about what it was trained at last."""
 LEAST = 0.01
 """What a flare adds to display values, below which there is none."""
-SURE = 0.003
+SURE = 0.002
 """Mean over the frame of what a flare adds, below which the network is not trusted at all; from twice as much on
 it is trusted whole. It tells small flares where there are none."""
-VIEWS = tuple((turns, mirrored) for turns in range(4) for mirrored in (False, True))
-"""Quarter turns, and whether mirrored then."""
+SIZES, TURNS = (1.0, 0.75), (0, 2)
+"""Of the views that the network is shown: parts of the working size, quarter turns."""
 RADIUS, SMOOTHNESS = 1, 1e-3
 """Of the guided filter, at the working size."""
 CLIPPED = 0.97
@@ -115,15 +115,24 @@ class Remover:
     def added(self, display: Pixels) -> Pixels:
         """What a flare adds to display values 0..1 (h, w, 3), h and w multiples of MULTIPLE.
 
-        The frame is shown in all its quarter turns, and mirrored. A flare is one in every view; what is taken for one
+        The frame is shown upright and upside down, in two sizes. A flare is one in every view; what is taken for one
         in some alone seldom is. So it is the mean of what is told, less by how far the views are apart.
         """
-        views = []
-        for turns, mirrored in VIEWS:
-            view = np.rot90(display, turns)
-            told = self._told(view[:, ::-1] if mirrored else view)
-            views.append(np.rot90(told[:, ::-1] if mirrored else told, -turns))
+        views = [self._told_of(display, part, turns) for part in SIZES for turns in TURNS]
         return np.maximum(np.mean(views, 0) - np.std(views, 0), 0)
+
+    def _told_of(self, display: Pixels, part: float, turns: int) -> Pixels:
+        """What the network tells of a view, brought back to the frame's size and upright."""
+        import cv2
+
+        height, width = display.shape[:2]
+        high, wide = (max(round(side * part / MULTIPLE), 2) * MULTIPLE for side in (height, width))
+        view = display
+        if (high, wide) != (height, width):
+            light = cv2.resize(display**GAMMA, (wide, high), interpolation=cv2.INTER_AREA)
+            view = _display(np.asarray(light, np.float32))
+        told = np.ascontiguousarray(np.rot90(self._told(np.rot90(view, turns)), -turns))
+        return np.asarray(cv2.resize(told, (width, height), interpolation=cv2.INTER_LINEAR), np.float32)
 
     @torch.inference_mode()
     def _told(self, display: Pixels) -> Pixels:

@@ -128,7 +128,10 @@ def _cleaning(layout: Any, state: Any, capture: Any, stage: str) -> None:
         lines(layout, "The fit can take its flare out of the frames." if stage == "finished" else
               "No frames without flare: scene and flare are told apart by how they move.", "INFO")
     if by_network:
-        layout.prop(state, "matte")
+        given = layout.column()
+        given.use_property_split = True
+        given.use_property_decorate = False
+        given.prop(state, "matte")
     if not there or (by_network and state.matte):
         layout.operator("fit_flare.clean_frames", text="Make Clean Frames Again" if there else "Make Clean Frames",
                         icon="BRUSH_DATA")

@@ -55,7 +55,8 @@ def panel():
     return ui.region("UI")
 
 
-def steps():
+def begin():
+    """From the empty profile to a 3D viewport, with the extension installed and its engine named."""
     settings = bpy.context.preferences
     settings.view.show_splash = False
     settings.inputs.use_mouse_continuous = False
@@ -67,6 +68,10 @@ def steps():
     yield from install(area)
     yield from name_the_engine(area)
     yield from ui.show_editor(area, "VIEW_3D")
+
+
+def steps():
+    yield from begin()
     yield from import_capture()
     yield from fit()
     yield from brighten()

@@ -152,13 +152,22 @@ def clean(scene: Any) -> Job:
     capture = capture_of(scene)
     if capture is None or not (capture / "images").is_dir():
         raise CaptureError("There is no capture with a folder images/ yet; import one first.")
-    return engine.run("clean", capture / "removal", cleaning(scene, capture))
+    return engine.run("clean", _cleaning_folder(capture), cleaning(scene, capture))
+
+
+def cleaning_of(capture: Path) -> Job | None:
+    """The cleaning of a capture's frames that runs or ran."""
+    return jobs.find(_cleaning_folder(capture))
+
+
+def _cleaning_folder(capture: Path) -> Path:
+    return capture / "removal"
 
 
 def cleaning(scene: Any, capture: Path) -> list[object]:
     """The engine's words for it: a finished fit knows the flare of all frames, a network sees a few at a time, and by
     a matte where there is one. What the engine itself has made before is made again."""
-    made = jobs.find(capture / "removal")
+    made = cleaning_of(capture)
     again = ["--overwrite"] if made is not None and made.state == "done" else []
     if state_of(scene) == "finished":
         return ["remove", "--run", folder_of(scene), "--out", capture / "removed", *again]
@@ -173,7 +182,7 @@ def cleaned(job: Job) -> None:
         return
     for scene in bpy.data.scenes:
         capture = capture_of(scene)
-        if capture is not None and capture / "removal" == job.folder:
+        if capture is not None and _cleaning_folder(capture) == job.folder:
             scene.fit_flare.mode = "default"
     _remember("Clean Frames")
 

@@ -90,7 +90,7 @@ class FITFLARE_PT_fit(_Part, bpy.types.Panel):
         settings.prop(state, "mode")
         settings.prop(state, "width")
         capture = fits.capture_of(scene)
-        if capture is not None and (state.mode == "split" or jobs.find(capture / "removal") is not None):
+        if capture is not None and (state.mode == "split" or fits.cleaning_of(capture) is not None):
             _cleaning(layout, state, capture, stage)
         if stage == "lost":
             lines(layout, f"The run's folder {folder} is gone: start a new fit.", "ERROR")
@@ -116,7 +116,7 @@ class FITFLARE_PT_fit(_Part, bpy.types.Panel):
 
 def _cleaning(layout: Any, state: Any, capture: Any, stage: str) -> None:
     """The frames without flare: made, being made, or to be made; with a matte they can be made again."""
-    job = jobs.find(capture / "removal")
+    job = fits.cleaning_of(capture)
     if job is not None and job.running:
         draw_progress(layout, job, "Clean frames")
         return

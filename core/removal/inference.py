@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Flare removal of plates of any size and depth.
 
-The network sees the plate at a bounded working size. The flare that it tells is carried up as it is, since a flare
-lies over the scene and knows nothing of its edges. But where the plate is over-exposed, only a part of the flare is
-to be seen in it, and that part ends where the clipping does: there it is carried up by a guided filter (He et al.
-2013, in the fast form of He and Sun 2015), flare = a * plate + b, with a and b found at the working size, smooth,
-and applied to the plate's own pixels. What was carried up is taken from the plate in linear light. Where the
+The network sees the plate at a bounded working size, in several views. The flare that it tells is carried up as it
+is, since a flare lies over the scene and knows nothing of its edges. But where the plate is over-exposed, only a part
+of the flare is to be seen in it, and that part ends where the clipping does: there it is carried up by a guided filter
+(He et al. 2013, in the fast form of He and Sun 2015), flare = a * plate + b, with a and b found at the working size,
+smooth, and applied to the plate's own pixels. What was carried up is taken from the plate in linear light. Where the
 network tells less than a threshold the flare is exactly zero, and the plate's own codes are kept.
 """
 from __future__ import annotations
@@ -118,10 +118,10 @@ class Remover:
         The frame is shown upright and upside down, in two sizes. A flare is one in every view; what is taken for one
         in some alone seldom is. So it is the mean of what is told, less by how far the views are apart.
         """
-        views = [self._told_of(display, part, turns) for part in SIZES for turns in TURNS]
+        views = [self._told_in_view(display, part, turns) for part in SIZES for turns in TURNS]
         return np.maximum(np.mean(views, 0) - np.std(views, 0), 0)
 
-    def _told_of(self, display: Pixels, part: float, turns: int) -> Pixels:
+    def _told_in_view(self, display: Pixels, part: float, turns: int) -> Pixels:
         """What the network tells of a view, brought back to the frame's size and upright."""
         import cv2
 

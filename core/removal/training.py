@@ -27,7 +27,7 @@ from .synthesis.prescription import Prescription
 from .trainer import FIGURES, Trainer, device
 
 CHECKPOINT, WEIGHTS, LOG = "checkpoint.safetensors", "removal.safetensors", "training.jsonl"
-GAIN = "gain_db"  # in the weights' header: of the check that they were kept for
+GAIN = "gain_db"  # of a check: in the log, and in the header of the weights that were kept for it
 CHECK_EVERY = 1000
 CHECK_SEED = 20_000
 CHECKS = 64
@@ -146,9 +146,9 @@ def _run(trainer: Trainer, batches: Iterator[Batch], folder: Path, held_out: Map
                                         **{name: round(value / (here - told), 5) for name, value in sums.items()}}
                 told, sums = here, dict.fromkeys(FIGURES, 0.0)
                 if held_out:
-                    line["gain_db"] = trainer.check(held_out)
+                    line[GAIN] = trainer.check(held_out)
                     if chosen:
-                        best = _keep_better(trainer, folder, line["gain_db"]["mean"], best)
+                        best = _keep_better(trainer, folder, line[GAIN]["mean"], best)
                 with open(folder / LOG, "a", encoding="utf-8") as stream:
                     stream.write(json.dumps(line) + "\n")
             if time.monotonic() - saved > save_every_s:

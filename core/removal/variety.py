@@ -12,6 +12,7 @@ import math
 from collections.abc import Callable
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .formation import Pixels
 from .synthesis.canvas import uniform_log
@@ -22,10 +23,12 @@ Film = Callable[[Random, int, int], Pixels]
 
 ROOM = 1.4
 """Parts of its size by which a picture to be laid askew is filmed larger."""
+SQUARE = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+"""The corners of a frame, from its middle in halves of its sides."""
 
 
 def varied(random: Random, film: Film, width: int, height: int) -> Pixels:
-    """(height, width, 3) linear light: as filmed in a third of all, else changed in some of the ways below."""
+    """(height, width, 3) linear light: as filmed in one of six, else changed in some of the ways below."""
     scene = _askew(random, film, width, height)
     if random.random() < 0.35:
         scene = _under_leaves(random, scene, film)
@@ -51,9 +54,8 @@ def _askew(random: Random, film: Film, width: int, height: int) -> Pixels:
     scene = film(random, wide, high)
     turn = math.radians(random.normal(0, 12))
     spin = np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]])
-    square = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
-    corners = (square * (width, height) / 2) @ spin.T * np.exp(random.normal(0, 0.1, (4, 1))) + (wide / 2, high / 2)
-    onto = (square + 1) / 2 * (width, height)
+    corners = (SQUARE * (width, height) / 2) @ spin.T * np.exp(random.normal(0, 0.1, (4, 1))) + (wide / 2, high / 2)
+    onto = (SQUARE + 1) / 2 * (width, height)
     matrix = cv2.getPerspectiveTransform(corners.astype(np.float32), onto.astype(np.float32))
     return np.asarray(cv2.warpPerspective(scene, matrix, (width, height), flags=cv2.INTER_LINEAR,
                                           borderMode=cv2.BORDER_REFLECT), np.float32)
@@ -82,26 +84,40 @@ def _mixed(one: Pixels, other: Pixels, of_other: Pixels) -> Pixels:
 
 
 def _leaf(random: Random, width: int, height: int) -> Pixels:
-    """(height, width) 0..1: an ellipse, a polygon or a blot, sharp in two of three."""
+    """(height, width) 0..1: a blot, a polygon or an ellipse, sharp in two of three."""
     import cv2
 
     kind = random.integers(3)
     if kind == 0:
-        coarse = random.random((int(random.integers(3, 9)), int(random.integers(3, 9)))).astype(np.float32)
-        coarse[0] = coarse[-1] = coarse[:, 0] = coarse[:, -1] = 0
-        hills = np.asarray(cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC), np.float32)
-        shape = np.clip((hills - random.uniform(0.3, 0.5)) * min(width, height) / 4 + 0.5, 0, 1)
+        shape = _blot(random, width, height)
     else:
-        corners = int(random.integers(3, 8)) if kind == 1 else 48
+        corners = int(random.integers(3, 8)) if kind == 1 else 48  # so many that it looks round
         at = np.sort(random.uniform(0, 2 * math.pi, corners)) if kind == 1 else np.linspace(0, 2 * math.pi, corners)
         reach = random.uniform(0.5, 1, (corners, 1)) if kind == 1 else 0.95
-        points = (np.stack([np.cos(at), np.sin(at)], -1) * reach + 1) / 2 * (width, height)
-        shape = np.zeros((height, width), np.float32)
-        cv2.fillPoly(shape, [(points * 16).astype(np.int32)], (1.0,), cv2.LINE_AA, 4)  # in sixteenths of a pixel
+        shape = _polygon((np.stack([np.cos(at), np.sin(at)], -1) * reach + 1) / 2 * (width, height), width, height)
     if random.random() < 1 / 3:
-        shape = cv2.GaussianBlur(shape, (0, 0), max(width, height) * uniform_log(random, 0.005, 0.08),
-                                 borderType=cv2.BORDER_CONSTANT)
-    return np.asarray(shape, np.float32)
+        soft = max(width, height) * uniform_log(random, 0.005, 0.08)
+        return np.asarray(cv2.GaussianBlur(shape, (0, 0), soft, borderType=cv2.BORDER_CONSTANT), np.float32)
+    return shape
+
+
+def _blot(random: Random, width: int, height: int) -> Pixels:
+    """(height, width) 0..1: what of some smooth hills is above a level."""
+    import cv2
+
+    coarse = random.random((int(random.integers(3, 9)), int(random.integers(3, 9)))).astype(np.float32)
+    coarse[0] = coarse[-1] = coarse[:, 0] = coarse[:, -1] = 0
+    hills = np.asarray(cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC), np.float32)
+    return np.asarray(np.clip((hills - random.uniform(0.3, 0.5)) * min(width, height) / 4 + 0.5, 0, 1), np.float32)
+
+
+def _polygon(corners: NDArray[np.float64], width: int, height: int) -> Pixels:
+    """(height, width) 0..1, with smooth edges. corners: (n, 2) in pixels."""
+    import cv2
+
+    shape = np.zeros((height, width), np.float32)
+    cv2.fillPoly(shape, [(corners * 16).astype(np.int32)], (1.0,), cv2.LINE_AA, 4)  # in sixteenths of a pixel
+    return shape
 
 
 def _graded(random: Random, scene: Pixels) -> Pixels:
@@ -165,10 +181,8 @@ def _panel(random: Random, height: int, width: int) -> Pixels:
     import cv2
 
     half = math.hypot(width, height) * np.array([uniform_log(random, 0.01, 0.15), uniform_log(random, 0.01, 0.15)])
-    square = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
-    corners = random.uniform(0, (width, height)) + square * half * np.exp(random.normal(0, 0.15, (4, 2)))
-    shown = np.zeros((height, width), np.float32)
-    cv2.fillPoly(shown, [(corners * 16).astype(np.int32)], (1.0,), cv2.LINE_AA, 4)  # in sixteenths of a pixel
+    corners = random.uniform(0, (width, height)) + SQUARE * half * np.exp(random.normal(0, 0.15, (4, 2)))
+    shown = _polygon(corners, width, height)
     if random.random() < 0.5:
         panes = random.uniform(random.random(), 1, tuple(random.integers(1, 8, 2))).astype(np.float32)
         shown *= cv2.resize(panes, (width, height), interpolation=cv2.INTER_NEAREST)

@@ -55,14 +55,19 @@ def facts(made: tuple[Any, Path]) -> Any:
     return made[0]
 
 
-def test_a_finished_fit_cleans_the_frames(made: tuple[Any, Path]) -> None:
+def test_frames_are_cleaned_by_the_network_or_by_a_finished_fit(made: tuple[Any, Path]) -> None:
     facts, base = made
     images, removed = str(Path("capture") / "images"), str(Path("capture") / "removed")
     assert facts["cleaned by the network"] == ["remove", images, "--out", removed]
+    assert facts["cleaned by the fit"] == ["remove", "--run", str(base / "a run"), "--out", removed]
+
+
+def test_frames_are_cleaned_by_a_matte_and_again(made: tuple[Any, Path]) -> None:
+    facts, base = made
+    images, removed = str(Path("capture") / "images"), str(Path("capture") / "removed")
     by_matte = ["remove", images, "--out", removed, "--matte", str(base / "roto")]
     assert facts["cleaned by a matte"] == by_matte
     assert facts["cleaned again"] == [*by_matte, "--overwrite"], "what the engine made, it makes again when it is asked"
-    assert facts["cleaned by the fit"] == ["remove", "--run", str(base / "a run"), "--out", removed]
 
 
 @pytest.mark.parametrize("kind", ["animated", "each"])

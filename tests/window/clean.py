@@ -32,7 +32,7 @@ def matte(name: str, white: slice) -> str:
     return str(path)
 
 
-def clean(capture: Path, where: str) -> object:
+def clean(capture: Path, where: str):
     """The matte into its field, and the button; the columns in which the first frame was changed, as a share of its
     width."""
     x, y = yield from ui.find("fit_flare.matte", flow.panel(), path=True, across=0.65)

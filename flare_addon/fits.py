@@ -173,7 +173,8 @@ def cleaning(scene: Any, capture: Path) -> list[object]:
         return ["remove", "--run", folder_of(scene), "--out", capture / "removed", *again]
     given = scene.fit_flare.matte
     matte = ["--matte", Path(bpy.path.abspath(given))] if given else []
-    return ["remove", capture / "images", "--out", capture / "removed", *matte, *again]
+    glow = ["--keep-glare"] if scene.fit_flare.keep_glow else []
+    return ["remove", capture / "images", "--out", capture / "removed", *matte, *glow, *again]
 
 
 def cleaned(job: Job) -> None:

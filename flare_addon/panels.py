@@ -115,7 +115,7 @@ class FITFLARE_PT_fit(_Part, bpy.types.Panel):
 
 
 def _cleaning(layout: Any, state: Any, capture: Any, stage: str) -> None:
-    """The frames without flare: made, being made, or to be made; with a matte they can be made again."""
+    """The frames without flare: made, being made, or to be made; those of a network can be made again, otherwise."""
     job = fits.cleaning_of(capture)
     if job is not None and job.running:
         draw_progress(layout, job, "Clean frames")
@@ -132,7 +132,8 @@ def _cleaning(layout: Any, state: Any, capture: Any, stage: str) -> None:
         given.use_property_split = True
         given.use_property_decorate = False
         given.prop(state, "matte")
-    if not there or (by_network and state.matte):
+        given.prop(state, "keep_glow")
+    if not there or by_network:
         layout.operator("fit_flare.clean_frames", text="Make Clean Frames Again" if there else "Make Clean Frames",
                         icon="BRUSH_DATA")
 

@@ -141,6 +141,9 @@ class FITFLARE_PG_scene(bpy.types.PropertyGroup):
         name="Matte", description="Where the flares are, white on black, roughly painted: a picture for all frames, or "
         "a folder with one for each, of its name. Faint flares are taken too then, and nothing elsewhere. Empty has "
         "them found", subtype="FILE_PATH", options=PATH)
+    keep_glow: BoolProperty(  # type: ignore[valid-type]
+        name="Keep Glow", description="Leave the glow round the lights in the clean frames: it stays with the scene, "
+        "and the flare is learned without it", default=False)
     run: StringProperty(  # type: ignore[valid-type]
         name="Run", description="Folder of the fit: settings, checkpoint, preview and result", subtype="DIR_PATH",
         options=PATH)

@@ -62,12 +62,13 @@ def test_frames_are_cleaned_by_the_network_or_by_a_finished_fit(made: tuple[Any,
     assert facts["cleaned by the fit"] == ["remove", "--run", str(base / "a run"), "--out", removed]
 
 
-def test_frames_are_cleaned_by_a_matte_and_again(made: tuple[Any, Path]) -> None:
+def test_frames_are_cleaned_by_a_matte_and_again_otherwise(made: tuple[Any, Path]) -> None:
     facts, base = made
     images, removed = str(Path("capture") / "images"), str(Path("capture") / "removed")
     by_matte = ["remove", images, "--out", removed, "--matte", str(base / "roto")]
     assert facts["cleaned by a matte"] == by_matte
     assert facts["cleaned again"] == [*by_matte, "--overwrite"], "what the engine made, it makes again when it is asked"
+    assert facts["cleaned again, glow kept"] == [*by_matte, "--keep-glare", "--overwrite"]
 
 
 @pytest.mark.parametrize("kind", ["animated", "each"])

@@ -76,6 +76,8 @@ scene.fit_flare.matte = str(Path(out) / "roto")
 facts["cleaned by a matte"] = [str(word) for word in fits.cleaning(scene, Path("capture"))]
 find, fits.jobs.find = fits.jobs.find, lambda _: SimpleNamespace(state="done")
 facts["cleaned again"] = [str(word) for word in fits.cleaning(scene, Path("capture"))]
+scene.fit_flare.keep_glow = True
+facts["cleaned again, glow kept"] = [str(word) for word in fits.cleaning(scene, Path("capture"))]
 fits.jobs.find = find
 run = Path(out) / "a run"
 run.mkdir()

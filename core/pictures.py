@@ -13,11 +13,12 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, BinaryIO, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from . import tiff
 from .errors import FrameError
 from .files import atomic_path
 
@@ -91,16 +92,7 @@ def read_picture(path: Path | str) -> Picture:
         raise FrameError(f"{path} is missing.")
     if path.suffix.lower() == ".exr":
         return Picture(_rec709(path, _rgb_from_channels(path, read_exr(path))), "linear")
-    import cv2
-
-    width, height = picture_size(path)
-    data = np.fromfile(path, np.uint8)  # imread cannot open every path that Windows allows
-    try:
-        stored = cv2.imdecode(data, cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
-    except cv2.error:
-        stored = None
-    if stored is None or stored.shape[:2] != (height, width):
-        raise FrameError(f"{path} is damaged or truncated; export it again.")
+    stored = stored_pixels(path)
     if stored.ndim == 2:
         stored = np.repeat(stored[..., None], 3, axis=2)
     colour = stored[..., 2::-1]  # OpenCV keeps B G R (A)
@@ -114,6 +106,24 @@ def read_picture(path: Path | str) -> Picture:
     return Picture(pixels, "linear")  # a float TIFF
 
 
+def stored_pixels(path: Path) -> NDArray[Any]:
+    """What a PNG, JPEG or TIFF holds, turned and multiplied with nothing: (height, width) or with the channels B G R
+    and alpha behind. Raises FrameError where it is missing or damaged."""
+    import cv2
+
+    width, height = picture_size(path)
+    data = np.fromfile(path, np.uint8)  # imread cannot open every path that Windows allows
+    if data[:4].tobytes() in (b"II*\0", b"MM\0*"):
+        data = np.frombuffer(tiff.as_stored(data.tobytes()), np.uint8)
+    try:
+        stored = cv2.imdecode(data, cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
+    except cv2.error:
+        stored = None
+    if stored is None or stored.shape[:2] != (height, width):
+        raise FrameError(f"{path} is damaged or truncated; export it again.")
+    return np.asarray(stored)
+
+
 def picture_size(path: Path | str) -> tuple[int, int]:
     """(width, height) from the header alone. Raises FrameError where the header is no picture's."""
     path = Path(path)
@@ -121,7 +131,7 @@ def picture_size(path: Path | str) -> tuple[int, int]:
         raise FrameError(f"{path} is missing.")
     try:
         with open(path, "rb") as stream:
-            size = _size_from_header(stream.read(1 << 16), path)
+            size = _size_from_header(stream)
     except OSError as problem:
         raise FrameError(f"{path} cannot be read: {problem.strerror or problem}.") from problem
     if size is None or min(size) <= 0:
@@ -131,67 +141,67 @@ def picture_size(path: Path | str) -> tuple[int, int]:
     return size
 
 
-def _size_from_header(head: bytes, path: Path) -> tuple[int, int] | None:
-    if head[:8] == b"\x89PNG\r\n\x1a\n" and len(head) >= 24:
+def _size_from_header(stream: BinaryIO) -> tuple[int, int] | None:
+    head = stream.read(24)
+    if head[:8] == b"\x89PNG\r\n\x1a\n" and len(head) == 24:
         return int.from_bytes(head[16:20], "big"), int.from_bytes(head[20:24], "big")
     if head[:2] == b"\xff\xd8":
-        return _jpeg_size(path)
+        return _jpeg_size(stream)
     if head[:4] in (b"II*\0", b"MM\0*"):
-        return _tiff_size(path, "little" if head[:2] == b"II" else "big")
+        sides = tiff.read_tags(stream, (tiff.WIDTH, tiff.HEIGHT))
+        return (int(sides[tiff.WIDTH].values[0]), int(sides[tiff.HEIGHT].values[0])) if len(sides) == 2 else None
     if head[:4] == b"\x76\x2f\x31\x01":
-        return _exr_size(head)
+        return _exr_size(stream)
     return None
 
 
-def _jpeg_size(path: Path) -> tuple[int, int] | None:
+def _jpeg_size(stream: BinaryIO) -> tuple[int, int] | None:
     """Walk the segments to the frame header (SOF)."""
-    with open(path, "rb") as stream:
-        stream.seek(2)
-        while marker := stream.read(2):
-            while len(marker) == 2 and marker[1] == 0xFF:  # fill bytes may stand before a marker
-                marker = marker[1:] + stream.read(1)
-            if len(marker) < 2 or marker[0] != 0xFF:
+    stream.seek(2)
+    while marker := stream.read(2):
+        while len(marker) == 2 and marker[1] == 0xFF:  # fill bytes may stand before a marker
+            marker = marker[1:] + stream.read(1)
+        if len(marker) < 2 or marker[0] != 0xFF:
+            return None
+        segment = stream.read(2)
+        length = int.from_bytes(segment, "big")
+        if len(segment) < 2 or length < 2:
+            return None
+        if 0xC0 <= marker[1] <= 0xCF and marker[1] not in (0xC4, 0xC8, 0xCC):
+            frame = stream.read(5)
+            if len(frame) < 5:
                 return None
-            segment = stream.read(2)
-            length = int.from_bytes(segment, "big")
-            if len(segment) < 2 or length < 2:
-                return None
-            if 0xC0 <= marker[1] <= 0xCF and marker[1] not in (0xC4, 0xC8, 0xCC):
-                frame = stream.read(5)
-                if len(frame) < 5:
-                    return None
-                return int.from_bytes(frame[3:5], "big"), int.from_bytes(frame[1:3], "big")
-            stream.seek(length - 2, os.SEEK_CUR)
+            return int.from_bytes(frame[3:5], "big"), int.from_bytes(frame[1:3], "big")
+        stream.seek(length - 2, os.SEEK_CUR)
     return None
 
 
-def _tiff_size(path: Path, order: Literal["little", "big"]) -> tuple[int, int] | None:
-    """Tags 256 and 257 of the first directory."""
-    with open(path, "rb") as stream:
-        stream.seek(4)
-        stream.seek(int.from_bytes(stream.read(4), order))
-        size: dict[int, int] = {}
-        for _ in range(int.from_bytes(stream.read(2), order)):
-            entry = stream.read(12)
-            if len(entry) < 12:
-                return None
-            tag, kind = (int.from_bytes(entry[at:at + 2], order) for at in (0, 2))
-            if tag in (256, 257):
-                size[tag] = int.from_bytes(entry[8:10] if kind == 3 else entry[8:12], order)
-    return (size[256], size[257]) if len(size) == 2 else None
+def _exr_size(stream: BinaryIO) -> tuple[int, int] | None:
+    """The dataWindow attribute of the first header: before it may stand others of any length."""
+    stream.seek(8)
+    while name := _until_zero(stream):
+        kind, length = _until_zero(stream), int.from_bytes(stream.read(4), "little", signed=True)
+        if name == b"dataWindow" and kind == b"box2i" and length == 16:
+            window = stream.read(16)
+            x0, y0, x1, y1 = np.frombuffer(window, "<i4").tolist() if len(window) == 16 else (0, 0, -1, -1)
+            return x1 - x0 + 1, y1 - y0 + 1
+        if length < 0:
+            return None
+        stream.seek(length, os.SEEK_CUR)
+    return None
 
 
-def _exr_size(head: bytes) -> tuple[int, int] | None:
-    """The dataWindow attribute of the first header."""
-    at = head.find(b"dataWindow\0box2i\0")
-    if at < 0 or len(head) < at + 17 + 4 + 16:
-        return None
-    x0, y0, x1, y1 = np.frombuffer(head, "<i4", 4, at + 17 + 4).tolist()
-    return x1 - x0 + 1, y1 - y0 + 1
+def _until_zero(stream: BinaryIO) -> bytes:
+    """A name in an EXR's header, 255 bytes at most."""
+    name = b""
+    while len(name) <= 255 and (byte := stream.read(1)) not in (b"", b"\0"):
+        name += byte
+    return name
 
 
 def read_exr(path: Path | str) -> dict[str, Pixels]:
-    """Every channel of every part of an EXR, by name, as (height, width) float32.
+    """Every channel of every part of an EXR, by name, as (height, width) float32; of two parts with channels of one
+    name (left and right eye, passes of a renderer) the first counts.
 
     Raises FrameError where the file is damaged or holds NaN or infinity.
     """
@@ -204,7 +214,7 @@ def read_exr(path: Path | str) -> dict[str, Pixels]:
         with OpenEXR.File(str(path), separate_channels=True) as file:
             for part in file.parts:
                 for name, channel in part.channels.items():
-                    channels[name] = np.asarray(channel.pixels, np.float32)
+                    channels.setdefault(name, np.asarray(channel.pixels, np.float32))
     except Exception as problem:  # the library raises bare RuntimeError and worse for damaged files
         raise FrameError(f"{path} is damaged or truncated ({problem}); export it again.") from problem
     for name, pixels in channels.items():
@@ -252,8 +262,14 @@ def write_exr(path: Path | str, channels: Mapping[str, NDArray[Any]], *, half: b
         return np.ascontiguousarray(pixels, np.float32)
 
     attributes = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **(header or {})}
-    packed = {name: stored(name, pixels) for name, pixels in channels.items()}
-    with atomic_path(path) as temporary, OpenEXR.File(attributes, packed) as file:
+    save_exr(path, attributes, {name: stored(name, pixels) for name, pixels in channels.items()})
+
+
+def save_exr(path: Path | str, header: Mapping[str, Any], channels: Mapping[str, NDArray[Any]]) -> None:
+    """Write one part as it is given. Raises OSError where the system refuses, a full disk among that."""
+    import OpenEXR
+
+    with atomic_path(path) as temporary, OpenEXR.File(dict(header), dict(channels)) as file:
         try:
             file.write(str(temporary))
         except RuntimeError as problem:  # how the library hands on what the system refused, by its words alone

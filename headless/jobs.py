@@ -58,22 +58,23 @@ def _ranges(numbers: Sequence[int]) -> str:
 
 
 def run_jobs(words: argparse.Namespace, step: str, numbers: Sequence[int], progress: Progress,
-             extra: Sequence[str] = ()) -> None:
+             extra: Sequence[str] = (), *, past_failures: bool = False) -> None:
     """Run a step of the command once for each share of the frames, at once; returns when all are done.
 
-    extra: words that the processes are given besides. Raises what `run_parts` raises.
+    extra: words that the processes are given besides. past_failures, and what is raised: as of `run_parts`.
     """
     parts = [[*extra, "--jobs", "1", "--frames", frames] for frames in shares(numbers, words.jobs)]
-    run_parts(words, step, parts, words.jobs, len(numbers), progress)
+    run_parts(words, step, parts, words.jobs, len(numbers), progress, past_failures=past_failures)
 
 
 def run_parts(words: argparse.Namespace, step: str, parts: Sequence[Sequence[str]], jobs: int, total: int,
-              progress: Progress) -> None:
+              progress: Progress, *, past_failures: bool = False) -> None:
     """Run a step of the command once for each part, its words with these after them, `jobs` of them at a time.
 
     total: steps of all together, as the processes count them; where it is the number of parts, parts are counted.
-    Raises Cancelled when asked to stop, after the processes have stopped; FitFlareError with the sentence of the
-    first that failed, after the others have been stopped.
+    past_failures: one that fails does not stop the others, since they go past what they cannot do themselves.
+    Raises Cancelled when asked to stop, after the processes have stopped; FitFlareError with the sentences of those
+    that failed, after the others have been stopped or, `past_failures`, have ended.
     """
     events: queue.Queue[tuple[int, dict[str, Any] | None]] = queue.Queue()
     threads = str(max((os.cpu_count() or 1) // max(min(jobs, len(parts)), 1), 1))
@@ -84,7 +85,7 @@ def run_parts(words: argparse.Namespace, step: str, parts: Sequence[Sequence[str
     counted, errors, ended = [0] * len(parts), dict[int, str](), 0
     progress.stage(step, total)
     try:
-        while ended < len(parts) and not errors:
+        while ended < len(parts) and (past_failures or not errors):
             while len(children) < len(parts) and len(children) - ended < jobs:
                 noises.append(tempfile.TemporaryFile())  # noqa: SIM115 - closed below, when its process has ended
                 whole = [sys.executable, str(hand_off.RUN), *words.words, "--step", step, *parts[len(children)],
@@ -116,7 +117,7 @@ def run_parts(words: argparse.Namespace, step: str, parts: Sequence[Sequence[str
         for noise in noises:
             noise.close()
     if errors:
-        text = next((text for text in errors.values() if text), "")
+        text = " ".join(dict.fromkeys(text for text in errors.values() if text))
         if not text:
             sys.stderr.write(said)
             raise EngineError(f"One of {len(parts)} processes of {step} failed; its last words stand above.")

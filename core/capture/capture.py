@@ -32,6 +32,8 @@ from .lens import PINHOLES, Lens, straightened
 from .transforms import FILE as TRANSFORMS
 from .transforms import read_transforms
 
+REMOVED = "removed"
+"""The folder of a capture that has its flare-free frames."""
 HOLDOUT = 8  # every 8th view is held out where nothing else is said, as 3DGS and mip-NeRF 360 do
 
 
@@ -64,7 +66,7 @@ class Capture:
         self.lights = tuple(lights)
         self._frames = frames or {}
         self._pictures = _Pictures(cache_bytes)
-        self._removed = _siblings(folder / "removed", self.views)
+        self._removed = _siblings(folder / REMOVED, self.views)
         self._truth_scene = _siblings(folder / "truth" / "scene", self.views)
         self._truth_flare = _siblings(folder / "truth" / "flare", self.views)
 

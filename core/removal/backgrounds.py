@@ -62,19 +62,23 @@ def read_backgrounds(folders: Iterable[Path | str], part: Part = "all", longest:
                      varied: bool = False) -> Backgrounds:
     """Read every photograph and environment map below the folders, photographs reduced to `longest` pixels.
 
-    Environment maps are .hdr, or .exr twice as wide as high. Raises SettingsError where nothing is found.
+    Environment maps are .hdr, or .exr twice as wide as high. Pictures that cannot be read are left out. Raises
+    SettingsError for what is no folder, and where nothing is found.
     """
     import cv2
 
     photos, maps, looked = [], [], []
     for folder in folders:
         looked.append(str(folder))
+        if not Path(folder).is_dir():
+            raise SettingsError(f"{folder} is no folder; name one with clean photographs or environment maps.")
         for path in sorted(Path(folder).rglob("*")):
             suffix = path.suffix.lower()
             if suffix not in PHOTOS | MAPS or (part != "all" and kept_for_test(path.name) != (part == "test")):
                 continue
             if suffix in PHOTOS:
-                picture = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_COLOR)
+                data = np.fromfile(path, np.uint8)
+                picture = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
                 if picture is None or min(picture.shape[:2]) < 64:
                     continue
                 scale = longest / max(picture.shape[:2])

@@ -89,13 +89,15 @@ class OwnFlares:
     def __init__(self, folder: Path | str, size: int) -> None:
         """Raises SettingsError where the folder holds neither pictures nor clips."""
         folder = Path(folder)
-        lights = {path.stem: path for path in folder.glob("**/Light_Source/*") if path.suffix.lower() in SUFFIXES}
+        # Beside the folder of its flares, as Flare7K++ has them: another set may have flares of the same names.
+        lights = {(path.parent.parent, path.stem): path for path in folder.glob("**/Light_Source/*")
+                  if path.suffix.lower() in SUFFIXES}
         self._size = size
         self._files: list[tuple[Path, Path | None]] = []
         for path in sorted(folder.rglob("*")):
             if "Light_Source" in path.parts or path.suffix.lower() not in SUFFIXES | VIDEOS:
                 continue
-            self._files.append((path, lights.get(path.stem)))
+            self._files.append((path, lights.get((path.parent.parent, path.stem))))
         if not self._files:
             raise SettingsError(f"{folder} holds no flare layers; give pictures or clips of flares on black.")
 

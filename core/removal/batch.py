@@ -2,6 +2,7 @@
 """Removal of many plates: one after the other, past those that cannot be read, resumable."""
 from __future__ import annotations
 
+import itertools
 from collections.abc import Container, Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,20 +16,25 @@ from ..progress import Progress
 from .inference import Remover
 from .mattes import Mattes
 from .plates import plates_below, write_plate
+from .results import are_newer, check_apart
 from .steady import Sequences, by_number
 
 TOLD = 20  # failures that are spelled out in the last sentence
 
 
-def plates_of(inputs: Iterable[Path]) -> list[tuple[Path, Path]]:
+def plates_of(inputs: Iterable[Path], apart_from: Iterable[Path | None] = ()) -> list[tuple[Path, Path]]:
     """(file, name below the output folder) of pictures, and of the pictures in folders.
 
-    Raises SettingsError where there are none, or where two would be written to one name.
+    apart_from: files and folders in these folders that hold no plates: the results of an earlier run, mattes. Raises
+    SettingsError where there are none, or where two would be written to one name.
     """
     found: dict[Path, Path] = {}
+    others = [other.resolve() for other in apart_from if other is not None]
     for given in inputs:
         if given.is_dir():
-            files = [(path, path.relative_to(given)) for path in plates_below(given)]
+            inner = [other for other in others if given.resolve() in other.parents]
+            files = [(path, path.relative_to(given)) for path in plates_below(given)
+                     if not any(path.resolve().is_relative_to(other) for other in inner)]
             if not files:
                 raise SettingsError(f"{given} holds no pictures; give a folder with PNG, JPEG, TIFF or EXR files.")
         else:
@@ -51,25 +57,22 @@ def remove_all(inputs: Sequence[Path], folder: Path, remover: Remover, progress:
     Raises SettingsError before anything is written, and FrameError after everything was tried, with a list of
     the plates that failed.
     """
-    plates = plates_of(inputs)
+    plates = plates_of(inputs, [folder, flare_folder, mattes.given if mattes else None])
+    results = {name: [folder / name, *([flare_folder / name.with_suffix(".exr")] if flare_folder else [])]
+               for _, name in plates}
+    check_apart([path for path, _ in plates], itertools.chain.from_iterable(results.values()))
     sequences = Sequences(remover, [] if stills else [path for path, _ in plates])
     if wanted is not None:
         plates = [(path, name) for path, name in plates if name in wanted]
-    for path, name in plates:
-        if (folder / name).resolve() == path.resolve():
-            raise SettingsError(f"{path} would be overwritten by its own result; choose another folder with --out.")
     progress.stage("remove", len(plates))
     failed: list[str] = []
     made = kept = 0
     for path, name in sorted(plates, key=lambda plate: (plate[0].parent, by_number(plate[0]))):
-        flare = flare_folder / name.with_suffix(".exr") if flare_folder else None
-        results = [folder / name, *([flare] if flare else [])]
         try:
-            sources = [path, *([mattes.path(name)] if mattes else [])]
-            if not overwrite and all(_is_newer(result, source) for result in results for source in sources):
+            if not overwrite and are_newer(results[name], [path, *([mattes.path(name)] if mattes else [])]):
                 kept += 1
             else:
-                _remove(path, name, results, remover, sequences, mattes)
+                _remove(path, name, results[name], remover, sequences, mattes)
                 made += 1
         except (FrameError, OSError, MemoryError) as problem:
             failed.append(str(problem) or f"{path} does not fit into memory.")
@@ -94,8 +97,5 @@ def _remove(path: Path, name: Path, results: Sequence[Path], remover: Remover, s
     codes, flare = remover.remove(plate, mattes.read(name, width, height) if mattes else None, told)
     write_plate(results[0], plate, codes)
     for result in results[1:]:
-        write_exr(result, {channel: np.ascontiguousarray(flare[..., k]) for k, channel in enumerate("RGB")})
-
-
-def _is_newer(result: Path, source: Path) -> bool:
-    return result.is_file() and source.is_file() and result.stat().st_mtime >= source.stat().st_mtime
+        write_exr(result, {channel: np.ascontiguousarray(flare[..., k]) for k, channel in enumerate("RGB")},
+                  header=plate.placing)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from ..capture import Capture
+from ..capture.capture import REMOVED
 from ..errors import CaptureError
 from ..files import inside
 from ..progress import Progress
@@ -12,7 +13,6 @@ from .inference import Remover
 from .plates import write_plate
 from .steady import Sequences
 
-REMOVED = "removed"
 UNFINISHED = "removed.unfinished"
 """Where they are until they are all there: half a removed/ would be taken for a whole one."""
 _LOSSY = frozenset({".jpg", ".jpeg"})

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -27,6 +27,8 @@ from .synthesis.prescription import Prescription, built_in
 INPUTS = ("input", "flare", "blend")
 TRUTHS = ("gt", "target", "clean", "scene")
 WORST = 10
+ALIKE = 100.0
+"""PSNR in dB that pictures which are the same count for in a gain: that of an error of 0.00001."""
 Scores = dict[str, float | None]
 
 
@@ -82,10 +84,10 @@ def evaluate(cases: Sequence[Case], clean: Callable[[Pixels], Pixels], progress:
              lpips: Callable[[Pixels, Pixels], float] | None = None) -> dict[str, Any]:
     """Scores of every case, means by category and of all; JSON-able.
 
-    clean: display values (height, width, 3) to the same without flare. `gain_db` is the PSNR above the
-    untouched input's, `made_worse` the share of pictures with a gain below -0.5 dB; `masked_psnr` counts
-    the pixels of the mask alone. lpips is null where no weights for it were given, FLIP where its package is
-    not installed.
+    clean: display values (height, width, 3) to the same without flare. `gain_db` is the PSNR above the untouched
+    input's (where two pictures are the same and have none, `ALIKE` counts), `made_worse` the share of pictures with a
+    gain below -0.5 dB; `masked_psnr` counts the pixels of the mask alone. lpips is null where no weights for it were
+    given, FLIP where its package is not installed.
     """
     progress = progress or Progress()
     progress.stage("eval-removal", len(cases))
@@ -97,7 +99,7 @@ def evaluate(cases: Sequence[Case], clean: Callable[[Pixels], Pixels], progress:
                                "result": _scores(result, truth, mask, lpips),
                                "input": _scores(frame, truth, mask, lpips)}
         before, after = row["input"]["psnr"], row["result"]["psnr"]
-        row["gain_db"] = None if before is None or after is None else round(after - before, 4)
+        row["gain_db"] = round((ALIKE if after is None else after) - (ALIKE if before is None else before), 4)
         rows.append(row)
         progress.advance()
     categories = sorted({row["category"] for row in rows})
@@ -117,7 +119,7 @@ def _scores(picture: Pixels, truth: Pixels, mask: Pixels | None,
 
 
 def _summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    gains = [row["gain_db"] for row in rows if row["gain_db"] is not None]
+    gains = [row["gain_db"] for row in rows]
     summary: dict[str, Any] = {"count": len(rows), "gain_db": _mean(gains),
                                "made_worse": round(sum(gain < -0.5 for gain in gains) / max(len(gains), 1), 4)}
     for side in ("result", "input"):
@@ -152,7 +154,7 @@ def worst_sheet(cases: Sequence[Case], clean: Callable[[Pixels], Pixels], scores
     """The pictures with the lowest gain, worst first: input | result | truth | flare taken, display values."""
     import cv2
 
-    ranked = sorted((row["gain_db"], k) for k, row in enumerate(scores["pictures"]) if row["gain_db"] is not None)
+    ranked = sorted((row["gain_db"], k) for k, row in enumerate(scores["pictures"]))
     strips = []
     for gain, k in ranked[:WORST]:
         frame, truth, _ = cases[k].read()
@@ -192,9 +194,3 @@ def synthetic(seed: int, count: int, backgrounds: Any, lenses: Sequence[Any], si
     return [Case(f"{number:04d}", kind, reader(index, number))
             for index, kind in enumerate(CLASSES) for number in range(count)]
 
-
-def pairs_of_pictures(cases: Iterable[Case]) -> Iterator[tuple[str, Pixels, Pixels]]:
-    """(category/name, frame, scene) of cases, for who wants them as files."""
-    for case in cases:
-        frame, truth, _ = case.read()
-        yield f"{case.category}/{case.name}", frame, truth

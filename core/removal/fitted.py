@@ -7,6 +7,7 @@ fitted scene stands in, as far as it is brighter. The lights' own clipped discs 
 """
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -16,13 +17,14 @@ from numpy.typing import NDArray
 
 from ..capture import Capture, View
 from ..capture.discs import clipped_discs
-from ..errors import CaptureError, SettingsError
+from ..errors import CaptureError
 from ..files import inside, remove_partial_of
 from ..metrics.evaluation import Renderer
 from ..pictures import linear_from_srgb, srgb_from_linear, write_exr
 from ..progress import Progress
 from .inference import CLIPPED
 from .plates import Plate, read_plate, write_plate
+from .results import are_newer, check_apart
 
 Pixels = NDArray[np.float32]
 
@@ -30,7 +32,8 @@ Pixels = NDArray[np.float32]
 def remove_fitted(fitted: Renderer, capture: Capture, views: Sequence[View], folder: Path, progress: Progress, *,
                   flare_folder: Path | None = None, overwrite: bool = False) -> dict[str, Any]:
     """Write the views' frames without the fitted flare below `folder`, each under its own name, in its own kind and
-    depth; those that are there and newer than the frame are kept, unless `overwrite`.
+    depth; those that are there and newer than the frame, their flares too where those are wanted, are kept, unless
+    `overwrite`.
 
     Raises CaptureError for frames with lens distortion, which the flare was not fitted with, SettingsError where frames
     would be overwritten, FrameError for a frame that cannot be read.
@@ -38,33 +41,45 @@ def remove_fitted(fitted: Renderer, capture: Capture, views: Sequence[View], fol
     if any(view.lens for view in views):
         raise CaptureError(f"The frames of {capture.folder} are distorted by their lens, and the flare was fitted "
                            "without that; undistort them first (for instance with COLMAP's image_undistorter).")
+    results = [_results(view, folder, flare_folder) for view in views]
+    check_apart([capture.frame_path(view) for view in capture.views], itertools.chain.from_iterable(results))
     progress.stage("remove", len(views))
     made = 0
-    for view in views:
-        path, target = capture.frame_path(view), inside(folder, view.name, CaptureError)
-        if target.resolve() == path.resolve():
-            raise SettingsError(f"{path} would be overwritten by its own result; choose another folder with --out.")
-        if overwrite or not target.is_file() or target.stat().st_mtime < path.stat().st_mtime:
-            _remove(fitted, capture, view, path, target, flare_folder)
+    for view, targets in zip(views, results, strict=True):
+        if overwrite or not are_newer(targets, [capture.frame_path(view)]):
+            _remove(fitted, capture, view, targets)
             made += 1
         progress.advance()
+    if made < len(views):
+        progress.say(f"{len(views) - made} plates were in {folder} already; --overwrite makes them again.")
     progress.say(f"{made} clean plates are in {folder}.")
     return {"plates": str(folder), "made": made, "kept": len(views) - made}
 
 
-def _remove(fitted: Renderer, capture: Capture, view: View, path: Path, target: Path,
-            flare_folder: Path | None) -> None:
-    remove_partial_of(target)
-    plate = read_plate(path)
+def _results(view: View, folder: Path, flare_folder: Path | None) -> list[Path]:
+    """Of the clean plate, and of the flare where it is wanted."""
+    plate = inside(folder, view.name, CaptureError)
+    if flare_folder is None:
+        return [plate]
+    return [plate, inside(flare_folder, str(Path(view.name).with_suffix(".exr")), CaptureError)]
+
+
+def _remove(fitted: Renderer, capture: Capture, view: View, results: Sequence[Path]) -> None:
+    """results: the clean plate's path, and the flare's where it is wanted."""
+    for result in results:
+        remove_partial_of(result)  # of a task that was killed
+    plate = read_plate(capture.frame_path(view))
     height, width = plate.codes.shape[:2]
     camera = view.camera if view.camera.size == (width, height) else view.camera.scaled(width, height)
     layers = fitted.render(camera)
     flare = np.sum([np.zeros((height, width, 3), np.float32), *layers.flare_by_light.values()], axis=0)
+    scene = layers.scene
+    if plate.encoding == "linear":  # the fit was shown Rec. 709
+        flare, scene = plate.space.from_linear(flare), plate.space.from_linear(scene)
     lights = clipped_discs(_display(plate), camera, [light.xyz for light in capture.lights])
-    write_plate(target, plate, without(plate, np.where(lights[..., None], 0, flare), layers.scene))
-    if flare_folder is not None:
-        exr = inside(flare_folder, str(Path(view.name).with_suffix(".exr")), CaptureError)
-        write_exr(exr, {name: np.ascontiguousarray(flare[..., k], np.float16) for k, name in enumerate("RGB")})
+    write_plate(results[0], plate, without(plate, np.where(lights[..., None], 0, flare), scene))
+    for result in results[1:]:
+        write_exr(result, {name: flare[..., k] for k, name in enumerate("RGB")}, header=plate.placing)
 
 
 def _display(plate: Plate) -> Pixels:
@@ -89,4 +104,4 @@ def without(plate: Plate, flare: Pixels, scene: Pixels) -> NDArray[Any]:
         codes = (srgb_from_linear(less) * np.float32(plate.top) + np.float32(0.5)).astype(plate.codes.dtype)
     else:
         codes = less.astype(plate.codes.dtype)
-    return np.where((flare > 0) & np.isfinite(plate.codes.astype(np.float32)), codes, plate.codes)
+    return np.where((flare != 0) & np.isfinite(plate.codes.astype(np.float32)), codes, plate.codes)

@@ -16,19 +16,9 @@ Pixels = NDArray[np.float32]
 GAMMAS = (1.8, 2.2)
 
 
-def light(display: Pixels, gamma: float) -> Pixels:
-    """Display values 0..1 as linear light."""
-    return np.power(np.maximum(display, 0), np.float32(gamma)).astype(np.float32)
-
-
 def display(linear: Pixels, gamma: float) -> Pixels:
     """Linear light as display values, clipped to 0..1."""
     return np.power(np.clip(linear, 0, 1), np.float32(1 / gamma)).astype(np.float32)
-
-
-def form(scene: Pixels, flare: Pixels, gamma: float) -> Pixels:
-    """The picture that a camera makes of display values `scene` under a flare of display values `flare`."""
-    return display(light(scene, gamma) + light(flare, gamma), gamma)
 
 
 def coverage(flare: Pixels, share: float = 0.9) -> float:

@@ -44,6 +44,8 @@ CLIPPED = 0.97
 """Display value from which on a plate is taken for over-exposed."""
 ROWS = 256
 """Rows of the plate that are worked on at a time, which bounds the memory."""
+COLUMNS = 16384
+"""Of them at a time where places are looked up, which OpenCV counts in 16 bits."""
 
 
 @dataclass(frozen=True)
@@ -254,9 +256,11 @@ def carried_up(found: FlareMap, codes: NDArray[Any], encoding: Encoding,
         low = max(int(y[0, 0]) - 2, 0)
         high = min(int(y[-1, 0]) + 4, low_height)
         at = (np.broadcast_to(x, (len(y), width)), np.broadcast_to(y - low, (len(y), width)))
-        gain, offset = (cv2.remap(np.ascontiguousarray(part[low:high]), np.ascontiguousarray(at[0]),
-                                  np.ascontiguousarray(at[1]), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-                        for part in (found.gain, found.offset))
+        gain, offset = (np.concatenate([
+            cv2.remap(np.ascontiguousarray(part[low:high]), np.ascontiguousarray(at[0][:, left:left + COLUMNS]),
+                      np.ascontiguousarray(at[1][:, left:left + COLUMNS]), cv2.INTER_LINEAR,
+                      borderMode=cv2.BORDER_REPLICATE) for left in range(0, width, COLUMNS)], 1)
+            for part in (found.gain, found.offset))
         light = _light(codes[rows], encoding, top)
         display = codes[rows].astype(np.float32) / np.float32(top) if encoding == "srgb" else _display(light)
         flare = gain * display + offset

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .backgrounds import Backgrounds
-from .formation import GAMMAS, Pixels
+from .formation import GAMMAS, Pixels, display
 
 Random = np.random.Generator
 
@@ -61,8 +61,7 @@ def pair(random: Random, bank: Bank, backgrounds: Backgrounds, width: int, heigh
     if random.random() < 0.5:  # of the sensor; the same in both pictures, since removal is no denoising
         grain = np.sqrt(np.maximum(scene, 0) * 0.002 + 1e-5).astype(np.float32) * random.chisquare(1) * 0.3
         scene = np.maximum(scene + grain * random.standard_normal(scene.shape, np.float32), 0)
-    shown = [np.power(np.clip(linear, 0, 1), np.float32(1 / gamma))
-             for linear in (scene + rest + glare, scene, scene + glare)]
+    shown = [display(linear, gamma) for linear in (scene + rest + glare, scene, scene + glare)]
     if random.random() < 0.35:
         shown = _developed(random, shown)
     frame, clear, gentle = shown

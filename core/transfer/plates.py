@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..colour import ColourSpace, colour_space, space_of_chromaticities
+from ..colour import ColourSpace, colour_space
 from ..removal.plates import Plate, read_plate, write_plate
 
 AUTO = "auto"
@@ -34,12 +34,7 @@ class ColouredPlate:
         Raises FrameError for a file that cannot be read, SettingsError for a space that is not known.
         """
         plate = read_plate(path)
-        if space != AUTO:
-            return cls(plate, colour_space(space, config))
-        if plate.encoding == "srgb":
-            return cls(plate, colour_space("srgb"))
-        told = plate.rest.get("header", {}).get("chromaticities")
-        return cls(plate, space_of_chromaticities(tuple(told)) if told is not None else colour_space("linear"))
+        return cls(plate, plate.space if space == AUTO else colour_space(space, config))
 
     @property
     def size(self) -> tuple[int, int]:

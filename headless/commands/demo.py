@@ -8,13 +8,14 @@ import time
 from pathlib import Path
 from typing import Any
 
+from ...core.capture.capture import REMOVED
 from ...core.errors import CaptureError, RunError
 from ...core.files import atomic_folder
 from ...core.progress import Progress
 from ..command import Command, Step
 from . import compose, evaluate, fit
 from .lights import LIGHTS, with_lights
-from .remove import REMOVED, with_removed
+from .remove import with_removed
 
 ROOT = Path(__file__).resolve().parents[2]
 SAMPLE = ROOT / "sample_scenes" / "desk"

@@ -16,10 +16,6 @@ if TYPE_CHECKING:
     from ...core.removal.inference import Remover
 
 
-REMOVED = "removed"
-"""The folder of a capture that has its flare-free frames."""
-
-
 def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("plates", type=Path, nargs="*", metavar="PLATE",
                         help="pictures (PNG, JPEG, TIFF, EXR), or folders of them")
@@ -61,11 +57,11 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
         return _by_run(words, progress)
     wanted = None
     if words.frames is not None or words.jobs != 1:
-        names = [name.as_posix() for _, name in plates_of(words.plates)]
+        names = [name.as_posix() for _, name in plates_of(words.plates, [words.out, words.flare, words.matte])]
         frames = chosen(numbered(names), words.frames)
         wanted = {Path(frame.view) for frame in frames}
         if words.jobs != 1:
-            jobs.run_jobs(words, "remove", [frame.number for frame in frames], progress)
+            jobs.run_jobs(words, "remove", [frame.number for frame in frames], progress, past_failures=True)
             progress.say(f"The clean plates are in {words.out}.")
             return {"plates": str(words.out)}
     return remove_all(words.plates, words.out, _remover(words), progress, flare_folder=words.flare,

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import OpenEXR
 import pytest
 
 from core import pictures
@@ -150,3 +151,17 @@ def test_a_full_disk_is_told_as_one(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     with pytest.raises(OSError) as told:
         write_png(tmp_path / "a.png", RAMP)
     assert told.value.errno == errno.ENOSPC
+
+
+def test_of_parts_with_channels_of_one_name_the_first_counts(tmp_path: Path) -> None:
+    parts = [OpenEXR.Part({"name": name, "type": OpenEXR.scanlineimage},
+                          dict.fromkeys("RGB", np.full((4, 5), value, np.float32)))
+             for name, value in (("left", 0.25), ("right", 0.75))]
+    with OpenEXR.File(parts) as file:
+        file.write(str(tmp_path / "two.exr"))
+    assert (read_picture(tmp_path / "two.exr").pixels == 0.25).all()
+
+
+def test_a_long_header_before_the_size_is_no_damage(tmp_path: Path) -> None:
+    write_exr(tmp_path / "a.exr", dict.fromkeys("RGB", RAMP[..., 0]), header={"cryptomatte/manifest": "x" * 90_000})
+    assert picture_size(tmp_path / "a.exr") == RAMP.shape[1::-1]

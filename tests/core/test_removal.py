@@ -2,8 +2,11 @@
 """Removal of flares from plates: what is kept, what is taken, and what cannot be read."""
 from __future__ import annotations
 
+import io
 import json
 import os
+import struct
+import zlib
 from pathlib import Path
 
 import cv2
@@ -13,6 +16,8 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
+from core import tiff
+from core.colour.spaces import AP1
 from core.errors import FrameError, RunError, SettingsError
 from core.pictures import read_exr, read_picture, write_exr, write_png
 from core.progress import Progress
@@ -298,6 +303,96 @@ def test_colour_tags_are_carried_over(tmp_path: Path) -> None:
     assert np.array_equal(read_plate(tmp_path / "b.png").codes, plate.codes)
 
 
+def _tiff_with(path: Path, codes: NDArray[np.generic], tags: dict[int, tiff.Tag]) -> Path:
+    _, data = cv2.imencode(".tif", codes)
+    path.write_bytes(tiff.with_tags(data.tobytes(), tags))
+    return path
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+@pytest.mark.parametrize("alpha", [tiff.STRAIGHT, tiff.PREMULTIPLIED])
+def test_a_tiff_keeps_its_alpha_profile_and_how_it_lies(tmp_path: Path, everywhere: Path, dtype: type,
+                                                       alpha: int) -> None:
+    codes = (np.random.default_rng(0).random((60, 90, 4)) * np.iinfo(dtype).max).astype(dtype)
+    tags = {tiff.EXTRA_SAMPLES: tiff.short(alpha), tiff.ORIENTATION: tiff.short(6),
+            tiff.COLOUR_PROFILE: tiff.Tag(7, np.arange(200, dtype=np.uint8)),
+            tiff.X_RESOLUTION: tiff.Tag(5, np.array([300, 1], np.uint32))}
+    source = _tiff_with(tmp_path / "plate.tif", codes, tags)
+    plate = read_plate(source)
+    assert np.array_equal(plate.codes, codes[..., 2::-1]) and np.array_equal(plate.alpha, codes[..., 3])
+    assert np.array_equal(read_picture(source).pixels, codes[..., 2::-1] / np.float32(np.iinfo(dtype).max))
+    remove_all([source], tmp_path / "out", Remover(everywhere, working_size=64), Progress())
+    clean = read_plate(tmp_path / "out" / "plate.tif")
+    assert np.array_equal(clean.alpha, codes[..., 3]) and clean.codes.mean() < plate.codes.mean()
+    with open(tmp_path / "out" / "plate.tif", "rb") as stream:
+        kept = tiff.read_tags(stream, tags)
+    assert {name: (tag.kind, tag.values.tolist()) for name, tag in kept.items()} == {
+        name: (tag.kind, tag.values.tolist()) for name, tag in tags.items()}
+
+
+def test_the_tags_of_a_tiff_of_the_other_byte_order_are_read() -> None:
+    entries = struct.pack(">HHII", tiff.COLOUR_PROFILE, 7, 6, 38) + struct.pack(">HHIHH", tiff.SAMPLES, 3, 1, 3, 0)
+    data = b"MM\0*" + struct.pack(">IH", 8, 2) + entries + struct.pack(">I", 0) + b"colour"
+    found = tiff.read_tags(io.BytesIO(data), (tiff.COLOUR_PROFILE, tiff.SAMPLES))
+    assert found[tiff.COLOUR_PROFILE].values.tobytes() == b"colour" and found[tiff.SAMPLES].values[0] == 3
+    more = tiff.with_tags(data, {tiff.EXTRA_SAMPLES: tiff.short(2), tiff.SAMPLES: tiff.short(4)})
+    found = tiff.read_tags(io.BytesIO(more), range(1 << 16))
+    assert {name: tag.values.tolist() for name, tag in found.items()} == {
+        tiff.COLOUR_PROFILE: list(b"colour"), tiff.SAMPLES: [4], tiff.EXTRA_SAMPLES: [2]}
+    for cut in range(len(more)):
+        tiff.read_tags(io.BytesIO(more[:cut]), range(1 << 16))
+        tiff.page_count(io.BytesIO(more[:cut]))
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png", ".tif", ".exr"])
+def test_a_plate_without_a_flare_is_copied(tmp_path: Path, nowhere: Path, suffix: str) -> None:
+    source = tmp_path / f"plate{suffix}"
+    if suffix == ".exr":
+        write_exr(source, dict.fromkeys("RGB", np.full((60, 90), np.nan)))
+    else:
+        _, data = cv2.imencode(suffix, picture(), [cv2.IMWRITE_JPEG_QUALITY, 60] if suffix == ".jpg" else [])
+        source.write_bytes(data.tobytes())
+    remove_all([source], tmp_path / "out", Remover(nowhere, working_size=64), Progress())
+    assert (tmp_path / "out" / source.name).read_bytes() == source.read_bytes()
+
+
+def test_a_profile_of_a_grey_png_is_not_given_to_colours(tmp_path: Path, everywhere: Path) -> None:
+    def chunk(name: bytes, data: bytes) -> bytes:
+        return len(data).to_bytes(4, "big") + name + data + zlib.crc32(name + data).to_bytes(4, "big")
+
+    rows = b"".join(b"\0" + bytes([90, 200] * 64) for _ in range(64))
+    header = struct.pack(">IIBBBBB", 64, 64, 8, 4, 0, 0, 0)
+    profile, size = chunk(b"iCCP", b"grey\0\0" + zlib.compress(b"profile")), chunk(b"pHYs", bytes(9))
+    (tmp_path / "a.png").write_bytes(b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + profile + size
+                                     + chunk(b"IDAT", zlib.compress(rows)) + chunk(b"IEND", b""))
+    remove_all([tmp_path / "a.png"], tmp_path / "out", Remover(everywhere, working_size=64), Progress())
+    clean = (tmp_path / "out" / "a.png").read_bytes()
+    assert size in clean and b"iCCP" not in clean
+    assert (read_plate(tmp_path / "out" / "a.png").alpha == 200).all()
+
+
+def test_a_very_wide_plate(everywhere: Path) -> None:
+    codes = picture(70, 40_000)
+    less = _remove(Remover(everywhere, working_size=64), codes) < codes
+    assert less[:, :30_000].any() and less[:, 35_000:].any()
+
+
+def test_the_flare_of_an_exr_lies_where_its_plate_does_in_its_colours(tmp_path: Path, everywhere: Path) -> None:
+    light = np.random.default_rng(0).uniform(0.2, 0.6, (48, 64)).astype(np.float32)
+    header = {"chromaticities": AP1, "dataWindow": (np.array([-5, -5], np.int32), np.array([58, 42], np.int32)),
+              "displayWindow": (np.array([0, 0], np.int32), np.array([53, 37], np.int32)), "pixelAspectRatio": 2.0}
+    write_exr(tmp_path / "plate.exr", dict.fromkeys("RGB", light), half=False, header=header)
+    remove_all([tmp_path / "plate.exr"], tmp_path / "out", Remover(everywhere, working_size=64), Progress(),
+               flare_folder=tmp_path / "flare")
+    placings = []
+    for folder in ("", "out", "flare"):
+        with OpenEXR.File(str(tmp_path / folder / "plate.exr"), header_only=True) as file:
+            placings.append([np.ravel(file.parts[0].header[name]).tolist() for name in header])
+    assert placings[0] == placings[1] == placings[2]
+    parts = [read_picture(tmp_path / folder / "plate.exr").pixels for folder in ("", "out", "flare")]
+    np.testing.assert_allclose(parts[1] + parts[2], parts[0], atol=1e-3)
+
+
 def test_the_flare_taken_is_what_plate_and_clean_plate_differ_by(tmp_path: Path, everywhere: Path) -> None:
     write_codes(tmp_path / "plate.png", picture())
     remove_all([tmp_path / "plate.png"], tmp_path / "out", Remover(everywhere, working_size=64), Progress(),
@@ -419,6 +514,74 @@ def test_inputs_that_make_no_sense(tmp_path: Path, everywhere: Path) -> None:
     twin = write_codes(tmp_path / "other" / "plate.png", picture())
     with pytest.raises(SettingsError, match="same file"):
         plates_of([source, twin])
+
+
+def test_nothing_that_is_read_is_written_over_and_nothing_twice(tmp_path: Path, nowhere: Path) -> None:
+    shot, remover = tmp_path / "shot", Remover(nowhere, working_size=64)
+    write_exr(shot / "a.exr", dict.fromkeys("RGB", np.full((60, 90), 0.5)))
+    before = (shot / "a.exr").read_bytes()
+    with pytest.raises(SettingsError, match=r"a\.exr would be overwritten"):
+        remove_all([shot], tmp_path / "out", remover, Progress(), flare_folder=shot)
+    with pytest.raises(SettingsError, match="Two results"):
+        remove_all([shot], tmp_path / "out", remover, Progress(), flare_folder=tmp_path / "out")
+    write_codes(shot / "a.png", picture())
+    with pytest.raises(SettingsError, match="Two results"):
+        remove_all([shot], tmp_path / "out", remover, Progress(), flare_folder=tmp_path / "flare")
+    assert (shot / "a.exr").read_bytes() == before and not (tmp_path / "out").exists()
+
+
+def test_results_mattes_and_hidden_files_below_a_folder_are_no_plates_of_it(tmp_path: Path, everywhere: Path) -> None:
+    shot = tmp_path / "shot"
+    for name in ("a.png", ".thumbs/a.png", "roto/a.png"):
+        (shot / name).parent.mkdir(parents=True, exist_ok=True)
+        write_codes(shot / name, picture())
+    for _ in range(2):
+        found = remove_all([shot], shot / "clean", Remover(everywhere, working_size=64), Progress(),
+                           flare_folder=shot / "flare", mattes=Mattes(shot / "roto"))
+        assert found["made"] + found["kept"] == 1
+    assert [path.name for path in (shot / "clean").rglob("*")] == ["a.png"]
+
+
+def _luminance_and_chroma(path: Path) -> None:
+    """An EXR of 8 x 8 pixels, 2 x 2 of them with one RY, in 16 bit floats without compression."""
+    def attribute(name: bytes, kind: bytes, value: bytes) -> bytes:
+        return name + b"\0" + kind + b"\0" + struct.pack("<i", len(value)) + value
+
+    channels = b"".join(name + b"\0" + struct.pack("<iIii", 1, 0, step, step) for name, step in ((b"RY", 2), (b"Y", 1)))
+    window = struct.pack("<4i", 0, 0, 7, 7)
+    header = b"".join([b"\x76\x2f\x31\x01\x02\0\0\0", attribute(b"channels", b"chlist", channels + b"\0"),
+                       attribute(b"compression", b"compression", b"\0"), attribute(b"dataWindow", b"box2i", window),
+                       attribute(b"displayWindow", b"box2i", window), attribute(b"lineOrder", b"lineOrder", b"\0"),
+                       attribute(b"pixelAspectRatio", b"float", struct.pack("<f", 1)),
+                       attribute(b"screenWindowCenter", b"v2f", bytes(8)),
+                       attribute(b"screenWindowWidth", b"float", struct.pack("<f", 1)), b"\0"])
+    lines = [struct.pack("<ii", y, length) + bytes(length) for y in range(8) for length in (24 - 8 * (y % 2),)]
+    starts = [len(header) + 8 * 8 + sum(map(len, lines[:y])) for y in range(8)]
+    path.write_bytes(header + struct.pack("<8Q", *starts) + b"".join(lines))
+
+
+def test_pictures_that_would_come_out_as_something_else_are_refused_by_name(tmp_path: Path) -> None:
+    codes = picture()
+    _, data = cv2.imencode(".jpg", codes)
+    jpeg = bytearray(data.tobytes())
+    frame = jpeg.index(b"\xff\xc0")
+    jpeg[frame + 9] = 4  # components; the sentence is about that, before a decoder looks at the rest
+    (tmp_path / "print.jpg").write_bytes(jpeg)
+    with pytest.raises(FrameError, match=r"print\.jpg is CMYK"):
+        read_plate(tmp_path / "print.jpg")
+    _tiff_with(tmp_path / "inks.tif", np.zeros((8, 8, 4), np.uint8), {tiff.PHOTOMETRIC: tiff.short(tiff.SEPARATED)})
+    with pytest.raises(FrameError, match=r"inks\.tif is CMYK"):
+        read_plate(tmp_path / "inks.tif")
+    _tiff_with(tmp_path / "grey.tif", np.zeros((8, 8), np.uint8), {tiff.SAMPLES: tiff.short(2)})
+    with pytest.raises(FrameError, match="grey with alpha"):
+        read_plate(tmp_path / "grey.tif")
+    _, pages = cv2.imencodemulti(".tif", [codes, codes, codes])
+    (tmp_path / "pages.tif").write_bytes(pages.tobytes())
+    with pytest.raises(FrameError, match="3 pages"):
+        read_plate(tmp_path / "pages.tif")
+    _luminance_and_chroma(tmp_path / "chroma.exr")
+    with pytest.raises(FrameError, match="several sizes"):
+        read_plate(tmp_path / "chroma.exr")
 
 
 def test_multipart_exr_is_told(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from core.capture import Camera, Capture
+from core.colour import ColourSpace, colour_space
 from core.errors import CaptureError, SettingsError
 from core.pictures import linear_from_srgb, read_exr, read_picture, write_exr
 from core.progress import Progress
@@ -116,21 +117,40 @@ def test_what_cannot_be_done_is_said_before_anything_is_written(capture: Capture
     assert not (tmp_path / "clean").exists()
 
 
-def test_an_exr_frame_stays_one(capture: Capture, tmp_path: Path) -> None:
-    view = capture.views[0]
-    shutil.copytree(capture.folder, tmp_path / "exr" / "capture")
-    folder = tmp_path / "exr" / "capture" / "images"
-    for path in sorted(folder.iterdir()):
-        light = linear_from_srgb(read_picture(path).pixels)
-        write_exr(path.with_suffix(".exr"), {name: light[..., k] for k, name in enumerate("RGB")}, half=False)
+def _as_exr(capture: Capture, folder: Path, space: ColourSpace) -> Capture:
+    """The capture with its frames as EXR in that space, and no clean ones."""
+    shutil.copytree(capture.folder, folder)
+    for path in sorted((folder / "images").iterdir()):
+        light = space.from_linear(linear_from_srgb(read_picture(path).pixels))
+        write_exr(path.with_suffix(".exr"), {name: light[..., k] for k, name in enumerate("RGB")}, half=False,
+                  header={"chromaticities": space.chromaticities} if space.chromaticities else {})
         path.unlink()
-    images = folder.parent / "sparse" / "0" / "images.txt"
+    images = folder / "sparse" / "0" / "images.txt"
     images.write_text(images.read_text(encoding="utf-8").replace(".png", ".exr"), encoding="utf-8")
-    shutil.rmtree(folder.parent / "removed")
-    linear = Capture.open(folder.parent)
-    remove_fitted(Exact(), linear, linear.views[:1], tmp_path / "clean", Progress())
-    clean = read_plate(tmp_path / "clean" / linear.views[0].name)
-    assert clean.encoding == "linear" and clean.codes.dtype == np.float32
+    shutil.rmtree(folder / "removed")
+    return Capture.open(folder)
+
+
+@pytest.mark.parametrize("space", ["linear", "acescg"])
+def test_an_exr_frame_stays_one_in_its_own_colours(capture: Capture, tmp_path: Path, space: str) -> None:
+    view = capture.views[0]
+    linear = _as_exr(capture, tmp_path / "exr", colour_space(space))
+    remove_fitted(Exact(), linear, linear.views[:1], tmp_path / "clean", Progress(), flare_folder=tmp_path / "flare")
+    name = linear.views[0].name
+    clean = read_plate(tmp_path / "clean" / name)
+    assert clean.encoding == "linear" and clean.codes.dtype == np.float32 and clean.space.name == space
     truth = linear_from_srgb(read_picture(capture.folder / "removed" / view.name).pixels)
     below = read_picture(capture.frame_path(view)).pixels.max(-1) < 0.99
-    assert np.abs(clean.codes - truth)[below].max() < 0.01
+    assert np.abs(read_picture(tmp_path / "clean" / name).pixels - truth)[below].max() < 0.01
+    taken = read_picture(tmp_path / "flare" / name).pixels
+    np.testing.assert_allclose(taken, flare(view.camera), atol=2e-3)
+
+
+def test_flares_that_are_asked_for_later_are_made(capture: Capture, tmp_path: Path) -> None:
+    for flares, made in ((None, 3), (tmp_path / "flare", 3), (tmp_path / "flare", 0)):
+        found = remove_fitted(Exact(), capture, capture.views, tmp_path / "clean", Progress(), flare_folder=flares)
+        assert found["made"] == made
+    with pytest.raises(SettingsError, match="overwritten"):
+        linear = _as_exr(capture, tmp_path / "exr", colour_space("linear"))
+        remove_fitted(Exact(), linear, linear.views, tmp_path / "other", Progress(),
+                      flare_folder=linear.folder / "images")

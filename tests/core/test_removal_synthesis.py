@@ -30,10 +30,10 @@ stop  2.0  1.0  0     10  0
 
 
 def test_flare_adds_in_light() -> None:
-    scene, glow = np.full((2, 2, 3), 0.5, np.float32), np.full((2, 2, 3), 0.4, np.float32)
-    assert formation.form(scene, glow, 2.0) == pytest.approx(np.sqrt(0.25 + 0.16), abs=1e-6)
-    assert formation.form(scene, np.ones_like(scene), 2.2) == pytest.approx(1.0)
-    assert formation.form(scene, np.zeros_like(scene), 1.8) == pytest.approx(0.5, abs=1e-6)
+    scene, glow = (np.full((2, 2, 3), value, np.float32) for value in (0.5, 0.4))
+    assert formation.display(scene**2 + glow**2, 2.0) == pytest.approx(np.sqrt(0.25 + 0.16), abs=1e-6)
+    assert formation.display(scene**2.2 + 1, 2.2) == pytest.approx(1.0)
+    assert formation.display(scene**1.8, 1.8) == pytest.approx(0.5, abs=1e-6)
 
 
 def test_coverage_is_the_share_of_the_frame_that_holds_the_energy() -> None:
@@ -186,6 +186,11 @@ def test_own_flares_with_their_lights(tmp_path: Path) -> None:
     write_png(tmp_path / "Scattering_Flare" / "Light_Source" / "1.png", light)
     own = OwnFlares(tmp_path, SIZE)
     assert len(own) == 1
+    write_png(tmp_path / "other set" / "Reflective_Flare" / "1.png", picture)
+    other = OwnFlares(tmp_path / "other set", SIZE)
+    for both in (OwnFlares(tmp_path, SIZE).draw(np.random.default_rng(k)) for k in range(8)):
+        assert both.light.max() > 1 or np.array_equal(both.rest, other.draw(np.random.default_rng(0)).rest), \
+            "a flare of another set has no light of this one's"
     layers = own.draw(np.random.default_rng(0))
     assert layers.light.max() > 1
     assert layers.lights[0] == pytest.approx((0, 0), abs=0.06)
@@ -198,9 +203,14 @@ def test_own_flares_with_their_lights(tmp_path: Path) -> None:
 def test_backgrounds_of_folders(tmp_path: Path) -> None:
     with pytest.raises(SettingsError, match="no pictures"):
         read_backgrounds([tmp_path])
+    with pytest.raises(SettingsError, match="is no folder"):
+        read_backgrounds([tmp_path, tmp_path / "misspelt"])
+    with pytest.raises(SettingsError, match="no lens prescriptions"):
+        lenses.read_lenses(tmp_path / "misspelt")
+    (tmp_path / "empty.jpg").touch()
     for k in range(30):
         write_png(tmp_path / f"{k}.png", np.random.default_rng(k).random((64, 80, 3)))
-    names = [path.name for path in tmp_path.iterdir()]
+    names = [path.name for path in tmp_path.glob("*.png")]
     both = [len(read_backgrounds([tmp_path], part).photos) for part in ("train", "test")]
     assert sum(both) == 30
     assert both[1] == sum(map(kept_for_test, names)) > 0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import multiprocessing
+import shutil
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -260,6 +261,18 @@ def test_scores_beside_the_untouched_input(tmp_path: Path) -> None:
     assert "real" in evaluation.table(worse)
     sheet = evaluation.worst_sheet(cases, lambda frame: frame, worse, 40)
     assert sheet.shape == (4 * (20 + 32), 160, 3)
+
+
+def test_a_clean_picture_that_is_changed_was_made_worse(tmp_path: Path) -> None:
+    pair_folder(tmp_path)
+    shutil.rmtree(tmp_path / "gt")
+    shutil.copytree(tmp_path / "input", tmp_path / "gt")
+    cases = evaluation.paired(tmp_path)
+    kept = evaluation.evaluate(cases, lambda frame: frame)["mean"]
+    assert (kept["gain_db"], kept["made_worse"]) == (0, 0)
+    black = evaluation.evaluate(cases, np.zeros_like)
+    assert black["mean"]["made_worse"] == 1 and black["mean"]["gain_db"] < -80
+    assert evaluation.worst_sheet(cases, np.zeros_like, black, 40).any()
 
 
 def test_masks_count_alone(tmp_path: Path) -> None:

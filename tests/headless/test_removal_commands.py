@@ -58,6 +58,20 @@ def test_bad_plates_are_listed_at_the_end(backgrounds: Path, tmp_path: Path,
     assert len(list((tmp_path / "clean").iterdir())) == 2
 
 
+def test_bad_plates_do_not_stop_other_processes(backgrounds: Path, tmp_path: Path,
+                                                capsys: pytest.CaptureFixture[str]) -> None:
+    folder = tmp_path / "plates"
+    folder.mkdir()
+    for number in range(1, 7):
+        shutil.copyfile(backgrounds / "a.png", folder / f"f{number}.png")
+    for number in (1, 4):  # the first of either process
+        (folder / f"f{number}.png").write_bytes(b"no picture")
+    assert cli.main(["remove", str(folder), "--out", str(tmp_path / "clean"), "--jobs", "2"]) == 1
+    said = capsys.readouterr().err
+    assert "f1.png" in said and "f4.png" in said
+    assert sorted(path.name for path in (tmp_path / "clean").iterdir()) == ["f2.png", "f3.png", "f5.png", "f6.png"]
+
+
 def test_diffusion_without_a_base_or_its_packages(backgrounds: Path, tmp_path: Path,
                                                   capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["remove", str(backgrounds), "--out", str(tmp_path), "--model", "diffusion"]) == 1

@@ -200,7 +200,9 @@ def parse_prescription(text: str, name: str, where: str = "The lens") -> Prescri
 
 def read_lenses(folder: Path | str, most: int = 0) -> list[Prescription]:
     """Photographic lenses of a folder, in order of name; files that are no lens, mirror lenses, converters and
-    what is not between 5 and 800 mm are left out. `most` picks that many, evenly spread; 0 is all."""
+    what is not between 5 and 800 mm are left out. `most` picks that many, evenly spread; 0 is all.
+
+    Raises SettingsError where there is none."""
     paths = sorted(Path(folder).glob("*.lens"))
     if most and len(paths) > most:
         paths = [paths[k * len(paths) // most] for k in range(most)]
@@ -212,6 +214,9 @@ def read_lenses(folder: Path | str, most: int = 0) -> list[Prescription]:
             continue
         if 5 < lens.focal_length() < 800 and (lens.index >= 1).all() and (lens.thickness >= -1e-6).all():
             lenses.append(lens)
+    if not lenses:
+        raise SettingsError(f"There are no lens prescriptions (.lens) in {folder}; name a folder that has some, or "
+                            "none for those that come with the program.")
     return lenses
 
 

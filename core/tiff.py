@@ -1,0 +1,126 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The tags of a TIFF (Adobe, TIFF 6.0, 1992), which OpenCV, that reads and writes its pixels, does not hand out."""
+from __future__ import annotations
+
+import io
+import struct
+from collections.abc import Container, Iterator, Mapping
+from typing import BinaryIO, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+SUBFILE, WIDTH, HEIGHT, PHOTOMETRIC, ORIENTATION, SAMPLES, EXTRA_SAMPLES = 254, 256, 257, 262, 274, 277, 338
+X_RESOLUTION, Y_RESOLUTION, RESOLUTION_UNIT, XMP, COLOUR_PROFILE = 282, 283, 296, 700, 34675
+
+UPRIGHT = 1
+"""Orientation: rows from the top, columns from the left."""
+SEPARATED = 5
+"""Photometric interpretation: inks, CMYK."""
+PREMULTIPLIED, STRAIGHT = 1, 2
+"""What the extra sample of a pixel is: alpha that the colours were multiplied with, or not."""
+
+_TYPES = {1: "u1", 2: "u1", 3: "u2", 4: "u4", 5: "u4", 6: "i1", 7: "u1", 8: "i2", 9: "i4", 10: "i4", 11: "f4", 12: "f8"}
+_Order = Literal["<", ">"]
+_NONE: tuple[_Order, list[bytes]] = ("<", [])
+_RATIONALS = (5, 10)
+_MOST_PAGES = 1000
+
+
+class Tag(NamedTuple):
+    """A tag's type, as the standard counts them, and its values; a fraction is two."""
+
+    kind: int
+    values: NDArray[np.generic]
+
+
+def short(value: int) -> Tag:
+    """A tag with one number of 16 bits."""
+    return Tag(3, np.array([value], np.uint16))
+
+
+def read_tags(stream: BinaryIO, wanted: Container[int]) -> dict[int, Tag]:
+    """Of the first page; those that are damaged are left out, and all where it is no TIFF."""
+    order, entries = next(_directories(stream), _NONE)
+    found: dict[int, Tag] = {}
+    for entry in entries:
+        number, kind, count = struct.unpack(order + "HHI", entry[:8])
+        if number not in wanted or kind not in _TYPES:
+            continue
+        values = np.dtype(_TYPES[kind]).newbyteorder(order)
+        length = count * values.itemsize * (2 if kind in _RATIONALS else 1)
+        raw = entry[8:8 + length]
+        if length > 4:
+            stream.seek(struct.unpack(order + "I", entry[8:])[0])
+            raw = stream.read(length)
+        if count and len(raw) == length:
+            found[number] = Tag(kind, np.frombuffer(raw, values).astype(values.newbyteorder("=")))
+    return found
+
+
+def page_count(stream: BinaryIO) -> int:
+    """Pages, without the small copies that some programs put beside them."""
+    count = 0
+    for order, entries in _directories(stream):
+        kinds = [struct.unpack(order + "I", entry[8:])[0] for entry in entries
+                 if struct.unpack(order + "H", entry[:2])[0] == SUBFILE]
+        count += not any(kind & 1 for kind in kinds)
+    return count
+
+
+def with_tags(data: bytes, tags: Mapping[int, Tag]) -> bytes:
+    """A TIFF with these tags in its first page, in place of what it has of them; as it is where it is none."""
+    order, entries = next(_directories(io.BytesIO(data)), _NONE)
+    if not entries or not tags:
+        return data
+    whole = bytearray(data)
+    kept = [entry for entry in entries if struct.unpack(order + "H", entry[:2])[0] not in tags]
+    for number, (kind, values) in tags.items():
+        raw = values.astype(values.dtype.newbyteorder(order)).tobytes()
+        count = len(values) // (2 if kind in _RATIONALS else 1)
+        if len(raw) <= 4:
+            place = raw.ljust(4, b"\0")
+        else:
+            whole += b"\0" * (len(whole) % 2)
+            place = struct.pack(order + "I", len(whole))
+            whole += raw
+        kept.append(struct.pack(order + "HHI", number, kind, count) + place)
+    whole += b"\0" * (len(whole) % 2)
+    at = struct.unpack(order + "I", data[4:8])[0]
+    following = data[at + 2 + 12 * len(entries):][:4].ljust(4, b"\0")
+    kept.sort(key=lambda entry: struct.unpack(order + "H", entry[:2])[0])
+    whole[4:8] = struct.pack(order + "I", len(whole))
+    whole += struct.pack(order + "H", len(kept)) + b"".join(kept) + following
+    return bytes(whole)
+
+
+def as_stored(data: bytes) -> bytes:
+    """A TIFF whose pixels a reader leaves alone: it says that they are upright, and not to be multiplied with alpha."""
+    told = read_tags(io.BytesIO(data), (ORIENTATION, EXTRA_SAMPLES))
+    instead = {ORIENTATION: short(UPRIGHT)} if ORIENTATION in told else {}
+    if EXTRA_SAMPLES in told and int(told[EXTRA_SAMPLES].values[0]) == STRAIGHT:
+        instead[EXTRA_SAMPLES] = Tag(3, np.array([PREMULTIPLIED, *told[EXTRA_SAMPLES].values[1:]], np.uint16))
+    return with_tags(data, instead)
+
+
+def _directories(stream: BinaryIO) -> Iterator[tuple[_Order, list[bytes]]]:
+    """(byte order, entries of 12 bytes) page by page, as far as the file is whole."""
+    stream.seek(0)
+    head = stream.read(8)
+    if head[:4] not in (b"II*\0", b"MM\0*") or len(head) < 8:
+        return
+    order: _Order = "<" if head[:2] == b"II" else ">"
+    at = struct.unpack(order + "I", head[4:])[0]
+    for _ in range(_MOST_PAGES):
+        stream.seek(at)
+        count = stream.read(2)
+        length = 12 * struct.unpack(order + "H", count)[0] if len(count) == 2 else 0
+        entries = stream.read(length)
+        if not length or len(entries) < length:
+            return
+        yield order, [entries[k:k + 12] for k in range(0, length, 12)]
+        stream.seek(at + 2 + length)
+        following = stream.read(4)
+        at = struct.unpack(order + "I", following)[0] if len(following) == 4 else 0
+        if not at:
+            return

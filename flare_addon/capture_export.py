@@ -19,7 +19,7 @@ import numpy as np
 from ..core.errors import CaptureError
 from ..core.files import atomic_path, write_json
 from . import cameras
-from .capture_import import stored
+from .paths import stored
 
 MOST_POINTS = 100_000
 _NUMBER = re.compile(r"(\d+)(?=\D*$)")

@@ -7,7 +7,6 @@ own numbers, and turning or scaling the empty turns and scales all.
 from __future__ import annotations
 
 import math
-import os
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -24,6 +23,7 @@ from ..core.capture.camera import quaternion_from_rotation
 from ..core.errors import CaptureError
 from . import cameras
 from .cameras import FLIP
+from .paths import stored
 
 SENSOR = 36.0  # mm
 UP = {"Z": (0.0, 0.0, 0.0), "-Y": (-math.pi / 2, 0.0, 0.0), "Y": (math.pi / 2, 0.0, 0.0)}
@@ -97,17 +97,6 @@ def import_capture(scene: Any, folder: Path | str, settings: ImportSettings | No
     if any(view.lens for view in capture.views) and settings.frames:
         notes.append("The frames behind the camera show the lens's distortion; the cameras have none.")
     return Imported(root, made, lights, tuple(notes))
-
-
-def stored(path: Path) -> str:
-    """A path as a .blend keeps it: relative to the file where it can be."""
-    text = os.fspath(path.resolve())
-    if bpy.data.filepath:
-        try:
-            return str(bpy.path.relpath(text))
-        except ValueError:  # another drive
-            return text
-    return text
 
 
 def add_light(collection: Any, root: Any, name: str, xyz: Any, size: float) -> Any:

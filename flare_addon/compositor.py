@@ -30,6 +30,7 @@ VIEWER = "Fit Flare Viewer"
 RENDER = "Fit Flare Render"
 NOTE = "fit_flare_compositor"  # a property of the scene: what was there before
 _GAIN = " Gain"
+_POINTING = ("image", "frame_start", "frame_offset", "frame_duration", "use_auto_refresh")
 
 _GROUPS_ARE_TREES = bpy.app.version >= (5, 0, 0)
 _END = "NodeGroupOutput" if _GROUPS_ARE_TREES else "CompositorNodeComposite"
@@ -162,12 +163,14 @@ def set_up(scene: Any, layers: LayerFolder, *, keep_image: bool = False, plate: 
     note = _note(scene)
     tree = tree_of(scene) or _new_tree(scene, keep_image)
     source = tree.nodes.get(LAYERS)
+    pointed = None if source is None else {name: getattr(source, name) for name in _POINTING}
     if source is None:
         source = _named(_node(tree, "CompositorNodeImage", -4, 0), LAYERS)
     _point_at(source, layers)
     sockets = {socket.name: socket for socket in source.outputs}
     names = [name for name in sockets if name.startswith("flare_")] or [name for name in sockets if name == "flare"]
     if not names or "scene" not in sockets:
+        _take_back(scene, tree, source, pointed, note)
         raise FrameError(f"{layers.files[layers.first]} holds no scene and flare layers; choose a folder of a bake.")
     if NOTE not in scene:
         scene[NOTE] = {**note, **_before(tree)}
@@ -199,6 +202,22 @@ def set_up(scene: Any, layers: LayerFolder, *, keep_image: bool = False, plate: 
         viewer = _named(_node(tree, "CompositorNodeViewer", 1, -1), VIEWER)  # what the backdrop shows
         tree.links.new(node.outputs["Image"], viewer.inputs["Image"])
     return node
+
+
+def _take_back(scene: Any, tree: Any, source: Any, pointed: dict[str, Any] | None, note: dict[str, Any]) -> None:
+    """Leave no trace of layers that turned out to be none: `pointed` is where their node pointed before, if it was
+    there, `note` what the scene had."""
+    image = source.image
+    if pointed is not None:
+        for name, value in pointed.items():
+            setattr(source, name, value)
+    else:
+        tree.nodes.remove(source)
+        if not note["tree"]:
+            _discard_tree(scene, tree, bool(note["use_nodes"]))
+        elif not _GROUPS_ARE_TREES:
+            scene.use_nodes = bool(note["use_nodes"])
+    _drop([image], note)
 
 
 def _render(tree: Any) -> Any:
@@ -325,8 +344,13 @@ def remove(scene: Any) -> None:
         del scene[NOTE]
     if group is not None and not group.users:
         bpy.data.node_groups.remove(group)
-    images += [image for image in bpy.data.images if image.type == "COMPOSITING" and not note.get("viewer", True)]
-    for image in images:
+    _drop(images, note)
+
+
+def _drop(images: Sequence[Any], note: dict[str, Any]) -> None:
+    """Remove images that nothing uses any more, and the viewer's where there was none before."""
+    viewers = [image for image in bpy.data.images if image.type == "COMPOSITING" and not note.get("viewer", True)]
+    for image in (*images, *viewers):
         if image is not None and (not image.users or image.type == "COMPOSITING"):  # that one counts itself
             bpy.data.images.remove(image)
 

@@ -71,7 +71,7 @@ def environment() -> dict[str, str]:
 
 def run(kind: str, folder: Path, words: Sequence[object]) -> Job:
     """Start a command of run.py whose events go to `folder`; see `jobs.start`."""
-    return jobs.start(kind, folder, command(*words), environment())
+    return jobs.start(kind, folder, command(*words), environment(), words=words)
 
 
 # ---- its state ------------------------------------------------------------------------------------
@@ -104,6 +104,11 @@ def set_up() -> Job:
     script = ROOT / "headless" / "set_up.py"
     words = [sys.executable, *bpy.app.python_args, str(script), str(user_folder(FOLDER, create=True) / "python")]
     return jobs.start("set up", user_folder(FOLDER), words, environment())
+
+
+def was_set_up() -> bool:
+    """Whether there is one that a click has set up."""
+    return (user_folder(FOLDER) / "python").is_dir()
 
 
 def setting_up() -> Job | None:

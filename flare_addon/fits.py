@@ -10,20 +10,20 @@ import bpy
 
 from ..core.errors import CaptureError, FitFlareError, RunError
 from . import engine, jobs, lights, looks
-from .capture_import import stored
 from .jobs import Job
+from .paths import absolute, stored
 
 FLARE, PREVIEW, CHECKPOINT, CONFIG = "flare.flare", "preview_small.png", "checkpoint/state.safetensors", "config.toml"
 
 
 def folder_of(scene: Any) -> Path | None:
     """The run's folder; None where none is chosen."""
-    return Path(bpy.path.abspath(scene.fit_flare.run)) if scene.fit_flare.run else None
+    return absolute(scene.fit_flare.run) if scene.fit_flare.run else None
 
 
 def capture_of(scene: Any) -> Path | None:
     """The capture's folder; None where none is chosen."""
-    return Path(bpy.path.abspath(scene.fit_flare.capture)) if scene.fit_flare.capture else None
+    return absolute(scene.fit_flare.capture) if scene.fit_flare.capture else None
 
 
 def job_of(scene: Any) -> Job | None:
@@ -85,9 +85,14 @@ def start(scene: Any) -> Job:
                            if capture else "There is no capture yet; import one first.")
     engine.command()  # says so before anything is written
     lights.write(scene, capture)
-    folder = new_folder(scene)
+    folder, before = new_folder(scene), scene.fit_flare.run
     scene.fit_flare.run = stored(folder)
-    return _run(scene, capture, folder)
+    try:
+        return _run(scene, capture, folder)
+    except FitFlareError:
+        if not (folder / CONFIG).is_file():  # refused before it began: an earlier fit is still what there is
+            scene.fit_flare.run = before
+        raise
 
 
 def resume(scene: Any) -> Job:
@@ -152,7 +157,12 @@ def clean(scene: Any) -> Job:
     capture = capture_of(scene)
     if capture is None or not (capture / "images").is_dir():
         raise CaptureError("There is no capture with a folder images/ yet; import one first.")
-    return engine.run("clean", _cleaning_folder(capture), cleaning(scene, capture))
+    words = cleaning(scene, capture)
+    made = cleaning_of(capture)
+    # What the engine itself has made is made again; what it was stopped at is gone on with, if it is still the same.
+    if made is not None and (made.state == "done" or made.words != list(map(str, words))):
+        words = [*words, "--overwrite"]
+    return engine.run("clean", _cleaning_folder(capture), words)
 
 
 def cleaning_of(capture: Path) -> Job | None:
@@ -166,15 +176,13 @@ def _cleaning_folder(capture: Path) -> Path:
 
 def cleaning(scene: Any, capture: Path) -> list[object]:
     """The engine's words for it: a finished fit knows the flare of all frames, a network sees a few at a time, and by
-    a matte where there is one. What the engine itself has made before is made again."""
-    made = cleaning_of(capture)
-    again = ["--overwrite"] if made is not None and made.state == "done" else []
+    a matte where there is one."""
     if state_of(scene) == "finished":
-        return ["remove", "--run", folder_of(scene), "--out", capture / "removed", *again]
+        return ["remove", "--run", folder_of(scene), "--out", capture / "removed"]
     given = scene.fit_flare.matte
-    matte = ["--matte", Path(bpy.path.abspath(given))] if given else []
+    matte = ["--matte", absolute(given)] if given else []
     glow = ["--keep-glare"] if scene.fit_flare.keep_glow else []
-    return ["remove", capture / "images", "--out", capture / "removed", *matte, *glow, *again]
+    return ["remove", capture / "images", "--out", capture / "removed", *matte, *glow]
 
 
 def cleaned(job: Job) -> None:

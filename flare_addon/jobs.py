@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Work of the engine, watched from Blender: a process of its own whose events land in a file.
 
-    FOLDER/job.json       what was started, and the process's number
+    FOLDER/job.json       what was started, in which words, and the process's number
     FOLDER/events.jsonl   its events, one JSON object a line (core/progress.py)
     FOLDER/engine.log     what else it said
 
@@ -47,8 +47,10 @@ _jobs: dict[str, Job] = {}
 class Job:
     """One command of the engine. done, total: steps of `stage`; left_s: seconds left, None where unknown."""
 
-    def __init__(self, kind: str, folder: Path, pid: int, process: subprocess.Popen[bytes] | None) -> None:
+    def __init__(self, kind: str, folder: Path, pid: int, process: subprocess.Popen[bytes] | None,
+                 words: Sequence[str] = ()) -> None:
         self.kind, self.folder, self.pid = kind, folder, pid
+        self.words = [word for word in words if word != "--overwrite"]
         self.state: State = "running"
         self.stage, self.done, self.total, self.left_s = "starting", 0, 0, None
         self.figures: dict[str, float] = {}
@@ -195,8 +197,9 @@ def _is_ours(pid: int) -> bool:
 # ---- starting and finding -------------------------------------------------------------------------
 
 
-def start(kind: str, folder: Path, command: Sequence[str], environment: Mapping[str, str] | None = None) -> Job:
-    """Start a command whose events go to `folder`, and watch it.
+def start(kind: str, folder: Path, command: Sequence[str], environment: Mapping[str, str] | None = None, *,
+          words: Sequence[object] = ()) -> Job:
+    """Start a command whose events go to `folder`, and watch it. words: those of it that say what is made.
 
     Without a window this returns when it has ended. Raises EngineError where it cannot be started, RunError
     where the folder cannot be written or has work running in it.
@@ -215,7 +218,8 @@ def start(kind: str, folder: Path, command: Sequence[str], environment: Mapping[
                                        env=dict(environment) if environment is not None else None, **apart)
         _yield_to_the_window(process.pid)
         try:
-            write_json(folder / RECORD, {"kind": kind, "pid": process.pid, "started": time.time()})
+            write_json(folder / RECORD, {"kind": kind, "pid": process.pid, "started": time.time(),
+                                          "words": [str(word) for word in words]})
         except OSError:
             process.kill()  # nobody would find it again
             raise
@@ -225,7 +229,7 @@ def start(kind: str, folder: Path, command: Sequence[str], environment: Mapping[
         if problem.errno in DISK_FULL:
             raise RunError(refusal(problem)) from problem
         raise RunError(f"{folder} cannot be used ({problem.strerror or problem}); choose another folder.") from problem
-    job = Job(kind, folder, process.pid, process)
+    job = Job(kind, folder, process.pid, process, [str(word) for word in words])
     _jobs[_key(folder)] = job
     if bpy.app.background:
         _wait(job)
@@ -251,7 +255,7 @@ def find(folder: Path | str | None) -> Job | None:
         return known
     try:
         record = json.loads((folder / RECORD).read_text(encoding="utf-8"))
-        job = Job(str(record["kind"]), folder, int(record["pid"]), None)
+        job = Job(str(record["kind"]), folder, int(record["pid"]), None, list(map(str, record.get("words", ()))))
     except (OSError, ValueError, KeyError, TypeError):
         return None
     _jobs[_key(folder)] = job

@@ -16,6 +16,7 @@ from ..core.look.look import Query
 from ..core.look.shot import PlacedLight, evaluate
 from . import cameras
 from .lights import name_of, of_scene, place_of
+from .paths import absolute
 from .properties import edit_of
 
 LIGHT_SHARE = 0.01  # of a light's distance: its radius where none is given (core/flare/visibility.py)
@@ -27,7 +28,7 @@ _cache: dict[str, tuple[tuple[float, int], Look | str]] = {}
 
 def path_of(scene: Any) -> Path | None:
     """The .flare of the scene; None where none is chosen."""
-    return Path(bpy.path.abspath(scene.fit_flare.flare)) if scene.fit_flare.flare else None
+    return absolute(scene.fit_flare.flare) if scene.fit_flare.flare else None
 
 
 def look_of(scene: Any) -> Look:

@@ -167,7 +167,14 @@ class FITFLARE_OT_set_up_engine(Action, bpy.types.Operator):
         making = engine.setting_up()
         if making is not None and making.running:
             return "The engine is being set up"
-        return ""
+        return "The engine is at work; wait for it, or cancel it" if jobs.running() else ""
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        if not engine.was_set_up():
+            return self.execute(context)
+        return context.window_manager.invoke_confirm(
+            self, event, title="Set the engine up again?", message="The one that is there is removed first",
+            confirm_text="Set Up Again")
 
     def act(self, _context: bpy.types.Context) -> None:
         engine.set_up()
@@ -181,7 +188,7 @@ class FITFLARE_OT_remove_engine(Action, bpy.types.Operator):
 
     @classmethod
     def why_not(cls, _context: bpy.types.Context) -> str:
-        if not (engine.user_folder(engine.FOLDER) / "python").is_dir():
+        if not engine.was_set_up():
             return "No engine was set up here; one that is named by its path is not touched"
         return ""
 

@@ -14,8 +14,8 @@ from ..core.files import write_json
 from ..core.look import Edit, LookEdits
 from ..core.look.shot import Shot, ShotFrame
 from . import cameras, engine, fits, looks
-from .capture_import import stored
 from .jobs import Job
+from .paths import absolute, stored
 
 SHOT = "shot.json"
 LIVE = "live.json"  # lights whose colour was left to the compositor
@@ -33,7 +33,8 @@ def frames_of(scene: Any) -> list[int]:
 
 def of_scene(scene: Any, chosen: Sequence[Any], frames: Sequence[int], flare: Path, run: Path | None,
              done: Callable[[int], None] = lambda _frame: None) -> Shot:
-    """The shot of these camera objects at these frames. The scene's current frame is put back.
+    """The shot of these camera objects at these frames; of none the scene's own, which markers on the timeline may
+    change from frame to frame, under the name of the first. The scene's current frame is put back.
 
     Raises CaptureError for a camera that is no perspective camera, FlareFileError for a bad .flare.
     """
@@ -45,10 +46,13 @@ def of_scene(scene: Any, chosen: Sequence[Any], frames: Sequence[int], flare: Pa
             scene.frame_set(frame)
             depsgraph = view_layer.depsgraph
             made += [frame_of(scene, depsgraph, camera, frame) for camera in chosen]
+            if not chosen:
+                one = frame_of(scene, depsgraph, scene.camera, frame)
+                made.append(replace(one, name=made[0].name if made else one.name))
             done(frame)
     finally:
         scene.frame_set(before, subframe=subframe)
-    return Shot(flare, tuple(made), looks.query_of(scene.fit_flare), run)
+    return Shot(flare, tuple(made), looks.query_of(scene.fit_flare), run, scene.fit_flare.bake_live)
 
 
 def frame_of(scene: Any, depsgraph: Any, camera: Any, frame: int) -> ShotFrame:
@@ -84,12 +88,12 @@ def layers_folder(scene: Any, create: bool = False) -> Path:
             number += 1
             folder = base / f"layers_{number}"
         state.layers = stored(folder)
-    return Path(bpy.path.abspath(state.layers)) if state.layers else Path()
+    return absolute(state.layers) if state.layers else Path()
 
 
 def bake(scene: Any, chosen: Sequence[Any]) -> Job:
-    """Bake layers of these cameras through the engine. Raises FitFlareError of every kind."""
-    if not chosen:
+    """Bake layers of these cameras through the engine, or of the scene's own. Raises FitFlareError of every kind."""
+    if not chosen and scene.camera is None:
         raise CaptureError("The scene has no camera to bake from; add one, or import a capture.")
     engine.command()
     look = looks.look_of(scene)

@@ -45,8 +45,8 @@ def here() -> Side | None:
 def engine_command(named: str | None) -> list[str]:
     """How to start run.py in a Python with torch.
 
-    Looked for in this order: `named` (--engine), FIT_FLARE_ENGINE, the add-on's preferences, `.venv` in
-    the repository or beside it. One that is named has to work; EngineError where none does.
+    Looked for in this order: `named` (--engine), FIT_FLARE_ENGINE, the add-on's preferences, what its Set Up Engine
+    has made, `.venv` in the repository or beside it. One that is named has to work; EngineError where none does.
     """
     for where, place in (("--engine", named), ("FIT_FLARE_ENGINE", os.environ.get("FIT_FLARE_ENGINE")),
                          ("the add-on's preferences", _engine_in_preferences())):
@@ -56,7 +56,7 @@ def engine_command(named: str | None) -> list[str]:
                 raise EngineError(f"The engine that {where} names, {place}, is not a Python with torch; "
                                   "install the engine there or name another.")
             return [str(python), str(RUN)]
-    for folder in (ROOT / ".venv", ROOT.parent / ".venv"):
+    for folder in (*_set_up_by_the_addon(), ROOT / ".venv", ROOT.parent / ".venv"):
         python = _python_at(folder)
         if python is not None and _has_torch(python):
             return [str(python), str(RUN)]
@@ -70,6 +70,14 @@ def _engine_in_preferences() -> str:
     from ..flare_addon.preferences import engine_path
 
     return engine_path()
+
+
+def _set_up_by_the_addon() -> list[Path]:
+    if "bpy" not in sys.modules:
+        return []
+    from ..flare_addon import engine
+
+    return [engine.user_folder(engine.FOLDER) / "python"]
 
 
 def _python_at(place: Path) -> Path | None:

@@ -8,7 +8,6 @@ hides the lights come along.
 from __future__ import annotations
 
 import hashlib
-import re
 from collections.abc import Container, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -48,17 +47,20 @@ class ShotRenderer:
 
     @property
     def fingerprint(self) -> str:
-        """Changes whenever a picture would."""
+        """Changes whenever all pictures would; what is a frame's alone, `fingerprint_of` tells."""
         digest = hashlib.sha256(self.shot.flare.read_bytes())
-        for one in self.shot.frames:
-            camera = one.camera
-            digest.update(repr((one.frame, one.name, camera.size, camera.intrinsics.tolist(),
-                                camera.world_to_camera.tolist(), one.edits, self.shot.query,
-                                [(light.name, light.source, light.xyz.tolist(), light.share) for light in one.lights]),
-                               ).encode())
+        digest.update(repr((self.shot.query, self.shot.live, self.lights)).encode())
         if self.run is not None:
             digest.update(self.run.fingerprint.encode())
         return digest.hexdigest()[:16]
+
+    @staticmethod
+    def fingerprint_of(one: ShotFrame) -> str:
+        """Of a frame's camera, lights and edits."""
+        camera = one.camera
+        told = (one.frame, one.name, camera.size, camera.intrinsics.tolist(), camera.world_to_camera.tolist(),
+                one.edits, [(light.name, light.source, light.xyz.tolist(), light.share) for light in one.lights])
+        return hashlib.sha256(repr(told).encode()).hexdigest()[:16]
 
     def render(self, one: ShotFrame, camera: Camera) -> Rendered:
         """The layers of a frame, under its camera at the size asked for."""
@@ -100,7 +102,11 @@ class _OfFrame:
 
     renderer: ShotRenderer
     one: ShotFrame
-    fingerprint: str = ""
+
+    @property
+    def fingerprint(self) -> str:
+        """See `ShotRenderer.fingerprint_of`."""
+        return self.renderer.fingerprint_of(self.one)
 
     def render(self, camera: Camera, edits: LookEdits | None = None) -> Rendered:  # noqa: ARG002 - see above
         return self.renderer.render(self.one, camera)
@@ -115,9 +121,9 @@ def bake_shot(shot: Shot, out: Path | str, *, half: bool = True, overwrite: bool
     """Write the layers of a shot's frames under `out`: `layers.0001.exr` for one camera, in a folder for each of
     several. wanted: frame numbers, None for all. space, config: see `BakeSettings`. Returns the content of bake.json.
     Raises what `bake` raises, and FlareFileError."""
-    several = len({one.name for one in shot.frames}) > 1
+    folders = shot.folders
     shown = {f"{one.name}/{one.frame}": one for one in shot.frames if wanted is None or one.frame in wanted}
-    frames = [Frame(view, one.frame, _file(one, several)) for view, one in shown.items()]
+    frames = [Frame(view, one.frame, _file(one, folders[one.name])) for view, one in shown.items()]
     cameras = {view: one.camera for view, one in shown.items()}
     renderer = ShotRenderer(shot)
     settings = BakeSettings(half=half, space=space, config=config)
@@ -125,6 +131,5 @@ def bake_shot(shot: Shot, out: Path | str, *, half: bool = True, overwrite: bool
                        progress, overwrite=overwrite)
 
 
-def _file(one: ShotFrame, several: bool) -> str:
-    folder = re.sub(r"[^A-Za-z0-9_-]+", "_", one.name).strip("_") or "camera"
-    return f"{folder}/layers.{one.frame:04d}.exr" if several else f"layers.{one.frame:04d}.exr"
+def _file(one: ShotFrame, folder: str) -> str:
+    return f"{folder}/layers.{one.frame:04d}.exr" if folder else f"layers.{one.frame:04d}.exr"

@@ -13,6 +13,7 @@ the scene it was learned from, else any.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -75,17 +76,32 @@ def evaluate(look: Look, world_to_camera: Any, lights: Sequence[PlacedLight], ed
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """Frames to be rendered with a flare. run: the folder of the fit whose scene belongs under it, or None."""
+    """Frames to be rendered with a flare. run: the folder of the fit whose scene belongs under it, or None. live:
+    whoever lays the layers over something applies the colour of whole lights, which the edits leave out."""
 
     flare: Path
     frames: tuple[ShotFrame, ...]
     query: Query = "target"
     run: Path | None = None
+    live: bool = False
 
     @property
     def lights(self) -> tuple[str, ...]:
         """Names of all lights, in order of appearance."""
         return tuple(dict.fromkeys(light.name for frame in self.frames for light in frame.lights))
+
+    @property
+    def folders(self) -> dict[str, str]:
+        """Of each camera the folder for its layers, where there are several; no two are one, on any file system."""
+        found: dict[str, str] = {}
+        for name in dict.fromkeys(frame.name for frame in self.frames):
+            plain = re.sub(r"[^\w-]+", "_", name).strip("_") or "camera"
+            taken, folder, number = {other.casefold() for other in found.values()}, plain, 1
+            while folder.casefold() in taken:
+                number += 1
+                folder = f"{plain}_{number}"
+            found[name] = folder
+        return found if len(found) > 1 else dict.fromkeys(found, "")
 
     def write(self, path: Path | str) -> None:
         """Write what `read` reads."""
@@ -95,7 +111,7 @@ class Shot:
                    "lights": [{"name": light.name, "source": light.source, "xyz": light.xyz.tolist(),
                                "share": light.share} for light in one.lights]} for one in self.frames]
         write_json(path, {"version": VERSION, "flare": str(self.flare), "run": str(self.run) if self.run else None,
-                          "query": self.query, "frames": frames})
+                          "query": self.query, "live": self.live, "frames": frames})
 
     @classmethod
     def read(cls, path: Path | str) -> Shot:
@@ -109,7 +125,7 @@ class Shot:
             frames = tuple(_frame(entry, data) for entry in data["frames"])
             here = Path(path).parent
             run = here / data["run"] if data.get("run") else None
-            return cls(here / data["flare"], frames, data.get("query", "target"), run)
+            return cls(here / data["flare"], frames, data.get("query", "target"), run, bool(data.get("live")))
         except (AttributeError, KeyError, TypeError, ValueError, np.linalg.LinAlgError) as problem:
             raise SettingsError(f"{path} is not a shot that can be rendered ({problem!r}); "
                                 "export it again.") from problem

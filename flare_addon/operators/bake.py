@@ -9,9 +9,11 @@ from typing import Any
 import bpy
 
 from ...core.bake.layers import layer_names
-from ...core.errors import FrameError
+from ...core.errors import FitFlareError, FrameError
+from ...core.look.shot import Shot
 from .. import compositor, engine, jobs, looks, shots
 from ..layer_folder import LayerFolder
+from ..paths import absolute
 from ..reports import NO_CAMERA, NO_FLARE, Action
 
 
@@ -20,6 +22,7 @@ class FITFLARE_OT_bake(Action, bpy.types.Operator):
 
     bl_idname = "fit_flare.bake"
     bl_label = "Bake Layers"
+    bl_options = {"UNDO"}  # the folder that it chooses, or undoing what comes later would forget it
 
     selected: bpy.props.BoolProperty(  # type: ignore[valid-type]
         name="Selected Cameras", description="Bake from every selected camera, each into a folder of its own",
@@ -39,7 +42,7 @@ class FITFLARE_OT_bake(Action, bpy.types.Operator):
     def act(self, context: bpy.types.Context) -> None:
         scene = context.scene
         chosen = [item for item in context.selected_objects if item.type == "CAMERA"] if self.selected else []
-        shots.bake(scene, chosen or [scene.camera])
+        shots.bake(scene, chosen)
 
 
 def _baking(scene: Any) -> bool:
@@ -51,7 +54,7 @@ def _baking(scene: Any) -> bool:
 def set_up(operator: Any, scene: Any, folder: str, *, keep_image: bool, plate: bool, match: bool = False) -> None:
     """Nodes for the layers in a folder, over the baked scene, what the compositor shows now (`keep_image`) or the
     footage behind the camera (`plate`); `match` gives the scene their frames and size. Raises FrameError."""
-    layers = LayerFolder.open(bpy.path.abspath(folder))
+    layers = LayerFolder.open(_of_camera(absolute(folder), scene))
     compositor.set_up(scene, layers, keep_image=keep_image, plate=footage_of(scene) if plate else None)
     if match:
         compositor.match_scene(scene, layers, layers.size())
@@ -70,6 +73,7 @@ class FITFLARE_OT_set_up_compositor(Action, bpy.types.Operator):
         name="Layers",
         description="Folder of the baked EXR layers",
         subtype="DIR_PATH",
+        options={"SKIP_SAVE"},  # else the last one would pass for one that was dropped
     )
     keep_image: bpy.props.BoolProperty(  # type: ignore[valid-type]
         name="Over the Present Image",
@@ -98,6 +102,15 @@ class FITFLARE_OT_set_up_compositor(Action, bpy.types.Operator):
                match=self.match_scene)
 
 
+def _of_camera(folder: Path, scene: Any) -> Path:
+    """The folder of the scene camera's layers, where those of several cameras were baked into this one."""
+    try:
+        folders = Shot.read(folder / shots.SHOT).folders
+    except FitFlareError:
+        return folder
+    return folder / folders.get(scene.camera.name if scene.camera is not None else "", "")
+
+
 def footage_of(scene: Any) -> tuple[Any, int, int, int]:
     """The image behind the scene's camera and its place in time. Raises FrameError where there is none."""
     camera = scene.camera
@@ -110,9 +123,9 @@ def footage_of(scene: Any) -> tuple[Any, int, int, int]:
 
 def wire(scene: Any, layers: LayerFolder) -> bool:
     """Connect the panel's sliders to layers that this scene has baked without them; whether it was done."""
-    note = layers.folder / shots.LIVE
+    folder = next((one for one in (layers.folder, layers.folder.parent) if (one / shots.LIVE).is_file()), layers.folder)
     try:
-        names = json.loads(note.read_text(encoding="utf-8"))["lights"]
+        names = json.loads((folder / shots.LIVE).read_text(encoding="utf-8"))["lights"]
     except (OSError, ValueError, KeyError, TypeError):
         return False
     present = {item.name for item in scene.fit_flare.lights}

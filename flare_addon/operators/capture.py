@@ -19,8 +19,9 @@ class FITFLARE_OT_import_capture(Action, bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}
 
     directory: bpy.props.StringProperty(name="Folder", description="The capture's folder, or one inside it",  # type: ignore[valid-type]
-                                        subtype="DIR_PATH")
-    filepath: bpy.props.StringProperty(name="File", description="A file of the capture", subtype="FILE_PATH")  # type: ignore[valid-type]
+                                        subtype="DIR_PATH", options={"SKIP_SAVE"})
+    filepath: bpy.props.StringProperty(name="File", description="A file of the capture", subtype="FILE_PATH",  # type: ignore[valid-type]
+                                       options={"SKIP_SAVE"})  # else the last one would pass for one that was dropped
     filter_folder: bpy.props.BoolProperty(default=True, options={"HIDDEN"})  # type: ignore[valid-type]
     filter_glob: bpy.props.StringProperty(default="*.json;*.bin;*.txt", options={"HIDDEN"})  # type: ignore[valid-type]
     cameras: bpy.props.EnumProperty(  # type: ignore[valid-type]

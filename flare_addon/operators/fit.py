@@ -17,6 +17,7 @@ class FITFLARE_OT_fit(Action, bpy.types.Operator):
 
     bl_idname = "fit_flare.fit"
     bl_label = "Fit"
+    bl_options = {"UNDO"}  # the run that it names, or undoing what comes later would forget it
 
     @classmethod
     def why_not(cls, context: bpy.types.Context) -> str:

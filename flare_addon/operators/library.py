@@ -18,9 +18,11 @@ class FITFLARE_OT_save_flare(Action, bpy.types.Operator):
     bl_idname = "fit_flare.save_flare"
     bl_label = "Save to Library"
 
-    name: bpy.props.StringProperty(name="Name", description="What it is called in the library")  # type: ignore[valid-type]
-    notes: bpy.props.StringProperty(name="Notes", description="Lens, aperture, camera, what it is good for")  # type: ignore[valid-type]
-    licence: bpy.props.StringProperty(name="Licence", description="Under which terms others may use it")  # type: ignore[valid-type]
+    name: bpy.props.StringProperty(name="Name", description="What it is called in the library", options={"SKIP_SAVE"})  # type: ignore[valid-type]
+    notes: bpy.props.StringProperty(name="Notes", description="Lens, aperture, camera, what it is good for",  # type: ignore[valid-type]
+                                    options={"SKIP_SAVE"})
+    licence: bpy.props.StringProperty(name="Licence", description="Under which terms others may use it",  # type: ignore[valid-type]
+                                      options={"SKIP_SAVE"})
 
     @classmethod
     def why_not(cls, context: bpy.types.Context) -> str:

@@ -33,7 +33,8 @@ class FITFLARE_OT_open_flare(Action, bpy.types.Operator):
     bl_label = "Open Flare"
     bl_options = {"REGISTER", "UNDO"}
 
-    filepath: bpy.props.StringProperty(name="Flare", description="A .flare file", subtype="FILE_PATH")  # type: ignore[valid-type]
+    filepath: bpy.props.StringProperty(name="Flare", description="A .flare file", subtype="FILE_PATH",  # type: ignore[valid-type]
+                                       options={"SKIP_SAVE"})  # else the last one would pass for one that was dropped
     filter_glob: bpy.props.StringProperty(default="*.flare", options={"HIDDEN"})  # type: ignore[valid-type]
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:

@@ -62,13 +62,29 @@ def test_frames_are_cleaned_by_the_network_or_by_a_finished_fit(made: tuple[Any,
     assert facts["cleaned by the fit"] == ["remove", "--run", str(base / "a run"), "--out", removed]
 
 
-def test_frames_are_cleaned_by_a_matte_and_again_otherwise(made: tuple[Any, Path]) -> None:
+def test_frames_are_cleaned_by_a_matte_and_otherwise_again(made: tuple[Any, Path]) -> None:
     facts, base = made
     images, removed = str(Path("capture") / "images"), str(Path("capture") / "removed")
     by_matte = ["remove", images, "--out", removed, "--matte", str(base / "roto")]
     assert facts["cleaned by a matte"] == by_matte
-    assert facts["cleaned again"] == [*by_matte, "--overwrite"], "what the engine made, it makes again when it is asked"
-    assert facts["cleaned again, glow kept"] == [*by_matte, "--keep-glare", "--overwrite"]
+    assert facts["cleaned, glow kept"] == [*by_matte, "--keep-glare"]
+    first, made, stopped, stopped_otherwise = facts["cleaned again"]
+    assert made and stopped_otherwise, "what the engine made is made again, and no two ways are mixed"
+    assert not first and not stopped
+
+
+def test_a_bake_follows_the_cuts_of_the_timeline(facts: Any) -> None:
+    names, *off = facts["cut"]
+    assert names == ["Camera"] and [far < 1e-4 for far in off] == [False, False, True], off
+
+
+def test_a_folder_without_layers_leaves_no_trace(facts: Any) -> None:
+    said, untouched, images = facts["no layers"]
+    assert "no scene and flare layers" in said and untouched and not images, images
+
+
+def test_a_blend_below_a_linked_folder_finds_its_files(facts: Any) -> None:
+    assert facts["through a link"] == ["//", True]
 
 
 @pytest.mark.parametrize("kind", ["animated", "each"])

@@ -451,6 +451,32 @@ def test_a_shot_is_baked_as_the_overlay_shows_it(tmp_path: Path) -> None:
         frame.camera.world_to_camera, lights={"lamp 0": frame.lights[1].xyz})["lamp 0"].opacities.max(), rtol=1e-5)
 
 
+def test_every_camera_has_a_folder_of_its_own(tmp_path: Path) -> None:
+    frame = a_shot(tmp_path).frames[0]
+    names = ("Cam.left", "Cam left", "cam_LEFT", "Левая", "カメラ", "../escaped", "..")
+    folders = Shot(tmp_path, tuple(replace(frame, name=name) for name in names)).folders
+    assert list(folders.values()) == ["Cam_left", "Cam_left_2", "cam_LEFT_3", "Левая", "カメラ", "escaped", "camera"]
+    assert Shot(tmp_path, (frame, frame)).folders == {frame.name: ""}
+
+
+def test_frames_baked_before_stay_when_others_are_baked(tmp_path: Path) -> None:
+    from core.bake.shot import bake_shot
+
+    def times() -> list[int]:
+        return [(out / f"layers.000{number}.exr").stat().st_mtime_ns for number in (1, 2, 3)]
+
+    out, shot = tmp_path / "layers", a_shot(tmp_path)
+    bake_shot(shot, out, overwrite=True)
+    first = times()
+    record = bake_shot(replace(shot, frames=shot.frames[1:2]), out, overwrite=True)
+    assert times() == first and len(record["frames"]) == 3
+    changed = replace(shot.frames[1], edits=("second.intensity=2",))
+    bake_shot(replace(shot, frames=(changed,)), out, overwrite=True)
+    assert [now == then for now, then in zip(times(), first, strict=True)] == [True, False, True]
+    bake_shot(replace(shot, frames=shot.frames[:1], live=True), out, overwrite=True)
+    assert [path.name for path in out.glob("*.exr")] == ["layers.0001.exr"], "colours half applied are no sequence"
+
+
 def test_notes_can_be_changed_and_the_engine_reads_it(tmp_path: Path) -> None:
     from core.look.look import annotated
 

@@ -74,11 +74,17 @@ fits = part("flare_addon.fits")
 facts["cleaned by the network"] = [str(word) for word in fits.cleaning(scene, Path("capture"))]
 scene.fit_flare.matte = str(Path(out) / "roto")
 facts["cleaned by a matte"] = [str(word) for word in fits.cleaning(scene, Path("capture"))]
-find, fits.jobs.find = fits.jobs.find, lambda _: SimpleNamespace(state="done")
-facts["cleaned again"] = [str(word) for word in fits.cleaning(scene, Path("capture"))]
 scene.fit_flare.keep_glow = True
-facts["cleaned again, glow kept"] = [str(word) for word in fits.cleaning(scene, Path("capture"))]
-fits.jobs.find = find
+facts["cleaned, glow kept"] = [str(word) for word in fits.cleaning(scene, Path("capture"))]
+given, again = [str(word) for word in fits.cleaning(scene, fits.capture_of(scene))], []
+find, start = fits.jobs.find, fits.engine.run
+fits.engine.run = lambda _kind, _folder, words: again.append(words[-1] == "--overwrite")
+for state, words in (("none", None), ("done", given), ("stopped", given), ("stopped", given[:-1])):
+    made = None if words is None else SimpleNamespace(state=state, words=words)
+    fits.jobs.find = lambda _, made=made: made
+    fits.clean(scene)
+fits.jobs.find, fits.engine.run = find, start
+facts["cleaned again"] = again
 run = Path(out) / "a run"
 run.mkdir()
 (run / fits.FLARE).write_bytes(b"")
@@ -226,6 +232,21 @@ moved = shots.of_scene(scene, [scene.camera], [1, 3], Path(flare), None)
 facts["moved root off"] = float(np.abs(moved.frames[0].camera.world_to_camera - pose).max())
 root.rotation_euler, root.scale, root.location = (0, 0, 0), (1, 1, 1), (0, 0, 0)
 
+# ---- cuts by markers --------------------------------------------------------------------------------
+bpy.context.view_layer.update()
+first, angle = scene.camera, bpy.data.objects.new("Other Angle", bpy.data.cameras.new("Other Angle"))
+scene.collection.objects.link(angle)
+angle.matrix_world = first.matrix_world
+angle.location.x += 3
+for frame, camera in ((1, first), (3, angle)):
+    scene.timeline_markers.new("cut", frame=frame).camera = camera
+cut = shots.of_scene(scene, [], [1, 2, 3], Path(flare), None)
+facts["cut"] = [sorted({one.name for one in cut.frames}), *(float(np.abs(one.camera.world_to_camera - np.linalg.inv(
+    np.array(angle.matrix_world) @ cameras.FLIP)).max()) for one in cut.frames)]
+scene.timeline_markers.clear()
+scene.camera = first
+bpy.data.objects.remove(angle)
+
 # ---- occlusion: a wall slides before the light ------------------------------------------------------
 scene.frame_set(1)
 depsgraph = bpy.context.evaluated_depsgraph_get()
@@ -320,6 +341,25 @@ facts["export off"] = max(float(np.abs(one.camera.world_to_camera - two.camera.w
                           for one, two in zip(again.views, original.views, strict=True))
 facts["export lens off"] = float(np.abs(again.views[0].camera.intrinsics - original.views[0].camera.intrinsics).max())
 facts["export points"] = len(again.points)
+
+# ---- a folder that holds no layers ------------------------------------------------------------------
+scene = empty()
+image = bpy.data.images.new("plain", 8, 8, float_buffer=True)
+image.filepath_raw, image.file_format = str(Path(out) / "plain" / "a.0001.exr"), "OPEN_EXR"
+image.save()
+bpy.data.images.remove(image)
+compositor = part("flare_addon.compositor")
+facts["no layers"] = [refusal(lambda: ops.set_up_compositor(directory=str(Path(out) / "plain"))),
+                      compositor.tree_of(scene) is None, [image.name for image in bpy.data.images]]
+
+# ---- a .blend below a linked folder -----------------------------------------------------------------
+real, link, beside = (Path(out) / name for name in ("real/deep", "link", "beside"))
+real.mkdir(parents=True)
+beside.mkdir()
+link.symlink_to(real, target_is_directory=True)
+bpy.ops.wm.save_as_mainfile(filepath=str(link / "a.blend"))
+paths = part("flare_addon.paths")
+facts["through a link"] = [paths.stored(beside)[:2], paths.absolute(paths.stored(beside)).is_dir()]
 
 # ---- the engine's own bake of a shot, from the panel ------------------------------------------------
 replace(shot, frames=shot.frames[:1]).write(Path(out) / "shot.json")

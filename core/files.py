@@ -16,6 +16,7 @@ from typing import Any
 from .errors import FitFlareError
 
 _PARTIAL = ".partial-"
+_REFUSALS = 100  # a hundredth of a second apart
 
 
 @contextlib.contextmanager
@@ -60,17 +61,21 @@ def locked(lock: Path | str, stale_s: float = 10.0) -> Iterator[None]:
     """
     lock = Path(lock)
     lock.parent.mkdir(parents=True, exist_ok=True)
+    refused = 0
     while True:
         try:
             os.close(os.open(lock, os.O_CREAT | os.O_EXCL | os.O_WRONLY))
             break
-        except (FileExistsError, PermissionError):  # Windows refuses while another one is removing it
+        except (FileExistsError, PermissionError) as problem:
+            time.sleep(0.01)
             try:
                 if time.time() - lock.stat().st_mtime > stale_s:
                     lock.unlink(missing_ok=True)
             except FileNotFoundError:
-                continue
-            time.sleep(0.01)
+                # Windows refuses while another one is removing it; a folder that may not be written refuses for ever.
+                refused += isinstance(problem, PermissionError)
+                if refused > _REFUSALS:
+                    raise problem from None
     try:
         yield
     finally:

@@ -76,6 +76,9 @@ def main(words: list[str]) -> int:
         say(type="error", text=f"{sys.executable} has no ensurepip to make an environment with (Debian keeps it in "
                                "python3-venv); install it, or name a Python that has torch in the field Engine.")
         return 1
+    if folder.exists() and not (folder / "pyvenv.cfg").is_file() and (not folder.is_dir() or any(folder.iterdir())):
+        say(type="error", text=f"{folder} is there and is no virtual environment; name another folder, or remove it.")
+        return 1
     shutil.rmtree(folder, ignore_errors=True)
     python = python_in(folder)
     constraints = ROOT / "constraints.txt"

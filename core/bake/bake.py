@@ -36,11 +36,13 @@ class OfCamera(Protocol):
 
 class FrameRenderer(OfCamera, Protocol):
     """What renders one frame. fingerprint: changes whenever this frame's picture would, beyond the whole's; empty
-    where nothing is this frame's alone. finished: its layers, already in the space asked for, as they are to be
-    written."""
+    where nothing is this frame's alone. rest_is_made: whether what `finished` writes beside the layers is there.
+    finished: its layers, already in the space asked for, as they are to be written."""
 
     @property
     def fingerprint(self) -> str: ...
+    @property
+    def rest_is_made(self) -> bool: ...
     def finished(self, layers: FrameLayers, camera: Camera) -> FrameLayers: ...
 
 
@@ -66,6 +68,7 @@ class _AnyFrame:
 
     renderer: Renderer
     fingerprint: str = ""
+    rest_is_made: bool = True
 
     def render(self, camera: Camera, edits: LookEdits | None = None) -> Rendering:
         return self.renderer.render(camera) if edits is None else self.renderer.render(camera, edits)
@@ -132,7 +135,7 @@ def bake_frames(source: Sequenced, frames: Sequence[Frame], cameras: Mapping[str
         own = {"inputs": inputs} if inputs else {}
         return {"view": frame.view, "frame": frame.number, **own, **made_from}
 
-    done = [frame for frame in frames if _is_made(out / frame.file, notes(frame))]
+    done = [frame for frame in frames if _is_made(out / frame.file, notes(frame)) and of_frame(frame).rest_is_made]
     record = _add_to_record(out, made_from, names, [_entry(out, frame) for frame in done])
     progress.stage("bake", len(frames), len(done))
 
@@ -165,8 +168,10 @@ def _begin(out: Path, made_from: dict[str, Any], overwrite: bool) -> None:
     if not (out / RECORD).exists():
         return
     with locked(out / LOCK):
+        if not (out / RECORD).exists():  # another task has just cleared it away
+            return
         record = read_record(out)
-        if record["made_from"] == made_from:
+        if record["made_from"] == made_from or not record["frames"]:
             return
         if not overwrite:
             raise RunError(f"{out} holds layers that were baked from another fit or with other settings; "

@@ -102,6 +102,7 @@ class _OfFrame:
 
     renderer: ShotRenderer
     one: ShotFrame
+    rest_is_made: bool = True
 
     @property
     def fingerprint(self) -> str:

@@ -110,7 +110,8 @@ def _environment(path: Path) -> NDArray[np.float16] | None:
             return None
         light: NDArray[Any] = np.stack([channels[name] for name in "RGB"], -1)
     else:
-        found = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        data = np.fromfile(path, np.uint8)
+        found = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
         if found is None:
             return None
         light = found[..., ::-1]

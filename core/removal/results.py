@@ -14,11 +14,10 @@ def check_apart(sources: Iterable[Path], results: Iterable[Path]) -> None:
     for path in results:
         whole = path.resolve()
         if whole in read:
-            raise SettingsError(f"{path} would be overwritten by a result; choose another folder with --out or "
-                                "--flare.")
+            raise SettingsError(f"{path} would be overwritten by a result; choose another folder for the results.")
         if whole in written:
-            raise SettingsError(f"Two results would be written to the same file, {path}; choose another folder with "
-                                "--flare, or clean plates that differ by their suffix alone apart.")
+            raise SettingsError(f"Two results would be written to the same file, {path}; choose another folder for "
+                                "one kind of them, or take plates that differ by their suffix alone apart.")
         written.add(whole)
 
 

@@ -41,6 +41,13 @@ class TargetFrame:
     plate: Path | None = None
     undistorted: Callable[[], Picture] | None = None
 
+    def flared(self, folder: Path) -> Path | None:
+        """Where below `folder` the plate with its flare goes: beside those of the layers' folder, under its own name.
+        None where none is written: without a plate, and at another size or form than the file's."""
+        if self.plate is None or self.undistorted is not None or picture_size(self.plate) != self.shot.camera.size:
+            return None
+        return folder / Path(self.frame.file).parent / self.plate.name
+
     def described(self) -> str:
         """Changes whenever the frame would; its plate counts by name and length, so that mirrored disks agree."""
         camera = self.shot.camera
@@ -82,11 +89,16 @@ def of_pictures(paths: Sequence[Path], look: Look, lights: Mapping[str, tuple[fl
     focal: in pixels (default: the training camera's field of view); centre: principal point in pixels (default: the
     middle). distances: of each source, at which its flare is as bright as it was learned. seen: what each source was
     learned from; a light that was found shows the source that stood most like it. Raises SettingsError where
-    a picture has no light.
+    a picture has no light, and for two of one name.
     """
+    by_name = {path.name: path for path in paths}
+    if len(by_name) < len(paths):
+        twin = next(path for path in paths if by_name[path.name] != path)
+        raise SettingsError(f"{twin} and {by_name[twin.name]} have one name; put the flare on them one after the "
+                            "other, each with an --out of its own.")
     frames = []
-    for frame in numbered(path.name for path in paths):
-        path = next(one for one in paths if one.name == frame.view)
+    for frame in numbered(by_name):
+        path = by_name[frame.view]
         width, height = picture_size(path)
         fx = focal or look.camera.fx * width / look.camera.width
         fy = focal or look.camera.fy * width / look.camera.width
@@ -185,18 +197,17 @@ def of_shot(shot: Shot, look: Look, wanted: Mapped, *, plates: Path | None = Non
     Raises SettingsError where a frame has no plate there.
     """
     given = _by_number(plates) if plates else {}
-    several = len({one.name for one in shot.frames}) > 1
     # Sources that the shot names itself hold, unless others are wanted or this look has none such.
     told = {light.name: light.source for one in shot.frames for light in one.lights}
     sources = assigned(list(told), look.names,
                        {**{name: source for name, source in told.items() if source in look.names}, **wanted})
-    frames = []
+    frames, folders = [], shot.folders
     for one in sorted(shot.frames, key=lambda each: (each.name, each.frame)):
         if plates and one.frame not in given:
             raise SettingsError(f"{plates} has no picture for frame {one.frame}.")
         lights = tuple(replace(light, source=sources[light.name]) for light in one.lights)
-        name = f"{one.name}/" if several else ""
-        frame = Frame(f"{one.name}/{one.frame}", one.frame, f"{name}layers.{one.frame:04d}.exr")
+        file = Path(folders[one.name]) / f"layers.{one.frame:04d}.exr"
+        frame = Frame(f"{one.name}/{one.frame}", one.frame, file.as_posix())
         frames.append(TargetFrame(frame, replace(one, lights=lights), given.get(one.frame)))
     if not frames:
         raise SettingsError("The shot has no frames; export it again.")

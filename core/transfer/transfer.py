@@ -32,6 +32,7 @@ from ..look import LookEdits, ViewOfLight, read
 from ..look.shot import PlacedLight
 from ..pictures import Picture
 from ..progress import Progress
+from ..removal.results import check_apart
 from . import query as queries
 from .plates import AUTO, ColouredPlate
 from .query import Query
@@ -111,8 +112,8 @@ class Transfer:
         """Each light's splats in a frame, under `camera`; of the lights that show something."""
         shot = self.target.frames[index].shot
         if shot.edits:
-            own = LookEdits.parse(shot.edits, self.lights, self.elements)
-            edits = own if edits is None or edits.neutral else edits
+            asked = edits.words() if edits is not None else []
+            edits = LookEdits.parse([*shot.edits, *asked], self.lights, self.elements)
         names = [light.name for light in shot.lights]
         _, intrinsics = pose_and_intrinsics(camera)
         shown: dict[str, Splats] = {}
@@ -183,6 +184,8 @@ class Transfer:
         cameras = {one.frame.view: one.shot.camera for one in self.target.frames}
         if settings.half and self._has_full_float():
             settings = replace(settings, half=False)
+        flared = [path for one in self.target.frames if (path := one.flared(Path(out) / FRAMES)) is not None]
+        check_apart([one.plate for one in self.target.frames if one.plate is not None], flared)
         return bake_frames(self, frames, cameras, out, lambda frame: self.of_frame(frame, space, Path(out) / FRAMES),
                            settings, progress, overwrite=overwrite)
 
@@ -208,6 +211,12 @@ class _OfFrame:
     def fingerprint(self) -> str:
         """See `Transfer.fingerprint_of`."""
         return self._transfer.fingerprint_of(self._index)
+
+    @property
+    def rest_is_made(self) -> bool:
+        """Whether the plate with its flare is there, where one is written."""
+        target = self._one.flared(self._out) if self._out is not None else None
+        return target is None or target.is_file()
 
     def render(self, camera: Camera, edits: LookEdits | None = None) -> Rendered:
         """Scene, flare of each light, depth; scene-linear Rec. 709."""
@@ -242,9 +251,10 @@ class _OfFrame:
         """The layers, with the plate's own numbers where the spaces are one; writes the plate with its flare."""
         if self._plate is None or self._plate.size != camera.size:
             return layers
-        if self._out is not None and self._one.plate is not None:
-            remove_partial_of(self._out / self._one.plate.name)  # of a task that was killed
-            self._plate.write(self._out / self._one.plate.name, self._space.to_linear(layers.flare))
+        target = self._one.flared(self._out) if self._out is not None else None
+        if target is not None:
+            remove_partial_of(target)  # of a task that was killed
+            self._plate.write(target, self._space.to_linear(layers.flare))
         own = self._plate.space.matrix
         if own is not None and self._space.matrix is not None and np.allclose(own, self._space.matrix, atol=1e-9):
             return FrameLayers(self._plate.values, layers.flares, layers.depth)

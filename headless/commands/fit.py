@@ -33,7 +33,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
                         help="a text file with a capture's folder on each line, instead of CAPTURE: --out is then the "
                              "folder of the runs, each under its capture's name")
     parser.add_argument("--entry", type=int, metavar="N", help="which line of --list, from 1 (default: all of them)")
-    jobs.add_option(parser)
+    jobs.add_option(parser, "captures of a --list that are fitted at once on this machine (default 1)")
     parser.add_argument("--resume", action="store_true",
                         help="go on with the run in --out, with the settings it was begun with; begin it if there is "
                              "none")
@@ -70,7 +70,7 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     if words.listed is not None and words.entry is None:
         count = len(listed(words.listed))
         parts = [["--entry", str(entry), "--jobs", "1"] for entry in range(1, count + 1)]
-        jobs.run_parts(words, "fit", parts, max(words.jobs, 1), count, progress)
+        jobs.run_parts(words, "fit", parts, max(words.jobs, 1), count, progress, past_failures=True)
         progress.say(f"{count} runs are in {words.out}.")
         return {"runs": str(words.out), "count": count}
     folder, out = place(words)

@@ -37,6 +37,7 @@ def set_up(folder: Path, *wanted: Path) -> tuple[int, list[dict[str, Any]]]:
 
 def test_it_makes_an_environment_and_fills_it(tmp_path: Path) -> None:
     (tmp_path / "engine").mkdir()
+    (tmp_path / "engine" / "pyvenv.cfg").touch()
     (tmp_path / "engine" / "left").write_text("by a set-up that was stopped")
     status, events = set_up(tmp_path / "engine", wheel(tmp_path, "sham_torch"))
     assert status == 0
@@ -53,6 +54,13 @@ def test_a_failure_is_told_and_leaves_nothing(tmp_path: Path) -> None:
     assert "could not be installed (" in events[-1]["text"]
     assert "nowhere-1.0" in events[-1]["text"], "what pip said"
     assert not (tmp_path / "engine").exists()
+
+
+def test_a_folder_that_holds_something_else_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").write_text("mine")
+    status, events = set_up(tmp_path, tmp_path / "nowhere-1.0-py3-none-any.whl")
+    assert status == 1 and "is no virtual environment" in events[-1]["text"]
+    assert (tmp_path / "notes.txt").read_text() == "mine"
 
 
 def module() -> Any:

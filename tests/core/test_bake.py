@@ -2,12 +2,15 @@
 """Layers, their files, edits, frame numbers, and a bake that can be gone on with."""
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from core.bake import bake as baking
 from core.bake.bake import RECORD, BakeSettings, bake, read_record
 from core.bake.exr import read_description, read_layers, write_layers
 from core.bake.frames import chosen, numbered
@@ -270,6 +273,33 @@ def test_a_record_cannot_reach_outside_its_folder(tmp_path: Path) -> None:
     with pytest.raises(RunError):
         bake(another_fit(), FRAMES[:1], CAMERAS, out, overwrite=True)
     assert treasure.read_text() == "mine"
+
+
+def test_a_bake_that_came_to_nothing_is_in_nobody_s_way(tmp_path: Path) -> None:
+    class Broken(FakeRenderer):
+        fingerprint = "broken"
+
+        def render(self, camera: Camera, edits: LookEdits | None = None) -> FakeRendering:
+            raise RunError(f"no light in {camera} {edits}")
+
+    with pytest.raises(RunError, match="no light"):
+        bake(Broken(), FRAMES, CAMERAS, tmp_path)
+    assert len(bake(FakeRenderer(), FRAMES, CAMERAS, tmp_path)["frames"]) == 3
+
+
+def test_another_task_may_clear_the_folder_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    bake(FakeRenderer(), FRAMES, CAMERAS, tmp_path)
+    usual = baking.locked
+
+    @contextlib.contextmanager
+    def cleared_meanwhile(lock: Path) -> Iterator[None]:
+        (tmp_path / RECORD).unlink(missing_ok=True)
+        monkeypatch.setattr(baking, "locked", usual)
+        with usual(lock):
+            yield
+
+    monkeypatch.setattr(baking, "locked", cleared_meanwhile)
+    assert len(bake(another_fit(), FRAMES, CAMERAS, tmp_path, overwrite=True)["frames"]) == 3
 
 
 def another_fit() -> FakeRenderer:

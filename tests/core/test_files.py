@@ -105,3 +105,13 @@ def test_a_lock_is_held_by_one_and_outlives_no_one(tmp_path: Path) -> None:
         with locked(lock, stale_s=0.05):  # as if the holder had been killed
             assert time.monotonic() - started >= 0.04
     assert not lock.exists()
+
+
+def test_a_folder_that_may_not_be_written_is_told_in_the_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> int:
+        raise PermissionError(errno.EACCES, "Permission denied", str(tmp_path / ".lock"))
+
+    monkeypatch.setattr("core.files._REFUSALS", 3)
+    monkeypatch.setattr("core.files.os.open", refuse)
+    with pytest.raises(PermissionError), locked(tmp_path / ".lock"):
+        pass

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -145,6 +147,15 @@ def test_a_solved_shot_is_not_solved_again(solved: tuple[Path, list[Camera], dic
     assert (out / "solve.json").stat().st_mtime_ns == before
 
 
+def test_lights_of_another_solve_are_not_taken_for_this_one_s(solved: tuple[Path, list[Camera], dict[str, Any]],
+                                                            tmp_path: Path) -> None:
+    shutil.copytree(solved[0], tmp_path / "out")
+    (tmp_path / "out" / "lights.json").write_text('{"lights": []}')
+    assert solve(solved[0].parent / "frames", tmp_path / "out", QUICK) == solved[2]
+    with pytest.raises(CaptureError, match=r"lights\.json of an earlier solve"):
+        solve(solved[0].parent / "frames", tmp_path / "out", replace(QUICK, seed=QUICK.seed + 1))
+
+
 class Stopping(Progress):
     """Asks to stop at the `count`-th step of a stage, and notes all stages."""
 
@@ -181,8 +192,12 @@ def test_stopped_and_taken_up_again(tmp_path: Path) -> None:
 def test_frames_of_different_sizes(tmp_path: Path) -> None:
     cameras = orbit(10, size=SIZE, arc=0.9)
     cameras[7:] = [camera.scaled(400, 300) for camera in cameras[7:]]
-    report = solve(shoot(tmp_path / "frames", cameras), tmp_path / "out", QUICK)
+    frames = shoot(tmp_path / "frames", cameras)
+    for file in frames.iterdir():
+        file.rename(frames / f"IMG (1) {file.name}")  # COLMAP takes a space for the end of a name
+    report = solve(frames, tmp_path / "out", QUICK)
     capture = Capture.open(tmp_path / "out")
+    assert capture.views[0].name == "IMG (1) 000.png"
     assert report["registered"] == 10 and len(report["cameras"]) == 2
     assert [view.camera.width for view in capture.views] == [320] * 7 + [400] * 3
     assert capture.views[0].camera.fx == pytest.approx(capture.views[9].camera.fx * 320 / 400, rel=0.05)

@@ -297,6 +297,22 @@ def test_a_png_plate_keeps_its_codes_and_gains_light(flare: Path, look: Look, tm
     np.testing.assert_allclose(found / 65535, expected, atol=2e-3)
 
 
+def test_no_plate_is_written_over_and_none_is_lost(flare: Path, look: Look, tmp_path: Path) -> None:
+    plates = [tmp_path / side / "frames" / "plate.png" for side in ("left", "right")]
+    for path in plates:
+        write_png(path, np.full((40, 60, 3), 0.2))
+    transfer = Transfer(flare, plate_target(plates[0], look))
+    with pytest.raises(SettingsError, match="would be overwritten"):
+        transfer.bake(tmp_path / "left")
+    with pytest.raises(SettingsError, match="have one name"):
+        of_pictures(plates, look, {"sun": (20.0, 12.0)}, {}, {name(look): 4.0})
+    transfer.bake(tmp_path / "out")
+    flared = (tmp_path / "out" / "frames" / "plate.png").read_bytes()
+    (tmp_path / "out" / "frames" / "plate.png").unlink()
+    transfer.bake(tmp_path / "out")
+    assert (tmp_path / "out" / "frames" / "plate.png").read_bytes() == flared
+
+
 def test_layers_in_a_space_with_a_curve_are_refused(flare: Path, look: Look, tmp_path: Path) -> None:
     write_png(tmp_path / "plate.png", np.full((40, 60, 3), 0.2))
     with pytest.raises(SettingsError, match="srgb is not linear"):
@@ -333,6 +349,22 @@ def test_edits_go_by_the_target_s_lights(flare: Path, look: Look, tmp_path: Path
     assert (big > 0).sum() > 1.2 * (one > 0).sum()
     with pytest.raises(SettingsError, match="moon"):
         Transfer(flare, target).bake(tmp_path / "bad", settings=BakeSettings(edits=("moon.intensity=2",)))
+
+
+def test_the_edits_of_a_shot_stay_below_others(flare: Path, look: Look, tmp_path: Path) -> None:
+    plain = shot(flare, look, [cameras(3)[1]])
+    muted = replace(plain, frames=tuple(replace(one, edits=("lamp.mute=1",)) for one in plain.frames))
+    for number, words in enumerate((("lamp.saturation=0.9",), ("lamp.scale=1.1",))):
+        Transfer(flare, of_shot(muted, look, {})).bake(tmp_path / str(number), settings=BakeSettings(edits=words))
+        assert not read_layers(tmp_path / str(number) / "layers.0001.exr").flare.any()
+
+
+def test_cameras_of_a_shot_stay_below_the_folder(flare: Path, look: Look, tmp_path: Path) -> None:
+    one = shot(flare, look, [cameras(3)[1]]).frames[0]
+    two = Shot(flare, tuple(replace(one, name=camera) for camera in ("../escaped", "other")))
+    record = Transfer(flare, of_shot(two, look, {})).bake(tmp_path / "out")
+    assert sorted(entry["file"] for entry in record["frames"]) == ["escaped/layers.0001.exr", "other/layers.0001.exr"]
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
 
 
 def test_edits_by_frame_may_be_toml(tmp_path: Path) -> None:

@@ -140,9 +140,12 @@ def test_fits_over_a_list_of_captures(capture: Path, tmp_path: Path, capfd: pyte
     words = [sys.executable, RUN, "fit", "--list", listed, "--out", tmp_path / "runs", "--resume"]
     assert cli.main([*map(str, words[2:]), "--entry", "3"]) == 1
     assert "lists 2 captures; --entry 3 is none of them" in capfd.readouterr().err
-    # All of the list at once: the first is there already, the second cannot be.
-    assert cli.main([*map(str, words[2:]), "--jobs", "2"]) == 1
+    # All of the list, one after the other: the first cannot be, the second is made all the same.
+    listed.write_text(f"{tmp_path / 'absent'}\n{capture}\n")
+    assert cli.main(["fit", "--list", str(listed), "--out", str(tmp_path / "all"), "--preset", "draft", "--set",
+                     "iterations=3"]) == 1
     assert "absent is not a folder" in capfd.readouterr().err
+    assert (tmp_path / "all" / capture.name / "flare.flare").is_file()
 
 
 def test_a_transfer_in_chunks(capture: Path, made: Path, tmp_path: Path) -> None:

@@ -127,6 +127,10 @@ def _claim(source: Path, out: Path, request: dict[str, Any], progress: Progress)
         if report.get("request") == request:
             progress.say(f"{out} is solved already.")
             return dict(report)
+        belongs = [name for name in ("lights.json", "removed", "split.json", "truth") if (out / name).exists()]
+        if belongs:
+            raise CaptureError(f"{out} holds {' and '.join(belongs)} of an earlier solve, which fit no other; choose "
+                               "another folder for the capture, or remove them.")
     elif theirs and not (out / WORK).is_dir():
         raise CaptureError(f"{out} holds {theirs[0]} that did not come from a solve; give another folder.")
     state = out / WORK / "request.json"

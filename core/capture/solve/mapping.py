@@ -117,7 +117,7 @@ def _refuse_one_picture(shots: Sequence[Shot], work: Path) -> None:
 
     first: Any = None
     for shot in shots:
-        small = cv2.imread(str(work / "small" / shot.name), cv2.IMREAD_GRAYSCALE)
+        small = _grey(work / "small" / shot.name)
         tiny = cv2.resize(small, (64, 64), interpolation=cv2.INTER_AREA).astype(np.float32)
         first = tiny if first is None else first
         if np.abs(tiny - first).max() > 3:
@@ -166,8 +166,18 @@ def _is_plain(small: Path) -> bool:
     """Whether a picture has little texture, by a quick count of corners."""
     import cv2
 
-    grey = cv2.imread(str(small), cv2.IMREAD_GRAYSCALE)
-    return grey is not None and len(cv2.FastFeatureDetector.create(12).detect(grey)) < PLAIN
+    return len(cv2.FastFeatureDetector.create(12).detect(_grey(small))) < PLAIN
+
+
+def _grey(path: Path) -> NDArray[np.uint8]:
+    """(height, width) of one of our own pictures. Raises CaptureError where it was damaged since."""
+    import cv2
+
+    data = np.fromfile(path, np.uint8)  # imread cannot open every path that Windows allows
+    picture = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if data.size else None
+    if picture is None:
+        raise CaptureError(f"{path} is damaged; remove the folder {path.parents[1]} and solve again.")
+    return np.asarray(picture, np.uint8)
 
 
 def _camera(pycolmap: Any, size: tuple[int, int], focal: float | None, model: str) -> Any:

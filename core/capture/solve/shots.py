@@ -109,7 +109,7 @@ def _from_folder(source: Path, work: Path, number: int, size: int,
             progress.advance()
         files = [files[i] for i in choose(scores, number)]
     progress.stage("read frames", len(files))
-    shots = []
+    shots: list[Shot] = []
     for file in files:
         try:
             picture_size(file)
@@ -119,8 +119,8 @@ def _from_folder(source: Path, work: Path, number: int, size: int,
             left_out.append(str(problem))
             progress.say(f"Left out: {problem}")
         else:
-            # The suffix stays in the name: a.jpg and a.png may lie side by side.
-            shot = Shot(f"{file.name}.png", str(file.resolve()), *picture.size, focal, orientation)
+            # Not its own name, which COLMAP would cut at a space, and which is another picture's without its suffix.
+            shot = Shot(f"{len(shots):06d}.png", str(file.resolve()), *picture.size, focal, orientation)
             _write_small(picture, work, shot.name, size)
             shots.append(shot)
         progress.advance()

@@ -30,10 +30,11 @@ Pixels = NDArray[np.float32]
 
 
 def remove_fitted(fitted: Renderer, capture: Capture, views: Sequence[View], folder: Path, progress: Progress, *,
-                  flare_folder: Path | None = None, overwrite: bool = False) -> dict[str, Any]:
+                  flare_folder: Path | None = None, overwrite: bool = False,
+                  made_by: Path | None = None) -> dict[str, Any]:
     """Write the views' frames without the fitted flare below `folder`, each under its own name, in its own kind and
-    depth; those that are there and newer than the frame, their flares too where those are wanted, are kept, unless
-    `overwrite`.
+    depth; those that are there and newer than the frame and `made_by`, the fit's file, their flares too where those are
+    wanted, are kept, unless `overwrite`.
 
     Raises CaptureError for frames with lens distortion, which the flare was not fitted with, SettingsError where frames
     would be overwritten, FrameError for a frame that cannot be read.
@@ -46,7 +47,7 @@ def remove_fitted(fitted: Renderer, capture: Capture, views: Sequence[View], fol
     progress.stage("remove", len(views))
     made = 0
     for view, targets in zip(views, results, strict=True):
-        if overwrite or not are_newer(targets, [capture.frame_path(view)]):
+        if overwrite or not are_newer(targets, [capture.frame_path(view), *([made_by] if made_by else [])]):
             _remove(fitted, capture, view, targets)
             made += 1
         progress.advance()

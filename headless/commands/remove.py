@@ -73,6 +73,7 @@ def _by_run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     from ...core.bake.frames import chosen, numbered
     from ...core.capture import Capture
     from ...core.fit import Run
+    from ...core.fit.run import FLARE
     from ...core.removal.fitted import remove_fitted
 
     network = (words.weights, words.working_size, words.keep_glare, words.matte, words.stills)
@@ -84,7 +85,7 @@ def _by_run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     frames = chosen(numbered([view.name for view in capture.views]), words.frames)
     wanted = {frame.view for frame in frames}
     return remove_fitted(fitted, capture, [view for view in capture.views if view.name in wanted], words.out, progress,
-                         flare_folder=words.flare, overwrite=words.overwrite)
+                         flare_folder=words.flare, overwrite=words.overwrite, made_by=fitted.folder / FLARE)
 
 
 def _remover(words: argparse.Namespace) -> Remover:

@@ -2,6 +2,7 @@
 """Frames of a capture without the flare that was fitted to them."""
 from __future__ import annotations
 
+import os
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
@@ -150,6 +151,13 @@ def test_flares_that_are_asked_for_later_are_made(capture: Capture, tmp_path: Pa
     for flares, made in ((None, 3), (tmp_path / "flare", 3), (tmp_path / "flare", 0)):
         found = remove_fitted(Exact(), capture, capture.views, tmp_path / "clean", Progress(), flare_folder=flares)
         assert found["made"] == made
+    fit = tmp_path / "flare.flare"
+    for later, made in ((-10, 0), (10, 3)):
+        fit.touch()
+        now = (tmp_path / "clean" / capture.views[0].name).stat().st_mtime
+        os.utime(fit, (now + later, now + later))
+        found = remove_fitted(Exact(), capture, capture.views, tmp_path / "clean", Progress(), made_by=fit)
+        assert found["made"] == made, "a fit that has gone on since has other flares"
     with pytest.raises(SettingsError, match="overwritten"):
         linear = _as_exr(capture, tmp_path / "exr", colour_space("linear"))
         remove_fitted(Exact(), linear, linear.views, tmp_path / "other", Progress(),

@@ -7,15 +7,16 @@
     engine.py, jobs.py  the process with torch            fits.py          fits
     looks.py            .flare, flares, occlusion         overlay.py, points.py   what is drawn in the viewport
     shots.py            what is baked                     compositor.py, layer_folder.py   layers back together
-    library.py          flares for other shots            operators/, panels.py   buttons and panels
+    library.py          flares for other shots            paths.py         files of a .blend that moves
+    operators/, panels.py   buttons and panels
 """
 from __future__ import annotations
 
 import bpy
 
-from . import fits, jobs, looks, operators, overlay, panels, points, preferences, properties
+from . import fits, jobs, looks, operators, overlay, panels, paths, points, preferences, properties
 
-_MODULES = (properties, preferences, operators, panels, points, overlay)
+_MODULES = (properties, preferences, operators, panels, points, overlay, paths)
 
 
 @bpy.app.handlers.persistent

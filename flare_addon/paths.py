@@ -7,19 +7,67 @@ from pathlib import Path
 
 import bpy
 
+OURS = ("capture", "matte", "run", "flare", "layers")
+"""Of a scene, the properties that hold one."""
+
+_before: dict[tuple[str, str], str] = {}
+"""By scene and property what they were before the save that goes on now."""
+
 
 def stored(path: Path) -> str:
     """A path as a .blend keeps it: relative to the file where it can be."""
-    text = os.fspath(path.resolve())
-    if bpy.data.filepath:
-        try:
-            return str(bpy.path.relpath(text))
-        except ValueError:  # another drive
-            return text
-    return text
+    return _relative(path.resolve(), bpy.data.filepath)
 
 
 def absolute(text: str) -> Path:
     """Of such a path the place on disk, without `..`: below a linked folder that would lead elsewhere, and the same
     place would have several names."""
     return Path(os.path.normpath(bpy.path.abspath(text)))
+
+
+def _relative(path: Path, blend: str) -> str:
+    if not blend:
+        return os.fspath(path)
+    try:
+        return str(bpy.path.relpath(os.fspath(path), start=os.fspath(Path(blend).parent)))
+    except ValueError:  # another drive
+        return os.fspath(path)
+
+
+# ---- a .blend saved elsewhere: what Blender does for its own paths ----------------------------------
+
+
+@bpy.app.handlers.persistent
+def _remap(blend: str, *_: object) -> None:
+    """Before a save: relative paths from where the file goes."""
+    _before.clear()
+    if not blend or not bpy.data.filepath or Path(blend).parent == Path(bpy.data.filepath).parent:
+        return
+    for scene in bpy.data.scenes:
+        for name in OURS:
+            text = getattr(scene.fit_flare, name)
+            if text.startswith("//"):
+                _before[scene.name, name] = text
+                setattr(scene.fit_flare, name, _relative(absolute(text), blend))
+
+
+@bpy.app.handlers.persistent
+def _put_back(blend: str, *_: object) -> None:
+    """After a save: as they were, where it was a copy or failed and the file here is still the other one."""
+    if not blend or Path(blend).parent != Path(bpy.data.filepath).parent:
+        for (scene, name), text in _before.items():
+            setattr(bpy.data.scenes[scene].fit_flare, name, text)
+    _before.clear()
+
+
+_HANDLERS = (("save_pre", _remap), ("save_post", _put_back), ("save_post_fail", _put_back))
+
+
+def register() -> None:
+    for when, handler in _HANDLERS:
+        getattr(bpy.app.handlers, when).append(handler)
+
+
+def unregister() -> None:
+    for when, handler in _HANDLERS:
+        getattr(bpy.app.handlers, when).remove(handler)

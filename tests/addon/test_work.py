@@ -87,6 +87,11 @@ def test_a_blend_below_a_linked_folder_finds_its_files(facts: Any) -> None:
     assert facts["through a link"] == ["//", True]
 
 
+def test_a_blend_saved_elsewhere_finds_its_files(facts: Any) -> None:
+    assert facts["after a copy"], "the file that is open is where it was"
+    assert facts["saved elsewhere"] == [["//..", True], True, True]
+
+
 @pytest.mark.parametrize("kind", ["animated", "each"])
 def test_cameras_see_points_where_the_footage_has_them(facts: Any, kind: str) -> None:
     """Off-centre principal point, turned and scaled root; by the matrices Blender renders with."""

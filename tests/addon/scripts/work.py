@@ -360,6 +360,16 @@ link.symlink_to(real, target_is_directory=True)
 bpy.ops.wm.save_as_mainfile(filepath=str(link / "a.blend"))
 paths = part("flare_addon.paths")
 facts["through a link"] = [paths.stored(beside)[:2], paths.absolute(paths.stored(beside)).is_dir()]
+state = bpy.context.scene.fit_flare
+state.capture, state.flare = paths.stored(beside), str(beside / "a.flare")
+(beside / "versions").mkdir()
+bpy.ops.wm.save_as_mainfile(filepath=str(beside / "copy.blend"), copy=True)
+facts["after a copy"] = paths.absolute(state.capture) == beside.resolve()
+bpy.ops.wm.save_as_mainfile(filepath=str(beside / "versions" / "b.blend"))
+facts["saved elsewhere"] = [[state.capture, paths.absolute(state.flare) == beside / "a.flare"]]
+for name in ("copy.blend", "versions/b.blend"):
+    bpy.ops.wm.open_mainfile(filepath=str(beside / name))
+    facts["saved elsewhere"].append(str(paths.absolute(bpy.context.scene.fit_flare.capture)) == str(beside))
 
 # ---- the engine's own bake of a shot, from the panel ------------------------------------------------
 replace(shot, frames=shot.frames[:1]).write(Path(out) / "shot.json")

@@ -43,7 +43,7 @@ def _remap(blend: str, *_: object) -> None:
     _before.clear()
     if not blend or not bpy.data.filepath or Path(blend).parent == Path(bpy.data.filepath).parent:
         return
-    for scene in bpy.data.scenes:
+    for scene in (scene for scene in bpy.data.scenes if scene.library is None):
         for name in OURS:
             text = getattr(scene.fit_flare, name)
             if text.startswith("//"):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Files that are whole or absent, and names that stay inside their folder."""
+"""Files that are whole or absent, names that stay inside their folder, and results that are written over nothing."""
 from __future__ import annotations
 
 import contextlib
@@ -9,11 +9,11 @@ import os
 import shutil
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
-from .errors import FitFlareError
+from .errors import FitFlareError, SettingsError
 
 _PARTIAL = ".partial-"
 _REFUSALS = 100  # a hundredth of a second apart
@@ -157,3 +157,24 @@ def inside(folder: Path | str, name: str, error: type[FitFlareError]) -> Path:
     if not path.resolve().is_relative_to(folder.resolve()):
         raise error(f"{path} is a link that leads out of {folder}; put the file itself there.")
     return path
+
+
+def check_apart(sources: Iterable[Path], results: Iterable[Path]) -> None:
+    """Raises SettingsError where a result would be written over a source, or two would be the same file."""
+    read, written = {path.resolve() for path in sources}, set()
+    for path in results:
+        whole = path.resolve()
+        if whole in read:
+            raise SettingsError(f"{path} would be overwritten by a result; choose another folder for the results.")
+        if whole in written:
+            raise SettingsError(f"Two results would be written to the same file, {path}; choose another folder for "
+                                "one kind of them, or take plates that differ by their suffix alone apart.")
+        written.add(whole)
+
+
+def are_newer(results: Iterable[Path], sources: Iterable[Path]) -> bool:
+    """Whether all results are there, and none older than a source."""
+    results, sources = list(results), list(sources)
+    if not all(path.is_file() for path in [*results, *sources]):
+        return False
+    return min(path.stat().st_mtime for path in results) >= max(path.stat().st_mtime for path in sources)

@@ -18,7 +18,7 @@ from typing import Any, BinaryIO, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from . import tiff
+from . import jpeg, tiff
 from .errors import FrameError
 from .files import atomic_path
 
@@ -112,16 +112,24 @@ def stored_pixels(path: Path) -> NDArray[Any]:
     import cv2
 
     width, height = picture_size(path)
-    data = np.fromfile(path, np.uint8)  # imread cannot open every path that Windows allows
+    stored = decoded(path, cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
+    if stored is None or stored.shape[:2] != (height, width):
+        raise FrameError(f"{path} is damaged or truncated; export it again.")
+    return stored
+
+
+def decoded(path: Path, flags: int) -> NDArray[Any] | None:
+    """What OpenCV makes of a file by its `flags`, of a TIFF as it is stored; None where that is nothing. From memory,
+    since its own reader cannot open every path that Windows allows."""
+    import cv2
+
+    data = np.fromfile(path, np.uint8)
     if data[:4].tobytes() in (b"II*\0", b"MM\0*"):
         data = np.frombuffer(tiff.as_stored(data.tobytes()), np.uint8)
     try:
-        stored = cv2.imdecode(data, cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
+        return cv2.imdecode(data, flags) if data.size else None
     except cv2.error:
-        stored = None
-    if stored is None or stored.shape[:2] != (height, width):
-        raise FrameError(f"{path} is damaged or truncated; export it again.")
-    return np.asarray(stored)
+        return None
 
 
 def picture_size(path: Path | str) -> tuple[int, int]:
@@ -146,33 +154,13 @@ def _size_from_header(stream: BinaryIO) -> tuple[int, int] | None:
     if head[:8] == b"\x89PNG\r\n\x1a\n" and len(head) == 24:
         return int.from_bytes(head[16:20], "big"), int.from_bytes(head[20:24], "big")
     if head[:2] == b"\xff\xd8":
-        return _jpeg_size(stream)
+        header = jpeg.frame_header(stream)
+        return header[:2] if header else None
     if head[:4] in (b"II*\0", b"MM\0*"):
         sides = tiff.read_tags(stream, (tiff.WIDTH, tiff.HEIGHT))
         return (int(sides[tiff.WIDTH].values[0]), int(sides[tiff.HEIGHT].values[0])) if len(sides) == 2 else None
     if head[:4] == b"\x76\x2f\x31\x01":
         return _exr_size(stream)
-    return None
-
-
-def _jpeg_size(stream: BinaryIO) -> tuple[int, int] | None:
-    """Walk the segments to the frame header (SOF)."""
-    stream.seek(2)
-    while marker := stream.read(2):
-        while len(marker) == 2 and marker[1] == 0xFF:  # fill bytes may stand before a marker
-            marker = marker[1:] + stream.read(1)
-        if len(marker) < 2 or marker[0] != 0xFF:
-            return None
-        segment = stream.read(2)
-        length = int.from_bytes(segment, "big")
-        if len(segment) < 2 or length < 2:
-            return None
-        if 0xC0 <= marker[1] <= 0xCF and marker[1] not in (0xC4, 0xC8, 0xCC):
-            frame = stream.read(5)
-            if len(frame) < 5:
-                return None
-            return int.from_bytes(frame[3:5], "big"), int.from_bytes(frame[1:3], "big")
-        stream.seek(length - 2, os.SEEK_CUR)
     return None
 
 

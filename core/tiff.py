@@ -39,9 +39,10 @@ def short(value: int) -> Tag:
     return Tag(3, np.array([value], np.uint16))
 
 
-def read_tags(stream: BinaryIO, wanted: Container[int]) -> dict[int, Tag]:
-    """Of the first page; those that are damaged are left out, and all where it is no TIFF."""
-    order, entries = next(_directories(stream), _NONE)
+def read_tags(stream: BinaryIO, wanted: Container[int], at: int | None = None) -> dict[int, Tag]:
+    """Of the first page, or of the directory that stands `at`; those that are damaged are left out, and all where it is
+    no TIFF."""
+    order, entries = next(_directories(stream, at), _NONE)
     found: dict[int, Tag] = {}
     for entry in entries:
         number, kind, count = struct.unpack(order + "HHI", entry[:8])
@@ -103,14 +104,15 @@ def as_stored(data: bytes) -> bytes:
     return with_tags(data, instead)
 
 
-def _directories(stream: BinaryIO) -> Iterator[tuple[_Order, list[bytes]]]:
-    """(byte order, entries of 12 bytes) page by page, as far as the file is whole."""
+def _directories(stream: BinaryIO, at: int | None = None) -> Iterator[tuple[_Order, list[bytes]]]:
+    """(byte order, entries of 12 bytes) page by page, or from the directory that stands `at`, as far as the file is
+    whole."""
     stream.seek(0)
     head = stream.read(8)
     if head[:4] not in (b"II*\0", b"MM\0*") or len(head) < 8:
         return
     order: _Order = "<" if head[:2] == b"II" else ">"
-    at = struct.unpack(order + "I", head[4:])[0]
+    at = struct.unpack(order + "I", head[4:])[0] if at is None else at
     for _ in range(_MOST_PAGES):
         stream.seek(at)
         count = stream.read(2)

@@ -9,7 +9,7 @@ from typing import Any
 
 import bpy
 
-from ..core.errors import CaptureError, RunError
+from ..core.errors import CaptureError, RunError, SettingsError
 from ..core.files import write_json
 from ..core.look import Edit, LookEdits
 from ..core.look.shot import Shot, ShotFrame
@@ -89,6 +89,15 @@ def layers_folder(scene: Any, create: bool = False) -> Path:
             folder = base / f"layers_{number}"
         state.layers = stored(folder)
     return absolute(state.layers) if state.layers else Path()
+
+
+def folder_of_camera(layers: Path, camera: Any) -> Path:
+    """Where a camera's layers are, in a folder into which one or several were baked."""
+    try:
+        folders = Shot.read(layers / SHOT).folders
+    except SettingsError:
+        return layers
+    return layers / folders.get(camera.name if camera is not None else "", "")
 
 
 def bake(scene: Any, chosen: Sequence[Any]) -> Job:

@@ -27,10 +27,10 @@ from . import hand_off
 POLL_S = 0.2
 
 
-def add_option(parser: argparse.ArgumentParser, help_text: str = "processes at once on this machine, each with a share "
-               "of the frames (default 1)") -> None:
-    """--jobs N."""
-    parser.add_argument("--jobs", type=int, default=1, metavar="N", help=help_text)
+def add_option(parser: argparse.ArgumentParser,
+               what: str = "processes at once on this machine, each with a share of the frames") -> None:
+    """--jobs N, of `what`."""
+    parser.add_argument("--jobs", type=int, default=1, metavar="N", help=f"{what} (default 1)")
 
 
 def shares(numbers: Sequence[int], jobs: int) -> list[str]:

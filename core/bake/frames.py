@@ -26,6 +26,11 @@ class Frame:
     file: str
 
 
+def layers_file(folder: PurePosixPath | str, number: int) -> str:
+    """A frame's file in its folder, "" for none."""
+    return str(PurePosixPath(folder) / f"layers.{number:04d}.exr")
+
+
 def numbered(views: Iterable[str]) -> list[Frame]:
     """Frames for views, by folder and number. A view in a folder keeps the folder: `left/layers.0001.exr`."""
     folders: dict[PurePosixPath, list[str]] = {}
@@ -38,7 +43,7 @@ def numbered(views: Iterable[str]) -> list[Frame]:
         if len(set(numbers)) < len(names):
             names, numbers = sorted(names), list(range(1, len(names) + 1))
         pairs = sorted(zip(numbers, names, strict=True))
-        frames += [Frame(name, number, str(folder / f"layers.{number:04d}.exr")) for number, name in pairs]
+        frames += [Frame(name, number, layers_file(folder, number)) for number, name in pairs]
     return frames
 
 

@@ -25,7 +25,7 @@ from ..look import LookEdits, read
 from ..look.shot import PlacedLight, Shot, ShotFrame, evaluate
 from ..progress import Progress
 from .bake import BakeSettings, bake_frames
-from .frames import Frame
+from .frames import Frame, layers_file
 from .layers import FrameLayers, Rendered
 
 
@@ -47,20 +47,12 @@ class ShotRenderer:
 
     @property
     def fingerprint(self) -> str:
-        """Changes whenever all pictures would; what is a frame's alone, `fingerprint_of` tells."""
+        """Changes whenever all pictures would; what is a frame's alone, its renderer's tells."""
         digest = hashlib.sha256(self.shot.flare.read_bytes())
         digest.update(repr((self.shot.query, self.shot.live, self.lights)).encode())
         if self.run is not None:
             digest.update(self.run.fingerprint.encode())
         return digest.hexdigest()[:16]
-
-    @staticmethod
-    def fingerprint_of(one: ShotFrame) -> str:
-        """Of a frame's camera, lights and edits."""
-        camera = one.camera
-        told = (one.frame, one.name, camera.size, camera.intrinsics.tolist(), camera.world_to_camera.tolist(),
-                one.edits, [(light.name, light.source, light.xyz.tolist(), light.share) for light in one.lights])
-        return hashlib.sha256(repr(told).encode()).hexdigest()[:16]
 
     def render(self, one: ShotFrame, camera: Camera) -> Rendered:
         """The layers of a frame, under its camera at the size asked for."""
@@ -106,8 +98,8 @@ class _OfFrame:
 
     @property
     def fingerprint(self) -> str:
-        """See `ShotRenderer.fingerprint_of`."""
-        return self.renderer.fingerprint_of(self.one)
+        """Of the frame's camera, lights and edits."""
+        return hashlib.sha256(self.one.described().encode()).hexdigest()[:16]
 
     def render(self, camera: Camera, edits: LookEdits | None = None) -> Rendered:  # noqa: ARG002 - see above
         return self.renderer.render(self.one, camera)
@@ -124,13 +116,9 @@ def bake_shot(shot: Shot, out: Path | str, *, half: bool = True, overwrite: bool
     Raises what `bake` raises, and FlareFileError."""
     folders = shot.folders
     shown = {f"{one.name}/{one.frame}": one for one in shot.frames if wanted is None or one.frame in wanted}
-    frames = [Frame(view, one.frame, _file(one, folders[one.name])) for view, one in shown.items()]
+    frames = [Frame(view, one.frame, layers_file(folders[one.name], one.frame)) for view, one in shown.items()]
     cameras = {view: one.camera for view, one in shown.items()}
     renderer = ShotRenderer(shot)
     settings = BakeSettings(half=half, space=space, config=config)
     return bake_frames(renderer, frames, cameras, out, lambda frame: _OfFrame(renderer, shown[frame.view]), settings,
                        progress, overwrite=overwrite)
-
-
-def _file(one: ShotFrame, folder: str) -> str:
-    return f"{folder}/layers.{one.frame:04d}.exr" if folder else f"layers.{one.frame:04d}.exr"

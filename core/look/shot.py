@@ -53,6 +53,13 @@ class ShotFrame:
     lights: tuple[PlacedLight, ...]
     edits: tuple[str, ...] = ()
 
+    def described(self) -> str:
+        """Changes whenever its picture would, with one .flare and query."""
+        camera = self.camera
+        return repr((self.frame, self.name, self.edits, camera.size, camera.intrinsics.tolist(),
+                     camera.world_to_camera.tolist(),
+                     [(light.name, light.source, light.xyz.tolist(), light.share) for light in self.lights]))
+
 
 def evaluate(look: Look, world_to_camera: Any, lights: Sequence[PlacedLight], edits: LookEdits | None = None,
              query: Query = "target") -> dict[str, PlaneGaussians]:

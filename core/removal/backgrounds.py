@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import SettingsError
+from ..pictures import decoded
 from . import variety
 from .formation import Pixels
 from .synthesis.canvas import uniform_log
@@ -77,8 +78,7 @@ def read_backgrounds(folders: Iterable[Path | str], part: Part = "all", longest:
             if suffix not in PHOTOS | MAPS or (part != "all" and kept_for_test(path.name) != (part == "test")):
                 continue
             if suffix in PHOTOS:
-                data = np.fromfile(path, np.uint8)
-                picture = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
+                picture = decoded(path, cv2.IMREAD_COLOR)
                 if picture is None or min(picture.shape[:2]) < 64:
                     continue
                 scale = longest / max(picture.shape[:2])
@@ -110,8 +110,7 @@ def _environment(path: Path) -> NDArray[np.float16] | None:
             return None
         light: NDArray[Any] = np.stack([channels[name] for name in "RGB"], -1)
     else:
-        data = np.fromfile(path, np.uint8)
-        found = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
+        found = decoded(path, cv2.IMREAD_UNCHANGED)
         if found is None:
             return None
         light = found[..., ::-1]

@@ -7,16 +7,12 @@ from collections.abc import Container, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from ..errors import FrameError, SettingsError
-from ..files import remove_partial_of
-from ..pictures import write_exr
+from ..files import are_newer, check_apart, remove_partial_of
 from ..progress import Progress
 from .inference import Remover
 from .mattes import Mattes
-from .plates import plates_below, write_plate
-from .results import are_newer, check_apart
+from .plates import plates_below, write_flare, write_plate
 from .steady import Sequences, by_number
 
 TOLD = 20  # failures that are spelled out in the last sentence
@@ -97,5 +93,4 @@ def _remove(path: Path, name: Path, results: Sequence[Path], remover: Remover, s
     codes, flare = remover.remove(plate, mattes.read(name, width, height) if mattes else None, told)
     write_plate(results[0], plate, codes)
     for result in results[1:]:
-        write_exr(result, {channel: np.ascontiguousarray(flare[..., k]) for k, channel in enumerate("RGB")},
-                  header=plate.placing)
+        write_flare(result, plate, flare)

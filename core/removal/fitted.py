@@ -18,13 +18,12 @@ from numpy.typing import NDArray
 from ..capture import Capture, View
 from ..capture.discs import clipped_discs
 from ..errors import CaptureError
-from ..files import inside, remove_partial_of
+from ..files import are_newer, check_apart, inside, remove_partial_of
 from ..metrics.evaluation import Renderer
-from ..pictures import linear_from_srgb, srgb_from_linear, write_exr
+from ..pictures import linear_from_srgb, srgb_from_linear
 from ..progress import Progress
 from .inference import CLIPPED
-from .plates import Plate, read_plate, write_plate
-from .results import are_newer, check_apart
+from .plates import Plate, read_plate, write_flare, write_plate
 
 Pixels = NDArray[np.float32]
 
@@ -80,7 +79,7 @@ def _remove(fitted: Renderer, capture: Capture, view: View, results: Sequence[Pa
     lights = clipped_discs(_display(plate), camera, [light.xyz for light in capture.lights])
     write_plate(results[0], plate, without(plate, np.where(lights[..., None], 0, flare), scene))
     for result in results[1:]:
-        write_exr(result, {name: flare[..., k] for k, name in enumerate("RGB")}, header=plate.placing)
+        write_flare(result, plate, flare)
 
 
 def _display(plate: Plate) -> Pixels:

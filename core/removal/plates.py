@@ -19,17 +19,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .. import tiff
+from .. import jpeg, tiff
 from ..colour import ColourSpace, colour_space, space_of_chromaticities
 from ..errors import FrameError
 from ..files import atomic_path
-from ..pictures import SUFFIXES, Encoding, picture_size, save_exr, stored_pixels
+from ..pictures import SUFFIXES, Encoding, picture_size, save_exr, stored_pixels, write_exr
 
 _KEPT_CHUNKS = (b"iCCP", b"gAMA", b"cHRM", b"sRGB", b"pHYs", b"eXIf", b"cICP")
 _KEPT_TAGS = (tiff.ORIENTATION, tiff.EXTRA_SAMPLES, tiff.X_RESOLUTION, tiff.Y_RESOLUTION, tiff.RESOLUTION_UNIT,
               tiff.XMP, tiff.COLOUR_PROFILE)
 _PLACING = ("chromaticities", "dataWindow", "displayWindow", "pixelAspectRatio")
-_JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+_CMYK = "is CMYK, for print; convert it to RGB"
 _JPEGS, _TIFFS = (".jpg", ".jpeg"), (".tif", ".tiff")
 
 
@@ -89,7 +89,9 @@ def read_plate(path: Path | str) -> Plate:
 
 
 def _read_codes(path: Path) -> Plate:
-    _check_is_one_colour_picture(path)
+    misread = _misread(path)
+    if misread:
+        raise FrameError(f"{path} {misread}.")
     stored = stored_pixels(path)
     if stored.dtype not in (np.uint8, np.uint16, np.float32):
         raise FrameError(f"{path} holds {stored.dtype} pixels; save it as 8 or 16 bit or as 32 bit float.")
@@ -102,24 +104,22 @@ def _read_codes(path: Path) -> Plate:
     return Plate(path, codes, "linear" if stored.dtype == np.float32 else "srgb", grey, alpha)
 
 
-def _check_is_one_colour_picture(path: Path) -> None:
-    """Raises FrameError for what OpenCV would read without a word as something else."""
+def _misread(path: Path) -> str:
+    """What OpenCV would read without a word as something else, and what to do; "" where there is no such thing."""
     with open(path, "rb") as stream:
-        samples = 0
         if path.suffix.lower() in _JPEGS:
-            frames = (segment for marker, segment in _jpeg_segments(stream.read()) if marker in _JPEG_FRAMES)
-            samples = next((segment[9] for segment in frames), 0)
-        elif path.suffix.lower() in _TIFFS:
-            pages = tiff.page_count(stream)
-            if pages > 1:
-                raise FrameError(f"{path} has {pages} pages; export the plate as a file of its own.")
-            told = tiff.read_tags(stream, (tiff.SAMPLES, tiff.PHOTOMETRIC))
-            if tiff.SAMPLES in told and int(told[tiff.SAMPLES].values[0]) == 2:
-                raise FrameError(f"{path} is grey with alpha; save it as RGB with alpha, or as PNG.")
-            if tiff.PHOTOMETRIC in told and int(told[tiff.PHOTOMETRIC].values[0]) == tiff.SEPARATED:
-                samples = 4
-    if samples == 4:
-        raise FrameError(f"{path} is CMYK, for print; convert it to RGB.")
+            header = jpeg.frame_header(stream)
+            return _CMYK if header is not None and header[2] == 4 else ""
+        if path.suffix.lower() not in _TIFFS:
+            return ""
+        told = {name: int(tag.values[0]) for name, tag in
+                tiff.read_tags(stream, (tiff.SAMPLES, tiff.PHOTOMETRIC)).items()}
+        pages = tiff.page_count(stream)
+    if pages > 1:
+        return f"has {pages} pages; export the plate as a file of its own"
+    if told.get(tiff.SAMPLES) == 2:
+        return "is grey with alpha; save it as RGB with alpha, or as PNG"
+    return _CMYK if told.get(tiff.PHOTOMETRIC) == tiff.SEPARATED else ""
 
 
 def _read_exr(path: Path) -> Plate:
@@ -170,6 +170,11 @@ def write_plate(path: Path | str, plate: Plate, codes: NDArray[Any], quality: in
         temporary.write_bytes(_tagged(data.tobytes(), suffix, plate))
 
 
+def write_flare(path: Path | str, plate: Plate, flare: NDArray[Any]) -> None:
+    """Write what was taken from a plate, light (height, width, 3) in its colours, as an EXR that lies where it does."""
+    write_exr(path, {name: flare[..., k] for k, name in enumerate("RGB")}, header=plate.placing)
+
+
 def _tagged(encoded: bytes, suffix: str, plate: Plate) -> bytes:
     """With what the plate's file says about how it is to be shown, where both are of one kind."""
     source = plate.path.suffix.lower()
@@ -202,22 +207,11 @@ def _write_exr(path: Path, plate: Plate, codes: NDArray[Any]) -> None:
 
 
 def _jpeg_tags(path: Path) -> Iterator[bytes]:
-    """The source's EXIF and colour profile segments (APP1, APP2), which say how it is to be shown."""
-    for marker, segment in _jpeg_segments(path.read_bytes()):
-        if marker in (0xE1, 0xE2) and segment[4:8] in (b"Exif", b"ICC_"):
-            yield segment
-
-
-def _jpeg_segments(data: bytes) -> Iterator[tuple[int, bytes]]:
-    """(marker, whole segment) of a JPEG before its pixels."""
-    at = 2
-    while at + 4 <= len(data) and data[at] == 0xFF and data[at + 1] != 0xDA:
-        if data[at + 1] == 0xFF:  # a fill byte
-            at += 1
-            continue
-        length = struct.unpack(">H", data[at + 2:at + 4])[0]
-        yield data[at + 1], data[at:at + 2 + length]
-        at += 2 + length
+    """The source's EXIF and colour profile segments, which say how it is to be shown."""
+    with open(path, "rb") as stream:
+        for marker, content in jpeg.segments(stream):
+            if marker in (jpeg.EXIF, jpeg.PROFILE) and content[:4] in (b"Exif", b"ICC_"):
+                yield jpeg.segment(marker, content)
 
 
 def _png_chunks(data: bytes) -> Iterator[tuple[bytes, bytes]]:

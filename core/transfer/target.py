@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..bake.frames import Frame, numbered
+from ..bake.frames import Frame, layers_file, numbered
 from ..capture import Camera, Capture, Light, View, read_lights
 from ..errors import CaptureError, SettingsError
 from ..gaussians.ply import read_ply
@@ -50,11 +50,8 @@ class TargetFrame:
 
     def described(self) -> str:
         """Changes whenever the frame would; its plate counts by name and length, so that mirrored disks agree."""
-        camera = self.shot.camera
         plate = (self.plate.name, self.plate.stat().st_size) if self.plate else None
-        return repr((self.frame, self.shot.name, self.shot.edits, camera.size, camera.intrinsics.tolist(),
-                     camera.world_to_camera.tolist(), plate,
-                     [(light.name, light.source, light.xyz.tolist(), light.share) for light in self.shot.lights]))
+        return repr((self.frame, plate)) + self.shot.described()
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,8 +203,7 @@ def of_shot(shot: Shot, look: Look, wanted: Mapped, *, plates: Path | None = Non
         if plates and one.frame not in given:
             raise SettingsError(f"{plates} has no picture for frame {one.frame}.")
         lights = tuple(replace(light, source=sources[light.name]) for light in one.lights)
-        file = Path(folders[one.name]) / f"layers.{one.frame:04d}.exr"
-        frame = Frame(f"{one.name}/{one.frame}", one.frame, file.as_posix())
+        frame = Frame(f"{one.name}/{one.frame}", one.frame, layers_file(folders[one.name], one.frame))
         frames.append(TargetFrame(frame, replace(one, lights=lights), given.get(one.frame)))
     if not frames:
         raise SettingsError("The shot has no frames; export it again.")

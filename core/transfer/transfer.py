@@ -22,7 +22,7 @@ from ..bake.frames import Frame
 from ..bake.layers import FrameLayers, Rendered
 from ..capture import Camera
 from ..colour import ColourSpace, colour_space
-from ..files import remove_partial_of
+from ..files import check_apart, remove_partial_of
 from ..fit.rendering import as_tensors, pose_and_intrinsics
 from ..flare.compositing import decode, encode, splat_flare
 from ..flare.compositing import layers as linear_layers
@@ -32,7 +32,6 @@ from ..look import LookEdits, ViewOfLight, read
 from ..look.shot import PlacedLight
 from ..pictures import Picture
 from ..progress import Progress
-from ..removal.results import check_apart
 from . import query as queries
 from .plates import AUTO, ColouredPlate
 from .query import Query

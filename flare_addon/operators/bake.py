@@ -9,8 +9,7 @@ from typing import Any
 import bpy
 
 from ...core.bake.layers import layer_names
-from ...core.errors import FitFlareError, FrameError
-from ...core.look.shot import Shot
+from ...core.errors import FrameError
 from .. import compositor, engine, jobs, looks, shots
 from ..layer_folder import LayerFolder
 from ..paths import absolute
@@ -54,7 +53,7 @@ def _baking(scene: Any) -> bool:
 def set_up(operator: Any, scene: Any, folder: str, *, keep_image: bool, plate: bool, match: bool = False) -> None:
     """Nodes for the layers in a folder, over the baked scene, what the compositor shows now (`keep_image`) or the
     footage behind the camera (`plate`); `match` gives the scene their frames and size. Raises FrameError."""
-    layers = LayerFolder.open(_of_camera(absolute(folder), scene))
+    layers = LayerFolder.open(shots.folder_of_camera(absolute(folder), scene.camera))
     compositor.set_up(scene, layers, keep_image=keep_image, plate=footage_of(scene) if plate else None)
     if match:
         compositor.match_scene(scene, layers, layers.size())
@@ -100,15 +99,6 @@ class FITFLARE_OT_set_up_compositor(Action, bpy.types.Operator):
     def act(self, context: bpy.types.Context) -> None:
         set_up(self, context.scene, self.directory, keep_image=self.keep_image, plate=self.plate,
                match=self.match_scene)
-
-
-def _of_camera(folder: Path, scene: Any) -> Path:
-    """The folder of the scene camera's layers, where those of several cameras were baked into this one."""
-    try:
-        folders = Shot.read(folder / shots.SHOT).folders
-    except FitFlareError:
-        return folder
-    return folder / folders.get(scene.camera.name if scene.camera is not None else "", "")
 
 
 def footage_of(scene: Any) -> tuple[Any, int, int, int]:

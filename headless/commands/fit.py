@@ -33,7 +33,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
                         help="a text file with a capture's folder on each line, instead of CAPTURE: --out is then the "
                              "folder of the runs, each under its capture's name")
     parser.add_argument("--entry", type=int, metavar="N", help="which line of --list, from 1 (default: all of them)")
-    jobs.add_option(parser, "captures of a --list that are fitted at once on this machine (default 1)")
+    jobs.add_option(parser, "captures of a --list that are fitted at once on this machine")
     parser.add_argument("--resume", action="store_true",
                         help="go on with the run in --out, with the settings it was begun with; begin it if there is "
                              "none")

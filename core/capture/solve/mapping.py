@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ...errors import CaptureError, EngineError
 from ...files import read_json, write_json, write_text
-from ...pictures import picture_size
+from ...pictures import decoded, picture_size
 from ...progress import Progress
 from ..camera import Floats
 from ..lens import MODELS, Lens
@@ -173,8 +173,7 @@ def _grey(path: Path) -> NDArray[np.uint8]:
     """(height, width) of one of our own pictures. Raises CaptureError where it was damaged since."""
     import cv2
 
-    data = np.fromfile(path, np.uint8)  # imread cannot open every path that Windows allows
-    picture = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if data.size else None
+    picture = decoded(path, cv2.IMREAD_GRAYSCALE)
     if picture is None:
         raise CaptureError(f"{path} is damaged; remove the folder {path.parents[1]} and solve again.")
     return np.asarray(picture, np.uint8)

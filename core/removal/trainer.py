@@ -136,10 +136,13 @@ class Trainer:
         return {name: value.detach().cpu().contiguous() for name, value in state.items()}
 
     def load_state(self, state: Mapping[str, Tensor], iteration: int) -> None:
-        """Go on from `state`, or from weights alone (then with fresh moments)."""
+        """Go on from `state`, or from weights alone (then with fresh moments), of a network that may have fewer
+        blocks: the others do nothing yet."""
         self.iteration = iteration
         if not any(name.startswith("network.") for name in state):
-            state = {f"{part}.{name}": value for name, value in state.items() for part in ("network", "averaged")}
+            grown = {name: value for name, value in self.network.state_dict().items() if name.startswith("enter.")}
+            state = {f"{part}.{name}": value for name, value in {**grown, **state}.items()
+                     for part in ("network", "averaged")}
         try:
             self.network.load_state_dict({name.removeprefix("network."): value.float()
                                           for name, value in state.items() if name.startswith("network.")})

@@ -60,11 +60,11 @@ def train(recipe: Recipe, folder: Path | str, backgrounds: Backgrounds, lenses: 
           progress: Progress | None = None) -> Path:
     """Train in `folder` and give the path of the weights (safetensors, fp16).
 
-    With `resume` a training in the folder goes on, by the given recipe from there on. `start`:
-    weights to begin with. `tests`: backgrounds and lenses kept out, for the checks in the log; the weights given are
-    those of the best check then. Without them, and with flares of the user's own, which the checks have none of, they
-    are the last. `processes` share the work, this one among them: the
-    pictures are the same by any number, the weights but for rounding.
+    With `resume` a training in the folder goes on, by the given recipe from there on. `start`: weights to begin with,
+    in a network of their widths and with as many blocks as they or the recipe have, whichever are more. `tests`:
+    backgrounds and lenses kept out, for the checks in the log; the weights given are those of the best check then.
+    Without them, and with flares of the user's own, which the checks have none of, they are the last. `processes`
+    share the work, this one among them: the pictures are the same by any number, the weights but for rounding.
     Raises RunError, SettingsError, and Cancelled when asked to stop (after a checkpoint).
     """
     progress, folder = progress or Progress(), Path(folder)
@@ -97,15 +97,15 @@ class Beginning(NamedTuple):
     own: OwnFlares | None
 
     def trainer(self, learner: Learner) -> Trainer:
-        """Of the recipe, or that of the weights where they say otherwise. Raises RunError."""
+        """Of the recipe, as wide as the weights' network and at least as deep. Raises RunError."""
         if self.source is None:
             return Trainer(self.recipe, learner)
         state, about = weights.read(self.source)
         widths, blocks = weights.form(self.source, about)
-        recipe = replace(self.recipe, widths=widths, blocks=blocks)
+        recipe = replace(self.recipe, widths=widths, blocks=tuple(map(max, self.recipe.blocks, blocks)))
         iteration = 0
         if self.goes_on:
-            recipe = replace(recipe, seed=json.loads(about["recipe"])["seed"])
+            recipe = replace(recipe, blocks=blocks, seed=json.loads(about["recipe"])["seed"])
             iteration = int(about["iteration"])
         trainer = Trainer(recipe, learner)
         trainer.load_state(state, iteration)

@@ -160,6 +160,23 @@ def test_going_on_from_weights(tmp_path: Path) -> None:
         training.train(RECIPE, tmp_path / "fourth", backgrounds(), built_in(), start=tmp_path / "foreign.safetensors")
 
 
+def test_a_network_grows_by_blocks_that_do_nothing_yet(tmp_path: Path) -> None:
+    small, large = replace(RECIPE, blocks=(0, 1, 1, 1, 1)), replace(RECIPE, blocks=(1, 0, 2, 1, 3))
+    first = training.train(small, tmp_path / "first", backgrounds(), built_in(), processes=1)
+    grown = training.Beginning(large, first, False, backgrounds(), built_in(), None).trainer(ALONE)
+    assert [len(enter) for enter in grown.network.enter] == [1, 1, 2, 1, 3]  # type: ignore[arg-type]
+    frame = torch.rand(1, 3, 64, 64)
+    with torch.no_grad():
+        before, after = weights.load(first)(frame), grown.network(frame)
+    assert before.flare.std() > 0
+    torch.testing.assert_close(after.flare, before.flare, rtol=1e-3, atol=1e-6)  # a fused layout adds up otherwise
+    grown_to = training.train(large, tmp_path / "second", backgrounds(), built_in(), start=first, processes=1)
+    assert weights.form(grown_to, weights.read(grown_to)[1]).blocks == (1, 1, 2, 1, 3)
+    longer = replace(large, iterations=5, blocks=(4, 4, 4, 4, 4))
+    training.train(longer, tmp_path / "second", backgrounds(), built_in(), resume=True, processes=1)
+    assert weights.form(grown_to, weights.read(grown_to)[1]).blocks == (1, 1, 2, 1, 3), "none grows on the way"
+
+
 def test_the_log_has_figures_and_checks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(training, "checks", partial(training.checks, count=8))
     training.train(RECIPE, tmp_path, backgrounds(), built_in(), tests=(backgrounds(), built_in()), processes=1)

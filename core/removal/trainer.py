@@ -140,7 +140,8 @@ class Trainer:
         blocks: the others do nothing yet."""
         self.iteration = iteration
         if not any(name.startswith("network.") for name in state):
-            grown = {name: value for name, value in self.network.state_dict().items() if name.startswith("enter.")}
+            grown = {name: value.clone() for name, value in self.network.state_dict().items()
+                     if name.startswith("enter.")}
             state = {f"{part}.{name}": value for name, value in {**grown, **state}.items()
                      for part in ("network", "averaged")}
         try:
@@ -150,7 +151,7 @@ class Trainer:
             raise RunError("The weights to go on from are of another network; give the recipe they were made "
                            "with.") from problem
         for name in self.averaged:
-            self.averaged[name] = state[f"averaged.{name}"].float().to(self.device)
+            self.averaged[name] = state[f"averaged.{name}"].to(self.device, torch.float32, copy=True)
         if iteration:
             self.begun_with = {name.removeprefix("begun."): value.float().to(self.device)
                                for name, value in state.items() if name.startswith("begun.")}

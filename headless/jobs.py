@@ -113,15 +113,19 @@ def run_parts(words: argparse.Namespace, step: str, parts: Sequence[Sequence[str
                 errors[number] = event["text"]
     finally:
         _end(children)
-        said = _last_words(noises[next(iter(errors))]) if errors else ""
+        silent = [number for number, text in errors.items() if not text]
+        said = _last_words(noises[silent[0]]) if silent else ""
         for noise in noises:
             noise.close()
-    if errors:
-        text = " ".join(dict.fromkeys(text for text in errors.values() if text))
-        if not text:
-            sys.stderr.write(said)
-            raise EngineError(f"One of {len(parts)} processes of {step} failed; its last words stand above.")
-        raise FitFlareError(text)
+    told = list(dict.fromkeys(text for text in errors.values() if text))
+    if silent:
+        sys.stderr.write(said)
+        statuses = ", ".join(str(children[number].returncode) for number in silent)
+        told.append(f"{len(silent)} of {len(parts)} processes of {step} ended without a reason, status {statuses}; "
+                    f"{'what one wrote last stands above' if said else 'memory may have been short'}.")
+        raise EngineError(" ".join(told))
+    if told:
+        raise FitFlareError(" ".join(told))
 
 
 def _listen(number: int, child: subprocess.Popen[str], events: queue.Queue[tuple[int, dict[str, Any] | None]]) -> None:

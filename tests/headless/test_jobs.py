@@ -1,0 +1,60 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Shares of the frames, and what is told of processes that failed."""
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import pytest
+from fit_flare.core.errors import EngineError, FitFlareError, SettingsError
+from fit_flare.core.progress import Progress
+from fit_flare.headless import hand_off, jobs
+
+PROCESS = """
+import json, os, sys
+word = sys.argv[sys.argv.index("--frames") + 1]
+if word == "bad":
+    print(json.dumps({"type": "error", "text": "Frame 7 is damaged."}))
+    sys.exit(1)
+if word == "killed":
+    os._exit(9)
+if word == "loud":
+    sys.exit("Bus error at 0x0")
+"""
+
+
+@pytest.fixture
+def program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In place of run.py one that fails as its frames say."""
+    (tmp_path / "run.py").write_text(PROCESS, encoding="utf-8")
+    monkeypatch.setattr(hand_off, "RUN", tmp_path / "run.py")
+
+
+def run(*frames: str) -> None:
+    words = argparse.Namespace(words=["remove"])
+    parts = [["--frames", word] for word in frames]
+    jobs.run_parts(words, "remove", parts, len(parts), len(parts), Progress(), past_failures=True)
+
+
+@pytest.mark.parametrize(("numbers", "count", "expected"), [
+    ([5, 1, 2, 3], 2, ["1-2", "3,5"]), ([4, 4], 3, ["4"]), ([], 2, []),
+])
+def test_shares(numbers: list[int], count: int, expected: list[str]) -> None:
+    assert jobs.shares(numbers, count) == expected
+    with pytest.raises(SettingsError, match="--jobs 0"):
+        jobs.shares(numbers, 0)
+
+
+@pytest.mark.usefixtures("program")
+def test_every_failed_process_is_told_those_without_a_reason_too(capfd: pytest.CaptureFixture[str]) -> None:
+    run("fine", "fine")
+    with pytest.raises(FitFlareError) as problem:
+        run("bad", "fine", "bad")
+    assert str(problem.value) == "Frame 7 is damaged."
+    with pytest.raises(EngineError) as problem:
+        run("bad", "killed")
+    assert str(problem.value) == ("Frame 7 is damaged. 1 of 2 processes of remove ended without a reason, status "
+                                  "9; memory may have been short.")
+    with pytest.raises(EngineError, match="status 1; what one wrote last stands above"):
+        run("loud", "fine")
+    assert "Bus error at 0x0" in capfd.readouterr().err

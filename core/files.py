@@ -6,17 +6,23 @@ import contextlib
 import glob
 import json
 import os
+import re
 import shutil
 import tempfile
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 from .errors import FitFlareError, SettingsError
 
+WRITTEN_BY_HAND = "utf-8-sig"
+"""Encoding to read what people write: UTF-8, before which Windows' editors put a mark."""
 _PARTIAL = ".partial-"
 _REFUSALS = 100  # a hundredth of a second apart
+_HELD = (5, 32, 33)  # Windows: access denied, sharing violation, lock violation
+_PATIENCE_S = 2.0
+_OF_DEVICES = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\.|$)", re.IGNORECASE)
 
 
 @contextlib.contextmanager
@@ -32,14 +38,34 @@ def atomic_path(target: Path | str) -> Iterator[Path]:
     temporary = Path(name)
     try:
         yield temporary
-        # mkstemp makes private files; the result gets the permissions that any new file here would have.
-        temporary.chmod(0o666 & ~_umask())
-        temporary.replace(target)
+        _share(temporary, 0o666)
+        patiently(temporary.replace, target)
     except OSError as problem:  # a write to an open file does not say which
         problem.filename = problem.filename or str(target)
         raise
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def patiently(change: Callable[..., object], *words: Any) -> None:
+    """Make a change of the disk, where Windows refuses again and again for two seconds: a virus scanner, an indexer or
+    Blender may hold the file for a moment."""
+    end = time.monotonic() + _PATIENCE_S
+    while True:
+        try:
+            change(*words)
+            return
+        except PermissionError as problem:
+            if getattr(problem, "winerror", None) not in _HELD or time.monotonic() > end:
+                raise
+            time.sleep(0.02)
+
+
+def _share(temporary: Path, mode: int) -> None:
+    """mkstemp makes private files; the result gets the permissions that any new one here would have, where the disk
+    has permissions at all and lets them be changed (Windows' disks in WSL and some network shares do not)."""
+    with contextlib.suppress(PermissionError):
+        temporary.chmod(mode & ~_umask())
 
 
 def _partial_of(target: Path) -> str:
@@ -79,7 +105,7 @@ def locked(lock: Path | str, stale_s: float = 10.0) -> Iterator[None]:
     try:
         yield
     finally:
-        lock.unlink(missing_ok=True)
+        patiently(lock.unlink, True)
 
 
 @contextlib.contextmanager
@@ -91,8 +117,8 @@ def atomic_folder(target: Path | str) -> Iterator[Path]:
     temporary = Path(tempfile.mkdtemp(prefix=_PARTIAL, dir=target.parent))
     try:
         yield temporary
-        temporary.chmod(0o777 & ~_umask())
-        temporary.rename(target)
+        _share(temporary, 0o777)
+        patiently(temporary.rename, target)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
 
@@ -127,11 +153,16 @@ def read_json(path: Path | str, error: type[FitFlareError]) -> Any:
     """The content of a JSON file; `error` with one sentence where it cannot be had."""
     path = Path(path)
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
+        return json.loads(path.read_text(encoding=WRITTEN_BY_HAND))
     except OSError as problem:
         raise error(f"{path} cannot be read: {problem.strerror or problem}.") from problem
     except (ValueError, RecursionError) as problem:
         raise error(f"{path} is not valid JSON ({problem}); mend it or make it again.") from problem
+
+
+def plain_name(name: str) -> str:
+    """`name`, or with "_" after it where Windows takes it for a device: con, aux, nul, com1 and their like."""
+    return f"{name}_" if _OF_DEVICES.match(name) else name
 
 
 def _is_file_name(part: str) -> bool:
@@ -161,15 +192,26 @@ def inside(folder: Path | str, name: str, error: type[FitFlareError]) -> Path:
 
 def check_apart(sources: Iterable[Path], results: Iterable[Path]) -> None:
     """Raises SettingsError where a result would be written over a source, or two would be the same file."""
-    read, written = {path.resolve() for path in sources}, set()
+    read, written = {_file_of(path) for path in sources}, set()
     for path in results:
-        whole = path.resolve()
+        whole = _file_of(path)
         if whole in read:
             raise SettingsError(f"{path} would be overwritten by a result; choose another folder for the results.")
         if whole in written:
             raise SettingsError(f"Two results would be written to the same file, {path}; choose another folder for "
                                 "one kind of them, or take plates that differ by their suffix alone apart.")
         written.add(whole)
+
+
+def _file_of(path: Path) -> object:
+    """The same of every name that a file has: of one that is there its place on the disk, which file systems that do
+    not tell Plates from plates know by both names."""
+    whole = path.resolve()
+    try:
+        folder, file = whole.parent.stat(), whole.stat()
+    except OSError:
+        return whole
+    return (folder.st_dev, folder.st_ino, file.st_ino) if folder.st_ino and file.st_ino else whole
 
 
 def are_newer(results: Iterable[Path], sources: Iterable[Path]) -> bool:

@@ -78,6 +78,13 @@ def linear_from_srgb(display: NDArray[Any]) -> Pixels:
     return np.copysign(np.where(size <= 0.04045, size / 12.92, curve), display).astype(np.float32)
 
 
+def pictures_in(folder: Path) -> list[Path]:
+    """The pictures of a folder by name, but for hidden ones: macOS keeps "._0001.png" beside 0001.png on foreign
+    disks."""
+    return sorted(path for path in folder.iterdir()
+                  if path.suffix.lower() in SUFFIXES and path.is_file() and not path.name.startswith("."))
+
+
 def read_picture(path: Path | str) -> Picture:
     """Decode PNG, JPEG, TIFF (8 or 16 bit, grey or colour, alpha dropped) or EXR.
 

@@ -16,14 +16,20 @@ from __future__ import annotations
 import contextlib
 import importlib.util
 import json
+import os
 import signal
 import sys
 import threading
 import time
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any, TextIO
 
 from .errors import DISK_FULL, Cancelled
+
+STOP_FILE = "FIT_FLARE_STOP"
+"""Of the environment: the path of a file which, when it is there, asks a command to stop."""
+STOP_FILE_EVERY_S = 0.3
 
 
 class Progress:
@@ -233,10 +239,38 @@ class OpenJdProgress(Progress):
 
 @contextlib.contextmanager
 def stoppable(progress: Progress) -> Iterator[Progress]:
-    """Let SIGINT, SIGTERM and (Windows) CTRL_BREAK ask the work to stop at its next step.
-
-    Only the main thread may set signal handlers; elsewhere this changes nothing.
+    """Let SIGINT, SIGTERM, (Windows) CTRL_BREAK and a file where STOP_FILE says ask the work to stop at its next step.
     """
+    with _stopped_by_file(progress), _stopped_by_signals(progress):
+        yield progress
+
+
+@contextlib.contextmanager
+def _stopped_by_file(progress: Progress) -> Iterator[Progress]:
+    named = os.environ.get(STOP_FILE)
+    if not named:
+        yield progress
+        return
+    file, ended = Path(named), threading.Event()
+
+    def look() -> None:
+        while not ended.wait(STOP_FILE_EVERY_S):
+            if file.exists():
+                progress.request_stop()
+                return
+
+    watcher = threading.Thread(target=look, daemon=True)
+    watcher.start()
+    try:
+        yield progress
+    finally:
+        ended.set()
+        watcher.join()
+
+
+@contextlib.contextmanager
+def _stopped_by_signals(progress: Progress) -> Iterator[Progress]:
+    """Only the main thread may set signal handlers; elsewhere this changes nothing."""
     if threading.current_thread() is not threading.main_thread():
         yield progress
         return

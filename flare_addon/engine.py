@@ -33,6 +33,18 @@ def user_folder(name: str, create: bool = False) -> Path:
         return folder
 
 
+def home(create: bool = False) -> Path:
+    """Where a click sets the engine up. On Windows not in Blender's user folder: its path is so long that those of
+    torch's files would have more than the 260 characters that are allowed."""
+    local = os.environ.get("LOCALAPPDATA")
+    if os.name != "nt" or not local:
+        return user_folder(FOLDER, create)
+    folder = Path(local, "fit_flare", "{}.{}".format(*bpy.app.version))
+    if create:
+        folder.mkdir(parents=True, exist_ok=True)
+    return folder
+
+
 def python_at(place: Path) -> Path | None:
     """The interpreter that `place` is, or that the virtual environment in it has."""
     for path in (place, place / "Scripts" / "python.exe", place / "bin" / "python"):
@@ -49,7 +61,7 @@ def find() -> Path | None:
     for place in (engine_path(), os.environ.get("FIT_FLARE_ENGINE", "")):
         if place:
             return python_at(Path(place).expanduser())
-    for folder in (user_folder(FOLDER) / "python", ROOT / ".venv"):
+    for folder in (home() / "python", ROOT / ".venv"):
         python = python_at(folder)
         if python is not None:
             return python
@@ -102,18 +114,18 @@ def set_up() -> Job:
     if not bpy.app.online_access:
         raise EngineError("Blender's online access is off; allow it in Preferences > System > Network, then set up.")
     script = ROOT / "headless" / "set_up.py"
-    words = [sys.executable, *bpy.app.python_args, str(script), str(user_folder(FOLDER, create=True) / "python")]
-    return jobs.start("set up", user_folder(FOLDER), words, environment())
+    words = [sys.executable, *bpy.app.python_args, str(script), str(home(create=True) / "python")]
+    return jobs.start("set up", home(), words, environment())
 
 
 def was_set_up() -> bool:
     """Whether there is one that a click has set up."""
-    return (user_folder(FOLDER) / "python").is_dir()
+    return (home() / "python").is_dir()
 
 
 def setting_up() -> Job | None:
     """The set-up that runs or ran."""
-    return jobs.find(user_folder(FOLDER))
+    return jobs.find(home())
 
 
 def remove() -> None:
@@ -122,6 +134,6 @@ def remove() -> None:
 
     if any(job.running for job in jobs.running()):
         raise FitFlareError("The engine is at work; wait for it or cancel it before removing it.")
-    folder = user_folder(FOLDER)
+    folder = home()
     jobs.forget(folder)
     shutil.rmtree(folder, ignore_errors=True)

@@ -87,6 +87,7 @@ def start(scene: Any) -> Job:
     lights.write(scene, capture)
     folder, before = new_folder(scene), scene.fit_flare.run
     scene.fit_flare.run = stored(folder)
+    folder = folder_of(scene) or folder  # by the name that it will be asked for
     try:
         return _run(scene, capture, folder)
     except FitFlareError:

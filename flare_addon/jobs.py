@@ -4,6 +4,7 @@
     FOLDER/job.json       what was started, in which words, and the process's number
     FOLDER/events.jsonl   its events, one JSON object a line (core/progress.py)
     FOLDER/engine.log     what else it said
+    FOLDER/stop           there when it has been asked to stop
 
 A file, not a pipe: the process needs nobody to read it, so Blender can be saved, closed and opened again
 meanwhile, and finds the work by its folder. A timer looks at what is new in the file, a few kilobytes at a
@@ -26,10 +27,12 @@ import bpy
 
 from ..core.errors import DISK_FULL, EngineError, FitFlareError, RunError, refusal
 from ..core.files import write_json
+from ..core.progress import STOP_FILE
+from . import processes
 
 State = Literal["running", "done", "failed", "stopped"]
 
-RECORD, EVENTS, LOG = "job.json", "events.jsonl", "engine.log"
+RECORD, EVENTS, LOG, STOP = "job.json", "events.jsonl", "engine.log", "stop"
 WINDOWS = os.name == "nt"
 STOPPED = 130  # the status of a command that was stopped (headless/cli.py)
 EVERY_S = 0.2
@@ -90,13 +93,19 @@ class Job:
         return True
 
     def stop(self) -> None:
-        """Ask it to stop; it keeps what it has, and ends by itself."""
+        """Ask it to stop; it keeps what it has, and ends by itself.
+
+        By a file, since on Windows a signal reaches only who shares a console; elsewhere by a signal too, which is
+        heard in start-up, and of which a second one ends what does not answer.
+        """
+        if not self.running or not self._alive():
+            return
         self.stage = "stopping"
         with contextlib.suppress(OSError):
-            if self._process is not None and self._process.poll() is None:
-                self._process.send_signal(getattr(signal, "CTRL_BREAK_EVENT", signal.SIGINT))
-            elif self._process is None:
-                os.kill(self.pid, getattr(signal, "CTRL_BREAK_EVENT", signal.SIGINT))
+            (self.folder / STOP).touch()
+        if not WINDOWS:
+            with contextlib.suppress(OSError):
+                os.kill(self.pid, signal.SIGINT)
 
     def _read(self) -> bool:
         try:
@@ -133,7 +142,7 @@ class Job:
     def _alive(self) -> bool:
         if self._process is not None:
             return self._process.poll() is None
-        return _is_ours(self.pid)
+        return self.pid > 0 and processes.runs(self.pid)
 
     def _end(self) -> None:
         """The process is gone."""
@@ -170,30 +179,6 @@ def _last_words(log: Path) -> str:
     return f' ("{lines[-1][:160]}")' if lines else ""
 
 
-def _is_ours(pid: int) -> bool:
-    """Whether a process that an earlier Blender started still runs."""
-    if WINDOWS:
-        import ctypes
-
-        kernel = ctypes.windll.kernel32  # type: ignore[attr-defined,unused-ignore]
-        handle = kernel.OpenProcess(0x1000, False, pid)
-        if not handle:
-            return False
-        code = ctypes.c_ulong()
-        kernel.GetExitCodeProcess(handle, ctypes.byref(code))
-        kernel.CloseHandle(handle)
-        return code.value == 259  # STILL_ACTIVE
-    try:
-        os.kill(pid, 0)
-    except OSError:
-        return False
-    command = Path(f"/proc/{pid}/cmdline")
-    try:  # the number may have gone to another program
-        return b"run.py" in command.read_bytes() if command.parent.parent.is_dir() and command.exists() else True
-    except OSError:
-        return True
-
-
 # ---- starting and finding -------------------------------------------------------------------------
 
 
@@ -213,9 +198,11 @@ def start(kind: str, folder: Path, command: Sequence[str], environment: Mapping[
                  | getattr(subprocess, "BELOW_NORMAL_PRIORITY_CLASS", 0)}
     try:
         folder.mkdir(parents=True, exist_ok=True)
+        (folder / STOP).unlink(missing_ok=True)
         with open(folder / EVENTS, "wb") as events, open(folder / LOG, "ab") as log:
             process = subprocess.Popen(list(command), stdin=subprocess.DEVNULL, stdout=events, stderr=log,
-                                       env=dict(environment) if environment is not None else None, **apart)
+                                       env={**(os.environ if environment is None else environment),
+                                            STOP_FILE: str((folder / STOP).absolute())}, **apart)
         _yield_to_the_window(process.pid)
         try:
             write_json(folder / RECORD, {"kind": kind, "pid": process.pid, "started": time.time(),
@@ -255,7 +242,9 @@ def find(folder: Path | str | None) -> Job | None:
         return known
     try:
         record = json.loads((folder / RECORD).read_text(encoding="utf-8"))
-        job = Job(str(record["kind"]), folder, int(record["pid"]), None, list(map(str, record.get("words", ()))))
+        pid = int(record["pid"])
+        job = Job(str(record["kind"]), folder, pid if processes.is_same(pid, float(record["started"])) else 0, None,
+                  list(map(str, record.get("words", ()))))
     except (OSError, ValueError, KeyError, TypeError):
         return None
     _jobs[_key(folder)] = job

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.errors import FitFlareError, FlareFileError
-from ..core.files import atomic_path
+from ..core.files import atomic_path, plain_name
 from ..core.look import Look, draw, read
 from ..core.look.look import ViewOfLight, annotated
 from ..core.pictures import linear_from_srgb, srgb_from_linear
@@ -47,7 +47,7 @@ def save(look: Look, name: str, notes: str, licence: str) -> Path:
     safe = "".join(letter for letter in name if letter.isalnum() or letter in " -_()").strip()
     if not safe:
         raise FlareFileError(f"{name!r} cannot be a file's name; use letters and digits.")
-    path = folder(create=True) / f"{safe}.flare"
+    path = folder(create=True) / f"{plain_name(safe)}.flare"
     if path.exists():
         raise FlareFileError(f"The library has {safe!r} already; choose another name.")
     annotated(look.path, path, notes=notes, licence=licence)

@@ -16,20 +16,22 @@ _before: dict[tuple[str, str], str] = {}
 
 def stored(path: Path) -> str:
     """A path as a .blend keeps it: relative to the file where it can be."""
-    return _relative(path.resolve(), bpy.data.filepath)
+    # Not resolved: a drive of the network would lose its letter.
+    return _relative(Path(os.path.normpath(path.absolute())), bpy.data.filepath)
 
 
 def absolute(text: str) -> Path:
     """Of such a path the place on disk, without `..`: below a linked folder that would lead elsewhere, and the same
     place would have several names."""
-    return Path(os.path.normpath(bpy.path.abspath(text)))
+    return Path(os.path.normpath(bpy.path.abspath(text.replace("\\", "/") if text.startswith("//") else text)))
 
 
 def _relative(path: Path, blend: str) -> str:
     if not blend:
         return os.fspath(path)
     try:
-        return str(bpy.path.relpath(os.fspath(path), start=os.fspath(Path(blend).parent)))
+        relative = str(bpy.path.relpath(os.fspath(path), start=os.fspath(Path(blend).parent)))
+        return relative.replace("\\", "/") if os.name == "nt" else relative
     except ValueError:  # another drive
         return os.fspath(path)
 

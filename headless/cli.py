@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import io
 import os
 import sys
 import traceback
@@ -113,6 +114,8 @@ def _progress(words: Sequence[str]) -> Iterator[Progress]:
     told = " ".join(words).replace("--progress=", "--progress ").split("--progress ")[1:]
     kind = told[-1].split(" ")[0] if told else ""
     if kind != "json" or "--help" in words:
+        if kind == "openjd" and isinstance(sys.stdout, io.TextIOWrapper):  # read as UTF-8 by farms on every system
+            sys.stdout.reconfigure(encoding="utf-8", errors="replace")
         progress: Progress = OpenJdProgress() if kind == "openjd" else TerminalProgress()
         try:
             yield progress

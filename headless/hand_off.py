@@ -77,7 +77,7 @@ def _set_up_by_the_addon() -> list[Path]:
         return []
     from ..flare_addon import engine
 
-    return [engine.user_folder(engine.FOLDER) / "python"]
+    return [engine.home() / "python"]
 
 
 def _python_at(place: Path) -> Path | None:
@@ -107,7 +107,7 @@ def blender_command(named: str | None) -> list[str]:
     script = ["-b", "--factory-startup", "-P", str(RUN), "--"]
     for where, text in (("--blender", named), ("FIT_FLARE_BLENDER", os.environ.get("FIT_FLARE_BLENDER"))):
         if text:
-            words = [text] if Path(text).is_file() else shlex.split(text, posix=not WINDOWS)
+            words = _command_line(text)
             if not words or not shutil.which(words[0]):
                 raise EngineError(f"The Blender that {where} names, {text}, is not a program; name another.")
             return [*words, *script]
@@ -118,6 +118,16 @@ def blender_command(named: str | None) -> list[str]:
             return [program, *script]
     raise EngineError("This step needs Blender, and none was found: name one with --blender or FIT_FLARE_BLENDER, "
                       "or install the bpy package beside the engine.")
+
+
+def _command_line(text: str) -> list[str]:
+    """The words of a program's path or of a command line; in the latter a path with spaces is quoted."""
+    if Path(text.strip('"')).is_file():
+        return [text.strip('"')]
+    try:
+        return [word.strip('"') if WINDOWS else word for word in shlex.split(text, posix=not WINDOWS)]
+    except ValueError:  # a quotation mark without its other one
+        return []
 
 
 def _usual_places() -> Iterator[str]:

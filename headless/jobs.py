@@ -21,7 +21,7 @@ from collections.abc import Sequence
 from typing import IO, Any
 
 from ..core.errors import EngineError, FitFlareError, SettingsError
-from ..core.progress import Progress
+from ..core.progress import STOP_FILE, Progress
 from . import hand_off
 
 POLL_S = 0.2
@@ -79,6 +79,7 @@ def run_parts(words: argparse.Namespace, step: str, parts: Sequence[Sequence[str
     events: queue.Queue[tuple[int, dict[str, Any] | None]] = queue.Queue()
     threads = str(max((os.cpu_count() or 1) // max(min(jobs, len(parts)), 1), 1))
     environment = {**os.environ, "OMP_NUM_THREADS": threads, "NUMBA_NUM_THREADS": threads}
+    environment.pop(STOP_FILE, None)  # this process looks for it, and stops the others
     by_part = total == len(parts)
     children: list[subprocess.Popen[str]] = []
     noises: list[IO[bytes]] = []

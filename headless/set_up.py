@@ -7,15 +7,21 @@ object a line (core/progress.py). A folder that a stopped set-up left is made an
 """
 from __future__ import annotations
 
+import contextlib
 import json
 import os
+import platform
 import shutil
+import signal
 import subprocess
 import sys
+import threading
 import tomllib
+from collections.abc import Iterator
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
+OLDEST_MACOS = 14  # that the wheels of torch and pycolmap in constraints.txt are made for
 
 
 def say(**event: object) -> None:
@@ -39,18 +45,62 @@ def run(command: list[str]) -> str:
     with subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
                           text=True, errors="replace") as process:
         assert process.stdout is not None
-        for line in process.stdout:
-            print(line, end="", file=sys.stderr, flush=True)
-            if line.strip().startswith(("Downloading ", "Installing collected")):
-                say(type="say", text=line.strip()[:120])  # torch takes minutes
-            unreached |= "Retrying (" in line  # what pip makes of that in the end speaks of versions
-            if not last.startswith("ERROR:"):
-                last = line.strip() or last
+        try:
+            with _ended_by_file(process):
+                for line in process.stdout:
+                    print(line, end="", file=sys.stderr, flush=True)
+                    if line.strip().startswith(("Downloading ", "Installing collected")):
+                        say(type="say", text=line.strip()[:120])  # torch takes minutes
+                    unreached |= "Retrying (" in line  # what pip makes of that in the end speaks of versions
+                    if not last.startswith("ERROR:"):
+                        last = line.strip() or last
+        except BaseException:
+            process.kill()
+            raise
     if not process.returncode:
         return ""
     if unreached:
         return "the network could not be reached"
     return last.removeprefix("ERROR:").strip(" .")[:200] or f"status {process.returncode}"
+
+
+@contextlib.contextmanager
+def _ended_by_file(process: subprocess.Popen[str]) -> Iterator[None]:
+    """The process ends when the file that FIT_FLARE_STOP names is there (core/progress.py), and KeyboardInterrupt is
+    raised: on Windows the panel has no signal for it."""
+    named, ended = os.environ.get("FIT_FLARE_STOP"), threading.Event()
+    if not named:
+        yield
+        return
+    file = Path(named)
+
+    def look() -> None:
+        while not ended.wait(0.3):
+            if file.exists():
+                process.kill()
+                return
+
+    watcher = threading.Thread(target=look, daemon=True)
+    watcher.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        watcher.join()
+    if file.exists():
+        raise KeyboardInterrupt
+
+
+def unsuitable() -> str:
+    """Why torch cannot be had for this machine, as a sentence; "" where it can."""
+    if sys.platform != "darwin":
+        return ""
+    if platform.machine() != "arm64":
+        return "The engine needs torch, which is made no more for Macs with Intel processors; use another computer."
+    version = platform.mac_ver()[0]
+    if version and int(version.partition(".")[0]) < OLDEST_MACOS:
+        return f"The engine needs macOS {OLDEST_MACOS} or later, and this is {version}; update the system."
+    return ""
 
 
 def base() -> str | None:
@@ -71,6 +121,9 @@ def main(words: list[str]) -> int:
     folder, wanted = Path(words[0]), words[1:] or packages()
     steps = ["a place of its own", *wanted, "a test"]
     say(type="stage", name="set up", total=len(steps), done=0)
+    if not words[1:] and unsuitable():
+        say(type="error", text=unsuitable())
+        return 1
     maker = base()
     if maker is None:
         say(type="error", text=f"{sys.executable} has no ensurepip to make an environment with (Debian keeps it in "
@@ -92,7 +145,11 @@ def main(words: list[str]) -> int:
         commands.append([str(python), "-c", test])
     for number, (what, command) in enumerate(zip(steps, commands, strict=False)):
         say(type="say", text=f"Installing {what}")
-        refused = run(command)
+        try:
+            refused = run(command)
+        except KeyboardInterrupt:  # a half of an engine would count as one
+            shutil.rmtree(folder, ignore_errors=True)
+            raise
         if refused:
             shutil.rmtree(folder, ignore_errors=True)
             say(type="error", text=f"{what[0].upper()}{what[1:]} could not be installed ({refused}); look at the log, "
@@ -104,6 +161,8 @@ def main(words: list[str]) -> int:
 
 
 if __name__ == "__main__":
+    if hasattr(signal, "SIGBREAK"):
+        signal.signal(signal.SIGBREAK, signal.default_int_handler)
     try:
         sys.exit(main(sys.argv[1:]))
     except KeyboardInterrupt:

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import CaptureError
-from ..files import atomic_path
+from ..files import WRITTEN_BY_HAND, atomic_path
 from ..pictures import LARGEST
 from .camera import Floats, quaternion_from_rotation, rotation_from_quaternion
 from .lens import MODELS, NAMES, Lens
@@ -149,7 +149,7 @@ def _read(folder: Path, name: str, binary: Any, text: Any) -> Any:
     try:
         if path.suffix == ".bin":
             return binary(_Bytes(path))
-        return text(path, path.read_text(encoding="utf-8").splitlines())
+        return text(path, path.read_text(encoding=WRITTEN_BY_HAND).splitlines())
     except OSError as problem:
         raise CaptureError(f"{path} cannot be read: {problem.strerror or problem}.") from problem
     except UnicodeDecodeError as problem:

@@ -14,8 +14,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from .. import tensors as on_disk
 from ..errors import RunError
-from ..files import atomic_path
 
 VERSION = 1
 _MANY_ROWS = 100_000
@@ -24,8 +24,6 @@ State = dict[str, Any]
 
 def save(path: Path, state: Mapping[str, Any]) -> None:
     """Write a state atomically."""
-    from safetensors.torch import save as packed
-
     tensors: dict[str, Tensor] = {}
     values: dict[str, Any] = {}
     shapes: dict[str, list[int]] = {}
@@ -42,26 +40,21 @@ def save(path: Path, state: Mapping[str, Any]) -> None:
                 continue
         tensors[name] = tensor
     description = json.dumps({"version": VERSION, "values": values, "shapes": shapes})
-    with atomic_path(path) as temporary:
-        # As bytes: its own writer makes a temporary file of another name, which a kill would leave behind.
-        temporary.write_bytes(packed(tensors, {"checkpoint": description}))
+    on_disk.write(path, tensors, {"checkpoint": description})
 
 
 def load(path: Path) -> State:
     """Read what `save` wrote. Raises RunError where the file is damaged or of another version."""
-    from safetensors import SafetensorError, safe_open
-
     try:
-        with safe_open(str(path), "pt") as file:
-            description = json.loads((file.metadata() or {})["checkpoint"])
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
+        tensors, about = on_disk.read(path)
+        description = json.loads(about["checkpoint"])
         if description["version"] != VERSION:
             raise RunError(f"{path} was written by another version of Fit Flare; start the fit anew.")
         for name, shape in description["shapes"].items():
             rows, values = tensors.pop(f"{name}@rows"), tensors.pop(f"{name}@values")
             tensors[name] = torch.zeros(shape, dtype=values.dtype).index_copy_(0, rows, values)
         flat = {**description["values"], **tensors}
-    except (SafetensorError, KeyError, TypeError, ValueError, RuntimeError, OSError) as problem:
+    except (KeyError, TypeError, ValueError, RuntimeError, OSError) as problem:
         raise RunError(f"{path} is damaged ({problem}); remove it and start the fit anew.") from problem
     state: State = {}
     for name, value in flat.items():

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from ..errors import RunError, SettingsError
-from ..files import write_text
+from ..files import WRITTEN_BY_HAND, write_text
 from ..flare.density import DensitySettings
 from ..flare.model import OURS, PAPER, FlareForm
 from ..flare.visibility import VisibilitySettings
@@ -295,7 +295,7 @@ def _toml(value: Any) -> str:
 def read_config(path: Path) -> FitSettings:
     """The settings of a run. Raises RunError where the file is missing, damaged, or holds unknown names."""
     try:
-        data = tomllib.loads(path.read_text(encoding="utf-8"))
+        data = tomllib.loads(path.read_text(encoding=WRITTEN_BY_HAND))
         return _read_table(FitSettings, data).checked()
     except OSError as problem:
         raise RunError(f"{path} cannot be read ({problem.strerror}); is this the folder of a run?") from problem

@@ -17,8 +17,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from .. import tensors as on_disk
 from ..errors import FlareFileError
-from ..files import atomic_path
 from .compositing import Blend
 from .deformation import QueryRange
 from .model import FlareForm, FlareModel, LightFlare
@@ -58,8 +58,6 @@ class FlareFile:
 
 def save(path: Path | str, flare: FlareFile) -> None:
     """Write a .flare atomically."""
-    from safetensors.torch import save as packed
-
     forms = [asdict(light.form) for light in flare.model.lights]
     lights = [
         {"name": name, "xyz": xyz, "form": form, "range": asdict(light.query_range), "count": light.count,
@@ -69,25 +67,20 @@ def save(path: Path | str, flare: FlareFile) -> None:
     ]
     description = {"version": VERSION, "blend": flare.blend, "lights": lights, "camera": asdict(flare.camera),
                    "elements": flare.elements, "seen": flare.seen, "licence": flare.licence, "notes": flare.notes}
-    with atomic_path(path) as temporary:
-        # As bytes: its own writer makes a temporary file of another name, which a kill would leave behind.
-        temporary.write_bytes(packed(_packed(flare.model), {_KEY: json.dumps(description)}))
+    on_disk.write(path, _packed(flare.model), {_KEY: json.dumps(description)})
 
 
 def load(path: Path | str) -> FlareFile:
     """Read a .flare. Raises FlareFileError where it is missing, damaged, newer, or not a flare."""
-    from safetensors import SafetensorError, safe_open
-
     path = Path(path)
     if not path.is_file():
         raise FlareFileError(f"{path} is missing; choose a .flare file that a fit has written.")
     try:
-        with safe_open(str(path), "pt") as file:
-            description = json.loads((file.metadata() or {})[_KEY])
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
+        tensors, about = on_disk.read(path)
+        description = json.loads(about[_KEY])
     except KeyError as problem:
         raise FlareFileError(f"{path} is a safetensors file, but not a flare; choose another.") from problem
-    except (SafetensorError, ValueError, OSError, RecursionError) as problem:
+    except (ValueError, OSError, RecursionError) as problem:
         raise FlareFileError(f"{path} is damaged or not a flare ({problem}); save it again.") from problem
     version = description.get("version") if isinstance(description, dict) else None
     if not isinstance(version, int) or version > VERSION:

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import SettingsError
-from ..files import read_json, write_json
+from ..files import WRITTEN_BY_HAND, read_json, write_json
 from .edits import LookEdits
 
 
@@ -66,7 +66,7 @@ class KeyedEdits:
 
 def _toml(path: Path) -> Any:
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        return tomllib.loads(path.read_text(encoding=WRITTEN_BY_HAND))
     except OSError as problem:
         raise SettingsError(f"{path} cannot be read: {problem.strerror or problem}.") from problem
     except ValueError as problem:

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from ..capture.camera import Camera
 from ..errors import SettingsError
-from ..files import read_json, write_json
+from ..files import plain_name, read_json, write_json
 from .edits import LookEdits
 from .look import Look, Query, ViewOfLight, asked
 from .plane import PlaneGaussians
@@ -103,6 +103,7 @@ class Shot:
         found: dict[str, str] = {}
         for name in dict.fromkeys(frame.name for frame in self.frames):
             plain = re.sub(r"[^\w-]+", "_", name).strip("_") or "camera"
+            plain = plain_name(plain)
             taken, folder, number = {other.casefold() for other in found.values()}, plain, 1
             while folder.casefold() in taken:
                 number += 1

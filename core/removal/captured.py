@@ -7,7 +7,7 @@ from pathlib import Path
 from ..capture import Capture
 from ..capture.capture import REMOVED
 from ..errors import CaptureError
-from ..files import inside
+from ..files import inside, patiently
 from ..progress import Progress
 from .inference import Remover
 from .plates import write_plate
@@ -38,7 +38,7 @@ def remove_from(capture: Capture, remover: Remover, progress: Progress) -> Path:
                 plate, told = sequences.read(capture.frame_path(view))
                 write_plate(result, plate, remover.remove(plate, told=told)[0])
             progress.advance()
-        work.rename(target)
+        patiently(work.rename, target)
     except OSError as problem:
         raise CaptureError(f"{work} cannot be written ({problem.strerror or problem}); copy the capture to where it "
                            "can, or make removed/ there with `remove`.") from problem

@@ -19,7 +19,7 @@ import numpy as np
 
 from ..errors import FrameError, SettingsError
 from ..metrics.pictures import flip, psnr, ssim
-from ..pictures import SUFFIXES, Pixels, read_picture
+from ..pictures import Pixels, pictures_in, read_picture
 from ..progress import Progress
 from .backgrounds import kept_for_test
 from .synthesis.prescription import Prescription, built_in
@@ -63,7 +63,7 @@ def paired(folder: Path | str) -> list[Case]:
 
 
 def _by_key(folder: Path) -> dict[str, Path]:
-    paths = [path for path in sorted(folder.iterdir()) if path.suffix.lower() in SUFFIXES]
+    paths = pictures_in(folder)
     plain = {re.sub(r"^(input|gt|target|clean|scene|flare|blend|mask)_?", "", path.stem): path for path in paths}
     return plain if len(plain) == len(paths) else {path.stem: path for path in paths}
 

@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 from torch import Tensor
 
+from .. import tensors as on_disk
 from ..errors import RunError
-from ..files import atomic_path
 from .network import RemovalNetwork
 
 IN_THE_BOX = Path(__file__).parent / "box" / "removal.safetensors"
@@ -19,25 +19,16 @@ IN_THE_BOX = Path(__file__).parent / "box" / "removal.safetensors"
 
 def write(path: Path | str, tensors: Mapping[str, Tensor], about: Mapping[str, str]) -> None:
     """Tensors and text about them, whole or not at all."""
-    from safetensors.torch import save as packed
-
-    with atomic_path(path) as temporary:
-        # As bytes: its own writer makes a temporary file of another name, which a kill would leave behind.
-        whole = {name: value.cpu().contiguous() for name, value in tensors.items()}
-        temporary.write_bytes(packed(whole, dict(about)))
+    on_disk.write(path, tensors, about)
 
 
 def read(path: Path | str) -> tuple[dict[str, Tensor], dict[str, str]]:
     """(tensors, what is said about them). Raises RunError where the file is missing or damaged."""
-    from safetensors import SafetensorError, safe_open
-
-    path = Path(path)
-    if not path.is_file():
+    if not Path(path).is_file():
         raise RunError(f"{path} is missing; train it with train-removal, or install the program again.")
     try:
-        with safe_open(str(path), "pt") as file:
-            return {name: file.get_tensor(name) for name in file.keys()}, dict(file.metadata() or {})  # noqa: SIM118
-    except (SafetensorError, OSError, ValueError) as problem:
+        return on_disk.read(path)
+    except (OSError, ValueError) as problem:
         raise RunError(f"{path} is damaged ({problem}); get it again.") from problem
 
 

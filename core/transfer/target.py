@@ -22,7 +22,7 @@ from ..gaussians.scene import SceneGaussians
 from ..lights.detection import Detector
 from ..look import Look
 from ..look.shot import PlacedLight, Shot, ShotFrame
-from ..pictures import SUFFIXES, Picture, picture_size, read_picture
+from ..pictures import Picture, picture_size, pictures_in, read_picture
 from .query import Seen
 from .sources import assigned
 
@@ -212,8 +212,7 @@ def of_shot(shot: Shot, look: Look, wanted: Mapped, *, plates: Path | None = Non
 
 def _by_number(folder: Path) -> dict[int, Path]:
     """Pictures of a folder by the number that each name ends with."""
-    files = {path.name: path for path in sorted(folder.glob("*"))
-             if path.suffix.lower() in SUFFIXES and not path.name.startswith(".")}
+    files = {path.name: path for path in pictures_in(folder)}
     if not files:
         raise SettingsError(f"{folder} holds no pictures.")
     return {frame.number: files[frame.view] for frame in numbered(files)}

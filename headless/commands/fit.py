@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ...core.errors import SettingsError
+from ...core.files import WRITTEN_BY_HAND
 from ...core.progress import Progress
 from .. import jobs
 from ..command import Command, Step
@@ -123,7 +124,7 @@ def place(words: argparse.Namespace) -> tuple[Path, Path]:
 def listed(path: Path) -> list[Path]:
     """The folders in a list of captures: one a line, relative to the list; lines that begin with # are comments."""
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
+        lines = path.read_text(encoding=WRITTEN_BY_HAND).splitlines()
     except (OSError, UnicodeDecodeError) as problem:
         raise SettingsError(f"{path} cannot be read ({problem}); it should list a folder a line.") from problem
     found = [path.parent / line.strip() for line in lines if line.strip() and not line.startswith("#")]

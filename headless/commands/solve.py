@@ -61,7 +61,7 @@ def of_blend(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     import bpy
 
     from ...core.bake.frames import numbered
-    from ...core.pictures import SUFFIXES
+    from ...core.pictures import pictures_in
     from ...flare_addon.blend_shot import capture_of
 
     if words.plates is None or not words.plates.is_dir():
@@ -74,7 +74,7 @@ def of_blend(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
         raise CaptureError(f"{words.source} cannot be opened by Blender {bpy.app.version_string} "
                            f"({problem}).") from problem
     scene = bpy.context.scene
-    files = {path.name: path for path in sorted(words.plates.glob("*")) if path.suffix.lower() in SUFFIXES}
+    files = {path.name: path for path in pictures_in(words.plates)}
     plates = {frame.number: files[frame.view] for frame in numbered(files)
               if scene.frame_start <= frame.number <= scene.frame_end}
     if not plates:

@@ -112,6 +112,12 @@ def test_work_is_found_again_and_can_be_cancelled(said: Any) -> None:
     assert said["state of the found"] == "running"
     assert said["cancelled"] == ["stopped", "Stopped during fit as asked; run it again to go on."]
     assert said["another program has the number"] != "running"
+    assert said["asked by a file too"]
+
+
+def test_paths_keep_the_name_that_a_drive_has(said: Any) -> None:
+    assert said["written on Windows"]
+    assert said["a linked drive"]
 
 
 def test_folders_that_went_are_told(said: Any) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import json
 import os
+import signal
 import subprocess
 import sys
 import zipfile
@@ -87,6 +88,41 @@ def test_a_blender_without_ensurepip_takes_another_python(tmp_path: Path, monkey
     assert "python3-venv" in event["text"]
     (tmp_path / "python3.11").symlink_to(able)
     assert set_up_.base() == str(tmp_path / "python3.11")
+
+
+@pytest.mark.skipif(os.name == "nt", reason="signals")
+@pytest.mark.parametrize("by_file", [True, False])
+def test_a_stop_ends_what_it_started_and_leaves_nothing(by_file: bool, tmp_path: Path) -> None:
+    sleeper = tmp_path / "slow-1.0-py3-none-any.whl"
+    os.mkfifo(sleeper)
+    command = [sys.executable, "-I", str(SCRIPT), str(tmp_path / "engine"), str(sleeper)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, start_new_session=True,
+                          env={**os.environ, "FIT_FLARE_STOP": str(tmp_path / "stop")}) as process:
+        assert process.stdout is not None
+        reading = os.open(sleeper, os.O_WRONLY)  # waits until pip has opened it, which then waits for what it reads
+        if by_file:
+            (tmp_path / "stop").touch()
+        else:
+            process.send_signal(signal.SIGINT)
+        events = [json.loads(line) for line in process.stdout]
+    os.close(reading)
+    assert process.returncode == 130
+    assert events[-1]["text"].startswith("Stopped")
+    assert not (tmp_path / "engine").exists()
+    with pytest.raises(ProcessLookupError):  # of its session nobody is left
+        os.killpg(process.pid, 0)
+
+
+@pytest.mark.parametrize(("machine", "version", "why"), [
+    ("x86_64", "15.1", "Intel processors"), ("arm64", "13.6.1", "macOS 14 or later"), ("arm64", "14.0", "")])
+def test_macs_without_torch(machine: str, version: str, why: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    script = module()
+    assert script.unsuitable() == ""
+    monkeypatch.setattr(sys, "platform", "darwin")
+    monkeypatch.setattr(script.platform, "machine", lambda: machine)
+    monkeypatch.setattr(script.platform, "mac_ver", lambda: (version, ("", "", ""), machine))
+    assert why in script.unsuitable()
+    assert bool(why) == bool(script.unsuitable())
 
 
 def test_a_network_that_is_down_is_told_as_one() -> None:

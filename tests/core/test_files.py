@@ -9,8 +9,20 @@ from pathlib import Path
 
 import pytest
 
-from core.errors import CaptureError, refusal
-from core.files import atomic_folder, atomic_path, inside, locked, read_json, remove_partial_of, write_json, write_text
+from core.errors import CaptureError, SettingsError, refusal
+from core.files import (
+    atomic_folder,
+    atomic_path,
+    check_apart,
+    inside,
+    locked,
+    patiently,
+    plain_name,
+    read_json,
+    remove_partial_of,
+    write_json,
+    write_text,
+)
 
 
 def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
@@ -42,6 +54,73 @@ def test_a_write_replaces_the_file_and_makes_its_folder(tmp_path: Path) -> None:
     write_json(target, {"a": 2})
     assert read_json(target, CaptureError) == {"a": 2}
     assert [path.name for path in target.parent.iterdir()] == ["a.json"]
+
+
+def refused_by_windows() -> PermissionError:
+    """As Windows says that another program holds the file."""
+    problem = PermissionError(errno.EACCES, "The process cannot access the file")
+    problem.winerror = 32  # type: ignore[attr-defined]
+    return problem
+
+
+def test_a_file_that_windows_holds_for_a_moment_is_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    refusals, replace = [refused_by_windows() for _ in range(3)], Path.replace
+
+    def held(path: Path, target: Path) -> Path:
+        if refusals:
+            raise refusals.pop()
+        return replace(path, target)
+
+    monkeypatch.setattr(Path, "replace", held)
+    write_text(tmp_path / "a.txt", "new")
+    assert (tmp_path / "a.txt").read_text() == "new"
+    assert not refusals
+    asked = []
+
+    def forbidden() -> None:
+        asked.append(1)
+        raise PermissionError(errno.EACCES, "Permission denied")
+
+    with pytest.raises(PermissionError):
+        patiently(forbidden)
+    assert len(asked) == 1, "what stays forbidden is told at once"
+    monkeypatch.setattr("core.files._PATIENCE_S", 0.1)
+    refusals[:] = [refused_by_windows() for _ in range(100)]
+    with pytest.raises(PermissionError):
+        write_text(tmp_path / "a.txt", "newer")
+    assert [path.name for path in tmp_path.iterdir()] == ["a.txt"]
+
+
+def test_a_disk_without_permissions_is_written_to(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(_path: Path, _mode: int) -> None:
+        raise PermissionError(errno.EPERM, "Operation not permitted")
+
+    monkeypatch.setattr(Path, "chmod", refuse)
+    write_text(tmp_path / "a.txt", "new")
+    with atomic_folder(tmp_path / "folder") as made:
+        (made / "b.txt").touch()
+    assert (tmp_path / "a.txt").read_text() == "new"
+    assert (tmp_path / "folder" / "b.txt").is_file()
+
+
+def test_what_windows_editors_write_is_read(tmp_path: Path) -> None:
+    (tmp_path / "lights.json").write_bytes(b'\xef\xbb\xbf{"a": 1}')
+    assert read_json(tmp_path / "lights.json", CaptureError) == {"a": 1}
+
+
+@pytest.mark.parametrize(("name", "expected"), [("Aux", "Aux_"), ("con.flare", "con.flare_"), ("COM1", "COM1_"),
+                                                ("Camera", "Camera"), ("console", "console"), ("com", "com")])
+def test_names_of_devices(name: str, expected: str) -> None:
+    assert plain_name(name) == expected
+
+
+def test_a_file_has_several_names(tmp_path: Path) -> None:
+    for name in ("a.png", "b.png"):
+        (tmp_path / name).touch()
+    check_apart([tmp_path / "a.png"], [tmp_path / "b.png"])
+    (tmp_path / "A.png").hardlink_to(tmp_path / "a.png")  # what macOS would find below that name
+    with pytest.raises(SettingsError, match="overwritten by a result"):
+        check_apart([tmp_path / "a.png"], [tmp_path / "A.png"])
 
 
 def test_json_refuses_nan(tmp_path: Path) -> None:

@@ -7,11 +7,14 @@ import io
 import json
 import os
 import signal
+import threading
+import time
+from pathlib import Path
 
 import pytest
 
 from core.errors import Cancelled
-from core.progress import JsonProgress, OpenJdProgress, Progress, TerminalProgress, stoppable
+from core.progress import STOP_FILE, JsonProgress, OpenJdProgress, Progress, TerminalProgress, stoppable
 
 
 def test_json_lines_are_whole_and_in_order() -> None:
@@ -95,3 +98,32 @@ def test_openjd_lines_are_a_farm_s() -> None:
     assert stream.getvalue().splitlines() == [
         "openjd_status: bake 0/4", "openjd_progress: 0", "openjd_progress: 100", "openjd_status: two lines",
         "openjd_fail: It failed."]
+
+
+@pytest.mark.parametrize("of_main_thread", [True, False])
+def test_a_file_asks_for_a_stop(of_main_thread: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(STOP_FILE, str(tmp_path / "stop"))
+    monkeypatch.setattr("core.progress.STOP_FILE_EVERY_S", 0.01)
+    stopped: list[str] = []
+
+    def work() -> None:
+        progress = Progress()
+        try:
+            with stoppable(progress):
+                progress.stage("fit", 1000)
+                (tmp_path / "stop").touch()
+                for _ in range(1000):
+                    progress.advance()
+                    time.sleep(0.01)
+        except Cancelled as stop:
+            stopped.append(str(stop))
+
+    before = threading.active_count()
+    if of_main_thread:
+        work()
+    else:
+        thread = threading.Thread(target=work)
+        thread.start()
+        thread.join()
+    assert stopped == ["Stopped during fit as asked; run it again to go on."]
+    assert threading.active_count() == before, "who looked has gone"

@@ -181,6 +181,8 @@ def test_stopped_and_taken_up_again(tmp_path: Path) -> None:
     for stage in ("read frames", "find features", "match frames", "place cameras", "write frames"):
         with pytest.raises(Cancelled):
             solve(frames, out, QUICK, Stopping(stage))
+        for name in (".DS_Store", f"._{stage}.png", "Thumbs.db"):  # left by who looks at the folder meanwhile
+            (frames / name).write_bytes(stage.encode())
         assert not (out / "sparse").exists() and not (out / "images").exists() and not (out / "solve.json").exists()
     last = Stopping()
     report = solve(frames, out, QUICK, last)

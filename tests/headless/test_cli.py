@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -121,6 +122,17 @@ def test_events_have_standard_output_for_themselves(monkeypatch: pytest.MonkeyPa
     assert "a library prints" in told.err
     assert cli.main(["try"]) == 0
     assert "a library prints" in capfd.readouterr().out
+
+
+def test_a_farm_is_told_names_of_any_script(tmp_path: Path) -> None:
+    words = [sys.executable, str(cli.hand_off.RUN), "bake", str(tmp_path / "写真"), "--out", str(tmp_path / "out"),
+             "--progress", "openjd"]
+    done = subprocess.run(words, capture_output=True, env={**os.environ, "PYTHONIOENCODING": "cp1252"}, check=False)
+    assert done.returncode == 1
+    lines = done.stdout.decode("utf-8").splitlines()
+    assert lines[-1].startswith("openjd_fail: ")
+    assert "写真" in lines[-1]
+    assert b"Traceback" not in done.stderr
 
 
 # ---- the pieces -----------------------------------------------------------------------------------

@@ -109,6 +109,18 @@ def test_blender_is_looked_for_in_order(monkeypatch: pytest.MonkeyPatch, tmp_pat
         hand_off.blender_command("no-such-blender -x")
 
 
+@pytest.mark.parametrize("on_windows", [True, False])
+def test_a_blender_in_a_folder_with_spaces(on_windows: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(hand_off, "WINDOWS", on_windows)
+    program = tmp_path / "Program Files" / "blender.exe"
+    program.parent.mkdir()
+    shutil.copy(sys.executable, program)
+    for text, words in ((str(program), []), (f'"{program}"', []), (f'"{program}" --threads 2', ["--threads", "2"])):
+        assert hand_off.blender_command(text)[:1 + len(words)] == [str(program), *words]
+    with pytest.raises(EngineError, match="is not a program"):
+        hand_off.blender_command(f'"{program} --threads 2')
+
+
 def test_a_process_is_one_side() -> None:
     assert hand_off.here() == "engine"
     assert "bpy" not in sys.modules

@@ -21,6 +21,7 @@ from typing import Any
 
 from ...errors import CaptureError
 from ...files import read_json, write_json
+from ...pictures import pictures_in
 from ...progress import Progress
 from ..lens import MODELS
 from .pairs import Matching
@@ -105,8 +106,8 @@ def solve(source: Path | str, out: Path | str, settings: SolveSettings | None = 
 
 
 def _fingerprint(source: Path) -> list[Any]:
-    """What tells one source from another: names, lengths and times."""
-    files = sorted(path for path in source.iterdir() if path.is_file()) if source.is_dir() else [source]
+    """What tells one source from another: names, lengths and times of what is read of it."""
+    files = pictures_in(source) if source.is_dir() else [source]
     stats = [(path.name, path.stat()) for path in files]
     return [str(source.resolve()), *([name, stat.st_size, stat.st_mtime_ns] for name, stat in stats)]
 

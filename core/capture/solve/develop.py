@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ...files import atomic_path
+from ...files import atomic_path, patiently
 from ...pictures import write_exr, write_png
 from ...progress import Progress
 from ..camera import Camera
@@ -50,7 +50,7 @@ def write(shots: Sequence[Shot], solved: Solved, out: Path, work: Path, size: in
     write_model(work / "sparse" / "0", written, cloud)
     for name in ("images", "sparse"):
         shutil.rmtree(out / name, ignore_errors=True)
-        (work / name).rename(out / name)
+        patiently((work / name).rename, out / name)
 
 
 def _names(shots: Sequence[Shot]) -> list[str]:

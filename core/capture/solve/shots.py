@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ...errors import CaptureError, FrameError
 from ...files import read_json, write_json
-from ...pictures import SUFFIXES, Picture, Pixels, picture_size, read_picture, write_png
+from ...pictures import Picture, Pixels, picture_size, pictures_in, read_picture, write_png
 from ...progress import Progress
 from .exif import read_exif, upright
 
@@ -94,7 +94,7 @@ def original(shot: Shot) -> Picture:
 
 def _from_folder(source: Path, work: Path, number: int, size: int,
                  progress: Progress) -> tuple[list[Shot], list[str]]:
-    files = sorted(path for path in source.iterdir() if path.suffix.lower() in SUFFIXES and path.is_file())
+    files = pictures_in(source)
     if not files:
         raise CaptureError(f"{source} holds no frames (PNG, JPEG, TIFF or EXR).")
     left_out: list[str] = []

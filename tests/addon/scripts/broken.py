@@ -126,7 +126,7 @@ with open(folder / "events", "wb") as events:
     process = subprocess.Popen([sham, str(engine.RUN), "fit"], stdout=events, start_new_session=True)
 run.mkdir()
 shutil.copy(folder / "events", run / jobs.EVENTS)
-(run / jobs.RECORD).write_text(f'{{"kind": "fit", "pid": {process.pid}}}')
+(run / jobs.RECORD).write_text(f'{{"kind": "fit", "pid": {process.pid}, "started": {time.time()}}}')
 time.sleep(0.5)
 shutil.copy(folder / "events", run / jobs.EVENTS)
 found = jobs.find(run)
@@ -135,11 +135,12 @@ said["found again"] = [found.state, found.stage, found.done, found.total]
 scene.fit_flare.run = str(run)
 said["state of the found"] = fits.state_of(scene)
 found.stop()
+said["asked by a file too"] = (run / jobs.STOP).exists()
 process.wait(20)
 shutil.copy(folder / "events", run / jobs.EVENTS)
 found.poll()
 said["cancelled"] = [found.state, found.error]
-(run / jobs.RECORD).write_text('{"kind": "fit", "pid": 1}')
+(run / jobs.RECORD).write_text(f'{{"kind": "fit", "pid": {os.getpid()}, "started": {time.time() - 86400}}}')
 jobs.forget(run)
 again = jobs.find(run)
 again.poll()
@@ -148,6 +149,13 @@ shutil.rmtree(run)
 jobs.forget(run)
 said["panel of a lost run"] = shown("fit")
 said["run folder deleted"] = [fits.state_of(scene), jobs.find(run) is None, polls("resume")]
+
+# ---- paths -------------------------------------------------------------------------------------------
+paths = part("flare_addon.paths")
+said["written on Windows"] = str(paths.absolute("//captures\\desk")) == str(paths.absolute("//captures/desk"))
+(folder / "drive").mkdir()
+(folder / "Z").symlink_to(folder / "drive", target_is_directory=True)
+said["a linked drive"] = paths.stored(folder / "Z" / "x" / ".." / "run") == str(folder / "Z" / "run")
 
 # ---- a capture that moved ---------------------------------------------------------------------------
 scene.fit_flare.run = ""

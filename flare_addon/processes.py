@@ -1,0 +1,82 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Processes that an earlier Blender started, known by their number and by when they began: systems give the numbers
+of ended processes out again."""
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import time
+from pathlib import Path
+
+WINDOWS = os.name == "nt"
+PROC = Path("/proc")
+SLACK_S = 5.0
+"""By which the clocks of the two may differ."""
+
+
+def is_same(pid: int, started: float) -> bool:
+    """Whether the process that was written down at `started`, seconds since the epoch, still runs.
+
+    One that began later has come by its number.
+    """
+    began = _began(pid)
+    return began is not None and began <= started + SLACK_S
+
+
+def runs(pid: int) -> bool:
+    """Whether there is a process of that number."""
+    if WINDOWS or PROC.is_dir():
+        return _began(pid) is not None
+    try:
+        os.kill(pid, 0)
+    except OSError:
+        return False
+    return True
+
+
+def _began(pid: int) -> float | None:
+    """Seconds since the epoch; None where no such process runs."""
+    try:
+        if WINDOWS:
+            return _told_by_windows(pid)
+        return _told_by_proc(pid) if PROC.is_dir() else _told_by_ps(pid)
+    except (OSError, ValueError, IndexError):
+        return None
+
+
+def _told_by_windows(pid: int) -> float | None:
+    import ctypes
+
+    kernel = ctypes.windll.kernel32  # type: ignore[attr-defined,unused-ignore]
+    kernel.OpenProcess.restype = ctypes.c_void_p
+    handle = ctypes.c_void_p(kernel.OpenProcess(0x1000, False, pid))
+    if not handle:
+        return None
+    code, times = ctypes.c_ulong(), [ctypes.c_ulonglong() for _ in range(4)]
+    kernel.GetExitCodeProcess(handle, ctypes.byref(code))
+    kernel.GetProcessTimes(handle, *map(ctypes.byref, times))
+    kernel.CloseHandle(handle)
+    if code.value != 259:  # STILL_ACTIVE
+        return None
+    return times[0].value / 1e7 - 11_644_473_600  # tenths of microseconds since 1601
+
+
+def _told_by_proc(pid: int) -> float | None:
+    after_name = (PROC / str(pid) / "stat").read_text(encoding="utf-8", errors="replace").rpartition(")")[2].split()
+    if after_name[0] in "ZX":  # it has ended, and nobody has asked how
+        return None
+    booted = re.search(r"^btime (\d+)", (PROC / "stat").read_text(encoding="utf-8"), re.MULTILINE)
+    return int(booted[1]) + int(after_name[19]) / os.sysconf("SC_CLK_TCK") if booted else None
+
+
+def _told_by_ps(pid: int) -> float | None:
+    """By its age: [[days-]hours:]minutes:seconds."""
+    told = subprocess.run(["ps", "-o", "etime=", "-p", str(pid)], capture_output=True, text=True, check=False)
+    days, _, clock = told.stdout.strip().rpartition("-")
+    if not clock:
+        return None
+    age = 0
+    for part in clock.split(":"):
+        age = age * 60 + int(part)
+    return time.time() - age - 86400 * int(days or 0)

@@ -1,0 +1,67 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Processes of an earlier session: known again, and told from others that have come by their numbers."""
+from __future__ import annotations
+
+import importlib.util
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from blenders import ROOT
+
+
+@pytest.fixture(scope="module")
+def processes() -> Any:
+    spec = importlib.util.spec_from_file_location("processes", ROOT / "flare_addon" / "processes.py")
+    assert spec is not None
+    assert spec.loader is not None
+    found = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(found)  # without the add-on, whose modules need Blender
+    return found
+
+
+@pytest.fixture(params=["this system's way", "by ps"])
+def sleeper(request: pytest.FixtureRequest, processes: Any, monkeypatch: pytest.MonkeyPatch,
+            tmp_path: Path) -> Iterator[tuple[subprocess.Popen[bytes], float]]:
+    """A process, and when it was started."""
+    if request.param == "by ps":
+        if os.name == "nt":
+            pytest.skip("Windows has no ps")
+        monkeypatch.setattr(processes, "PROC", tmp_path / "none")  # as on macOS
+    process = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
+    yield process, time.time()
+    process.kill()
+    process.wait()
+
+
+def test_the_same_and_another_of_its_number(processes: Any, sleeper: tuple[subprocess.Popen[bytes], float]) -> None:
+    process, started = sleeper
+    assert processes.runs(process.pid)
+    assert processes.is_same(process.pid, started)
+    assert not processes.is_same(process.pid, started - 3600), "it began after that which was written down"
+    process.kill()
+    process.wait()
+    assert not processes.runs(process.pid)
+    assert not processes.is_same(process.pid, started)
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="needs /proc")
+def test_one_that_ended_unasked_does_not_run(processes: Any) -> None:
+    process = subprocess.Popen([sys.executable, "-c", ""])
+    time.sleep(1)  # not waited for: its number is not given out yet
+    assert not processes.runs(process.pid)
+    process.wait()
+
+
+def test_ages_as_ps_tells_them(processes: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    for told, age in (("      03:07\n", 187), ("1-02:03:04", 93784), ("   12:00:00", 43200)):
+        monkeypatch.setattr(processes.subprocess, "run",
+                            lambda *_words, told=told, **_options: subprocess.CompletedProcess([], 0, told))
+        assert processes._told_by_ps(1) == pytest.approx(time.time() - age, abs=1)
+    monkeypatch.setattr(processes.subprocess, "run", lambda *_words, **_options: subprocess.CompletedProcess([], 1, ""))
+    assert processes._told_by_ps(1) is None

@@ -16,11 +16,9 @@ import numpy as np
 from ..core.errors import CaptureError
 from ..core.files import write_json
 from ..core.look.shot import PlacedLight, Shot, ShotFrame
-from . import cameras, capture_export, looks
+from . import cameras, capture_export, lights, looks
 
 KINDS = ("POINT", "SPOT", "AREA", "SUN")
-SUN_DISTANCE = 1e4
-"""Scene units at which a sun is placed, against its direction, from the camera."""
 
 
 def shot_of(scene: Any, flare: Path, names: Sequence[str], frames: Sequence[int], *, radius: float = 0.0,
@@ -42,8 +40,8 @@ def shot_of(scene: Any, flare: Path, names: Sequence[str], frames: Sequence[int]
         camera = scene.camera.evaluated_get(depsgraph)
         core = cameras.core_camera(camera.data, camera.matrix_world, scene.render)
         eye = camera.matrix_world.translation
-        lights = [_placed(scene, depsgraph, thing, eye, radius, occlusion) for thing in things]
-        made.append(ShotFrame(frame, scene.camera.name, core, tuple(lights)))
+        placed = tuple(_placed(scene, depsgraph, thing, eye, radius, occlusion) for thing in things)
+        made.append(ShotFrame(frame, scene.camera.name, core, placed))
         done()
     return Shot(flare, tuple(made))
 
@@ -62,22 +60,16 @@ def _lights(scene: Any, names: Sequence[str]) -> list[Any]:
 
 
 def _placed(scene: Any, depsgraph: Any, thing: Any, eye: Any, radius: float, occlusion: bool) -> PlacedLight:
-    here = thing.evaluated_get(depsgraph)
-    where = here.matrix_world.translation.copy()
-    if thing.type == "LIGHT" and thing.data.type == "SUN":
-        from mathutils import Vector
-
-        where = eye + (here.matrix_world.to_3x3() @ Vector((0.0, 0.0, 1.0))).normalized() * SUN_DISTANCE
-        share = looks.share_seen(scene, depsgraph, eye, where, {thing.name}, radius) if occlusion else 1.0
-    else:
-        item = SimpleNamespace(target=thing, radius=radius or _radius(thing))
-        share = looks.visible_share(scene, depsgraph, eye, item) if occlusion else 1.0
-    return PlacedLight(thing.name, thing.name, np.array(where, np.float64), float(share))
+    item = SimpleNamespace(target=thing, radius=radius or _radius(thing))
+    share = looks.visible_share(scene, depsgraph, eye, item) if occlusion else 1.0
+    where = np.array(lights.stands(thing, thing.evaluated_get(depsgraph).matrix_world, eye), np.float64)
+    return PlacedLight(thing.name, thing.name, where, float(share))
 
 
 def _radius(thing: Any) -> float:
-    """Of a lamp that has one; 0 where it is a point or a mesh."""
-    return float(getattr(thing.data, "shadow_soft_size", 0.0)) if thing.type == "LIGHT" else 0.0
+    """Of a lamp that has one; 0 where it is a point, a sun or a mesh."""
+    sized = thing.type == "LIGHT" and thing.data.type != "SUN"
+    return float(getattr(thing.data, "shadow_soft_size", 0.0)) if sized else 0.0
 
 
 def capture_of(scene: Any, plates: Mapping[int, Path], folder: Path, names: Sequence[str],
@@ -102,8 +94,10 @@ def capture_of(scene: Any, plates: Mapping[int, Path], folder: Path, names: Sequ
     capture_export.write_points(folder / "points.ply", points)
     things = _lights(scene, names) if names or any(thing.type == "LIGHT" for thing in scene.objects) else []
     if things:
+        eye = scene.camera.matrix_world.translation
         write_json(folder / "lights.json", {"lights": [
-            {"name": thing.name, "xyz": list(map(float, thing.matrix_world.translation))} for thing in things]})
+            {"name": thing.name, "xyz": list(map(float, lights.stands(thing, thing.matrix_world, eye)))}
+            for thing in things]})
     write_json(folder / "transforms.json",
                {"camera_model": "PINHOLE", "ply_file_path": "points.ply", "frames": entries})
     return len(entries)

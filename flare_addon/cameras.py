@@ -33,8 +33,8 @@ def lens_of(camera: Camera, sensor_width: float, aspect: tuple[float, float]) ->
 
 def render_size(render: Any) -> tuple[int, int]:
     """(width, height) of the picture that is rendered, in pixels."""
-    share = render.resolution_percentage / 100
-    return max(int(render.resolution_x * share), 1), max(int(render.resolution_y * share), 1)
+    percentage = render.resolution_percentage  # in whole numbers, as Blender rounds
+    return max(render.resolution_x * percentage // 100, 1), max(render.resolution_y * percentage // 100, 1)
 
 
 def intrinsics_of(data: Any, render: Any) -> tuple[float, float, float, float]:

@@ -52,7 +52,7 @@ def footage_of(camera: Any) -> Footage | None:
             # The sequence shows file number `frame - frame_start + 1 + frame_offset`.
             return Footage(path, shown)
         if back.source == "MOVIE_CLIP" and back.clip is not None and back.clip.source == "SEQUENCE":
-            return Footage(Path(bpy.path.abspath(back.clip.filepath)), back.clip.frame_start)
+            return Footage(Path(bpy.path.abspath(back.clip.filepath)), back.clip.frame_start - back.clip.frame_offset)
     return None
 
 
@@ -104,7 +104,37 @@ def entry_of(scene: Any, camera: Any, frame: int, path: Path, folder: Path) -> d
             shutil.copy2(path, target)
     pose = cameras.camera_to_world(evaluated.matrix_world) @ cameras.FLIP
     return {"file_path": name, "w": core.width, "h": core.height, "fl_x": core.fx, "fl_y": core.fy, "cx": core.cx,
-            "cy": core.cy, "transform_matrix": pose.tolist()}
+            "cy": core.cy, **distortion_of(camera, path), "transform_matrix": pose.tolist()}
+
+
+def distortion_of(camera: Any, path: Path) -> dict[str, float]:
+    """What the motion tracker found of a lens's distortion, for a picture of the clip itself; {} for none, and for
+    pictures from elsewhere, which are taken for straight.
+
+    Raises CaptureError for distortion of another model than Polynomial, which transforms.json has no words for.
+    """
+    for back in camera.data.background_images:
+        clip = back.clip if back.source == "MOVIE_CLIP" else None
+        if clip is None or Path(bpy.path.abspath(clip.filepath)).parent.resolve() != path.parent.resolve():
+            continue
+        lens = clip.tracking.camera
+        if lens.distortion_model == "POLYNOMIAL":
+            found = {name: float(getattr(lens, name)) for name in ("k1", "k2", "k3")}
+            return found if any(found.values()) else {}
+        prefix = {"DIVISION": "division_k", "NUKE": "nuke_k", "BROWN": "brown_"}.get(lens.distortion_model, "")
+        if any(getattr(lens, name) for name in dir(lens) if prefix and name.startswith(prefix)):
+            raise CaptureError(f"The lens of the clip {clip.name!r} is distorted by the model {lens.distortion_model}; "
+                               "solve it with the model Polynomial, or give undistorted frames.")
+    return {}
+
+
+def space_of_bundles(camera: Any) -> Any:
+    """The matrix from the space of a clip's solved points to the world; None for the world itself. With the solver's
+    constraint on the camera they move with the camera object's own transform, which Set Origin and Set Scale write."""
+    parent = camera.parent.matrix_world if camera.parent else None
+    if not any(one.type == "CAMERA_SOLVER" and not one.mute for one in camera.constraints):
+        return parent
+    return camera.matrix_basis if parent is None else parent @ camera.matrix_parent_inverse @ camera.matrix_basis
 
 
 def points_of(scene: Any, camera: Any) -> np.ndarray[Any, Any]:
@@ -113,8 +143,8 @@ def points_of(scene: Any, camera: Any) -> np.ndarray[Any, Any]:
     for back in camera.data.background_images:
         if back.source == "MOVIE_CLIP" and back.clip is not None:
             bundles = [list(track.bundle) for track in back.clip.tracking.tracks if track.has_bundle]
-            if bundles:  # in the space of the camera's parent, or the world
-                found.append(_moved(np.array(bundles), camera.parent.matrix_world if camera.parent else None))
+            if bundles:
+                found.append(_moved(np.array(bundles), space_of_bundles(camera)))
     for item in scene.objects:
         if item.type == "MESH" and len(item.data.vertices):
             flat = np.empty(3 * len(item.data.vertices), np.float32)

@@ -28,6 +28,7 @@ LAYERS = "Fit Flare Layers"
 PLATE = "Fit Flare Footage"
 VIEWER = "Fit Flare Viewer"
 RENDER = "Fit Flare Render"
+SIZE = "Fit Flare Size"
 NOTE = "fit_flare_compositor"  # a property of the scene: what was there before
 _GAIN = " Gain"
 _POINTING = ("image", "frame_start", "frame_offset", "frame_duration", "use_auto_refresh")
@@ -78,12 +79,13 @@ def _declare(group: Any, inputs: Iterable[str]) -> None:
 
 def _fill(group: Any, layers: Sequence[str]) -> None:
     entry = _node(group, "NodeGroupInput", 0, 0)
-    gained = [_mix(group, "MULTIPLY", entry.outputs[name], entry.outputs[gain_of(name)], 1, -row)
-              for row, name in enumerate(layers, 1)]
+    sized = [_of_render_size(group, entry.outputs[name], 1, -row) for row, name in enumerate(layers, 1)]
+    gained = [_mix(group, "MULTIPLY", one.outputs[0], entry.outputs[gain_of(name)], 2, -row)
+              for row, (name, one) in enumerate(zip(layers, sized, strict=True), 1)]
     total = gained[0]
-    for column, one in enumerate(gained[1:], 2):
+    for column, one in enumerate(gained[1:], 3):
         total = _mix(group, "ADD", total, one, column, -1)
-    column = len(layers) + 1
+    column = len(layers) + 2
     tinted = _mix(group, "MULTIPLY", total, entry.outputs["Tint"], column, -1)
     scaled = _mix(group, "MULTIPLY", tinted, entry.outputs["Intensity"], column + 1, -1)
     image = _mix(group, "ADD", entry.outputs["Scene"], scaled, column + 2, 0)
@@ -107,6 +109,21 @@ def _with_matte(group: Any, colour: Any, column: int) -> Any:
 def _node(tree: Any, kind: str, column: float, row: float) -> Any:
     node = tree.nodes.new(kind)
     node.location = (220 * column, 220 * row)
+    return node
+
+
+def _of_render_size(tree: Any, socket: Any, column: float, row: float) -> Any:
+    """A node that brings a picture to the size that is rendered: at other percentages than it was baked for Blender
+    would lay it over the middle as it is."""
+    node = _node(tree, "CompositorNodeScale", column, row)
+    if hasattr(node, "space"):
+        node.space, node.frame_method = "RENDER_SIZE", "STRETCH"
+    else:
+        for name, value in (("Type", "Render Size"), ("Frame Type", "Stretch"), ("Extension X", "Extend"),
+                            ("Extension Y", "Extend")):
+            if name in node.inputs:
+                node.inputs[name].default_value = value
+    tree.links.new(socket, node.inputs["Image"])
     return node
 
 
@@ -158,8 +175,11 @@ def set_up(scene: Any, layers: LayerFolder, *, keep_image: bool = False, plate: 
     keep_image: the scene is what fed the output until now (a render, a plate), and the flare goes over
     it; otherwise it is the baked scene. plate: (image, frame_start, frame_offset, frame_duration) of footage
     that is the scene instead. Other nodes stay as they are. Returns the "Fit Flare" node.
-    Raises FrameError where the files hold no flare layers.
+    Raises FrameError where the files hold no flare layers, and for a scene that renders a cropped region.
     """
+    if scene.render.use_border and scene.render.use_crop_to_border:
+        raise FrameError(f"The scene {scene.name!r} renders a region cut out of the frame, where layers of whole "
+                         "frames do not fit; switch Crop to Render Region off in its output properties.")
     note = _note(scene)
     tree = tree_of(scene) or _new_tree(scene, keep_image)
     source = tree.nodes.get(LAYERS)
@@ -190,12 +210,16 @@ def set_up(scene: Any, layers: LayerFolder, *, keep_image: bool = False, plate: 
     before = end.links[0].from_socket if end.is_linked else None
     if before is not None and before.node == node:  # set up earlier: what the scene is was chosen then
         before = node.inputs["Scene"].links[0].from_socket if node.inputs["Scene"].is_linked else None
-    keep = keep_image and before is not None and before.node != source and before.node.name != PLATE
+    keep = keep_image and before is not None and before.node != source and before.node.name not in (PLATE, SIZE)
     scene_socket = before if keep else sockets["scene"]
     if plate is not None:
         scene_socket = _footage(tree, plate).outputs["Image"]
     elif keep_image and not keep:
         scene_socket = _render(tree).outputs["Image"]
+    if (size := tree.nodes.get(SIZE)) is not None:
+        tree.nodes.remove(size)
+    if scene_socket is not None and scene_socket.node.name in (LAYERS, PLATE):
+        scene_socket = _named(_of_render_size(tree, scene_socket, -3, 1), SIZE).outputs[0]
     tree.links.new(scene_socket, node.inputs["Scene"])
     tree.links.new(node.outputs["Image"], end)
     if not any(other.bl_idname == "CompositorNodeViewer" for other in tree.nodes):
@@ -322,7 +346,7 @@ def remove(scene: Any) -> None:
     _undriven(tree)
     if not note.get("drivers", True) and tree.animation_data is not None and not tree.animation_data.drivers:
         tree.animation_data_clear()
-    for name in (GROUP, LAYERS, PLATE, VIEWER, RENDER):
+    for name in (GROUP, LAYERS, PLATE, SIZE, VIEWER, RENDER):
         if (ours := tree.nodes.get(name)) is not None:
             inner = None if inner is not None and inner.node == ours else inner
             tree.nodes.remove(ours)
@@ -422,12 +446,12 @@ def _point_at(node: Any, layers: LayerFolder) -> None:
 
 
 def match_scene(scene: Any, layers: LayerFolder, size: tuple[int, int]) -> None:
-    """Give the scene the layers' frames and size (width, height)."""
+    """Give the scene the layers' frames and size (width, height). Its pixels keep their aspect: the camera goes by
+    that."""
     scene.frame_start, scene.frame_end = layers.first, layers.last
     render = scene.render
     render.resolution_x, render.resolution_y = size
     render.resolution_percentage = 100
-    render.pixel_aspect_x = render.pixel_aspect_y = 1.0
 
 
 def plain_view(scene: Any) -> None:

@@ -15,6 +15,9 @@ from ..core.files import read_json, write_json
 from . import cameras
 from .capture_import import add_light
 
+SUN_DISTANCE = 1e4
+"""Scene units at which a sun is from who looks."""
+
 
 def of_scene(scene: Any) -> list[Any]:
     """The objects of the scene that stand for lights, by name of the light."""
@@ -31,6 +34,16 @@ def place_of(light: Any, root: Any, matrix: Any = None) -> Any:
     """(3,) position in the capture's coordinates. matrix: the light's matrix_world, if not the present one."""
     world = np.array([*(matrix or light.matrix_world).translation, 1.0])
     return (cameras.to_capture(root) @ world)[:3]
+
+
+def stands(light: Any, matrix: Any, eye: Any) -> Any:
+    """Where a light is for who looks from `eye`, in the world, `matrix` being its matrix_world: a sun is far away
+    against its direction, wherever its object is put."""
+    from mathutils import Vector
+
+    if light.type == "LIGHT" and light.data.type == "SUN":
+        return eye + (matrix.to_3x3() @ Vector((0.0, 0.0, 1.0))).normalized() * SUN_DISTANCE
+    return matrix.translation.copy()
 
 
 def add(scene: Any, where: Any, name: str = "") -> Any:
@@ -82,9 +95,12 @@ def write(scene: Any, folder: Path) -> int:
     path = folder / "lights.json"
     data: dict[str, Any] = read_json(path, CaptureError) if path.is_file() else {}
     known = {entry.get("name"): entry for entry in data.get("lights", []) if isinstance(entry, dict)}
+    eye = scene.camera.matrix_world.translation if scene.camera is not None else objects[0].matrix_world.translation
     lights = []
     for item, name in zip(objects, names, strict=True):
-        xyz = [round(float(value), 6) for value in place_of(item, scene.fit_flare.root)]
+        matrix = item.matrix_world.copy()
+        matrix.translation = stands(item, matrix, eye)
+        xyz = [round(float(value), 6) for value in place_of(item, scene.fit_flare.root, matrix)]
         lights.append({**known.get(name, {}), "name": name, "xyz": xyz})
     if lights != data.get("lights"):
         write_json(path, {**data, "lights": lights})

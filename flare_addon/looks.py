@@ -15,11 +15,11 @@ from ..core.look import Edit, Look, LookEdits, PlaneGaussians, read
 from ..core.look.look import Query
 from ..core.look.shot import PlacedLight, evaluate
 from . import cameras
-from .lights import name_of, of_scene, place_of
+from .lights import name_of, of_scene, place_of, stands
 from .paths import absolute
 from .properties import edit_of
 
-LIGHT_SHARE = 0.01  # of a light's distance: its radius where none is given (core/flare/visibility.py)
+LIGHT_SHARE = 0.02  # of a light's distance: the disc's radius where none is given; as a fit's, two deviations wide
 MARGIN = 0.06  # what stands nearer to the light than this share of its distance is the lamp itself
 RAYS = 25
 
@@ -161,7 +161,7 @@ def placed(scene: Any, depsgraph: Any, camera: Any) -> tuple[NDArray[np.float64]
     for item in state.lights:
         if item.target is None or item.target.name not in scene.objects:
             continue
-        where = item.target.evaluated_get(depsgraph).matrix_world.translation
+        where = stands(item.target, item.target.evaluated_get(depsgraph).matrix_world, matrix.translation)
         share = visible_share(scene, depsgraph, matrix.translation, item) if state.occlusion else 1.0
         xyz = (into @ np.array([*where, 1.0]))[:3]
         lights.append(PlacedLight(item.name, item.source, xyz, share))
@@ -194,7 +194,7 @@ def visible_share(scene: Any, depsgraph: Any, eye: Any, item: Any) -> float:
 
     What stands right at the light (within 6% of the distance) is the lamp itself and hides nothing.
     """
-    where = item.target.evaluated_get(depsgraph).matrix_world.translation
+    where = stands(item.target, item.target.evaluated_get(depsgraph).matrix_world, eye)
     own = {item.target.name, *(child.name for child in item.target.children_recursive)}
     return share_seen(scene, depsgraph, eye, where, own, item.radius)
 
@@ -222,7 +222,7 @@ def share_seen(scene: Any, depsgraph: Any, eye: Any, light: Any, own: set[str], 
             hit, where, _normal, _index, thing, _matrix = scene.ray_cast(depsgraph, start, direction, distance=left)
             if not hit:
                 break
-            if thing is None or thing.original.name not in own:
+            if thing is None or not (thing.original.name in own or _is_unseen(thing)):
                 clear = False
                 break
             step = (where - start).length + 1e-4 * distance
@@ -231,6 +231,11 @@ def share_seen(scene: Any, depsgraph: Any, eye: Any, light: Any, own: set[str], 
                 break
         share += weight * clear
     return share
+
+
+def _is_unseen(thing: Any) -> bool:
+    """Whether pictures of the camera do not show an object that the viewport has."""
+    return bool(thing.original.hide_render) or not thing.original.visible_camera
 
 
 def forget() -> None:

@@ -36,11 +36,14 @@ class OfCamera(Protocol):
 
 class FrameRenderer(OfCamera, Protocol):
     """What renders one frame. fingerprint: changes whenever this frame's picture would, beyond the whole's; empty
-    where nothing is this frame's alone. rest_is_made: whether what `finished` writes beside the layers is there.
-    finished: its layers, already in the space asked for, as they are to be written."""
+    where nothing is this frame's alone. words: edits that the frame comes with, for `LookEdits.parse`. rest_is_made:
+    whether what `finished` writes beside the layers is there. finished: its layers, already in the space asked for, as
+    they are to be written."""
 
     @property
     def fingerprint(self) -> str: ...
+    @property
+    def words(self) -> Sequence[str]: ...
     @property
     def rest_is_made(self) -> bool: ...
     def finished(self, layers: FrameLayers, camera: Camera) -> FrameLayers: ...
@@ -68,6 +71,7 @@ class _AnyFrame:
 
     renderer: Renderer
     fingerprint: str = ""
+    words: tuple[str, ...] = ()
     rest_is_made: bool = True
 
     def render(self, camera: Camera, edits: LookEdits | None = None) -> Rendering:
@@ -140,8 +144,10 @@ def bake_frames(source: Sequenced, frames: Sequence[Frame], cameras: Mapping[str
     progress.stage("bake", len(frames), len(done))
 
     def made(frame: Frame) -> FrameLayers:
-        camera, one = settings.scaled(cameras[frame.view]), of_frame(frame)
-        return one.finished(_layers(one, camera, edits[frame.number], source.lights).in_space(space), camera)
+        camera, one, asked = settings.scaled(cameras[frame.view]), of_frame(frame), edits[frame.number]
+        if one.words:
+            asked = LookEdits.parse([*one.words, *asked.words()], source.lights, source.elements)
+        return one.finished(_layers(one, camera, asked, source.lights).in_space(space), camera)
 
     for frame in frames:
         if frame in done:

@@ -8,7 +8,7 @@ hides the lights come along.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Container, Mapping
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -54,16 +54,15 @@ class ShotRenderer:
             digest.update(self.run.fingerprint.encode())
         return digest.hexdigest()[:16]
 
-    def render(self, one: ShotFrame, camera: Camera) -> Rendered:
+    def render(self, one: ShotFrame, camera: Camera, edits: LookEdits | None = None) -> Rendered:
         """The layers of a frame, under its camera at the size asked for."""
         import torch
 
-        words = LookEdits.parse(one.edits, self.lights, self.elements)
         placed = [self._behind_the_scene(light, camera) for light in one.lights]
         with torch.no_grad():
             _, intrinsics = pose_and_intrinsics(camera)
             flares = {name: splat_flare(as_tensors(found), intrinsics, *camera.size, self.look.blend)
-                      for name, found in evaluate(self.look, camera.world_to_camera, placed, words,
+                      for name, found in evaluate(self.look, camera.world_to_camera, placed, edits,
                                                   self.shot.query).items()}
             dark = torch.zeros(camera.height, camera.width, 3)
             scene = self.run.scene.render(camera) if self.run is not None else None
@@ -90,7 +89,7 @@ class ShotRenderer:
 
 @dataclass(frozen=True)
 class _OfFrame:
-    """A frame of a shot. Its edits are the shot's own."""
+    """A frame of a shot."""
 
     renderer: ShotRenderer
     one: ShotFrame
@@ -101,8 +100,13 @@ class _OfFrame:
         """Of the frame's camera, lights and edits."""
         return hashlib.sha256(self.one.described().encode()).hexdigest()[:16]
 
-    def render(self, camera: Camera, edits: LookEdits | None = None) -> Rendered:  # noqa: ARG002 - see above
-        return self.renderer.render(self.one, camera)
+    @property
+    def words(self) -> Sequence[str]:
+        """The shot's own edits."""
+        return self.one.edits
+
+    def render(self, camera: Camera, edits: LookEdits | None = None) -> Rendered:
+        return self.renderer.render(self.one, camera, edits)
 
     def finished(self, layers: FrameLayers, camera: Camera) -> FrameLayers:  # noqa: ARG002 - nothing to add
         return layers

@@ -2,6 +2,8 @@
 """What a fit begins with: a scene, and a flare for each light, which is put in its place first."""
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import torch
 
@@ -17,12 +19,37 @@ from .frames import Frames
 from .settings import FitSettings
 from .sky import with_sky
 
+NEAREST, NEAREST_PART = 0.01, 0.5
+"""Quantile of the depths of points that counts as the nearest, and the part of it at which Gaussians are culled, where
+that is less than usual: worlds of small units, metres about a watch, are fitted as others are."""
+NEAREST_POINTS = 10_000  # that are looked at
 SNAP_WIDTH, SNAP_VIEWS = 160, 40
 """Pixels of the pictures that lights are placed by, and about how many of them."""
 
 
 def first_scene(capture: Capture, settings: FitSettings, views: tuple[View, ...], frames: Frames) -> SceneGaussians:
     """The scene a fit begins with: one that was trained elsewhere, or a Gaussian at each point."""
+    scene = _scene(capture, settings, views, frames)
+    scene.near = min(scene.near, NEAREST_PART * nearest_depth(capture))
+    return scene
+
+
+def nearest_depth(capture: Capture) -> float:
+    """Camera depth, world units, of the points that are nearest in the views: the hundredth part of all that are on the
+    frame. Infinity where no view has any."""
+    points = capture.points.xyz[:: max(len(capture.points) // NEAREST_POINTS, 1)]
+    depths = []
+    for camera in (view.camera for view in capture.views):
+        seen = points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+        seen = seen[seen[:, 2] > 0]
+        x, y = (seen[:, :2] / seen[:, 2:] * (camera.fx, camera.fy) + (camera.cx, camera.cy)).T
+        depths.append(seen[(x > 0) & (x < camera.width) & (y > 0) & (y < camera.height), 2])
+    every = np.concatenate(depths) if depths else np.zeros(0)
+    return float(np.quantile(every, NEAREST)) if len(every) else math.inf
+
+
+def _scene(capture: Capture, settings: FitSettings, views: tuple[View, ...],
+                    frames: Frames) -> SceneGaussians:
     if settings.scene.start:
         scene = read_ply(settings.scene.start)
         if not len(scene):

@@ -8,6 +8,7 @@ rot_0..3 (w x y z). Fewer f_rest (0, 9, 24) mean a lower degree. Compressed form
 """
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -18,9 +19,11 @@ from numpy.typing import NDArray
 from ..errors import FlareFileError
 from ..files import atomic_path
 from .compressed import is_compressed, read_compressed
+from .rendering import NEAR
 from .scene import COEFFICIENTS, SceneGaussians
 
 HEADER_MAX = 1 << 16
+_NEAR = "near"  # a comment of ours: camera depth at which Gaussians are culled
 ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
 TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2",
@@ -59,6 +62,8 @@ def write_ply(path: Path | str, scene: SceneGaussians, *, extra: Mapping[str, ND
         [means, np.zeros((n, 3), "<f4"), sh[:, 0], rest, opacities[:, None], log_scales, quaternions,
          *(np.asarray(column, "<f4")[:, None] for column in extra.values())], 1
     )
+    if scene.near != NEAR:
+        comments = [*comments, f"{_NEAR} {scene.near:.9g}"]
     lines = ["ply", "format binary_little_endian 1.0", *(f"comment {line}" for line in comments),
              f"element vertex {n}"]
     lines += [f"property float {name}" for name in names] + ["end_header"]
@@ -77,7 +82,7 @@ def read_ply(path: Path | str) -> SceneGaussians:
         if is_compressed(path):
             return read_compressed(path)
         with open(path, "rb") as file:
-            order, n, layout, start = _header(path, file.read(HEADER_MAX))
+            order, n, layout, start, near = _header(path, file.read(HEADER_MAX))
             kind = np.dtype([(name, order + code) for name, code in layout])
             if path.stat().st_size - start < n * kind.itemsize:
                 raise FlareFileError(f"{path} is cut short: it announces {n} Gaussians; copy it again.")
@@ -108,25 +113,31 @@ def read_ply(path: Path | str) -> SceneGaussians:
     sh[:, 0] = columns(DC)
     if rest_names:
         sh[:, 1 : 1 + len(rest_names) // 3] = columns(rest_names).reshape(n, 3, len(rest_names) // 3).transpose(1, 2)
-    return SceneGaussians(
+    scene = SceneGaussians(
         columns(POSITION), columns(SCALE), columns(ROTATION), columns(("opacity",))[:, 0].clone(), sh
     )
+    scene.near = near
+    return scene
 
 
-def _header(path: Path, head: bytes) -> tuple[str, int, list[tuple[str, str]], int]:
-    """Byte order, number of vertices, their properties with types, and where the data starts."""
+def _header(path: Path, head: bytes) -> tuple[str, int, list[tuple[str, str]], int, float]:
+    """Byte order, number of vertices, their properties with types, where the data starts, and the near depth."""
     end = head.find(b"\nend_header")
     start = head.find(b"\n", end + 1) + 1
     if not head.startswith(b"ply") or end < 0 or not start:
         raise FlareFileError(f"{path} is not a PLY file.")
     order, count, element = "", -1, ""
     layout: list[tuple[str, str]] = []
+    near = NEAR
     for line in head[:end].decode("ascii", "replace").splitlines()[1:]:
         match line.split():
             case ["format", form, _]:
                 if form not in ORDERS:
                     raise FlareFileError(f"{path} is a PLY file in the format {form}; export it as binary.")
                 order = ORDERS[form]
+            case ["comment", word, number] if word == _NEAR:
+                with contextlib.suppress(ValueError):
+                    near = float(number) if 0 < float(number) < NEAR else NEAR
             case ["element", name, number]:
                 if count < 0 and (name != "vertex" or not (number.isascii() and number.isdigit())):
                     raise FlareFileError(f"{path} does not begin with its vertices; export it again.")
@@ -138,4 +149,4 @@ def _header(path: Path, head: bytes) -> tuple[str, int, list[tuple[str, str]], i
                 layout.append((words[1], TYPES[words[0]]))
     if not order or not layout or len({name for name, _ in layout}) < len(layout):
         raise FlareFileError(f"{path} is not a PLY file of Gaussians.")
-    return order, count, layout, start
+    return order, count, layout, start, near

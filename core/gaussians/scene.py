@@ -15,7 +15,7 @@ from . import spherical_harmonics
 from .optimiser import Rate, replace_rows
 from .ordering import nearest_distances
 from .rasterizer import Kernels, rasterization
-from .rendering import Rendering
+from .rendering import NEAR, Rendering
 
 COEFFICIENTS = (spherical_harmonics.MAX_DEGREE + 1) ** 2
 INITIAL_OPACITY = 0.1
@@ -42,6 +42,8 @@ class SceneGaussians(nn.Module):
         self.quaternions = nn.Parameter(quaternions)
         self.opacity_logits = nn.Parameter(opacity_logits)
         self.sh = nn.Parameter(sh)
+        self.near = NEAR
+        """Camera depth at which Gaussians are culled, world units: less in a world of small units."""
 
     @classmethod
     def from_points(cls, points: PointCloud) -> SceneGaussians:
@@ -104,7 +106,7 @@ class SceneGaussians(nn.Module):
             torch.as_tensor(camera.world_to_camera).to(self.means),
             torch.as_tensor(camera.intrinsics).to(self.means),
             camera.width, camera.height, background=background, sh_degree=sh_degree, kernels=kernels,
-            depth=depth, raw=True,
+            near=self.near, depth=depth, raw=True,
         )  # fmt: skip
 
 

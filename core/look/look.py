@@ -93,9 +93,12 @@ class LightLook:
 
     def __init__(self, name: str, xyz: NDArray[np.float64], form: Form, query_range: QueryRange,
                  rows: Mapping[str, Floats], tensors: Mapping[str, NDArray[Any]], blend: str,
-                 listed: list[Element]) -> None:
-        """rows: canonical Gaussians by name; tensors: the network's; listed: elements the file has, [] for none."""
+                 listed: list[Element], clear: float = 1.0) -> None:
+        """rows: canonical Gaussians by name; tensors: the network's; listed: elements the file has, [] for none.
+        clear: what the scene it was learned in leaves of the light where nothing hides it, 0..1
+        (`core.flare.model.FlareModel`)."""
         self.name, self.xyz, self.form, self.query_range, self.blend = name, xyz, form, query_range, blend
+        self.clear = clear
         self._rows, self._listed = rows, listed
         encoded = frequency_encoding(rows["positions"])
         if form.latent:
@@ -312,7 +315,7 @@ def _light(path: Path, number: int, entry: Mapping[str, Any], tensors: Mapping[s
         if rows[key].shape != (count, width):
             raise ValueError(f"{key} has the shape {rows[key].shape}")
     return LightLook(name, xyz, form, QueryRange.read(entry["range"]), rows, own, blend,
-                     elements.read(listed, name, count))
+                     elements.read(listed, name, count), min(max(float(entry.get("clear", 1.0)), 0.0), 1.0))
 
 
 def _widths(form: Form) -> dict[str, int]:

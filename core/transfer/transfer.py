@@ -26,7 +26,7 @@ from ..files import check_apart, remove_partial_of
 from ..fit.rendering import as_tensors, pose_and_intrinsics
 from ..flare.compositing import decode, encode, splat_flare
 from ..flare.compositing import layers as linear_layers
-from ..flare.visibility import VisibilitySettings, visible_share
+from ..flare.visibility import VisibilitySettings, of_clear, visible_share
 from ..gaussians import Splats
 from ..look import LookEdits, ViewOfLight, read
 from ..look.shot import PlacedLight
@@ -110,9 +110,6 @@ class Transfer:
     def flares(self, index: int, camera: Camera, edits: LookEdits | None = None) -> dict[str, Splats]:
         """Each light's splats in a frame, under `camera`; of the lights that show something."""
         shot = self.target.frames[index].shot
-        if shot.edits:
-            asked = edits.words() if edits is not None else []
-            edits = LookEdits.parse([*shot.edits, *asked], self.lights, self.elements)
         names = [light.name for light in shot.lights]
         _, intrinsics = pose_and_intrinsics(camera)
         shown: dict[str, Splats] = {}
@@ -144,6 +141,9 @@ class Transfer:
                 with torch.no_grad():
                     seen = float(visible_share(self.target.scene, torch.from_numpy(shot.camera.position),
                                                torch.from_numpy(placed.xyz), self.settings.visibility))
+                source = self.sources[placed.source]
+                if np.allclose(placed.xyz, source.xyz, rtol=1e-6, atol=1e-9):  # the splats it was learned in
+                    seen = float(of_clear(torch.tensor(seen), source.clear))
                 share *= min(max((seen - SURE) / (1 - 2 * SURE), 0.0), 1.0)
             self._shares[key] = share
         return self._shares[key]
@@ -210,6 +210,11 @@ class _OfFrame:
     def fingerprint(self) -> str:
         """See `Transfer.fingerprint_of`."""
         return self._transfer.fingerprint_of(self._index)
+
+    @property
+    def words(self) -> Sequence[str]:
+        """The shot's own edits."""
+        return self._one.shot.edits
 
     @property
     def rest_is_made(self) -> bool:

@@ -102,6 +102,23 @@ def test_the_flare_can_go_over_the_present_image(made: Made) -> None:
     assert_half_equal(rgb(made.out / "over" / "0.exr"), plate + baked(made, 0).flare)
 
 
+@pytest.mark.parametrize(("name", "factor"), [("over at 50", 0.5), ("over at 200", 2), ("plain at 50", 0.5)])
+def test_layers_are_brought_to_the_size_that_is_rendered(made: Made, name: str, factor: float) -> None:
+    layers, image = baked(made, 0), rgb(made.out / name / "0.exr")
+    assert image.shape[:2] == (SIZE[0] * factor, SIZE[1] * factor)
+    expected = layers.flare if name.startswith("over") else layers.composite
+    small, large = sorted((image, expected), key=len)
+    means = large.reshape(len(small), 2, small.shape[1], 2, 3).mean((1, 3))  # of pixels that know nothing of each other
+    assert np.corrcoef(means.ravel(), small.ravel())[0, 1] > 0.9
+
+
+def test_what_the_camera_goes_by_stays(made: Made) -> None:
+    assert made.facts["pixel aspect"] == 2
+    sentence, nothing = made.facts["cropped"]
+    assert "switch Crop to Render Region off" in sentence
+    assert nothing
+
+
 def test_the_saved_file_shows_the_same_elsewhere_and_without_us(made: Made, blender: Blender, tmp_path: Path) -> None:
     shutil.copytree(made.layers, tmp_path / "layers")
     shutil.copytree(made.out / "scene", tmp_path / "out" / "scene")

@@ -73,6 +73,26 @@ for _ in range(2):
 facts["plate stays"] = plate.name in tree.nodes
 render(scene, "over", sorted(layers.files)[:1])
 
+# At other percentages of the size than it was baked for: the baked scene, and over a plain colour.
+for percentage in (50, 200):
+    scene.render.resolution_percentage = percentage
+    render(scene, f"over at {percentage}", sorted(layers.files)[:1])
+scene = empty()
+compositor.set_up(scene, layers)
+scene.render.resolution_percentage = 50
+render(scene, "plain at 50", sorted(layers.files)[:1])
+
+# Wide pixels stay; a region that is cut out is refused, and leaves nothing.
+scene = empty()
+scene.render.pixel_aspect_x = 2
+compositor.match_scene(scene, layers, layers.size())
+facts["pixel aspect"] = scene.render.pixel_aspect_x
+scene.render.use_border = scene.render.use_crop_to_border = True
+try:
+    compositor.set_up(scene, layers)
+except compositor.FrameError as problem:
+    facts["cropped"] = [str(problem), compositor.find_node(scene) is None]
+
 print(json.dumps(facts))
 sys.stdout.flush()
 os._exit(0)

@@ -257,7 +257,7 @@ forward = (light - eye).normalized()
 right = forward.orthogonal().normalized()
 up = forward.cross(right)
 shares = []
-for edge in np.linspace(-0.03, 0.03, 13):
+for edge in np.linspace(-0.06, 0.06, 13):
     mesh = bpy.data.meshes.new("Wall")
     mesh.from_pydata([middle + right * (edge - 2 * a) + up * b for a, b in ((0, -2), (0, 2), (1, 2), (1, -2))], [],
                      [(0, 1, 2, 3)])

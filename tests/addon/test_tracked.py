@@ -1,0 +1,48 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What Blender's motion tracker found comes out as a capture; suns are directions; what renders show hides lights."""
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from blenders import Blender
+
+SCRIPTS = Path(__file__).parent / "scripts"
+
+
+@pytest.fixture(scope="session")
+def facts(blender: Blender, package: Path, tmp_path_factory: pytest.TempPathFactory) -> Any:
+    base = tmp_path_factory.mktemp("tracked")
+    return blender.run(SCRIPTS / "tracked.py", package, base / "out", user=base / "user")
+
+
+@pytest.mark.parametrize("how", ["as solved", "set to the floor", "on a dolly"])
+def test_points_of_the_tracker_lie_on_their_tracks(facts: Any, how: str) -> None:
+    """In frames with the lens's own distortion; without it they are 5 pixels off."""
+    assert facts["solve error"] < 0.01
+    assert facts[how] < 0.05
+
+
+def test_distortion_is_that_of_the_clip_alone(facts: Any) -> None:
+    assert facts["frames from elsewhere"] == {}
+    assert "solve it with the model Polynomial" in facts["another model"]
+
+
+def test_a_clip_with_an_offset_shows_its_own_frames(facts: Any) -> None:
+    assert facts["offset"] == ["0004.png", "0005.png"]
+
+
+def test_sizes_are_rounded_as_blender_does(facts: Any) -> None:
+    assert facts["size at 35 %"] == [448, 252]
+
+
+def test_a_sun_is_a_direction_wherever_it_is_put(facts: Any) -> None:
+    assert len(facts["sun"]) == 3, "for a fit, a shot of a .blend, and the panel"
+    assert max(facts["sun"]) < 1e-5
+
+
+def test_what_renders_do_not_show_hides_nothing(facts: Any) -> None:
+    assert facts["behind a wall"] == 0
+    assert facts["that renders do not show"] == pytest.approx(1)
+    assert facts["that cameras do not see"] == pytest.approx(1)

@@ -88,7 +88,8 @@ def pictures_in(folder: Path) -> list[Path]:
 def read_picture(path: Path | str) -> Picture:
     """Decode PNG, JPEG, TIFF (8 or 16 bit, grey or colour, alpha dropped) or EXR.
 
-    An EXR whose `chromaticities` say another space than Rec. 709 (ACEScg, say) is converted.
+    An EXR whose `chromaticities` say another space than Rec. 709 (ACEScg, say) is converted, and one that has more
+    pixels than the frame (overscan), or fewer, is cut to the frame, and black where it has none.
 
     Raises FrameError where the file is missing, damaged or of another kind, or holds NaN or infinity.
     """
@@ -98,7 +99,7 @@ def read_picture(path: Path | str) -> Picture:
     if not path.is_file():
         raise FrameError(f"{path} is missing.")
     if path.suffix.lower() == ".exr":
-        return Picture(_rec709(path, _rgb_from_channels(path, read_exr(path))), "linear")
+        return Picture(_framed(path, _rec709(path, _rgb_from_channels(path, read_exr(path)))), "linear")
     stored = stored_pixels(path)
     if stored.ndim == 2:
         stored = np.repeat(stored[..., None], 3, axis=2)
@@ -140,7 +141,8 @@ def decoded(path: Path, flags: int) -> NDArray[Any] | None:
 
 
 def picture_size(path: Path | str) -> tuple[int, int]:
-    """(width, height) from the header alone. Raises FrameError where the header is no picture's."""
+    """(width, height) from the header alone; an EXR's are those of the frame, its displayWindow. Raises FrameError
+    where the header is no picture's."""
     path = Path(path)
     if not path.is_file():
         raise FrameError(f"{path} is missing.")
@@ -149,11 +151,65 @@ def picture_size(path: Path | str) -> tuple[int, int]:
             size = _size_from_header(stream)
     except OSError as problem:
         raise FrameError(f"{path} cannot be read: {problem.strerror or problem}.") from problem
+    return _checked(path, size)
+
+
+def _checked(path: Path, size: tuple[int, int] | None) -> tuple[int, int]:
     if size is None or min(size) <= 0:
         raise FrameError(f"{path} is not a picture, or its header is damaged; export it again.")
     if size[0] * size[1] > LARGEST:
         raise FrameError(f"{path} claims {size[0]} x {size[1]} pixels, more than this program opens.")
     return size
+
+
+@dataclass(frozen=True)
+class Window:
+    """Where the pixels of a file lie on the frame. size: (width, height) of what is stored; origin: (x, y) of its first
+    pixel on the frame, below 0 with overscan; frame: (width, height); aspect: a pixel's width by its height."""
+
+    size: tuple[int, int]
+    origin: tuple[int, int]
+    frame: tuple[int, int]
+    aspect: float = 1.0
+
+    @property
+    def is_frame(self) -> bool:
+        """Whether what is stored is the frame and no more."""
+        return self.size == self.frame and self.origin == (0, 0)
+
+
+def window_of(path: Path | str) -> Window:
+    """Where a picture's pixels lie on its frame: only EXRs have others than those of the frame. Raises FrameError."""
+    import OpenEXR
+
+    path = Path(path)
+    size = picture_size(path)
+    if path.suffix.lower() != ".exr":
+        return Window(size, (0, 0), size)
+    try:
+        with OpenEXR.File(str(path), header_only=True) as file:
+            header = file.parts[0].header
+            (low, high), (first, _) = header["dataWindow"], header["displayWindow"]
+            aspect = float(header.get("pixelAspectRatio", 1.0))
+    except Exception as problem:  # the library raises bare RuntimeError and worse for damaged files
+        raise FrameError(f"{path} is damaged or truncated ({problem}); export it again.") from problem
+    stored = _checked(path, (int(high[0]) - int(low[0]) + 1, int(high[1]) - int(low[1]) + 1))
+    return Window(stored, (int(low[0]) - int(first[0]), int(low[1]) - int(first[1])), size,
+                  aspect if 0.1 < aspect < 10 else 1.0)
+
+
+def _framed(path: Path, pixels: Pixels) -> Pixels:
+    """The frame of an EXR's pixels (height, width, 3)."""
+    window = window_of(path)
+    if window.is_frame:
+        return pixels
+    (width, height), (x, y) = window.frame, window.origin
+    framed = np.zeros((height, width, 3), np.float32)
+    left, top = max(x, 0), max(y, 0)
+    right, bottom = min(x + window.size[0], width), min(y + window.size[1], height)
+    if right > left and bottom > top:
+        framed[top:bottom, left:right] = pixels[top - y:bottom - y, left - x:right - x]
+    return framed
 
 
 def _size_from_header(stream: BinaryIO) -> tuple[int, int] | None:
@@ -172,18 +228,25 @@ def _size_from_header(stream: BinaryIO) -> tuple[int, int] | None:
 
 
 def _exr_size(stream: BinaryIO) -> tuple[int, int] | None:
-    """The dataWindow attribute of the first header: before it may stand others of any length."""
+    """Of the displayWindow attribute of the first header: about it may stand others of any length. A dataWindow of more
+    pixels than may be opened counts in its place."""
     stream.seek(8)
+    sizes: dict[bytes, tuple[int, int]] = {}
     while name := _until_zero(stream):
         kind, length = _until_zero(stream), int.from_bytes(stream.read(4), "little", signed=True)
-        if name == b"dataWindow" and kind == b"box2i" and length == 16:
-            window = stream.read(16)
-            x0, y0, x1, y1 = np.frombuffer(window, "<i4").tolist() if len(window) == 16 else (0, 0, -1, -1)
-            return x1 - x0 + 1, y1 - y0 + 1
         if length < 0:
             return None
-        stream.seek(length, os.SEEK_CUR)
-    return None
+        if name in (b"dataWindow", b"displayWindow") and kind == b"box2i" and length == 16:
+            window = stream.read(16)
+            x0, y0, x1, y1 = np.frombuffer(window, "<i4").tolist() if len(window) == 16 else (0, 0, -1, -1)
+            sizes[name] = x1 - x0 + 1, y1 - y0 + 1
+            if len(sizes) == 2:
+                stored = sizes[b"dataWindow"]
+                whole = min(stored) > 0 and stored[0] * stored[1] <= LARGEST
+                return sizes[b"displayWindow"] if whole else stored
+        else:
+            stream.seek(length, os.SEEK_CUR)
+    return sizes.get(b"dataWindow")
 
 
 def _until_zero(stream: BinaryIO) -> bytes:

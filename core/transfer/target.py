@@ -22,7 +22,7 @@ from ..gaussians.scene import SceneGaussians
 from ..lights.detection import Detector
 from ..look import Look
 from ..look.shot import PlacedLight, Shot, ShotFrame
-from ..pictures import Picture, picture_size, pictures_in, read_picture
+from ..pictures import Picture, pictures_in, read_picture, window_of
 from .query import Seen
 from .sources import assigned
 
@@ -44,7 +44,7 @@ class TargetFrame:
     def flared(self, folder: Path) -> Path | None:
         """Where below `folder` the plate with its flare goes: beside those of the layers' folder, under its own name.
         None where none is written: without a plate, and at another size or form than the file's."""
-        if self.plate is None or self.undistorted is not None or picture_size(self.plate) != self.shot.camera.size:
+        if self.plate is None or self.undistorted is not None or window_of(self.plate).size != self.shot.camera.size:
             return None
         return folder / Path(self.frame.file).parent / self.plate.name
 
@@ -96,11 +96,12 @@ def of_pictures(paths: Sequence[Path], look: Look, lights: Mapping[str, tuple[fl
     frames = []
     for frame in numbered(by_name):
         path = by_name[frame.view]
-        width, height = picture_size(path)
+        window = window_of(path)
+        width, height = window.frame
         fx = focal or look.camera.fx * width / look.camera.width
-        fy = focal or look.camera.fy * width / look.camera.width
+        fy = (focal or look.camera.fy * width / look.camera.width) * window.aspect
         cx, cy = centre or (width / 2, height / 2)
-        camera = Camera(width, height, fx, fy, cx, cy, np.eye(4))
+        camera = on_plate(Camera(width, height, fx, fy, cx, cy, np.eye(4)), path)
         found = dict(lights) or _detected(path, detector)
         if not found:
             raise SettingsError(f"No light was found in {path}; say where it is with --light X,Y.")
@@ -160,7 +161,8 @@ def of_capture(capture: Capture, look: Look, wanted: Mapped, *, lights: Path | N
         view = views[frame.view]
         path = None if shown else capture.frame_path(view)
         straight = view.lens is None or path is None
-        shot = ShotFrame(frame.number, str(Path(frame.view).parent), view.camera, placed)
+        camera = on_plate(view.camera, path) if straight and path is not None else view.camera
+        shot = ShotFrame(frame.number, str(Path(frame.view).parent), camera, placed)
         frames.append(TargetFrame(frame, shot, path, None if straight else _undistorted(capture, view)))
     return Target(tuple(frames), read_ply(scene) if scene else None, shown)
 
@@ -204,10 +206,26 @@ def of_shot(shot: Shot, look: Look, wanted: Mapped, *, plates: Path | None = Non
             raise SettingsError(f"{plates} has no picture for frame {one.frame}.")
         lights = tuple(replace(light, source=sources[light.name]) for light in one.lights)
         frame = Frame(f"{one.name}/{one.frame}", one.frame, layers_file(folders[one.name], one.frame))
-        frames.append(TargetFrame(frame, replace(one, lights=lights), given.get(one.frame)))
+        plate = given.get(one.frame)
+        camera = on_plate(one.camera, plate) if plate is not None else one.camera
+        frames.append(TargetFrame(frame, replace(one, camera=camera, lights=lights), plate))
     if not frames:
         raise SettingsError("The shot has no frames; export it again.")
     return Target(tuple(frames), read_ply(scene) if scene else None, shown)
+
+
+def on_plate(camera: Camera, plate: Path) -> Camera:
+    """The camera of the pixels that a plate's file has: an EXR's may be more than those of the frame (overscan), or
+    fewer. Raises SettingsError where they are, and the frame is not of the camera's size."""
+    window = window_of(plate)
+    if window.is_frame:
+        return camera
+    if window.frame != camera.size:
+        raise SettingsError(f"{plate} has pixels beyond its frame, or lacks some of it, and its frame of "
+                            f"{window.frame[0]} x {window.frame[1]} is not the camera's {camera.width} x "
+                            f"{camera.height}; give plates of the camera's size, or cut them to the frame.")
+    (width, height), (x, y) = window.size, window.origin
+    return replace(camera, width=width, height=height, cx=camera.cx - x, cy=camera.cy - y)
 
 
 def _by_number(folder: Path) -> dict[int, Path]:

@@ -165,3 +165,23 @@ def test_of_parts_with_channels_of_one_name_the_first_counts(tmp_path: Path) -> 
 def test_a_long_header_before_the_size_is_no_damage(tmp_path: Path) -> None:
     write_exr(tmp_path / "a.exr", dict.fromkeys("RGB", RAMP[..., 0]), header={"cryptomatte/manifest": "x" * 90_000})
     assert picture_size(tmp_path / "a.exr") == RAMP.shape[1::-1]
+
+
+@pytest.mark.parametrize(("low", "high"), [((-4, -2), (23, 13)), ((3, 2), (9, 30)), ((40, 0), (50, 3))])
+def test_an_exr_is_what_its_frame_shows(low: tuple[int, int], high: tuple[int, int], tmp_path: Path) -> None:
+    """With overscan, with a part left out, with nothing on the frame at all."""
+    width, height = high[0] - low[0] + 1, high[1] - low[1] + 1
+    stored = np.random.default_rng(0).random((height, width)).astype(np.float32)
+    windows = {name: (np.array(first, np.int32), np.array(last, np.int32))
+               for name, first, last in (("dataWindow", low, high), ("displayWindow", (0, 0), (19, 11)))}
+    pictures.write_exr(tmp_path / "a.exr", dict.fromkeys("RGB", stored), half=False, header=windows)
+    assert pictures.picture_size(tmp_path / "a.exr") == (20, 12)
+    found = pictures.read_picture(tmp_path / "a.exr").pixels
+    expected = np.zeros((12, 20), np.float32)
+    for y in range(12):
+        for x in range(20):
+            if low[0] <= x <= high[0] and low[1] <= y <= high[1]:
+                expected[y, x] = stored[y - low[1], x - low[0]]
+    np.testing.assert_array_equal(found[..., 0], expected)
+    window = pictures.window_of(tmp_path / "a.exr")
+    assert (window.size, window.origin, window.is_frame) == ((width, height), low, False)

@@ -162,6 +162,30 @@ def test_stills_are_not_mixed(flare: Path, look: Look) -> None:
     assert [gapped.share(index, "lamp") for index in range(3)] == [1, 0, 1]
 
 
+def test_splats_that_a_flare_was_learned_in_hide_as_little_as_then(flare: Path, tmp_path: Path) -> None:
+    """Of splats that leave a third of a light where nothing hides it, a third is all of it."""
+    flare_file.save(tmp_path / "veiled.flare", replace(flare_file.load(flare), model=veiled(flare, 1 / 3)))
+    look, camera = read(tmp_path / "veiled.flare"), cameras(3)[1]
+    middle = camera.position + 0.5 * (look.lights[0].xyz - camera.position)
+    haze = SceneGaussians(torch.tensor(middle[None], dtype=torch.float32), torch.full((1, 3), 1.0),
+                          torch.tensor([[1.0, 0, 0, 0]]), torch.logit(torch.tensor([2 / 3])), torch.zeros(1, 16, 3))
+    write_ply(tmp_path / "haze.ply", haze)
+    settings = TransferSettings(smooth=0)
+
+    def share(xyz: Any) -> float:
+        there = of_shot(shot(flare, look, [camera], xyz=xyz), look, {}, scene=tmp_path / "haze.ply")
+        return Transfer(tmp_path / "veiled.flare", there, settings).share(0, "lamp")
+
+    assert share(look.lights[0].xyz) == pytest.approx(1, abs=0.03)
+    assert share(look.lights[0].xyz + 1e-3) == pytest.approx(1 / 3, abs=0.03), "a world of its own"
+
+
+def veiled(flare: Path, clear: float) -> Any:
+    model = flare_file.load(flare).model
+    model.clear.fill_(clear)
+    return model
+
+
 def test_the_target_s_splats_hide_its_lights(flare: Path, look: Look, tmp_path: Path) -> None:
     """A wall between camera and light, in one of two views."""
     camera = cameras(3)[1]
@@ -295,6 +319,59 @@ def test_a_png_plate_keeps_its_codes_and_gains_light(flare: Path, look: Look, tm
     np.testing.assert_array_equal(found[outside], codes[outside])
     expected = srgb_from_linear(np.clip(layers.composite, 0, 1))
     np.testing.assert_allclose(found / 65535, expected, atol=2e-3)
+
+
+def boxed(low: tuple[int, int], high: tuple[int, int]) -> tuple[Any, Any]:
+    return np.array(low, np.int32), np.array(high, np.int32)
+
+
+def plate_exr(path: Path, size: tuple[int, int], origin: tuple[int, int], frame: tuple[int, int],
+              aspect: float = 1.0) -> Path:
+    """A grey plate, `size` pixels of it stored from `origin` on."""
+    (x, y), (width, height) = origin, size
+    write_exr(path, dict.fromkeys("RGB", np.full((height, width), 0.1, np.float32)), half=False,
+              header={"dataWindow": boxed(origin, (x + width - 1, y + height - 1)),
+                      "displayWindow": boxed((0, 0), (frame[0] - 1, frame[1] - 1)), "pixelAspectRatio": aspect})
+    return path
+
+
+@pytest.mark.parametrize(("size", "origin"), [((120, 80), (-10, -10)), ((100, 30), (0, 20)), ((60, 40), (13, 5))])
+def test_the_flare_lies_on_the_frame_whatever_of_it_is_stored(flare: Path, look: Look, tmp_path: Path,
+                                                              size: tuple[int, int], origin: tuple[int, int]) -> None:
+    """Overscan, and frames of which a part was left out: to the camera of a picture, and of a shot."""
+    whole = plate_exr(tmp_path / "whole.0001.exr", (100, 60), (0, 0), (100, 60))
+    (tmp_path / "plates").mkdir()
+    plate = plate_exr(tmp_path / "plates" / "plate.0001.exr", size, origin, (100, 60))
+    expected = light_of(Transfer(flare, plate_target(whole, look)))
+    camera = plate_target(whole, look).frames[0].shot.camera
+    light = plate_target(whole, look).frames[0].shot.lights[0]
+    by_shot = of_shot(Shot(flare, (ShotFrame(1, "Camera", camera, (light,)),)), look, {}, plates=tmp_path / "plates")
+    (x, y), (width, height) = origin, size
+    left, top, right, bottom = max(x, 0), max(y, 0), min(x + width, 100), min(y + height, 60)
+    for target in (plate_target(plate, look), by_shot):
+        found = light_of(Transfer(flare, target))
+        assert found.shape == (height, width, 3)
+        np.testing.assert_allclose(found[top - y:bottom - y, left - x:right - x], expected[top:bottom, left:right],
+                                   atol=1e-4)
+    Transfer(flare, by_shot).bake(tmp_path / "out")
+    flared = tmp_path / "out" / "frames" / "plate.0001.exr"
+    with OpenEXR.File(str(flared), header_only=True) as file:
+        assert file.parts[0].header["dataWindow"][0].tolist() == list(origin)
+    np.testing.assert_allclose(read_exr(flared)["R"] - 0.1, found[..., 0], atol=1e-5)
+
+
+def test_a_plate_of_another_frame_with_overscan_is_refused(flare: Path, look: Look, tmp_path: Path) -> None:
+    plate_exr(tmp_path / "plate.0002.exr", (120, 80), (-10, -10), (100, 60))
+    with pytest.raises(SettingsError, match="not the camera's 64 x 40"):
+        of_shot(shot(flare, look, [replace(cameras(3)[1], width=64, height=40)] * 2), look, {},
+                plates=plate_exr(tmp_path / "plate.0001.exr", (120, 80), (-10, -10), (100, 60)).parent)
+
+
+def test_wide_pixels_are_not_stretched_twice(look: Look, tmp_path: Path) -> None:
+    """An anamorphic plate: squeezed as it is stored, round as it is shown."""
+    squeezed = plate_target(plate_exr(tmp_path / "plate.exr", (100, 120), (0, 0), (100, 120), aspect=2.0), look)
+    camera = squeezed.frames[0].shot.camera
+    assert camera.fy == pytest.approx(2 * camera.fx)
 
 
 def test_no_plate_is_written_over_and_none_is_lost(flare: Path, look: Look, tmp_path: Path) -> None:

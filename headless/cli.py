@@ -102,6 +102,9 @@ def _status(words: Sequence[str], progress: Progress) -> int:
     except OSError as problem:
         progress.error(refusal(problem))
         return FAILED
+    except MemoryError:
+        progress.error("It does not fit into the memory of this machine; use a smaller --size, or fewer --jobs.")
+        return FAILED
     except Exception as problem:
         traceback.print_exc()
         progress.error(f"A defect of Fit Flare, please report it: {type(problem).__name__}: {problem}.")

@@ -18,6 +18,16 @@ Side = Literal["engine", "blender"]
 Run = Callable[[argparse.Namespace, Progress], dict[str, Any]]
 
 
+MOST_SEED = 2**31 - 1
+
+
+def seed(text: str) -> int:
+    """Of all randomness: a whole number that every library takes."""
+    if not text.isdecimal() or int(text) > MOST_SEED:
+        raise argparse.ArgumentTypeError(f"a seed is a whole number from 0 to {MOST_SEED}, not {text!r}")
+    return int(text)
+
+
 @dataclass(frozen=True)
 class Step:
     """optional: left out, with a sentence, on a machine that lacks its side. wanted: whether these words ask for it."""

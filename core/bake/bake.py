@@ -6,6 +6,7 @@ processes may make frames of one folder. `bake.json` lists what is whole; it is 
 """
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -66,13 +67,20 @@ class Renderer(OfCamera, Sequenced, Protocol):
 
 
 @dataclass(frozen=True)
-class _AnyFrame:
-    """A frame of such a renderer."""
+class _OfView:
+    """A frame of such a renderer, as its camera sees it."""
 
     renderer: Renderer
-    fingerprint: str = ""
+    camera: Camera
     words: tuple[str, ...] = ()
     rest_is_made: bool = True
+
+    @property
+    def fingerprint(self) -> str:
+        """Of the camera: a capture that was solved again has other ones under the same names."""
+        one = self.camera
+        told = (one.size, one.fx, one.fy, one.cx, one.cy, one.world_to_camera.tolist())
+        return hashlib.sha256(repr(told).encode()).hexdigest()[:16]
 
     def render(self, camera: Camera, edits: LookEdits | None = None) -> Rendering:
         return self.renderer.render(camera) if edits is None else self.renderer.render(camera, edits)
@@ -107,8 +115,8 @@ def bake(renderer: Renderer, frames: Sequence[Frame], cameras: Mapping[str, Came
          settings: BakeSettings | None = None, progress: Progress | None = None, *,
          overwrite: bool = False) -> dict[str, Any]:
     """Write the layers of `frames` (cameras by the view's name) under `out`; see `bake_frames`."""
-    any_frame = _AnyFrame(renderer)
-    return bake_frames(renderer, frames, cameras, out, lambda _: any_frame, settings, progress, overwrite=overwrite)
+    return bake_frames(renderer, frames, cameras, out, lambda frame: _OfView(renderer, cameras[frame.view]), settings,
+                       progress, overwrite=overwrite)
 
 
 def bake_frames(source: Sequenced, frames: Sequence[Frame], cameras: Mapping[str, Camera], out: Path | str,
@@ -130,8 +138,8 @@ def bake_frames(source: Sequenced, frames: Sequence[Frame], cameras: Mapping[str
         made_from["space"] = [settings.space, settings.config]
     if keyed.frames:
         made_from["keyed"] = keyed.described()["frames"]
-    _begin(out, made_from, overwrite)
     names = layer_names(source.lights)
+    _begin(out, made_from, names, overwrite)
 
     def notes(frame: Frame) -> dict[str, Any]:
         """What the frame's header is to say."""
@@ -169,7 +177,7 @@ def _layers(renderer: OfCamera, camera: Camera, edits: LookEdits, lights: Sequen
     return layers_of(renderer.render(camera, edits.without_colour_of_lights()), colours)
 
 
-def _begin(out: Path, made_from: dict[str, Any], overwrite: bool) -> None:
+def _begin(out: Path, made_from: dict[str, Any], names: dict[str, str], overwrite: bool) -> None:
     """Refuse, or clear away, what was made otherwise."""
     if not (out / RECORD).exists():
         return
@@ -177,8 +185,13 @@ def _begin(out: Path, made_from: dict[str, Any], overwrite: bool) -> None:
         if not (out / RECORD).exists():  # another task has just cleared it away
             return
         record = read_record(out)
-        if record["made_from"] == made_from or not record["frames"]:
+        same = record["made_from"] == json.loads(json.dumps(made_from))
+        if (same and record["layers"] == names) or not record["frames"]:
             return
+        if same and not overwrite:
+            raise RunError(f"{out} holds layers of the lights {', '.join(record['layers'])}, and these frames have "
+                           f"{', '.join(names) or 'none'}: one sequence has the same in all frames. Give all frames at "
+                           "once, or another folder, or ask for overwriting.")
         if not overwrite:
             raise RunError(f"{out} holds layers that were baked from another fit or with other settings; "
                            f"choose another folder, or ask for overwriting.")

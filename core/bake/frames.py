@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from pathlib import PurePosixPath
+from pathlib import Path, PurePosixPath
 
 from ..errors import SettingsError
 
@@ -47,6 +47,20 @@ def numbered(views: Iterable[str]) -> list[Frame]:
     return frames
 
 
+def plates_by_number(pictures: Sequence[Path]) -> dict[int, Path]:
+    """Plates by the number that each name ends with; those without one are no plates of the sequence, unless none has
+    one: then they are counted from 1 in their order. Raises SettingsError where two have one number."""
+    found: dict[int, Path] = {}
+    for path in pictures:
+        match = _LAST_NUMBER.search(path.stem)
+        if match is None:
+            continue
+        if int(match[1]) in found:
+            raise SettingsError(f"{found[int(match[1])]} and {path} have one number; keep one sequence in a folder.")
+        found[int(match[1])] = path
+    return found or dict(enumerate(sorted(pictures), 1))
+
+
 def chosen(frames: Sequence[Frame], text: str | None) -> list[Frame]:
     """The frames that `text` asks for: numbers and ranges, "3", "1-20", "1-20,31,40-44"; None asks for all.
 
@@ -63,5 +77,5 @@ def chosen(frames: Sequence[Frame], text: str | None) -> list[Frame]:
     result = [frame for frame in frames if any(low <= frame.number <= high for low, high in ranges)]
     if not result:
         there = f"{frames[0].number} to {frames[-1].number}" if frames else "none"
-        raise SettingsError(f"None of the frames {text!r} is in the capture, whose frames are {there}.")
+        raise SettingsError(f"None of the frames {text!r} is there: they are {there}.")
     return result

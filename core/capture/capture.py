@@ -81,7 +81,8 @@ class Capture:
         """
         folder = Path(folder)
         if not folder.is_dir():
-            raise CaptureError(f"{folder} is not a folder; give the capture's folder.")
+            raise CaptureError(f"{folder} is not a folder; give the capture's folder, or where it is now with "
+                               "--capture.")
         posed, points, root = _read_poses(folder)
         names = [frame.name for frame in posed]
         if len(set(names)) < len(names):
@@ -360,13 +361,23 @@ def _siblings(folder: Path, views: Sequence[View]) -> dict[str, Path]:
     found: dict[str, Path] = {}
     if not folder.is_dir():
         return found
+    there: dict[str, str] = {}
+    pictures = [path for path in sorted(folder.rglob("*")) if path.suffix.lower() in SUFFIXES
+                and not path.name.startswith(".")]
+    for path in pictures:  # by the name with the suffix in small letters
+        name = path.relative_to(folder)
+        there.setdefault(name.with_suffix(name.suffix.lower()).as_posix(), name.as_posix())
     for view in views:
-        path = inside(folder, view.name, CaptureError)
-        choices = [path, *(path.with_suffix(suffix) for suffix in (".exr", ".png", ".tif", ".tiff", ".jpg", ".jpeg"))]
-        for choice in choices:
-            if choice.is_file():
-                found[view.name] = inside(folder, choice.relative_to(folder).as_posix(), CaptureError)
-                break
+        inside(folder, view.name, CaptureError)
+        name = Path(view.name)
+        suffixes = (name.suffix.lower(), ".exr", ".png", ".tif", ".tiff", ".jpg", ".jpeg")
+        keys = (name.with_suffix(suffix).as_posix() for suffix in suffixes)
+        choice = next((there[key] for key in keys if key in there), None)
+        if choice is not None:
+            found[view.name] = inside(folder, choice, CaptureError)
+    if pictures and views and not found:
+        raise CaptureError(f"{folder} holds {len(pictures)} pictures, the first {pictures[0].name}, and none has the "
+                           f"name of a frame, such as {views[0].name}; give them the frames' names.")
     return found
 
 

@@ -66,7 +66,10 @@ def _scene(capture: Capture, settings: FitSettings, views: tuple[View, ...],
 def first_flare(capture: Capture, views: tuple[View, ...], frames: Frames, settings: FitSettings) -> FlareModel:
     """The flares a fit begins with. Raises CaptureError where there are no lights, or one is behind all cameras."""
     if not capture.lights:
-        raise CaptureError(f"{capture.folder} has no lights.json; run lights on it first, or fit with --mode 3dgs.")
+        there = (capture.folder / "lights.json").exists()
+        raise CaptureError(f"{capture.folder / 'lights.json'} lists no light; add one by hand, or fit with --mode 3dgs."
+                           if there else
+                           f"{capture.folder} has no lights.json; run lights on it first, or fit with --mode 3dgs.")
     generator = torch.Generator().manual_seed(settings.seed)
     positions = torch.tensor([list(map(float, light.xyz)) for light in capture.lights], dtype=torch.float64)
     if not settings.flare.detection:

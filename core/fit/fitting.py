@@ -40,6 +40,7 @@ def fit(capture: Capture, settings: FitSettings, folder: Path | str, progress: P
     continued = resume and (folder / "config.toml").exists()
     if continued:
         run = Run.open(folder)
+        _check_capture(run, capture)
         if run.finished:
             progress.say(f"The fit in {folder} is finished already.")
             return run
@@ -67,6 +68,14 @@ def fit(capture: Capture, settings: FitSettings, folder: Path | str, progress: P
     _finish(trainer, run)
     _log(run, f"finished at iteration {trainer.iteration}")
     return run
+
+
+def _check_capture(run: Run, capture: Capture) -> None:
+    """Raises RunError where the run was begun with another capture, which is still there: it did not move."""
+    begun = run.capture_folder
+    if begun.is_dir() and not begun.samefile(capture.folder):
+        raise RunError(f"{run.folder} holds a fit of {begun}, not of {capture.folder}; choose another folder for this "
+                       "one.")
 
 
 def _train(trainer: Trainer, run: Run, progress: Progress) -> None:

@@ -93,6 +93,13 @@ class Run:
         """Whether the fit ran to its end: the flare is written last."""
         return (self.folder / FLARE).is_file() or (self.settings.mode == "3dgs" and (self.folder / SCENE).is_file())
 
+    @property
+    def without_flare(self) -> str:
+        """Why there is no flare in it, as a sentence."""
+        if self.settings.mode == "3dgs":
+            return f"{self.folder} is a fit of the scene alone (mode 3dgs) and has no flare; fit with another --mode."
+        return f"{self.folder} has no {FLARE} yet; finish the fit with --resume first."
+
     @cached_property
     def flare(self) -> FlareFile | None:
         """The fitted flare; None for plain 3DGS."""
@@ -144,5 +151,6 @@ class Run:
 
     def _needed(self, name: str) -> Path:
         if not (self.folder / name).is_file():
-            raise RunError(f"{self.folder} has no {name} yet; finish the fit with --resume first.")
+            raise RunError(self.without_flare if name == FLARE else
+                           f"{self.folder} has no {name} yet; finish the fit with --resume first.")
         return self.folder / name

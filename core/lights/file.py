@@ -26,6 +26,22 @@ from .gather import FoundLight
 NEAR = 0.02  # of the frame's diagonal: projections nearer than this are one light
 
 
+def check_replaceable(path: Path) -> None:
+    """Raises CaptureError where lights.json has what a person has put there: entries that no search has found, renamed
+    or moved ones."""
+    if not path.exists():
+        return
+    read_lights(path)  # checks it
+    data = read_json(path, CaptureError)
+    places = [place for place in data.get("found", []) if isinstance(place, list)]
+    own = [str(entry["name"]) for number, entry in enumerate(data["lights"], 1) if not (
+        "support" in entry and entry["name"] == f"light{number}"
+        and any(np.allclose(entry["xyz"], place, rtol=1e-3, atol=1e-5) for place in places if len(place) == 3))]
+    if own:
+        raise CaptureError(f"{path} has lights that were not found here ({', '.join(own)}); add --keep to leave them "
+                           "as they are, or remove the file to look for all anew.")
+
+
 def write_lights(path: Path, found: Sequence[FoundLight], views: Sequence[tuple[str, Camera]],
                  keep: bool = False) -> list[dict[str, Any]]:
     """Write lights.json and return its entries. `keep`: see the module's head.

@@ -31,6 +31,8 @@ class KeyedEdits:
         """Raises SettingsError where the file is missing, damaged or of another form."""
         data = _toml(Path(path)) if Path(path).suffix.lower() == ".toml" else read_json(path, SettingsError)
         try:
+            if strange := set(data) - {"set", "frames"}:
+                raise ValueError(f"it has {', '.join(sorted(map(repr, strange)))}")
             frames = {int(number): _words(words) for number, words in data.get("frames", {}).items()}
             return cls(_words(data.get("set", [])), dict(sorted(frames.items())))
         except (AttributeError, TypeError, ValueError) as problem:

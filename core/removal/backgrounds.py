@@ -75,6 +75,8 @@ def read_backgrounds(folders: Iterable[Path | str], part: Part = "all", longest:
             raise SettingsError(f"{folder} is no folder; name one with clean photographs or environment maps.")
         for path in sorted(Path(folder).rglob("*")):
             suffix = path.suffix.lower()
+            if not path.is_file() or path.name.startswith("."):
+                continue
             if suffix not in PHOTOS | MAPS or (part != "all" and kept_for_test(path.name) != (part == "test")):
                 continue
             if suffix in PHOTOS:

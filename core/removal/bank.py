@@ -97,6 +97,8 @@ class OwnFlares:
         for path in sorted(folder.rglob("*")):
             if "Light_Source" in path.parts or path.suffix.lower() not in SUFFIXES | VIDEOS:
                 continue
+            if not path.is_file() or path.name.startswith("."):
+                continue
             self._files.append((path, lights.get((path.parent.parent, path.stem))))
         if not self._files:
             raise SettingsError(f"{folder} holds no flare layers; give pictures or clips of flares on black.")

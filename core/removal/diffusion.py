@@ -26,7 +26,7 @@ from torch import Tensor, nn
 from ..errors import EngineError, RunError, SettingsError
 from ..pictures import Pixels
 from . import weights
-from .inference import WORKING_SIZE, Remover
+from .inference import WORKING_SIZE, Remover, described
 
 PROMPT = "remove flares and keep the original image. High quality. Retain original colors"
 STEP = 199
@@ -198,6 +198,7 @@ class DiffusionRemover(Remover):
         self.model = DiffusionRemoval(base, rank_of(lora))
         self.model.load(lora)
         self.model.eval()
+        self.described = described("diffusion", lora, str(base), working_size)
 
     @torch.inference_mode()
     def added(self, display: Pixels) -> Pixels:

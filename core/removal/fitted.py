@@ -52,7 +52,7 @@ def remove_fitted(fitted: Renderer, capture: Capture, views: Sequence[View], fol
         progress.advance()
     if made < len(views):
         progress.say(f"{len(views) - made} plates were in {folder} already; --overwrite makes them again.")
-    progress.say(f"{made} clean plates are in {folder}.")
+    progress.say(f"{len(views)} clean plates are in {folder}.")
     return {"plates": str(folder), "made": made, "kept": len(views) - made}
 
 

@@ -10,6 +10,7 @@ network tells less than a threshold the flare is exactly zero, and the plate's o
 """
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -74,6 +75,8 @@ class Remover:
 
     sure = SURE
     """`SURE` is the network's own; other models have another."""
+    described: str
+    """Changes when plates would come out otherwise."""
 
     def __init__(self, weights: Path | None = None, *, working_size: int = WORKING_SIZE,
                  keep_glare: bool = False) -> None:
@@ -82,6 +85,7 @@ class Remover:
             raise SettingsError(f"A working size of {working_size} pixels is outside 64 to 8192.")
         self.network: RemovalNetwork = load(weights or IN_THE_BOX)
         self.working_size, self.keep_glare = working_size, keep_glare
+        self.described = described("network", weights or IN_THE_BOX, working_size, keep_glare)
 
     def remove(self, plate: Plate, matte: Pixels | None = None,
                told: Told | None = None) -> tuple[NDArray[Any], NDArray[np.float16]]:
@@ -172,6 +176,13 @@ class Remover:
         else:
             small = _reduced(codes, encoding, top, fit[0], fit[1])
         return _display(np.asarray(small, np.float32))
+
+
+def described(model: str, weights: Path | str, *settings: Any) -> str:
+    """A short text that changes when plates would come out otherwise: by the weights' content, not their name."""
+    digest = hashlib.sha256(Path(weights).read_bytes())
+    digest.update(repr((model, *settings)).encode())
+    return digest.hexdigest()[:16]
 
 
 def flare_light(display: Pixels, added: Pixels) -> Pixels:

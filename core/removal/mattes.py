@@ -36,8 +36,8 @@ class Mattes:
         return found
 
     def read(self, name: Path, width: int, height: int) -> NDArray[np.float32]:
-        """(height, width), 0..1: the brightest channel of the plate's matte. Raises FrameError for a damaged one, and
-        for one of another shape."""
+        """(height, width), 0..1: the brightest channel of the plate's matte, by its alpha where it has one. Raises
+        FrameError for a damaged one, and for one of another shape."""
         import cv2
 
         path = self.path(name)
@@ -47,6 +47,8 @@ class Mattes:
             raise FrameError(f"{path} is {columns} x {rows} pixels, another shape than its plate of {width} x "
                              f"{height}; make it for that plate.")
         values = np.nan_to_num(matte.codes.max(-1).astype(np.float32) / np.float32(matte.top), nan=0.0, posinf=1.0)
+        if matte.alpha is not None and matte.encoding == "srgb":  # painted on nothing, which counts as black
+            values = values * (matte.alpha.astype(np.float32) / np.float32(matte.top))
         if (columns, rows) != (width, height):
             values = np.asarray(cv2.resize(values, (width, height), interpolation=cv2.INTER_LINEAR), np.float32)
         return np.clip(values, 0, 1)

@@ -82,6 +82,8 @@ def read_plate(path: Path | str) -> Plate:
     Raises FrameError where the file is missing, damaged, of another kind, or has no colour.
     """
     path = Path(path)
+    if not path.exists():
+        raise FrameError(f"{path} is missing.")
     if path.suffix.lower() not in SUFFIXES:
         raise FrameError(f"{path} is not a picture this program reads; use PNG, JPEG, TIFF or EXR.")
     picture_size(path)

@@ -43,8 +43,11 @@ class Recipe:
     def __post_init__(self) -> None:
         if min(self.iterations, self.pixels, self.bank, self.renew_every, self.warm) < 1:
             raise SettingsError("A recipe needs at least one iteration, pixel and flare.")
-        if not 0 <= self.begun <= 1:
-            raise SettingsError("A recipe keeps a share from 0 to 1 of the weights that it began with.")
+        for name in ("begun", "polish", "own_share", "clean", "average"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise SettingsError(f"A recipe's {name} is a share from 0 to 1, not {getattr(self, name)}.")
+        if self.seed < 0 or self.decay < 0 or not 32 <= self.canvas <= 8192:
+            raise SettingsError("A recipe needs a seed and a decay of 0 or more, and a canvas of 32 to 8192 pixels.")
         if not 0 < self.learning_rate < 1 or not len(self.widths) == len(self.blocks) == LEVELS:
             raise SettingsError(f"A recipe needs a learning rate below 1, and widths and blocks of {LEVELS} levels.")
         if not self.stages or any(len(stage) != 3 or not 2 * MULTIPLE <= stage[1] <= stage[2] for stage in self.stages):
@@ -88,4 +91,22 @@ def from_dict(data: dict[str, Any]) -> Recipe:
     unknown = set(data) - known
     if unknown:
         raise SettingsError(f"A recipe has no {', '.join(sorted(unknown))}.")
-    return Recipe(**{key: _tuples(value) for key, value in data.items()})
+    return Recipe(**{key: _of_kind(key, _tuples(value)) for key, value in data.items()})
+
+
+def _of_kind(name: str, value: Any) -> Any:
+    """A value of the kind that the recipe has by that name. Raises SettingsError."""
+    usual = getattr(Recipe, name)
+    if name == "stages":
+        fits = isinstance(value, tuple) and all(isinstance(one, tuple) and all(map(_is_number, one)) for one in value)
+    elif isinstance(usual, tuple):
+        fits = isinstance(value, tuple) and all(type(one) is int and one >= 0 for one in value)
+    else:
+        fits = type(value) is int or (isinstance(usual, float) and _is_number(value))
+    if not fits:
+        raise SettingsError(f"A recipe's {name} cannot be {value!r}; it is {usual!r} usually.")
+    return value
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)

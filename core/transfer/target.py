@@ -7,14 +7,15 @@ that hides lights and can be shown.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..bake.frames import Frame, layers_file, numbered
+from ..bake.frames import Frame, layers_file, numbered, plates_by_number
 from ..capture import Camera, Capture, Light, View, read_lights
 from ..errors import CaptureError, SettingsError
 from ..gaussians.ply import read_ply
@@ -49,9 +50,19 @@ class TargetFrame:
         return folder / Path(self.frame.file).parent / self.plate.name
 
     def described(self) -> str:
-        """Changes whenever the frame would; its plate counts by name and length, so that mirrored disks agree."""
-        plate = (self.plate.name, self.plate.stat().st_size) if self.plate else None
+        """Changes whenever the frame would; its plate counts by name and content, so that mirrored disks agree."""
+        plate = None
+        if self.plate:
+            state = self.plate.stat()
+            plate = self.plate.name, _content(self.plate, state.st_size, state.st_mtime_ns)
         return repr((self.frame, plate)) + self.shot.described()
+
+
+@lru_cache(maxsize=64)
+def _content(path: Path, _size: int, _time: int) -> str:
+    """A digest of a file. Neighbours ask for it too: those that were read of late are kept."""
+    with open(path, "rb") as stream:
+        return hashlib.file_digest(stream, "blake2b").hexdigest()[:16]
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +72,8 @@ class Target:
     frames: tuple[TargetFrame, ...]
     scene: SceneGaussians | None = None
     shown: bool = False
+    says: tuple[str, ...] = ()
+    """Sentences for the person who asked for it."""
 
     @property
     def lights(self) -> tuple[str, ...]:
@@ -93,7 +106,7 @@ def of_pictures(paths: Sequence[Path], look: Look, lights: Mapping[str, tuple[fl
         twin = next(path for path in paths if by_name[path.name] != path)
         raise SettingsError(f"{twin} and {by_name[twin.name]} have one name; put the flare on them one after the "
                             "other, each with an --out of its own.")
-    frames = []
+    frames, dark = [], []
     for frame in numbered(by_name):
         path = by_name[frame.view]
         window = window_of(path)
@@ -104,7 +117,7 @@ def of_pictures(paths: Sequence[Path], look: Look, lights: Mapping[str, tuple[fl
         camera = on_plate(Camera(width, height, fx, fy, cx, cy, np.eye(4)), path)
         found = dict(lights) or _detected(path, detector)
         if not found:
-            raise SettingsError(f"No light was found in {path}; say where it is with --light X,Y.")
+            dark.append(path.name)
         told = {name: source for name, source in wanted.items() if name in found}
         if not lights:
             places = {name: ((x - cx) / fx, (y - cy) / fy) for name, (x, y) in found.items()}
@@ -115,7 +128,13 @@ def of_pictures(paths: Sequence[Path], look: Look, lights: Mapping[str, tuple[fl
             ray = np.array([(x - cx) / fx, (y - cy) / fy, 1.0])
             placed.append(PlacedLight(name, sources[name], ray / np.linalg.norm(ray) * distances[sources[name]]))
         frames.append(TargetFrame(frame, ShotFrame(frame.number, frame.view, camera, tuple(placed)), path))
-    return Target(tuple(frames))
+    if len(dark) == len(frames):
+        raise SettingsError(f"No light was found in {paths[0]}; say where it is with --light X,Y.")
+    target = Target(tuple(frames), says=(f"{len(dark)} of {len(frames)} pictures show no light, and get no flare: "
+                                         f"{', '.join(dark[:12])}{', …' if len(dark) > 12 else ''}.",) if dark else ())
+    if missing := set(wanted) - set(target.lights):
+        raise SettingsError(f"The pictures have no light {min(missing)!r}; they have {', '.join(target.lights)}.")
+    return target
 
 
 def _detected(path: Path, detector: Detector | None) -> dict[str, tuple[float, float]]:
@@ -190,8 +209,9 @@ def of_cameras(capture: Capture, look: Look, scene: Path | None = None) -> Targe
 
 
 def of_shot(shot: Shot, look: Look, wanted: Mapped, *, plates: Path | None = None, scene: Path | None = None,
-            shown: bool = False) -> Target:
-    """A shot's frames. plates: a folder of pictures whose names end with the frames' numbers.
+            shown: bool = False, wanted_frames: Container[int] | None = None) -> Target:
+    """A shot's frames. plates: a folder of pictures whose names end with the frames' numbers. wanted_frames: those that
+    have to have one, None for all: a farm's task may begin before the last frame is rendered.
 
     Raises SettingsError where a frame has no plate there.
     """
@@ -202,16 +222,27 @@ def of_shot(shot: Shot, look: Look, wanted: Mapped, *, plates: Path | None = Non
                        {**{name: source for name, source in told.items() if source in look.names}, **wanted})
     frames, folders = [], shot.folders
     for one in sorted(shot.frames, key=lambda each: (each.name, each.frame)):
-        if plates and one.frame not in given:
+        if plates and one.frame not in given and (wanted_frames is None or one.frame in wanted_frames):
             raise SettingsError(f"{plates} has no picture for frame {one.frame}.")
         lights = tuple(replace(light, source=sources[light.name]) for light in one.lights)
         frame = Frame(f"{one.name}/{one.frame}", one.frame, layers_file(folders[one.name], one.frame))
         plate = given.get(one.frame)
         camera = on_plate(one.camera, plate) if plate is not None else one.camera
+        if plate is not None:
+            _check_aspect(plate, camera)
         frames.append(TargetFrame(frame, replace(one, camera=camera, lights=lights), plate))
     if not frames:
         raise SettingsError("The shot has no frames; export it again.")
     return Target(tuple(frames), read_ply(scene) if scene else None, shown)
+
+
+def _check_aspect(plate: Path, camera: Camera) -> None:
+    """Raises SettingsError for a plate of another shape than the frame, which would be stretched."""
+    width, height = window_of(plate).size
+    scale = max(width / camera.width, height / camera.height)
+    if abs(width - camera.width * scale) > max(scale, 1) or abs(height - camera.height * scale) > max(scale, 1):
+        raise SettingsError(f"{plate} is {width} x {height} pixels and the shot {camera.width} x {camera.height}, "
+                            "which is another shape; give the plates of this shot.")
 
 
 def on_plate(camera: Camera, plate: Path) -> Camera:
@@ -230,10 +261,10 @@ def on_plate(camera: Camera, plate: Path) -> Camera:
 
 def _by_number(folder: Path) -> dict[int, Path]:
     """Pictures of a folder by the number that each name ends with."""
-    files = {path.name: path for path in pictures_in(folder)}
+    files = pictures_in(folder) if folder.is_dir() else []
     if not files:
-        raise SettingsError(f"{folder} holds no pictures.")
-    return {frame.number: files[frame.view] for frame in numbered(files)}
+        raise SettingsError(f"{folder} holds no pictures; name the folder of the plates.")
+    return plates_by_number(files)
 
 
 def sized(target: Target, width: int | None, height: int | None) -> Target:

@@ -189,8 +189,12 @@ class Transfer:
                            settings, progress, overwrite=overwrite)
 
     def _has_full_float(self) -> bool:
-        first = next((one for one in self.target.frames if one.plate is not None), None)
-        return first is not None and self.plate(first).is_full_float
+        """By the first plate of each kind of file."""
+        first: dict[str, TargetFrame] = {}
+        for one in self.target.frames:
+            if one.plate is not None:
+                first.setdefault(one.plate.suffix.lower(), one)
+        return any(self.plate(one).is_full_float for one in first.values())
 
     def plate(self, one: TargetFrame) -> ColouredPlate:
         """The frame's plate in its own space."""

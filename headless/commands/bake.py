@@ -62,6 +62,8 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
         from .transfer import bake_flare
 
         return bake_flare(words, progress)
+    if words.scene or words.lights:
+        raise SettingsError(f"--{'scene' if words.scene else 'lights'} is for a .flare: name the run's flare.flare.")
     made = Run.open(words.run)
     if not made.finished:
         raise RunError(f"{words.run} is not finished; go on with it by `fit --resume` first.")

@@ -39,6 +39,8 @@ def frames_of(folder: Path, out: Path, progress: Progress, *, wanted: str | None
     from ...flare_addon import compositor
     from ...flare_addon.layer_folder import LayerFolder
 
+    if out.resolve() == folder.resolve():
+        raise SettingsError(f"{out} holds the layers; choose another folder for the frames.")
     layers = LayerFolder.open(folder)
     if not 0 <= intensity < float("inf"):
         raise SettingsError(f"The intensity {intensity} is not a number of 0 or more.")

@@ -27,7 +27,8 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, default=ROOT / "build" / "demo", metavar="DIR",
                         help="folder for everything (default build/demo in the repository)")
     parser.add_argument("--capture", type=Path, metavar="CAPTURE",
-                        help="another capture than the sample, which is worked on in a copy, DIR/capture")
+                        help="another capture than the sample; what it lacks, lights.json and, with --remove, "
+                             "removed/, is written into it")
     without = parser.add_mutually_exclusive_group()
     without.add_argument("--split", action="store_true",
                          help="do without flare-free frames: tell scene and flare apart by parallax, as `fit` does "

@@ -8,7 +8,7 @@ from typing import Any
 
 from ...core.errors import SettingsError
 from ...core.progress import Progress
-from ..command import Command, Step
+from ..command import Command, Step, seed
 
 SHEET, SCORES = "worst.png", "eval.json"
 
@@ -24,7 +24,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--lenses", type=Path, metavar="DIR",
                         help="lens prescriptions for --synthetic, of which one in ten, by name, is kept from training")
     parser.add_argument("--all-backgrounds", action="store_true", help="use every clean picture, not one in ten")
-    parser.add_argument("--seed", type=int, default=7, metavar="N", help="of --synthetic (default 7)")
+    parser.add_argument("--seed", type=seed, default=7, metavar="N", help="of --synthetic (default 7)")
     parser.add_argument("--size", type=int, nargs=2, default=(960, 640), metavar=("W", "H"),
                         help="of --synthetic's pictures (default 960 640)")
     parser.add_argument("--keep-glare", action="store_true", help="leave the glow round the lights")

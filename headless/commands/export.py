@@ -37,7 +37,9 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     if words.flare.is_dir():
         folder = folder or Run.open(words.flare).capture_folder
         if not (words.flare / FLARE).is_file():
-            raise RunError(f"{words.flare} has no {FLARE} yet; finish the fit with --resume first.")
+            raise RunError(Run.open(words.flare).without_flare)
+    if not words.flare.exists():
+        raise RunError(f"{words.flare} is missing; name a .flare, or the folder of a run.")
     if folder is None:
         raise SettingsError(f"{words.flare} says nothing of cameras; name a capture with --capture.")
     look = read(words.flare / FLARE if words.flare.is_dir() else words.flare)

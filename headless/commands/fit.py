@@ -10,7 +10,7 @@ from ...core.errors import SettingsError
 from ...core.files import WRITTEN_BY_HAND
 from ...core.progress import Progress
 from .. import jobs
-from ..command import Command, Step
+from ..command import Command, Step, seed
 from .lights import with_lights
 from .remove import with_removed
 
@@ -53,7 +53,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
                              "split.json, else every 8th)")
     parser.add_argument("--size", type=int, metavar="WIDTH", help="work at this width in pixels (default: the frames')")
     parser.add_argument("--iterations", type=int, metavar="N", help="length, with every schedule stretched to it")
-    parser.add_argument("--seed", type=int, metavar="N", help="of all randomness (default 0)")
+    parser.add_argument("--seed", type=seed, metavar="N", help="of all randomness (default 0)")
     parser.add_argument("--scene", type=Path, metavar="PLY",
                         help="begin with this 3DGS scene, trained elsewhere in the capture's world (INRIA's layout, as "
                              "gsplat, nerfstudio, Brush and Postshot write it, or PlayCanvas's compressed one)")
@@ -68,6 +68,10 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     from ...core.fit import fit
     from ...core.fit.settings import changed, preset
 
+    if words.listed is not None and words.capture is not None:
+        raise SettingsError("fit takes a capture, or a list of them with --list: the one or the other.")
+    if words.listed is None and (words.entry is not None or words.jobs != 1):
+        raise SettingsError(f"--{'jobs' if words.entry is None else 'entry'} goes with --list; leave it out.")
     if words.listed is not None and words.entry is None:
         count = len(listed(words.listed))
         parts = [["--entry", str(entry), "--jobs", "1"] for entry in range(1, count + 1)]

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ...core.progress import Progress
-from ..command import Command, Step
+from ..command import Command, Step, seed
 
 if TYPE_CHECKING:
     from ...core.capture import Capture
@@ -34,17 +34,20 @@ def arguments(parser: argparse.ArgumentParser) -> None:
                         help="views that must show a light (default 3)")
     parser.add_argument("--scene", type=Path, metavar="SCENE.PLY",
                         help="a fitted scene (RUN/scene.ply): lift detections on to its Gaussians, as the paper does")
-    parser.add_argument("--seed", type=int, default=0, metavar="N", help="of all randomness (default 0)")
+    parser.add_argument("--seed", type=seed, default=0, metavar="N", help="of all randomness (default 0)")
 
 
 def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     from ...core.capture import Capture
     from ...core.lights import GatherSettings, detector_for
+    from ...core.lights.file import check_replaceable
 
     capture = Capture.open(words.capture)
     detector = detector_for(words.method, words.threshold, words.boxes, words.masks)
     settings = GatherSettings(min_views=words.min_views, seed=words.seed)
     gaussians = _gaussians(words.scene) if words.scene else None
+    if not words.keep:
+        check_replaceable(capture.folder / LIGHTS)
     report = _find(capture, detector, progress, settings, gaussians=gaussians, keep=words.keep)
     return {"lights": report["lights"], "file": str(capture.folder / LIGHTS),
             "sheets": [str(capture.folder / sheet) for sheet in report["sheets"]]}

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ...core.errors import SettingsError
+from ...core.errors import RunError, SettingsError
 from ...core.progress import Progress
 from .. import jobs
 from ..command import Command, Step
@@ -22,6 +22,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--run", type=Path, metavar="RUN",
                         help="instead of PLATE: the frames of the capture that this run was fitted to, less the flare "
                              "that it found in them")
+    parser.add_argument("--capture", type=Path, metavar="CAPTURE", help="where the run's capture is, if it was moved")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR",
                         help="folder for the clean plates, under the names that the plates have")
     parser.add_argument("--frames", metavar="A-B",
@@ -55,6 +56,8 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
         raise SettingsError("remove needs plates, or a fitted run with --run: the one or the other.")
     if words.run is not None:
         return _by_run(words, progress)
+    if words.capture is not None:
+        raise SettingsError("--capture goes with --run; leave it out.")
     wanted = None
     if words.frames is not None or words.jobs != 1:
         names = [name.as_posix() for _, name in plates_of(words.plates, [words.out, words.flare, words.matte])]
@@ -79,9 +82,11 @@ def _by_run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     network = (words.weights, words.working_size, words.keep_glare, words.matte, words.stills)
     if words.jobs != 1 or words.model != "network" or any(network):
         raise SettingsError("--run takes away the flare that was fitted: of the other options only --out, --frames, "
-                            "--flare and --overwrite go with it.")
+                            "--flare, --capture and --overwrite go with it.")
     fitted = Run.open(words.run)
-    capture = Capture.open(fitted.capture_folder)
+    if fitted.settings.mode == "3dgs":
+        raise RunError(fitted.without_flare)
+    capture = Capture.open(words.capture or fitted.capture_folder)
     frames = chosen(numbered([view.name for view in capture.views]), words.frames)
     wanted = {frame.view for frame in frames}
     return remove_fitted(fitted, capture, [view for view in capture.views if view.name in wanted], words.out, progress,

@@ -8,7 +8,7 @@ from typing import Any
 
 from ...core.errors import CaptureError, SettingsError
 from ...core.progress import Progress
-from ..command import Command, Step
+from ..command import Command, Step, seed
 
 MATCHING = ("auto", "exhaustive", "sequential", "similar")
 
@@ -34,7 +34,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
                         help="long side of the frames written (default: as filmed)")
     parser.add_argument("--no-mask", action="store_true",
                         help="take features from clipped pixels and the lines of ghosts too")
-    parser.add_argument("--seed", type=int, default=0, metavar="N", help="of all randomness (default 0)")
+    parser.add_argument("--seed", type=seed, default=0, metavar="N", help="of all randomness (default 0)")
 
 
 def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
@@ -44,8 +44,8 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
                              size=words.work_size, output_size=words.size, mask=not words.no_mask, seed=words.seed)
     report = solve(words.source, words.out, settings, progress)
     progress.say(f"{report['registered']} of {report['frames']} frames placed, {report['points']} points, reprojection "
-                 f"error {report['reprojection_error_px']:.2f} px at {words.work_size}, {report['track_length']:.1f} "
-                 f"frames a point. See {words.out / PICTURE}; next: `lights {words.out}`.")
+                 f"error {report['reprojection_error_px']:.2f} px in pictures of {words.work_size} or less, "
+                 f"{report['track_length']:.1f} frames a point. See {words.out / PICTURE}; next: `lights {words.out}`.")
     return {"capture": str(words.out), "report": str(words.out / REPORT), "picture": str(words.out / PICTURE),
             **{name: report[name] for name in ("frames", "registered", "points", "reprojection_error_px",
                                                "track_length")}}
@@ -60,7 +60,7 @@ def of_blend(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     """Blender's part: the animated camera of a .blend as a capture."""
     import bpy
 
-    from ...core.bake.frames import numbered
+    from ...core.bake.frames import plates_by_number
     from ...core.pictures import pictures_in
     from ...flare_addon.blend_shot import capture_of
 
@@ -74,9 +74,8 @@ def of_blend(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
         raise CaptureError(f"{words.source} cannot be opened by Blender {bpy.app.version_string} "
                            f"({problem}).") from problem
     scene = bpy.context.scene
-    files = {path.name: path for path in pictures_in(words.plates)}
-    plates = {frame.number: files[frame.view] for frame in numbered(files)
-              if scene.frame_start <= frame.number <= scene.frame_end}
+    plates = {number: path for number, path in plates_by_number(pictures_in(words.plates)).items()
+              if scene.frame_start <= number <= scene.frame_end}
     if not plates:
         raise CaptureError(f"{words.plates} has no picture for the frames {scene.frame_start} to {scene.frame_end}.")
     progress.stage("look at the .blend", len(plates))

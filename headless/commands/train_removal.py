@@ -54,6 +54,8 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     from ...core.removal.synthesis.prescription import built_in, read_lenses
     from ...core.removal.training import train
 
+    if words.threads is not None and words.threads < 1:
+        raise SettingsError(f"--threads {words.threads} makes no sense; give a number from 1.")
     if words.threads:
         torch.set_num_threads(words.threads)
     changes = dict(map(change, words.changes))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 from pathlib import Path
 from typing import Any
 
@@ -41,7 +42,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     looks.add_argument("--smooth", type=int, default=1, metavar="FRAMES",
                        help="frames over which a light fades where it is hidden, on paths (default 1, 0 for none)")
     looks.add_argument("--radius", type=float, default=0.0, metavar="UNITS",
-                       help="of the lights of a .blend, for the soft edge (default: the lamp's, else 1%% of the "
+                       help="of the lights of a .blend, for the soft edge (default: the lamp's, else 2%% of the "
                             "distance)")
     looks.add_argument("--scale", type=float, default=1.0, metavar="X",
                        help="units of the target's world to one of the source's (default 1)")
@@ -99,7 +100,10 @@ def look_at_blend(words: argparse.Namespace, progress: Progress) -> dict[str, An
         frames = list(every)  # whose middle chooses the training view
     names = [name.strip() for name in (words.lights or "").split(",") if name.strip()]
     progress.stage("look at the .blend", len(frames))
-    shot = shot_of(scene, words.flare.resolve(), names, frames, radius=words.radius, done=progress.advance)
+    flare = words.flare.resolve()
+    if flare.is_dir():
+        flare /= "flare.flare"
+    shot = shot_of(scene, flare, names, frames, radius=words.radius, done=progress.advance)
     shot.write(shot_path(words))
     return {"shot": str(shot_path(words))}
 
@@ -113,10 +117,35 @@ def shot_path(words: argparse.Namespace) -> Path:
 
 
 def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
-    if words.smooth < 0 or not words.scale > 0:
-        raise SettingsError("--smooth is 0 or more, and --scale more than 0.")
+    _check_numbers(words)
     flare, training = source(words)
     return _made(words, "transfer", target_of(words, flare, training), flare, training, progress)
+
+
+def _check_numbers(words: argparse.Namespace) -> None:
+    """Raises SettingsError for what is no sensible number."""
+    if words.smooth < 0 or not 0 < words.scale < math.inf:
+        raise SettingsError("--smooth is 0 or more, and --scale a number above 0.")
+    if words.focal is not None and not 0 < words.focal < math.inf:
+        raise SettingsError(f"--focal {words.focal} is not a length in pixels above 0.")
+    if not 0 <= words.radius < math.inf:
+        raise SettingsError(f"--radius {words.radius} is not a length of 0 or more.")
+
+
+OF_PICTURES, OF_WORLDS = ("light", "focal", "centre"), ("lights", "scene", "plates", "cameras", "radius")
+"""Options for pictures as a target, and for those that have cameras."""
+_FOR = {".blend": ("lights", "scene", "plates", "radius"), ".json": ("scene", "plates"), ".ply": ("lights", "cameras"),
+        "run": ("lights", "scene", "cameras"), "capture": ("lights", "scene")}
+
+
+def _check_options(words: argparse.Namespace, kind: str) -> None:
+    """Raises SettingsError for an option that the kind of target has no use for: who gives it believes that it does
+    something."""
+    allowed = OF_PICTURES if kind == "picture" else _FOR[kind]
+    given = [name for name in (*OF_PICTURES, *OF_WORLDS) if getattr(words, name) and name not in allowed]
+    if given:
+        what = {"picture": "a picture", "run": "a run", "capture": "a capture"}.get(kind, f"a {kind}")
+        raise SettingsError(f"--{given[0]} is not for {what} as the target; leave it out.")
 
 
 def _made(words: argparse.Namespace, step: str, target: Any, flare: Path, training: list[Any] | None,
@@ -128,7 +157,13 @@ def _made(words: argparse.Namespace, step: str, target: Any, flare: Path, traini
     from ...core.transfer.target import sized
     from ...core.transfer.transfer import Transfer, TransferSettings
 
+    for sentence in target.says:
+        progress.say(sentence)
     target = sized(target, *size(words.size))
+    plates = [one for one in target.frames if one.plate is not None]
+    if unwritten := sum(one.flared(words.out) is None for one in plates):
+        progress.say(f"{unwritten} of {len(plates)} plates are not written with their flare, only its layers are: they "
+                     "are of another size than is rendered, or distorted by a lens.")
     settings = TransferSettings(words.query, words.scale, words.smooth, words.plate_space)
     transfer = Transfer(flare, target, settings, training, words.ocio)
     frames = chosen([one.frame for one in target.frames], words.frames)
@@ -177,7 +212,7 @@ def source(words: argparse.Namespace) -> tuple[Path, list[Any] | None]:
     if flare.is_dir():
         made = Run.open(flare)
         if not (flare / FLARE).is_file():
-            raise RunError(f"{flare} has no {FLARE} yet; finish the fit with --resume first.")
+            raise RunError(made.without_flare)
         flare, holdout = flare / FLARE, made.settings.holdout
         capture = capture or (made.capture_folder if made.capture_folder.is_dir() else None)
     if capture is None:
@@ -188,12 +223,14 @@ def source(words: argparse.Namespace) -> tuple[Path, list[Any] | None]:
 
 def target_of(words: argparse.Namespace, flare: Path, training: list[Any] | None = None) -> Any:
     """The target, by what --to names. training: poses, for a .flare that does not tell."""
+    from ...core.bake.frames import Frame, chosen
     from ...core.capture import Capture
     from ...core.fit.run import CONFIG, SCENE, Run
     from ...core.lights.detection import Detector
     from ...core.lights.exposure import Exposure
     from ...core.look import read
     from ...core.look.shot import Shot
+    from ...core.pictures import pictures_in
     from ...core.transfer import target as targets
     from ...core.transfer.query import seen_by
     from ...core.transfer.sources import parsed
@@ -201,7 +238,11 @@ def target_of(words: argparse.Namespace, flare: Path, training: list[Any] | None
     look, to, wanted = read(flare), words.to, parsed(words.use)
     if len(to) > 1 and not all(path.suffix.lower() in PICTURES for path in to):
         raise SettingsError("Several targets at once have to be pictures.")
+    if len(to) == 1 and to[0].is_dir() and not (to[0] / CONFIG).is_file() and _is_of_plates(to[0]):
+        to = pictures_in(to[0])
     kind = to[0].suffix.lower()
+    _check_options(words, "picture" if kind in PICTURES else kind if kind in _FOR else
+                   "run" if (to[0] / CONFIG).is_file() else "capture")
     if kind in PICTURES:
         seen = seen_by(flare, look.lights, training)
         distances = {light.name: _usual_distance(light, seen.get(light.name)) for light in look.lights}
@@ -210,7 +251,10 @@ def target_of(words: argparse.Namespace, flare: Path, training: list[Any] | None
                                    focal=words.focal, centre=_point(words.centre) if words.centre else None, seen=seen)
     if kind in (".blend", ".json"):
         path = shot_path(words) if kind == ".blend" else to[0]
-        return targets.of_shot(Shot.read(path), look, wanted, plates=words.plates, scene=words.scene)
+        shot = Shot.read(path)
+        numbers = [Frame("", number, "") for number in sorted({one.frame for one in shot.frames})]
+        return targets.of_shot(shot, look, wanted, plates=words.plates, scene=words.scene,
+                               wanted_frames={frame.number for frame in chosen(numbers, words.frames)})
     lights = Path(words.lights) if words.lights else None
     if kind == ".ply":
         if words.cameras is None:
@@ -221,6 +265,14 @@ def target_of(words: argparse.Namespace, flare: Path, training: list[Any] | None
         capture = Capture.open(words.cameras or Run.open(to[0]).capture_folder, need_frames=False)
         return targets.of_capture(capture, look, wanted, lights=lights, scene=words.scene or to[0] / SCENE, shown=True)
     return targets.of_capture(Capture.open(to[0]), look, wanted, lights=lights, scene=words.scene)
+
+
+def _is_of_plates(folder: Path) -> bool:
+    """Whether a folder holds pictures themselves, not a capture."""
+    from ...core.pictures import pictures_in
+
+    capture = any((folder / name).exists() for name in ("images", "sparse", "colmap", "transforms.json"))
+    return not capture and bool(pictures_in(folder))
 
 
 def _usual_distance(light: Any, seen: Any) -> float:
@@ -237,14 +289,19 @@ def _points(words: list[str]) -> dict[str, tuple[float, float]]:
     """"[name=]x,y" by name."""
     found: dict[str, tuple[float, float]] = {}
     for number, word in enumerate(words, 1):
-        name, equals, place = word.rpartition("=")
-        found[name.strip() if equals else f"light{number}"] = _point(place)
+        given, equals, place = word.rpartition("=")
+        name = given.strip() if equals else f"light{number}"
+        if name in found:
+            raise SettingsError(f"--light names {name!r} twice; give each light a name of its own.")
+        found[name] = _point(place)
     return found
 
 
 def _point(text: str) -> tuple[float, float]:
     try:
         x, y = (float(part) for part in text.split(","))
+        if not (math.isfinite(x) and math.isfinite(y)):
+            raise ValueError(text)
     except ValueError:
         raise SettingsError(f"{text!r} is not a place in pixels such as 640,360.") from None
     return x, y

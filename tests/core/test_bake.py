@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +13,7 @@ import pytest
 from core.bake import bake as baking
 from core.bake.bake import RECORD, BakeSettings, bake, read_record
 from core.bake.exr import read_description, read_layers, write_layers
-from core.bake.frames import chosen, numbered
+from core.bake.frames import chosen, numbered, plates_by_number
 from core.bake.layers import FARTHEST, FrameLayers, layer_names, layers_of
 from core.capture.camera import Camera
 from core.errors import Cancelled, FrameError, RunError, SettingsError
@@ -252,6 +252,35 @@ def test_other_settings_do_not_mix_with_what_is_there(tmp_path: Path) -> None:
         bake(FakeRenderer(), FRAMES[:1], CAMERAS, tmp_path, changed)
     bake(FakeRenderer(), FRAMES[:1], CAMERAS, tmp_path, changed, overwrite=True)
     assert [path.name for path in sorted(tmp_path.iterdir())] == [RECORD, FRAMES[0].file]
+
+
+def test_frames_of_other_lights_do_not_mix_with_what_is_there(tmp_path: Path) -> None:
+    """A light's layer that a frame lacks is taken from the composite by Blender, and added twice."""
+    bake(FakeRenderer(), FRAMES[:2], CAMERAS, tmp_path)
+    alone = FakeRenderer()
+    alone.lights = ("lamp",)  # type: ignore[assignment]
+    with pytest.raises(RunError, match=r"layers of the lights lamp, key light, and these frames have lamp:"):
+        bake(alone, FRAMES[2:], CAMERAS, tmp_path)
+    bake(alone, FRAMES[2:], CAMERAS, tmp_path, overwrite=True)
+    assert [path.name for path in sorted(tmp_path.iterdir())] == [RECORD, FRAMES[2].file]
+
+
+def test_a_frame_whose_camera_changed_is_made_again(tmp_path: Path) -> None:
+    """A capture that was solved again has other cameras under the same names."""
+    bake(FakeRenderer(), FRAMES, CAMERAS, tmp_path)
+    again = FakeRenderer()
+    turned = replace(CAMERAS[VIEWS[1]], world_to_camera=np.diag([-1.0, -1, 1, 1]))
+    bake(again, FRAMES, {**CAMERAS, VIEWS[1]: turned}, tmp_path)
+    assert again.rendered == [2]
+
+
+def test_plates_have_the_numbers_of_their_names(tmp_path: Path) -> None:
+    plates = [tmp_path / name for name in ("r_1001.png", "r_1002.png", "contact_sheet.png")]
+    assert plates_by_number(plates) == {1001: plates[0], 1002: plates[1]}
+    with pytest.raises(SettingsError, match=r"r_1002\.png and .*r_1002\.tif have one number"):
+        plates_by_number([*plates, tmp_path / "r_1002.tif"])
+    unnumbered = [tmp_path / "b.png", tmp_path / "a.png"]
+    assert plates_by_number(unnumbered) == {1: unnumbered[1], 2: unnumbered[0]}
 
 
 def test_a_damaged_record_is_one_sentence(tmp_path: Path) -> None:

@@ -183,6 +183,19 @@ def test_removed_and_truth(tmp_path: Path) -> None:
     assert capture.truth_flare(capture.views[0]) is None
 
 
+def test_flare_free_frames_by_other_suffixes_and_names(tmp_path: Path) -> None:
+    folder = make_capture(tmp_path / "c")
+    (folder / "removed").mkdir()
+    for i in range(4):
+        cv2.imwrite(str(folder / "removed" / f"{i:04d}.png"), picture(i))
+        (folder / "removed" / f"{i:04d}.png").rename(folder / "removed" / f"{i:04d}.PNG")
+    assert Capture.open(folder).has_removed
+    for path in (folder / "removed").iterdir():
+        path.rename(path.with_name(f"clean_{path.name}"))
+    with pytest.raises(CaptureError, match=r"removed holds 4 pictures, the first clean_0000\.PNG, and none has"):
+        Capture.open(folder)
+
+
 def test_split(tmp_path: Path) -> None:
     folder = make_capture(tmp_path / "c", views=10)
     capture = Capture.open(folder)

@@ -12,6 +12,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,11 +23,13 @@ import torch
 from core.capture import Capture, Light
 from core.errors import Cancelled, CaptureError, FlareFileError, RunError
 from core.fit import FitSettings, Run, fit, preset
+from core.fit.beginning import NEAREST_PART, nearest_depth
 from core.fit.frames import Frames
 from core.fit.settings import SplitSettings, changed
 from core.fit.sky import COUNT, with_sky
 from core.fit.splitting import from_below, is_found, nearness, scene_beside_flare
 from core.fit.trainer import Trainer
+from core.gaussians.rendering import NEAR
 from core.pictures import read_picture, write_png
 from core.progress import Progress
 from tests.core.flared import flared_capture
@@ -356,6 +359,34 @@ def test_a_run_folder_is_not_overwritten(tmp_path: Path, capture: Capture) -> No
         fit(capture, quick(), tmp_path / "run")
     with pytest.raises(RunError, match="scene"):
         _ = Run.open(tmp_path / "run").scene
+
+
+def test_a_run_goes_on_with_its_own_capture(tmp_path: Path, capture: Capture) -> None:
+    other = Capture.open(shutil.copytree(capture.folder, tmp_path / "other"))
+    with pytest.raises(Cancelled):
+        fit(capture, quick(), tmp_path / "run", StopAt(2))
+    with pytest.raises(RunError, match=r"holds a fit of .*, not of .*other"):
+        fit(other, quick(), tmp_path / "run", resume=True)
+    (tmp_path / "run" / "capture.txt").write_text(str(tmp_path / "gone"))  # it moved: here it lies elsewhere
+    with pytest.raises(Cancelled):
+        fit(other, quick(), tmp_path / "run", StopAt(1), resume=True)
+
+
+def test_a_world_of_small_units_is_fitted_as_others_are(capture: Capture) -> None:
+    """Gaussians are culled before what the frames show, however small its units."""
+    assert Trainer(capture, quick()).scene.near == NEAR
+    for scale in (0.1, 0.01):
+        views = []
+        for view in capture.views:
+            pose = view.camera.world_to_camera.copy()
+            pose[:3, 3] *= scale
+            views.append(replace(view, camera=replace(view.camera, world_to_camera=pose)))
+        points = replace(capture.points, xyz=capture.points.xyz * scale)
+        small = copy.copy(capture)
+        small.views, small.points = tuple(views), points
+        near, nearest = Trainer(small, quick()).scene.near, nearest_depth(small)
+        assert near <= NEAREST_PART * nearest
+        assert near == pytest.approx(min(NEAR, NEAREST_PART * nearest_depth(capture) * scale), rel=1e-3)
 
 
 def test_a_damaged_checkpoint_or_result_is_one_sentence(tmp_path: Path, capture: Capture) -> None:

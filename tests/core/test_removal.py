@@ -22,7 +22,7 @@ from core.errors import FrameError, RunError, SettingsError
 from core.pictures import read_exr, read_picture, write_exr, write_png
 from core.progress import Progress
 from core.removal import inference, weights
-from core.removal.batch import plates_of, remove_all
+from core.removal.batch import RECORD, plates_of, remove_all
 from core.removal.inference import FlareMap, Remover, Told, carried_up, flare_light
 from core.removal.mattes import Mattes
 from core.removal.network import LEVELS, SHOWN, RemovalNetwork, seen
@@ -444,6 +444,40 @@ def test_what_is_faint_is_taken_where_it_is_marked(tmp_path: Path) -> None:
     assert (faint.remove(plate_of(codes), np.ones((60, 90), np.float32))[0] < codes).mean() > 0.3
 
 
+def test_a_plate_is_made_again_when_it_would_come_out_otherwise(tmp_path: Path, everywhere: Path,
+                                                                nowhere: Path) -> None:
+    """By other weights, options or mattes, whatever the times of their files."""
+    (tmp_path / "in").mkdir()
+    write_codes(tmp_path / "in" / "a.png", picture())
+    with pytest.raises(FrameError, match=r"b\.png is missing"):
+        remove_all([tmp_path / "in" / "b.png"], tmp_path / "none", Remover(everywhere, working_size=64), Progress())
+    for name, values in (("left", 0), ("right", 255)):
+        (tmp_path / name).mkdir()
+        write_codes(tmp_path / name / "a.png", np.full((60, 90, 3), values, np.uint8))
+
+    def made(remover: Remover, matte: str = "", **options: bool) -> int:
+        mattes = Mattes(tmp_path / matte) if matte else None
+        found = remove_all([tmp_path / "in"], tmp_path / "out", remover, Progress(), mattes=mattes, **options)
+        return int(found["made"])
+
+    first = Remover(everywhere, working_size=64)
+    assert [made(first), made(first)] == [1, 0]
+    for remover in (Remover(nowhere, working_size=64), Remover(everywhere, working_size=96),
+                    Remover(everywhere, working_size=64, keep_glare=True), first):
+        assert [made(remover), made(remover)] == [1, 0]
+    assert [made(first, "left"), made(first, "left"), made(first, "right"), made(first), made(first, stills=True)] == [
+        1, 0, 1, 1, 1]
+
+
+def test_a_matte_painted_on_nothing_is_its_alpha(tmp_path: Path) -> None:
+    painted = np.full((60, 90, 4), 255, np.uint8)
+    painted[:, :45, 3] = 0
+    cv2.imwrite(str(tmp_path / "matte.png"), painted)
+    found = Mattes(tmp_path / "matte.png").read(Path("a.png"), 90, 60)
+    assert not found[:, :45].any()
+    assert found[:, 45:].min() == 1
+
+
 def test_every_plate_has_its_own_matte(tmp_path: Path, everywhere: Path) -> None:
     for name in ("a.png", "b.png", "c.png"):
         (tmp_path / "in").mkdir(exist_ok=True)
@@ -453,7 +487,7 @@ def test_every_plate_has_its_own_matte(tmp_path: Path, everywhere: Path) -> None
     remover, mattes = Remover(everywhere, working_size=64), Mattes(tmp_path / "mattes")
     with pytest.raises(FrameError, match=r"1 of 3 plates .*c\.png has no matte"):
         remove_all([tmp_path / "in"], tmp_path / "out", remover, Progress(), mattes=mattes)
-    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["a.png", "b.png"]
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["a.png", "b.png", RECORD]
     assert np.array_equal(cv2.imread(str(tmp_path / "out" / "b.png")), cv2.imread(str(tmp_path / "in" / "b.png")))
     os.utime(tmp_path / "mattes" / "a.png", (2e9, 2e9))
     plates = [tmp_path / "in" / "a.png", tmp_path / "in" / "b.png"]
@@ -490,7 +524,7 @@ def test_bad_plates_do_not_stop_the_others(tmp_path: Path, everywhere: Path) -> 
         remove_all([tmp_path / "in"], tmp_path / "out", Remover(everywhere, working_size=64), Progress())
     assert f"{len(bad)} of {len(bad) + 1} plates" in str(told.value)
     assert all(path.name in str(told.value) for path in bad)
-    assert [path.name for path in (tmp_path / "out").iterdir()] == ["good.png"]
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["good.png", RECORD]
 
 
 def test_what_is_there_is_kept(tmp_path: Path, everywhere: Path) -> None:
@@ -539,7 +573,7 @@ def test_results_mattes_and_hidden_files_below_a_folder_are_no_plates_of_it(tmp_
         found = remove_all([shot], shot / "clean", Remover(everywhere, working_size=64), Progress(),
                            flare_folder=shot / "flare", mattes=Mattes(shot / "roto"))
         assert found["made"] + found["kept"] == 1
-    assert [path.name for path in (shot / "clean").rglob("*")] == ["a.png"]
+    assert sorted(path.name for path in (shot / "clean").rglob("*")) == ["a.png", RECORD]
 
 
 def _luminance_and_chroma(path: Path) -> None:

@@ -69,6 +69,18 @@ def test_misuse_is_status_2_and_one_sentence(words: list[str], capfd: pytest.Cap
     ["fit", "{capture}", "--out", "{tmp}/o", "--set", "flare"],
     ["fit", "{capture}", "--out", "{tmp}/o", "--set", "flare.colour=1"],
     ["fit", "{capture}", "--out", "{tmp}/o", "--set", "flare.count=many"],
+    ["fit", "{capture}", "--out", "{tmp}/o", "--list", "{capture}/split.json"],
+    ["fit", "{capture}", "--out", "{tmp}/o", "--jobs", "2"], ["fit", "{capture}", "--out", "{tmp}/o", "--entry", "2"],
+    ["bake", "no/run", "--out", "{tmp}/o", "--scene", "no.ply"],
+    ["remove", "a.png", "--out", "{tmp}/o", "--capture", "{capture}"],
+    ["transfer", "no.flare", "--to", "a.png", "--out", "{tmp}/o", "--light", "nan,20"],
+    ["transfer", "no.flare", "--to", "a.png", "--out", "{tmp}/o", "--focal", "0"],
+    ["transfer", "no.flare", "--to", "a.png", "--out", "{tmp}/o", "--scale", "inf"],
+    ["compose", "{capture}", "--out", "{capture}"],
+    ["train-removal", "--backgrounds", "{capture}", "--out", "{tmp}/o", "--threads", "-1"],
+    *(["train-removal", "--backgrounds", "{capture}", "--out", "{tmp}/o", "--set", change] for change in (
+        "learning_rate=abc", "stages=5", "polish=abc", "bank=1.5", "seed=-1", "pixels=NaN", "decay=-1", "canvas=abc",
+        "clean=7", "average=9", "own_share=abc", "blocks=[1,2]")),
 ])
 def test_bad_input_is_status_1_and_one_sentence(words: list[str], capture: Path, tmp_path: Path,
                                                 capfd: pytest.CaptureFixture[str]) -> None:
@@ -101,6 +113,7 @@ def ending_with(problem: BaseException | None, monkeypatch: pytest.MonkeyPatch) 
     (OSError(28, "No space left on device", "x.exr"), 1,
      "The disk is full (x.exr); make room and start it again, what is finished is kept."),
     (OSError(13, "Permission denied", "x.exr"), 1, "The system refused: Permission denied (x.exr)."),
+    (MemoryError(), 1, "It does not fit into the memory of this machine; use a smaller --size, or fewer --jobs."),
     (ZeroDivisionError("division by zero"), 1,
      "A defect of Fit Flare, please report it: ZeroDivisionError: division by zero."),
 ])

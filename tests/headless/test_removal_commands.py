@@ -39,7 +39,7 @@ def test_training_is_stopped_by_its_length_and_goes_on(backgrounds: Path, tmp_pa
     assert cli.main([*words, "--iterations", "3", "--resume"]) == 0
     weights = str(tmp_path / "made" / "removal.safetensors")
     assert cli.main(["remove", str(backgrounds), "--out", str(tmp_path / "clean"), "--weights", weights]) == 0
-    assert {path.name for path in (tmp_path / "clean").iterdir()} == {"a.png", "b.png"}
+    assert {path.name for path in (tmp_path / "clean").iterdir()} == {"a.png", "b.png", "remove.json"}
     assert cli.main(["train-removal", "--backgrounds", str(backgrounds), "--out", str(tmp_path / "x"),
                      "--set", "speed=3"]) == 1
     assert "speed" in capsys.readouterr().err
@@ -55,7 +55,7 @@ def test_bad_plates_are_listed_at_the_end(backgrounds: Path, tmp_path: Path,
     assert events[-1]["type"] == "error"
     assert "1 of 3 plates" in events[-1]["text"]
     assert "0_bad.png" in events[-1]["text"]
-    assert len(list((tmp_path / "clean").iterdir())) == 2
+    assert {path.name for path in (tmp_path / "clean").iterdir()} == {"a.png", "b.png", "remove.json"}
 
 
 def test_bad_plates_do_not_stop_other_processes(backgrounds: Path, tmp_path: Path,
@@ -69,7 +69,8 @@ def test_bad_plates_do_not_stop_other_processes(backgrounds: Path, tmp_path: Pat
     assert cli.main(["remove", str(folder), "--out", str(tmp_path / "clean"), "--jobs", "2"]) == 1
     said = capsys.readouterr().err
     assert "f1.png" in said and "f4.png" in said
-    assert sorted(path.name for path in (tmp_path / "clean").iterdir()) == ["f2.png", "f3.png", "f5.png", "f6.png"]
+    assert sorted(path.name for path in (tmp_path / "clean").iterdir()) == [
+        "f2.png", "f3.png", "f5.png", "f6.png", "remove.json"]
 
 
 def test_diffusion_without_a_base_or_its_packages(backgrounds: Path, tmp_path: Path,

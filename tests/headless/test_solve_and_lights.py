@@ -49,6 +49,26 @@ def test_lights_and_keep(tmp_path: Path) -> None:
     assert [light.name for light in Capture.open(folder).lights] == ["lamp"]
 
 
+def test_lights_by_hand_are_not_written_over(tmp_path: Path) -> None:
+    folder = lit_capture(tmp_path / "c", 8, [(0.4, -0.5, 0.3)])
+    assert run("lights", folder)[0] == run("lights", folder)[0] == 0, "what was found may be found again"
+    file = folder / "lights.json"
+    for change in ({"name": "lamp"}, {"xyz": [0.3, -0.5, 0.3]}, None):
+        data = json.loads(file.read_text())
+        if change is None:
+            data = {"lights": [{"name": "sun", "xyz": [0, 0, 9]}]}
+        else:
+            data["lights"][0].update(change)
+        own = json.dumps(data)
+        file.write_text(own)
+        status, events = run("lights", folder, "--min-views", "99")
+        assert status == 1
+        assert "add --keep" in events[-1]["text"]
+        assert file.read_text() == own
+        file.unlink()
+        run("lights", folder)
+
+
 @pytest.mark.parametrize("words", [("solve", "nowhere", "--out", "c"), ("lights", "nowhere"),
                                    ("lights", "nowhere", "--threshold", "3")])
 def test_a_clear_sentence_and_a_status(tmp_path: Path, words: tuple[str, ...]) -> None:

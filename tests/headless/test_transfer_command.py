@@ -66,6 +66,41 @@ def test_on_to_a_picture(run: Run, made: Path, tmp_path: Path) -> None:
     assert "No light was found in" in problem["text"]
 
 
+def test_options_that_a_target_has_no_use_for_are_refused(run: Run, made: Path, capture: Path, tmp_path: Path) -> None:
+    write_png(tmp_path / "plate.png", np.full((54, 96, 3), 0.3))
+    for target, *words in ((tmp_path / "plate.png", "--light", "9,9", "--scene", "x.ply"),
+                           (tmp_path / "plate.png", "--light", "9,9", "--plates", tmp_path),
+                           (capture, "--light", "9,9"), (capture, "--plates", tmp_path), (made, "--focal", "90")):
+        problem = run("transfer", made, "--to", target, *words, "--out", tmp_path / "none", status=1)[-1]["text"]
+        assert "as the target; leave it out." in problem
+    for words, sentence in ((("--light", "a=1,2", "--light", "a=3,4"), "names 'a' twice"),
+                            (("--light", "a=1,2", "--use", "b=lamp"), "have no light 'b'")):
+        problem = run("transfer", made, "--to", tmp_path / "plate.png", *words, "--out", tmp_path / "x",
+                      status=1)[-1]["text"]
+        assert sentence in problem
+    assert not (tmp_path / "none").exists()
+
+
+def test_on_to_a_folder_of_plates_of_which_one_shows_no_light(run: Run, made: Path, tmp_path: Path) -> None:
+    lit = np.full((54, 96, 3), 0.1)
+    lit[20:25, 40:45] = 1
+    write_png(tmp_path / "plates" / "f.0001.png", lit)
+    write_png(tmp_path / "plates" / "f.0002.png", np.full((54, 96, 3), 0.1))
+    events = run("transfer", made, "--to", tmp_path / "plates", "--out", tmp_path / "out")
+    assert any("1 of 2 pictures show no light, and get no flare: f.0002.png" in event.get("text", "")
+               for event in events)
+    assert not read_layers(tmp_path / "out" / "layers.0002.exr").flare.any()
+    assert read_layers(tmp_path / "out" / "layers.0001.exr").flare.any()
+
+
+def test_plates_that_are_not_written_are_told(run: Run, made: Path, tmp_path: Path) -> None:
+    write_png(tmp_path / "plate.png", np.full((54, 96, 3), 0.3))
+    events = run("transfer", made, "--to", tmp_path / "plate.png", "--light", "60,10", "--size", "48", "--out",
+                 tmp_path / "out")
+    assert any("1 of 1 plates are not written with their flare" in event.get("text", "") for event in events)
+    assert not (tmp_path / "out" / "frames").exists()
+
+
 def test_a_bare_flare_is_baked_as_its_run_is(run: Run, made: Path, capture: Path, tmp_path: Path) -> None:
     """With the capture's cameras: the same light, less what the run's scene hides, over black."""
     run("bake", made / "flare.flare", "--capture", capture, "--out", tmp_path / "flare", "--frames", "3-4", "--space",

@@ -25,8 +25,6 @@ from .model import FlareModel
 LEAST_CLEAR = 0.01
 CLEAR_FROM = 0.9
 """Quantile of the views' shares that counts as clear: a light may be hidden in most of them."""
-NEAREST = 0.01
-"""Depth, in world units, from which on Gaussians hide lights, and nearer where the lights are near."""
 COVERED, LEAST_SHARE = 1e-4, 1e-6
 """Weight of the loss of a covered light, about that of the pixels that show it; and what is added to its share."""
 
@@ -95,7 +93,7 @@ def visible_share(scene: SceneGaussians, camera: Tensor, light: Tensor, settings
     # The disk's edge, two deviations of the window, is the picture's edge.
     focal = half / (2 * settings.radius)
     intrinsics = torch.tensor([[focal, 0, half], [0, focal, half], [0, 0, 1]])
-    near = _near(distance)
+    near = _near(scene, distance)
     colourless = scene.sh.new_zeros(len(chosen), 1, 3)  # the colours' gradient would be the dearest part
     alpha = rasterization(scene.means[chosen], scene.quaternions[chosen], scene.log_scales[chosen].exp(),
                           scene.opacity_logits[chosen].sigmoid(), colourless, pose, intrinsics, size, size,
@@ -106,9 +104,9 @@ def visible_share(scene: SceneGaussians, camera: Tensor, light: Tensor, settings
     return ((1 - alpha) * weights).sum() / weights.sum()
 
 
-def _near(distance: float) -> float:
+def _near(scene: SceneGaussians, distance: float) -> float:
     """Depth from which on a light so far away is hidden: what a picture shows hides one however far it is."""
-    return min(1e-3 * distance, NEAREST)
+    return min(1e-3 * distance, scene.near)
 
 
 def _before(scene: SceneGaussians, pose: Tensor, distance: float, settings: VisibilitySettings) -> Tensor:
@@ -117,7 +115,7 @@ def _before(scene: SceneGaussians, pose: Tensor, distance: float, settings: Visi
     means, scales, rigid = (part.detach().cpu().numpy() for part in (scene.means, scene.log_scales, pose))
     x, y, depth = (means @ rigid[:3, :3].T + rigid[:3, 3]).T
     reach = 3 * np.exp(np.maximum(np.maximum(scales[:, 0], scales[:, 1]), scales[:, 2]))
-    between = (depth > _near(distance)) & (depth < (1 - settings.margin) * distance)
+    between = (depth > _near(scene, distance)) & (depth < (1 - settings.margin) * distance)
     aside = np.sqrt(x * x + y * y)
     rows = np.flatnonzero(between & (aside < depth * settings.radius * 4 + reach))
     return torch.from_numpy(rows).to(scene.means.device)

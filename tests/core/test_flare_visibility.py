@@ -42,6 +42,17 @@ def test_what_lies_behind_or_at_the_light_does_not_hide_it() -> None:
     assert share(wall(z=-2.0)) == 1
 
 
+@pytest.mark.parametrize("distance", [100.0, 1000.0, 10_000.0])
+def test_what_is_near_hides_lights_however_far_they_are(distance: float) -> None:
+    """All that the picture shows; what it culls hides nothing."""
+    light = torch.tensor([0.0, 0.0, distance])
+    assert share(wall(z=0.5), light) < 0.01
+    near = wall(z=0.1)
+    assert share(near, light) > 0.99
+    near.near = 0.05  # a world of small units
+    assert share(near, light) < 0.01
+
+
 def test_an_edge_through_the_light_hides_half_and_fades_smoothly() -> None:
     reach = 0.022  # Gaussians of 0.008 and the rasterizer's low-pass go on so far past the last centre
     assert share(wall(x=0.5 + reach)) == pytest.approx(0.5, abs=0.08)

@@ -11,6 +11,7 @@ import torch
 from core.errors import FlareFileError
 from core.gaussians import SceneGaussians
 from core.gaussians.ply import read_ply, write_ply
+from core.gaussians.rendering import NEAR
 
 
 def scene(n: int = 7) -> SceneGaussians:
@@ -37,6 +38,20 @@ def test_every_bit_comes_back(tmp_path: Path, n: int) -> None:
         assert torch.equal(parameter, again.get_parameter(name)), name
     write_ply(tmp_path / "b.ply", again)
     assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
+
+
+@pytest.mark.parametrize(("said", "near"), [("comment near 0.03", 0.03), ("comment near 5", NEAR),
+                                            ("comment near nan", NEAR), ("comment near far", NEAR)])
+def test_the_near_depth_comes_back(said: str, near: float, tmp_path: Path) -> None:
+    first = scene()
+    first.near = 0.0125
+    write_ply(tmp_path / "a.ply", first)
+    assert read_ply(tmp_path / "a.ply").near == 0.0125
+    write_ply(tmp_path / "b.ply", scene())
+    assert b"near" not in (tmp_path / "b.ply").read_bytes()[:3000], "other programs read what they know"
+    (tmp_path / "b.ply").write_bytes(
+        (tmp_path / "b.ply").read_bytes().replace(b"element vertex", f"{said}\nelement vertex".encode(), 1))
+    assert read_ply(tmp_path / "b.ply").near == near
 
 
 def test_the_layout_is_that_of_3dgs(tmp_path: Path) -> None:

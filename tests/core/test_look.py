@@ -487,3 +487,22 @@ def test_notes_can_be_changed_and_the_engine_reads_it(tmp_path: Path) -> None:
     view = cameras(3)[0].world_to_camera
     before, after_ = (read(tmp_path / name).evaluate(view) for name in ("a.flare", "b.flare"))
     np.testing.assert_array_equal(before["lamp 1"].means, after_["lamp 1"].means)
+
+
+@pytest.mark.parametrize("blend", ["add", "over"])
+def test_the_light_of_a_shot_s_layers_follows_its_intensity(blend: str, tmp_path: Path) -> None:
+    """As that of a run's: an exact factor, whatever the blend."""
+    from core.bake.exr import read_layers
+    from core.bake.shot import bake_shot
+
+    saved(tmp_path / "a.flare", lights=1, blend=blend)
+    light = read(tmp_path / "a.flare").lights[0]
+    layers = {}
+    for words in ((), ("lamp.intensity=0.25",), ("lamp.tint=0,1,0.5",)):
+        one = ShotFrame(1, "Camera", cameras(3)[1], (PlacedLight("lamp", light.name, light.xyz, 1.0),), words)
+        bake_shot(Shot(tmp_path / "a.flare", (one,)), tmp_path / f"{words}", half=False)
+        layers[words] = read_layers(tmp_path / f"{words}" / "layers.0001.exr").flares["lamp"]
+    plain, darker, tinted = layers.values()
+    assert plain.max() > 0.01
+    np.testing.assert_allclose(darker, 0.25 * plain, atol=1e-6)
+    np.testing.assert_allclose(tinted, plain * (0, 1, 0.5), atol=1e-6)

@@ -85,6 +85,20 @@ def pictures_in(folder: Path) -> list[Path]:
                   if path.suffix.lower() in SUFFIXES and path.is_file() and not path.name.startswith("."))
 
 
+def pictures_below(folder: Path) -> list[Path]:
+    """The pictures in a folder and its folders, but for hidden ones, sorted by name."""
+    return [path for path in sorted(folder.rglob("*")) if path.suffix.lower() in SUFFIXES and path.is_file()
+            and not any(part.startswith(".") for part in path.relative_to(folder).parts)]
+
+
+def are_one_shape(size: tuple[int, int], other: tuple[int, int]) -> bool:
+    """Whether one size (width, height) is the other, scaled and rounded to whole pixels."""
+    small, large = sorted((size, other))
+    scale = max(large[0] / small[0], large[1] / small[1])
+    return (abs(large[0] - small[0] * scale) <= max(scale, 1.0) + 1e-9
+            and abs(large[1] - small[1] * scale) <= max(scale, 1.0) + 1e-9)
+
+
 def read_picture(path: Path | str) -> Picture:
     """Decode PNG, JPEG, TIFF (8 or 16 bit, grey or colour, alpha dropped) or EXR.
 

@@ -107,6 +107,11 @@ def entry_of(scene: Any, camera: Any, frame: int, path: Path, folder: Path) -> d
             "cy": core.cy, **distortion_of(camera, path), "transform_matrix": pose.tolist()}
 
 
+_OTHER_DISTORTION = {"DIVISION": ("division_k1", "division_k2"), "NUKE": ("nuke_k1", "nuke_k2"),
+                     "BROWN": ("brown_k1", "brown_k2", "brown_k3", "brown_k4", "brown_p1", "brown_p2")}
+"""Coefficients of the tracker's models that are not Polynomial."""
+
+
 def distortion_of(camera: Any, path: Path) -> dict[str, float]:
     """What the motion tracker found of a lens's distortion, for a picture of the clip itself; {} for none, and for
     pictures from elsewhere, which are taken for straight.
@@ -121,8 +126,7 @@ def distortion_of(camera: Any, path: Path) -> dict[str, float]:
         if lens.distortion_model == "POLYNOMIAL":
             found = {name: float(getattr(lens, name)) for name in ("k1", "k2", "k3")}
             return found if any(found.values()) else {}
-        prefix = {"DIVISION": "division_k", "NUKE": "nuke_k", "BROWN": "brown_"}.get(lens.distortion_model, "")
-        if any(getattr(lens, name) for name in dir(lens) if prefix and name.startswith(prefix)):
+        if any(getattr(lens, name, 0) for name in _OTHER_DISTORTION.get(lens.distortion_model, ())):
             raise CaptureError(f"The lens of the clip {clip.name!r} is distorted by the model {lens.distortion_model}; "
                                "solve it with the model Polynomial, or give undistorted frames.")
     return {}

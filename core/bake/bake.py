@@ -78,9 +78,7 @@ class _OfView:
     @property
     def fingerprint(self) -> str:
         """Of the camera: a capture that was solved again has other ones under the same names."""
-        one = self.camera
-        told = (one.size, one.fx, one.fy, one.cx, one.cy, one.world_to_camera.tolist())
-        return hashlib.sha256(repr(told).encode()).hexdigest()[:16]
+        return hashlib.sha256(repr(self.camera.numbers).encode()).hexdigest()[:16]
 
     def render(self, camera: Camera, edits: LookEdits | None = None) -> Rendering:
         return self.renderer.render(camera) if edits is None else self.renderer.render(camera, edits)

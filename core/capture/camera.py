@@ -33,6 +33,11 @@ class Camera:
         return self.width, self.height
 
     @property
+    def numbers(self) -> tuple[Any, ...]:
+        """All of it as plain numbers, which change whenever its picture would."""
+        return self.size, self.intrinsics.tolist(), self.world_to_camera.tolist()
+
+    @property
     def intrinsics(self) -> Floats:
         """(3, 3) matrix from (x/z, y/z, 1) to pixels."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])

@@ -25,7 +25,7 @@ import numpy as np
 
 from ..errors import CaptureError, FrameError
 from ..files import inside, read_json
-from ..pictures import SUFFIXES, Picture, picture_size, read_picture
+from ..pictures import SUFFIXES, Picture, are_one_shape, picture_size, pictures_below, read_picture
 from .camera import Camera, Floats
 from .colmap import PointCloud, Posed, find_model, read_model
 from .lens import PINHOLES, Lens, straightened
@@ -232,7 +232,7 @@ class Capture:
             for view in self.views:
                 if view.name in paths:
                     size = picture_size(paths[view.name])
-                    if not _uniform(size, view.camera.size):
+                    if not are_one_shape(size, view.camera.size):
                         raise FrameError(f"{paths[view.name]} is {size[0]} x {size[1]} pixels and the frame "
                                          f"{view.camera.width} x {view.camera.height}; make them one shape.")
 
@@ -256,7 +256,7 @@ class _Pictures:
         picture = read_picture(path)
         if view.lens is not None:
             picture = self._undistorted(picture, view, path)
-        elif not _uniform(picture.size, view.camera.size):
+        elif not are_one_shape(picture.size, view.camera.size):
             raise FrameError(f"{path} is {picture.size[0]} x {picture.size[1]} pixels, not "
                              f"{view.camera.width} x {view.camera.height}.")
         picture = picture.resized(*size)
@@ -276,7 +276,7 @@ class _Pictures:
 
     def _undistorted(self, picture: Picture, view: View, path: Path) -> Picture:
         assert view.lens is not None
-        if not _uniform(picture.size, view.camera.size):
+        if not are_one_shape(picture.size, view.camera.size):
             raise FrameError(f"{path} is {picture.size[0]} x {picture.size[1]} pixels, not "
                              f"{view.camera.width} x {view.camera.height}.")
         camera = view.camera.scaled(*picture.size)
@@ -330,17 +330,9 @@ def _read_poses(folder: Path) -> tuple[list[Posed], PointCloud, Path]:
     return *read_model(model), folder / "images"
 
 
-def _uniform(size: tuple[int, int], other: tuple[int, int]) -> bool:
-    """Whether one size is the other, scaled and rounded to whole pixels."""
-    small, large = sorted((size, other))
-    scale = max(large[0] / small[0], large[1] / small[1])
-    return (abs(large[0] - small[0] * scale) <= max(scale, 1.0) + 1e-9
-            and abs(large[1] - small[1] * scale) <= max(scale, 1.0) + 1e-9)
-
-
 def _checked_size(path: Path, lens: Lens) -> tuple[int, int]:
     size = picture_size(path)
-    if not _uniform(size, (lens.width, lens.height)):
+    if not are_one_shape(size, (lens.width, lens.height)):
         raise FrameError(f"{path} is {size[0]} x {size[1]} pixels and its camera {lens.width} x {lens.height}, "
                          "which is another shape; use the frames that were solved.")
     if path.suffix.lower() not in SUFFIXES:
@@ -362,8 +354,7 @@ def _siblings(folder: Path, views: Sequence[View]) -> dict[str, Path]:
     if not folder.is_dir():
         return found
     there: dict[str, str] = {}
-    pictures = [path for path in sorted(folder.rglob("*")) if path.suffix.lower() in SUFFIXES
-                and not path.name.startswith(".")]
+    pictures = pictures_below(folder)
     for path in pictures:  # by the name with the suffix in small letters
         name = path.relative_to(folder)
         there.setdefault(name.with_suffix(name.suffix.lower()).as_posix(), name.as_posix())

@@ -40,10 +40,8 @@ def nearest_depth(capture: Capture) -> float:
     points = capture.points.xyz[:: max(len(capture.points) // NEAREST_POINTS, 1)]
     depths = []
     for camera in (view.camera for view in capture.views):
-        seen = points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
-        seen = seen[seen[:, 2] > 0]
-        x, y = (seen[:, :2] / seen[:, 2:] * (camera.fx, camera.fy) + (camera.cx, camera.cy)).T
-        depths.append(seen[(x > 0) & (x < camera.width) & (y > 0) & (y < camera.height), 2])
+        pixels, depth = camera.project(points)
+        depths.append(depth[camera.contains(pixels, depth)])
     every = np.concatenate(depths) if depths else np.zeros(0)
     return float(np.quantile(every, NEAREST)) if len(every) else math.inf
 

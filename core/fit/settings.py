@@ -6,11 +6,7 @@ fit ends in minutes on two CPU cores.
 """
 from __future__ import annotations
 
-import dataclasses
-import math
 import tomllib
-import types
-import typing
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
@@ -22,6 +18,7 @@ from ..flare.density import DensitySettings
 from ..flare.model import OURS, PAPER, FlareForm
 from ..flare.visibility import VisibilitySettings
 from ..gaussians.densification import ClassicSettings, McmcSettings
+from ..typed import field_of, table_of
 
 Mode = Literal["default", "split", "unsup", "in-flare", "2d", "3dgs"]
 Preset = Literal["draft", "standard", "high", "paper"]
@@ -296,7 +293,7 @@ def read_config(path: Path) -> FitSettings:
     """The settings of a run. Raises RunError where the file is missing, damaged, or holds unknown names."""
     try:
         data = tomllib.loads(path.read_text(encoding=WRITTEN_BY_HAND))
-        return _read_table(FitSettings, data).checked()
+        return table_of(FitSettings, data).checked()
     except OSError as problem:
         raise RunError(f"{path} cannot be read ({problem.strerror}); is this the folder of a run?") from problem
     except (ValueError, TypeError, SettingsError) as problem:
@@ -323,35 +320,6 @@ def _changed(table: Any, keys: list[str], value: Any, name: str) -> Any:
             raise SettingsError(f"There is no setting {name!r}; {keys[0]} has no parts.")
         return replace(table, **{keys[0]: _changed(now, keys[1:], value, name)})
     try:
-        return replace(table, **{keys[0]: _read_value(typing.get_type_hints(type(table))[keys[0]], value)})
+        return replace(table, **{keys[0]: field_of(type(table), keys[0], value)})
     except (ValueError, TypeError) as problem:
         raise SettingsError(f"The setting {name!r} cannot be {value!r} ({problem}).") from problem
-
-
-def _read_table(kind: Any, data: Any) -> Any:
-    if not isinstance(data, dict):
-        raise ValueError(f"{kind.__name__} must be a table")
-    hints = typing.get_type_hints(kind)
-    unknown = set(data) - set(hints)
-    if unknown:
-        raise ValueError(f"unknown settings {', '.join(sorted(unknown))}")
-    values = {key: _read_value(hints[key], value) for key, value in data.items()}
-    return kind(**values)
-
-
-def _read_value(kind: Any, value: Any) -> Any:
-    if dataclasses.is_dataclass(kind):
-        return _read_table(kind, value)
-    if typing.get_origin(kind) is Literal:
-        if value not in typing.get_args(kind):
-            raise ValueError(f"{value!r} is not one of {', '.join(typing.get_args(kind))}")
-        return value
-    options = typing.get_args(kind) if isinstance(kind, types.UnionType) else (kind,)
-    for option in options:
-        if option is float and isinstance(value, int | float) and not isinstance(value, bool):
-            if not math.isfinite(value):
-                raise ValueError("it must be a finite number")
-            return float(value)
-        if type(value) is option or (option is type(None) and value is None):
-            return value
-    raise ValueError(f"{value!r} is not {kind}")

@@ -55,9 +55,7 @@ class ShotFrame:
 
     def described(self) -> str:
         """Changes whenever its picture would, with one .flare and query."""
-        camera = self.camera
-        return repr((self.frame, self.name, self.edits, camera.size, camera.intrinsics.tolist(),
-                     camera.world_to_camera.tolist(),
+        return repr((self.frame, self.name, self.edits, *self.camera.numbers,
                      [(light.name, light.source, light.xyz.tolist(), light.share) for light in self.lights]))
 
 

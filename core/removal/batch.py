@@ -10,10 +10,11 @@ from typing import Any
 
 from ..errors import FrameError, SettingsError
 from ..files import are_newer, check_apart, locked, read_json, remove_partial_of, write_json
+from ..pictures import pictures_below
 from ..progress import Progress
 from .inference import Remover
 from .mattes import Mattes
-from .plates import plates_below, write_flare, write_plate
+from .plates import write_flare, write_plate
 from .steady import Sequences, by_number
 
 RECORD, LOCK = "remove.json", ".remove.lock"
@@ -31,7 +32,7 @@ def plates_of(inputs: Iterable[Path], apart_from: Iterable[Path | None] = ()) ->
     for given in inputs:
         if given.is_dir():
             inner = [other for other in others if given.resolve() in other.parents]
-            files = [(path, path.relative_to(given)) for path in plates_below(given)
+            files = [(path, path.relative_to(given)) for path in pictures_below(given)
                      if not any(path.resolve().is_relative_to(other) for other in inner)]
             if not files:
                 raise SettingsError(f"{given} holds no pictures; give a folder with PNG, JPEG, TIFF or EXR files.")

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FrameError, SettingsError
-from .plates import plates_below, read_plate
+from ..pictures import pictures_below
+from .plates import read_plate
 
 ASPECT = 0.01
 """By how much of it the aspect of a matte may differ from that of its plate: a smaller one has rounded sides."""
@@ -57,7 +58,7 @@ class Mattes:
 def _by_name(folder: Path) -> dict[Path, Path]:
     """Every matte of the folder, by its name there without the suffix."""
     found: dict[Path, Path] = {}
-    for path in plates_below(folder):
+    for path in pictures_below(folder):
         name = path.relative_to(folder).with_suffix("")
         if name in found:
             raise SettingsError(f"{found[name]} and {path} are both mattes for {name}; keep one of them.")

@@ -70,12 +70,6 @@ class Plate:
         return {name: header[name] for name in _PLACING if name in header}
 
 
-def plates_below(folder: Path) -> list[Path]:
-    """The pictures in a folder and its folders, but for hidden ones, sorted by name."""
-    return [path for path in sorted(folder.rglob("*")) if path.suffix.lower() in SUFFIXES and path.is_file()
-            and not any(part.startswith(".") for part in path.relative_to(folder).parts)]
-
-
 def read_plate(path: Path | str) -> Plate:
     """Read PNG, JPEG, TIFF or EXR as it is stored. Floats that are not finite are kept.
 

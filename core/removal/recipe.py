@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import SettingsError
+from ..typed import field_of
 from .network import LEVELS, MULTIPLE
 
 
@@ -50,6 +51,8 @@ class Recipe:
             raise SettingsError("A recipe needs a seed and a decay of 0 or more, and a canvas of 32 to 8192 pixels.")
         if not 0 < self.learning_rate < 1 or not len(self.widths) == len(self.blocks) == LEVELS:
             raise SettingsError(f"A recipe needs a learning rate below 1, and widths and blocks of {LEVELS} levels.")
+        if min(self.widths) < 1 or min(self.blocks) < 0:
+            raise SettingsError("A recipe needs widths of one plane or more, and blocks of 0 or more.")
         if not self.stages or any(len(stage) != 3 or not 2 * MULTIPLE <= stage[1] <= stage[2] for stage in self.stages):
             raise SettingsError("A recipe needs stages of (share of the iterations, least and most pixels of a long "
                                 f"side), of {2 * MULTIPLE} pixels or more.")
@@ -76,37 +79,21 @@ class Recipe:
         return max(round(self.pixels / (width * height)), 1), width, height
 
 
-def _tuples(value: Any) -> Any:
-    return tuple(map(_tuples, value)) if isinstance(value, list | tuple) else value
-
-
 def as_dict(recipe: Recipe) -> dict[str, Any]:
     """JSON-able."""
     return asdict(recipe)
 
 
 def from_dict(data: dict[str, Any]) -> Recipe:
-    """The inverse of `as_dict`; SettingsError for names that a recipe has not."""
+    """The inverse of `as_dict`; SettingsError for names that a recipe has not, and values of another kind."""
     known = {field.name for field in fields(Recipe)}
     unknown = set(data) - known
     if unknown:
         raise SettingsError(f"A recipe has no {', '.join(sorted(unknown))}.")
-    return Recipe(**{key: _of_kind(key, _tuples(value)) for key, value in data.items()})
-
-
-def _of_kind(name: str, value: Any) -> Any:
-    """A value of the kind that the recipe has by that name. Raises SettingsError."""
-    usual = getattr(Recipe, name)
-    if name == "stages":
-        fits = isinstance(value, tuple) and all(isinstance(one, tuple) and all(map(_is_number, one)) for one in value)
-    elif isinstance(usual, tuple):
-        fits = isinstance(value, tuple) and all(type(one) is int and one >= 0 for one in value)
-    else:
-        fits = type(value) is int or (isinstance(usual, float) and _is_number(value))
-    if not fits:
-        raise SettingsError(f"A recipe's {name} cannot be {value!r}; it is {usual!r} usually.")
-    return value
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    values = {}
+    for name, value in data.items():
+        try:
+            values[name] = field_of(Recipe, name, value)
+        except ValueError as problem:
+            raise SettingsError(f"A recipe's {name} cannot be {value!r} ({problem}).") from problem
+    return Recipe(**values)

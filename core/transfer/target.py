@@ -23,7 +23,7 @@ from ..gaussians.scene import SceneGaussians
 from ..lights.detection import Detector
 from ..look import Look
 from ..look.shot import PlacedLight, Shot, ShotFrame
-from ..pictures import Picture, pictures_in, read_picture, window_of
+from ..pictures import Picture, are_one_shape, pictures_in, read_picture, window_of
 from .query import Seen
 from .sources import assigned
 
@@ -229,18 +229,17 @@ def of_shot(shot: Shot, look: Look, wanted: Mapped, *, plates: Path | None = Non
         plate = given.get(one.frame)
         camera = on_plate(one.camera, plate) if plate is not None else one.camera
         if plate is not None:
-            _check_aspect(plate, camera)
+            _check_shape(plate, camera)
         frames.append(TargetFrame(frame, replace(one, camera=camera, lights=lights), plate))
     if not frames:
         raise SettingsError("The shot has no frames; export it again.")
     return Target(tuple(frames), read_ply(scene) if scene else None, shown)
 
 
-def _check_aspect(plate: Path, camera: Camera) -> None:
+def _check_shape(plate: Path, camera: Camera) -> None:
     """Raises SettingsError for a plate of another shape than the frame, which would be stretched."""
     width, height = window_of(plate).size
-    scale = max(width / camera.width, height / camera.height)
-    if abs(width - camera.width * scale) > max(scale, 1) or abs(height - camera.height * scale) > max(scale, 1):
+    if not are_one_shape((width, height), camera.size):
         raise SettingsError(f"{plate} is {width} x {height} pixels and the shot {camera.width} x {camera.height}, "
                             "which is another shape; give the plates of this shot.")
 

@@ -80,6 +80,7 @@ def look_at_blend(words: argparse.Namespace, progress: Progress) -> dict[str, An
 
     from ...core.bake.frames import Frame, chosen
     from ...flare_addon.blend_shot import shot_of
+    from ...flare_addon.fits import FLARE
 
     if len(words.to) > 1:
         raise SettingsError("One .blend at a time can be the target.")
@@ -102,7 +103,7 @@ def look_at_blend(words: argparse.Namespace, progress: Progress) -> dict[str, An
     progress.stage("look at the .blend", len(frames))
     flare = words.flare.resolve()
     if flare.is_dir():
-        flare /= "flare.flare"
+        flare /= FLARE
     shot = shot_of(scene, flare, names, frames, radius=words.radius, done=progress.advance)
     shot.write(shot_path(words))
     return {"shot": str(shot_path(words))}
@@ -132,20 +133,28 @@ def _check_numbers(words: argparse.Namespace) -> None:
         raise SettingsError(f"--radius {words.radius} is not a length of 0 or more.")
 
 
-OF_PICTURES, OF_WORLDS = ("light", "focal", "centre"), ("lights", "scene", "plates", "cameras", "radius")
-"""Options for pictures as a target, and for those that have cameras."""
-_FOR = {".blend": ("lights", "scene", "plates", "radius"), ".json": ("scene", "plates"), ".ply": ("lights", "cameras"),
-        "run": ("lights", "scene", "cameras"), "capture": ("lights", "scene")}
+OPTIONS = {"picture": ("light", "focal", "centre"), ".blend": ("lights", "scene", "plates", "radius"),
+           ".json": ("scene", "plates"), ".ply": ("lights", "cameras"), "run": ("lights", "scene", "cameras"),
+           "capture": ("lights", "scene")}
+"""By kind of target those that it has a use for, of all that are for some alone."""
+
+
+def _kind(target: Path) -> str:
+    """Of OPTIONS."""
+    from ...core.fit.run import CONFIG
+
+    suffix = target.suffix.lower()
+    if suffix in PICTURES:
+        return "picture"
+    return suffix if suffix in OPTIONS else "run" if (target / CONFIG).is_file() else "capture"
 
 
 def _check_options(words: argparse.Namespace, kind: str) -> None:
     """Raises SettingsError for an option that the kind of target has no use for: who gives it believes that it does
     something."""
-    allowed = OF_PICTURES if kind == "picture" else _FOR[kind]
-    given = [name for name in (*OF_PICTURES, *OF_WORLDS) if getattr(words, name) and name not in allowed]
-    if given:
-        what = {"picture": "a picture", "run": "a run", "capture": "a capture"}.get(kind, f"a {kind}")
-        raise SettingsError(f"--{given[0]} is not for {what} as the target; leave it out.")
+    for name in dict.fromkeys(name for names in OPTIONS.values() for name in names):
+        if getattr(words, name) and name not in OPTIONS[kind]:
+            raise SettingsError(f"--{name} is not for a {kind} as the target; leave it out.")
 
 
 def _made(words: argparse.Namespace, step: str, target: Any, flare: Path, training: list[Any] | None,
@@ -225,7 +234,7 @@ def target_of(words: argparse.Namespace, flare: Path, training: list[Any] | None
     """The target, by what --to names. training: poses, for a .flare that does not tell."""
     from ...core.bake.frames import Frame, chosen
     from ...core.capture import Capture
-    from ...core.fit.run import CONFIG, SCENE, Run
+    from ...core.fit.run import SCENE, Run
     from ...core.lights.detection import Detector
     from ...core.lights.exposure import Exposure
     from ...core.look import read
@@ -238,12 +247,11 @@ def target_of(words: argparse.Namespace, flare: Path, training: list[Any] | None
     look, to, wanted = read(flare), words.to, parsed(words.use)
     if len(to) > 1 and not all(path.suffix.lower() in PICTURES for path in to):
         raise SettingsError("Several targets at once have to be pictures.")
-    if len(to) == 1 and to[0].is_dir() and not (to[0] / CONFIG).is_file() and _is_of_plates(to[0]):
+    if len(to) == 1 and _kind(to[0]) == "capture" and _is_of_plates(to[0]):
         to = pictures_in(to[0])
-    kind = to[0].suffix.lower()
-    _check_options(words, "picture" if kind in PICTURES else kind if kind in _FOR else
-                   "run" if (to[0] / CONFIG).is_file() else "capture")
-    if kind in PICTURES:
+    kind = _kind(to[0])
+    _check_options(words, kind)
+    if kind == "picture":
         seen = seen_by(flare, look.lights, training)
         distances = {light.name: _usual_distance(light, seen.get(light.name)) for light in look.lights}
         detector: Detector | None = None if words.light else Exposure()
@@ -261,18 +269,18 @@ def target_of(words: argparse.Namespace, flare: Path, training: list[Any] | None
             raise SettingsError(f"{to[0]} is a scene without cameras; name a capture that has them with --cameras.")
         return targets.of_capture(Capture.open(words.cameras, need_frames=False), look, wanted, lights=lights,
                                   scene=to[0], shown=True)
-    if (to[0] / CONFIG).is_file():
+    if kind == "run":
         capture = Capture.open(words.cameras or Run.open(to[0]).capture_folder, need_frames=False)
         return targets.of_capture(capture, look, wanted, lights=lights, scene=words.scene or to[0] / SCENE, shown=True)
     return targets.of_capture(Capture.open(to[0]), look, wanted, lights=lights, scene=words.scene)
 
 
 def _is_of_plates(folder: Path) -> bool:
-    """Whether a folder holds pictures themselves, not a capture."""
+    """Whether it is a folder that holds pictures themselves, not a capture."""
     from ...core.pictures import pictures_in
 
     capture = any((folder / name).exists() for name in ("images", "sparse", "colmap", "transforms.json"))
-    return not capture and bool(pictures_in(folder))
+    return folder.is_dir() and not capture and bool(pictures_in(folder))
 
 
 def _usual_distance(light: Any, seen: Any) -> float:

@@ -1,0 +1,53 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Values from files and command lines, checked against the types that dataclasses declare."""
+from __future__ import annotations
+
+import dataclasses
+import math
+import types
+import typing
+from typing import Any, Literal
+
+
+def table_of(kind: Any, data: Any) -> Any:
+    """A dataclass of `kind` from a dictionary. Raises ValueError for what is no table, has other names, or values of
+    another type."""
+    if not isinstance(data, dict):
+        raise ValueError(f"{kind.__name__} must be a table")
+    hints = typing.get_type_hints(kind)
+    unknown = set(data) - set(hints)
+    if unknown:
+        raise ValueError(f"unknown settings {', '.join(sorted(unknown))}")
+    return kind(**{key: value_of(hints[key], value) for key, value in data.items()})
+
+
+def field_of(kind: Any, name: str, value: Any) -> Any:
+    """A value for the field of a dataclass. Raises ValueError where it is of another type."""
+    return value_of(typing.get_type_hints(kind)[name], value)
+
+
+def value_of(kind: Any, value: Any) -> Any:
+    """`value` as the type `kind`: a dataclass, a Literal, a tuple, or one of a union; numbers are finite. Raises
+    ValueError."""
+    if dataclasses.is_dataclass(kind):
+        return table_of(kind, value)
+    parts = typing.get_args(kind)
+    if typing.get_origin(kind) is Literal:
+        if value not in parts:
+            raise ValueError(f"{value!r} is not one of {', '.join(parts)}")
+        return value
+    if typing.get_origin(kind) is tuple:
+        if not isinstance(value, list | tuple):
+            raise ValueError(f"{value!r} is not {kind}")
+        kinds = parts[:1] * len(value) if parts[-1] is Ellipsis else parts
+        if len(kinds) != len(value):
+            raise ValueError(f"{value!r} should have {len(kinds)} parts")
+        return tuple(value_of(one, part) for one, part in zip(kinds, value, strict=True))
+    for option in parts if isinstance(kind, types.UnionType) else (kind,):
+        if option is float and isinstance(value, int | float) and not isinstance(value, bool):
+            if not math.isfinite(value):
+                raise ValueError("it must be a finite number")
+            return float(value)
+        if type(value) is option or (option is type(None) and value is None):
+            return value
+    raise ValueError(f"{value!r} is not {kind}")

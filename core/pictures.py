@@ -18,7 +18,7 @@ from typing import Any, BinaryIO, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from . import jpeg, tiff
+from . import exr, jpeg, tiff
 from .errors import FrameError
 from .files import atomic_path
 
@@ -168,6 +168,19 @@ def picture_size(path: Path | str) -> tuple[int, int]:
     return _checked(path, size)
 
 
+def channel_names(path: Path | str) -> list[str]:
+    """The channels of an EXR's first part by its header alone. Raises FrameError where the header is no EXR's."""
+    path = Path(path)
+    try:
+        with open(path, "rb") as stream:
+            names = exr.channel_names(stream) if stream.read(4) == exr.MAGIC else []
+    except OSError as problem:
+        raise FrameError(f"{path} cannot be read: {problem.strerror or problem}.") from problem
+    if not names:
+        raise FrameError(f"{path} is not an EXR, or its header is damaged; make it again.")
+    return names
+
+
 def _checked(path: Path, size: tuple[int, int] | None) -> tuple[int, int]:
     if size is None or min(size) <= 0:
         raise FrameError(f"{path} is not a picture, or its header is damaged; export it again.")
@@ -236,39 +249,17 @@ def _size_from_header(stream: BinaryIO) -> tuple[int, int] | None:
     if head[:4] in (b"II*\0", b"MM\0*"):
         sides = tiff.read_tags(stream, (tiff.WIDTH, tiff.HEIGHT))
         return (int(sides[tiff.WIDTH].values[0]), int(sides[tiff.HEIGHT].values[0])) if len(sides) == 2 else None
-    if head[:4] == b"\x76\x2f\x31\x01":
+    if head[:4] == exr.MAGIC:
         return _exr_size(stream)
     return None
 
 
 def _exr_size(stream: BinaryIO) -> tuple[int, int] | None:
-    """Of the displayWindow attribute of the first header: about it may stand others of any length. A dataWindow of more
-    pixels than may be opened counts in its place."""
-    stream.seek(8)
-    sizes: dict[bytes, tuple[int, int]] = {}
-    while name := _until_zero(stream):
-        kind, length = _until_zero(stream), int.from_bytes(stream.read(4), "little", signed=True)
-        if length < 0:
-            return None
-        if name in (b"dataWindow", b"displayWindow") and kind == b"box2i" and length == 16:
-            window = stream.read(16)
-            x0, y0, x1, y1 = np.frombuffer(window, "<i4").tolist() if len(window) == 16 else (0, 0, -1, -1)
-            sizes[name] = x1 - x0 + 1, y1 - y0 + 1
-            if len(sizes) == 2:
-                stored = sizes[b"dataWindow"]
-                whole = min(stored) > 0 and stored[0] * stored[1] <= LARGEST
-                return sizes[b"displayWindow"] if whole else stored
-        else:
-            stream.seek(length, os.SEEK_CUR)
-    return sizes.get(b"dataWindow")
-
-
-def _until_zero(stream: BinaryIO) -> bytes:
-    """A name in an EXR's header, 255 bytes at most."""
-    name = b""
-    while len(name) <= 255 and (byte := stream.read(1)) not in (b"", b"\0"):
-        name += byte
-    return name
+    """Of the frame; a dataWindow of more pixels than may be opened counts in its place."""
+    sizes = exr.windows(stream)
+    stored = sizes.get("dataWindow")
+    whole = stored is not None and min(stored) > 0 and stored[0] * stored[1] <= LARGEST
+    return sizes.get("displayWindow", stored) if whole else stored
 
 
 def read_exr(path: Path | str) -> dict[str, Pixels]:

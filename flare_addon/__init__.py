@@ -6,7 +6,7 @@
     cameras.py          Blender's cameras and the core's  lights.py        light objects
     engine.py, jobs.py  the process with torch            fits.py          fits
     looks.py            .flare, flares, occlusion         overlay.py, points.py   what is drawn in the viewport
-    shots.py            what is baked                     compositor.py, layer_folder.py   layers back together
+    shots.py            what is baked                     compositor.py    layers back together
     library.py          flares for other shots            paths.py         files of a .blend that moves
     operators/, panels.py   buttons and panels
 """

@@ -19,9 +19,9 @@ from typing import Any
 
 import bpy
 
+from ..core.bake.folder import LayerFolder
 from ..core.errors import FrameError
 from ..core.files import atomic_path
-from .layer_folder import LayerFolder
 
 GROUP = "Fit Flare"
 LAYERS = "Fit Flare Layers"

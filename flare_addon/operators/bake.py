@@ -8,10 +8,10 @@ from typing import Any
 
 import bpy
 
+from ...core.bake.folder import LayerFolder
 from ...core.bake.layers import layer_names
 from ...core.errors import FrameError
 from .. import compositor, engine, jobs, looks, shots
-from ..layer_folder import LayerFolder
 from ..paths import absolute
 from ..reports import NO_CAMERA, NO_FLARE, Action
 

@@ -35,9 +35,9 @@ def frames_of(folder: Path, out: Path, progress: Progress, *, wanted: str | None
     """Build the compositor over the layers in `folder`, save it as a .blend in `out`, render its frames there."""
     import bpy
 
+    from ...core.bake.folder import LayerFolder
     from ...core.bake.frames import Frame, chosen
     from ...flare_addon import compositor
-    from ...flare_addon.layer_folder import LayerFolder
 
     if out.resolve() == folder.resolve():
         raise SettingsError(f"{out} holds the layers; choose another folder for the frames.")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import cv2
@@ -17,6 +17,7 @@ from core.colour import colour_space
 from core.errors import FrameError
 from core.pictures import (
     Picture,
+    channel_names,
     linear_from_srgb,
     picture_size,
     read_exr,
@@ -185,3 +186,20 @@ def test_an_exr_is_what_its_frame_shows(low: tuple[int, int], high: tuple[int, i
     np.testing.assert_array_equal(found[..., 0], expected)
     window = pictures.window_of(tmp_path / "a.exr")
     assert (window.size, window.origin, window.is_frame) == ((width, height), low, False)
+
+
+def test_the_channels_of_an_exr_by_its_header_alone(tmp_path: Path) -> None:
+    names = ["R", "flare_key light.R", "flare_ö.A", "depth.Z"]
+    write_exr(tmp_path / "a.exr", dict.fromkeys(names, RAMP[..., 0]), header={"view": "x" * 90_000})
+    assert sorted(channel_names(tmp_path / "a.exr")) == sorted(names)
+
+
+@pytest.mark.parametrize("damage", [
+    lambda whole: whole[:0], lambda whole: whole[:40], lambda whole: b"\x89PNG" + whole[4:],
+    lambda whole: whole.replace(b"chlist\0" + whole.split(b"chlist\0")[1][:4], b"chlist\0\xff\xff\xff\x7f"),
+    lambda whole: whole.replace(b"flare", b"\0lare")])
+def test_the_channels_of_a_damaged_header_are_told_as_such(damage: Callable[[bytes], bytes], tmp_path: Path) -> None:
+    write_exr(tmp_path / "a.exr", {"flare.R": RAMP[..., 0]})
+    (tmp_path / "a.exr").write_bytes(damage((tmp_path / "a.exr").read_bytes()))
+    with pytest.raises(FrameError, match=r"a\.exr is not an EXR, or its header is damaged"):
+        channel_names(tmp_path / "a.exr")

@@ -16,8 +16,8 @@ run = importlib.util.module_from_spec(spec)
 spec.loader.exec_module(run)
 run.load()
 
+from fit_flare.core.bake.folder import LayerFolder  # noqa: E402
 from fit_flare.flare_addon import compositor  # noqa: E402
-from fit_flare.flare_addon.layer_folder import LayerFolder  # noqa: E402
 
 INTENSITY, TINT = 1.7, (1.0, 0.5, 0.25, 1.0)
 

@@ -6,8 +6,8 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
-from ..core.errors import FrameError
-from ..core.pictures import picture_size
+from ..errors import FrameError
+from ..pictures import channel_names, picture_size
 
 _NUMBERED = re.compile(r"(.*?)(\d+)\.exr", re.IGNORECASE)
 
@@ -21,7 +21,8 @@ class LayerFolder:
 
     @classmethod
     def open(cls, folder: Path | str) -> LayerFolder:
-        """Raises FrameError where the folder holds no numbered EXR files, or more than one sequence."""
+        """Raises FrameError where the folder holds no numbered EXR files, more than one sequence, or frames that do not
+        all have the same layers: Blender goes by the first, and would show the others without theirs."""
         folder = Path(folder).resolve()
         sequences: dict[str, dict[int, Path]] = {}
         for path in sorted(folder.glob("*")):
@@ -34,7 +35,16 @@ class LayerFolder:
             heads = " and ".join(f"{head}*.exr" for head in sorted(sequences)[:2])
             raise FrameError(f"{folder} holds more than one sequence ({heads}); keep each in a folder of its own.")
         files = next(iter(sequences.values()))
-        return cls(folder, dict(sorted(files.items())))
+        files = dict(sorted(files.items()))
+        layers = {path: _layers_of(path) for path in files.values()}
+        first, *others = files.values()
+        for path in others:
+            if layers[path] != layers[first]:
+                here, there = (" and ".join(sorted(layers[one] - layers[two])) or "none of its own"
+                               for one, two in ((first, path), (path, first)))
+                raise FrameError(f"{folder} holds frames of two bakes: beside the layers of both {first.name} has "
+                                 f"{here}, {path.name} {there}; bake each into a folder of its own.")
+        return cls(folder, files)
 
     @property
     def first(self) -> int:
@@ -47,3 +57,7 @@ class LayerFolder:
     def size(self) -> tuple[int, int]:
         """(width, height) of the first frame, from its header."""
         return picture_size(self.files[self.first])
+
+
+def _layers_of(path: Path) -> set[str]:
+    return {name.rpartition(".")[0] for name in channel_names(path)} - {""}

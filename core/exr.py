@@ -1,0 +1,56 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What an EXR's first header says, read without a library: Blender's own Python has none that reads EXRs.
+
+The layout is that of "OpenEXR File Layout" (Academy Software Foundation): after a magic number and a version, each
+attribute is a name, a type, a length and that many bytes; an empty name ends the header.
+"""
+from __future__ import annotations
+
+import os
+from typing import BinaryIO
+
+import numpy as np
+
+MAGIC = b"\x76\x2f\x31\x01"
+_LONGEST = 1 << 20
+"""Bytes of an attribute that is read: some ten thousand channels, where hostile files claim gigabytes."""
+
+
+def windows(stream: BinaryIO) -> dict[str, tuple[int, int]]:
+    """(width, height) of the "dataWindow" (what is stored) and the "displayWindow" (the frame), where they are told."""
+    told = _attributes(stream, {b"dataWindow": b"box2i", b"displayWindow": b"box2i"})
+    corners = {name: np.frombuffer(value, "<i4").tolist() for name, value in told.items() if len(value) == 16}
+    return {name.decode(): (x1 - x0 + 1, y1 - y0 + 1) for name, (x0, y0, x1, y1) in corners.items()}
+
+
+def channel_names(stream: BinaryIO) -> list[str]:
+    """The channels, such as "flare_sun.R", in the file's order; none where the header is damaged."""
+    value = _attributes(stream, {b"channels": b"chlist"}).get(b"channels", b"")
+    names, at = [], 0
+    while (end := value.find(b"\0", at)) > at:
+        names.append(value[at:end].decode(errors="replace"))
+        at = end + 17  # past the zero, the pixel type, whether it is linear, and the sampling
+    return names if value[at:] == b"\0" else []
+
+
+def _attributes(stream: BinaryIO, kinds: dict[bytes, bytes]) -> dict[bytes, bytes]:
+    """Those of the given names and types, up to the end of the header, or to where it is damaged."""
+    stream.seek(len(MAGIC) + 4)
+    found: dict[bytes, bytes] = {}
+    while len(found) < len(kinds) and (name := _until_zero(stream)):
+        kind, length = _until_zero(stream), int.from_bytes(stream.read(4), "little", signed=True)
+        if length < 0:
+            break
+        if kinds.get(name) == kind and length <= _LONGEST:
+            found[name] = stream.read(length)
+        else:
+            stream.seek(length, os.SEEK_CUR)
+    return found
+
+
+def _until_zero(stream: BinaryIO) -> bytes:
+    """A name, 255 bytes at most."""
+    name = b""
+    while len(name) <= 255 and (byte := stream.read(1)) not in (b"", b"\0"):
+        name += byte
+    return name

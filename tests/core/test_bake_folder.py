@@ -1,0 +1,43 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Which folders of layers are put together."""
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from core.bake.exr import write_layers
+from core.bake.folder import LayerFolder
+from core.bake.layers import FrameLayers
+from core.errors import FrameError
+
+
+def frame(folder: Path, number: int, lights: Sequence[str]) -> Path:
+    black = np.zeros((4, 6, 3), np.float32)
+    path = folder / f"layers.{number:04d}.exr"
+    write_layers(path, FrameLayers(black, dict.fromkeys(lights, black), np.ones((4, 6), np.float32)))
+    return path
+
+
+def test_frames_of_the_same_layers_are_a_sequence_with_gaps_or_none(tmp_path: Path) -> None:
+    files = {number: frame(tmp_path, number, ["sun", "lamp"]) for number in (0, 3, 4)}
+    layers = LayerFolder.open(tmp_path)
+    assert (layers.files, layers.first, layers.last, layers.size()) == (files, 0, 4, (6, 4))
+
+
+def test_frames_of_other_lights_are_not_taken_for_one_sequence(tmp_path: Path) -> None:
+    """Blender goes by the layers of the first: the lamp would be gone in silence."""
+    frame(tmp_path, 1, ["sun"])
+    frame(tmp_path, 2, ["sun"])
+    frame(tmp_path, 3, ["sun", "lamp"])
+    with pytest.raises(FrameError, match=r"two bakes.*layers\.0001\.exr has none of its own, layers\.0003\.exr .*lamp"):
+        LayerFolder.open(tmp_path)
+
+
+def test_a_damaged_frame_is_named(tmp_path: Path) -> None:
+    frame(tmp_path, 1, ["sun"])
+    frame(tmp_path, 2, ["sun"]).write_bytes(b"torn")
+    with pytest.raises(FrameError, match=r"layers\.0002\.exr is not an EXR"):
+        LayerFolder.open(tmp_path)

@@ -12,6 +12,10 @@ from typing import BinaryIO
 import numpy as np
 
 MAGIC = b"\x76\x2f\x31\x01"
+LINES = (1, 1, 1, 16, 32, 16, 32, 32, 32, 256, 256, 32)
+"""Lines of a chunk, by the number of the compression: none, RLE, ZIPS, ZIP, PIZ, PXR24, B44, B44A, DWAA, DWAB and two
+of HTJ2K."""
+_TILES, _DEEP, _PARTS = 0x200, 0x800, 0x1000  # flags of the version
 _LONGEST = 1 << 20
 """Bytes of an attribute that is read: some ten thousand channels, where hostile files claim gigabytes."""
 
@@ -33,11 +37,39 @@ def channel_names(stream: BinaryIO) -> list[str]:
     return names if value[at:] == b"\0" else []
 
 
-def _attributes(stream: BinaryIO, kinds: dict[bytes, bytes]) -> dict[bytes, bytes]:
-    """Those of the given names and types, up to the end of the header, or to where it is damaged."""
+def is_cut_off(stream: BinaryIO) -> bool:
+    """Whether the chunks of a picture of one part in lines are not all in the file. Of other kinds it is not known, and
+    none of those is."""
+    stream.seek(len(MAGIC))
+    flags = int.from_bytes(stream.read(4), "little")
+    if flags & (_TILES | _DEEP | _PARTS):
+        return False
+    told = _attributes(stream, {b"dataWindow": b"box2i", b"compression": b"compression"}, to_the_end=True)
+    window, compression = told.get(b"dataWindow", b""), told.get(b"compression")
+    if len(window) != 16 or not compression:
+        return True
+    if compression[0] >= len(LINES):
+        return False
+    _, top, _, bottom = np.frombuffer(window, "<i4").tolist()
+    begin, end = stream.tell(), stream.seek(0, os.SEEK_END)
+    chunks = -(-(bottom + 1 - top) // LINES[compression[0]])
+    if chunks <= 0 or begin + 8 * chunks > end:
+        return True
+    stream.seek(begin)
+    places = np.frombuffer(stream.read(8 * chunks), "<u8")
+    if not places.all():  # one that is still being written has none yet
+        return True
+    last = int(places.max())
+    stream.seek(min(last + 4, end))
+    return last + 8 + int.from_bytes(stream.read(4), "little") > end
+
+
+def _attributes(stream: BinaryIO, kinds: dict[bytes, bytes], *, to_the_end: bool = False) -> dict[bytes, bytes]:
+    """Those of the given names and types, up to where the header ends or is damaged; the stream is past all of them,
+    and `to_the_end` past the header."""
     stream.seek(len(MAGIC) + 4)
     found: dict[bytes, bytes] = {}
-    while len(found) < len(kinds) and (name := _until_zero(stream)):
+    while (to_the_end or len(found) < len(kinds)) and (name := _until_zero(stream)):
         kind, length = _until_zero(stream), int.from_bytes(stream.read(4), "little", signed=True)
         if length < 0:
             break

@@ -181,6 +181,13 @@ def channel_names(path: Path | str) -> list[str]:
     return names
 
 
+def exr_is_cut_off(path: Path | str) -> bool:
+    """Whether an EXR ends before its last lines, by its table of where they are. Raises OSError where there is no such
+    file."""
+    with open(path, "rb") as stream:
+        return stream.read(4) == exr.MAGIC and exr.is_cut_off(stream)
+
+
 def _checked(path: Path, size: tuple[int, int] | None) -> tuple[int, int]:
     if size is None or min(size) <= 0:
         raise FrameError(f"{path} is not a picture, or its header is damaged; export it again.")
@@ -268,22 +275,32 @@ def read_exr(path: Path | str) -> dict[str, Pixels]:
 
     Raises FrameError where the file is damaged or holds NaN or infinity.
     """
-    import OpenEXR
-
     path = Path(path)
     picture_size(path)
     channels: dict[str, Pixels] = {}
-    try:
-        with OpenEXR.File(str(path), separate_channels=True) as file:
-            for part in file.parts:
-                for name, channel in part.channels.items():
-                    channels.setdefault(name, np.asarray(channel.pixels, np.float32))
-    except Exception as problem:  # the library raises bare RuntimeError and worse for damaged files
-        raise FrameError(f"{path} is damaged or truncated ({problem}); export it again.") from problem
-    for name, pixels in channels.items():
-        if not np.isfinite(pixels).all():
+    for _header, of_part in exr_parts(path):
+        for name, pixels in of_part.items():
+            channels.setdefault(name, np.asarray(pixels, np.float32))
+    for name, values in channels.items():
+        if not np.isfinite(values).all():
             raise FrameError(f"{path} holds values in channel {name} that are not finite; clean it first.")
     return channels
+
+
+def exr_parts(path: Path) -> list[tuple[dict[str, Any], dict[str, NDArray[Any]]]]:
+    """The header and the channels, (height, width) as stored, of each part of an EXR. Raises FrameError where the file
+    is damaged: of one that is cut off the library reads no part at all."""
+    import OpenEXR
+
+    try:
+        with OpenEXR.File(str(path), separate_channels=True) as file:
+            parts = [(dict(part.header), {name: channel.pixels for name, channel in part.channels.items()})
+                     for part in file.parts]
+    except Exception as problem:  # the library raises bare RuntimeError and worse for damaged files
+        raise FrameError(f"{path} is damaged or truncated ({problem}); export it again.") from problem
+    if not parts:
+        raise FrameError(f"{path} is damaged or truncated; export it again.")
+    return parts
 
 
 def _rgb_from_channels(path: Path, channels: Mapping[str, Pixels]) -> Pixels:

@@ -75,7 +75,7 @@ class Progress:
     def check(self) -> None:
         """Raise Cancelled if a stop was asked for."""
         if self._stop.is_set():
-            raise Cancelled(f"Stopped during {self._stage or 'start-up'} as asked; run it again to go on.")
+            raise Cancelled(f"Stopped during {self._stage or 'start-up'} as asked; what is done is kept.")
 
     @property
     def left_s(self) -> float | None:

@@ -18,8 +18,8 @@ ROOT = Path(__file__).resolve().parents[1]
 RUN = ROOT / "headless" / "run.py"
 PACKAGE = (__package__ or "").rpartition(".")[0]
 FOLDER = "engine"
+VARIABLE = "FIT_FLARE_ENGINE"
 TESTED = "python.txt"  # which Python the last test was of
-MISSING = "No engine is set up. Open the preferences of Fit Flare and set one up, or name a Python that has it"
 
 
 def user_folder(name: str, create: bool = False) -> Path:
@@ -53,14 +53,23 @@ def python_at(place: Path) -> Path | None:
     return None
 
 
-def find() -> Path | None:
-    """The engine's Python: the preferences' own, FIT_FLARE_ENGINE, the one that was set up by a click, .venv
-    beside the extension's source. None where there is none; a look at the disk, cheap enough for a panel."""
+def named() -> tuple[str, str]:
+    """What names an engine, and which: the variable FIT_FLARE_ENGINE, or else the preferences; of none ("", "")."""
     from .preferences import engine_path
 
-    for place in (engine_path(), os.environ.get("FIT_FLARE_ENGINE", "")):
+    for who, place in ((VARIABLE, os.environ.get(VARIABLE, "")), ("the preferences", engine_path())):
         if place:
-            return python_at(Path(place).expanduser())
+            return who, place
+    return "", ""
+
+
+def find() -> Path | None:
+    """The engine's Python: the one that is named, else the one that was set up by a click, or .venv beside the
+    extension's source, in the order of the commands. None where there is none; a look at the disk, cheap enough for a
+    panel."""
+    _, place = named()
+    if place:
+        return python_at(Path(place).expanduser())
     for folder in (home() / "python", ROOT / ".venv"):
         python = python_at(folder)
         if python is not None:
@@ -68,11 +77,19 @@ def find() -> Path | None:
     return None
 
 
+def missing() -> str:
+    """Why there is none, and what to do, without a full stop."""
+    who, place = named()
+    if place:
+        return f"The engine named by {who} is not there: {place}. Name a Python that has torch, or none"
+    return "No engine is set up. Open the preferences of Fit Flare and set one up, or name a Python that has it"
+
+
 def command(*words: object) -> list[str]:
     """A command of run.py as the engine runs it. Raises EngineError where no engine is set up."""
     python = find()
     if python is None:
-        raise EngineError(f"{MISSING}.")
+        raise EngineError(f"{missing()}.")
     return [str(python), str(RUN), *map(str, words), "--progress", "json"]
 
 

@@ -56,7 +56,7 @@ def why_not(scene: Any) -> str:
     if not lights.of_scene(scene):
         return "Add a light first, or find the lights in the frames"
     if engine.find() is None:
-        return engine.MISSING
+        return engine.missing()
     if state_of(scene) == "running":
         return "A fit is running"
     return ""

@@ -187,7 +187,7 @@ def _reading(layout: Any, folder: Any) -> None:
 def draw_engine(layout: Any) -> None:
     """That there is no engine, and the way to one."""
     box = layout.box()
-    lines(box, "No engine is set up: the fit and the bake need a Python with torch.", "ERROR")
+    lines(box, f"{engine.missing()}.", "ERROR")
     box.operator("preferences.addon_show", text="Open Preferences", icon="PREFERENCES").module = PACKAGE
 
 

@@ -29,7 +29,9 @@ Takes lens flares out of footage, learns them, and gives them back as layers.
   blender -b -P headless/run.py -- COMMAND …"""
 
 _EPILOGUE = """\
-A command that is stopped (Ctrl-C) can be given again and goes on. `COMMAND --help` tells more."""
+A command that is stopped (Ctrl-C) can be given again and goes on, `fit` and `train-removal` with --resume.
+Status at the end: 0 done; 1 it could not be done, the last line says why; 2 the words made no sense; 130 stopped.
+`COMMAND --help` tells more."""
 
 
 class Misuse(FitFlareError):
@@ -50,7 +52,8 @@ def parser() -> argparse.ArgumentParser:
                               "lines of the Open Job Description, for farms")
     options.add_argument("--engine", metavar="PYTHON",
                          help="the Python with torch, or the folder of its virtual environment, for a Blender that "
-                              "has none (else FIT_FLARE_ENGINE, the add-on's preferences, .venv in the repository)")
+                              "has none (else FIT_FLARE_ENGINE, the add-on's preferences, what its Set Up Engine has "
+                              "made, .venv in the repository)")
     options.add_argument("--blender", metavar="PROGRAM",
                          help="the Blender for the steps that need one (else FIT_FLARE_BLENDER, the bpy package of "
                               "this Python, `blender` on the PATH)")
@@ -79,8 +82,9 @@ def main(words: Sequence[str]) -> int:
 
 
 def _status(words: Sequence[str], progress: Progress) -> int:
+    arguments = argparse.Namespace(words=list(words))
     try:
-        arguments = parser().parse_args(words, argparse.Namespace(words=list(words)))
+        arguments = parser().parse_args(words, arguments)
         with stoppable(progress):
             result = _run(COMMANDS[arguments.command], arguments, words, progress)
         progress.close()
@@ -92,7 +96,9 @@ def _status(words: Sequence[str], progress: Progress) -> int:
         progress.error(str(problem))
         return MISUSED
     except (Cancelled, KeyboardInterrupt) as stop:
-        progress.error(str(stop) or "Stopped.")
+        how = " with --resume" if hasattr(arguments, "resume") else ""
+        hint = f" Give the command again{how} to go on." if isinstance(progress, TerminalProgress) else ""
+        progress.error(f"{str(stop) or 'Stopped.'}{hint}")
         return STOPPED
     except FitFlareError as problem:
         progress.error(str(problem))

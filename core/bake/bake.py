@@ -18,7 +18,7 @@ from ..colour import colour_space
 from ..errors import FrameError, RunError
 from ..files import inside, locked, read_json, remove_partial_of, write_json
 from ..look import KeyedEdits, LookEdits
-from ..pictures import picture_size
+from ..pictures import exr_is_cut_off, picture_size
 from ..progress import Progress
 from .exr import read_description, write_layers
 from .frames import Frame
@@ -199,12 +199,13 @@ def _begin(out: Path, made_from: dict[str, Any], names: dict[str, str], overwrit
 
 
 def _is_made(path: Path, wanted: Mapping[str, Any]) -> bool:
-    """Whether the file is this frame under these settings, by its own header: other tasks of a farm write here too."""
-    if not path.is_file():
-        return False
+    """Whether the file is whole and this frame under these settings, by its own header: other tasks of a farm write
+    here too."""
     try:
+        if exr_is_cut_off(path):
+            return False
         notes = read_description(path)
-    except FrameError:
+    except (FrameError, OSError):
         return False
     return all(notes.get(name) == value for name, value in json.loads(json.dumps(wanted)).items())
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..errors import FrameError
-from ..pictures import channel_names, picture_size
+from ..pictures import channel_names, exr_is_cut_off, picture_size
 
 _NUMBERED = re.compile(r"(.*?)(\d+)\.exr", re.IGNORECASE)
 
@@ -22,7 +22,8 @@ class LayerFolder:
     @classmethod
     def open(cls, folder: Path | str) -> LayerFolder:
         """Raises FrameError where the folder holds no numbered EXR files, more than one sequence, or frames that do not
-        all have the same layers: Blender goes by the first, and would show the others without theirs."""
+        all have the same layers: Blender goes by the first, and would show the others without theirs. Also where
+        one is cut off, of which Blender would show the part there is."""
         folder = Path(folder).resolve()
         sequences: dict[str, dict[int, Path]] = {}
         for path in sorted(folder.glob("*")):
@@ -60,4 +61,6 @@ class LayerFolder:
 
 
 def _layers_of(path: Path) -> set[str]:
+    if exr_is_cut_off(path):
+        raise FrameError(f"{path} ends before its last lines; bake it again.")
     return {name.rpartition(".")[0] for name in channel_names(path)} - {""}

@@ -2,11 +2,12 @@
 """Which views are which frames: numbers for a sequence, from the names of the views.
 
 A view's frame number is the number its name ends with ("DSC_0123.JPG" is frame 123), so that layers line
-up with the footage. Where names have none, or two views of a folder would share one, the views of that
-folder are counted from 1 in their order.
+up with the footage; views without one come after the last that has one. Where no name of a folder has one, or two
+would share one, the views of that folder are counted from 1 in their order.
 """
 from __future__ import annotations
 
+import itertools
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -38,11 +39,13 @@ def numbered(views: Iterable[str]) -> list[Frame]:
         folders.setdefault(PurePosixPath(view).parent, []).append(view)
     frames: list[Frame] = []
     for folder, names in sorted(folders.items()):
-        found = [_LAST_NUMBER.search(PurePosixPath(name).stem) for name in names]
-        numbers = [int(match[1]) for match in found if match]
-        if len(set(numbers)) < len(names):
-            names, numbers = sorted(names), list(range(1, len(names) + 1))
-        pairs = sorted(zip(numbers, names, strict=True))
+        found = {name: _LAST_NUMBER.search(PurePosixPath(name).stem) for name in sorted(names)}
+        numbers = {name: int(match[1]) for name, match in found.items() if match}
+        if len(set(numbers.values())) < len(numbers):
+            numbers = {}
+        after = max(numbers.values(), default=0) + 1
+        numbers.update(zip((name for name in found if name not in numbers), itertools.count(after)))
+        pairs = sorted((number, name) for name, number in numbers.items())
         frames += [Frame(name, number, layers_file(folder, number)) for number, name in pairs]
     return frames
 
@@ -62,20 +65,37 @@ def plates_by_number(pictures: Sequence[Path]) -> dict[int, Path]:
 
 
 def chosen(frames: Sequence[Frame], text: str | None) -> list[Frame]:
-    """The frames that `text` asks for: numbers and ranges, "3", "1-20", "1-20,31,40-44"; None asks for all.
+    """The frames that `text` asks for: numbers, and ranges, by steps too: "3", "1-20", "1-20:2", "1-20,31,40-44"; None
+    asks for all.
 
     Raises SettingsError where the text is no such list or asks for no frame that there is.
     """
     if text is None:
         return list(frames)
-    ranges: list[tuple[int, int]] = []
-    for part in text.split(","):
-        match = re.fullmatch(r"\s*(\d+)\s*(?:-\s*(\d+)\s*)?", part)
-        if not match or int(match[2] or match[1]) < int(match[1]):
-            raise SettingsError(f"The frames {text!r} are not a list of numbers and ranges such as 1-20,31.")
-        ranges.append((int(match[1]), int(match[2] or match[1])))
-    result = [frame for frame in frames if any(low <= frame.number <= high for low, high in ranges)]
+    asked = _asked(text)
+    result = [frame for frame in frames if any(frame.number in some for some in asked)]
     if not result:
         there = f"{frames[0].number} to {frames[-1].number}" if frames else "none"
         raise SettingsError(f"None of the frames {text!r} is there: they are {there}.")
     return result
+
+
+def absent(frames: Sequence[Frame], text: str | None) -> str:
+    """Which numbers `text` asks for that no frame has, as such a text; "" where there is none."""
+    known, gaps = {frame.number for frame in frames}, []
+    for some in _asked(text) if text is not None else []:
+        there = [-1, *sorted(some.index(number) for number in known if number in some), len(some)]
+        gaps += [some[before + 1:after] for before, after in itertools.pairwise(there) if after > before + 1]
+    return ",".join(str(gap[0]) if len(gap) == 1 else f"{gap[0]}-{gap[-1]}" + f":{gap.step}" * (gap.step > 1)
+                    for gap in gaps)
+
+
+def _asked(text: str) -> list[range]:
+    """Raises SettingsError where the text is no list of frames."""
+    ranges = []
+    for part in text.split(","):
+        match = re.fullmatch(r"\s*(\d{1,9})\s*(?:-\s*(\d{1,9})\s*(?::\s*(\d{1,9})\s*)?)?", part)
+        if not match or int(match[2] or match[1]) < int(match[1]) or (match[3] and not int(match[3])):
+            raise SettingsError(f"The frames {text!r} are not a list of numbers and ranges such as 1-20,31 or 1-99:2.")
+        ranges.append(range(int(match[1]), int(match[2] or match[1]) + 1, int(match[3] or 1)))
+    return ranges

@@ -23,7 +23,7 @@ from .. import jpeg, tiff
 from ..colour import ColourSpace, colour_space, space_of_chromaticities
 from ..errors import FrameError
 from ..files import atomic_path
-from ..pictures import SUFFIXES, Encoding, picture_size, save_exr, stored_pixels, write_exr
+from ..pictures import SUFFIXES, Encoding, exr_parts, picture_size, save_exr, stored_pixels, write_exr
 
 _KEPT_CHUNKS = (b"iCCP", b"gAMA", b"cHRM", b"sRGB", b"pHYs", b"eXIf", b"cICP")
 _KEPT_TAGS = (tiff.ORIENTATION, tiff.EXTRA_SAMPLES, tiff.X_RESOLUTION, tiff.Y_RESOLUTION, tiff.RESOLUTION_UNIT,
@@ -119,14 +119,7 @@ def _misread(path: Path) -> str:
 
 
 def _read_exr(path: Path) -> Plate:
-    import OpenEXR
-
-    try:
-        with OpenEXR.File(str(path), separate_channels=True) as file:
-            parts = [(dict(part.header), {name: channel.pixels for name, channel in part.channels.items()})
-                     for part in file.parts]
-    except Exception as problem:  # the library raises bare RuntimeError and worse for damaged files
-        raise FrameError(f"{path} is damaged or truncated ({problem}); export it again.") from problem
+    parts = exr_parts(path)
     header, channels = parts[0]
     if len(parts) > 1:
         raise FrameError(f"{path} has {len(parts)} parts; export the plate as a file of its own.")

@@ -35,7 +35,7 @@ class FITFLARE_OT_bake(Action, bpy.types.Operator):
         if scene.camera is None:
             return NO_CAMERA
         if engine.find() is None:
-            return engine.MISSING
+            return engine.missing()
         return "A bake is running" if _baking(scene) else ""
 
     def act(self, context: bpy.types.Context) -> None:

@@ -36,7 +36,7 @@ class FITFLARE_OT_resume(Action, bpy.types.Operator):
     @classmethod
     def why_not(cls, context: bpy.types.Context) -> str:
         if engine.find() is None:
-            return engine.MISSING
+            return engine.missing()
         if fits.state_of(context.scene) != "resumable":
             return "There is no broken-off fit to go on with"
         return ""
@@ -57,7 +57,7 @@ class FITFLARE_OT_clean_frames(Action, bpy.types.Operator):
         if capture is None or not (capture / "images").is_dir():
             return NO_CAPTURE
         if engine.find() is None:
-            return engine.MISSING
+            return engine.missing()
         return ""
 
     def act(self, context: bpy.types.Context) -> None:

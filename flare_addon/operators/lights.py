@@ -78,7 +78,7 @@ class FITFLARE_OT_find_lights(Action, bpy.types.Operator):
         if capture is None or not capture.is_dir():
             return NO_CAPTURE
         if engine.find() is None:
-            return engine.MISSING
+            return engine.missing()
         return ""
 
     def act(self, context: bpy.types.Context) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 
 from ...core.errors import RunError, SettingsError
 from ...core.progress import Progress
-from .. import jobs
+from .. import frames, jobs
 from ..command import Command, Step
 
 
@@ -18,7 +18,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
                         help="folder that `fit` has written; or a .flare, with --capture or --blend; or a shot: a JSON "
                              "file of cameras and lights by frame, as the add-on writes it (core/look/shot.py)")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for layers.####.exr")
-    parser.add_argument("--frames", metavar="A-B", help="frame numbers, such as 1-20,31; all where not given")
+    frames.add_option(parser)
     parser.add_argument("--size", metavar="WIDTH[xHEIGHT]", help="pixels (default: the frames')")
     parser.add_argument("--set", action="append", default=[], metavar="LIGHT.WHAT=VALUE", dest="edits",
                         help="lamp.intensity=2, lamp.tint=1,0.8,0.6, lamp.tint=#ffcc88, lamp.scale=1.5; * for all "
@@ -27,7 +27,8 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--edits", type=Path, metavar="FILE", dest="keyed",
                         help='edits by frame: {"frames": {"1": ["lamp.intensity=0"], "25": ["lamp.intensity=1"]}}')
     parser.add_argument("--float", action="store_true", help="32 bit floats (default: 16 bit, depth always 32)")
-    parser.add_argument("--overwrite", action="store_true", help="replace layers of another bake in DIR")
+    parser.add_argument("--overwrite", action="store_true",
+                        help="replace layers of another bake in DIR (whole ones of the same settings are kept)")
     parser.add_argument("--capture", type=Path, metavar="CAPTURE",
                         help="where the capture is, if it was moved; of a .flare: whose cameras see it, the lights "
                              "where it was learned")
@@ -51,7 +52,7 @@ def space_options(parser: argparse.ArgumentParser) -> None:
 
 def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     from ...core.bake.bake import BakeSettings, bake
-    from ...core.bake.frames import chosen, numbered
+    from ...core.bake.frames import numbered
     from ...core.capture import Capture
     from ...core.fit.run import Run
     from ...core.look import KeyedEdits
@@ -69,15 +70,14 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
         raise RunError(f"{words.run} is not finished; go on with it by `fit --resume` first.")
     capture = Capture.open(words.capture or made.capture_folder, need_frames=False)
     cameras = {view.name: view.camera for view in capture.views}
-    frames = chosen(numbered(cameras), words.frames)
+    wanted = frames.asked(numbered(cameras), words.frames, progress)
     if words.jobs != 1:
-        jobs.run_jobs(words, "bake", [frame.number for frame in frames], progress)
+        jobs.run_jobs(words, "bake", [frame.number for frame in wanted], progress)
     settings = BakeSettings(*size(words.size), half=not words.float, edits=tuple(words.edits),
                             keyed=KeyedEdits.read(words.keyed) if words.keyed else KeyedEdits(), space=words.space,
                             config=words.ocio)
-    record = bake(made, frames, cameras, words.out, settings, progress, overwrite=words.overwrite)
-    progress.say(f"{len(record['frames'])} frames of layers are in {words.out}.")
-    return {"layers": str(words.out), "frames": len(record["frames"])}
+    record = bake(made, wanted, cameras, words.out, settings, progress, overwrite=words.overwrite)
+    return frames.layers_made(wanted, words.out, len(record["frames"]), progress)
 
 
 def look(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
@@ -91,21 +91,19 @@ def look(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
 
 def run_shot(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     """A shot's layers; its edits are in the file."""
-    from ...core.bake.frames import Frame, chosen
+    from ...core.bake.frames import Frame
     from ...core.bake.shot import bake_shot
     from ...core.look.shot import Shot
 
     if words.edits or words.keyed:
         raise SettingsError("The edits of a shot stand in its file; --set and --edits are for runs.")
     shot = Shot.read(words.run).sized(*size(words.size))
-    known = chosen([Frame("", one.frame, "") for one in shot.frames], words.frames)
+    wanted = frames.asked([Frame("", one.frame, "") for one in shot.frames], words.frames, progress)
     if words.jobs != 1:
-        jobs.run_jobs(words, "bake", [frame.number for frame in known], progress)
-    wanted = {one.number for one in known}
+        jobs.run_jobs(words, "bake", [frame.number for frame in wanted], progress)
     record = bake_shot(shot, words.out, half=not words.float, overwrite=words.overwrite, progress=progress,
-                       wanted=wanted, space=words.space, config=words.ocio)
-    progress.say(f"{len(record['frames'])} frames of layers are in {words.out}.")
-    return {"layers": str(words.out), "frames": len(record["frames"])}
+                       wanted={frame.number for frame in wanted}, space=words.space, config=words.ocio)
+    return frames.layers_made(wanted, words.out, len(record["frames"]), progress)
 
 
 def size(text: str | None) -> tuple[int | None, int | None]:

@@ -9,6 +9,7 @@ from typing import Any
 from ...core.errors import SettingsError
 from ...core.look import LookEdits
 from ...core.progress import Progress
+from .. import frames
 from ..command import Command, Step
 
 BLEND = "compositor.blend"
@@ -17,7 +18,7 @@ BLEND = "compositor.blend"
 def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("layers", type=Path, metavar="LAYERS", help="folder that `bake` has written")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help=f"folder for the frames and {BLEND}")
-    parser.add_argument("--frames", metavar="A-B", help="frame numbers, such as 1-20,31; all where not given")
+    frames.add_option(parser)
     parser.add_argument("--intensity", type=float, default=1.0, metavar="X", help="factor on the flare (default 1)")
     parser.add_argument("--tint", default="1,1,1", metavar="R,G,B",
                         help="colour on the flare, linear factors or #rrggbb (default 1,1,1)")
@@ -36,7 +37,7 @@ def frames_of(folder: Path, out: Path, progress: Progress, *, wanted: str | None
     import bpy
 
     from ...core.bake.folder import LayerFolder
-    from ...core.bake.frames import Frame, chosen
+    from ...core.bake.frames import Frame
     from ...flare_addon import compositor
 
     if out.resolve() == folder.resolve():
@@ -46,7 +47,7 @@ def frames_of(folder: Path, out: Path, progress: Progress, *, wanted: str | None
         raise SettingsError(f"The intensity {intensity} is not a number of 0 or more.")
     colour = LookEdits.parse([f"flare.tint={tint}"], ["flare"]).light("flare").tint
     known = [Frame("", number, str(path)) for number, path in layers.files.items()]
-    frames = [frame.number for frame in chosen(known, wanted)]
+    numbers = [frame.number for frame in frames.asked(known, wanted, progress)]
 
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
     scene = bpy.context.scene
@@ -56,8 +57,8 @@ def frames_of(folder: Path, out: Path, progress: Progress, *, wanted: str | None
     node.inputs["Intensity"].default_value = intensity
     node.inputs["Tint"].default_value = (*colour, 1.0)
     compositor.save_beside(out.resolve() / BLEND)
-    progress.stage("compose", len(frames))
-    compositor.render_frames(scene, frames, lambda number, suffix: out.resolve() / f"frame.{number:04d}{suffix}",
+    progress.stage("compose", len(numbers))
+    compositor.render_frames(scene, numbers, lambda number, suffix: out.resolve() / f"frame.{number:04d}{suffix}",
                              lambda _number: progress.advance())
     return {"frames": str(out), "blend": str(out / BLEND), "blender": bpy.app.version_string}
 

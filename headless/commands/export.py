@@ -8,6 +8,7 @@ from typing import Any
 
 from ...core.errors import RunError, SettingsError
 from ...core.progress import Progress
+from .. import frames
 from ..command import Command, Step
 
 KINDS = ("preset", "ply")
@@ -21,13 +22,13 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, required=True, metavar="PATH",
                         help="preset: the JSON file; ply: a folder for flare.####.ply")
     parser.add_argument("--capture", type=Path, metavar="CAPTURE", help="whose cameras to use (default: the run's own)")
-    parser.add_argument("--frames", metavar="A-B", help="frame numbers; all for ply, the first for a preset")
+    frames.add_option(parser, "frame numbers; all for ply, the first for a preset")
     parser.add_argument("--set", action="append", default=[], metavar="LIGHT.WHAT=VALUE", dest="edits",
                         help="edits, as of `bake`; repeatable")
 
 
 def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
-    from ...core.bake.frames import chosen, numbered
+    from ...core.bake.frames import numbered
     from ...core.capture import Capture
     from ...core.fit.run import FLARE, Run
     from ...core.look import LookEdits, ViewOfLight, read
@@ -45,20 +46,20 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     look = read(words.flare / FLARE if words.flare.is_dir() else words.flare)
     edits = LookEdits.parse(words.edits, look.names, look.element_names)
     cameras = {view.name: view.camera for view in Capture.open(folder, need_frames=False).views}
-    frames = chosen(numbered(cameras), words.frames)
+    wanted = frames.asked(numbered(cameras), words.frames, progress)
     if words.kind == "preset":
-        pose = cameras[frames[0].view].world_to_camera
+        pose = cameras[wanted[0].view].world_to_camera
         write_preset(words.out, look, {light.name: ViewOfLight.of(pose, light.xyz) for light in look.lights}, edits)
         progress.say(f"The preset is {words.out}.")
         return {"preset": str(words.out)}
-    progress.stage("export", len(frames))
-    for frame in frames:
+    progress.stage("export", len(wanted))
+    for frame in wanted:
         camera = cameras[frame.view]
         write_flare_ply(words.out / frame.file.replace("layers.", "flare.").replace(".exr", ".ply"),
                         look.evaluate(camera.world_to_camera, edits=edits), camera, look.blend)
         progress.advance()
-    progress.say(f"{len(frames)} frames of Gaussians are in {words.out}.")
-    return {"ply": str(words.out), "frames": len(frames)}
+    progress.say(f"{len(wanted)} frames of Gaussians are in {words.out}.")
+    return {"ply": str(words.out), "frames": len(wanted)}
 
 
 COMMAND = Command(

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from ...core.errors import RunError, SettingsError
 from ...core.progress import Progress
-from .. import jobs
+from .. import frames, jobs
 from ..command import Command, Step
 
 if TYPE_CHECKING:
@@ -25,8 +25,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--capture", type=Path, metavar="CAPTURE", help="where the run's capture is, if it was moved")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR",
                         help="folder for the clean plates, under the names that the plates have")
-    parser.add_argument("--frames", metavar="A-B",
-                        help="frame numbers, such as 1-20,31, of those in the plates' names; all where not given")
+    frames.add_option(parser, "frame numbers, such as 1-20,31, of those in the plates' names; all where not given")
     parser.add_argument("--flare", type=Path, metavar="DIR", help="write the flares too, as EXR in linear light")
     parser.add_argument("--matte", type=Path, metavar="PICTURE_OR_DIR",
                         help="where the flares are, white on black: one picture for all plates, or a folder with one "
@@ -48,7 +47,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
-    from ...core.bake.frames import chosen, numbered
+    from ...core.bake.frames import numbered
     from ...core.removal.batch import plates_of, remove_all
     from ...core.removal.mattes import Mattes
 
@@ -61,10 +60,10 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     wanted = None
     if words.frames is not None or words.jobs != 1:
         names = [name.as_posix() for _, name in plates_of(words.plates, [words.out, words.flare, words.matte])]
-        frames = chosen(numbered(names), words.frames)
-        wanted = {Path(frame.view) for frame in frames}
+        chosen = frames.asked(numbered(names), words.frames, progress)
+        wanted = {Path(frame.view) for frame in chosen}
         if words.jobs != 1:
-            jobs.run_jobs(words, "remove", [frame.number for frame in frames], progress, past_failures=True)
+            jobs.run_jobs(words, "remove", [frame.number for frame in chosen], progress, past_failures=True)
             progress.say(f"The clean plates are in {words.out}.")
             return {"plates": str(words.out)}
     return remove_all(words.plates, words.out, _remover(words), progress, flare_folder=words.flare,
@@ -73,7 +72,7 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
 
 
 def _by_run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
-    from ...core.bake.frames import chosen, numbered
+    from ...core.bake.frames import numbered
     from ...core.capture import Capture
     from ...core.fit import Run
     from ...core.fit.run import FLARE
@@ -87,8 +86,8 @@ def _by_run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     if fitted.settings.mode == "3dgs":
         raise RunError(fitted.without_flare)
     capture = Capture.open(words.capture or fitted.capture_folder)
-    frames = chosen(numbered([view.name for view in capture.views]), words.frames)
-    wanted = {frame.view for frame in frames}
+    chosen = frames.asked(numbered([view.name for view in capture.views]), words.frames, progress)
+    wanted = {frame.view for frame in chosen}
     return remove_fitted(fitted, capture, [view for view in capture.views if view.name in wanted], words.out, progress,
                          flare_folder=words.flare, overwrite=words.overwrite, made_by=fitted.folder / FLARE)
 

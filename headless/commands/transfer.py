@@ -9,7 +9,7 @@ from typing import Any
 
 from ...core.errors import CaptureError, RunError, SettingsError
 from ...core.progress import Progress
-from .. import jobs
+from .. import frames, jobs
 from ..command import Command, Step
 from .bake import size, space_options
 
@@ -27,7 +27,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--query", choices=QUERIES, default="blend",
                         help="what the flare's appearance follows: one training view (source), the target's view "
                              "(target), or the target's view kept inside what was trained (blend, the default)")
-    parser.add_argument("--frames", metavar="A-B", help="frame numbers, such as 1-20,31; all where not given")
+    frames.add_option(parser)
     parser.add_argument("--size", metavar="WIDTH[xHEIGHT]", help="pixels (default: the target's)")
     looks = parser.add_argument_group("lights")
     looks.add_argument("--light", action="append", default=[], metavar="[NAME=]X,Y",
@@ -96,15 +96,15 @@ def look_at_blend(words: argparse.Namespace, progress: Progress) -> dict[str, An
     # Neighbours too: the share of a light is smoothed over them, and a chunk must come out as the whole does.
     wanted = {frame.number for frame in chosen([Frame("", number, "") for number in every], words.frames)}
     around = range(-2 * words.smooth, 2 * words.smooth + 1)
-    frames = [number for number in every if any(number + step in wanted for step in around)]
+    looked_at = [number for number in every if any(number + step in wanted for step in around)]
     if words.query == "source":
-        frames = list(every)  # whose middle chooses the training view
+        looked_at = list(every)  # whose middle chooses the training view
     names = [name.strip() for name in (words.lights or "").split(",") if name.strip()]
-    progress.stage("look at the .blend", len(frames))
+    progress.stage("look at the .blend", len(looked_at))
     flare = words.flare.resolve()
     if flare.is_dir():
         flare /= FLARE
-    shot = shot_of(scene, flare, names, frames, radius=words.radius, done=progress.advance)
+    shot = shot_of(scene, flare, names, looked_at, radius=words.radius, done=progress.advance)
     shot.write(shot_path(words))
     return {"shot": str(shot_path(words))}
 
@@ -161,7 +161,6 @@ def _made(words: argparse.Namespace, step: str, target: Any, flare: Path, traini
           progress: Progress) -> dict[str, Any]:
     """The layers of a target."""
     from ...core.bake.bake import BakeSettings
-    from ...core.bake.frames import chosen
     from ...core.look import KeyedEdits
     from ...core.transfer.target import sized
     from ...core.transfer.transfer import Transfer, TransferSettings
@@ -175,15 +174,14 @@ def _made(words: argparse.Namespace, step: str, target: Any, flare: Path, traini
                      "are of another size than is rendered, or distorted by a lens.")
     settings = TransferSettings(words.query, words.scale, words.smooth, words.plate_space)
     transfer = Transfer(flare, target, settings, training, words.ocio)
-    frames = chosen([one.frame for one in target.frames], words.frames)
+    wanted = frames.asked([one.frame for one in target.frames], words.frames, progress)
     if words.jobs != 1:
         extra = ["--shot", str(shot_path(words))] if is_blend(words) else []
-        jobs.run_jobs(words, step, [frame.number for frame in frames], progress, extra)
+        jobs.run_jobs(words, step, [frame.number for frame in wanted], progress, extra)
     baked = BakeSettings(half=not words.float, edits=tuple(words.edits), space=words.space, config=words.ocio,
                          keyed=KeyedEdits.read(words.keyed) if words.keyed else KeyedEdits())
-    record = transfer.bake(words.out, frames, baked, progress, overwrite=words.overwrite)
-    progress.say(f"{len(record['frames'])} frames of layers are in {words.out}.")
-    return {"layers": str(words.out), "frames": len(record["frames"])}
+    record = transfer.bake(words.out, wanted, baked, progress, overwrite=words.overwrite)
+    return frames.layers_made(wanted, words.out, len(record["frames"]), progress)
 
 
 def words_of_bake(words: argparse.Namespace) -> argparse.Namespace:

@@ -58,6 +58,9 @@ def test_refusals_leave_nothing_behind(said: Any) -> None:
 def test_without_an_engine_the_button_says_so(said: Any) -> None:
     assert said["no engine"]
     assert said["engine named, not there"] == [False, False]
+    why = "The engine named by FIT_FLARE_ENGINE is not there: gone."
+    assert said["engine of the variable, not there"] == [False, why]
+    assert said["engine of the variable"], "as for the commands, the variable goes before the preferences"
 
 
 def test_every_panel_says_what_is_missing(said: Any) -> None:
@@ -68,7 +71,7 @@ def test_every_panel_says_what_is_missing(said: Any) -> None:
     assert "No flare yet" in look
     assert "Nothing to bake yet" in bake
     assert "The library is empty" in transfer
-    assert "No engine is set up" in said["panel without an engine"]
+    assert "The engine named by the preferences is not there: " in said["panel without an engine"]
     assert "no camera" in said["panel without a camera"]
 
 
@@ -110,7 +113,7 @@ def test_the_engine_says_what_it_is(said: Any) -> None:
 def test_work_is_found_again_and_can_be_cancelled(said: Any) -> None:
     assert said["found again"] == ["running", "fit", 40, 100]
     assert said["state of the found"] == "running"
-    assert said["cancelled"] == ["stopped", "Stopped during fit as asked; run it again to go on."]
+    assert said["cancelled"] == ["stopped", "Stopped during fit as asked; what is done is kept."]
     assert said["another program has the number"] != "running"
     assert said["asked by a file too"]
 

@@ -13,7 +13,7 @@ import pytest
 from core.bake import bake as baking
 from core.bake.bake import RECORD, BakeSettings, bake, read_record
 from core.bake.exr import read_description, read_layers, write_layers
-from core.bake.frames import chosen, numbered, plates_by_number
+from core.bake.frames import absent, chosen, numbered, plates_by_number
 from core.bake.layers import FARTHEST, FrameLayers, layer_names, layers_of
 from core.capture.camera import Camera
 from core.errors import Cancelled, FrameError, RunError, SettingsError
@@ -172,14 +172,24 @@ def test_frame_numbers_come_from_names_or_else_from_the_order() -> None:
     assert [entry[1] for entry in of("a1.png", "b1.png")] == [1, 2]
     assert of("left/7.png", "right/7.png") == [
         ("left/7.png", 7, "left/layers.0007.exr"), ("right/7.png", 7, "right/layers.0007.exr")]
+    assert [entry[:2] for entry in of("slate.png", "sh.1002.png", "sh.1001.png", "chart.png")] == [
+        ("sh.1001.png", 1001), ("sh.1002.png", 1002), ("chart.png", 1003), ("slate.png", 1004)]
 
 
 def test_frames_are_chosen_by_ranges() -> None:
     assert [frame.number for frame in chosen(FRAMES, None)] == [3, 4, 10]
     assert [frame.number for frame in chosen(FRAMES, "1-3, 10")] == [3, 10]
-    for text in ("", "a", "3-", "5-4", "20-30", "-3"):
+    assert [frame.number for frame in chosen(FRAMES, "2-10:2")] == [4, 10]
+    for text in ("", "a", "3-", "5-4", "20-30", "-3", "1-9:0", "1:2", "4-4000000000000000000000"):
         with pytest.raises(SettingsError):
             chosen(FRAMES, text)
+
+
+def test_what_is_asked_for_and_is_not_there_is_told() -> None:
+    assert absent(FRAMES, None) == absent(FRAMES, "3-4,10") == ""
+    assert absent(FRAMES, "1-12, 99") == "1-2,5-9,11-12,99"
+    assert absent(FRAMES, "2-14:2") == "2,6-8:2,12-14:2"
+    assert absent(FRAMES, "3-999999999") == "5-9,11-999999999"
 
 
 # ---- bake -----------------------------------------------------------------------------------------
@@ -243,6 +253,16 @@ def test_a_lost_file_is_made_again_and_others_stay_listed(tmp_path: Path) -> Non
     bake(again, FRAMES[1:2], CAMERAS, tmp_path)
     assert again.rendered == [2]
     assert [entry["frame"] for entry in read_record(tmp_path)["frames"]] == [3, 4, 10]
+
+
+def test_a_frame_that_is_cut_off_is_made_again(tmp_path: Path) -> None:
+    bake(FakeRenderer(), FRAMES, CAMERAS, tmp_path)
+    whole = (tmp_path / FRAMES[1].file).read_bytes()
+    (tmp_path / FRAMES[1].file).write_bytes(whole[:-100])
+    again = FakeRenderer()
+    bake(again, FRAMES, CAMERAS, tmp_path)
+    assert again.rendered == [2]
+    assert (tmp_path / FRAMES[1].file).read_bytes() == whole
 
 
 def test_other_settings_do_not_mix_with_what_is_there(tmp_path: Path) -> None:

@@ -41,3 +41,7 @@ def test_a_damaged_frame_is_named(tmp_path: Path) -> None:
     frame(tmp_path, 2, ["sun"]).write_bytes(b"torn")
     with pytest.raises(FrameError, match=r"layers\.0002\.exr is not an EXR"):
         LayerFolder.open(tmp_path)
+    whole = frame(tmp_path, 2, ["sun"]).read_bytes()
+    (tmp_path / "layers.0002.exr").write_bytes(whole[:-20])
+    with pytest.raises(FrameError, match=r"layers\.0002\.exr ends before its last lines"):
+        LayerFolder.open(tmp_path)

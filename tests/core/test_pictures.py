@@ -18,10 +18,12 @@ from core.errors import FrameError
 from core.pictures import (
     Picture,
     channel_names,
+    exr_is_cut_off,
     linear_from_srgb,
     picture_size,
     read_exr,
     read_picture,
+    save_exr,
     srgb_from_linear,
     write_exr,
     write_png,
@@ -203,3 +205,24 @@ def test_the_channels_of_a_damaged_header_are_told_as_such(damage: Callable[[byt
     (tmp_path / "a.exr").write_bytes(damage((tmp_path / "a.exr").read_bytes()))
     with pytest.raises(FrameError, match=r"a\.exr is not an EXR, or its header is damaged"):
         channel_names(tmp_path / "a.exr")
+
+
+@pytest.mark.parametrize("lines", [1, 16, 257])
+@pytest.mark.parametrize("compression", ["NO", "RLE", "ZIPS", "ZIP", "PIZ", "PXR24", "B44", "B44A", "DWAA", "DWAB"])
+def test_an_exr_that_ends_too_soon_is_known_by_its_table(compression: str, lines: int, tmp_path: Path) -> None:
+    path = tmp_path / "a.exr"
+    header = {"type": OpenEXR.scanlineimage, "compression": getattr(OpenEXR, f"{compression}_COMPRESSION")}
+    save_exr(path, header, {"R": np.random.default_rng(0).random((lines, 9)).astype(np.float16)})
+    whole = path.read_bytes()
+    assert not exr_is_cut_off(path)
+    for length in (len(whole) - 1, len(whole) // 2, 100, 8):
+        path.write_bytes(whole[:length])
+        assert exr_is_cut_off(path), length
+        with pytest.raises(FrameError, match=r"a\.exr"):
+            read_picture(path)
+
+
+def test_of_an_exr_in_tiles_it_is_not_known_whether_it_is_cut_off(tmp_path: Path) -> None:
+    tiles = {"type": OpenEXR.tiledimage, "tiles": OpenEXR.TileDescription()}
+    save_exr(tmp_path / "a.exr", tiles, {"R": RAMP[..., 0]})
+    assert not exr_is_cut_off(tmp_path / "a.exr")

@@ -125,5 +125,5 @@ def test_a_file_asks_for_a_stop(of_main_thread: bool, tmp_path: Path, monkeypatc
         thread = threading.Thread(target=work)
         thread.start()
         thread.join()
-    assert stopped == ["Stopped during fit as asked; run it again to go on."]
+    assert stopped == ["Stopped during fit as asked; what is done is kept."]
     assert threading.active_count() == before, "who looked has gone"

@@ -512,6 +512,8 @@ def bad_files(folder: Path) -> list[Path]:
     (folder / "empty.jpg").write_bytes(b"")
     whole = write_codes(folder / "cut.png", picture())
     whole.write_bytes(whole.read_bytes()[:400])
+    write_exr(folder / "cut.exr", dict.fromkeys("RGB", picture()[..., 0] / np.float32(255)))
+    (folder / "cut.exr").write_bytes((folder / "cut.exr").read_bytes()[:-100])
     (folder / "bad.exr").write_bytes(b"\x76\x2f\x31\x01 and no more")
     write_exr(folder / "no_colour.exr", {"Z": np.ones((4, 4))})
     return sorted(folder.iterdir())

@@ -126,6 +126,22 @@ def test_status_and_sentence(problem: BaseException, status: int, sentence: str,
     assert ("Traceback" in told.err) == sentence.startswith("A defect")
 
 
+@pytest.mark.parametrize(("options", "hint"), [([], "Give the command again to go on."),
+                                               (["--resume"], "Give the command again with --resume to go on.")])
+def test_who_stops_a_command_is_told_how_it_goes_on(options: list[str], hint: str, monkeypatch: pytest.MonkeyPatch,
+                                                    capfd: pytest.CaptureFixture[str]) -> None:
+    def run(_words: argparse.Namespace, _progress: Progress) -> dict[str, Any]:
+        raise Cancelled("Stopped as asked.")
+
+    def arguments(parser: argparse.ArgumentParser) -> None:
+        for option in options:
+            parser.add_argument(option, action="store_true")
+
+    monkeypatch.setitem(COMMANDS, "try", Command("try", "Tries.", "", arguments, (Step("try", "engine", run),)))
+    assert cli.main(["try"]) == 130
+    assert f"Stopped as asked. {hint}" in capfd.readouterr().err
+
+
 def test_events_have_standard_output_for_themselves(monkeypatch: pytest.MonkeyPatch,
                                                     capfd: pytest.CaptureFixture[str]) -> None:
     ending_with(None, monkeypatch)

@@ -97,6 +97,12 @@ preferences.engine = str(folder / "nowhere")
 said["engine named, not there"] = [polls("fit"), polls("test_engine")]
 said["panel without an engine"] = shown("fit")
 preferences.engine = sham
+os.environ["FIT_FLARE_ENGINE"] = "gone"
+said["engine of the variable, not there"] = [polls("fit"), engine.missing().split(" Name")[0]]
+preferences.engine, os.environ["FIT_FLARE_ENGINE"] = str(folder / "nowhere"), sham
+said["engine of the variable"] = str(engine.find()) == sham
+preferences.engine = sham
+del os.environ["FIT_FLARE_ENGINE"]
 
 
 def behave(how: str) -> None:

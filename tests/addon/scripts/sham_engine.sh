@@ -23,6 +23,6 @@ case $(cat "$here/behaviour") in
          echo '{"type": "result", "data": {"layers": "x", "frames": 2}}' ;;
   finishes) mkdir -p "$out"; cp "$here/lamp.flare" "$out/flare.flare"; echo '{"type": "result", "data": {"run": "x"}}' ;;
   answers) echo '{"type": "result", "data": {"version": "1", "torch": "2", "device": "a sham"}}' ;;
-  sleeps) trap 'echo "{\"type\": \"error\", \"text\": \"Stopped during fit as asked; run it again to go on.\"}"; exit 130' INT
+  sleeps) trap 'echo "{\"type\": \"error\", \"text\": \"Stopped during fit as asked; what is done is kept.\"}"; exit 130' INT
           n=0; while [ $n -lt 300 ]; do sleep 0.1; n=$((n + 1)); done ;;
 esac

@@ -1,0 +1,33 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""--frames: which of the frames that there are a command is to do."""
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+
+from ..core.bake.frames import Frame, absent, chosen
+from ..core.progress import Progress
+
+
+def add_option(parser: argparse.ArgumentParser,
+               what: str = "frame numbers, such as 1-20,31 or 1-99:2; all where not given") -> None:
+    """--frames."""
+    parser.add_argument("--frames", metavar="A-B", help=what)
+
+
+def asked(known: Sequence[Frame], text: str | None, progress: Progress) -> list[Frame]:
+    """The frames of `known` that --frames asks for; what it asks for besides is told. Raises SettingsError where none
+    of them is there."""
+    frames = chosen(known, text)
+    if missing := absent(known, text):
+        numbers = [frame.number for frame in known]
+        progress.say(f"The frames {missing} are not there: they are {min(numbers)} to {max(numbers)}.")
+    return frames
+
+
+def layers_made(frames: Sequence[Frame], folder: Path, of_folder: int, progress: Progress) -> dict[str, object]:
+    """Tell that the layers of `frames` are in a folder, which has `of_folder`; what a command's result says of it."""
+    besides = "" if of_folder == len(frames) else f", which holds {of_folder}"
+    progress.say(f"Layers of {len(frames)} frame{'s' * (len(frames) != 1)} are in {folder}{besides}.")
+    return {"layers": str(folder), "frames": len(frames), "frames_in_folder": of_folder}

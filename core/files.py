@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import glob
 import json
+import math
 import os
 import re
 import shutil
@@ -45,6 +46,11 @@ def atomic_path(target: Path | str) -> Iterator[Path]:
         raise
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def short(value: float) -> float:
+    """For a file that people read: six decimals, and more where the world's unit is so large that it takes them."""
+    return round(value, 6 + max(0, -math.floor(math.log10(abs(value))))) if value and math.isfinite(value) else value
 
 
 def patiently(change: Callable[..., object], *words: Any) -> None:

@@ -151,15 +151,14 @@ class Capture:
     def extent(self) -> float:
         """The scene's extent as in 3DGS: 1.1 x the largest distance of a camera from the mean of all.
 
-        Where the cameras share one place: the median distance of the points from it, or 1.
+        Where the cameras share one place, but for rounding: the median distance of the points from it, or 1.
         """
         centre = self.centre
         reach = max(float(np.linalg.norm(view.camera.position - centre)) for view in self.views)
-        if reach > 0:
-            return 1.1 * reach
-        if len(self.points):
-            return float(np.median(np.linalg.norm(self.points.xyz - centre, axis=1))) or 1.0
-        return 1.0
+        away = float(np.median(np.linalg.norm(self.points.xyz - centre, axis=1))) if len(self.points) else 0.0
+        # A tripod's positions differ by rounding, or by what a solve leaves: that is no path.
+        least = max(1e-3 * away, 1e-9 * (1 + float(np.abs(centre).max())))
+        return 1.1 * reach if reach > least else away or 1.0
 
     def view(self, name: str) -> View:
         """The view of that name; CaptureError where there is none."""
@@ -186,7 +185,7 @@ class Capture:
             test = tuple(view for i, view in enumerate(self.views) if holdout and not i % holdout)
             if not train:
                 raise CaptureError(f"{self.folder}: with every {holdout}th of {len(self.views)} views held out, "
-                                   "none is left to train on.")
+                                   "none is left to train on; hold none out (--holdout 0).")
             return train, test
         names = self._test_names(Path(holdout))
         train = tuple(view for view in self.views if view.name not in names)

@@ -103,16 +103,17 @@ def _train(trainer: Trainer, run: Run, progress: Progress) -> None:
 
 
 def _finish(trainer: Trainer, run: Run) -> None:
-    """Results first, then the checkpoint goes: a kill in between repeats the last steps, and loses nothing."""
+    """Results first, the flare last and whole, then the checkpoint goes: a kill in between repeats the last steps, and
+    loses nothing."""
     _preview(trainer, run)
     write_ply(run.folder / SCENE, trainer.scene)
     if trainer.flare is not None:
         camera = trainer.views[0].camera
         lens = TrainingCamera(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
-        flare_file.save(run.folder / FLARE, FlareFile(
-            trainer.flare, run.settings.blend, lens,
-            seen=trainer.flare.seen_from([torch.from_numpy(view.camera.world_to_camera) for view in trainer.views])))
-        list_elements(run.folder / FLARE)
+        seen = trainer.flare.seen_from([torch.from_numpy(view.camera.world_to_camera) for view in trainer.views])
+        with atomic_path(run.folder / FLARE) as unnamed:
+            flare_file.save(unnamed, FlareFile(trainer.flare, run.settings.blend, lens, seen=seen))
+            list_elements(unnamed)
     (run.folder / CHECKPOINT).unlink(missing_ok=True)
 
 

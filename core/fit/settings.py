@@ -145,8 +145,8 @@ class FitSettings:
     """A whole fit. `width`: the working width in pixels at most; 0 keeps the frames' own size.
 
     ssim_share is 1 - lambda of the paper's loss. `apart`: share of the iterations at the beginning in which the
-    flare is put before the flare-free frames instead of the scene; 0 in the paper. `holdout`: None (every view is
-    fitted), a number N (every N-th view is held out) or a split file's name.
+    flare is put before the flare-free frames instead of the scene; 0 in the paper. `holdout`: a number N (every N-th
+    view is held out; 0: none), a split file's name, or None (the capture's split.json, else every 8th).
     """
 
     mode: Mode = "default"

@@ -64,7 +64,7 @@ class ClassicSettings:
 
 
 class Classic:
-    """3DGS's own densification. extent: of the scene, world units (see `scene_extent`)."""
+    """3DGS's own densification. extent: of the scene, world units (see `Capture.extent`)."""
 
     SHRINK = 1.6  # scales of the halves of a split Gaussian, by which they are divided
 

@@ -2,7 +2,6 @@
 """The scene as 3D Gaussians: what is optimised, in the form in which nothing needs to be constrained."""
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -20,7 +19,10 @@ from .rendering import NEAR, Rendering
 COEFFICIENTS = (spherical_harmonics.MAX_DEGREE + 1) ** 2
 INITIAL_OPACITY = 0.1
 DISTANCE_MIN = 1e-7 ** 0.5
-"""Points nearer to each other than this make Gaussians of this size."""
+"""Points nearer to each other than this make Gaussians of this size; or than a part of the median of all, where a world
+has smaller units (3DGS's own number is for worlds of some units)."""
+SMALL = 1e-3
+"""That part."""
 
 
 class SceneGaussians(nn.Module):
@@ -65,7 +67,7 @@ class SceneGaussians(nn.Module):
         quaternions[:, 0] = 1
         return cls(
             means,
-            size.clamp(min=DISTANCE_MIN).log()[:, None].repeat(1, 3),
+            size.clamp(min=min(DISTANCE_MIN, SMALL * float(size.median()) or DISTANCE_MIN)).log()[:, None].repeat(1, 3),
             quaternions,
             torch.logit(torch.full((n,), INITIAL_OPACITY)),
             sh,
@@ -117,7 +119,7 @@ def sh_degree_at(iteration: int, interval: int = 1000) -> int:
 
 
 def learning_rates(extent: float) -> dict[str, Rate]:
-    """Rates of 3DGS by parameter, for `Adam`; extent: of the scene, world units (see `scene_extent`)."""
+    """Rates of 3DGS by parameter, for `Adam`; extent: of the scene, world units (see `Capture.extent`)."""
     sh = torch.full((COEFFICIENTS, 3), 2.5e-3 / 20)
     sh[0] = 2.5e-3
     return {
@@ -133,11 +135,3 @@ def means_rate(extent: float, iteration: int, iterations: int) -> float:
     """Rate of the means at an iteration: falls exponentially from 1.6e-4 to 1.6e-6 of the extent."""
     share = min(max(iteration / max(iterations, 1), 0.0), 1.0)
     return float(1.6e-4 * extent * 0.01**share)
-
-
-def scene_extent(cameras: Iterable[Camera]) -> float:
-    """1.1 times the largest distance of a camera from the middle of them all (3DGS), world units; 1 where
-    they stand in one place."""
-    positions = np.stack([camera.position for camera in cameras])
-    radius = float(np.linalg.norm(positions - positions.mean(0), axis=1).max())
-    return 1.1 * radius or 1.0

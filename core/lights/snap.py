@@ -23,6 +23,8 @@ from ..pictures import linear_from_srgb
 WINDOWS = (0.12, 0.08, 0.05, 0.03, 0.02, 0.013)
 """Deviations of the windows, of the frame's width: from as far as a light may be off. Peaks nearby are tried first, so
 that each light finds its own."""
+REACH = 1.5
+"""Of the widest window: how far a light may be off, in the median view."""
 STEPS = 12
 """At most, under each window."""
 FINE, PEAK, RESTLESS = 0.02, 1.5, 0.3
@@ -59,7 +61,7 @@ def snapped(sights: Sequence[Sight], lights: ArrayLike) -> Floats:
         if settled.all():
             break
         tried = _climbed(sights, found, ~settled, WINDOWS[first:])
-        better = ~settled & _on_peaks(sights, tried) & ~_together(sights, tried)
+        better = ~settled & _on_peaks(sights, tried) & ~_together(sights, tried) & _near(sights, given, tried)
         found[better], settled = tried[better], settled | better
     return found
 
@@ -147,3 +149,15 @@ def _together(sights: Sequence[Sight], places: Floats) -> NDArray[np.bool_]:
         near += np.linalg.norm(pixels[:, None] - pixels, axis=-1) < FINE * camera.width
     near -= np.diag(np.diag(near))
     return np.asarray((near > len(sights) / 2).any(1))
+
+
+def _near(sights: Sequence[Sight], given: Floats, places: Floats) -> NDArray[np.bool_]:
+    """(n,) which places lie no farther from the lights given than the widest window reaches: what does is a ghost of
+    a light that is out of the frame."""
+    near = np.zeros(len(given), bool)
+    pictures = [(camera.width, *camera.project(given), *camera.project(places)) for camera, _ in sights]
+    for light in range(len(given)):
+        moved = [float(np.linalg.norm(after[light] - before[light])) / width
+                 for width, before, front, after, still in pictures if front[light] > 0 and still[light] > 0]
+        near[light] = bool(moved) and float(np.median(moved)) < REACH * WINDOWS[0]
+    return near

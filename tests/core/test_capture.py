@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -267,6 +268,23 @@ def test_extent(tmp_path: Path) -> None:
     assert capture.extent == pytest.approx(1.1 * np.linalg.norm(positions - positions.mean(0), axis=1).max())
     assert Capture.open(make_capture(tmp_path / "one", views=1)).extent == pytest.approx(
         np.median(np.linalg.norm(capture.points.xyz - orbit(1)[0].position, axis=1)), rel=1e-6)
+
+
+@pytest.mark.parametrize("slip", [0.0, 1e-15, 1e-7, 1e-4])
+@pytest.mark.parametrize("offset", [0.0, 1e6])
+def test_the_extent_of_a_tripod_is_that_of_its_points(slip: float, offset: float, tmp_path: Path) -> None:
+    """Its positions are told by rotated vectors, whose rounding is no path."""
+    whole = Capture.open(make_capture(tmp_path / "c"))
+    random = np.random.default_rng(0)
+    poses = [view.camera.world_to_camera.copy() for view in whole.views]
+    for pose in poses:
+        pose[:3, 3] = -pose[:3, :3] @ (np.array([0.4, 0.1, -5]) + offset + slip * random.normal(size=3))
+    views = [replace(view, camera=replace(view.camera, world_to_camera=pose))
+             for view, pose in zip(whole.views, poses, strict=True)]
+    points = replace(whole.points, xyz=whole.points.xyz + offset)
+    tripod = Capture(whole.folder, views, points, frames={view.name: whole.folder for view in views})
+    away = np.linalg.norm(whole.points.xyz - (0.4, 0.1, -5), axis=1)
+    assert tripod.extent == pytest.approx(np.median(away), rel=0.05)
 
 
 def test_the_cache_is_bounded_and_serves(tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from core.errors import RunError, SettingsError
 from core.gaussians import Adam, Rendering, SceneGaussians, kernels, l1_ssim, ssim
 from core.gaussians.densification import Classic, ClassicSettings, Mcmc, McmcSettings, shared
 from core.gaussians.ordering import morton_order, nearest_distances
-from core.gaussians.scene import learning_rates, means_rate, scene_extent, sh_degree_at
+from core.gaussians.scene import learning_rates, means_rate, sh_degree_at
 
 
 def pictures(height: int, width: int, seed: int = 0) -> tuple[Tensor, Tensor]:
@@ -204,9 +204,6 @@ def test_schedules() -> None:
     assert [sh_degree_at(i) for i in (0, 999, 1000, 2500, 9999)] == [0, 0, 1, 2, 3]
     assert means_rate(2.0, 0, 100) == pytest.approx(3.2e-4)
     assert means_rate(2.0, 100, 100) == pytest.approx(3.2e-6)
-    poses = [np.eye(4) for _ in range(2)]
-    poses[0][0, 3], poses[1][0, 3] = 3.0, -3.0
-    assert scene_extent([Camera(4, 4, 4.0, 4.0, 2.0, 2.0, pose) for pose in poses]) == pytest.approx(3.3)
 
 
 CAMERA = Camera(36, 28, 40.0, 40.0, 18.0, 14.0, np.array([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 4], [0, 0, 0, 1]]))

@@ -32,9 +32,26 @@ def glow(small: Camera, lights: Sequence[tuple[NDArray[np.float64], float]]) -> 
         flare += strength * (0.5 / (1 + (away / 4) ** 2) + 0.02 * np.exp(-0.5 * ((away - 25) / 3) ** 2))
         ghost = np.hypot(across - 2 * camera.cx + pixel[0], down - 2 * camera.cy + pixel[1])
         flare += strength * 0.05 * (ghost < 12)
+    return seen_by(camera, scene, flare)
+
+
+def seen_by(camera: Camera, scene: NDArray[np.float64], flare: NDArray[np.float64]) -> Sight:
+    """Of grey linear light (height, width)."""
     frame, clean = (np.repeat(srgb_from_linear(np.clip(light, 0, 1))[..., None], 3, -1).astype(np.float32)
                     for light in (scene + flare, scene))
     return sight(camera, frame, clean)
+
+
+def ghosts_alone(small: Camera, light: NDArray[np.float64]) -> Sight:
+    """What a light out of the frame leaves in it: ghosts on the line through it, soft and brightest in the middle."""
+    camera = small.scaled(SCALE * WIDTH, SCALE * HEIGHT)
+    across, down = np.arange(camera.width) + 0.5, np.arange(camera.height)[:, None] + 0.5
+    (pixel,), _ = camera.project(light)
+    flare = np.zeros((camera.height, camera.width))
+    for mu in (0.5, -0.4):
+        x, y = (middle + mu * (at - middle) for middle, at in zip((camera.cx, camera.cy), pixel, strict=True))
+        flare += 0.3 * np.exp(-0.5 * (np.hypot(across - x, down - y) / 5) ** 2)
+    return seen_by(camera, np.full_like(flare, 0.1), flare)
 
 
 def sights(*lights: tuple[NDArray[np.float64], float]) -> list[Sight]:
@@ -77,6 +94,13 @@ def test_two_lights_do_not_climb_one_flare() -> None:
     seen = sights((LAMP, 1.0))
     given = np.add(LAMP, [[0, 0, 0], [0.3, 0.1, 0.0]])
     assert (snapped(seen, given) == given).all()
+
+
+@pytest.mark.parametrize("height", [-1.9, -2.3])
+def test_a_light_out_of_the_frame_is_not_put_on_to_its_ghost(height: float) -> None:
+    light = np.array([0.3, height, 1.5])
+    assert all(camera.project(light)[0][0, 1] < 0 for camera in cameras(9))
+    assert (snapped([ghosts_alone(camera, light) for camera in cameras(9)], [light])[0] == light).all()
 
 
 def test_without_a_flare_nothing_moves() -> None:

@@ -49,4 +49,8 @@ def refusal(problem: OSError) -> str:
     where = f" ({problem.filename})" if problem.filename else ""
     if problem.errno in DISK_FULL:
         return f"The disk is full{where}; make room and start it again, what is finished is kept."
+    if isinstance(problem, IsADirectoryError):
+        return f"There is a folder where a file is to be written{where}; name another."
+    if isinstance(problem, FileExistsError | NotADirectoryError):
+        return f"There is a file where a folder is to be{where}; name another, or move it away."
     return f"The system refused: {problem.strerror or problem}{where}."

@@ -42,7 +42,8 @@ def atomic_path(target: Path | str) -> Iterator[Path]:
         _share(temporary, 0o666)
         patiently(temporary.replace, target)
     except OSError as problem:  # a write to an open file does not say which
-        problem.filename = problem.filename or str(target)
+        if problem.filename in (None, str(temporary)):
+            problem.filename = str(target)
         raise
     finally:
         temporary.unlink(missing_ok=True)

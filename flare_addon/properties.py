@@ -117,7 +117,7 @@ class FITFLARE_PG_light(Edits, bpy.types.PropertyGroup):
     show_elements: BoolProperty(  # type: ignore[valid-type]
         name="Elements", description="Show the sliders of single ghosts, streaks and rings", default=False)
     radius: FloatProperty(  # type: ignore[valid-type]
-        name="Light Size", description="Radius of the light for occlusion, in scene units; 0 takes 1% of its distance. "
+        name="Light Size", description="Radius of the light for occlusion, in scene units; 0 takes 2% of its distance. "
         "The larger, the softer the flare fades behind things", default=0.0, min=0.0, subtype="DISTANCE", update=redraw)
 
 

@@ -51,8 +51,8 @@ def parser() -> argparse.ArgumentParser:
                          help="json: one JSON object a line on standard output, for programs that watch; openjd: "
                               "lines of the Open Job Description, for farms")
     options.add_argument("--engine", metavar="PYTHON",
-                         help="the Python with torch, or the folder of its virtual environment, for a Blender that "
-                              "has none (else FIT_FLARE_ENGINE, the add-on's preferences, what its Set Up Engine has "
+                         help="the Python with torch, or the folder of its virtual environment (else this one where "
+                              "it has torch, FIT_FLARE_ENGINE, the add-on's preferences, what its Set Up Engine has "
                               "made, .venv in the repository)")
     options.add_argument("--blender", metavar="PROGRAM",
                          help="the Blender for the steps that need one (else FIT_FLARE_BLENDER, the bpy package of "
@@ -70,7 +70,11 @@ def parser() -> argparse.ArgumentParser:
 
 
 def main(words: Sequence[str]) -> int:
-    """Run the command that `words` ask for; returns the status the process should end with."""
+    """Run the command that `words` ask for; returns the status the process should end with.
+
+    An option with nothing behind its "=" counts as not given: the templates of farms cannot leave one out.
+    """
+    words = [word for word in words if not (word.startswith("--") and word.endswith("="))]
     if not words:
         parser().print_help(sys.stderr)
         return MISUSED
@@ -173,7 +177,8 @@ def _run(command: Command, arguments: argparse.Namespace, words: Sequence[str], 
 def _run_step(step: Step, arguments: argparse.Namespace, words: Sequence[str], progress: Progress) -> dict[str, Any]:
     if arguments.step and step.side == "blender" and "bpy" not in sys.modules:
         __import__("bpy")  # this process was started for it, in a Python that has Blender as a module
-    if hand_off.here() == step.side:
+    elsewhere = step.side == "engine" and arguments.engine is not None and not arguments.step
+    if hand_off.here() == step.side and not elsewhere:
         with _quiet() if step.side == "blender" else contextlib.nullcontext():
             return step.run(arguments, progress)
     if arguments.step:

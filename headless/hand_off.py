@@ -61,7 +61,8 @@ def engine_command(named: str | None) -> list[str]:
         if python is not None and _has_torch(python):
             return [str(python), str(RUN)]
     raise EngineError(f"This step needs a Python with torch, and none was found: run `make setup` in {ROOT}, or "
-                      "name one with --engine or FIT_FLARE_ENGINE.")
+                      "`python -m pip install --group engine -c constraints.txt` there with a Python of yours, or name "
+                      "one with --engine or FIT_FLARE_ENGINE.")
 
 
 def _engine_in_preferences() -> str:

@@ -189,10 +189,10 @@ def _begin(out: Path, made_from: dict[str, Any], names: dict[str, str], overwrit
         if same and not overwrite:
             raise RunError(f"{out} holds layers of the lights {', '.join(record['layers'])}, and these frames have "
                            f"{', '.join(names) or 'none'}: one sequence has the same in all frames. Give all frames at "
-                           "once, or another folder, or ask for overwriting.")
+                           "once, or another folder, or overwrite them (--overwrite).")
         if not overwrite:
             raise RunError(f"{out} holds layers that were baked from another fit or with other settings; "
-                           f"choose another folder, or ask for overwriting.")
+                           f"choose another folder, or overwrite them (--overwrite).")
         for entry in record["frames"]:  # a mixture of two bakes would pass for one sequence
             (out / entry["file"]).unlink(missing_ok=True)
         (out / RECORD).unlink()

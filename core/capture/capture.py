@@ -81,8 +81,7 @@ class Capture:
         """
         folder = Path(folder)
         if not folder.is_dir():
-            raise CaptureError(f"{folder} is not a folder; give the capture's folder, or where it is now with "
-                               "--capture.")
+            raise CaptureError(f"{folder} is {'no folder' if folder.exists() else 'missing'}; name a capture's folder.")
         posed, points, root = _read_poses(folder)
         names = [frame.name for frame in posed]
         if len(set(names)) < len(names):

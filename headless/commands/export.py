@@ -36,7 +36,7 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
 
     folder = words.capture
     if words.flare.is_dir():
-        folder = folder or Run.open(words.flare).capture_folder
+        folder = Run.open(words.flare).where(folder)
         if not (words.flare / FLARE).is_file():
             raise RunError(Run.open(words.flare).without_flare)
     if not words.flare.exists():
@@ -64,9 +64,9 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
 
 COMMAND = Command(
     "export", "Writes a flare as a preset (JSON) or as Gaussians (PLY), for other tools.",
-    """A preset is a flat list of elements for one frame: offset (0 at the light, 1 at the centre), size, colour,
-shape; procedural flare tools can be fed from it. The PLY has a frame's flare as 3D Gaussians before the
-camera, in 3DGS's layout, with ring_r0 and ring_w besides. docs/interop.md has both.
+    """A preset is lights, their elements and the parts of each, for one frame: offset (0 at the light, 1 at
+the centre), size, colour, shape; procedural flare tools can be fed from it. The PLY has a frame's flare
+as 3D Gaussians before the camera, in 3DGS's layout, with ring_r0 and ring_w besides. docs/interop.md has both.
 
   run.py export build/demo/run --as preset --out lamp.json --frames 20
   run.py export lamp.flare --capture my_capture --as ply --out build/flares""",

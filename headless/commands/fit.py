@@ -72,10 +72,12 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
         raise SettingsError("fit takes a capture, or a list of them with --list: the one or the other.")
     if words.listed is None and (words.entry is not None or words.jobs != 1):
         raise SettingsError(f"--{'jobs' if words.entry is None else 'entry'} goes with --list; leave it out.")
+    if words.jobs < 1:
+        raise SettingsError(f"--jobs {words.jobs} makes no sense; give a number from 1.")
     if words.listed is not None and words.entry is None:
         count = len(listed(words.listed))
         parts = [["--entry", str(entry), "--jobs", "1"] for entry in range(1, count + 1)]
-        jobs.run_parts(words, "fit", parts, max(words.jobs, 1), count, progress, past_failures=True)
+        jobs.run_parts(words, "fit", parts, words.jobs, count, progress, past_failures=True)
         progress.say(f"{count} runs are in {words.out}.")
         return {"runs": str(words.out), "count": count}
     folder, out = place(words)

@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ...core.errors import SettingsError
 from ...core.progress import Progress
 from ..command import Command, Step, seed
 
@@ -42,6 +43,8 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     from ...core.lights import GatherSettings, detector_for
     from ...core.lights.file import check_replaceable
 
+    if words.method != "grounded" and (words.boxes or words.masks):
+        raise SettingsError(f"--{'boxes' if words.boxes else 'masks'} is for --method grounded; leave it out.")
     capture = Capture.open(words.capture)
     detector = detector_for(words.method, words.threshold, words.boxes, words.masks)
     settings = GatherSettings(min_views=words.min_views, seed=words.seed)

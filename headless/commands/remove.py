@@ -78,14 +78,14 @@ def _by_run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     from ...core.fit.run import FLARE
     from ...core.removal.fitted import remove_fitted
 
-    network = (words.weights, words.working_size, words.keep_glare, words.matte, words.stills)
+    network = (words.weights, words.working_size, words.keep_glare, words.matte, words.stills, words.base)
     if words.jobs != 1 or words.model != "network" or any(network):
         raise SettingsError("--run takes away the flare that was fitted: of the other options only --out, --frames, "
                             "--flare, --capture and --overwrite go with it.")
     fitted = Run.open(words.run)
     if fitted.settings.mode == "3dgs":
         raise RunError(fitted.without_flare)
-    capture = Capture.open(words.capture or fitted.capture_folder)
+    capture = Capture.open(fitted.where(words.capture))
     chosen = frames.asked(numbered([view.name for view in capture.views]), words.frames, progress)
     wanted = {frame.view for frame in chosen}
     return remove_fitted(fitted, capture, [view for view in capture.views if view.name in wanted], words.out, progress,
@@ -97,6 +97,8 @@ def _remover(words: argparse.Namespace) -> Remover:
 
     size = WORKING_SIZE if words.working_size is None else words.working_size
     if words.model == "network":
+        if words.base is not None:
+            raise SettingsError("--base is for --model diffusion; leave it out.")
         return Remover(words.weights, working_size=size, keep_glare=words.keep_glare)
     from ...core.removal.diffusion import DiffusionRemover, need
 

@@ -40,6 +40,8 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     from ...core.capture.solve import PICTURE, REPORT, SolveSettings, solve
 
+    if words.plates or words.lights:
+        raise SettingsError(f"--{'plates' if words.plates else 'lights'} is for a .blend; leave it out.")
     settings = SolveSettings(frames=words.frames, matching=words.matching, lens=words.lens.upper(),
                              size=words.work_size, output_size=words.size, mask=not words.no_mask, seed=words.seed)
     report = solve(words.source, words.out, settings, progress)

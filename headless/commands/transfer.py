@@ -58,7 +58,8 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     plates.add_argument("--plates", type=Path, metavar="DIR", help="pictures for the frames of a .blend or a shot")
     plates.add_argument("--plate-space", default="auto", metavar="NAME",
                         help="colour space of the plates: srgb, rec709, linear, acescg, … or one of an OpenColorIO "
-                             "configuration (default: an EXR's by its chromaticities, sRGB for other files)")
+                             "configuration (default: an EXR's by its chromaticities, linear for float TIFFs, sRGB for "
+                             "other files)")
     space_options(parser)
     plates.add_argument("--set", action="append", default=[], metavar="LIGHT.WHAT=VALUE", dest="edits",
                         help="edits of the look, as of `bake`, by the target's lights; repeatable")
@@ -201,6 +202,8 @@ def bake_flare(bake_words: argparse.Namespace, progress: Progress) -> dict[str, 
     if bake_words.blend is None and bake_words.capture is None:
         raise SettingsError(f"{bake_words.run} has no cameras of its own; name a capture with --capture, or a .blend "
                             "with --blend.")
+    if bake_words.lights and bake_words.blend is None:
+        raise SettingsError("--lights names objects of a .blend: it goes with --blend.")
     words = words_of_bake(bake_words)
     if words.blend is not None:
         words.capture = None
@@ -270,6 +273,8 @@ def target_of(words: argparse.Namespace, flare: Path, training: list[Any] | None
     if kind == "run":
         capture = Capture.open(words.cameras or Run.open(to[0]).capture_folder, need_frames=False)
         return targets.of_capture(capture, look, wanted, lights=lights, scene=words.scene or to[0] / SCENE, shown=True)
+    if to[0].is_dir() and not any(to[0].iterdir()):
+        raise CaptureError(f"{to[0]} is empty: neither pictures nor a capture; name what the flare goes on to.")
     return targets.of_capture(Capture.open(to[0]), look, wanted, lights=lights, scene=words.scene)
 
 

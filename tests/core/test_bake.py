@@ -14,7 +14,7 @@ from core.bake import bake as baking
 from core.bake.bake import RECORD, BakeSettings, bake, read_record
 from core.bake.exr import read_description, read_layers, write_layers
 from core.bake.frames import absent, chosen, numbered, plates_by_number
-from core.bake.layers import FARTHEST, FrameLayers, layer_names, layers_of
+from core.bake.layers import FARTHEST, FrameLayers, Rendered, layer_names, layers_of
 from core.capture.camera import Camera
 from core.errors import Cancelled, FrameError, RunError, SettingsError
 from core.files import write_json
@@ -355,3 +355,13 @@ def another_fit() -> FakeRenderer:
     renderer = FakeRenderer()
     renderer.fingerprint = "another"
     return renderer
+
+
+def test_colours_of_layers_are_light_and_plain_factors_exact() -> None:
+    """A covering flare may take light away: a factor leaves that, so that scene + flare stays the composite."""
+    layer = np.full((2, 2, 3), (1.0, 0.0, -0.25), np.float32)
+    rendering = Rendered(np.zeros_like(layer), {"lamp": layer}, layer[..., 0])
+    vivid, double = (LookEdits.parse([f"lamp.{edit}=2"], ["lamp"]).matrices(["lamp"])
+                     for edit in ("saturation", "intensity"))
+    assert (layers_of(rendering, vivid).flares["lamp"] >= 0).all()
+    np.testing.assert_array_equal(layers_of(rendering, double).flares["lamp"], 2 * layer)

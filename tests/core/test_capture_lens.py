@@ -2,6 +2,7 @@
 """Lens equations against COLMAP's own, and what is left after them."""
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import cv2
@@ -12,7 +13,7 @@ import pytest
 from core.capture import Capture, Lens
 from core.capture.lens import MODELS, PINHOLES
 from core.errors import CaptureError
-from tests.core.captures import make_capture
+from tests.core.captures import make_capture, make_transforms
 
 EXTRA: dict[str, list[float]] = {
     "SIMPLE_RADIAL": [-0.1], "RADIAL": [-0.2, 0.05], "OPENCV": [-0.2, 0.05, 0.001, -0.002],
@@ -128,3 +129,21 @@ def test_frames_are_straightened(tmp_path: Path, model: str, scale: int) -> None
             neighbours = np.sort(np.linalg.norm(view.camera.project(world[at:at + 8])[0] - (x, y), axis=1))
             if neighbours[1] > 16 * scale:
                 assert np.linalg.norm(found - (x, y)) < 0.15 * scale
+
+
+@pytest.mark.parametrize(("model", "told"), [
+    ("OPENCV", {"k1": -0.1, "k2": 0.02, "k3": -0.003, "p1": 0.004, "p2": -0.005}),
+    ("OPENCV_FISHEYE", {"k1": -0.1, "k2": 0.02, "k3": -0.003, "k4": 0.0006})])
+def test_the_distortion_of_a_transforms_json_goes_by_its_names(model: str, told: dict[str, float],
+                                                               tmp_path: Path) -> None:
+    found = Capture.open(make_transforms(tmp_path / "c", camera_model=model, **told)).views[0].lens
+    assert {name: found.named[name] for name in told} == told
+
+
+def test_angles_of_view_stand_for_focal_lengths(tmp_path: Path) -> None:
+    folder = make_transforms(tmp_path / "c", camera_angle_x=1.0, camera_angle_y=0.7)
+    meta = json.loads((folder / "transforms.json").read_text())
+    del meta["fl_x"], meta["fl_y"]
+    (folder / "transforms.json").write_text(json.dumps(meta))
+    camera = Capture.open(folder).views[0].camera
+    np.testing.assert_allclose((camera.fx, camera.fy), (32 / np.tan(0.5), 24 / np.tan(0.35)))

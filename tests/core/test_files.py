@@ -11,6 +11,7 @@ import pytest
 
 from core.errors import CaptureError, SettingsError, refusal
 from core.files import (
+    are_newer,
     atomic_folder,
     atomic_path,
     check_apart,
@@ -202,3 +203,22 @@ def test_numbers_for_people_keep_what_worlds_of_any_unit_need() -> None:
         0.0, 1.234568, -5000000.123457, 0.1234568]
     assert short(-1.52345678e-5) == pytest.approx(-1.52345678e-5, rel=1e-6)
     assert short(float("inf")) == float("inf")
+
+
+@pytest.mark.skipif(os.name == "nt", reason="rights are another matter on Windows")
+def test_what_is_written_can_be_read_by_those_whom_the_system_lets(tmp_path: Path) -> None:
+    """Temporary files are their owner's alone; other workers of a farm have to read the results."""
+    mask = os.umask(0o022)
+    try:
+        write_json(tmp_path / "a.json", {})
+    finally:
+        os.umask(mask)
+    assert (tmp_path / "a.json").stat().st_mode & 0o777 == 0o644
+
+
+def test_the_oldest_of_several_results_counts(tmp_path: Path) -> None:
+    for name, at in (("source", 100), ("clean", 200), ("flare", 50)):
+        (tmp_path / name).touch()
+        os.utime(tmp_path / name, (at, at))
+    assert are_newer([tmp_path / "clean"], [tmp_path / "source"])
+    assert not are_newer([tmp_path / "clean", tmp_path / "flare"], [tmp_path / "source"])

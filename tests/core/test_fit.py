@@ -22,9 +22,10 @@ import torch
 
 from core.capture import Capture, Light
 from core.errors import Cancelled, CaptureError, FlareFileError, RunError
-from core.fit import FitSettings, Run, fit, preset
+from core.fit import FitSettings, Run, checkpoint, fit, preset
 from core.fit.beginning import NEAREST_PART, nearest_depth
 from core.fit.frames import Frames
+from core.fit.run import FLARE, SCENE
 from core.fit.settings import SplitSettings, changed
 from core.fit.sky import COUNT, with_sky
 from core.fit.splitting import from_below, is_found, nearness, scene_beside_flare
@@ -406,3 +407,28 @@ def test_a_damaged_checkpoint_or_result_is_one_sentence(tmp_path: Path, capture:
         _ = Run.open(folder).flare
     with pytest.raises(RunError, match="not the folder"):
         Run.open(tmp_path)
+
+
+def test_a_run_is_known_by_its_scene_and_its_flare(tmp_path: Path) -> None:
+    def fingerprint(scene: bytes, flare: bytes) -> str:
+        (tmp_path / SCENE).write_bytes(scene)
+        (tmp_path / FLARE).write_bytes(flare)
+        return Run(tmp_path, FitSettings(), tmp_path).fingerprint
+
+    assert len({fingerprint(b"a", b"x"), fingerprint(b"b", b"x"), fingerprint(b"a", b"y")}) == 3
+
+
+def test_a_checkpoint_brings_back_what_no_optimiser_holds(tmp_path: Path) -> None:
+    """How clear each view is, where the lights are, and how long the scene goes on alone."""
+    capture = Capture.open(flared_capture(tmp_path / "c", 5))
+    first, second = (Trainer(capture, quick(mode="split")) for _ in range(2))
+    assert first.flare is not None
+    assert second.flare is not None
+    first.flare.clear.fill_(0.3)
+    first.flare.positions += 0.25
+    first._head_start.goes_on()
+    checkpoint.save(tmp_path / "state.safetensors", first.state())
+    second.load_state(checkpoint.load(tmp_path / "state.safetensors"))
+    assert torch.equal(second.flare.clear, first.flare.clear)
+    assert torch.equal(second.flare.positions, first.flare.positions)
+    assert second._head_start.until == first._head_start.until

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -14,6 +15,7 @@ from core.capture import Camera, Capture
 from core.errors import CaptureError, EngineError, SettingsError
 from core.lights import Detection, Exposure, GatherSettings, detector_for, find_lights, gather, record, union
 from core.lights.file import write_lights
+from core.lights.find import _from_one_view
 from core.lights.gather import FoundLight, without_ghosts
 from core.lights.ghosts import find_blobs, gather_ghosts
 from core.lights.lifted import lift
@@ -394,3 +396,23 @@ class TestFind:
 def test_grounded_without_its_libraries_or_weights(tmp_path: Path) -> None:
     with pytest.raises(EngineError, match="exposure method"):
         detector_for("grounded", boxes=tmp_path / "none", masks=tmp_path / "none")
+
+
+def test_a_light_taken_out_by_hand_stays_out_when_it_was_missed_in_between(tmp_path: Path) -> None:
+    path, views, found = tmp_path / "lights.json", named(orbit(12, size=SIZE)), TestFile().found
+    kept, out = (0.4, -0.5, 0.3), (0.0, 0.5, 0.0)
+    write_lights(path, found(kept, out), views)
+    data = json.loads(path.read_text())
+    data["lights"] = [one for one in data["lights"] if np.linalg.norm(np.subtract(one["xyz"], out)) > 0.1]
+    path.write_text(json.dumps(data))
+    for places in ((kept,), (kept, out)):
+        write_lights(path, found(*places), views, keep=True)
+    assert len(json.loads(path.read_text())["lights"]) == 1
+
+
+def test_a_light_of_one_view_lies_as_deep_as_the_points_not_as_far() -> None:
+    camera, place = Camera(64, 48, 30.0, 30.0, 32.0, 24.0, np.eye(4)), np.array([2.0, 0.0, 2.4])
+    capture = SimpleNamespace(views=[SimpleNamespace(name="a", camera=camera)], extent=1.0,
+                              points=SimpleNamespace(xyz=place[None]))
+    one = SimpleNamespace(xy=camera.project([place])[0][0], colour=np.ones(3), radius=2.0)
+    np.testing.assert_allclose(_from_one_view(capture, [one])[0].xyz, place, atol=1e-6)  # type: ignore[arg-type, list-item]

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from core.capture import Camera
 from core.lights.snap import Sight, sight, snapped
-from core.pictures import srgb_from_linear
+from core.pictures import linear_from_srgb, srgb_from_linear
 from tests.core.flared import HEIGHT, WIDTH, cameras
 
 LAMP, SPOT = np.array([0.3, -0.6, 1.5]), np.array([-0.9, 0.3, 2.0])
@@ -110,3 +110,10 @@ def test_without_a_flare_nothing_moves() -> None:
     assert (snapped(sights((LAMP, 1.0)), behind) == behind).all()
     assert snapped(sights((LAMP, 1.0)), np.zeros((0, 3))).shape == (0, 3)
     assert (snapped([], given) == given).all()
+
+
+def test_how_bright_a_flare_is_counts_in_light() -> None:
+    camera = cameras(1)[0]
+    clean = np.full((camera.height, camera.width, 3), 0.5, np.float32)
+    bright, dark = (float(linear_from_srgb(np.float32(value))) for value in (0.7, 0.5))
+    np.testing.assert_allclose(sight(camera, clean + np.float32(0.2), clean).flare, bright - dark, rtol=1e-4)

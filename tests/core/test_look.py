@@ -6,21 +6,25 @@ import json
 import math
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
+from core.bake import shot as shot_bakes
 from core.errors import FlareFileError, SettingsError
 from core.flare import file as flare_file
 from core.flare.compositing import splat_flare
 from core.flare.file import FlareFile, TrainingCamera
 from core.flare.model import OURS, PAPER, FlareForm, FlareModel
-from core.look import Edit, KeyedEdits, LookEdits, PlaneGaussians, draw, list_elements, read
+from core.look import Edit, KeyedEdits, LookEdits, PlaneGaussians, ViewOfLight, draw, list_elements, read
 from core.look import elements as grouping
 from core.look.container import read_tensors, rewritten
 from core.look.edits import edited
+from core.look.look import asked
 from core.look.shot import PlacedLight, Shot, ShotFrame, evaluate
+from core.pictures import linear_from_srgb, srgb_from_linear
 from tests.core.flared import cameras
 from tests.core.test_flare import pose, some_flare
 
@@ -506,3 +510,41 @@ def test_the_light_of_a_shot_s_layers_follows_its_intensity(blend: str, tmp_path
     assert plain.max() > 0.01
     np.testing.assert_allclose(darker, 0.25 * plain, atol=1e-6)
     np.testing.assert_allclose(tinted, plain * (0, 1, 0.5), atol=1e-6)
+
+
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # of Rec. 709
+
+
+def test_colour_is_taken_away_before_the_tint_gives_one() -> None:
+    words = ["lamp.tint=1,0.5,0.25", "lamp.saturation=0", "lamp.intensity=2"]
+    matrix = LookEdits.parse(words, ["lamp"]).matrices(["lamp"])["lamp"]
+    np.testing.assert_allclose(matrix @ (0.2, 0.6, 1.0), 2 * (LUMINANCE @ (0.2, 0.6, 1.0)) * np.array([1, 0.5, 0.25]),
+                               rtol=1e-6)
+
+
+def test_covering_flares_lose_their_colour_in_light() -> None:
+    gaussians, elements = ghosts()
+    gaussians = replace(gaussians, colours=np.array([[1, 0.2, 0], [0.1, 0.9, 0.3], [0, 0, 1]], np.float32))
+    grey = srgb_from_linear(linear_from_srgb(gaussians.colours) @ LUMINANCE)
+    shown = edited(gaussians, "lamp", LIGHT, elements, LookEdits.parse(["lamp.saturation=0"], ["lamp"]), "over")
+    np.testing.assert_allclose(shown.colours, np.repeat(grey[:, None], 3, 1), atol=1e-5)
+
+
+def test_a_bake_of_a_shot_goes_by_its_query_and_its_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    one = a_shot(tmp_path)
+    prints = {shot_bakes.ShotRenderer(one).fingerprint,
+              shot_bakes.ShotRenderer(replace(one, query="trained")).fingerprint}
+    for mark in "ab":
+        run = SimpleNamespace(fingerprint=mark, flare=None)
+        monkeypatch.setattr(shot_bakes.Run, "open", lambda _folder, run=run: run)
+        prints.add(shot_bakes.ShotRenderer(replace(one, run=tmp_path)).fingerprint)
+    assert len(prints) == 4
+
+
+def test_the_source_s_view_lies_within_what_was_trained(tmp_path: Path) -> None:
+    saved(tmp_path / "a.flare", lights=1)
+    light = read(tmp_path / "a.flare").lights[0]
+    far = ViewOfLight(np.zeros(3, np.float32), np.eye(3, dtype=np.float32), np.array([3, 4], np.float32), 1.0)
+    found, reach = asked(light, far, "source").light, light.query_range.light_high
+    assert np.linalg.norm(found) <= reach[2] + 1e-5
+    assert (np.abs(found) <= reach[:2] + 1e-5).all()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -204,3 +205,15 @@ def test_infinite_scores_become_null() -> None:
     made = summary("removed", [("a", {**scores, "flare": scores["scene"]})], (4, 4))
     assert made["composite"] == {"psnr": None, "ssim": 1.0}
     assert "removed/" in table(made)
+
+
+def test_a_pixel_that_is_clipped_in_one_channel_is_clipped() -> None:
+    pixels = np.full((4, 4, 3), 0.5, np.float32)
+    pixels[1, 2, 0] = 1.0
+    assert clipped(Picture(pixels, "srgb")).sum() == 1
+    flare = np.full((4, 4, 3), 0.1, np.float32)
+    flare[2, 3, 0] = 5.0
+    capture = SimpleNamespace(frame=lambda _: Picture(np.full_like(flare, 0.5), "srgb"),
+                              truth_scene=lambda _: Picture(np.full_like(flare, 0.1), "linear"),
+                              truth_flare=lambda _: Picture(flare, "linear"))
+    assert out_of_range(capture, SimpleNamespace()).sum() == 1  # type: ignore[arg-type]

@@ -127,3 +127,11 @@ def test_a_file_asks_for_a_stop(of_main_thread: bool, tmp_path: Path, monkeypatc
         thread.join()
     assert stopped == ["Stopped during fit as asked; what is done is kept."]
     assert threading.active_count() == before, "who looked has gone"
+
+
+def test_the_time_left_of_what_goes_on_is_by_the_steps_made_since() -> None:
+    progress = Progress()
+    progress.stage("fit", 1000, 900)
+    progress._began -= 50
+    progress.advance(50)
+    assert progress.left_s == pytest.approx(50, rel=0.05)

@@ -634,3 +634,16 @@ def test_write_png_is_read_as_a_plate(tmp_path: Path) -> None:
     plate = read_plate(tmp_path / "a.png")
     assert plate.top == 65535
     assert plate.codes[0, 0, 0] == 32768
+
+
+def test_a_jpeg_keeps_the_resolution_of_its_colours(tmp_path: Path) -> None:
+    codes = np.zeros((32, 32, 3), np.uint8)
+    codes[:, ::2, 2] = codes[:, 1::2, 0] = 220  # columns of red and blue
+    full = [cv2.IMWRITE_JPEG_QUALITY, 98, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
+    assert cv2.imwrite(str(tmp_path / "a.jpg"), codes, full)
+    plate = read_plate(tmp_path / "a.jpg")
+    changed = plate.codes.copy()
+    changed[0, 0] = 7
+    write_plate(tmp_path / "b.jpg", plate, changed)
+    before, after = (cv2.imread(str(tmp_path / name))[16:].astype(int) for name in ("a.jpg", "b.jpg"))
+    assert np.abs(after - before).max() < 30

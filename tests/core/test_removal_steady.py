@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -14,7 +15,7 @@ from core.progress import Progress
 from core.removal.batch import RECORD, remove_all
 from core.removal.inference import Remover, Told
 from core.removal.plates import Plate
-from core.removal.steady import Sequences, by_number, calm, steadied
+from core.removal.steady import REACH, Sequences, by_number, calm, steadied
 
 Pixels = NDArray[np.float32]
 
@@ -124,3 +125,9 @@ def test_neighbours_are_those_of_the_folder(shot: Path) -> None:
     remover = Wavering()
     Sequences(remover, [shot / "f1.png", shot / "f2.png", shot.parent / "f3.png"]).read(shot / "f1.png")
     assert remover.asked == 2
+
+
+def test_a_frame_is_brought_into_line_with_those_of_both_sides(tmp_path: Path) -> None:
+    paths = [tmp_path / f"f{number}.png" for number in range(20)]
+    beside = Sequences(SimpleNamespace(), paths)._beside[paths[10]]  # type: ignore[arg-type]
+    assert list(beside) == [*paths[10 - REACH:10], *paths[11:11 + REACH]]

@@ -24,7 +24,9 @@ from core.gaussians.ply import write_ply
 from core.look import KeyedEdits, Look, ViewOfLight, read
 from core.look.shot import PlacedLight, Shot, ShotFrame
 from core.pictures import read_exr, srgb_from_linear, write_exr, write_png
+from core.removal.plates import Plate
 from core.transfer import query as queries
+from core.transfer.plates import ColouredPlate
 from core.transfer.sources import assigned, parsed
 from core.transfer.target import Target, _most_alike, of_capture, of_pictures, of_shot
 from core.transfer.transfer import Transfer, TransferSettings
@@ -453,3 +455,51 @@ def test_edits_by_frame_may_be_toml(tmp_path: Path) -> None:
     (tmp_path / "bad.toml").write_text("set = [")
     with pytest.raises(SettingsError, match=r"bad\.toml is not valid TOML"):
         KeyedEdits.read(tmp_path / "bad.toml")
+
+
+def from_ten_times_as_far(camera: Camera, centre: np.ndarray, xyz: np.ndarray) -> np.ndarray:
+    """The pose (4, 4) of a camera that sees a light at `xyz` in a tenfold world as `camera` sees one at `centre`."""
+    pose = camera.world_to_camera.copy()
+    pose[:3, 3] = -pose[:3, :3] @ (xyz + 10 * (camera.position - centre))
+    return pose
+
+
+@pytest.mark.parametrize("times", [1, 10])
+def test_a_world_of_ten_times_the_size_is_asked_at_the_source_s_own_distance(times: int, flare: Path,
+                                                                             look: Look) -> None:
+    light, camera = look.lights[0], cameras(3)[1]
+    xyz = times * light.xyz
+    pose, seen = from_ten_times_as_far(camera, light.xyz, xyz), queries.seen_by(flare, look.lights)[light.name]
+    target, blend = (queries._asked(light, ViewOfLight.of(pose, xyz), xyz, query, seen, 10.0, None)
+                     for query in ("target", "blend"))
+    np.testing.assert_allclose(target[0][1].camera, camera.position, atol=1e-4)
+    assert len(blend) > 1
+    assert min(np.linalg.norm(one.camera - camera.position) for _, one in blend) < 0.5, "a view of the training"
+
+
+def test_the_one_view_of_the_source_is_chosen_by_its_own_distances(flare: Path, look: Look,
+                                                                   monkeypatch: pytest.MonkeyPatch) -> None:
+    xyz, told = look.lights[0].xyz, list[float]()
+    fixed_view = queries.fixed_view
+    monkeypatch.setattr(queries, "fixed_view", lambda light, views, distances, seen: (
+        told.extend(distances), fixed_view(light, views, distances, seen))[1])
+    views = [replace(camera, world_to_camera=from_ten_times_as_far(camera, xyz, xyz)) for camera in cameras(5)[:2]]
+    Transfer(flare, of_shot(shot(flare, look, views), look, {}), TransferSettings(query="source", scale=10))
+    np.testing.assert_allclose(told, [np.linalg.norm(camera.position - xyz) for camera in cameras(5)[:2]], rtol=1e-6)
+
+
+def test_a_frame_is_made_again_when_one_changes_that_it_is_smoothed_with(flare: Path, look: Look) -> None:
+    def prints(*shares: float) -> list[str]:
+        target = of_shot(shot(flare, look, cameras(5), shares=list(shares)), look, {})
+        transfer = Transfer(flare, target, TransferSettings(smooth=1))
+        return [transfer.fingerprint_of(number) for number in range(5)]
+
+    same = [a == b for a, b in zip(prints(1, 1, 1, 1, 1), prints(1, 1, 1, 1, 0), strict=True)]
+    assert same == [True, True, False, False, False], "the share is smoothed, then its step: two frames to each side"
+
+
+def test_a_half_plate_holds_no_infinity() -> None:
+    plate = ColouredPlate(Plate(Path("a.exr"), np.full((2, 2, 3), 60000, np.float16), "linear"), colour_space("linear"))
+    stored = plate.with_light(np.full((2, 2, 3), 30000, np.float32))
+    assert stored.dtype == np.float16
+    assert (stored == 65504).all()

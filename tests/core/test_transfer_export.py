@@ -15,7 +15,7 @@ from core.gaussians import rasterization
 from core.gaussians.ply import read_ply
 from core.gaussians.projection import rotation_matrices
 from core.look import PlaneGaussians, ViewOfLight, draw, read
-from core.transfer.export import flare_scene, preset, write_flare_ply, write_preset
+from core.transfer.export import _part, flare_scene, preset, write_flare_ply, write_preset
 from tests.core.flared import cameras
 from tests.core.test_look import saved
 
@@ -105,3 +105,17 @@ def test_a_preset_says_where_and_how_bright(tmp_path: Path, monkeypatch: pytest.
     assert parts[2]["arc"] == pytest.approx({"towards": 90, "share": np.exp(-2 * 4 * 0.5)}, rel=1e-3)
     np.testing.assert_allclose(parts[0]["colour"], [1, 0.5, 0.25])
     assert parts[0]["intensity"] == pytest.approx(1.0)
+
+
+def test_a_preset_tells_to_which_side_a_part_lies_and_turns() -> None:
+    """Clockwise of the axis through the light, as the picture is seen."""
+    along, aside = np.array([0.6, 0.8]), np.array([-0.8, 0.6])
+    long = np.cos(np.radians(30)) * along + np.sin(np.radians(30)) * aside
+    turn = np.stack([long, [-long[1], long[0]]], 1)
+    spread = turn @ np.diag([0.2**2, 0.01**2]) @ turn.T
+    mean = (0.25 * along + 0.1 * aside)[None].astype(np.float32)
+    one = PlaneGaussians(mean, np.array([[spread[0, 0], spread[0, 1], spread[1, 1]]], np.float32),
+                         np.ones(1, np.float32), np.ones((1, 3), np.float32))
+    part = _part(one, 0, 0.5 * along, 1.0)
+    assert part["rotation"] == pytest.approx(30, abs=0.01)
+    assert (part["offset"], part["aside"]) == pytest.approx((0.5, 0.1), abs=1e-6)

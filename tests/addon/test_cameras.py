@@ -1,0 +1,48 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Cameras, axes and frame numbers, between the core and Blender."""
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from blenders import Blender
+
+SCRIPT = Path(__file__).parent / "scripts" / "cameras.py"
+
+
+@pytest.fixture(scope="session")
+def facts(blender: Blender, package: Path, tmp_path_factory: pytest.TempPathFactory) -> Any:
+    return blender.run(SCRIPT, package, user=tmp_path_factory.mktemp("cameras"))
+
+
+def test_intrinsics_are_blender_s_own_for_every_fit_and_pixel(facts: Any) -> None:
+    assert len(facts["intrinsics"]) == 18
+    for name, (blenders, ours) in facts["intrinsics"].items():
+        np.testing.assert_allclose(ours, blenders, atol=2e-4, err_msg=name)
+
+
+def test_other_pixels_than_square_come_back(facts: Any) -> None:
+    for given, back in facts["back"]:
+        np.testing.assert_allclose(back, given, atol=1e-3)
+
+
+def test_what_was_up_is_up(facts: Any) -> None:
+    for name, up in facts["up"].items():
+        np.testing.assert_allclose(up, (0, 0, 1), atol=1e-6, err_msg=name)
+
+
+def test_frames_are_counted_as_blender_counts(facts: Any) -> None:
+    """It shows the file with the number frame - frame_start + 1 + frame_offset."""
+    assert facts["custom"] == [3, 4, 5]
+    assert facts["footage"] == "plate.1007.exr"
+
+
+def test_what_is_live_is_not_baked_too(facts: Any) -> None:
+    assert facts["baked edits"] == ["lamp.scale=2"]
+
+
+def test_a_light_that_was_moved_is_not_where_it_was_learned(facts: Any) -> None:
+    assert facts["native"] == [True, False]
+    assert facts["query"] == ["target", "source"]

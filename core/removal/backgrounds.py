@@ -162,11 +162,8 @@ def _view(random: Random, light: NDArray[np.float16], width: int, height: int) -
 
 def _defocused(random: Random, scene: Pixels) -> Pixels:
     """Under a disc of 1 to 8 % of the width."""
-    import cv2
-
     radius = scene.shape[1] * uniform_log(random, 0.005, 0.04)
     reach = math.ceil(radius)
     y, x = np.mgrid[-reach:reach + 1, -reach:reach + 1]
     disc = np.clip(radius + 0.5 - np.hypot(x, y), 0, 1).astype(np.float32)
-    blurred = cv2.filter2D(scene, -1, disc / disc.sum(), borderType=cv2.BORDER_REFLECT)
-    return np.asarray(np.maximum(blurred, 0), np.float32)  # by Fourier transform, which rounds to either side
+    return variety.through(scene, disc)

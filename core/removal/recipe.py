@@ -34,7 +34,7 @@ class Recipe:
     begun: float = 0.0             # share, in the weights that are kept, of those that a training began with
     polish: float = 0.15           # of the iterations, the last of them, go for each picture's PSNR
     widths: tuple[int, ...] = (32, 48, 96, 128, 160)
-    blocks: tuple[int, ...] = (0, 1, 2, 4, 4)
+    blocks: tuple[int, ...] = (0, 1, 4, 8, 6)
     canvas: int = 384              # pixels a side of the flares' canvas
     bank: int = 400                # flares at hand at a time, 2.7 MB each
     renew_every: int = 6           # iterations for each new flare

@@ -30,6 +30,8 @@ SQUARE = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
 def varied(random: Random, film: Film, width: int, height: int) -> Pixels:
     """(height, width, 3) linear light: as filmed in one of six, else changed in some of the ways below."""
     scene = _askew(random, film, width, height)
+    if random.random() < 0.12:
+        scene = _out_of_focus(random, scene)
     if random.random() < 0.35:
         scene = _under_leaves(random, scene, film)
     elif random.random() < 0.2:
@@ -59,6 +61,23 @@ def _askew(random: Random, film: Film, width: int, height: int) -> Pixels:
     matrix = cv2.getPerspectiveTransform(corners.astype(np.float32), onto.astype(np.float32))
     return np.asarray(cv2.warpPerspective(scene, matrix, (width, height), flags=cv2.INTER_LINEAR,
                                           borderMode=cv2.BORDER_REFLECT), np.float32)
+
+
+def _out_of_focus(random: Random, scene: Pixels) -> Pixels:
+    """What lies behind, as a lens focused on something nearer shows it: its lights become discs or polygons."""
+    radius = math.hypot(*scene.shape[:2]) * uniform_log(random, 0.004, 0.04)
+    blades = int(random.integers(5, 9)) if random.random() < 0.4 else 48  # so many that it looks round
+    at = np.arange(blades) * (2 * math.pi / blades) + random.uniform(0, 2 * math.pi)
+    side = 2 * math.ceil(radius) + 1
+    return through(scene, _polygon(np.stack([np.cos(at), np.sin(at)], -1) * radius + side // 2, side, side))
+
+
+def through(scene: Pixels, opening: Pixels) -> Pixels:
+    """A scene out of focus, behind a lens of that opening (height, width) in pixels."""
+    import cv2
+
+    blurred = cv2.filter2D(scene, -1, opening / opening.sum(), borderType=cv2.BORDER_REFLECT)
+    return np.asarray(np.maximum(blurred, 0), np.float32)  # by Fourier transform, which rounds to either side
 
 
 def _under_leaves(random: Random, scene: Pixels, film: Film) -> Pixels:

@@ -10,7 +10,7 @@ import pytest
 
 from core.errors import SettingsError
 from core.pictures import write_png
-from core.removal import formation, pairs
+from core.removal import formation, pairs, variety
 from core.removal.backgrounds import Backgrounds, kept_for_test, read_backgrounds
 from core.removal.bank import Mixed, OwnFlares, SynthesisBank
 from core.removal.synthesis import prescription as lenses
@@ -258,3 +258,20 @@ def test_some_backgrounds_hold_bright_things_that_are_no_flare() -> None:
     bright = [one for one in drawn if one.max() > 4 * np.median(one)]
     assert 0.05 < len(bright) / len(drawn) < 0.2
     assert all(np.isfinite(one).all() and one.min() >= 0 for one in drawn)
+
+
+def test_a_light_out_of_focus_is_a_disc_or_a_polygon_of_as_much_light() -> None:
+    light = np.zeros((80, 120, 3), np.float32)
+    light[40, 60] = 900.0
+    shapes = [variety._out_of_focus(np.random.default_rng(seed), light) for seed in range(60)]
+    for shape in shapes:
+        lit = shape[..., 0] > 0.01 * shape.max()
+        rows, columns = np.nonzero(lit)
+        reach = np.hypot(rows - 40, columns - 60).max()
+        assert shape.sum() == pytest.approx(2700, rel=0.01)
+        assert reach <= 0.04 * np.hypot(80, 120) + 1.5
+        if reach > 3:
+            inside = shape[lit][:, 0]
+            assert np.median(inside) > 0.8 * shape.max(), "as bright everywhere, unlike a glow"
+    sizes = [int((shape[..., 0] > 0.01 * shape.max()).sum()) for shape in shapes]
+    assert min(sizes) < 15 < 60 < max(sizes)

@@ -19,9 +19,9 @@ from .rendering import NEAR, Rendering
 COEFFICIENTS = (spherical_harmonics.MAX_DEGREE + 1) ** 2
 INITIAL_OPACITY = 0.1
 DISTANCE_MIN = 1e-7 ** 0.5
-"""Points nearer to each other than this make Gaussians of this size; or than a part of the median of all, where a world
-has smaller units (3DGS's own number is for worlds of some units)."""
-SMALL = 1e-3
+"""Points nearer to each other than this make Gaussians of this size; where a world has such large units
+that this is no small distance in it, than a part of the median of all."""
+SMALL = 0.1
 """That part."""
 
 

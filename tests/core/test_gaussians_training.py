@@ -446,3 +446,15 @@ def test_training_finds_a_picture() -> None:
         counts.append(len(scene))
     assert np.mean(losses[-6:]) < 0.35 * np.mean(losses[:6])
     assert 30 < counts[-1] <= 80 and all(b >= a - 10 for a, b in pairwise(counts))
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e-5])
+def test_points_make_gaussians_of_their_distances_in_worlds_of_any_unit(unit: float) -> None:
+    """Two that coincide have the floor's size, which lies below that of the others."""
+    xyz = np.random.default_rng(0).uniform(-1, 1, (200, 3))
+    xyz[1] = xyz[2] = xyz[3] = xyz[0]
+    cloud = PointCloud((xyz * unit).astype(np.float32), np.full((200, 3), 128, np.uint8),
+                       np.zeros(200, np.float32))
+    sizes = SceneGaussians.from_points(cloud).log_scales.detach().exp()[:, 0].numpy() / unit
+    assert sizes[0] < 0.2 * np.median(sizes)
+    assert 0.05 < np.median(sizes) < 0.5

@@ -25,6 +25,8 @@ that is less than usual: worlds of small units, metres about a watch, are fitted
 NEAREST_POINTS = 10_000  # that are looked at
 SNAP_WIDTH, SNAP_VIEWS = 160, 40
 """Pixels of the pictures that lights are placed by, and about how many of them."""
+WHITE_VIEWS = 3
+"""About how many frames are looked at for light above white."""
 
 
 def first_scene(capture: Capture, settings: FitSettings, views: tuple[View, ...], frames: Frames) -> SceneGaussians:
@@ -99,6 +101,16 @@ def _sights(views: tuple[View, ...], frames: Frames) -> list[Sight]:
             shrunk = (Picture(part.numpy(), "srgb").resized(*small.size).display() for part in (frame, removed))
             found.append(sight(small, *shrunk))
     return found
+
+
+def light_above_white(capture: Capture, views: tuple[View, ...]) -> tuple[str, ...]:
+    """A sentence where float frames hold light that display values, which are what is fitted, cannot show."""
+    for view in views[:: max(len(views) // WHITE_VIEWS, 1)]:
+        frame = capture.frame(view)
+        if frame.encoding == "linear" and frame.pixels.max() > 1:
+            return ("The frames hold light above white (1.0), and the fit sees it as white: where a flare is brighter "
+                    "than that, the fitted one may be too bright or too dark.",)
+    return ()
 
 
 def moved_lights(capture: Capture, flare: FlareModel) -> tuple[str, ...]:

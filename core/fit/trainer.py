@@ -28,7 +28,7 @@ from ..gaussians.densification import Classic, Mcmc, Strategy
 from ..gaussians.loss import l1_ssim
 from ..gaussians.optimiser import Adam
 from ..gaussians.ordering import morton_order
-from .beginning import first_flare, first_scene, moved_lights
+from .beginning import first_flare, first_scene, light_above_white, moved_lights
 from .checkpoint import State
 from .frames import Frames, Targets
 from .rendering import render_flare
@@ -61,7 +61,9 @@ class Trainer:
                                "or fit with --mode unsup.")
         self.scene = first_scene(capture, settings, self.views, self.frames)
         self.flare = None if settings.mode == "3dgs" else first_flare(capture, self.views, self.frames, settings)
-        self.says = () if self.flare is None else moved_lights(capture, self.flare)
+        self.says = light_above_white(capture, self.views)
+        if self.flare is not None:
+            self.says += moved_lights(capture, self.flare)
         self.extent = capture.extent
         self._head_start = HeadStart(settings.split, len(self.views), settings.iterations)
         self.scene_adam = Adam(dict(self.scene.named_parameters()), self._scene_rates())

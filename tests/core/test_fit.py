@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 import torch
 
-from core.capture import Capture, Light
+from core.capture import Capture, Light, View
 from core.errors import Cancelled, CaptureError, FlareFileError, RunError
 from core.fit import FitSettings, Run, checkpoint, fit, preset
 from core.fit.beginning import NEAREST_PART, nearest_depth
@@ -31,7 +31,7 @@ from core.fit.sky import COUNT, with_sky
 from core.fit.splitting import from_below, is_found, nearness, scene_beside_flare
 from core.fit.trainer import Trainer
 from core.gaussians.rendering import NEAR
-from core.pictures import read_picture, write_png
+from core.pictures import Encoding, Picture, read_picture, write_png
 from core.progress import Progress
 from tests.core.flared import flared_capture
 
@@ -432,3 +432,19 @@ def test_a_checkpoint_brings_back_what_no_optimiser_holds(tmp_path: Path) -> Non
     assert torch.equal(second.flare.clear, first.flare.clear)
     assert torch.equal(second.flare.positions, first.flare.positions)
     assert second._head_start.until == first._head_start.until
+
+
+@pytest.mark.parametrize(("encoding", "brightest", "told"), [("linear", 4.0, True), ("linear", 1.0, False),
+                                                             ("srgb", 1.0, False)])
+def test_light_that_the_fit_cannot_see_is_told(encoding: Encoding, brightest: float, told: bool,
+                                               tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    capture = Capture.open(flared_capture(tmp_path / "c", 5))
+    frame = capture.frame
+
+    def lit(view: View, size: tuple[int, int] | None = None) -> Picture:
+        pixels = frame(view, size).pixels.copy()
+        pixels[3, 4] = brightest
+        return Picture(pixels, encoding)
+
+    monkeypatch.setattr(capture, "frame", lit)
+    assert any("above white" in text for text in Trainer(capture, quick()).says) == told

@@ -12,7 +12,7 @@ from typing import BinaryIO
 import numpy as np
 
 MAGIC = b"\x76\x2f\x31\x01"
-LINES = (1, 1, 1, 16, 32, 16, 32, 32, 32, 256, 256, 32)
+_LINES = (1, 1, 1, 16, 32, 16, 32, 32, 32, 256, 256, 32)
 """Lines of a chunk, by the number of the compression: none, RLE, ZIPS, ZIP, PIZ, PXR24, B44, B44A, DWAA, DWAB and two
 of HTJ2K."""
 _TILES, _DEEP, _PARTS = 0x200, 0x800, 0x1000  # flags of the version
@@ -48,11 +48,11 @@ def is_cut_off(stream: BinaryIO) -> bool:
     window, compression = told.get(b"dataWindow", b""), told.get(b"compression")
     if len(window) != 16 or not compression:
         return True
-    if compression[0] >= len(LINES):
+    if compression[0] >= len(_LINES):
         return False
     _, top, _, bottom = np.frombuffer(window, "<i4").tolist()
     begin, end = stream.tell(), stream.seek(0, os.SEEK_END)
-    chunks = -(-(bottom + 1 - top) // LINES[compression[0]])
+    chunks = -(-(bottom + 1 - top) // _LINES[compression[0]])
     if chunks <= 0 or begin + 8 * chunks > end:
         return True
     stream.seek(begin)

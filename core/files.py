@@ -49,7 +49,7 @@ def atomic_path(target: Path | str) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
-def short(value: float) -> float:
+def rounded(value: float) -> float:
     """For a file that people read: six decimals, and more where the world's unit is so large that it takes them."""
     return round(value, 6 + max(0, -math.floor(math.log10(abs(value))))) if value and math.isfinite(value) else value
 

@@ -47,8 +47,9 @@ def _draw_engine(layout: Any) -> None:
         _log_of(box, making)
         return
     if python is None:
-        box.label(text="The engine that is named is not there" if engine.named()[1] else "No engine yet", icon="ERROR")
-        lines(box, f"{engine.missing()}." if engine.named()[1] else
+        _, named = engine.named()
+        box.label(text="The engine that is named is not there" if named else "No engine yet", icon="ERROR")
+        lines(box, f"{engine.missing()}." if named else
               f"Set it up here ({DOWNLOAD}), or name a Python above that has torch.")
         if not bpy.app.online_access:
             lines(box, "Set Up Engine needs online access: allow it in System > Network.", "INTERNET_OFFLINE")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""--frames: which of the frames that there are a command is to do."""
+"""--frames: which of the frames that there are a command does, and what it tells of them."""
 from __future__ import annotations
 
 import argparse

@@ -88,7 +88,7 @@ class Run:
             raise RunError(f"{folder / CAPTURE} cannot be read ({problem.strerror}); start the fit anew.") from problem
         return cls(folder, settings, capture)
 
-    def where(self, given: Path | None) -> Path:
+    def find_capture(self, given: Path | None) -> Path:
         """The folder of its capture: the one given, else the one it was fitted to. RunError where that is gone."""
         if given is None and not self.capture_folder.is_dir():
             raise RunError(f"The capture that {self.folder} was fitted to, {self.capture_folder}, is not there; say "

@@ -14,7 +14,7 @@ from typing import NamedTuple, cast
 import torch
 from torch import Tensor, nn
 
-from ..files import short
+from ..files import rounded
 from ..gaussians.spherical_harmonics import colours
 from . import placement
 from .deformation import DeformationNetwork, QueryRange
@@ -245,7 +245,7 @@ class FlareModel(nn.Module):
         for pose in poses:
             for name, view in zip(self.names, self.views(pose), strict=True):
                 if view.depth > 0:
-                    seen[name].append([short(value) for value in (*view.camera.tolist(), *view.light.tolist())])
+                    seen[name].append([rounded(value) for value in (*view.camera.tolist(), *view.light.tolist())])
         return seen
 
     def corrections(self, world_to_camera: Tensor) -> Tensor:

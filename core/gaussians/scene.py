@@ -19,10 +19,9 @@ from .rendering import NEAR, Rendering
 COEFFICIENTS = (spherical_harmonics.MAX_DEGREE + 1) ** 2
 INITIAL_OPACITY = 0.1
 DISTANCE_MIN = 1e-7 ** 0.5
-"""Points nearer to each other than this make Gaussians of this size; where a world has such large units
-that this is no small distance in it, than a part of the median of all."""
+"""The least size of a Gaussian that a point makes (3DGS), where that is small against the others."""
 SMALL = 0.1
-"""That part."""
+"""Of the median size: the least one in worlds whose unit is so large that DISTANCE_MIN is not small in them."""
 
 
 class SceneGaussians(nn.Module):
@@ -61,13 +60,14 @@ class SceneGaussians(nn.Module):
         n = len(means)
         distances = nearest_distances(means)
         size = distances.square().mean(-1).sqrt() if distances.shape[1] else torch.ones(n)
+        least = min(DISTANCE_MIN, SMALL * float(size.median()) or DISTANCE_MIN)
         sh = torch.zeros(n, COEFFICIENTS, 3)
         sh[:, 0] = spherical_harmonics.dc_from_colour(colours)
         quaternions = torch.zeros(n, 4)
         quaternions[:, 0] = 1
         return cls(
             means,
-            size.clamp(min=min(DISTANCE_MIN, SMALL * float(size.median()) or DISTANCE_MIN)).log()[:, None].repeat(1, 3),
+            size.clamp(min=least).log()[:, None].repeat(1, 3),
             quaternions,
             torch.logit(torch.full((n,), INITIAL_OPACITY)),
             sh,

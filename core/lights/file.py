@@ -20,7 +20,7 @@ import numpy as np
 from ..capture import read_lights
 from ..capture.camera import Camera
 from ..errors import CaptureError
-from ..files import read_json, short, write_json
+from ..files import read_json, rounded, write_json
 from .gather import FoundLight
 
 NEAR = 0.02  # of the frame's diagonal: projections nearer than this are one light
@@ -62,14 +62,14 @@ def write_lights(path: Path, found: Sequence[FoundLight], views: Sequence[tuple[
         if any(_one(light.xyz, xyz, views) for xyz in known):
             continue
         entries.append(_entry(light, _free_name({entry["name"] for entry in entries})))
-    places = [[short(float(x)) for x in light.xyz] for light in found]
+    places = [[rounded(float(x)) for x in light.xyz] for light in found]
     places += [xyz for xyz in found_before if not any(_one(place, xyz, views) for place in places)]
     write_json(path, {"lights": entries, "found": places})
     return entries
 
 
 def _entry(light: FoundLight, name: str) -> dict[str, Any]:
-    return {"name": name, "xyz": [short(float(x)) for x in light.xyz],
+    return {"name": name, "xyz": [rounded(float(x)) for x in light.xyz],
             "colour": [round(float(c), 3) for c in light.colour], "support": len(light.support),
             "views": light.visible, "residual_px": round(light.residual, 3),
             "uncertainty": round(light.uncertainty, 5), "far": light.far, "how": light.how}

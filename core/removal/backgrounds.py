@@ -166,4 +166,4 @@ def _defocused(random: Random, scene: Pixels) -> Pixels:
     reach = math.ceil(radius)
     y, x = np.mgrid[-reach:reach + 1, -reach:reach + 1]
     disc = np.clip(radius + 0.5 - np.hypot(x, y), 0, 1).astype(np.float32)
-    return variety.through(scene, disc)
+    return variety.seen_through(scene, disc)

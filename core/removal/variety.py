@@ -69,10 +69,10 @@ def _out_of_focus(random: Random, scene: Pixels) -> Pixels:
     blades = int(random.integers(5, 9)) if random.random() < 0.4 else 48  # so many that it looks round
     at = np.arange(blades) * (2 * math.pi / blades) + random.uniform(0, 2 * math.pi)
     side = 2 * math.ceil(radius) + 1
-    return through(scene, _polygon(np.stack([np.cos(at), np.sin(at)], -1) * radius + side // 2, side, side))
+    return seen_through(scene, _polygon(np.stack([np.cos(at), np.sin(at)], -1) * radius + side // 2, side, side))
 
 
-def through(scene: Pixels, opening: Pixels) -> Pixels:
+def seen_through(scene: Pixels, opening: Pixels) -> Pixels:
     """A scene out of focus, behind a lens of that opening (height, width) in pixels."""
     import cv2
 

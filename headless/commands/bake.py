@@ -68,7 +68,7 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     made = Run.open(words.run)
     if not made.finished:
         raise RunError(f"{words.run} is not finished; go on with it by `fit --resume` first.")
-    capture = Capture.open(made.where(words.capture), need_frames=False)
+    capture = Capture.open(made.find_capture(words.capture), need_frames=False)
     cameras = {view.name: view.camera for view in capture.views}
     wanted = frames.asked(numbered(cameras), words.frames, progress)
     if words.jobs != 1:

@@ -33,7 +33,7 @@ def scores_of(folder: Path, progress: Progress, *, which: str = "held-out",
     from ...core.metrics.evaluation import evaluate, table
 
     made = Run.open(folder)
-    capture = Capture.open(made.where(capture_folder))
+    capture = Capture.open(made.find_capture(capture_folder))
     train, held_out = capture.split(made.settings.holdout)
     views = {"held-out": held_out, "train": train, "all": capture.views}[which]
     if not views:

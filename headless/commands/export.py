@@ -36,7 +36,7 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
 
     folder = words.capture
     if words.flare.is_dir():
-        folder = Run.open(words.flare).where(folder)
+        folder = Run.open(words.flare).find_capture(folder)
         if not (words.flare / FLARE).is_file():
             raise RunError(Run.open(words.flare).without_flare)
     if not words.flare.exists():

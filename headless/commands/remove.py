@@ -85,7 +85,7 @@ def _by_run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     fitted = Run.open(words.run)
     if fitted.settings.mode == "3dgs":
         raise RunError(fitted.without_flare)
-    capture = Capture.open(fitted.where(words.capture))
+    capture = Capture.open(fitted.find_capture(words.capture))
     chosen = frames.asked(numbered([view.name for view in capture.views]), words.frames, progress)
     wanted = {frame.view for frame in chosen}
     return remove_fitted(fitted, capture, [view for view in capture.views if view.name in wanted], words.out, progress,

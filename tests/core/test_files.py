@@ -21,7 +21,7 @@ from core.files import (
     plain_name,
     read_json,
     remove_partial_of,
-    short,
+    rounded,
     write_json,
     write_text,
 )
@@ -199,10 +199,10 @@ def test_a_folder_that_may_not_be_written_is_told_in_the_end(tmp_path: Path, mon
 
 
 def test_numbers_for_people_keep_what_worlds_of_any_unit_need() -> None:
-    assert [short(value) for value in (0.0, 1.23456789, -5e6 - 0.123456789, 0.123456789)] == [
+    assert [rounded(value) for value in (0.0, 1.23456789, -5e6 - 0.123456789, 0.123456789)] == [
         0.0, 1.234568, -5000000.123457, 0.1234568]
-    assert short(-1.52345678e-5) == pytest.approx(-1.52345678e-5, rel=1e-6)
-    assert short(float("inf")) == float("inf")
+    assert rounded(-1.52345678e-5) == pytest.approx(-1.52345678e-5, rel=1e-6)
+    assert rounded(float("inf")) == float("inf")
 
 
 @pytest.mark.skipif(os.name == "nt", reason="rights are another matter on Windows")

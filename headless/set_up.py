@@ -161,6 +161,8 @@ def main(words: list[str]) -> int:
 
 
 if __name__ == "__main__":
+    # Where Blender was started in the background of a script it ignores SIGINT, and what it starts would too.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     if hasattr(signal, "SIGBREAK"):
         signal.signal(signal.SIGBREAK, signal.default_int_handler)
     try:

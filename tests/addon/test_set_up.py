@@ -91,16 +91,18 @@ def test_a_blender_without_ensurepip_takes_another_python(tmp_path: Path, monkey
 
 
 @pytest.mark.skipif(os.name == "nt", reason="signals")
-@pytest.mark.parametrize("by_file", [True, False])
-def test_a_stop_ends_what_it_started_and_leaves_nothing(by_file: bool, tmp_path: Path) -> None:
+@pytest.mark.parametrize("how", ["by a file", "by a signal", "by a signal that was ignored before"])
+def test_a_stop_ends_what_it_started_and_leaves_nothing(how: str, tmp_path: Path) -> None:
     sleeper = tmp_path / "slow-1.0-py3-none-any.whl"
     os.mkfifo(sleeper)
     command = [sys.executable, "-I", str(SCRIPT), str(tmp_path / "engine"), str(sleeper)]
+    if how.endswith("before"):
+        command = ["sh", "-c", 'trap "" INT; exec "$@"', "sh", *command]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, start_new_session=True,
                           env={**os.environ, "FIT_FLARE_STOP": str(tmp_path / "stop")}) as process:
         assert process.stdout is not None
         reading = os.open(sleeper, os.O_WRONLY)  # waits until pip has opened it, which then waits for what it reads
-        if by_file:
+        if how == "by a file":
             (tmp_path / "stop").touch()
         else:
             process.send_signal(signal.SIGINT)

@@ -41,10 +41,10 @@ class Picture:
         """(width, height) in pixels."""
         return self.pixels.shape[1], self.pixels.shape[0]
 
-    def display(self) -> Pixels:
-        """sRGB display values, clipped to 0..1 as a screen clips."""
+    def display(self, white: float = 1.0) -> Pixels:
+        """sRGB display values, clipped to 0..white: as a screen clips, or farther up."""
         pixels = srgb_from_linear(self.pixels) if self.encoding == "linear" else self.pixels
-        return np.clip(pixels, 0.0, 1.0)
+        return np.clip(pixels, 0.0, white)
 
     def linear(self) -> Pixels:
         """Scene-linear Rec. 709 values."""

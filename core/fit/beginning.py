@@ -2,6 +2,7 @@
 """What a fit begins with: a scene, and a flare for each light, which is put in its place first."""
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
@@ -25,8 +26,11 @@ that is less than usual: worlds of small units, metres about a watch, are fitted
 NEAREST_POINTS = 10_000  # that are looked at
 SNAP_WIDTH, SNAP_VIEWS = 160, 40
 """Pixels of the pictures that lights are placed by, and about how many of them."""
-WHITE_VIEWS = 3
+WHITE_VIEWS = 10
 """About how many frames are looked at for light above white."""
+WHITEST = 64.0
+"""Scene-linear light at which frames that hold light above white are clipped: six stops above it, as far as cameras
+reach; a fit that is shown a rendered sun is not drawn to it alone."""
 
 
 def first_scene(capture: Capture, settings: FitSettings, views: tuple[View, ...], frames: Frames) -> SceneGaussians:
@@ -103,14 +107,19 @@ def _sights(views: tuple[View, ...], frames: Frames) -> list[Sight]:
     return found
 
 
-def light_above_white(capture: Capture, views: tuple[View, ...]) -> tuple[str, ...]:
-    """A sentence where float frames hold light that display values, which are what is fitted, cannot show."""
-    for view in views[:: max(len(views) // WHITE_VIEWS, 1)]:
-        frame = capture.frame(view)
-        if frame.encoding == "linear" and frame.pixels.max() > 1:
-            return ("The frames hold light above white (1.0), and the fit sees it as white: where a flare is brighter "
-                    "than that, the fitted one may be too bright or too dark.",)
-    return ()
+def white_of(capture: Capture, settings: FitSettings) -> tuple[float, str]:
+    """Scene-linear light at which the frames of a fit are clipped, and a sentence about it, empty where nothing is to
+    be said: 1, the white of their format, or more where float frames, and those without flare, hold more."""
+    views, _ = capture.split(settings.holdout)
+    some = (capture.frame(view) for view in views[:: max(len(views) // WHITE_VIEWS, 1)])
+    floats = itertools.takewhile(lambda frame: frame.encoding == "linear", some)
+    if not any(frame.pixels.max() > 1 for frame in floats):
+        return 1.0, ""
+    clean = capture.removed(views[0]) if capture.has_removed else None
+    if clean is not None and clean.encoding == "srgb":
+        return 1.0, ("The frames hold light above white (1.0), and those in removed/ cannot: it is fitted as white, "
+                     "and flares that are brighter come out wrong; EXR files in removed/ would keep it.")
+    return WHITEST, f"The frames hold light above white (1.0); it is fitted up to {WHITEST:g}."
 
 
 def moved_lights(capture: Capture, flare: FlareModel) -> tuple[str, ...]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -17,6 +18,7 @@ from ..gaussians.ply import write_ply
 from ..look import list_elements
 from ..progress import Progress
 from . import checkpoint
+from .beginning import white_of
 from .preview import row, spread, write_preview, write_small
 from .rendering import render
 from .run import CHECKPOINT, FLARE, LOG, METRICS, PREVIEW, SCENE, SMALL_PREVIEW, Run
@@ -38,6 +40,7 @@ def fit(capture: Capture, settings: FitSettings, folder: Path | str, progress: P
     """
     progress, folder = progress or Progress(), Path(folder)
     continued = resume and (folder / "config.toml").exists()
+    says: list[str] = []
     if continued:
         run = Run.open(folder)
         _check_capture(run, capture)
@@ -47,13 +50,17 @@ def fit(capture: Capture, settings: FitSettings, folder: Path | str, progress: P
         trainer = Trainer(capture, run.settings)
         remove_partial(folder)
     else:
+        if settings.white is None:
+            white, of_white = white_of(capture, settings)
+            settings, says = replace(settings, white=white), [of_white] if of_white else []
         trainer = Trainer(capture, settings)  # before anything is written: it may refuse the capture
         run = Run.create(folder, settings, capture.folder)
+    trainer.frames.cache.overflow_into(folder)
     path = folder / CHECKPOINT
     if continued and path.exists():
         trainer.load_state(checkpoint.load(path))
     else:
-        for text in trainer.says:
+        for text in (*says, *trainer.says):
             progress.say(text)
             _log(run, text)
     _forget_after(folder / METRICS, trainer.iteration)
@@ -126,7 +133,7 @@ def _preview(trainer: Trainer, run: Run) -> None:
     for index in spread(len(views), PREVIEW_ROWS):
         camera = trainer.frames.camera(views[index])
         view = render(trainer.scene, trainer.flare, run.settings.blend, camera, run.settings.kernels,
-                      visibility=run.settings.flare.occluded_by_scene)
+                      white=run.settings.display_white, visibility=run.settings.flare.occluded_by_scene)
         rows.append(row(trainer.frames.frame(views[index]), view))
     write_preview(run.folder / PREVIEW, rows)
     if rows:

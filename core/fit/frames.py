@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The pictures a fit looks at, decoded once and kept as bytes while memory allows."""
+"""The pictures a fit looks at, at the size and in the encoding in which it does."""
 from __future__ import annotations
 
 from collections.abc import Callable
@@ -7,18 +7,16 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from ..capture import Camera, Capture, View
 from ..errors import CaptureError
 from ..pictures import Picture
-
-CACHE_BYTES = 1 << 29  # 80 frames of 960x540 with their flare-free pairs; others are decoded when they are looked at
+from .cache import MEMORY, PictureCache
 
 
 class Targets(NamedTuple):
-    """A view's camera and pictures in display space, (height, width, 3) float32 in 0..1."""
+    """A view's camera and pictures in display space, (height, width, 3) float32 in 0..white."""
 
     camera: Camera
     frame: Tensor
@@ -28,15 +26,16 @@ class Targets(NamedTuple):
 class Frames:
     """Frames of a capture at the working size, with the flare-free frame of each where there is one.
 
+    white: display value at which they are clipped; above 1 for float frames that hold light above white.
     `reference` says where the flare-free frames come from: "removed" (files in removed/), "truth" (exact
     scene layers, when there is no removed/), or "" (none).
     """
 
-    def __init__(self, capture: Capture, width: int = 0, cache_bytes: int = CACHE_BYTES) -> None:
+    def __init__(self, capture: Capture, width: int = 0, memory: int = MEMORY, *, white: float = 1.0) -> None:
         self.capture = capture
+        self.white = white
         self._width = width
-        self._left = cache_bytes
-        self._cache: dict[tuple[str, str], NDArray[np.uint16]] = {}
+        self.cache = PictureCache(memory)
         self.reference = "removed" if capture.has_removed else "truth" if capture.has_truth else ""
 
     def camera(self, view: View) -> Camera:
@@ -67,16 +66,14 @@ class Frames:
 
     def _display(self, view: View, kind: str,
                  decode: Callable[[View, tuple[int, int]], Picture | None]) -> Tensor | None:
-        key = (kind, view.name)
-        stored = self._cache.get(key)
+        name = f"{kind}/{view.name}"
+        stored = self.cache.get(name)
         if stored is None:
             camera = self.camera(view)
             picture = decode(view, (camera.width, camera.height))
             if picture is None:
                 return None
             # 16 bit keeps the smoothness of linear footage at half the size of float.
-            stored = (picture.display() * 65535 + 0.5).astype(np.uint16)
-            if stored.nbytes <= self._left:
-                self._left -= stored.nbytes
-                self._cache[key] = stored
-        return torch.from_numpy(stored.astype(np.float32)) / 65535
+            stored = (picture.display(self.white) * (65535 / self.white) + 0.5).astype(np.uint16)
+            self.cache.put(name, stored)
+        return torch.from_numpy(stored.astype(np.float32)) / (65535 / self.white)

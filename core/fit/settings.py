@@ -12,12 +12,15 @@ from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
+
 from ..errors import RunError, SettingsError
 from ..files import WRITTEN_BY_HAND, write_text
 from ..flare.density import DensitySettings
 from ..flare.model import OURS, PAPER, FlareForm
 from ..flare.visibility import VisibilitySettings
 from ..gaussians.densification import ClassicSettings, McmcSettings
+from ..pictures import srgb_from_linear
 from ..typed import field_of, table_of
 
 Mode = Literal["default", "split", "unsup", "in-flare", "2d", "3dgs"]
@@ -147,6 +150,8 @@ class FitSettings:
     ssim_share is 1 - lambda of the paper's loss. `apart`: share of the iterations at the beginning in which the
     flare is put before the flare-free frames instead of the scene; 0 in the paper. `holdout`: a number N (every N-th
     view is held out; 0: none), a split file's name, or None (the capture's split.json, else every 8th).
+    `white`: scene-linear light at which frames are clipped; None where a fit has yet to look whether its frames hold
+    more than 1, which only float frames can, and in runs of versions that clipped all there.
     """
 
     mode: Mode = "default"
@@ -157,6 +162,7 @@ class FitSettings:
     ssim_share: float = 0.1
     apart: float = 0.0
     holdout: str | int | None = None
+    white: float | None = None
     kernels: Literal["auto", "torch", "tiles", "cpu", "cuda"] = "auto"
     checkpoint_every_s: float = 60.0
     preview_every: int = 1000
@@ -164,12 +170,18 @@ class FitSettings:
     scene: SceneSettings = field(default_factory=SceneSettings)
     split: SplitSettings = field(default_factory=SplitSettings)
 
+    @property
+    def display_white(self) -> float:
+        """`white` as a display value; 1 where it is not known."""
+        return 1.0 if self.white is None else float(srgb_from_linear(np.array(self.white)))
+
     def checked(self) -> FitSettings:
         """Itself; raises SettingsError where a value makes no sense."""
         checks = (
             (self.iterations >= 1, "iterations must be at least 1"),
             (self.width >= 0, "size must not be negative"),
             (0 <= self.ssim_share <= 1, "ssim_share must lie between 0 and 1"),
+            (self.white is None or 1 <= self.white <= 65504, "white must lie between 1 and 65504"),
             (0 <= self.apart <= 1, "apart must lie between 0 and 1"),
             (self.flare.count >= 1, "a flare starts with at least one Gaussian"),
             (0 <= self.flare.begin < 1, "flare.begin must lie between 0 and 1"),

@@ -37,7 +37,7 @@ def with_sky(capture: Capture, views: tuple[View, ...], frames: Frames) -> Point
         row[inside] = frames.frame(view).numpy()[y, x]
     found = np.isfinite(seen[..., 0]).any(0)
     colours = np.nanquantile(seen[:, found], FROM_BELOW, axis=0)
-    rgb = np.concatenate([points.rgb, (colours * 255 + 0.5).astype(np.uint8)])
+    rgb = np.concatenate([points.rgb, (colours.clip(0, 1) * 255 + 0.5).astype(np.uint8)])
     return PointCloud(np.concatenate([points.xyz, xyz[found].astype(np.float32)]), rgb,
                       np.concatenate([points.error, np.zeros(int(found.sum()), np.float32)]))
 

@@ -5,7 +5,8 @@ Two ways, a setting of the fit:
 
 over  the paper's: flare Gaussians hide what lies behind, in display space. All of them lie in front of
       every scene Gaussian, so the joint picture is C_flare + T_flare * C_scene.
-add   light adds: I = encode(scene_linear + flare_linear), clipped as a camera clips.
+add   light adds: I = encode(scene_linear + flare_linear), clipped as a camera clips, at white; frames of a format
+      that does not clip there have a white above 1.
 
 Layers are scene-linear whichever way was fitted, and scene + flare = composite in every pixel.
 """
@@ -55,13 +56,14 @@ def _joined(parts: list[tuple[Tensor | None, int]], plain: Tensor) -> Tensor | N
     return torch.cat([plain.expand(count, -1) if rows is None else rows for rows, count in parts])
 
 
-def composite(scene: Tensor, flare: Splats | None, blend: Blend) -> Tensor:
-    """The picture in display space: scene (height, width, 3) in display space, with the flare before it."""
+def composite(scene: Tensor, flare: Splats | None, blend: Blend, white: float = 1.0) -> Tensor:
+    """The picture in display space: scene (height, width, 3) in display space, with the flare before it. white: display
+    value at which light that adds is clipped."""
     if flare is None:
         return scene
     if blend == "over":
         return over(flare, scene)
-    added: Tensor = _LightAdded.apply(scene, flare.colour)
+    added: Tensor = _LightAdded.apply(scene, flare.colour, white)
     return added
 
 
@@ -77,23 +79,23 @@ def encode(linear: Tensor) -> Tensor:
 
 
 class _LightAdded(torch.autograd.Function):
-    """encode(decode(scene) + light), clipped to 0..1 on the way in and out, with the gradient passed on as it is.
+    """encode(decode(scene) + light), clipped to 0..white on the way in and out, with the gradient passed on as it is.
 
     A pixel that is too bright must be able to come down again; the true gradient of a clip is zero there.
     """
 
     @staticmethod
-    def forward(ctx: Any, scene: Tensor, light: Tensor) -> Tensor:
-        linear, within = _decoded(scene.clamp(0, 1))
+    def forward(ctx: Any, scene: Tensor, light: Tensor, white: float) -> Tensor:
+        linear, within = _decoded(scene.clamp(0, white))
         shown, slope = _encoded(linear.add_(light))
         ctx.save_for_backward(within if ctx.needs_input_grad[0] else None, slope)
-        return shown.clamp_(0, 1)
+        return shown.clamp_(0, white)
 
     @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, Tensor]:
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, Tensor, None]:
         within, slope = ctx.saved_tensors
         of_light = gradient * slope
-        return None if within is None else of_light * within, of_light
+        return None if within is None else of_light * within, of_light, None
 
 
 def _decoded(display: Tensor) -> tuple[Tensor, Tensor]:
@@ -123,13 +125,14 @@ class Layers(NamedTuple):
     flares: dict[str, Tensor]
 
 
-def layers(scene: Tensor, flares: Mapping[str, Splats], blend: Blend) -> Layers:
-    """Layers from the scene's picture in display space and each light's splats, in the lights' order.
+def layers(scene: Tensor, flares: Mapping[str, Splats], blend: Blend, white: float = 1.0) -> Layers:
+    """Layers from the scene's picture in display space, clipped at `white`, and each light's splats, in the lights'
+    order.
 
     `over` is not a sum: a light's layer is what the picture gains in linear light when that light is put
     before those that follow it, so the layers add up to the whole exactly.
     """
-    display = scene.clamp(0, 1)
+    display = scene.clamp(0, white)
     scene_linear = decode(display)
     parts: dict[str, Tensor] = {}
     if blend == "add":

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import shutil
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -91,7 +92,8 @@ def _check_earlier(folder: Path, settings: Any, capture: Any) -> None:
 
     if (folder / CONFIG).exists():
         earlier = Run.open(folder)
-        if earlier.settings != settings or earlier.capture_folder != capture.folder.resolve():
+        asked = replace(earlier.settings, white=settings.white)  # which the fit has found by itself
+        if asked != settings or earlier.capture_folder != capture.folder.resolve():
             raise RunError(f"{folder} holds a fit with other settings or of another capture; remove it, or choose "
                            "another folder with --out.")
 

@@ -51,24 +51,28 @@ def flare(camera: Camera) -> NDArray[np.float32]:
     return picture.astype(np.float32)
 
 
-def flared_capture(folder: Path, count: int = 12, dots: int = 150) -> Path:
-    """A whole capture folder, with removed/, truth/ and lights.json."""
+def flared_capture(folder: Path, count: int = 12, dots: int = 150, *, float_gain: float | None = None) -> Path:
+    """A whole capture folder, with removed/, truth/ and lights.json. float_gain: of scene and flare, of which frames
+    and removed/ are EXR files then, and keep what is above white."""
     random = np.random.default_rng(0)
     xyz = random.uniform(-1.2, 1.2, (dots, 3)).astype(np.float32)
     rgb = random.uniform(0.1, 0.9, (dots, 3)).astype(np.float32)
-    scene = (torch.from_numpy(xyz), torch.tensor([1.0, 0, 0, 0]).repeat(dots, 1), torch.full((dots, 3), 0.16),
+    splats = (torch.from_numpy(xyz), torch.tensor([1.0, 0, 0, 0]).repeat(dots, 1), torch.full((dots, 3), 0.16),
              torch.full((dots,), 0.9), ((torch.from_numpy(rgb) - 0.5) / 0.28209479)[:, None])
     lines = []
     for number, camera in enumerate(cameras(count)):
-        name = f"{number:04d}.png"
+        name = f"{number:04d}.{'png' if float_gain is None else 'exr'}"
         view = torch.from_numpy(camera.world_to_camera).float(), torch.from_numpy(camera.intrinsics).float()
-        clean = rasterization(*scene, *view, WIDTH, HEIGHT, kernels="torch").colour.clamp(0, 1).numpy()
-        light = flare(camera)
-        write_png(folder / "removed" / name, clean)
-        write_png(folder / "images" / name, srgb_from_linear(linear_from_srgb(clean) + light))
-        for kind, picture in (("scene", linear_from_srgb(clean)), ("flare", light)):
-            write_exr(folder / "truth" / kind / f"{number:04d}.exr",
-                      {channel: picture[..., index] for index, channel in enumerate("RGB")})
+        clean = rasterization(*splats, *view, WIDTH, HEIGHT, kernels="torch").colour.clamp(0, 1).numpy()
+        gain = np.float32(1 if float_gain is None else float_gain)
+        scene_light, light = linear_from_srgb(clean) * gain, flare(camera) * gain
+        for kind, picture in (("removed", scene_light), ("images", scene_light + light)):
+            if float_gain is None:
+                write_png(folder / kind / name, srgb_from_linear(picture))
+            else:
+                _write_exr(folder / kind / name, picture)
+        for kind, picture in (("scene", scene_light), ("flare", light)):
+            _write_exr(folder / "truth" / kind / f"{number:04d}.exr", picture)
         w, x, y, z = _quaternion(camera.world_to_camera[:3, :3])
         place = " ".join(map(str, camera.world_to_camera[:3, 3]))
         lines.append(f"{number + 1} {w} {x} {y} {z} {place} 1 {name}\n\n")
@@ -79,6 +83,10 @@ def flared_capture(folder: Path, count: int = 12, dots: int = 150) -> Path:
         f"{i + 1} {p[0]} {p[1]} {p[2]} {' '.join(str(int(c * 255)) for c in rgb[i])} 0.5\n" for i, p in enumerate(xyz)))
     write_json(folder / "lights.json", {"lights": [{"name": "lamp", "xyz": LIGHT.tolist()}]})
     return folder
+
+
+def _write_exr(path: Path, light: NDArray[np.float32]) -> None:
+    write_exr(path, {channel: light[..., index] for index, channel in enumerate("RGB")})
 
 
 def _quaternion(rotation: NDArray[np.float64]) -> tuple[float, float, float, float]:

@@ -1,0 +1,83 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Decoded pictures, kept for as long as a fit looks at them: in memory as far as that goes, then on disk.
+
+To decode a frame of 4K and make it small takes far longer than an iteration of a fit at 960 pixels.
+"""
+from __future__ import annotations
+
+import math
+import shutil
+import tempfile
+from pathlib import Path
+from typing import BinaryIO, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+MEMORY = 1 << 29  # 80 frames of 960x540 with their flare-free pairs
+DISK_LEFT = 1 << 31
+"""Bytes that stay free on the disk."""
+
+Codes = NDArray[np.uint16]
+
+
+class _Place(NamedTuple):
+    offset: int
+    shape: tuple[int, ...]
+
+
+class PictureCache:
+    """Arrays of 16 bit by name. What fits neither memory nor disk is not kept, and `get` knows nothing of it."""
+
+    def __init__(self, memory: int = MEMORY) -> None:
+        self._left = memory
+        self._in_memory: dict[str, Codes] = {}
+        self._on_disk: dict[str, _Place] = {}
+        self._file: BinaryIO | None = None
+        self._folder: Path | None = None
+
+    def overflow_into(self, folder: Path) -> None:
+        """Keep what exceeds memory in a file in `folder`, which nobody sees and which goes with this process, however
+        that ends."""
+        try:
+            # The name in `folder` is gone at once where the system allows that; Windows takes it at the end.
+            self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115 - open for as long as the fit runs
+        except OSError:
+            return  # then they are decoded again
+        self._folder = folder
+
+    def get(self, name: str) -> Codes | None:
+        """What was put under a name, if it is there."""
+        place = self._on_disk.get(name)
+        if place is None or self._file is None:
+            return self._in_memory.get(name)
+        try:
+            self._file.seek(place.offset)
+            data = self._file.read(2 * math.prod(place.shape))
+            return np.frombuffer(data, np.uint16).reshape(place.shape)
+        except (OSError, ValueError):  # a disk that went away
+            self._close()
+            return None
+
+    def put(self, name: str, codes: Codes) -> None:
+        """Keep an array."""
+        if codes.nbytes <= self._left:
+            self._left -= codes.nbytes
+            self._in_memory[name] = codes
+        elif self._file is not None and self._folder is not None:
+            try:
+                if shutil.disk_usage(self._folder).free - codes.nbytes < DISK_LEFT:
+                    return
+                offset = self._file.seek(0, 2)
+                self._file.write(codes.tobytes())
+                self._file.flush()
+            except OSError:
+                self._close()
+                return
+            self._on_disk[name] = _Place(offset, codes.shape)
+
+    def _close(self) -> None:
+        file, self._file = self._file, None
+        self._on_disk.clear()
+        if file is not None:
+            file.close()

@@ -1,0 +1,86 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Pictures of a fit are decoded once, whether they fit memory or not, and nothing goes wrong with a disk that does."""
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from core.capture import Capture, View
+from core.fit.cache import DISK_LEFT, PictureCache
+from core.fit.frames import Frames
+from core.pictures import Picture
+from tests.core.captures import make_capture
+
+
+def codes(seed: int) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, 65536, (6, 5, 3), np.uint16)
+
+
+ROOM = 2 * codes(0).nbytes
+
+
+def test_what_exceeds_memory_lies_on_disk(tmp_path: Path) -> None:
+    cache = PictureCache(ROOM)
+    cache.overflow_into(tmp_path)
+    for number in range(5):
+        cache.put(f"{number}", codes(number))
+    for number in (4, 0, 3, 1, 2):
+        np.testing.assert_array_equal(cache.get(f"{number}"), codes(number))
+    assert cache.get("5") is None
+    assert not list(tmp_path.iterdir()), "nobody sees the file"
+
+
+def test_without_a_folder_the_rest_is_not_kept() -> None:
+    cache = PictureCache(ROOM)
+    for number in range(3):
+        cache.put(f"{number}", codes(number))
+    assert [cache.get(f"{number}") is None for number in range(3)] == [False, False, True]
+
+
+def test_room_is_left_on_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    free = DISK_LEFT + codes(0).nbytes
+    monkeypatch.setattr(shutil, "disk_usage", lambda _path: SimpleNamespace(free=free))
+    cache = PictureCache(0)
+    cache.overflow_into(tmp_path)
+    cache.put("fits", codes(0))
+    free -= 1
+    cache.put("does not", codes(1))
+    np.testing.assert_array_equal(cache.get("fits"), codes(0))
+    assert cache.get("does not") is None
+
+
+def test_a_disk_that_fails_costs_time_and_no_fit(tmp_path: Path) -> None:
+    cache = PictureCache(0)
+    cache.overflow_into(tmp_path / "none")
+    cache.put("a", codes(0))
+    assert cache.get("a") is None
+    cache.overflow_into(tmp_path)
+    cache.put("a", codes(0))
+    assert cache._file is not None
+    cache._file.truncate(10)
+    assert cache.get("a") is None, "cut short"
+    cache.put("b", codes(1))
+    assert cache.get("b") is None, "and it is not asked again"
+
+
+def test_a_frame_is_decoded_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    capture = Capture.open(make_capture(tmp_path / "c"))
+    decode, asked = capture.frame, []
+
+    def counted(view: View, size: tuple[int, int] | None = None) -> Picture:
+        asked.append(view.name)
+        return decode(view, size)
+
+    monkeypatch.setattr(capture, "frame", counted)
+    for memory in (0, 1 << 20):
+        frames = Frames(capture, memory=memory)
+        frames.cache.overflow_into(tmp_path)
+        first, second = ([frames.frame(view) for view in capture.views] for _ in range(2))
+        assert all(map(torch.equal, first, second))
+        assert asked == [view.name for view in capture.views]
+        asked.clear()

@@ -1,0 +1,224 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Float frames are fitted with the light that they hold above white; others as they are, clipped there."""
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from core.bake.shot import ShotRenderer
+from core.capture import Capture, View
+from core.errors import SettingsError
+from core.fit import FitSettings, Run, fit, preset
+from core.fit.beginning import WHITEST, white_of
+from core.fit.frames import Frames, Targets
+from core.fit.run import FLARE
+from core.fit.settings import changed
+from core.fit.sky import with_sky
+from core.fit.trainer import Trainer
+from core.flare.compositing import composite, decode, encode, layers
+from core.gaussians import Splats
+from core.look.shot import Shot, ShotFrame
+from core.pictures import Encoding, Picture, srgb_from_linear, write_png
+from core.progress import Progress
+from tests.core.flared import flared_capture
+
+GAIN = 8.0  # the brightest of the flare is 3.6 then
+
+
+class Heard(Progress):
+    """What was said."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.texts: list[str] = []
+
+    def say(self, text: str) -> None:
+        self.texts.append(text)
+
+
+@pytest.fixture(scope="module")
+def bright(tmp_path_factory: pytest.TempPathFactory) -> Capture:
+    return Capture.open(flared_capture(tmp_path_factory.mktemp("bright"), float_gain=GAIN))
+
+
+def quick(iterations: int = 400) -> FitSettings:
+    return changed(preset("draft", iterations=iterations), {
+        "flare.count": 60, "flare.occlusion": False, "holdout": 4, "flare.density.every": 50, "seed": 1})
+
+
+def lit(brightest: float, encoding: Encoding, size: tuple[int, int] = (64, 40)) -> Picture:
+    pixels = np.full((size[1], size[0], 3), 0.25, np.float32)
+    pixels[3, 4] = brightest
+    return Picture(pixels, encoding)
+
+
+@pytest.mark.parametrize(("frame", "clean", "white", "said"), [
+    (lit(4.0, "linear"), lit(1.0, "linear"), WHITEST, "up to 64"),
+    (lit(1.0, "linear"), lit(1.0, "linear"), 1.0, ""),
+    (lit(1.0, "srgb"), lit(1.0, "srgb"), 1.0, ""),
+    (lit(4.0, "linear"), lit(1.0, "srgb"), 1.0, "fitted as white"),
+])
+def test_white_is_where_the_frames_end(frame: Picture, clean: Picture, white: float, said: str, tmp_path: Path,
+                                       monkeypatch: pytest.MonkeyPatch) -> None:
+    capture = Capture.open(flared_capture(tmp_path / "c", 5))
+    monkeypatch.setattr(capture, "frame", lambda _view, _size=None: frame)
+    monkeypatch.setattr(capture, "removed", lambda _view, _size=None: clean)
+    found, says = white_of(capture, quick())
+    assert found == white
+    assert said in says and bool(said) == bool(says)
+
+
+def test_frames_keep_what_is_above_white(bright: Capture) -> None:
+    view = bright.views[3]
+    light = bright.frame(view).pixels
+    assert light.max() > 3
+    shown = Frames(bright, white=float(srgb_from_linear(np.array(WHITEST)))).frame(view).numpy()
+    np.testing.assert_allclose(shown, srgb_from_linear(light), atol=1e-4)
+    np.testing.assert_allclose(Frames(bright).frame(view).numpy(), srgb_from_linear(light).clip(0, 1), atol=1e-5)
+    picture = Picture(np.full((1, 1, 3), 1e4, np.float32), "linear")
+    assert picture.display(5.0).max() == 5.0
+
+
+def test_light_that_adds_is_clipped_at_white() -> None:
+    scene = torch.full((1, 1, 3), 0.5, requires_grad=True)
+    light = torch.full((1, 1, 3), 2.0, requires_grad=True)
+    flare = Splats(light, torch.ones(1, 1))
+    expected = encode(decode(torch.tensor(0.5)) + 2)
+    assert composite(scene, flare, "add").detach().max() == 1
+    picture = composite(scene, flare, "add", 6.0)
+    torch.testing.assert_close(picture, expected.expand(1, 1, 3))
+    picture.sum().backward()
+    numeric = (encode(decode(torch.tensor(0.5)) + 2.001) - encode(decode(torch.tensor(0.5)) + 1.999)) / 0.002
+    torch.testing.assert_close(light.grad, numeric.expand(1, 1, 3), rtol=1e-3, atol=0)
+
+
+def test_layers_of_a_scene_above_white_keep_it() -> None:
+    scene = encode(torch.tensor([0.5, 3.0, 100.0])).expand(1, 1, 3)
+    white = float(encode(torch.tensor(WHITEST)))
+    for blend in ("add", "over"):
+        parts = layers(scene, {}, blend, white)
+        torch.testing.assert_close(parts.scene[0, 0], torch.tensor([0.5, 3.0, WHITEST]))
+        assert float(layers(scene, {}, blend).scene.max()) == pytest.approx(1)
+
+
+def light_s_pixel(targets: Targets, capture: Capture) -> tuple[int, int]:
+    (x, y), = targets.camera.project(capture.lights[0].xyz)[0].astype(int)
+    return int(y), int(x)
+
+
+def test_above_white_a_light_s_disc_is_the_scene_s_where_the_frames_tell_so(bright: Capture) -> None:
+    trainer = Trainer(bright, replace(quick(), white=WHITEST))
+    targets = trainer.frames.targets(trainer.views[0])
+    assert targets.removed is not None
+    at = light_s_pixel(targets, bright)
+    picture = torch.full_like(targets.frame, 0.5)
+    told = targets._replace(removed=targets.removed.clone(), frame=targets.frame.clone())
+    assert told.removed is not None
+    told.removed[at], told.frame[at] = 2.0, 2.4
+    sources = trainer._sources(told)
+    assert sources is not None and not sources.any(), "the flare is what the frame has more"
+    assert torch.equal(trainer._target(told, picture, sources), told.frame)
+    told.frame[at] = 2.0
+    sources = trainer._sources(told)
+    assert sources is not None and sources[at] and sources.sum() == 1
+    assert not trainer._behind_flare(told, torch.ones_like(picture), sources)[at].any()
+    for drawn, wanted in ((0.5, 1.0), (3.0, 3.0)):  # at least white, and as bright as what is round it makes it
+        target = trainer._target(told, torch.full_like(picture, drawn), sources)
+        assert (target[at] == wanted).all()
+        target[at] = told.frame[at]
+        assert torch.equal(target, told.frame)
+
+
+def test_behind_a_flare_what_is_above_white_is_the_clean_frame_s_to_the_end(bright: Capture) -> None:
+    trainer = Trainer(bright, replace(quick(), white=WHITEST))
+    targets = trainer.frames.targets(trainer.views[0])
+    assert targets.removed is not None
+    scene, hot = torch.full_like(targets.frame, 0.25), targets.removed > 1
+    assert hot.any() and not hot.all()
+    trainer.iteration = trainer.settings.iterations
+    behind = trainer._behind_flare(targets, scene, None)
+    assert torch.equal(behind[hot], targets.removed[hot])
+    assert (behind[~hot] == 0.25).all()
+
+
+def test_colours_of_bright_scenes_have_a_longer_way(bright: Capture) -> None:
+    rates = [trainer.scene_adam.rates["sh"] for trainer in
+             (Trainer(bright, replace(quick(), white=white)) for white in (None, 1.0, WHITEST))]
+    assert all(isinstance(rate, torch.Tensor) for rate in rates)
+    plain, clipped, far = (torch.as_tensor(rate) for rate in rates)
+    assert torch.equal(plain, clipped) and (far[0] > 2 * plain[0]).all() and torch.equal(far[1:], plain[1:])
+
+
+def truth(capture: Capture, view: View) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    scene, flare = capture.truth_scene(view), capture.truth_flare(view)
+    assert scene is not None and flare is not None
+    return scene.linear(), flare.linear()
+
+
+def test_a_flare_above_white_is_fitted_as_bright_as_it_is(bright: Capture, tmp_path: Path) -> None:
+    heard = Heard()
+    run = fit(bright, quick(), tmp_path / "run", heard)
+    assert any("up to 64" in text for text in heard.texts)
+    assert Run.open(run.folder).settings.white == WHITEST
+    clipped = fit(bright, replace(quick(), white=1.0), tmp_path / "clipped")
+    _, views = bright.split(4)
+    ratios, errors = [], {"run": [], "clipped": []}
+    for view in views:
+        scene, flare = truth(bright, view)
+        hot = flare.max(-1) > 1
+        for one, name in ((run, "run"), (clipped, "clipped")):
+            layer = sum(one.render(view.camera).flare_by_light.values())
+            errors[name].append(np.square(layer - flare)[hot].mean())
+            if one is run:
+                ratios.append(layer[hot].sum() / flare[hot].sum())
+    assert 0.85 < np.mean(ratios) < 1.15
+    assert np.mean(errors["run"]) < 0.6 * np.mean(errors["clipped"])
+    view = max(views, key=lambda one: float(truth(bright, one)[0].max()))
+    scene = truth(bright, view)[0]
+    found = run.render(view.camera).scene
+    assert scene.max() > 2 and found.max() > 0.7 * scene.max()
+    assert clipped.render(view.camera).scene.max() == pytest.approx(1)
+    shot = ShotRenderer(Shot(run.folder / FLARE, (ShotFrame(1, "a", view.camera, ()),), run=run.folder))
+    np.testing.assert_allclose(shot.render(shot.shot.frames[0], view.camera).scene, found, atol=1e-4)
+
+
+def test_a_run_of_an_earlier_version_is_shown_as_it_was_fitted(bright: Capture, tmp_path: Path) -> None:
+    run = fit(bright, replace(quick(12), white=1.0), tmp_path / "run")
+    config = run.folder / "config.toml"
+    text = config.read_text(encoding="utf-8")
+    assert "white = 1.0" in text
+    config.write_text(text.replace("white = 1.0\n", ""), encoding="utf-8")
+    again = Run.open(run.folder)
+    assert again.settings.white is None and again.settings.display_white == 1
+    camera = bright.views[0].camera
+    np.testing.assert_array_equal(again.render(camera).scene, run.render(camera).scene)
+
+
+def test_a_sky_above_white_is_white_at_first(bright: Capture) -> None:
+    found, plain = (with_sky(bright, bright.views, Frames(bright, white=white)).rgb[len(bright.points):].astype(int)
+                    for white in (float(srgb_from_linear(np.array(WHITEST))), 1.0))
+    assert (found >= plain).all(), "it is drawn up, and no colour begins anew from black"
+    assert found.max() == 255
+
+
+@pytest.mark.parametrize("white", [0.5, 0.0, -1.0, 1e6])
+def test_a_white_that_is_none_is_refused(white: float) -> None:
+    with pytest.raises(SettingsError, match="white must lie"):
+        replace(quick(), white=white).checked()
+
+
+def test_clean_frames_that_end_at_white_are_told(tmp_path: Path) -> None:
+    folder = flared_capture(tmp_path / "c", 5, float_gain=GAIN)
+    shutil.rmtree(folder / "truth")
+    for path in sorted((folder / "removed").glob("*.exr")):
+        write_png(path.with_suffix(".png"), np.full((40, 64, 3), 0.5))
+        path.unlink()
+    heard = Heard()
+    fit(Capture.open(folder), quick(2), tmp_path / "run", heard)
+    assert any("EXR files in removed/" in text for text in heard.texts)

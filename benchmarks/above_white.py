@@ -23,6 +23,7 @@ from benchmarks import report
 from core.capture import Capture, View
 from core.errors import CaptureError
 from core.fit import Run, fit, preset
+from core.fit.beginning import WHITEST
 from core.metrics.pictures import relative_l2
 from core.pictures import Picture
 
@@ -72,7 +73,7 @@ def main() -> None:
     for folder in words.captures:
         capture = FloatFrames.open(folder)
         for mode in words.modes:
-            for name, white in (("clipped", 1.0), ("as they are", None)):
+            for name, white in (("clipped", 1.0), ("as they are", WHITEST)):
                 with tempfile.TemporaryDirectory() as place:
                     settings = replace(preset(words.preset, mode=mode), white=white)
                     found = scores(fit(capture, settings, Path(place) / "run"), capture)

@@ -128,6 +128,13 @@ def read_picture(path: Path | str) -> Picture:
     return Picture(pixels, "linear")  # a float TIFF
 
 
+def holds_floats(path: Path) -> bool:
+    """Whether a picture is scene-linear, and may hold light above white. Raises FrameError for a TIFF that is damaged:
+    only its pixels tell."""
+    suffix = path.suffix.lower()
+    return suffix == ".exr" or (suffix in {".tif", ".tiff"} and stored_pixels(path).dtype.kind == "f")
+
+
 def stored_pixels(path: Path) -> NDArray[Any]:
     """What a PNG, JPEG or TIFF holds, turned and multiplied with nothing: (height, width) or with the channels B G R
     and alpha behind. Raises FrameError where it is missing or damaged."""

@@ -123,6 +123,10 @@ class Capture:
         """The frame without its flare, from removed/; None where there is none."""
         return self._sibling(self._removed, view, size)
 
+    def removed_path(self, view: View) -> Path:
+        """The file of the view in removed/, where `has_removed`."""
+        return self._removed[view.name]
+
     def truth_scene(self, view: View, size: tuple[int, int] | None = None) -> Picture | None:
         """The exact scene layer, where it is known."""
         return self._sibling(self._truth_scene, view, size)

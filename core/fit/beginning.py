@@ -2,7 +2,6 @@
 """What a fit begins with: a scene, and a flare for each light, which is put in its place first."""
 from __future__ import annotations
 
-import itertools
 import math
 
 import numpy as np
@@ -15,7 +14,7 @@ from ..flare.model import FlareModel, LightFlare, ViewOfLight
 from ..gaussians.ply import read_ply
 from ..gaussians.scene import SceneGaussians
 from ..lights.snap import Sight, sight, snapped
-from ..pictures import Picture
+from ..pictures import Picture, holds_floats
 from .frames import Frames
 from .settings import FitSettings
 from .sky import with_sky
@@ -26,8 +25,6 @@ that is less than usual: worlds of small units, metres about a watch, are fitted
 NEAREST_POINTS = 10_000  # that are looked at
 SNAP_WIDTH, SNAP_VIEWS = 160, 40
 """Pixels of the pictures that lights are placed by, and about how many of them."""
-WHITE_VIEWS = 10
-"""About how many frames are looked at for light above white."""
 WHITEST = 64.0
 """Scene-linear light at which frames that hold light above white are clipped: six stops above it, as far as cameras
 reach; a fit that is shown a rendered sun is not drawn to it alone."""
@@ -37,6 +34,7 @@ def first_scene(capture: Capture, settings: FitSettings, views: tuple[View, ...]
     """The scene a fit begins with: one that was trained elsewhere, or a Gaussian at each point."""
     scene = _scene(capture, settings, views, frames)
     scene.near = min(scene.near, NEAREST_PART * nearest_depth(capture))
+    scene.white = settings.display_white
     return scene
 
 
@@ -109,17 +107,22 @@ def _sights(views: tuple[View, ...], frames: Frames) -> list[Sight]:
 
 def white_of(capture: Capture, settings: FitSettings) -> tuple[float, str]:
     """Scene-linear light at which the frames of a fit are clipped, and a sentence about it, empty where nothing is to
-    be said: 1, the white of their format, or more where float frames, and those without flare, hold more."""
+    be said: 1, the white of most formats, or more where all are float files and some frame holds more."""
     views, _ = capture.split(settings.holdout)
-    some = (capture.frame(view) for view in views[:: max(len(views) // WHITE_VIEWS, 1)])
-    floats = itertools.takewhile(lambda frame: frame.encoding == "linear", some)
-    if not any(frame.pixels.max() > 1 for frame in floats):
+    if not any(_is_above_white(capture, view) for view in views):
         return 1.0, ""
-    clean = capture.removed(views[0]) if capture.has_removed else None
-    if clean is not None and clean.encoding == "srgb":
-        return 1.0, ("The frames hold light above white (1.0), and those in removed/ cannot: it is fitted as white, "
-                     "and flares that are brighter come out wrong; EXR files in removed/ would keep it.")
+    files = [capture.frame_path(view) for view in views]
+    if capture.has_removed and settings.supervised:
+        files += [capture.removed_path(view) for view in views]
+    clipped = next((path for path in files if not holds_floats(path)), None)
+    if clipped is not None:
+        return 1.0, (f"The frames hold light above white (1.0), and {clipped} cannot: it is fitted as white, and "
+                     "flares that are brighter come out wrong; EXR files for all would keep it.")
     return WHITEST, f"The frames hold light above white (1.0); it is fitted up to {WHITEST:g}."
+
+
+def _is_above_white(capture: Capture, view: View) -> bool:
+    return holds_floats(capture.frame_path(view)) and bool(capture.frame(view).pixels.max() > 1)
 
 
 def moved_lights(capture: Capture, flare: FlareModel) -> tuple[str, ...]:

@@ -5,16 +5,18 @@ To decode a frame of 4K and make it small takes far longer than an iteration of 
 """
 from __future__ import annotations
 
+import contextlib
 import math
 import shutil
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-MEMORY = 1 << 29  # 80 frames of 960x540 with their flare-free pairs
+MEMORY = 1 << 29  # 86 frames of 960x540 with their flare-free pairs
 DISK_LEFT = 1 << 31
 """Bytes that stay free on the disk."""
 
@@ -36,15 +38,18 @@ class PictureCache:
         self._file: BinaryIO | None = None
         self._folder: Path | None = None
 
-    def overflow_into(self, folder: Path) -> None:
-        """Keep what exceeds memory in a file in `folder`, which nobody sees and which goes with this process, however
-        that ends."""
+    @contextlib.contextmanager
+    def overflowing_into(self, folder: Path) -> Iterator[None]:
+        """Within it, keep what exceeds memory in a file in `folder`, which is gone afterwards, however this process
+        ends; but for Windows it has no name even before."""
+        # Without a file, as without room in it, pictures are decoded again.
+        with contextlib.suppress(OSError):
+            self._file = tempfile.TemporaryFile(dir=folder, buffering=0)  # noqa: SIM115 - closed below
+            self._folder = folder
         try:
-            # The name in `folder` is gone at once where the system allows that; Windows takes it at the end.
-            self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115 - open for as long as the fit runs
-        except OSError:
-            return  # then they are decoded again
-        self._folder = folder
+            yield
+        finally:
+            self._close()
 
     def get(self, name: str) -> Codes | None:
         """What was put under a name, if it is there."""
@@ -69,8 +74,8 @@ class PictureCache:
                 if shutil.disk_usage(self._folder).free - codes.nbytes < DISK_LEFT:
                     return
                 offset = self._file.seek(0, 2)
-                self._file.write(codes.tobytes())
-                self._file.flush()
+                if self._file.write(codes.tobytes()) < codes.nbytes:
+                    return  # the disk, or what one may have of it, is full
             except OSError:
                 self._close()
                 return
@@ -80,4 +85,5 @@ class PictureCache:
         file, self._file = self._file, None
         self._on_disk.clear()
         if file is not None:
-            file.close()
+            with contextlib.suppress(OSError):
+                file.close()

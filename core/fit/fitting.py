@@ -55,7 +55,6 @@ def fit(capture: Capture, settings: FitSettings, folder: Path | str, progress: P
             settings, says = replace(settings, white=white), [of_white] if of_white else []
         trainer = Trainer(capture, settings)  # before anything is written: it may refuse the capture
         run = Run.create(folder, settings, capture.folder)
-    trainer.frames.cache.overflow_into(folder)
     path = folder / CHECKPOINT
     if continued and path.exists():
         trainer.load_state(checkpoint.load(path))
@@ -66,13 +65,14 @@ def fit(capture: Capture, settings: FitSettings, folder: Path | str, progress: P
     _forget_after(folder / METRICS, trainer.iteration)
     _log(run, f"begun at iteration {trainer.iteration} of {run.settings.iterations}")
     progress.stage("fit", run.settings.iterations, trainer.iteration)
-    try:
-        _train(trainer, run, progress)
-    except Cancelled:
-        checkpoint.save(path, trainer.state())
-        _log(run, f"stopped at iteration {trainer.iteration}")
-        raise
-    _finish(trainer, run)
+    with trainer.frames.cache.overflowing_into(folder):
+        try:
+            _train(trainer, run, progress)
+        except Cancelled:
+            checkpoint.save(path, trainer.state())
+            _log(run, f"stopped at iteration {trainer.iteration}")
+            raise
+        _finish(trainer, run)
     _log(run, f"finished at iteration {trainer.iteration}")
     return run
 
@@ -133,7 +133,7 @@ def _preview(trainer: Trainer, run: Run) -> None:
     for index in spread(len(views), PREVIEW_ROWS):
         camera = trainer.frames.camera(views[index])
         view = render(trainer.scene, trainer.flare, run.settings.blend, camera, run.settings.kernels,
-                      white=run.settings.display_white, visibility=run.settings.flare.occluded_by_scene)
+                      visibility=run.settings.flare.occluded_by_scene)
         rows.append(row(trainer.frames.frame(views[index]), view))
     write_preview(run.folder / PREVIEW, rows)
     if rows:

@@ -60,10 +60,9 @@ def _shares(flare: FlareModel, pose: Tensor, scene: SceneGaussians | None, visib
 
 @torch.no_grad()
 def render(scene: SceneGaussians, flare: FlareModel | None, blend: Blend, camera: Camera,
-           kernels: Kernels = "auto", *, white: float = 1.0, visibility: VisibilitySettings | None = None,
+           kernels: Kernels = "auto", *, visibility: VisibilitySettings | None = None,
            look: Look | None = None, edits: LookEdits | None = None) -> RenderedView:
-    """Everything a view has to give, without gradients. white: display value at which the scene is clipped.
-    edits: changes of the flare, of which `look` is the reader."""
+    """Everything a view has to give, without gradients. edits: changes of the flare, of which `look` is the reader."""
     rendering = scene.render(camera, kernels=kernels)
     flares: dict[str, Splats] = {}
     if flare is not None:
@@ -72,7 +71,7 @@ def render(scene: SceneGaussians, flare: FlareModel | None, blend: Blend, camera
         gaussians = flare(pose, shares) if look is None or edits is None else _edited(look, edits, camera, shares)
         flares = {name: splat_flare(one, intrinsics, camera.width, camera.height, blend, kernels=kernels)
                   for name, one in gaussians.items()}
-    parts = layers(rendering.colour, flares, blend, white)
+    parts = layers(rendering.colour, flares, blend, scene.white)
     return RenderedView(rendering, flares, encode(parts.composite.clamp_min(0)).clamp(0, 1), parts)
 
 

@@ -145,7 +145,7 @@ class Run:
         """Scene, flares and composite as tensors."""
         model = self.flare.model if self.flare else None
         return render(self.scene, model, self.settings.blend, camera, self.settings.kernels,
-                      white=self.settings.display_white, visibility=self.settings.flare.occluded_by_scene,
+                      visibility=self.settings.flare.occluded_by_scene,
                       look=None if edits is None else self.look, edits=edits)
 
     def render(self, camera: Camera, edits: LookEdits | None = None) -> ViewLayers:

@@ -171,6 +171,11 @@ class FitSettings:
     split: SplitSettings = field(default_factory=SplitSettings)
 
     @property
+    def supervised(self) -> bool:
+        """Whether the scene is taught by flare-free frames."""
+        return self.mode in ("default", "2d")
+
+    @property
     def display_white(self) -> float:
         """`white` as a display value; 1 where it is not known."""
         return 1.0 if self.white is None else float(srgb_from_linear(np.array(self.white)))

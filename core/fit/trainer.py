@@ -61,7 +61,7 @@ class Trainer:
         self.views, _ = capture.split(settings.holdout)
         self.iteration = 0
         self.scene_is_fitted = not settings.scene.frozen
-        if self._supervised and not self.frames.reference and self.scene_is_fitted:
+        if self.settings.supervised and not self.frames.reference and self.scene_is_fitted:
             raise CaptureError(f"{capture.folder} has no flare-free frames (removed/); run remove on it first, "
                                "or fit with --mode unsup.")
         self.scene = first_scene(capture, settings, self.views, self.frames)
@@ -178,17 +178,12 @@ class Trainer:
         eye = torch.from_numpy(targets.camera.position)
         return uncovering(self.scene, eye, shown, visibility, self.settings.kernels)
 
-    @property
-    def _supervised(self) -> bool:
-        """Whether the scene is taught by flare-free frames."""
-        return self.settings.mode in ("default", "2d")
-
     def _scene_alone(self, targets: Targets) -> bool:
         """Whether the scene is fitted alone as yet, so that it hides lights by the time their flares are fitted."""
         if self.settings.mode == "split":
             return self.iteration <= self._head_start.until
         begun = self.iteration > self.settings.flare.begin * self.settings.iterations
-        return self._supervised and self.scene_is_fitted and targets.removed is not None and not begun
+        return self.settings.supervised and self.scene_is_fitted and targets.removed is not None and not begun
 
     def _behind_flare(self, targets: Targets, scene: Tensor, sources: Tensor | None) -> Tensor:
         """What the flare is put before: the flare-free frame while both are fitted apart, then the scene.
@@ -198,7 +193,7 @@ class Trainer:
         but not above white, where its errors are larger than a flare to the end.
         """
         behind = scene
-        if self._supervised and targets.removed is not None and self.settings.apart:
+        if self.settings.supervised and targets.removed is not None and self.settings.apart:
             apart = self.iteration <= self.settings.apart * self.settings.iterations
             behind = targets.removed if apart else torch.where(targets.removed > 1, targets.removed, scene)
         return behind if sources is None else behind.masked_fill(sources[..., None], 0)
@@ -209,8 +204,9 @@ class Trainer:
         Frame and flare-free frame are white there, so nothing would tell how bright the flare is in its middle, and
         over another shot a hole would show. Black behind it, it has to be white by itself. Above white they may tell.
         """
-        clean = targets.frame if self.settings.mode == "split" else targets.removed if self._supervised else None
-        if self.settings.blend != "add" or self.flare is None or clean is None:
+        settings = self.settings
+        clean = targets.frame if settings.mode == "split" else targets.removed if settings.supervised else None
+        if settings.blend != "add" or self.flare is None or clean is None:
             return None
         discs = torch.from_numpy(clipped_discs(clean.numpy(), targets.camera, self.flare.positions.numpy()))
         return discs if self.frames.white == 1 else discs & (targets.frame - clean < UNTOLD).all(-1)
@@ -223,7 +219,7 @@ class Trainer:
         return torch.where(sources[..., None], picture.clamp_min(1), targets.frame)
 
     def _scene_target(self, targets: Targets, picture: Tensor, scene: Tensor) -> Tensor | None:
-        if self._supervised:
+        if self.settings.supervised:
             return targets.removed
         if self.settings.mode == "in-flare":
             # Input minus the flare as reconstructed so far: the composite's gain over the scene.

@@ -24,6 +24,8 @@ from .scene import COEFFICIENTS, SceneGaussians
 
 HEADER_MAX = 1 << 16
 _NEAR = "near"  # a comment of ours: camera depth at which Gaussians are culled
+_WHITE = "white"  # likewise: display value at which pictures of the scene are clipped
+_WHITE_MOST = 107.0  # of the brightest half float
 ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
 TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2",
@@ -64,6 +66,8 @@ def write_ply(path: Path | str, scene: SceneGaussians, *, extra: Mapping[str, ND
     )
     if scene.near != NEAR:
         comments = [*comments, f"{_NEAR} {scene.near:.9g}"]
+    if scene.white != 1:
+        comments = [*comments, f"{_WHITE} {scene.white:.9g}"]
     lines = ["ply", "format binary_little_endian 1.0", *(f"comment {line}" for line in comments),
              f"element vertex {n}"]
     lines += [f"property float {name}" for name in names] + ["end_header"]
@@ -82,7 +86,7 @@ def read_ply(path: Path | str) -> SceneGaussians:
         if is_compressed(path):
             return read_compressed(path)
         with open(path, "rb") as file:
-            order, n, layout, start, near = _header(path, file.read(HEADER_MAX))
+            order, n, layout, start, near, white = _header(path, file.read(HEADER_MAX))
             kind = np.dtype([(name, order + code) for name, code in layout])
             if path.stat().st_size - start < n * kind.itemsize:
                 raise FlareFileError(f"{path} is cut short: it announces {n} Gaussians; copy it again.")
@@ -116,19 +120,19 @@ def read_ply(path: Path | str) -> SceneGaussians:
     scene = SceneGaussians(
         columns(POSITION), columns(SCALE), columns(ROTATION), columns(("opacity",))[:, 0].clone(), sh
     )
-    scene.near = near
+    scene.near, scene.white = near, white
     return scene
 
 
-def _header(path: Path, head: bytes) -> tuple[str, int, list[tuple[str, str]], int, float]:
-    """Byte order, number of vertices, their properties with types, where the data starts, and the near depth."""
+def _header(path: Path, head: bytes) -> tuple[str, int, list[tuple[str, str]], int, float, float]:
+    """Byte order, number of vertices, their properties with types, where the data starts, near depth and white."""
     end = head.find(b"\nend_header")
     start = head.find(b"\n", end + 1) + 1
     if not head.startswith(b"ply") or end < 0 or not start:
         raise FlareFileError(f"{path} is not a PLY file.")
     order, count, element = "", -1, ""
     layout: list[tuple[str, str]] = []
-    near = NEAR
+    near, white = NEAR, 1.0
     for line in head[:end].decode("ascii", "replace").splitlines()[1:]:
         match line.split():
             case ["format", form, _]:
@@ -138,6 +142,9 @@ def _header(path: Path, head: bytes) -> tuple[str, int, list[tuple[str, str]], i
             case ["comment", word, number] if word == _NEAR:
                 with contextlib.suppress(ValueError):
                     near = float(number) if 0 < float(number) < NEAR else NEAR
+            case ["comment", word, number] if word == _WHITE:
+                with contextlib.suppress(ValueError):
+                    white = float(number) if 1 < float(number) < _WHITE_MOST else 1.0
             case ["element", name, number]:
                 if count < 0 and (name != "vertex" or not (number.isascii() and number.isdigit())):
                     raise FlareFileError(f"{path} does not begin with its vertices; export it again.")
@@ -149,4 +156,4 @@ def _header(path: Path, head: bytes) -> tuple[str, int, list[tuple[str, str]], i
                 layout.append((words[1], TYPES[words[0]]))
     if not order or not layout or len({name for name, _ in layout}) < len(layout):
         raise FlareFileError(f"{path} is not a PLY file of Gaussians.")
-    return order, count, layout, start, near
+    return order, count, layout, start, near, white

@@ -44,6 +44,7 @@ class SceneGaussians(nn.Module):
         self.opacity_logits = nn.Parameter(opacity_logits)
         self.sh = nn.Parameter(sh)
         self.near = NEAR
+        self.white = 1.0
         """Camera depth at which Gaussians are culled, world units: less in a world of small units."""
 
     @classmethod

@@ -3,7 +3,8 @@
 
 What a fit knows of a flare it knows from all views together, which is more than any single plate says. Its flare is
 taken from a plate in linear light. Where the plate is clipped, nothing is left of what lay under the flare: there the
-fitted scene stands in, as far as it is brighter. The lights' own clipped discs stay as they are.
+fitted scene stands in, as far as it is brighter. The lights' own clipped discs stay as they are; where the fit was
+shown light above white the scene stands in there too, so that a lamp keeps the light that is its own.
 """
 from __future__ import annotations
 
@@ -30,10 +31,10 @@ Pixels = NDArray[np.float32]
 
 def remove_fitted(fitted: Renderer, capture: Capture, views: Sequence[View], folder: Path, progress: Progress, *,
                   flare_folder: Path | None = None, overwrite: bool = False,
-                  made_by: Path | None = None) -> dict[str, Any]:
+                  made_by: Path | None = None, above_white: bool = False) -> dict[str, Any]:
     """Write the views' frames without the fitted flare below `folder`, each under its own name, in its own kind and
     depth; those that are there and newer than the frame and `made_by`, the fit's file, their flares too where those are
-    wanted, are kept, unless `overwrite`.
+    wanted, are kept, unless `overwrite`. above_white: whether the fit was shown light above white.
 
     Raises CaptureError for frames with lens distortion, which the flare was not fitted with, SettingsError where frames
     would be overwritten, FrameError for a frame that cannot be read.
@@ -47,7 +48,7 @@ def remove_fitted(fitted: Renderer, capture: Capture, views: Sequence[View], fol
     made = 0
     for view, targets in zip(views, results, strict=True):
         if overwrite or not are_newer(targets, [capture.frame_path(view), *([made_by] if made_by else [])]):
-            _remove(fitted, capture, view, targets)
+            _remove(fitted, capture, view, targets, above_white)
             made += 1
         progress.advance()
     if made < len(views):
@@ -64,7 +65,7 @@ def _results(view: View, folder: Path, flare_folder: Path | None) -> list[Path]:
     return [plate, inside(flare_folder, str(Path(view.name).with_suffix(".exr")), CaptureError)]
 
 
-def _remove(fitted: Renderer, capture: Capture, view: View, results: Sequence[Path]) -> None:
+def _remove(fitted: Renderer, capture: Capture, view: View, results: Sequence[Path], above_white: bool) -> None:
     """results: the clean plate's path, and the flare's where it is wanted."""
     for result in results:
         remove_partial_of(result)  # of a task that was killed
@@ -77,7 +78,10 @@ def _remove(fitted: Renderer, capture: Capture, view: View, results: Sequence[Pa
     if plate.encoding == "linear":  # the fit was shown Rec. 709
         flare, scene = plate.space.from_linear(flare), plate.space.from_linear(scene)
     lights = clipped_discs(_display(plate), camera, [light.xyz for light in capture.lights])
-    write_plate(results[0], plate, without(plate, np.where(lights[..., None], 0, flare), scene))
+    told = above_white and plate.encoding == "linear"
+    clean = (without(plate, flare, scene, lights) if told else
+             without(plate, np.where(lights[..., None], 0, flare), scene))
+    write_plate(results[0], plate, clean)
     for result in results[1:]:
         write_flare(result, plate, flare)
 
@@ -89,15 +93,16 @@ def _display(plate: Plate) -> Pixels:
     return srgb_from_linear(np.clip(np.nan_to_num(plate.codes.astype(np.float32)), 0, 1))
 
 
-def without(plate: Plate, flare: Pixels, scene: Pixels) -> NDArray[Any]:
+def without(plate: Plate, flare: Pixels, scene: Pixels, lights: NDArray[np.bool_] | None = None) -> NDArray[Any]:
     """The plate's codes less a flare, given linear light of flare and scene as (height, width, 3); kept to the last bit
-    where there is no flare, and where they are no numbers."""
+    where there is no flare, and where they are no numbers. lights: (height, width), where the scene stands in besides
+    where the plate is clipped."""
     if plate.encoding == "srgb":
         display = _display(plate)
         light, clipped = linear_from_srgb(display), display.max(-1, keepdims=True) >= CLIPPED
     else:
         light = np.nan_to_num(plate.codes.astype(np.float32), nan=0.0, posinf=65504.0, neginf=0.0)
-        clipped = np.zeros((*light.shape[:2], 1), bool)
+        clipped = np.zeros((*light.shape[:2], 1), bool) if lights is None else lights[..., None]
     less = light - flare
     less = np.maximum(np.where(clipped, np.maximum(less, np.minimum(scene, light)), less), np.minimum(light, 0))
     if plate.encoding == "srgb":

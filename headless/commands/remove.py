@@ -89,7 +89,8 @@ def _by_run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     chosen = frames.asked(numbered([view.name for view in capture.views]), words.frames, progress)
     wanted = {frame.view for frame in chosen}
     return remove_fitted(fitted, capture, [view for view in capture.views if view.name in wanted], words.out, progress,
-                         flare_folder=words.flare, overwrite=words.overwrite, made_by=fitted.folder / FLARE)
+                         flare_folder=words.flare, overwrite=words.overwrite, made_by=fitted.folder / FLARE,
+                         above_white=fitted.settings.display_white > 1)
 
 
 def _remover(words: argparse.Namespace) -> Remover:

@@ -70,9 +70,9 @@ def flared_capture(folder: Path, count: int = 12, dots: int = 150, *, float_gain
             if float_gain is None:
                 write_png(folder / kind / name, srgb_from_linear(picture))
             else:
-                _write_exr(folder / kind / name, picture)
+                write_light(folder / kind / name, picture)
         for kind, picture in (("scene", scene_light), ("flare", light)):
-            _write_exr(folder / "truth" / kind / f"{number:04d}.exr", picture)
+            write_light(folder / "truth" / kind / f"{number:04d}.exr", picture)
         w, x, y, z = _quaternion(camera.world_to_camera[:3, :3])
         place = " ".join(map(str, camera.world_to_camera[:3, 3]))
         lines.append(f"{number + 1} {w} {x} {y} {z} {place} 1 {name}\n\n")
@@ -85,7 +85,8 @@ def flared_capture(folder: Path, count: int = 12, dots: int = 150, *, float_gain
     return folder
 
 
-def _write_exr(path: Path, light: NDArray[np.float32]) -> None:
+def write_light(path: Path, light: NDArray[np.float32]) -> None:
+    """Scene-linear light (height, width, 3) as EXR."""
     write_exr(path, {channel: light[..., index] for index, channel in enumerate("RGB")})
 
 

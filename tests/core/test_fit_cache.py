@@ -2,6 +2,7 @@
 """Pictures of a fit are decoded once, whether they fit memory or not, and nothing goes wrong with a disk that does."""
 from __future__ import annotations
 
+import os
 import shutil
 from pathlib import Path
 from types import SimpleNamespace
@@ -26,13 +27,15 @@ ROOM = 2 * codes(0).nbytes
 
 def test_what_exceeds_memory_lies_on_disk(tmp_path: Path) -> None:
     cache = PictureCache(ROOM)
-    cache.overflow_into(tmp_path)
-    for number in range(5):
-        cache.put(f"{number}", codes(number))
-    for number in (4, 0, 3, 1, 2):
-        np.testing.assert_array_equal(cache.get(f"{number}"), codes(number))
-    assert cache.get("5") is None
-    assert not list(tmp_path.iterdir()), "nobody sees the file"
+    with cache.overflowing_into(tmp_path):
+        for number in range(5):
+            cache.put(f"{number}", codes(number))
+        for number in (4, 0, 3, 1, 2):
+            np.testing.assert_array_equal(cache.get(f"{number}"), codes(number))
+        assert cache.get("5") is None
+        assert os.name == "nt" or not list(tmp_path.iterdir()), "the file has no name"
+    assert not list(tmp_path.iterdir())
+    assert [cache.get(f"{number}") is None for number in range(5)] == [False, False, True, True, True]
 
 
 def test_without_a_folder_the_rest_is_not_kept() -> None:
@@ -46,26 +49,42 @@ def test_room_is_left_on_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     free = DISK_LEFT + codes(0).nbytes
     monkeypatch.setattr(shutil, "disk_usage", lambda _path: SimpleNamespace(free=free))
     cache = PictureCache(0)
-    cache.overflow_into(tmp_path)
-    cache.put("fits", codes(0))
-    free -= 1
-    cache.put("does not", codes(1))
-    np.testing.assert_array_equal(cache.get("fits"), codes(0))
-    assert cache.get("does not") is None
+    with cache.overflowing_into(tmp_path):
+        cache.put("fits", codes(0))
+        free -= 1
+        cache.put("does not", codes(1))
+        np.testing.assert_array_equal(cache.get("fits"), codes(0))
+        assert cache.get("does not") is None
 
 
 def test_a_disk_that_fails_costs_time_and_no_fit(tmp_path: Path) -> None:
     cache = PictureCache(0)
-    cache.overflow_into(tmp_path / "none")
-    cache.put("a", codes(0))
-    assert cache.get("a") is None
-    cache.overflow_into(tmp_path)
-    cache.put("a", codes(0))
-    assert cache._file is not None
-    cache._file.truncate(10)
-    assert cache.get("a") is None, "cut short"
-    cache.put("b", codes(1))
-    assert cache.get("b") is None, "and it is not asked again"
+    with cache.overflowing_into(tmp_path / "none"):
+        cache.put("a", codes(0))
+        assert cache.get("a") is None
+    with cache.overflowing_into(tmp_path):
+        cache.put("a", codes(0))
+        assert cache._file is not None
+        cache._file.truncate(10)
+        assert cache.get("a") is None, "cut short"
+        cache.put("b", codes(1))
+        assert cache.get("b") is None, "and it is not asked again"
+
+
+@pytest.mark.skipif(os.name == "nt", reason="limits of files are POSIX's")
+@pytest.mark.parametrize("short", [1, 100, codes(0).nbytes])
+def test_a_quota_that_ends_within_a_picture_costs_that_picture(short: int, tmp_path: Path) -> None:
+    import resource
+
+    cache, before = PictureCache(0), resource.getrlimit(resource.RLIMIT_FSIZE)
+    with cache.overflowing_into(tmp_path):
+        cache.put("a", codes(0))
+        resource.setrlimit(resource.RLIMIT_FSIZE, (2 * codes(0).nbytes - short, before[1]))
+        try:
+            cache.put("b", codes(1))
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        assert cache.get("b") is None
 
 
 def test_a_frame_is_decoded_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -79,8 +98,8 @@ def test_a_frame_is_decoded_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(capture, "frame", counted)
     for memory in (0, 1 << 20):
         frames = Frames(capture, memory=memory)
-        frames.cache.overflow_into(tmp_path)
-        first, second = ([frames.frame(view) for view in capture.views] for _ in range(2))
+        with frames.cache.overflowing_into(tmp_path):
+            first, second = ([frames.frame(view) for view in capture.views] for _ in range(2))
         assert all(map(torch.equal, first, second))
         assert asked == [view.name for view in capture.views]
         asked.clear()

@@ -2,10 +2,10 @@
 """Float frames are fitted with the light that they hold above white; others as they are, clipped there."""
 from __future__ import annotations
 
-import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -24,9 +24,9 @@ from core.fit.trainer import Trainer
 from core.flare.compositing import composite, decode, encode, layers
 from core.gaussians import Splats
 from core.look.shot import Shot, ShotFrame
-from core.pictures import Encoding, Picture, srgb_from_linear, write_png
+from core.pictures import Picture, holds_floats, srgb_from_linear, write_png
 from core.progress import Progress
-from tests.core.flared import flared_capture
+from tests.core.flared import flared_capture, write_light
 
 GAIN = 8.0  # the brightest of the flare is 3.6 then
 
@@ -52,26 +52,53 @@ def quick(iterations: int = 400) -> FitSettings:
         "flare.count": 60, "flare.occlusion": False, "holdout": 4, "flare.density.every": 50, "seed": 1})
 
 
-def lit(brightest: float, encoding: Encoding, size: tuple[int, int] = (64, 40)) -> Picture:
-    pixels = np.full((size[1], size[0], 3), 0.25, np.float32)
-    pixels[3, 4] = brightest
-    return Picture(pixels, encoding)
-
-
-@pytest.mark.parametrize(("frame", "clean", "white", "said"), [
-    (lit(4.0, "linear"), lit(1.0, "linear"), WHITEST, "up to 64"),
-    (lit(1.0, "linear"), lit(1.0, "linear"), 1.0, ""),
-    (lit(1.0, "srgb"), lit(1.0, "srgb"), 1.0, ""),
-    (lit(4.0, "linear"), lit(1.0, "srgb"), 1.0, "fitted as white"),
+@pytest.mark.parametrize(("lit", "mode", "white", "said"), [
+    (3, "default", WHITEST, "up to 64"), (None, "default", 1.0, ""),
+    (3, "split", WHITEST, "up to 64"), (3, "3dgs", WHITEST, "up to 64"),
 ])
-def test_white_is_where_the_frames_end(frame: Picture, clean: Picture, white: float, said: str, tmp_path: Path,
-                                       monkeypatch: pytest.MonkeyPatch) -> None:
-    capture = Capture.open(flared_capture(tmp_path / "c", 5))
-    monkeypatch.setattr(capture, "frame", lambda _view, _size=None: frame)
-    monkeypatch.setattr(capture, "removed", lambda _view, _size=None: clean)
-    found, says = white_of(capture, quick())
+def test_white_is_where_float_frames_end(lit: int | None, mode: str, white: float, said: str, tmp_path: Path) -> None:
+    """lit: the one view that holds light above white, late and for a moment."""
+    capture = Capture.open(flared_capture(tmp_path / "c", 6, float_gain=0.3))
+    if lit is not None:
+        write_light(capture.frame_path(capture.views[lit]), np.full((40, 64, 3), 1.5, np.float32))
+    found, says = white_of(Capture.open(capture.folder), replace(quick(), mode=mode))
     assert found == white
     assert said in says and bool(said) == bool(says)
+
+
+@pytest.mark.parametrize(("folder", "mode", "white"), [
+    ("removed", "default", 1.0), ("removed", "split", WHITEST), ("images", "default", 1.0), ("images", "split", 1.0),
+])
+@pytest.mark.parametrize("number", [0, 3])
+def test_one_file_that_ends_at_white_decides(folder: str, mode: str, white: float, number: int,
+                                             tmp_path: Path) -> None:
+    where = flared_capture(tmp_path / "c", 6, float_gain=GAIN)
+    path = where / folder / f"{number:04d}.exr"
+    write_png(path.with_suffix(".png"), np.full((40, 64, 3), 0.5))
+    path.unlink()
+    if folder == "images":
+        images = where / "sparse" / "0" / "images.txt"
+        images.write_text(images.read_text(encoding="utf-8").replace(path.name, path.with_suffix(".png").name),
+                          encoding="utf-8")
+    settings = replace(quick(), mode=mode, holdout=0)
+    found, says = white_of(Capture.open(where), settings)
+    assert found == white
+    assert (f"{number:04d}.png cannot" in says) == (white == 1)
+
+
+def test_frames_that_are_no_floats_end_at_white(tmp_path: Path) -> None:
+    assert white_of(Capture.open(flared_capture(tmp_path / "c", 5)), quick()) == (1.0, "")
+
+
+@pytest.mark.parametrize(("name", "kind", "floats"), [
+    ("a.exr", np.float32, True), ("a.tif", np.float32, True), ("a.tif", np.uint16, False), ("a.png", np.uint8, False)])
+def test_float_files_are_told_from_others(name: str, kind: type, floats: bool, tmp_path: Path) -> None:
+    path = tmp_path / name
+    if name == "a.exr":
+        write_light(path, np.ones((4, 5, 3), np.float32))
+    else:
+        assert cv2.imwrite(str(path), np.ones((4, 5, 3), kind))
+    assert holds_floats(path) == floats
 
 
 def test_frames_keep_what_is_above_white(bright: Capture) -> None:
@@ -215,10 +242,9 @@ def test_a_white_that_is_none_is_refused(white: float) -> None:
 
 def test_clean_frames_that_end_at_white_are_told(tmp_path: Path) -> None:
     folder = flared_capture(tmp_path / "c", 5, float_gain=GAIN)
-    shutil.rmtree(folder / "truth")
     for path in sorted((folder / "removed").glob("*.exr")):
         write_png(path.with_suffix(".png"), np.full((40, 64, 3), 0.5))
         path.unlink()
     heard = Heard()
     fit(Capture.open(folder), quick(2), tmp_path / "run", heard)
-    assert any("EXR files in removed/" in text for text in heard.texts)
+    assert any("EXR files for all" in text for text in heard.texts)

@@ -54,6 +54,20 @@ def test_the_near_depth_comes_back(said: str, near: float, tmp_path: Path) -> No
     assert read_ply(tmp_path / "b.ply").near == near
 
 
+@pytest.mark.parametrize(("said", "white"), [("comment white 3.5", 3.5), ("comment white 0.5", 1.0),
+                                             ("comment white 1e9", 1.0), ("comment white nan", 1.0)])
+def test_the_white_comes_back(said: str, white: float, tmp_path: Path) -> None:
+    first = scene()
+    first.white = 5.9063
+    write_ply(tmp_path / "a.ply", first)
+    assert read_ply(tmp_path / "a.ply").white == 5.9063
+    write_ply(tmp_path / "b.ply", scene())
+    assert b"white" not in (tmp_path / "b.ply").read_bytes()[:3000]
+    (tmp_path / "b.ply").write_bytes(
+        (tmp_path / "b.ply").read_bytes().replace(b"element vertex", f"{said}\nelement vertex".encode(), 1))
+    assert read_ply(tmp_path / "b.ply").white == white
+
+
 def test_the_layout_is_that_of_3dgs(tmp_path: Path) -> None:
     """Column by column, from the bytes."""
     s = scene(3)

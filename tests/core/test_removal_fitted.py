@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from core.capture import Camera, Capture
+from core.capture.discs import clipped_discs
 from core.colour import ColourSpace, colour_space
 from core.errors import CaptureError, SettingsError
 from core.pictures import linear_from_srgb, read_exr, read_picture, write_exr
@@ -93,6 +94,33 @@ def test_a_light_s_own_disc_stays(capture: Capture, tmp_path: Path) -> None:
     clean = cv2.imread(str(tmp_path / "clean" / view.name))
     assert (clean[int(y), int(x)] == 255).all()
     assert (clean[2, 3] == 0).all(), "white far from every light is flare"
+
+
+def test_above_white_a_lamp_keeps_its_own_light_and_loses_its_flare(tmp_path: Path) -> None:
+    capture = Capture.open(flared_capture(tmp_path / "bright", count=3, float_gain=8.0))
+
+    class Fitted:
+        def __init__(self, lamp: float) -> None:
+            self.lamp = lamp
+
+        def render(self, camera: Camera) -> Layers:
+            view = next(one for one in capture.views if one.camera is camera)
+            scene = capture.truth_scene(view)
+            assert scene is not None
+            return Layers(scene.linear(), {"lamp": flare(camera) * 8 + np.float32(self.lamp)})
+
+    for lamp, tolerance in ((0.0, 0.02), (100.0, 0.02)):  # the very flare, and one that would take the lamp away
+        for shown in (True, False):
+            out = tmp_path / f"{lamp}{shown}"
+            remove_fitted(Fitted(lamp), capture, capture.views, out, Progress(), above_white=shown)
+            for view in capture.views:
+                scene, frame = capture.truth_scene(view), capture.frame(view)
+                assert scene is not None
+                discs = clipped_discs(frame.display(), view.camera, LIGHT[None])
+                assert discs.any()
+                found = read_picture(out / view.name).pixels[discs]
+                expected = (scene if shown else frame).pixels[discs]
+                np.testing.assert_allclose(found, expected, atol=tolerance)
 
 
 def test_floats_keep_what_is_above_white_below_black_or_no_number() -> None:

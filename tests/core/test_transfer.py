@@ -204,6 +204,12 @@ def test_the_target_s_splats_hide_its_lights(flare: Path, look: Look, tmp_path: 
     rendering = shown.of_frame(there.frames[0].frame).render(camera)
     assert rendering.scene.max() > 0.1
     assert rendering.depth.max() > 1
+    assert there.scene is not None
+    with torch.no_grad():
+        there.scene.sh[:, 0] = (3.0 - 0.5) / 0.28209479  # a display value
+    for white, brightest in ((1.0, 1.0), (5.9, 12.5)):  # of a wall that is not quite opaque
+        there.scene.white = white
+        assert shown.of_frame(there.frames[0].frame).render(camera).scene.max() == pytest.approx(brightest, rel=0.05)
 
 
 def test_far_outside_of_what_was_trained_it_fades(look: Look) -> None:

@@ -65,9 +65,9 @@ class ShotRenderer:
                       for name, found in evaluate(self.look, camera.world_to_camera, placed, edits,
                                                   self.shot.query).items()}
             dark = torch.zeros(camera.height, camera.width, 3)
-            scene = self.run.scene.render(camera) if self.run is not None else None
-            parts = (linear_layers(dark, flares, self.look.blend) if self.run is None or scene is None else
-                     linear_layers(scene.colour, flares, self.look.blend, self.run.scene.white))
+            scene, white = (None, 1.0) if self.run is None else (self.run.scene.render(camera),
+                                                                 self.run.scene.display_white)
+            parts = linear_layers(dark if scene is None else scene.colour, flares, self.look.blend, white)
         found = {name: np.maximum(layer.numpy(), 0) if scene is None else layer.numpy()
                  for name, layer in parts.flares.items()}
         depth = dark[..., 0] if scene is None else scene.depth

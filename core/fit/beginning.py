@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What a fit begins with: a scene, and a flare for each light, which is put in its place first."""
+"""What a fit begins with: the white of its frames, a scene, and a flare for each light, which is put in its place
+first."""
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -34,7 +36,7 @@ def first_scene(capture: Capture, settings: FitSettings, views: tuple[View, ...]
     """The scene a fit begins with: one that was trained elsewhere, or a Gaussian at each point."""
     scene = _scene(capture, settings, views, frames)
     scene.near = min(scene.near, NEAREST_PART * nearest_depth(capture))
-    scene.white = settings.display_white
+    scene.display_white = settings.display_white
     return scene
 
 
@@ -105,20 +107,26 @@ def _sights(views: tuple[View, ...], frames: Frames) -> list[Sight]:
     return found
 
 
-def white_of(capture: Capture, settings: FitSettings) -> tuple[float, str]:
-    """Scene-linear light at which the frames of a fit are clipped, and a sentence about it, empty where nothing is to
-    be said: 1, the white of most formats, or more where all are float files and some frame holds more."""
+def with_white(settings: FitSettings, capture: Capture) -> tuple[FitSettings, tuple[str, ...]]:
+    """The settings with the light at which frames are clipped, where that was left open, and what is to be said of it.
+
+    It is 1, the white of most formats, or more where all are float files and some frame holds more.
+    """
+    if settings.white is not None:
+        return settings, ()
     views, _ = capture.split(settings.holdout)
     if not any(_is_above_white(capture, view) for view in views):
-        return 1.0, ""
+        return replace(settings, white=1.0), ()
     files = [capture.frame_path(view) for view in views]
     if capture.has_removed and settings.supervised:
         files += [capture.removed_path(view) for view in views]
     clipped = next((path for path in files if not holds_floats(path)), None)
     if clipped is not None:
-        return 1.0, (f"The frames hold light above white (1.0), and {clipped} cannot: it is fitted as white, and "
-                     "flares that are brighter come out wrong; EXR files for all would keep it.")
-    return WHITEST, f"The frames hold light above white (1.0); it is fitted up to {WHITEST:g}."
+        return replace(settings, white=1.0), (
+            f"The frames hold light above white (1.0), and {clipped} cannot: it is fitted as white, and flares that "
+            "are brighter come out wrong; EXR files for all would keep it.",)
+    return replace(settings, white=WHITEST), (
+        f"The frames hold light above white (1.0); it is fitted up to {WHITEST:g}.",)
 
 
 def _is_above_white(capture: Capture, view: View) -> bool:

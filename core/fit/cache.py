@@ -16,7 +16,8 @@ from typing import BinaryIO, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-MEMORY = 1 << 29  # 86 frames of 960x540 with their flare-free pairs
+MEMORY = 1 << 29
+"""Bytes that are kept in memory: 86 frames of 960x540 with their flare-free pairs."""
 DISK_LEFT = 1 << 31
 """Bytes that stay free on the disk."""
 

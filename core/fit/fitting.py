@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import time
-from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -18,7 +17,7 @@ from ..gaussians.ply import write_ply
 from ..look import list_elements
 from ..progress import Progress
 from . import checkpoint
-from .beginning import white_of
+from .beginning import with_white
 from .preview import row, spread, write_preview, write_small
 from .rendering import render
 from .run import CHECKPOINT, FLARE, LOG, METRICS, PREVIEW, SCENE, SMALL_PREVIEW, Run
@@ -40,7 +39,7 @@ def fit(capture: Capture, settings: FitSettings, folder: Path | str, progress: P
     """
     progress, folder = progress or Progress(), Path(folder)
     continued = resume and (folder / "config.toml").exists()
-    says: list[str] = []
+    said: tuple[str, ...] = ()
     if continued:
         run = Run.open(folder)
         _check_capture(run, capture)
@@ -50,16 +49,14 @@ def fit(capture: Capture, settings: FitSettings, folder: Path | str, progress: P
         trainer = Trainer(capture, run.settings)
         remove_partial(folder)
     else:
-        if settings.white is None:
-            white, of_white = white_of(capture, settings)
-            settings, says = replace(settings, white=white), [of_white] if of_white else []
+        settings, said = with_white(settings, capture)
         trainer = Trainer(capture, settings)  # before anything is written: it may refuse the capture
         run = Run.create(folder, settings, capture.folder)
     path = folder / CHECKPOINT
     if continued and path.exists():
         trainer.load_state(checkpoint.load(path))
     else:
-        for text in (*says, *trainer.says):
+        for text in (*said, *trainer.says):
             progress.say(text)
             _log(run, text)
     _forget_after(folder / METRICS, trainer.iteration)

@@ -16,7 +16,7 @@ from .cache import MEMORY, PictureCache
 
 
 class Targets(NamedTuple):
-    """A view's camera and pictures in display space, (height, width, 3) float32 in 0..white."""
+    """A view's camera and pictures in display space, (height, width, 3) float32 in 0..`display_white`."""
 
     camera: Camera
     frame: Tensor
@@ -26,14 +26,15 @@ class Targets(NamedTuple):
 class Frames:
     """Frames of a capture at the working size, with the flare-free frame of each where there is one.
 
-    white: display value at which they are clipped; above 1 for float frames that hold light above white.
+    display_white: display value at which they are clipped; above 1 for float frames that hold light above white.
     `reference` says where the flare-free frames come from: "removed" (files in removed/), "truth" (exact
     scene layers, when there is no removed/), or "" (none).
     """
 
-    def __init__(self, capture: Capture, width: int = 0, memory: int = MEMORY, *, white: float = 1.0) -> None:
+    def __init__(self, capture: Capture, width: int = 0, memory: int = MEMORY, *,
+                 display_white: float = 1.0) -> None:
         self.capture = capture
-        self.white = white
+        self.display_white = display_white
         self._width = width
         self.cache = PictureCache(memory)
         self.reference = "removed" if capture.has_removed else "truth" if capture.has_truth else ""
@@ -74,6 +75,6 @@ class Frames:
             if picture is None:
                 return None
             # 16 bit keeps the smoothness of linear footage at half the size of float.
-            stored = (picture.display(self.white) * (65535 / self.white) + 0.5).astype(np.uint16)
+            stored = (picture.display(self.display_white) * (65535 / self.display_white) + 0.5).astype(np.uint16)
             self.cache.put(name, stored)
-        return torch.from_numpy(stored.astype(np.float32)) / (65535 / self.white)
+        return torch.from_numpy(stored.astype(np.float32)) / (65535 / self.display_white)

@@ -71,7 +71,7 @@ def render(scene: SceneGaussians, flare: FlareModel | None, blend: Blend, camera
         gaussians = flare(pose, shares) if look is None or edits is None else _edited(look, edits, camera, shares)
         flares = {name: splat_flare(one, intrinsics, camera.width, camera.height, blend, kernels=kernels)
                   for name, one in gaussians.items()}
-    parts = layers(rendering.colour, flares, blend, scene.white)
+    parts = layers(rendering.colour, flares, blend, scene.display_white)
     return RenderedView(rendering, flares, encode(parts.composite.clamp_min(0)).clamp(0, 1), parts)
 
 

@@ -145,8 +145,8 @@ class Run:
         """Scene, flares and composite as tensors."""
         model = self.flare.model if self.flare else None
         return render(self.scene, model, self.settings.blend, camera, self.settings.kernels,
-                      visibility=self.settings.flare.occluded_by_scene,
-                      look=None if edits is None else self.look, edits=edits)
+                      visibility=self.settings.flare.occluded_by_scene, look=None if edits is None else self.look,
+                      edits=edits)
 
     def render(self, camera: Camera, edits: LookEdits | None = None) -> ViewLayers:
         """The layers of a view at the camera's size, the flare as `edits` change it."""

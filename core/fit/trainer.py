@@ -40,7 +40,7 @@ CLEAR_EVERY = 50
 """Iterations between two looks at how much of the lights the scene leaves (`visibility.clear_shares`)."""
 UNTOLD = 0.01
 """Difference of display values between frame and flare-free frame below which nothing is told of a flare."""
-ABOVE_WHITE = 3.0
+RATE_ABOVE_WHITE = 3.0
 """Times the rate of a scene's colours where frames go on above white: theirs is a longer way. Lamps of 32 times white
 end a sixth off instead of three fifths (`desk`, preset draft)."""
 ASKED = 40
@@ -57,16 +57,16 @@ class Trainer:
         torch.manual_seed(settings.seed)
         self.settings = settings
         self.capture = capture
-        self.frames = Frames(capture, settings.width, white=settings.display_white)
+        self.frames = Frames(capture, settings.width, display_white=settings.display_white)
         self.views, _ = capture.split(settings.holdout)
         self.iteration = 0
         self.scene_is_fitted = not settings.scene.frozen
-        if self.settings.supervised and not self.frames.reference and self.scene_is_fitted:
+        if settings.supervised and not self.frames.reference and self.scene_is_fitted:
             raise CaptureError(f"{capture.folder} has no flare-free frames (removed/); run remove on it first, "
                                "or fit with --mode unsup.")
         self.scene = first_scene(capture, settings, self.views, self.frames)
         self.flare = None if settings.mode == "3dgs" else first_flare(capture, self.views, self.frames, settings)
-        self.says = moved_lights(capture, self.flare) if self.flare is not None else ()
+        self.says = () if self.flare is None else moved_lights(capture, self.flare)
         self.extent = capture.extent
         self._head_start = HeadStart(settings.split, len(self.views), settings.iterations)
         self.scene_adam = Adam(dict(self.scene.named_parameters()), self._scene_rates())
@@ -90,10 +90,10 @@ class Trainer:
                                                 scene=self.scene, visibility=settings.flare.occluded_by_scene)
         sources = self._sources(targets)
         picture = composite(self._behind_flare(targets, scene.colour, sources), flare, settings.blend,
-                            self.frames.white)
+                            self.frames.display_white)
         weight = 1 - settings.ssim_share
         loss = (scene.colour.new_zeros(()) if alone else
-                l1_ssim(picture, self._target(targets, picture.detach(), sources), weight))
+                l1_ssim(picture, self._joint_target(targets, picture.detach(), sources), weight))
         figures = {"loss": float(loss.detach())}
         clean = self._scene_target(targets, picture, scene.colour)
         if clean is not None and self.scene_is_fitted:
@@ -209,12 +209,12 @@ class Trainer:
         if settings.blend != "add" or self.flare is None or clean is None:
             return None
         discs = torch.from_numpy(clipped_discs(clean.numpy(), targets.camera, self.flare.positions.numpy()))
-        return discs if self.frames.white == 1 else discs & (targets.frame - clean < UNTOLD).all(-1)
+        return discs if self.frames.display_white == 1 else discs & (targets.frame - clean < UNTOLD).all(-1)
 
-    def _target(self, targets: Targets, picture: Tensor, sources: Tensor | None) -> Tensor:
+    def _joint_target(self, targets: Targets, picture: Tensor, sources: Tensor | None) -> Tensor:
         """The frame, which picture, scene and flare together, is to become. Above white a light's own disc says
         nothing of the flare but that white is the least of it."""
-        if self.frames.white == 1 or sources is None:
+        if self.frames.display_white == 1 or sources is None:
             return targets.frame
         return torch.where(sources[..., None], picture.clamp_min(1), targets.frame)
 
@@ -223,7 +223,7 @@ class Trainer:
             return targets.removed
         if self.settings.mode == "in-flare":
             # Input minus the flare as reconstructed so far: the composite's gain over the scene.
-            return (targets.frame - (picture - scene).detach()).clamp(0, self.frames.white)
+            return (targets.frame - (picture - scene).detach()).clamp(0, self.frames.display_white)
         return None
 
     def _split_loss(self, targets: Targets, scene: Tensor, sources: Tensor | None, alone: bool) -> Tensor:
@@ -263,7 +263,7 @@ class Trainer:
     def _scene_rates(self) -> dict[str, float | Tensor]:
         rates = self.settings.scene.rates
         features = torch.full((16, 1), rates.features_rest)
-        features[0] = rates.features * (ABOVE_WHITE if self.frames.white > 1 else 1)
+        features[0] = rates.features * (RATE_ABOVE_WHITE if self.frames.display_white > 1 else 1)
         progress = self.iteration / self.settings.iterations
         return {
             "means": _decayed(rates.position, rates.position_final, progress) * self.extent,

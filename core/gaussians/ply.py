@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -23,9 +24,10 @@ from .rendering import NEAR
 from .scene import COEFFICIENTS, SceneGaussians
 
 HEADER_MAX = 1 << 16
-_NEAR = "near"  # a comment of ours: camera depth at which Gaussians are culled
-_WHITE = "white"  # likewise: display value at which pictures of the scene are clipped
-_WHITE_MOST = 107.0  # of the brightest half float
+NEAR_WORD, WHITE_WORD = "near", "white"
+"""Comments of ours, each with a number: the scene's `near` and `display_white`, where they are not the usual ones."""
+WHITE_MOST = 107.0
+"""Display value, somewhat above that of the brightest half float."""
 ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
 TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2",
@@ -64,10 +66,8 @@ def write_ply(path: Path | str, scene: SceneGaussians, *, extra: Mapping[str, ND
         [means, np.zeros((n, 3), "<f4"), sh[:, 0], rest, opacities[:, None], log_scales, quaternions,
          *(np.asarray(column, "<f4")[:, None] for column in extra.values())], 1
     )
-    if scene.near != NEAR:
-        comments = [*comments, f"{_NEAR} {scene.near:.9g}"]
-    if scene.white != 1:
-        comments = [*comments, f"{_WHITE} {scene.white:.9g}"]
+    own = ((NEAR_WORD, scene.near, NEAR), (WHITE_WORD, scene.display_white, 1.0))
+    comments = [*comments, *(f"{word} {number:.9g}" for word, number, usual in own if number != usual)]
     lines = ["ply", "format binary_little_endian 1.0", *(f"comment {line}" for line in comments),
              f"element vertex {n}"]
     lines += [f"property float {name}" for name in names] + ["end_header"]
@@ -86,11 +86,12 @@ def read_ply(path: Path | str) -> SceneGaussians:
         if is_compressed(path):
             return read_compressed(path)
         with open(path, "rb") as file:
-            order, n, layout, start, near, white = _header(path, file.read(HEADER_MAX))
-            kind = np.dtype([(name, order + code) for name, code in layout])
-            if path.stat().st_size - start < n * kind.itemsize:
+            header = _header(path, file.read(HEADER_MAX))
+            n, layout = header.vertices, header.layout
+            kind = np.dtype([(name, header.order + code) for name, code in layout])
+            if path.stat().st_size - header.start < n * kind.itemsize:
                 raise FlareFileError(f"{path} is cut short: it announces {n} Gaussians; copy it again.")
-            file.seek(start)
+            file.seek(header.start)
             table = np.frombuffer(file.read(n * kind.itemsize), kind)
     except OSError as problem:
         raise FlareFileError(f"{path} cannot be read: {problem.strerror or problem}.") from problem
@@ -120,31 +121,41 @@ def read_ply(path: Path | str) -> SceneGaussians:
     scene = SceneGaussians(
         columns(POSITION), columns(SCALE), columns(ROTATION), columns(("opacity",))[:, 0].clone(), sh
     )
-    scene.near, scene.white = near, white
+    scene.near, scene.display_white = header.near, header.display_white
     return scene
 
 
-def _header(path: Path, head: bytes) -> tuple[str, int, list[tuple[str, str]], int, float, float]:
-    """Byte order, number of vertices, their properties with types, where the data starts, near depth and white."""
+class _Header(NamedTuple):
+    """Byte order, number of vertices, their properties with types, where the data starts, and what our comments say."""
+
+    order: str
+    vertices: int
+    layout: list[tuple[str, str]]
+    start: int
+    near: float
+    display_white: float
+
+
+def _header(path: Path, head: bytes) -> _Header:
     end = head.find(b"\nend_header")
     start = head.find(b"\n", end + 1) + 1
     if not head.startswith(b"ply") or end < 0 or not start:
         raise FlareFileError(f"{path} is not a PLY file.")
     order, count, element = "", -1, ""
     layout: list[tuple[str, str]] = []
-    near, white = NEAR, 1.0
+    near, display_white = NEAR, 1.0
     for line in head[:end].decode("ascii", "replace").splitlines()[1:]:
         match line.split():
             case ["format", form, _]:
                 if form not in ORDERS:
                     raise FlareFileError(f"{path} is a PLY file in the format {form}; export it as binary.")
                 order = ORDERS[form]
-            case ["comment", word, number] if word == _NEAR:
+            case ["comment", word, number] if word == NEAR_WORD:
                 with contextlib.suppress(ValueError):
                     near = float(number) if 0 < float(number) < NEAR else NEAR
-            case ["comment", word, number] if word == _WHITE:
+            case ["comment", word, number] if word == WHITE_WORD:
                 with contextlib.suppress(ValueError):
-                    white = float(number) if 1 < float(number) < _WHITE_MOST else 1.0
+                    display_white = float(number) if 1 < float(number) < WHITE_MOST else 1.0
             case ["element", name, number]:
                 if count < 0 and (name != "vertex" or not (number.isascii() and number.isdigit())):
                     raise FlareFileError(f"{path} does not begin with its vertices; export it again.")
@@ -156,4 +167,4 @@ def _header(path: Path, head: bytes) -> tuple[str, int, list[tuple[str, str]], i
                 layout.append((words[1], TYPES[words[0]]))
     if not order or not layout or len({name for name, _ in layout}) < len(layout):
         raise FlareFileError(f"{path} is not a PLY file of Gaussians.")
-    return order, count, layout, start, near, white
+    return _Header(order, count, layout, start, near, display_white)

@@ -43,8 +43,9 @@ class SceneGaussians(nn.Module):
         self.quaternions = nn.Parameter(quaternions)
         self.opacity_logits = nn.Parameter(opacity_logits)
         self.sh = nn.Parameter(sh)
+        self.display_white = 1.0
+        """Display value at which pictures of the scene are clipped: above 1 where its frames went on above white."""
         self.near = NEAR
-        self.white = 1.0
         """Camera depth at which Gaussians are culled, world units: less in a world of small units."""
 
     @classmethod

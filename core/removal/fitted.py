@@ -78,9 +78,10 @@ def _remove(fitted: Renderer, capture: Capture, view: View, results: Sequence[Pa
     if plate.encoding == "linear":  # the fit was shown Rec. 709
         flare, scene = plate.space.from_linear(flare), plate.space.from_linear(scene)
     lights = clipped_discs(_display(plate), camera, [light.xyz for light in capture.lights])
-    told = above_white and plate.encoding == "linear"
-    clean = (without(plate, flare, scene, lights) if told else
-             without(plate, np.where(lights[..., None], 0, flare), scene))
+    if above_white and plate.encoding == "linear":
+        clean = without(plate, flare, scene, lights)
+    else:
+        clean = without(plate, np.where(lights[..., None], 0, flare), scene)
     write_plate(results[0], plate, clean)
     for result in results[1:]:
         write_flare(result, plate, flare)
@@ -93,16 +94,18 @@ def _display(plate: Plate) -> Pixels:
     return srgb_from_linear(np.clip(np.nan_to_num(plate.codes.astype(np.float32)), 0, 1))
 
 
-def without(plate: Plate, flare: Pixels, scene: Pixels, lights: NDArray[np.bool_] | None = None) -> NDArray[Any]:
+def without(plate: Plate, flare: Pixels, scene: Pixels, hidden: NDArray[np.bool_] | None = None) -> NDArray[Any]:
     """The plate's codes less a flare, given linear light of flare and scene as (height, width, 3); kept to the last bit
-    where there is no flare, and where they are no numbers. lights: (height, width), where the scene stands in besides
-    where the plate is clipped."""
+    where there is no flare, and where they are no numbers. The scene stands in where the plate is clipped and where,
+    (height, width), what lies under the flare is `hidden` otherwise."""
     if plate.encoding == "srgb":
         display = _display(plate)
         light, clipped = linear_from_srgb(display), display.max(-1, keepdims=True) >= CLIPPED
     else:
         light = np.nan_to_num(plate.codes.astype(np.float32), nan=0.0, posinf=65504.0, neginf=0.0)
-        clipped = np.zeros((*light.shape[:2], 1), bool) if lights is None else lights[..., None]
+        clipped = np.zeros((*light.shape[:2], 1), bool)
+    if hidden is not None:
+        clipped = clipped | hidden[..., None]
     less = light - flare
     less = np.maximum(np.where(clipped, np.maximum(less, np.minimum(scene, light)), less), np.minimum(light, 0))
     if plate.encoding == "srgb":

@@ -252,7 +252,7 @@ class _OfFrame:
             return np.asarray(Picture(plate.linear, "linear").resized(*camera.size).pixels, np.float32), nothing
         if target.scene is not None and target.shown:
             rendering = target.scene.render(camera)
-            return decode(rendering.colour.clamp(0, target.scene.white)).numpy(), rendering.depth.numpy()
+            return decode(rendering.colour.clamp(0, target.scene.display_white)).numpy(), rendering.depth.numpy()
         return np.zeros((camera.height, camera.width, 3), np.float32), nothing
 
     def finished(self, layers: FrameLayers, camera: Camera) -> FrameLayers:

@@ -96,7 +96,7 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     settings = changed(settings, {**changes, **dict(map(change, words.changes))})
     if settings.mode != "3dgs":
         capture = with_lights(capture, progress)
-    if settings.mode in ("default", "2d") and not settings.scene.frozen and not capture.has_truth:
+    if settings.supervised and not settings.scene.frozen and not capture.has_truth:
         capture = with_removed(capture, progress)
     done = fit(capture, settings, out, progress, resume=words.resume)
     progress.say(f"The run is in {done.folder}: see preview.png there, then `eval` and `bake` it.")

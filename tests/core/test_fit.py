@@ -34,6 +34,7 @@ from core.gaussians.rendering import NEAR
 from core.pictures import read_picture, write_png
 from core.progress import Progress
 from tests.core.flared import flared_capture
+from tests.core.heard import Heard
 
 ROOT = Path(__file__).parents[2]
 
@@ -137,17 +138,12 @@ def test_a_light_given_beside_its_flare_is_put_there(tmp_path: Path) -> None:
             picture[max(y - 1, 0):y + 2, max(x - 1, 0):x + 2] = 1
             write_png(path, picture)
     capture.lights = (Light(lamp.name, lamp.xyz + np.array([0.2, 0.15, 0.3])),)
-    says: list[str] = []
-
-    class Heard(Progress):
-        def say(self, text: str) -> None:
-            says.append(text)
-
+    heard = Heard()
     for snap in (True, False):
-        run = fit(capture, quick(4, **{"flare.snap": snap}), tmp_path / f"run {snap}", Heard())
+        run = fit(capture, quick(4, **{"flare.snap": snap}), tmp_path / f"run {snap}", heard)
         off = np.linalg.norm(run.flare.model.positions.numpy()[0] - lamp.xyz)
         assert off < 0.1 if snap else off > 0.35
-    assert [text.split(" was put")[0] for text in says] == ["The light 'lamp'"]
+    assert [text.split(" was put")[0] for text in heard.texts] == ["The light 'lamp'"]
 
 
 def test_stopped_and_resumed_is_bit_for_bit_the_unbroken_fit(tmp_path: Path, capture: Capture) -> None:

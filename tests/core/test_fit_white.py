@@ -15,7 +15,7 @@ from core.bake.shot import ShotRenderer
 from core.capture import Capture, View
 from core.errors import SettingsError
 from core.fit import FitSettings, Run, fit, preset
-from core.fit.beginning import WHITEST, white_of
+from core.fit.beginning import WHITEST, with_white
 from core.fit.frames import Frames, Targets
 from core.fit.run import FLARE
 from core.fit.settings import changed
@@ -25,21 +25,11 @@ from core.flare.compositing import composite, decode, encode, layers
 from core.gaussians import Splats
 from core.look.shot import Shot, ShotFrame
 from core.pictures import Picture, holds_floats, srgb_from_linear, write_png
-from core.progress import Progress
 from tests.core.flared import flared_capture, write_light
+from tests.core.heard import Heard
 
 GAIN = 8.0  # the brightest of the flare is 3.6 then
-
-
-class Heard(Progress):
-    """What was said."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.texts: list[str] = []
-
-    def say(self, text: str) -> None:
-        self.texts.append(text)
+SHOWN = float(srgb_from_linear(np.array(WHITEST)))
 
 
 @pytest.fixture(scope="module")
@@ -61,9 +51,9 @@ def test_white_is_where_float_frames_end(lit: int | None, mode: str, white: floa
     capture = Capture.open(flared_capture(tmp_path / "c", 6, float_gain=0.3))
     if lit is not None:
         write_light(capture.frame_path(capture.views[lit]), np.full((40, 64, 3), 1.5, np.float32))
-    found, says = white_of(Capture.open(capture.folder), replace(quick(), mode=mode))
-    assert found == white
-    assert said in says and bool(said) == bool(says)
+    found, says = with_white(replace(quick(), mode=mode), Capture.open(capture.folder))
+    assert found.white == white
+    assert said in "".join(says) and bool(said) == bool(says)
 
 
 @pytest.mark.parametrize(("folder", "mode", "white"), [
@@ -81,13 +71,14 @@ def test_one_file_that_ends_at_white_decides(folder: str, mode: str, white: floa
         images.write_text(images.read_text(encoding="utf-8").replace(path.name, path.with_suffix(".png").name),
                           encoding="utf-8")
     settings = replace(quick(), mode=mode, holdout=0)
-    found, says = white_of(Capture.open(where), settings)
-    assert found == white
-    assert (f"{number:04d}.png cannot" in says) == (white == 1)
+    found, says = with_white(settings, Capture.open(where))
+    assert found.white == white
+    assert (f"{number:04d}.png cannot" in "".join(says)) == (white == 1)
 
 
 def test_frames_that_are_no_floats_end_at_white(tmp_path: Path) -> None:
-    assert white_of(Capture.open(flared_capture(tmp_path / "c", 5)), quick()) == (1.0, "")
+    capture = Capture.open(flared_capture(tmp_path / "c", 5))
+    assert with_white(quick(), capture) == (replace(quick(), white=1.0), ())
 
 
 @pytest.mark.parametrize(("name", "kind", "floats"), [
@@ -105,7 +96,7 @@ def test_frames_keep_what_is_above_white(bright: Capture) -> None:
     view = bright.views[3]
     light = bright.frame(view).pixels
     assert light.max() > 3
-    shown = Frames(bright, white=float(srgb_from_linear(np.array(WHITEST)))).frame(view).numpy()
+    shown = Frames(bright, display_white=SHOWN).frame(view).numpy()
     np.testing.assert_allclose(shown, srgb_from_linear(light), atol=1e-4)
     np.testing.assert_allclose(Frames(bright).frame(view).numpy(), srgb_from_linear(light).clip(0, 1), atol=1e-5)
     picture = Picture(np.full((1, 1, 3), 1e4, np.float32), "linear")
@@ -150,13 +141,13 @@ def test_above_white_a_light_s_disc_is_the_scene_s_where_the_frames_tell_so(brig
     told.removed[at], told.frame[at] = 2.0, 2.4
     sources = trainer._sources(told)
     assert sources is not None and not sources.any(), "the flare is what the frame has more"
-    assert torch.equal(trainer._target(told, picture, sources), told.frame)
+    assert torch.equal(trainer._joint_target(told, picture, sources), told.frame)
     told.frame[at] = 2.0
     sources = trainer._sources(told)
     assert sources is not None and sources[at] and sources.sum() == 1
     assert not trainer._behind_flare(told, torch.ones_like(picture), sources)[at].any()
     for drawn, wanted in ((0.5, 1.0), (3.0, 3.0)):  # at least white, and as bright as what is round it makes it
-        target = trainer._target(told, torch.full_like(picture, drawn), sources)
+        target = trainer._joint_target(told, torch.full_like(picture, drawn), sources)
         assert (target[at] == wanted).all()
         target[at] = told.frame[at]
         assert torch.equal(target, told.frame)
@@ -228,8 +219,8 @@ def test_a_run_of_an_earlier_version_is_shown_as_it_was_fitted(bright: Capture, 
 
 
 def test_a_sky_above_white_is_white_at_first(bright: Capture) -> None:
-    found, plain = (with_sky(bright, bright.views, Frames(bright, white=white)).rgb[len(bright.points):].astype(int)
-                    for white in (float(srgb_from_linear(np.array(WHITEST))), 1.0))
+    skies = (with_sky(bright, bright.views, Frames(bright, display_white=white)) for white in (SHOWN, 1.0))
+    found, plain = (sky.rgb[len(bright.points):].astype(int) for sky in skies)
     assert (found >= plain).all(), "it is drawn up, and no colour begins anew from black"
     assert found.max() == 255
 

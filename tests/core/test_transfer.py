@@ -208,7 +208,7 @@ def test_the_target_s_splats_hide_its_lights(flare: Path, look: Look, tmp_path: 
     with torch.no_grad():
         there.scene.sh[:, 0] = (3.0 - 0.5) / 0.28209479  # a display value
     for white, brightest in ((1.0, 1.0), (5.9, 12.5)):  # of a wall that is not quite opaque
-        there.scene.white = white
+        there.scene.display_white = white
         assert shown.of_frame(there.frames[0].frame).render(camera).scene.max() == pytest.approx(brightest, rel=0.05)
 
 

@@ -149,9 +149,11 @@ def main() -> None:
         core = cameras.core_camera(scene.camera.data, scene.camera.matrix_world, scene.render)
         window = overlay.window_of(overlay.Frame(0, 0, 1920, 1080), (1920, 1080), core)
 
+        look = looks.look_of(scene)
+
         def frame() -> None:
             found = overlay.joined(list(looks.seen(scene, depsgraph, scene.camera).values()))
-            overlay.levels(found, window, "add")
+            overlay.levels(found, window, look)
 
         frame()
         fast, slow = best(frame, 20)

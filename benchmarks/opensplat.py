@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from core.gaussians import projection, rendering
+from core.sampling import DILATION
 
 _BINDINGS = """
 #include <torch/extension.h>
@@ -71,7 +72,7 @@ class Rasterizer:
         self.module, self.size, self.upstream = module, (width, height), upstream
         with torch.no_grad():
             seen = projection.project(
-                means, quats, scales, *camera, width, height, rendering.NEAR, rendering.DILATION
+                means, quats, scales, *camera, width, height, rendering.NEAR, DILATION
             )
             xx, xy, yy = seen.covariances.unbind(-1)
             conics = torch.stack([yy, -xy, xx], -1) / (xx * yy - xy * xy)[:, None]

@@ -64,7 +64,7 @@ def thumbnail(look: Look) -> NDArray[np.float32]:
         _, place = light.query_range.clipped(middle, np.array([-0.24, -0.2], np.float32))
         found = light.evaluate(ViewOfLight(middle, np.eye(3, dtype=np.float32), place, 1.0))
         if found is not None:
-            shown = draw([found], k, SIDE, SIDE, look.blend)
+            shown = draw([found], k, SIDE, SIDE, look.blend, look.sampling)
             total += shown if look.blend == "add" else linear_from_srgb(shown)
     return np.clip(srgb_from_linear(np.maximum(total, 0)), 0, 1)
 

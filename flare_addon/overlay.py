@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.errors import FitFlareError
-from ..core.look import PlaneGaussians, pixels
+from ..core.look import Look, PlaneGaussians, pixels
 from ..core.look.drawing import OPACITY_MAX, reach
 from ..core.look.plane import arc_level, joined, ways
 from . import cameras, looks
@@ -153,9 +153,11 @@ def inside(centres: Floats, covariances: Floats, radii: Floats, width: int, heig
                           & (xx * yy - xy * xy > 0) & (radii > 0) & np.isfinite(x + y))
 
 
-def levels(gaussians: PlaneGaussians, window: Window, blend: str) -> dict[int, Quads]:
-    """Quads by level (a divisor of the size), those of the level in its own pixels; in drawing order."""
-    centres, covariances = pixels(gaussians, window.intrinsics)
+def levels(gaussians: PlaneGaussians, window: Window, look: Look) -> dict[int, Quads]:
+    """Quads of a look's Gaussians by level (a divisor of the size), those of the level in its own pixels; in drawing
+    order."""
+    blend = look.blend
+    centres, covariances = pixels(gaussians, window.intrinsics, look.sampling)
     radii, arcs = reach(gaussians, blend), ways(gaussians, window.intrinsics)
     rows = np.flatnonzero(inside(centres, covariances, radii, window.width, window.height))
     opacities = gaussians.opacities if blend == "add" else np.minimum(gaussians.opacities, OPACITY_MAX)
@@ -289,22 +291,23 @@ def _batch(made: Quads) -> Any:
     return gpu.types.GPUBatch(type="TRIS", buf=buffer, elem=triangles)
 
 
-def render(gaussians: PlaneGaussians | None, window: Window, blend: str) -> list[Any]:
-    """Draw Gaussians into the offscreens; returns one for each level, the full size first. Needs a GPU context."""
+def render(gaussians: PlaneGaussians | None, window: Window, look: Look) -> list[Any]:
+    """Draw Gaussians of a look into the offscreens; returns one for each level, the full size first. Needs a GPU
+    context."""
     import gpu
 
-    made = {} if gaussians is None else levels(gaussians, window, blend)
+    made = {} if gaussians is None else levels(gaussians, window, look)
     drawn = []
     for divisor in LEVELS:
         offscreen = _offscreen(divisor, window.width, window.height)
         with offscreen.bind():
             gpu.state.active_framebuffer_get().clear(color=(0.0, 0.0, 0.0, 0.0))
             if divisor in made:
-                gpu.state.blend_set("ADDITIVE" if blend == "add" else "ALPHA_PREMULT")
+                gpu.state.blend_set("ADDITIVE" if look.blend == "add" else "ALPHA_PREMULT")
                 gpu.state.depth_test_set("NONE")
                 shader = _shader("gaussian")
                 shader.bind()
-                shader.uniform_float("covers", 0.0 if blend == "add" else 1.0)
+                shader.uniform_float("covers", 0.0 if look.blend == "add" else 1.0)
                 # The level's own pixels: its last ones may reach past the window's edge.
                 shader.uniform_float("size", (offscreen.width, offscreen.height))
                 _batch(made[divisor]).draw(shader)
@@ -365,7 +368,7 @@ def draw_in(context: Any, scene: Any, camera: Any) -> None:
     gaussians = joined(list(looks.seen(scene, depsgraph, camera).values()))
     if gaussians is None:
         return
-    drawn = render(gaussians, window, look.blend)
+    drawn = render(gaussians, window, look)
     viewport = gpu.state.viewport_get()
     add(drawn, (window.x / region[0], window.y / region[1], (window.x + window.width) / region[0],
                 (window.y + window.height) / region[1]), look.blend, window)
@@ -382,7 +385,7 @@ def picture(scene: Any, depsgraph: Any, camera: Any, width: int, height: int) ->
     assert window is not None
     look = looks.look_of(scene)
     gaussians = joined(list(looks.seen(scene, depsgraph, camera).values()))
-    drawn = render(gaussians, window, look.blend)
+    drawn = render(gaussians, window, look)
     target = gpu.types.GPUOffScreen(width, height, format="RGBA32F")
     try:
         with target.bind():

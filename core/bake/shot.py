@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from ..capture.camera import Camera
-from ..fit.rendering import as_tensors, pose_and_intrinsics
+from ..fit.rendering import as_tensors, pose_and_intrinsics, render_scene
 from ..fit.run import Run
 from ..flare.compositing import layers as linear_layers
 from ..flare.compositing import splat_flare
@@ -61,11 +61,12 @@ class ShotRenderer:
         placed = [self._behind_the_scene(light, camera) for light in one.lights]
         with torch.no_grad():
             _, intrinsics = pose_and_intrinsics(camera)
-            flares = {name: splat_flare(as_tensors(found), intrinsics, *camera.size, self.look.blend)
+            flares = {name: splat_flare(as_tensors(found), intrinsics, *camera.size, self.look.blend,
+                                        sampling=self.look.sampling)
                       for name, found in evaluate(self.look, camera.world_to_camera, placed, edits,
                                                   self.shot.query).items()}
             dark = torch.zeros(camera.height, camera.width, 3)
-            scene, white = (None, 1.0) if self.run is None else (self.run.scene.render(camera),
+            scene, white = (None, 1.0) if self.run is None else (render_scene(self.run.scene, camera),
                                                                  self.run.scene.display_white)
             parts = linear_layers(dark if scene is None else scene.colour, flares, self.look.blend, white)
         found = {name: np.maximum(layer.numpy(), 0) if scene is None else layer.numpy()

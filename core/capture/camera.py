@@ -43,6 +43,11 @@ class Camera:
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
     @property
+    def focal_length(self) -> float:
+        """In pixels, the (geometric) mean of both directions."""
+        return math.sqrt(self.fx * self.fy)
+
+    @property
     def camera_to_world(self) -> Floats:
         """(4, 4), the inverse of the pose."""
         inverse = np.eye(4)

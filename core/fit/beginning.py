@@ -60,6 +60,8 @@ def _scene(capture: Capture, settings: FitSettings, views: tuple[View, ...],
             raise CaptureError(f"{settings.scene.start} holds no Gaussians; export it again.")
         for parameter in scene.parameters():
             parameter.requires_grad_(not settings.scene.frozen)
+        if not settings.scene.frozen:
+            scene.sampling = None  # it learns another grid
         return scene
     if not len(capture.points):
         raise CaptureError(f"{capture.folder} has no 3D points to start from; solve it again.")

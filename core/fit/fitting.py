@@ -16,6 +16,7 @@ from ..flare.file import FlareFile, TrainingCamera
 from ..gaussians.ply import write_ply
 from ..look import list_elements
 from ..progress import Progress
+from ..sampling import Sampling
 from . import checkpoint
 from .beginning import with_white
 from .preview import row, spread, write_preview, write_small
@@ -110,13 +111,17 @@ def _finish(trainer: Trainer, run: Run) -> None:
     """Results first, the flare last and whole, then the checkpoint goes: a kill in between repeats the last steps, and
     loses nothing."""
     _preview(trainer, run)
+    sampling = Sampling.of(trainer.frames.camera(view).focal_length for view in trainer.views)
+    if not run.settings.scene.frozen:
+        trainer.scene.sampling = sampling
     write_ply(run.folder / SCENE, trainer.scene)
     if trainer.flare is not None:
         camera = trainer.views[0].camera
         lens = TrainingCamera(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
         seen = trainer.flare.seen_from([torch.from_numpy(view.camera.world_to_camera) for view in trainer.views])
         with atomic_path(run.folder / FLARE) as unnamed:
-            flare_file.save(unnamed, FlareFile(trainer.flare, run.settings.blend, lens, seen=seen))
+            flare_file.save(unnamed, FlareFile(trainer.flare, run.settings.blend, lens, seen=seen,
+                                                sampling=sampling))
             list_elements(unnamed)
     (run.folder / CHECKPOINT).unlink(missing_ok=True)
 

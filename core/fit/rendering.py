@@ -2,13 +2,14 @@
 """One view of a fitted model: the scene, each light's flare, and both together."""
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from ..capture import Camera
-from ..flare.compositing import Blend, Layers, encode, joined, layers, splat_flare
+from ..flare.compositing import Blend, Layers, decode, encode, joined, layers, splat_flare
 from ..flare.model import FlareModel
 from ..flare.placement import PlaneGaussians
 from ..flare.visibility import VisibilitySettings, visible_shares
@@ -17,6 +18,9 @@ from ..gaussians.rasterizer import Kernels
 from ..gaussians.scene import SceneGaussians
 from ..look import Look, LookEdits
 from ..look import PlaneGaussians as LookGaussians
+from ..sampling import Sampling
+
+LEAST_ALPHA = 1e-6  # by which a depth is divided: where nothing is it stays 0
 
 
 class RenderedView(NamedTuple):
@@ -61,18 +65,44 @@ def _shares(flare: FlareModel, pose: Tensor, scene: SceneGaussians | None, visib
 @torch.no_grad()
 def render(scene: SceneGaussians, flare: FlareModel | None, blend: Blend, camera: Camera,
            kernels: Kernels = "auto", *, visibility: VisibilitySettings | None = None,
-           look: Look | None = None, edits: LookEdits | None = None) -> RenderedView:
-    """Everything a view has to give, without gradients. edits: changes of the flare, of which `look` is the reader."""
-    rendering = scene.render(camera, kernels=kernels)
+           look: Look | None = None, edits: LookEdits | None = None, sampling: Sampling | None = None) -> RenderedView:
+    """Everything a view has to give, without gradients. edits: changes of the flare, of which `look` is the reader.
+    sampling: the grid on which the flare was learned."""
+    rendering = render_scene(scene, camera, kernels)
     flares: dict[str, Splats] = {}
     if flare is not None:
         pose, intrinsics = pose_and_intrinsics(camera)
         shares = _shares(flare, pose, scene, visibility, kernels)
         gaussians = flare(pose, shares) if look is None or edits is None else _edited(look, edits, camera, shares)
-        flares = {name: splat_flare(one, intrinsics, camera.width, camera.height, blend, kernels=kernels)
+        flares = {name: splat_flare(one, intrinsics, camera.width, camera.height, blend, kernels=kernels,
+                                    sampling=sampling)
                   for name, one in gaussians.items()}
     parts = layers(rendering.colour, flares, blend, scene.display_white)
     return RenderedView(rendering, flares, encode(parts.composite.clamp_min(0)).clamp(0, 1), parts)
+
+
+def render_scene(scene: SceneGaussians, camera: Camera, kernels: Kernels = "auto", *, sh_degree: int | None = None,
+                 depth: bool = True) -> Rendering:
+    """A scene as the camera of the frames that it was fitted to would show it at this camera's size: where that is
+    coarser than theirs, each pixel is the mean, in linear light, of those of a larger picture."""
+    samples = 1 if scene.sampling is None else scene.sampling.samples(camera.focal_length, *camera.size)
+    if samples == 1:
+        return scene.render(camera, sh_degree, kernels=kernels, depth=depth)
+    large = scene.render(camera.scaled(samples * camera.width, samples * camera.height), sh_degree, kernels=kernels,
+                         depth=depth)
+
+    def mean(picture: Tensor) -> Tensor:
+        """(height, width, ...) of (samples height, samples width, ...)."""
+        return picture.reshape(camera.height, samples, camera.width, samples, *picture.shape[2:]).mean((1, 3))
+
+    alpha = mean(large.alpha)
+    found = replace(large, colour=encode(mean(decode(large.colour.clamp_min(0)))), alpha=alpha,
+                    centres=large.centres / samples, radii=large.radii / samples)
+    if not depth:
+        return found
+    middle = slice(samples // 2, None, samples)
+    return replace(found, depth=mean(large.alpha * large.depth) / alpha.clamp_min(LEAST_ALPHA),
+                   median_depth=large.median_depth[middle, middle])
 
 
 def _edited(look: Look, edits: LookEdits, camera: Camera,

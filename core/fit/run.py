@@ -143,10 +143,10 @@ class Run:
 
     def view(self, camera: Camera, edits: LookEdits | None = None) -> RenderedView:
         """Scene, flares and composite as tensors."""
-        model = self.flare.model if self.flare else None
+        model, sampling = (self.flare.model, self.flare.sampling) if self.flare else (None, None)
         return render(self.scene, model, self.settings.blend, camera, self.settings.kernels,
                       visibility=self.settings.flare.occluded_by_scene, look=None if edits is None else self.look,
-                      edits=edits)
+                      edits=edits, sampling=sampling)
 
     def render(self, camera: Camera, edits: LookEdits | None = None) -> ViewLayers:
         """The layers of a view at the camera's size, the flare as `edits` change it."""

@@ -31,7 +31,7 @@ from ..gaussians.ordering import morton_order
 from .beginning import first_flare, first_scene, moved_lights
 from .checkpoint import State
 from .frames import Frames, Targets
-from .rendering import render_flare
+from .rendering import render_flare, render_scene
 from .settings import FitSettings
 from .splitting import HeadStart, from_below, is_found, scene_beside_flare
 
@@ -82,7 +82,7 @@ class Trainer:
         settings = self.settings
         targets = self.frames.targets(self._view())
         self._set_rates()
-        scene = self.scene.render(targets.camera, sh_degree=self._sh_degree(), depth=False, kernels=settings.kernels)
+        scene = render_scene(self.scene, targets.camera, settings.kernels, sh_degree=self._sh_degree(), depth=False)
         self._look_for_lights()
         self._look_for_scene()
         alone = self._scene_alone(targets)
@@ -160,8 +160,8 @@ class Trainer:
             return
 
         def missing(targets: Targets) -> Tensor:
-            return targets.frame - self.scene.render(targets.camera, sh_degree=self._sh_degree(), depth=False,
-                                                     kernels=self.settings.kernels).colour
+            return targets.frame - render_scene(self.scene, targets.camera, self.settings.kernels,
+                                                sh_degree=self._sh_degree(), depth=False).colour
 
         asked = self.views[:: max(len(self.views) // ASKED, 1)]
         if not is_found((missing(self.frames.targets(view)) for view in asked), self.settings.split.found):

@@ -20,6 +20,7 @@ from torch import Tensor
 
 from ..gaussians import Splats, over, splat
 from ..gaussians.rasterizer import Kernels, Resolution
+from ..sampling import Sampling
 from . import placement
 from .placement import PlaneGaussians
 
@@ -27,12 +28,14 @@ Blend = Literal["over", "add"]
 
 
 def splat_flare(gaussians: PlaneGaussians, intrinsics: Tensor, width: int, height: int, blend: Blend, *,
-                kernels: Kernels = "auto", resolution: Resolution = "full") -> Splats:
-    """The flare's colour (height, width, 3) and transmittance (height, width) under these intrinsics.
+                kernels: Kernels = "auto", resolution: Resolution = "full",
+                sampling: Sampling | None = None) -> Splats:
+    """The flare's colour (height, width, 3) and transmittance (height, width) under these intrinsics. sampling: the
+    grid on which it was learned, so that it looks alike at every size.
 
     The colour is in display space for `over` and scene-linear for `add`.
     """
-    centres, covariances = placement.pixels(gaussians, intrinsics)
+    centres, covariances = placement.pixels(gaussians, intrinsics, sampling)
     arcs = None if gaussians.arcs is None else placement.slopes(gaussians.arcs, covariances, intrinsics)
     return splat(centres, covariances, gaussians.opacities, gaussians.colours, width, height,
                  rings=gaussians.rings, arcs=arcs, blend=blend, kernels=kernels, resolution=resolution)

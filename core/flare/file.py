@@ -19,6 +19,7 @@ from torch import Tensor
 
 from .. import tensors as on_disk
 from ..errors import FlareFileError
+from ..sampling import Sampling
 from .compositing import Blend
 from .deformation import QueryRange
 from .model import FlareForm, FlareModel, LightFlare
@@ -45,6 +46,7 @@ class FlareFile:
     """A flare model and what an artist needs to know of it.
 
     seen: by light, camera x, y, z (world) and light x, y (normalised) of each training view that had it in front.
+    sampling: the grid of the frames that it was fitted to, at the size at which they were.
     """
 
     model: FlareModel
@@ -54,6 +56,7 @@ class FlareFile:
     notes: str = ""
     elements: list[dict[str, Any]] = field(default_factory=list)
     seen: dict[str, list[list[float]]] = field(default_factory=dict)
+    sampling: Sampling | None = None
 
 
 def save(path: Path | str, flare: FlareFile) -> None:
@@ -67,6 +70,8 @@ def save(path: Path | str, flare: FlareFile) -> None:
     ]
     description = {"version": VERSION, "blend": flare.blend, "lights": lights, "camera": asdict(flare.camera),
                    "elements": flare.elements, "seen": flare.seen, "licence": flare.licence, "notes": flare.notes}
+    if flare.sampling is not None:
+        description["sampling"] = asdict(flare.sampling)
     on_disk.write(path, _packed(flare.model), {_KEY: json.dumps(description)})
 
 
@@ -147,4 +152,4 @@ def _unpacked(description: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> 
         raise ValueError(f"blend {blend!r}")
     return FlareFile(model, blend, TrainingCamera(**description["camera"]), str(description.get("licence", "")),
                      str(description.get("notes", "")), list(description.get("elements", [])),
-                     dict(description.get("seen", {})))
+                     dict(description.get("seen", {})), Sampling.read(description.get("sampling")))

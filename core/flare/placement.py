@@ -7,6 +7,7 @@ the only place where a camera's intrinsics enter.
 """
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import torch
@@ -14,6 +15,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from ..gaussians.rendering import STRENGTH2_MIN
+from ..sampling import Sampling, dilation
 
 PLANE_DEPTH = 0.21  # just past 3DGS's near plane of 0.2 (paper, appendix)
 
@@ -96,12 +98,14 @@ def rotation_matrices(quaternions: Tensor) -> Tensor:
     return torch.stack(rows, -1).reshape(-1, 3, 3)
 
 
-def pixels(gaussians: PlaneGaussians, intrinsics: Tensor, dilation: float = 0.3) -> tuple[Tensor, Tensor]:
-    """Centres (n, 2) px and covariances (n, 3) px^2 under intrinsics (3, 3), with 3DGS's low-pass added."""
+def pixels(gaussians: PlaneGaussians, intrinsics: Tensor, sampling: Sampling | None = None) -> tuple[Tensor, Tensor]:
+    """Centres (n, 2) px and covariances (n, 3) px^2 under intrinsics (3, 3), with the low-pass added, that of the grid
+    on which they were learned where it is known."""
     focal, centre = intrinsics.diagonal()[:2], intrinsics[:2, 2]
     fx, fy = focal
     stretch = torch.stack([fx * fx, fx * fy, fy * fy])
-    low_pass = torch.tensor([dilation, 0.0, dilation], dtype=stretch.dtype, device=stretch.device)
+    wide = dilation(sampling, math.sqrt(float(fx * fy)))
+    low_pass = torch.tensor([wide, 0.0, wide], dtype=stretch.dtype, device=stretch.device)
     return gaussians.means * focal + centre, gaussians.covariances * stretch + low_pass
 
 

@@ -19,13 +19,15 @@ from numpy.typing import NDArray
 
 from ..errors import FlareFileError
 from ..files import atomic_path
+from ..sampling import Sampling
 from .compressed import is_compressed, read_compressed
 from .rendering import NEAR
 from .scene import COEFFICIENTS, SceneGaussians
 
 HEADER_MAX = 1 << 16
-NEAR_WORD, WHITE_WORD = "near", "white"
-"""Comments of ours, each with a number: the scene's `near` and `display_white`, where they are not the usual ones."""
+NEAR_WORD, WHITE_WORD, FOCAL_WORD = "near", "white", "focal_lengths"
+"""Comments of ours: the scene's `near` and `display_white`, where they are not the usual ones, each a number, and the
+two of its `sampling`, where that is known."""
 WHITE_MOST = 107.0
 """Display value, somewhat above that of the brightest half float."""
 ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
@@ -68,6 +70,8 @@ def write_ply(path: Path | str, scene: SceneGaussians, *, extra: Mapping[str, ND
     )
     own = ((NEAR_WORD, scene.near, NEAR), (WHITE_WORD, scene.display_white, 1.0))
     comments = [*comments, *(f"{word} {number:.9g}" for word, number, usual in own if number != usual)]
+    if scene.sampling is not None:
+        comments.append(f"{FOCAL_WORD} {scene.sampling.least:.9g} {scene.sampling.most:.9g}")
     lines = ["ply", "format binary_little_endian 1.0", *(f"comment {line}" for line in comments),
              f"element vertex {n}"]
     lines += [f"property float {name}" for name in names] + ["end_header"]
@@ -121,7 +125,7 @@ def read_ply(path: Path | str) -> SceneGaussians:
     scene = SceneGaussians(
         columns(POSITION), columns(SCALE), columns(ROTATION), columns(("opacity",))[:, 0].clone(), sh
     )
-    scene.near, scene.display_white = header.near, header.display_white
+    scene.near, scene.display_white, scene.sampling = header.near, header.display_white, header.sampling
     return scene
 
 
@@ -134,6 +138,7 @@ class _Header(NamedTuple):
     start: int
     near: float
     display_white: float
+    sampling: Sampling | None
 
 
 def _header(path: Path, head: bytes) -> _Header:
@@ -144,6 +149,7 @@ def _header(path: Path, head: bytes) -> _Header:
     order, count, element = "", -1, ""
     layout: list[tuple[str, str]] = []
     near, display_white = NEAR, 1.0
+    sampling = None
     for line in head[:end].decode("ascii", "replace").splitlines()[1:]:
         match line.split():
             case ["format", form, _]:
@@ -156,6 +162,9 @@ def _header(path: Path, head: bytes) -> _Header:
             case ["comment", word, number] if word == WHITE_WORD:
                 with contextlib.suppress(ValueError):
                     display_white = float(number) if 1 < float(number) < WHITE_MOST else 1.0
+            case ["comment", word, least, most] if word == FOCAL_WORD:
+                with contextlib.suppress(ValueError):
+                    sampling = Sampling(float(least), float(most))
             case ["element", name, number]:
                 if count < 0 and (name != "vertex" or not (number.isascii() and number.isdigit())):
                     raise FlareFileError(f"{path} does not begin with its vertices; export it again.")
@@ -167,4 +176,4 @@ def _header(path: Path, head: bytes) -> _Header:
                 layout.append((words[1], TYPES[words[0]]))
     if not order or not layout or len({name for name, _ in layout}) < len(layout):
         raise FlareFileError(f"{path} is not a PLY file of Gaussians.")
-    return _Header(order, count, layout, start, near, display_white)
+    return _Header(order, count, layout, start, near, display_white, sampling)

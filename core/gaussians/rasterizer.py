@@ -7,9 +7,10 @@ from typing import Literal
 from torch import Tensor
 
 from ..errors import SettingsError
+from ..sampling import DILATION
 from .kernels import choose
 from .mixed import splat_mixed
-from .rendering import DILATION, NEAR, Rendering, Splats, levelled
+from .rendering import NEAR, Rendering, Splats, levelled
 from .spherical_harmonics import degree_of
 
 Kernels = Literal["auto", "torch", "tiles", "cpu", "cuda"]

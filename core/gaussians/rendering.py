@@ -21,8 +21,6 @@ STRENGTH2_MIN = 1e-16
 """Arcs whose squared strength is below this have no direction, nor a gradient by it."""
 NEAR = 0.2
 """Gaussians at this camera depth or nearer are culled."""
-DILATION = 0.3
-"""Added to the diagonal of projected covariances, px²: nothing is thinner than about half a pixel."""
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from ..capture import Camera, PointCloud
 from ..errors import SettingsError
+from ..sampling import Sampling, dilation
 from . import spherical_harmonics
 from .optimiser import Rate, replace_rows
 from .ordering import nearest_distances
@@ -47,6 +48,8 @@ class SceneGaussians(nn.Module):
         """Display value at which pictures of the scene are clipped: above 1 where its frames went on above white."""
         self.near = NEAR
         """Camera depth at which Gaussians are culled, world units: less in a world of small units."""
+        self.sampling: Sampling | None = None
+        """The grid of the frames that it was fitted to, where that is known: it looks alike at every size then."""
 
     @classmethod
     def from_points(cls, points: PointCloud) -> SceneGaussians:
@@ -110,7 +113,7 @@ class SceneGaussians(nn.Module):
             torch.as_tensor(camera.world_to_camera).to(self.means),
             torch.as_tensor(camera.intrinsics).to(self.means),
             camera.width, camera.height, background=background, sh_degree=sh_degree, kernels=kernels,
-            near=self.near, depth=depth, raw=True,
+            near=self.near, dilation=dilation(self.sampling, camera.focal_length), depth=depth, raw=True,
         )  # fmt: skip
 
 

@@ -12,6 +12,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..sampling import Sampling
 from .plane import Floats, PlaneGaussians, arc_level, joined, pixels, strengths, ways
 
 PROFILE_MIN = 1 / 4096  # added light below this share of its peak is left out (core/gaussians/rendering.py)
@@ -33,8 +34,9 @@ def reach(gaussians: PlaneGaussians, blend: str = "add") -> Floats:
 
 
 def draw(flares: Iterable[PlaneGaussians], intrinsics: ArrayLike, width: int, height: int,
-         blend: Literal["over", "add"] = "add") -> Floats:
-    """The flares as a picture (height, width, 3) under intrinsics (3, 3), pixel centres at + 0.5.
+         blend: Literal["over", "add"] = "add", sampling: Sampling | None = None) -> Floats:
+    """The flares as a picture (height, width, 3) under intrinsics (3, 3), pixel centres at + 0.5. sampling: the grid on
+    which they were learned.
 
     "add": scene-linear light. "over": display colour, premultiplied, laid over black.
     """
@@ -43,7 +45,7 @@ def draw(flares: Iterable[PlaneGaussians], intrinsics: ArrayLike, width: int, he
     if gaussians is None:
         return picture
     left = np.ones((height, width), np.float32)
-    centres, covariances = pixels(gaussians, intrinsics)
+    centres, covariances = pixels(gaussians, intrinsics, sampling)
     arcs = ways(gaussians, intrinsics)
     radii = reach(gaussians, blend)
     for number in range(len(gaussians)):

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import FlareFileError
+from ..sampling import Sampling
 from . import container, elements
 from .edits import LookEdits, edited
 from .elements import Element
@@ -174,8 +175,9 @@ class Look:
     """All lights of a .flare; made by `read`."""
 
     def __init__(self, path: Path, lights: tuple[LightLook, ...], blend: Literal["over", "add"], camera: TrainedCamera,
-                 licence: str = "", notes: str = "") -> None:
+                 licence: str = "", notes: str = "", sampling: Sampling | None = None) -> None:
         self.path, self.lights, self.blend, self.camera = path, lights, blend, camera
+        self.sampling = sampling
         self.licence, self.notes = licence, notes
 
     @property
@@ -288,11 +290,13 @@ def read(path: Path | str) -> Look:
         lights = tuple(_light(path, number, entry, tensors, blend, listed)
                        for number, entry in enumerate(description["lights"]))
         camera = TrainedCamera(**description["camera"])
+        sampling = Sampling.read(description.get("sampling"))
         if len({light.name for light in lights}) < len(lights):
             raise ValueError("two lights have one name")
     except (KeyError, TypeError, ValueError, IndexError, AttributeError) as problem:
         raise FlareFileError(f"{path} is damaged: its tensors do not fit its description ({problem}).") from problem
-    return Look(path, lights, blend, camera, str(description.get("licence", "")), str(description.get("notes", "")))
+    return Look(path, lights, blend, camera, str(description.get("licence", "")), str(description.get("notes", "")),
+                sampling)
 
 
 def _light(path: Path, number: int, entry: Mapping[str, Any], tensors: Mapping[str, NDArray[Any]], blend: str,

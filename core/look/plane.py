@@ -5,6 +5,7 @@ Everything is in normalised image coordinates (x/z, y/z, origin at the principal
 """
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -12,10 +13,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..sampling import Sampling, dilation
+
 Floats = NDArray[np.float32]
 
 PLANE_DEPTH = 0.21  # where solid Gaussians lie (core/flare/placement.py)
-DILATION = 0.3  # px², the low-pass of 3DGS
 ARC_SOFT = 0.1  # strength of an arc at which its opacity begins to be that of the brightest place
 
 C0 = 0.28209479177387814  # spherical harmonics with the signs and order of 3DGS
@@ -128,12 +130,14 @@ def colours(rays: Floats, sh: Floats, degree: int) -> Floats:
     return np.maximum(shown + np.float32(0.5), 0)
 
 
-def pixels(gaussians: PlaneGaussians, intrinsics: ArrayLike, dilation: float = DILATION) -> tuple[Floats, Floats]:
-    """Centres (n, 2) px and covariances (n, 3) px² under intrinsics (3, 3), with 3DGS's low-pass added."""
+def pixels(gaussians: PlaneGaussians, intrinsics: ArrayLike, sampling: Sampling | None = None) -> tuple[Floats, Floats]:
+    """Centres (n, 2) px and covariances (n, 3) px² under intrinsics (3, 3), with the low-pass added, that of the grid
+    on which they were learned where it is known."""
     k = np.asarray(intrinsics, np.float32)
     focal, centre = k.diagonal()[:2], k[:2, 2]
     stretch = np.array([focal[0] ** 2, focal[0] * focal[1], focal[1] ** 2], np.float32)
-    low_pass = np.array([dilation, 0, dilation], np.float32)
+    wide = dilation(sampling, math.sqrt(float(focal[0] * focal[1])))
+    low_pass = np.array([wide, 0, wide], np.float32)
     return gaussians.means * focal + centre, gaussians.covariances * stretch + low_pass
 
 

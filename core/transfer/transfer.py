@@ -23,7 +23,7 @@ from ..bake.layers import FrameLayers, Rendered
 from ..capture import Camera
 from ..colour import ColourSpace, colour_space
 from ..files import check_apart, remove_partial_of
-from ..fit.rendering import as_tensors, pose_and_intrinsics
+from ..fit.rendering import as_tensors, pose_and_intrinsics, render_scene
 from ..flare.compositing import decode, encode, splat_flare
 from ..flare.compositing import layers as linear_layers
 from ..flare.visibility import VisibilitySettings, of_clear, visible_share
@@ -122,7 +122,8 @@ class Transfer:
                 share=self.share(index, light.name) if view.depth > 0 else 0.0, edits=edits, name=light.name,
                 scale=self.settings.scale, fixed=self._fixed.get(light.name))
             if found is not None:
-                shown[light.name] = splat_flare(as_tensors(found), intrinsics, *camera.size, self.look.blend)
+                shown[light.name] = splat_flare(as_tensors(found), intrinsics, *camera.size, self.look.blend,
+                                                sampling=self.look.sampling)
         return shown
 
     def share(self, index: int, light: str) -> float:
@@ -251,7 +252,7 @@ class _OfFrame:
                 return plate.linear, nothing
             return np.asarray(Picture(plate.linear, "linear").resized(*camera.size).pixels, np.float32), nothing
         if target.scene is not None and target.shown:
-            rendering = target.scene.render(camera)
+            rendering = render_scene(target.scene, camera)
             return decode(rendering.colour.clamp(0, target.scene.display_white)).numpy(), rendering.depth.numpy()
         return np.zeros((camera.height, camera.width, 3), np.float32), nothing
 

@@ -26,6 +26,7 @@ from core.flare.model import OURS, PAPER, FlareForm, FlareModel, LightFlare, Vie
 from core.gaussians import Splats, rasterization
 from core.gaussians.optimiser import Adam
 from core.gaussians.rendering import arc_strengths
+from core.sampling import Sampling
 from tests.core.flared import cameras
 
 RANGE = QueryRange((-1.0, -1.0, -5.0), (1.0, 1.0, -3.0), (0.5, 0.5, 0.7))
@@ -109,8 +110,8 @@ def test_an_ellipse_has_its_axes() -> None:
 def test_resolution_and_focal_length_move_the_flare_as_a_lens_would() -> None:
     gaussians = next(iter(some_flare(replace(OURS, arcs=True))(pose()).values()))
     small, large = (torch.tensor([[f, 0, f / 3], [0, f, f / 4], [0, 0, 1.0]]) for f in (100.0, 200.0))
-    centres, covariances = placement.pixels(gaussians, small, dilation=0)
-    twice, wide = placement.pixels(gaussians, large, dilation=0)
+    centres, covariances = placement.pixels(gaussians, small, Sampling(100.0, 100.0))
+    twice, wide = placement.pixels(gaussians, large, Sampling(100.0, 100.0))
     assert torch.allclose(twice, 2 * centres, atol=1e-4)
     assert torch.allclose(wide, 4 * covariances, rtol=1e-5)
     slopes = [placement.slopes(gaussians.arcs, found, k) for found, k in ((covariances, small), (wide, large))]

@@ -359,9 +359,9 @@ def speed_of(overlay, scene) -> dict[str, float]:
     for _ in range(8):
         began = time.perf_counter()
         gaussians = overlay.joined(list(looks.seen(scene, depsgraph, scene.camera).values()))
-        overlay.levels(gaussians, window, look.blend)
+        overlay.levels(gaussians, window, look)
         middle = time.perf_counter()
-        drawn = overlay.render(gaussians, window, look.blend)
+        drawn = overlay.render(gaussians, window, look)
         with drawn[-1].bind():  # reading back waits for the drawing
             wait_for_gpu()
         numpy_ms.append(middle - began)

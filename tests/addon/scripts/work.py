@@ -170,7 +170,7 @@ core = cameras.core_camera(evaluated.data, evaluated.matrix_world, scene.render)
 def drawn(window):
     """The sum of the levels, as the last shader makes it."""
     total = np.zeros((window.height, window.width, 3), np.float32)
-    for divisor, quads in overlay.levels(gaussians, window, look.blend).items():
+    for divisor, quads in overlay.levels(gaussians, window, look).items():
         size = -(-window.height // divisor), -(-window.width // divisor)
         level = np.zeros((*size, 3), np.float32)
         x, y = np.arange(size[1]) + 0.5, np.arange(size[0])[:, None] + 0.5
@@ -211,7 +211,7 @@ def far_off(picture, expected):
 
 whole = overlay.window_of(overlay.Frame(0, 0, 3 * core.width, 3 * core.height), (3 * core.width, 3 * core.height), core)
 large = core.scaled(3 * core.width, 3 * core.height)
-expected = drawing.draw([gaussians], large.intrinsics, *large.size, look.blend)
+expected = drawing.draw([gaussians], large.intrinsics, *large.size, look.blend, look.sampling)
 facts["overlay off"] = far_off(drawn(whole), expected)
 # Zoomed in, the frame larger than the region and beyond its edges.
 cropped = overlay.window_of(overlay.Frame(-40, -30, 3 * core.width, 3 * core.height), (100, 80), core)

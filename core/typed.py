@@ -9,6 +9,36 @@ import typing
 from typing import Any, Literal
 
 
+@dataclasses.dataclass(frozen=True)
+class Bounds:
+    """The numbers from `least` to `most`; above, below: without the least, without the most itself."""
+
+    least: float
+    most: float
+    above: bool = False
+    below: bool = False
+
+    def __str__(self) -> str:
+        """After "must lie"."""
+        if not self.above and not self.below:
+            return f"between {self.least} and {self.most}"
+        return f"{'above' if self.above else 'from'} {self.least} {'and below' if self.below else 'to'} {self.most}"
+
+    def hold(self, value: float) -> bool:
+        """Whether the number is one of them; NaN never is."""
+        low = self.least < value if self.above else self.least <= value
+        return low and (value < self.most if self.below else value <= self.most)
+
+
+def is_utf8(text: str) -> bool:
+    """Whether it can be written into a file. Names of files can be what UTF-8 has no bytes for."""
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
+
+
 def table_of(kind: Any, data: Any) -> Any:
     """A dataclass of `kind` from a dictionary. Raises ValueError for what is no table, has other names, or values of
     another type."""
@@ -27,8 +57,12 @@ def field_of(kind: Any, name: str, value: Any) -> Any:
 
 
 def value_of(kind: Any, value: Any) -> Any:
-    """`value` as the type `kind`: a dataclass, a Literal, a tuple, or one of a union; numbers are finite. Raises
-    ValueError."""
+    """`value` as the type `kind`: a dataclass, a Literal, a tuple, or one of a union; numbers are finite, whole ones of
+    64 bits as TOML has them, and text is UTF-8. Raises ValueError."""
+    if isinstance(value, int) and value.bit_length() > 63:
+        raise ValueError("it has too many digits")
+    if isinstance(value, str) and not is_utf8(value):
+        raise ValueError(f"{value!r} is not UTF-8")
     if dataclasses.is_dataclass(kind):
         return table_of(kind, value)
     parts = typing.get_args(kind)

@@ -72,6 +72,10 @@ class Camera:
         return replace(self, width=width, height=height,
                        fx=self.fx * x, cx=self.cx * x, fy=self.fy * y, cy=self.cy * y)
 
+    def cropped(self, left: int, top: int, width: int, height: int) -> Camera:
+        """What of its picture lies from this pixel on, of this size."""
+        return replace(self, width=width, height=height, cx=self.cx - left, cy=self.cy - top)
+
     def normalised(self, xyz: ArrayLike) -> tuple[Floats, Floats]:
         """World points (n, 3) to ((n, 2) of x/z and y/z, (n,) depth z).
 

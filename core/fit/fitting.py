@@ -50,7 +50,7 @@ def fit(capture: Capture, settings: FitSettings, folder: Path | str, progress: P
         trainer = Trainer(capture, run.settings)
         remove_partial(folder)
     else:
-        settings, said = with_white(settings, capture)
+        settings, said = with_white(settings.checked(), capture)
         trainer = Trainer(capture, settings)  # before anything is written: it may refuse the capture
         run = Run.create(folder, settings, capture.folder)
     path = folder / CHECKPOINT
@@ -133,10 +133,10 @@ def _preview(trainer: Trainer, run: Run) -> None:
     views = held_out or trainer.views
     rows = []
     for index in spread(len(views), PREVIEW_ROWS):
-        camera = trainer.frames.camera(views[index])
+        camera, frame, _ = trainer.frames.targets(views[index])
         view = render(trainer.scene, trainer.flare, run.settings.blend, camera, run.settings.kernels,
                       visibility=run.settings.flare.occluded_by_scene)
-        rows.append(row(trainer.frames.frame(views[index]), view))
+        rows.append(row(frame, view))
     write_preview(run.folder / PREVIEW, rows)
     if rows:
         write_small(run.folder / SMALL_PREVIEW, rows[len(rows) // 2])

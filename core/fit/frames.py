@@ -7,12 +7,19 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
+from ..borders import DARKEST, Inside, inside_borders
 from ..capture import Camera, Capture, View
 from ..errors import CaptureError
 from ..pictures import Picture
 from .cache import MEMORY, PictureCache
+
+ASKED = 12
+"""Frames, about, that are asked for their borders."""
+SOFT = 1
+"""Lines beside a border that hold some of it at another size."""
 
 
 class Targets(NamedTuple):
@@ -28,7 +35,8 @@ class Frames:
 
     display_white: display value at which they are clipped; above 1 for float frames that hold light above white.
     `reference` says where the flare-free frames come from: "removed" (files in removed/), "truth" (exact
-    scene layers, when there is no removed/), or "" (none).
+    scene layers, when there is no removed/), or "" (none). Black borders that all frames have are cut off: they stay
+    with the camera, and would be put before it as a part of the scene.
     """
 
     def __init__(self, capture: Capture, width: int = 0, memory: int = MEMORY, *,
@@ -38,27 +46,59 @@ class Frames:
         self._width = width
         self.cache = PictureCache(memory)
         self.reference = "removed" if capture.has_removed else "truth" if capture.has_truth else ""
+        self.inside = self._inside()
+        """What lies inside the borders; None where there are none."""
+
+    @property
+    def says(self) -> tuple[str, ...]:
+        """Sentences for the person who asked for the fit."""
+        if self.inside is None:
+            return ()
+        (width, height), inside = self.camera(self.capture.views[0]).size, self.inside
+        return (f"The frames have black borders ({inside.top} and {height - inside.bottom} rows, {inside.left} and "
+                f"{width - inside.right} columns of {width}x{height}), which are left out of the fit.",)
 
     def camera(self, view: View) -> Camera:
-        """The view's camera at the working size: never larger than the frame."""
+        """The view's camera at the working size, never larger than the frame; with the borders."""
         camera = view.camera
         if not self._width or camera.width <= self._width:
             return camera
         return camera.scaled(self._width)
 
+    def _inside(self) -> Inside | None:
+        """What lies inside the borders that all frames have, at the working size; None where they have none, or are of
+        several sizes."""
+        views, scale = self.capture.views, 65535 / self.display_white
+        sizes = {self.camera(view).size for view in views}
+        if len(sizes) != 1:
+            return None
+        size, found = sizes.pop(), None
+        for view in views[:: max(len(views) // ASKED, 1)]:
+            stored = self._stored(view, "frame", self.capture.frame)
+            if stored is None or stored.max() <= DARKEST * scale:  # faded out
+                continue
+            inside = inside_borders(stored, lambda line: line / scale)
+            found = inside if found is None else found.joined(inside)
+            if found == Inside.whole(*size):
+                return None
+        return None if found is None else found.less(SOFT, *size)
+
     def targets(self, view: View) -> Targets:
-        """Camera, frame and flare-free frame of a view."""
-        return Targets(self.camera(view), self.frame(view), self.removed(view))
+        """Camera, frame and flare-free frame of a view, without the borders."""
+        camera, inside = self.camera(view), self.inside
+        if inside is not None:
+            camera = camera.cropped(inside.left, inside.top, *inside.size)
+        return Targets(camera, self.frame(view), self.removed(view))
 
     def frame(self, view: View) -> Tensor:
-        """The frame as filmed."""
+        """The frame as filmed, without the borders."""
         pixels = self._display(view, "frame", self.capture.frame)
         if pixels is None:
             raise CaptureError(f"{self.capture.folder} has no frame {view.name}.")
         return pixels
 
     def removed(self, view: View) -> Tensor | None:
-        """The frame without flare, None where the capture has none."""
+        """The frame without flare and borders, None where the capture has none."""
         if self.reference == "removed":
             return self._display(view, "removed", self.capture.removed)
         if self.reference == "truth":
@@ -67,14 +107,23 @@ class Frames:
 
     def _display(self, view: View, kind: str,
                  decode: Callable[[View, tuple[int, int]], Picture | None]) -> Tensor | None:
+        stored = self._stored(view, kind, decode)
+        if stored is None:
+            return None
+        if self.inside is not None:
+            stored = stored[self.inside.part]
+        return torch.from_numpy(stored.astype(np.float32)) / (65535 / self.display_white)
+
+    def _stored(self, view: View, kind: str,
+                decode: Callable[[View, tuple[int, int]], Picture | None]) -> NDArray[np.uint16] | None:
+        """The whole picture, as it is kept; None where there is none."""
         name = f"{kind}/{view.name}"
         stored = self.cache.get(name)
         if stored is None:
-            camera = self.camera(view)
-            picture = decode(view, (camera.width, camera.height))
+            picture = decode(view, self.camera(view).size)
             if picture is None:
                 return None
             # 16 bit keeps the smoothness of linear footage at half the size of float.
             stored = (picture.display(self.display_white) * (65535 / self.display_white) + 0.5).astype(np.uint16)
             self.cache.put(name, stored)
-        return torch.from_numpy(stored.astype(np.float32)) / (65535 / self.display_white)
+        return stored

@@ -27,6 +27,7 @@ from ..gaussians.ply import read_ply
 from ..gaussians.scene import SceneGaussians
 from ..look import Look, LookEdits
 from ..look import read as read_look
+from ..typed import is_utf8
 from .rendering import RenderedView, render
 from .settings import FitSettings, read_config, write_config
 
@@ -66,11 +67,15 @@ class Run:
 
     @classmethod
     def create(cls, folder: Path | str, settings: FitSettings, capture_folder: Path) -> Run:
-        """A new run folder, with its settings written. RunError where the folder holds a run already."""
+        """A new run folder, with its settings written. RunError where the folder holds a run already, or the capture's
+        name cannot be written down."""
         folder = Path(folder)
         if (folder / CONFIG).exists():
             raise RunError(f"{folder} holds a run already; go on with it by --resume, or choose another folder.")
         run = cls(folder, settings, capture_folder.resolve())
+        if not is_utf8(str(run.capture_folder)):
+            raise RunError(f"The name of the capture's folder, {str(run.capture_folder)!r}, is not UTF-8 and cannot be "
+                           "written down; rename it.")
         write_text(folder / CAPTURE, f"{run.capture_folder}\n")
         write_config(folder / CONFIG, settings)
         return run
@@ -83,7 +88,7 @@ class Run:
             raise RunError(f"{folder} is not the folder of a run (it has no {CONFIG}).")
         settings = read_config(folder / CONFIG)
         try:
-            capture = Path((folder / CAPTURE).read_text(encoding="utf-8").strip())
+            capture = Path((folder / CAPTURE).read_text(encoding="utf-8").removesuffix("\n"))
         except OSError as problem:
             raise RunError(f"{folder / CAPTURE} cannot be read ({problem.strerror}); start the fit anew.") from problem
         return cls(folder, settings, capture)

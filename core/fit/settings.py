@@ -6,9 +6,12 @@ fit ends in minutes on two CPU cores.
 """
 from __future__ import annotations
 
+import json
+import re
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, is_dataclass, replace
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, Literal
 
@@ -20,8 +23,9 @@ from ..flare.density import DensitySettings
 from ..flare.model import OURS, PAPER, FlareForm
 from ..flare.visibility import VisibilitySettings
 from ..gaussians.densification import ClassicSettings, McmcSettings
+from ..look.look import FORM_BOUNDS, MOST_GAUSSIANS
 from ..pictures import srgb_from_linear
-from ..typed import field_of, table_of
+from ..typed import Bounds, field_of, table_of
 
 Mode = Literal["default", "split", "unsup", "in-flare", "2d", "3dgs"]
 Preset = Literal["draft", "standard", "high", "paper"]
@@ -181,27 +185,14 @@ class FitSettings:
         return 1.0 if self.white is None else float(srgb_from_linear(np.array(self.white)))
 
     def checked(self) -> FitSettings:
-        """Itself; raises SettingsError where a value makes no sense."""
+        """Itself; raises SettingsError where a number lies outside of its `BOUNDS`, or values do not go together."""
+        for name, bounds in BOUNDS.items():
+            value = attrgetter(name)(self)
+            if isinstance(value, int | float) and not bounds.hold(value):
+                raise SettingsError(f"The settings cannot be used: {name} must lie {bounds}.")
         checks = (
-            (self.iterations >= 1, "iterations must be at least 1"),
-            (self.width >= 0, "size must not be negative"),
-            (0 <= self.ssim_share <= 1, "ssim_share must lie between 0 and 1"),
-            (self.white is None or 1 <= self.white <= 65504, "white must lie between 1 and 65504"),
-            (0 <= self.apart <= 1, "apart must lie between 0 and 1"),
-            (self.flare.count >= 1, "a flare starts with at least one Gaussian"),
-            (0 <= self.flare.begin < 1, "flare.begin must lie between 0 and 1"),
-            (self.flare.steady >= 0, "flare.steady must not be negative"),
-            (0 < self.flare.opacity < 1, "a flare's opacity must lie between 0 and 1"),
-            (self.seed >= 0, "seed must not be negative"),
+            (_is_holdout(self.holdout), "holdout must be a number of a few digits or the name of a split file"),
             (not self.scene.frozen or bool(self.scene.start), "a frozen scene needs a PLY to start from"),
-            (self.split.rounds >= 0, "split.rounds must not be negative"),
-            (0 <= self.split.excess <= 1 and 0 <= self.split.excess_unfound <= 1,
-             "split.excess and split.excess_unfound must lie between 0 and 1"),
-            (self.split.found >= 0, "split.found must not be negative"),
-            (self.split.weight >= 0 and self.split.glow >= 0, "split.weight and split.glow must not be negative"),
-            (self.split.reach > 0, "split.reach must be positive"),
-            (0 <= self.split.plain <= 1, "split.plain must lie between 0 and 1"),
-            (0 <= self.split.sh_degree <= 3, "split.sh_degree must lie between 0 and 3"),
             (self.mode != "2d" or not self.flare.form.line, "mode 2d needs a form without the line"),
             (self.flare.form.consistent, "a form with arcs needs rings, and ellipses instead of solid Gaussians"),
         )
@@ -209,6 +200,62 @@ class FitSettings:
             if not good:
                 raise SettingsError(f"The settings cannot be used: {sentence}.")
         return self
+
+
+def _is_holdout(holdout: str | int | None) -> bool:
+    """Whether text that reads as a number is one that can be counted to: `Capture.split` takes it for that."""
+    if not isinstance(holdout, str) or not holdout.strip().lstrip("+-").isdigit():
+        return True
+    return re.fullmatch(r"[+-]?\d{1,18}", holdout.strip()) is not None
+
+
+# ---- what the numbers may be ----------------------------------------------------------------------
+
+_COUNTED = 2**63 - 1  # TOML has no greater whole numbers
+_LARGE = 1e30  # what float32 still computes with
+_FROM_0, _FROM_1 = Bounds(0, _COUNTED), Bounds(1, _COUNTED)
+_SHARE = Bounds(0, 1)
+_BETWEEN = Bounds(0, 1, above=True, below=True)  # has a logit
+_AMOUNT = Bounds(0, _LARGE)  # a weight, or a rate: at 0 what it is of stays as it is
+_POSITIVE = Bounds(0, _LARGE, above=True)  # a rate that falls by a ratio, or is refused at 0 by its optimiser
+
+MOST_SEED = 2**31 - 1
+"""The greatest that every library takes; `headless.command` has it too, where there is no torch."""
+BOUNDS: dict[str, Bounds] = {
+    "iterations": Bounds(1, 10**9), "width": _FROM_0, "seed": Bounds(0, MOST_SEED), "ssim_share": _SHARE,
+    "apart": _SHARE, "holdout": _FROM_0, "white": Bounds(1, 65504), "checkpoint_every_s": _AMOUNT,
+    "preview_every": _FROM_1,
+
+    "flare.count": Bounds(1, MOST_GAUSSIANS), "flare.opacity": _BETWEEN, "flare.begin": Bounds(0, 1, below=True),
+    "flare.steady": _AMOUNT,
+    **{f"flare.form.{name}": bounds for name, bounds in FORM_BOUNDS.items()},
+    "flare.density.start": _FROM_0, "flare.density.stop": _FROM_0, "flare.density.every": _FROM_1,
+    "flare.density.clone_above": _SHARE, "flare.density.clone_ratio": _SHARE, "flare.density.noise": _AMOUNT,
+    "flare.density.prune_below": _SHARE, "flare.density.most": Bounds(0, MOST_GAUSSIANS),
+    **dict.fromkeys((f"flare.rates.{name}" for name in (
+        "network", "features", "opacity", "scale", "rotation", "offset", "ring", "arc", "latent")), _AMOUNT),
+    **dict.fromkeys(("flare.rates.grids", "flare.rates.position", "flare.rates.position_final"), _POSITIVE),
+    "flare.rates.settled": Bounds(0, 1, above=True),
+    "flare.visibility.radius": Bounds(1e-6, 1), "flare.visibility.margin": _SHARE,
+    "flare.visibility.pixels": Bounds(1, 1024),
+
+    "scene.sh_every": _FROM_1, "scene.reorder_every": _FROM_1,
+    "scene.classic.start": _FROM_0, "scene.classic.stop": _FROM_0, "scene.classic.every": _FROM_1,
+    "scene.classic.gradient": _AMOUNT, "scene.classic.small": _AMOUNT, "scene.classic.large": _POSITIVE,
+    "scene.classic.faint": Bounds(0, 1, below=True), "scene.classic.reset_every": _FROM_1,
+    "scene.classic.reset_to": _BETWEEN, "scene.classic.cap": _FROM_1,
+    "scene.mcmc.cap": _FROM_1, "scene.mcmc.start": _FROM_0, "scene.mcmc.stop": _FROM_0, "scene.mcmc.every": _FROM_1,
+    "scene.mcmc.growth": Bounds(1, 100), "scene.mcmc.faint": Bounds(0, 1, below=True), "scene.mcmc.noise": _AMOUNT,
+    "scene.mcmc.opacity_weight": _AMOUNT, "scene.mcmc.scale_weight": _AMOUNT,
+    **dict.fromkeys((f"scene.rates.{name}" for name in (
+        "features", "features_rest", "opacity", "scale", "rotation")), _AMOUNT),
+    **dict.fromkeys(("scene.rates.position", "scene.rates.position_final"), _POSITIVE),
+
+    "split.rounds": _FROM_0, "split.excess": _SHARE, "split.excess_unfound": _SHARE, "split.found": _AMOUNT,
+    "split.weight": _AMOUNT, "split.glow": _AMOUNT, "split.reach": Bounds(1e-6, 1e6), "split.plain": _SHARE,
+    "split.sh_degree": Bounds(0, 3),
+}
+"""What each number among the settings may be, by its dotted name; some may be None or text instead."""
 
 
 APART = 0.7
@@ -243,7 +290,7 @@ def preset(name: Preset, *, model: Literal["paper", "ours"] | None = None, mode:
     if model == "ours":
         flare = replace(flare, occlusion=True, begin=BEGIN, snap=True, steady=STEADY)
     settings = FitSettings(mode=mode, blend=blend, iterations=length, flare=flare,
-                           apart=APART if model == "ours" else 0.0)
+                           apart=APART if model == "ours" else 0.0).checked()  # schedules are computed from its length
     if name != "paper":
         count, most = {"draft": (300, 40_000), "standard": (500, 60_000), "high": (700, 200_000)}[name]
         settings = _shortened(settings, count, most)
@@ -301,8 +348,8 @@ def _toml(value: Any) -> str:
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, str):
-        escaped = value.replace("\\", "\\\\").replace('"', '\\"')
-        return f'"{escaped}"'
+        # JSON's text is TOML's, but that TOML wants one more control character escaped, and no pairs of surrogates.
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
     return repr(value)
 
 
@@ -339,4 +386,4 @@ def _changed(table: Any, keys: list[str], value: Any, name: str) -> Any:
     try:
         return replace(table, **{keys[0]: field_of(type(table), keys[0], value)})
     except (ValueError, TypeError) as problem:
-        raise SettingsError(f"The setting {name!r} cannot be {value!r} ({problem}).") from problem
+        raise SettingsError(f"The setting {name!r} cannot be used so ({problem}).") from problem

@@ -30,11 +30,11 @@ def with_sky(capture: Capture, views: tuple[View, ...], frames: Frames) -> Point
     xyz = middle + radius * _directions(COUNT)
     seen = np.full((len(views[:: _step(views)]), COUNT, 3), np.nan, np.float32)
     for row, view in zip(seen, views[:: _step(views)], strict=True):
-        camera = frames.camera(view)
+        camera, frame, _ = frames.targets(view)
         pixels, depth = camera.project(xyz)
         inside = camera.contains(pixels, depth)
         x, y = np.minimum(pixels[inside].astype(int), np.array(camera.size) - 1).T
-        row[inside] = frames.frame(view).numpy()[y, x]
+        row[inside] = frame.numpy()[y, x]
     found = np.isfinite(seen[..., 0]).any(0)
     colours = np.nanquantile(seen[:, found], FROM_BELOW, axis=0)
     rgb = np.concatenate([points.rgb, (colours.clip(0, 1) * 255 + 0.5).astype(np.uint8)])

@@ -28,6 +28,7 @@ from ..gaussians.densification import Classic, Mcmc, Strategy
 from ..gaussians.loss import l1_ssim
 from ..gaussians.optimiser import Adam
 from ..gaussians.ordering import morton_order
+from . import exposure
 from .beginning import first_flare, first_scene, moved_lights
 from .checkpoint import State
 from .frames import Frames, Targets
@@ -66,7 +67,8 @@ class Trainer:
                                "or fit with --mode unsup.")
         self.scene = first_scene(capture, settings, self.views, self.frames)
         self.flare = None if settings.mode == "3dgs" else first_flare(capture, self.views, self.frames, settings)
-        self.says = () if self.flare is None else moved_lights(capture, self.flare)
+        self.says = (*self.frames.says, *exposure.says(capture, self.views, self.frames),
+                     *(() if self.flare is None else moved_lights(capture, self.flare)))
         self.extent = capture.extent
         self._head_start = HeadStart(settings.split, len(self.views), settings.iterations)
         self.scene_adam = Adam(dict(self.scene.named_parameters()), self._scene_rates())
@@ -311,19 +313,22 @@ class Trainer:
                         "scene": dict(self.scene.state_dict()),
                         "scene_adam": self.scene_adam.state_dict(), "strategy": self.strategy.state_dict()}
         if self.flare is not None and self.flare_adam is not None and self.grid_adam is not None:
+            state["lights"] = self._given_lights()
             state["flare"] = dict(self.flare.state_dict())
             state["flare_adam"] = self.flare_adam.state_dict()
             state["grid_adam"] = {str(key): dict(value) for key, value in self.grid_adam.state_dict()["state"].items()}
         return state
 
     def load_state(self, state: State) -> None:
-        """Go on from a state. Raises RunError where it does not fit the capture and settings."""
+        """Go on from a state. Raises RunError where it does not fit the capture and settings, or the lights that the
+        fit was given have changed."""
         try:
             self.iteration, self._head_start.until = int(state["iteration"]), int(state["alone_until"])
             _load_parameters(dict(self.scene.named_parameters()), state["scene"])
             self.scene_adam.load_state_dict(state["scene_adam"])
             self.strategy.load_state_dict(state["strategy"])
             if self.flare is not None and self.flare_adam is not None and self.grid_adam is not None:
+                self._check_lights(state)
                 _load_parameters(dict(self.flare.named_parameters()), state["flare"])
                 self.flare.positions.copy_(state["flare"]["positions"])
                 self.flare.clear.copy_(state["flare"]["clear"])
@@ -331,14 +336,36 @@ class Trainer:
                 groups = self.grid_adam.state_dict()["param_groups"]
                 moments = {int(key): value for key, value in state.get("grid_adam", {}).items()}
                 self.grid_adam.load_state_dict({"state": moments, "param_groups": groups})
-        except (KeyError, RuntimeError, TypeError) as problem:
+        except (KeyError, RuntimeError, TypeError, ValueError) as problem:
             raise RunError(f"The checkpoint does not fit this fit ({problem}); start it anew.") from problem
+
+    def _given_lights(self) -> list[Any]:
+        """[name, [x, y, z]] of each light as the capture has it, wherever the fit has put it since."""
+        return [[light.name, light.xyz.tolist()] for light in self.capture.lights]
+
+    def _check_lights(self, state: State) -> None:
+        """Raises RunError where the state was made with other lights: flares belong to lights by their order. States of
+        earlier versions do not say with which."""
+        begun, given = state.get("lights"), self._given_lights()
+        if begun is not None and begun != given:
+            raise RunError(f"{self.capture.folder / 'lights.json'} has changed since the fit began "
+                           f"({_difference(begun, given)}); put the old one back, or begin the fit anew in another "
+                           "folder.")
 
 
 def _load_parameters(parameters: dict[str, Parameter], state: State) -> None:
     """Values of any number of rows: Gaussians come and go during a fit."""
     for name, parameter in parameters.items():
         parameter.data = state[name].clone().to(parameter.dtype)
+
+
+def _difference(begun: list[Any], given: list[Any]) -> str:
+    """What has changed in a list of [name, [x, y, z]]: the names, or else the first place."""
+    before, after = ([name for name, _ in lights] for lights in (begun, given))
+    if before != after:
+        return f"its lights were {', '.join(map(repr, before))}, and are {', '.join(map(repr, after))} now"
+    return next(f"{name!r} was at {old}, and is at {new} now"
+                for (name, old), (_, new) in zip(begun, given, strict=True) if old != new)
 
 
 def _decayed(first: float, last: float, progress: float) -> float:

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from .. import tensors as on_disk
 from ..errors import FlareFileError
+from ..look.look import MOST_GAUSSIANS
 from ..sampling import Sampling
 from .compositing import Blend
 from .deformation import QueryRange
@@ -26,7 +27,6 @@ from .model import FlareForm, FlareModel, LightFlare
 
 VERSION = 1
 _KEY = "fit_flare"
-_MOST_GAUSSIANS = 1_000_000  # a file that claims more is damaged or hostile
 
 
 @dataclass(frozen=True)
@@ -124,12 +124,11 @@ def _unpacked(description: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> 
     for light in description["lights"]:
         count = int(light["count"])
         xyz = [float(value) for value in light["xyz"]]
-        if not 0 <= count <= _MOST_GAUSSIANS or len(xyz) != 3 or not all(map(math.isfinite, xyz)):
+        if not 0 <= count <= MOST_GAUSSIANS or len(xyz) != 3 or not all(map(math.isfinite, xyz)):
             raise ValueError("a light's description makes no sense")
         low, high, reach = (_triple(light["range"][key]) for key in ("camera_low", "camera_high", "light_high"))
         form = FlareForm(**light["form"])
-        if not (form.sh_degree in range(4) and 1 <= form.levels <= 16 and 1 <= form.base <= 256
-                and 0 <= form.latent <= 64 and form.consistent):
+        if not form.makes_sense:
             raise ValueError("a light's form makes no sense")
         flares.append(LightFlare(form, QueryRange(low, high, reach), count, torch.Generator()))
         names.append(str(light["name"]))

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import NamedTuple, cast
 
 import torch
@@ -16,6 +16,7 @@ from torch import Tensor, nn
 
 from ..files import rounded
 from ..gaussians.spherical_harmonics import colours
+from ..look.look import Form
 from . import placement
 from .deformation import DeformationNetwork, QueryRange
 from .placement import PlaneGaussians
@@ -34,42 +35,8 @@ RING_WIDTH = 0.5
 """w of rings at first, in standard deviations."""
 
 
-@dataclass(frozen=True)
-class FlareForm:
-    """What the model is made of; each field a choice that can be measured alone.
-
-    line              Gaussians live on the line through principal point and light; else free (mode `2d`)
-    light_correction  delta_l, a 2D correction of the light's position for each view (paper, eq. 4)
-    plane_offset      delta_f, a deformed 2D offset of each Gaussian (paper, eq. 3)
-    solid             3D Gaussians with SH colour at depth 0.21 (paper); else ellipses on the plane
-    sh_degree         of the colour's view dependence, 0 to 3 (solid only)
-    static_offset     a learned 2D offset of each Gaussian, the same in all views
-    rings             the radial profile exp(-(r - r0)^2 / (2 w^2)) (METHOD, section 5)
-    arcs              one side of it brighter, by exp(b·d): rings of which the lens's barrel hides a part (ellipses with
-                      rings only)
-    latent            width of a per-Gaussian code that the network sees
-    levels, base      of the hash grids: how many, and the resolution of the coarsest. Fine cells hold a view
-                      each, and learn nothing about the views between
-    """
-
-    line: bool = True
-    light_correction: bool = True
-    plane_offset: bool = True
-    solid: bool = True
-    sh_degree: int = 3
-    static_offset: bool = False
-    rings: bool = False
-    latent: int = 0
-    levels: int = 16
-    base: int = 16
-    arcs: bool = False
-
-    @property
-    def consistent(self) -> bool:
-        """Whether its parts go together."""
-        return not self.arcs or (self.rings and not self.solid)
-
-
+FlareForm = Form
+"""What the model is made of: one definition, for this model and for the one without torch."""
 PAPER = FlareForm()
 OURS = replace(PAPER, solid=False, sh_degree=0, static_offset=True, rings=True, latent=4, levels=3, base=4)
 

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import FlareFileError
 from ..sampling import Sampling
+from ..typed import Bounds
 from . import container, elements
 from .edits import LookEdits, edited
 from .elements import Element
@@ -30,14 +31,31 @@ from .plane import (
 
 VERSION = 1
 _KEY = "fit_flare"
-_MOST_GAUSSIANS = 1_000_000  # a file that claims more is damaged or hostile
+MOST_GAUSSIANS = 1_000_000
+"""Of a light; a file that claims more is damaged or hostile."""
+FORM_BOUNDS = {"sh_degree": Bounds(0, 3), "latent": Bounds(0, 64), "levels": Bounds(1, 16), "base": Bounds(1, 256)}
+"""What the numbers of a form may be, likewise."""
 
 Query = Literal["target", "source", "trained"]
 
 
 @dataclass(frozen=True)
 class Form:
-    """What the model is made of (core.flare.model.FlareForm)."""
+    """What the model is made of; each field a choice that can be measured alone.
+
+    line              Gaussians live on the line through principal point and light; else free (mode `2d`)
+    light_correction  delta_l, a 2D correction of the light's position for each view (paper, eq. 4)
+    plane_offset      delta_f, a deformed 2D offset of each Gaussian (paper, eq. 3)
+    solid             3D Gaussians with SH colour at depth 0.21 (paper); else ellipses on the plane
+    sh_degree         of the colour's view dependence, 0 to 3 (solid only)
+    static_offset     a learned 2D offset of each Gaussian, the same in all views
+    rings             the radial profile exp(-(r - r0)^2 / (2 w^2)) (METHOD, section 5)
+    arcs              one side of it brighter, by exp(b·d): rings of which the lens's barrel hides a part (ellipses with
+                      rings only)
+    latent            width of a per-Gaussian code that the network sees
+    levels, base      of the hash grids: how many, and the resolution of the coarsest. Fine cells hold a view
+                      each, and learn nothing about the views between
+    """
 
     line: bool = True
     light_correction: bool = True
@@ -50,6 +68,16 @@ class Form:
     levels: int = 16
     base: int = 16
     arcs: bool = False
+
+    @property
+    def consistent(self) -> bool:
+        """Whether its parts go together."""
+        return not self.arcs or (self.rings and not self.solid)
+
+    @property
+    def makes_sense(self) -> bool:
+        """Whether its numbers lie within `FORM_BOUNDS` too."""
+        return self.consistent and all(bounds.hold(getattr(self, name)) for name, bounds in FORM_BOUNDS.items())
 
 
 @dataclass(frozen=True)
@@ -307,10 +335,9 @@ def _light(path: Path, number: int, entry: Mapping[str, Any], tensors: Mapping[s
                              "update to open it.")
     form, name, count = Form(**entry["form"]), str(entry["name"]), int(entry["count"])
     xyz = np.array([float(value) for value in entry["xyz"]], np.float64)
-    if not 0 <= count <= _MOST_GAUSSIANS or xyz.shape != (3,) or not np.isfinite(xyz).all():
+    if not 0 <= count <= MOST_GAUSSIANS or xyz.shape != (3,) or not np.isfinite(xyz).all():
         raise ValueError("a light's description makes no sense")
-    if not (form.sh_degree in range(4) and 1 <= form.levels <= 16 and 1 <= form.base <= 256
-            and 0 <= form.latent <= 64 and (not form.arcs or (form.rings and not form.solid))):
+    if not form.makes_sense:
         raise ValueError("a light's form makes no sense")
     own = {key[len(f"{number}."):]: value for key, value in tensors.items() if key.startswith(f"{number}.")}
     rows = {key[len("gaussians."):]: np.asarray(value, np.float32) for key, value in own.items()

@@ -11,11 +11,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..borders import Inside
 from ..capture import Camera, Capture, View
 from ..pictures import Picture, srgb_from_linear
 from ..progress import Progress
@@ -45,10 +47,11 @@ class Renderer(Protocol):
 
 
 def evaluate(renderer: Renderer, capture: Capture, cameras: Mapping[View, Camera],
-             progress: Progress | None = None) -> dict[str, Any]:
+             progress: Progress | None = None, inside: Inside | None = None) -> dict[str, Any]:
     """Scores of the given views, each rendered from its camera: the content of eval.json.
 
-    Scene and flare are scored against truth/ where the capture has it, else against removed/, else not.
+    Scene and flare are scored against truth/ where the capture has it, else against removed/, else not. inside: what
+    lies inside the frames' black borders, which alone is scored.
     Raises FrameError for pictures that cannot be read, and Cancelled when asked to stop.
     """
     progress = progress or Progress()
@@ -58,11 +61,15 @@ def evaluate(renderer: Renderer, capture: Capture, cameras: Mapping[View, Camera
     for view, camera in cameras.items():
         rendering = renderer.render(camera)
         composite = sum(rendering.flare_by_light.values(), rendering.scene)
+        part = (slice(None), slice(None)) if inside is None else inside.part
         clean = {"truth": capture.truth_scene, "removed": capture.removed}.get(reference, _nothing)
+        flare = capture.truth_flare if reference == "truth" else _nothing
+        known, exact = (None if picture is None else replace(picture, pixels=picture.pixels[part])
+                        for picture in (clean(view, camera.size), flare(view, camera.size)))
+        filmed = capture.frame(view, camera.size)
         scored.append((view.name, score_view(
-            composite, rendering.scene, capture.frame(view, camera.size), clean(view, camera.size),
-            capture.truth_flare(view, camera.size) if reference == "truth" else None,
-            out_of_range(capture, view, camera.size))))
+            composite[part], rendering.scene[part], replace(filmed, pixels=filmed.pixels[part]), known, exact,
+            out_of_range(capture, view, camera.size)[part])))
         progress.advance()
     size = next(iter(cameras.values())).size if cameras else (0, 0)
     return summary(reference, scored, size)

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -100,11 +100,12 @@ class Remover:
         codes = plate.codes.copy()
         flare = np.zeros(plate.codes.shape, np.float16)
         if not found.empty:
-            for rows, light in carried_up(found, plate.codes, plate.encoding, plate.top):
+            filmed, clean, taken = (one[plate.inside.part] for one in (plate.codes, codes, flare))
+            for rows, light in carried_up(found, filmed, plate.encoding, plate.top):
                 if matte is not None:
-                    light *= matte[rows, :, None]
-                codes[rows] = _less(plate.codes[rows], light, plate.encoding, plate.top)
-                flare[rows] = _taken(plate.codes[rows], codes[rows], light, plate.encoding, plate.top)
+                    light *= matte[plate.inside.part][rows, :, None]
+                clean[rows] = _less(filmed[rows], light, plate.encoding, plate.top)
+                taken[rows] = _taken(filmed[rows], clean[rows], light, plate.encoding, plate.top)
         return codes, flare
 
     def clean_display(self, display: Pixels) -> Pixels:
@@ -114,8 +115,8 @@ class Remover:
         return np.where(clean == codes, display, clean.astype(np.float32) / 65535)
 
     def tell(self, plate: Plate) -> Told:
-        """What the network tells of a plate."""
-        display = self.shown(plate)
+        """What the network tells of a plate, of what lies inside its black borders: it is shown pictures alone."""
+        display = self.shown(replace(plate, codes=plate.codes[plate.inside.part]))
         return Told(display, self.added(display))
 
     def added(self, display: Pixels) -> Pixels:

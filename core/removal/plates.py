@@ -13,6 +13,7 @@ import struct
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -20,10 +21,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import jpeg, tiff
+from ..borders import Inside, inside_borders
 from ..colour import ColourSpace, colour_space, space_of_chromaticities
 from ..errors import FrameError
 from ..files import atomic_path
-from ..pictures import SUFFIXES, Encoding, exr_parts, picture_size, save_exr, stored_pixels, write_exr
+from ..pictures import (
+    SUFFIXES,
+    Encoding,
+    exr_parts,
+    picture_size,
+    save_exr,
+    srgb_from_linear,
+    stored_pixels,
+    write_exr,
+)
 
 _KEPT_CHUNKS = (b"iCCP", b"gAMA", b"cHRM", b"sRGB", b"pHYs", b"eXIf", b"cICP")
 _KEPT_TAGS = (tiff.ORIENTATION, tiff.EXTRA_SAMPLES, tiff.X_RESOLUTION, tiff.Y_RESOLUTION, tiff.RESOLUTION_UNIT,
@@ -52,6 +63,14 @@ class Plate:
     def top(self) -> float:
         """The code that means 1."""
         return float(np.iinfo(self.codes.dtype).max) if self.codes.dtype.kind == "u" else 1.0
+
+    @cached_property
+    def inside(self) -> Inside:
+        """What lies inside its black borders."""
+        if self.encoding == "srgb":
+            return inside_borders(self.codes, lambda line: line / self.top)
+        return inside_borders(self.codes, lambda line: srgb_from_linear(
+            np.clip(np.nan_to_num(line.astype(np.float32), nan=1.0), 0, 1)))
 
     @property
     def space(self) -> ColourSpace:

@@ -39,7 +39,7 @@ def scores_of(folder: Path, progress: Progress, *, which: str = "held-out",
     if not views:
         raise RunError(f"{folder} held no view out; score others with --views train or all.")
     frames = Frames(capture, made.settings.width)
-    scores = evaluate(made, capture, {view: frames.camera(view) for view in views}, progress)
+    scores = evaluate(made, capture, {view: frames.camera(view) for view in views}, progress, frames.inside)
     write_json(made.folder / EVALUATION, scores)
     progress.say(table(scores))
     return {"eval": str(made.folder / EVALUATION),

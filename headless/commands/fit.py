@@ -23,6 +23,8 @@ MODES = ("default", "split", "unsup", "in-flare", "2d", "3dgs")
 MODELS = ("paper", "ours")
 BLENDS = ("over", "add")
 DECODED_BYTES = 1 << 26
+HOLDOUT_DIGITS = 18
+"""Digits of a number of views at most."""
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -141,11 +143,13 @@ def listed(path: Path) -> list[Path]:
 
 def holdout(text: str | None) -> str | int | None:
     """A number, or a file's absolute path, since a run is opened again from anywhere."""
-    if text is None or text.isdigit():
-        return text if text is None else int(text)
+    if text is None:
+        return None
+    if text.isdecimal() and len(text) <= HOLDOUT_DIGITS:
+        return int(text)
     path = Path(text)
-    if not path.is_file():
-        raise SettingsError(f"--holdout {text} is neither a number nor a file such as split.json.")
+    if text.isdecimal() or not path.is_file():
+        raise SettingsError(f"--holdout {text:.80} is neither a number nor a file such as split.json.")
     return str(path.resolve())
 
 
@@ -158,7 +162,7 @@ def change(text: str) -> tuple[str, Any]:
         raise SettingsError(f"--set {text} is not of the form name=value.")
     try:
         return name.strip(), tomllib.loads(f"value = {value}")["value"]
-    except tomllib.TOMLDecodeError:
+    except (ValueError, RecursionError):  # no TOML, or a number that is too long to be one
         return name.strip(), value.strip()
 
 

@@ -21,7 +21,7 @@ import pytest
 import torch
 
 from core.capture import Capture, Light
-from core.errors import Cancelled, CaptureError, FlareFileError, RunError
+from core.errors import Cancelled, CaptureError, FlareFileError, RunError, SettingsError
 from core.fit import FitSettings, Run, checkpoint, fit, preset
 from core.fit.beginning import NEAREST_PART, nearest_depth
 from core.fit.frames import Frames
@@ -31,6 +31,7 @@ from core.fit.sky import COUNT, with_sky
 from core.fit.splitting import from_below, is_found, nearness, scene_beside_flare
 from core.fit.trainer import Trainer
 from core.gaussians.rendering import NEAR
+from core.look.look import FORM_BOUNDS
 from core.pictures import read_picture, write_png
 from core.progress import Progress
 from tests.core.flared import flared_capture
@@ -343,10 +344,41 @@ def test_a_capture_without_what_the_mode_needs_is_refused_and_nothing_written(tm
 
 
 def test_a_fit_that_diverges_says_so_and_writes_no_result(tmp_path: Path, capture: Capture) -> None:
-    settings = quick(120, **{"scene.rates.features": 1e38})
+    settings = quick(120, **{"scene.rates.features": 1e30})
     with pytest.raises(RunError, match="diverged"):
         fit(capture, settings, tmp_path / "run")
     assert not (tmp_path / "run" / "scene.ply").exists()
+
+
+@pytest.mark.parametrize(("end", "name"), [(end, name) for name in FORM_BOUNDS for end in ("least", "most")])
+def test_a_form_at_its_bounds_is_fitted_and_read(tmp_path: Path, capture: Capture, end: str, name: str) -> None:
+    value = getattr(FORM_BOUNDS[name], end)
+    run = fit(capture, quick(1, **{f"flare.form.{name}": value}), tmp_path / "run")
+    assert run.flare is not None and run.look is not None
+    assert getattr(run.flare.model.lights[0].form, name) == getattr(run.look.lights[0].form, name) == value
+
+
+def test_settings_that_nobody_has_checked_are_before_anything_is_written(tmp_path: Path, capture: Capture) -> None:
+    with pytest.raises(SettingsError, match="preview_every"):
+        fit(capture, replace(quick(), preview_every=0), tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("name", ["cap ", " cap", "cap\n"])
+def test_a_run_finds_its_capture_by_any_name(tmp_path: Path, capture: Capture, name: str) -> None:
+    made = Run.create(tmp_path / "run", quick(), shutil.copytree(capture.folder, tmp_path / name))
+    found = Run.open(made.folder)
+    assert found.find_capture(None).samefile(tmp_path / name)
+
+
+def test_a_capture_whose_name_cannot_be_written_down_is_refused(tmp_path: Path, capture: Capture) -> None:
+    try:
+        folder = Path(shutil.copytree(capture.folder, tmp_path / os.fsdecode(b"cap\xff")))
+    except OSError:
+        pytest.skip("this disk has no such names")
+    with pytest.raises(RunError, match="not UTF-8"):
+        fit(Capture.open(folder), quick(2), tmp_path / "run")
+    assert not (tmp_path / "run").exists()
 
 
 def test_a_run_folder_is_not_overwritten(tmp_path: Path, capture: Capture) -> None:
@@ -367,6 +399,45 @@ def test_a_run_goes_on_with_its_own_capture(tmp_path: Path, capture: Capture) ->
     (tmp_path / "run" / "capture.txt").write_text(str(tmp_path / "gone"))  # it moved: here it lies elsewhere
     with pytest.raises(Cancelled):
         fit(other, quick(), tmp_path / "run", StopAt(1), resume=True)
+
+
+def test_a_fit_goes_on_with_the_lights_it_began_with(tmp_path: Path, capture: Capture) -> None:
+    """Flares are kept by the order of their lights, which keep the names and places that lights.json has."""
+    (lamp,) = capture.lights
+    both = (lamp, Light("sun", lamp.xyz + 0.1))
+
+    def with_lights(*lights: Light) -> Capture:
+        own = copy.copy(capture)
+        own.lights = lights
+        return own
+
+    with pytest.raises(Cancelled):
+        fit(with_lights(*both), quick(), tmp_path / "run", StopAt(2))
+    for lights, what in (
+            (both[::-1], "were 'lamp', 'sun', and are 'sun', 'lamp' now"), (both[:1], "are 'lamp' now"),
+            ((lamp, Light("moon", both[1].xyz)), "are 'lamp', 'moon' now"),
+            ((lamp, Light("sun", lamp.xyz + 0.2)), "'sun' was at .*, and is at .* now")):
+        with pytest.raises(RunError, match=rf"lights\.json has changed .*{what}.*; put the old one back"):
+            fit(with_lights(*lights), quick(), tmp_path / "run", resume=True)
+    with pytest.raises(Cancelled):
+        fit(with_lights(*both), quick(), tmp_path / "run", StopAt(1), resume=True)
+
+
+def test_a_light_that_the_fit_has_moved_is_still_the_one_it_was_given(capture: Capture) -> None:
+    first, second = (Trainer(capture, quick()) for _ in range(2))
+    assert first.flare is not None
+    first.flare.positions += 0.25
+    second.load_state(first.state())
+    assert second.flare is not None and torch.equal(second.flare.positions, first.flare.positions)
+
+
+def test_a_checkpoint_of_an_earlier_version_goes_on(capture: Capture) -> None:
+    """It does not say which lights the fit was given."""
+    state = Trainer(capture, quick()).state()
+    del state["lights"]
+    moved = copy.copy(capture)
+    moved.lights = (Light("sun", capture.lights[0].xyz + 0.1),)
+    Trainer(moved, quick()).load_state(state)
 
 
 def test_a_world_of_small_units_is_fitted_as_others_are(capture: Capture) -> None:

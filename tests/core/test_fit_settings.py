@@ -2,13 +2,16 @@
 """Settings survive config.toml, presets hold the paper's figures, and nonsense is refused."""
 from __future__ import annotations
 
+import typing
+from collections.abc import Iterator
+from dataclasses import is_dataclass
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from core.errors import RunError, SettingsError
-from core.fit.settings import changed, preset, read_config, write_config
+from core.fit.settings import BOUNDS, FitSettings, changed, preset, read_config, write_config
 
 
 @pytest.mark.parametrize("name", ["draft", "standard", "high", "paper"])
@@ -17,6 +20,62 @@ def test_config_round_trip(tmp_path: Path, name: Any, model: Any) -> None:
     settings = changed(preset(name, model=model), {"holdout": 'odd "name"\\.json', "seed": 7})
     write_config(tmp_path / "config.toml", settings)
     assert read_config(tmp_path / "config.toml") == settings
+
+
+@pytest.mark.parametrize("name", ["a\nb\r.ply", "a\tb\x00\x1b\x7f.ply", "Straße 写真 \U0001f526.ply"])
+def test_names_of_any_characters_come_back(tmp_path: Path, name: str) -> None:
+    settings = changed(preset("draft"), {"scene.start": name})
+    write_config(tmp_path / "config.toml", settings)
+    assert read_config(tmp_path / "config.toml").scene.start == name
+
+
+def test_a_name_that_is_not_utf_8_is_refused() -> None:
+    for setting in ("scene.start", "holdout"):
+        with pytest.raises(SettingsError, match="not UTF-8"):
+            changed(preset("draft"), {setting: "cap\udcff"})
+
+
+def numbers(kind: Any, prefix: str = "") -> Iterator[tuple[str, bool]]:
+    """Dotted names of the settings that can be numbers, and whether those are whole."""
+    for name, of in typing.get_type_hints(kind).items():
+        if is_dataclass(of):
+            yield from numbers(of, f"{prefix}{name}.")
+        elif {int, float} & {of, *typing.get_args(of)}:
+            yield f"{prefix}{name}", float not in (of, *typing.get_args(of))
+
+
+NUMBERS = dict(numbers(FitSettings))
+
+
+def test_every_number_has_bounds() -> None:
+    assert NUMBERS.keys() == BOUNDS.keys()
+
+
+@pytest.mark.parametrize("name", NUMBERS)
+def test_a_number_lies_within_its_bounds(name: str) -> None:
+    bounds, settings = BOUNDS[name], preset("draft")
+    step = 1 if NUMBERS[name] else 1e-9
+    good = [bounds.least + step * bounds.above, bounds.most - step * bounds.below]
+    bad = [bounds.least - step * (not bounds.above), -1, -1e30, bounds.most * 1.01 + step, 10**30, 10**400]
+    if bounds.below:
+        bad.append(bounds.most)
+    for value in good:
+        changed(settings, {name: value})
+    for value in bad:
+        with pytest.raises(SettingsError, match=f"{name}.* (must lie|cannot be used so)"):
+            changed(settings, {name: int(value) if NUMBERS[name] else value})
+
+
+def test_numbers_too_long_to_be_written_are_refused() -> None:
+    for name, value in (("mode", 1 << 20_000), ("ssim_share", 1 << 20_000), ("holdout", "9" * 5000)):
+        with pytest.raises(SettingsError):
+            changed(preset("draft"), {name: value})
+
+
+def test_a_preset_of_any_length_is_one_sentence() -> None:
+    for length in (0, -5, 10**400):
+        with pytest.raises(SettingsError, match="iterations must lie"):
+            preset("draft", iterations=length)
 
 
 def test_the_paper_preset_is_the_paper() -> None:
@@ -36,7 +95,7 @@ def test_the_paper_preset_is_the_paper() -> None:
 @pytest.mark.parametrize(("name", "value"), [
     ("iterations", 0), ("iterations", 2.5), ("ssim_share", 2.0), ("ssim_share", float("nan")), ("mode", "fast"),
     ("width", -1), ("flare.rates.network", "quick"), ("flare.rates", 1.0), ("nothing", 1), ("seed.low", 1),
-    ("flare.count", True), ("mode", "2d"),
+    ("flare.count", True), ("mode", "2d"), ("holdout", "²"), ("holdout", "+-5"),
 ])
 def test_nonsense_is_refused_with_the_name(name: str, value: Any) -> None:
     with pytest.raises(SettingsError):

@@ -22,7 +22,7 @@ from core.look import Edit, KeyedEdits, LookEdits, PlaneGaussians, ViewOfLight, 
 from core.look import elements as grouping
 from core.look.container import read_tensors, rewritten
 from core.look.edits import edited
-from core.look.look import asked
+from core.look.look import FORM_BOUNDS, asked
 from core.look.shot import PlacedLight, Shot, ShotFrame, evaluate
 from core.pictures import linear_from_srgb, srgb_from_linear
 from tests.core.flared import cameras
@@ -307,6 +307,19 @@ def test_arcs_need_rings(tmp_path: Path) -> None:
     for reader in (read, flare_file.load):
         with pytest.raises(FlareFileError, match="is damaged"):
             reader(tmp_path / "b.flare")
+
+
+@pytest.mark.parametrize("name", FORM_BOUNDS)
+def test_a_form_outside_of_its_bounds_is_refused_by_all_readers(name: str, tmp_path: Path) -> None:
+    saved(tmp_path / "a.flare", SMALL, 1)
+    _, metadata = read_tensors(tmp_path / "a.flare")
+    description = json.loads(metadata["fit_flare"])
+    for value in (FORM_BOUNDS[name].least - 1, FORM_BOUNDS[name].most + 1):
+        description["lights"][0]["form"][name] = value
+        rewritten(tmp_path / "a.flare", tmp_path / "b.flare", {"fit_flare": json.dumps(description)})
+        for reader in (read, flare_file.load):
+            with pytest.raises(FlareFileError, match="form makes no sense"):
+                reader(tmp_path / "b.flare")
 
 
 def test_streaks_alone_are_lengthened() -> None:

@@ -15,7 +15,7 @@ from fit_flare.core.errors import Cancelled, FitFlareError, SettingsError
 from fit_flare.core.fit import settings as fit_settings
 from fit_flare.core.progress import Progress
 from fit_flare.headless import cli
-from fit_flare.headless.command import Command, Step
+from fit_flare.headless.command import MOST_SEED, Command, Step
 from fit_flare.headless.commands import COMMANDS, bake, fit
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -69,6 +69,15 @@ def test_misuse_is_status_2_and_one_sentence(words: list[str], capfd: pytest.Cap
     ["fit", "{capture}", "--out", "{tmp}/o", "--set", "flare"],
     ["fit", "{capture}", "--out", "{tmp}/o", "--set", "flare.colour=1"],
     ["fit", "{capture}", "--out", "{tmp}/o", "--set", "flare.count=many"],
+    ["fit", "{capture}", "--out", "{tmp}/o", "--holdout", "9" * 5000],
+    ["fit", "{capture}", "--out", "{tmp}/o", "--holdout", "²"],
+    ["fit", "{capture}", "--out", "{tmp}/o", "--iterations", "9" * 400],
+    *(["fit", "{capture}", "--out", "{tmp}/o", "--set", change] for change in (
+        "flare.form.latent=65", "flare.form.levels=0", "flare.form.base=300", "preview_every=0", "scene.sh_every=0",
+        "scene.reorder_every=0", "scene.classic.every=0", "flare.visibility.radius=0", "flare.rates.position=0",
+        "flare.rates.settled=-1", "scene.rates.position=-1", "flare.count=100000000000", "seed=" + "9" * 26,
+        "seed=" + "9" * 5000, "seed=0x" + "f" * 5000, "ssim_share=" + "9" * 400, "holdout=" + "9" * 5000,
+        "seed=" + "[" * 5000)),
     ["fit", "{capture}", "--out", "{tmp}/o", "--list", "{capture}/split.json"],
     ["fit", "{capture}", "--out", "{tmp}/o", "--jobs", "2"], ["fit", "{capture}", "--out", "{tmp}/o", "--entry", "2"],
     ["bake", "no/run", "--out", "{tmp}/o", "--scene", "no.ply"],
@@ -177,6 +186,7 @@ def test_a_farm_is_told_names_of_any_script(tmp_path: Path) -> None:
 def test_choices_are_those_of_the_settings() -> None:
     assert get_args(fit_settings.Preset) == fit.PRESETS
     assert get_args(fit_settings.Mode) == fit.MODES
+    assert fit_settings.MOST_SEED == MOST_SEED
 
 
 def test_settings_on_the_command_line() -> None:

@@ -4,18 +4,22 @@ from __future__ import annotations
 
 import contextlib
 import glob
+import hashlib
 import json
 import math
 import os
+import platform
 import re
 import shutil
 import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 from .errors import FitFlareError, SettingsError
+from .processes import runs
 
 WRITTEN_BY_HAND = "utf-8-sig"
 """Encoding to read what people write: UTF-8, before which Windows' editors put a mark."""
@@ -23,6 +27,8 @@ _PARTIAL = ".partial-"
 _REFUSALS = 100  # a hundredth of a second apart
 _HELD = (5, 32, 33)  # Windows: access denied, sharing violation, lock violation
 _PATIENCE_S = 2.0
+_WRITER = re.compile(r"-(?P<process>\d+)@(?P<machine>[0-9a-f]{8})-")
+_ABANDONED_S = 3600.0
 _OF_DEVICES = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\.|$)", re.IGNORECASE)
 
 
@@ -34,7 +40,7 @@ def atomic_path(target: Path | str) -> Iterator[Path]:
     """
     target = Path(target)
     target.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(prefix=_partial_of(target), suffix=target.suffix, dir=target.parent)
+    handle, name = tempfile.mkstemp(prefix=_partial_of(target) + _writer(), suffix=target.suffix, dir=target.parent)
     os.close(handle)
     temporary = Path(name)
     try:
@@ -76,14 +82,38 @@ def _share(temporary: Path, mode: int) -> None:
 
 
 def _partial_of(target: Path) -> str:
-    return f"{_PARTIAL}{target.name[:80]}-"
+    return f"{_PARTIAL}{os.fsencode(target.name)[:80].decode(errors='ignore')}-"
+
+
+def _writer() -> str:
+    """This process, for the name of what it writes: its number and its machine's."""
+    return f"{os.getpid()}@{_machine()}-"
+
+
+@lru_cache(maxsize=1)
+def _machine() -> str:
+    return hashlib.sha256(platform.node().encode()).hexdigest()[:8]
+
+
+def _is_being_written(partial: Path) -> bool:
+    """Whether the process that its name tells still runs. Of another machine it is taken to for an hour."""
+    told = _WRITER.search(partial.name)
+    if told is None:
+        return False
+    if told["machine"] != _machine():
+        with contextlib.suppress(OSError):
+            return time.time() - partial.stat().st_mtime < _ABANDONED_S
+        return False
+    return int(told["process"]) == os.getpid() or runs(int(told["process"]))
 
 
 def remove_partial_of(target: Path | str) -> None:
-    """Remove what a killed process left of `target` half written; only for whom that file is to write."""
+    """Remove what a killed process left of `target` half written. What another one is writing stays: on a farm a task
+    may be given again while its first worker still lives."""
     target = Path(target)
     for path in target.parent.glob(f"{glob.escape(_partial_of(target))}*"):
-        path.unlink(missing_ok=True)
+        if not _is_being_written(path):
+            path.unlink(missing_ok=True)
 
 
 @contextlib.contextmanager
@@ -135,7 +165,7 @@ def remove_partial(folder: Path | str) -> None:
     for path in Path(folder).rglob(f"{_PARTIAL}*"):
         if path.is_dir():
             shutil.rmtree(path, ignore_errors=True)
-        else:
+        elif not _is_being_written(path):
             path.unlink(missing_ok=True)
 
 
@@ -221,9 +251,13 @@ def _file_of(path: Path) -> object:
     return (folder.st_dev, folder.st_ino, file.st_ino) if folder.st_ino and file.st_ino else whole
 
 
-def are_newer(results: Iterable[Path], sources: Iterable[Path]) -> bool:
-    """Whether all results are there, and none older than a source."""
-    results, sources = list(results), list(sources)
-    if not all(path.is_file() for path in [*results, *sources]):
-        return False
-    return min(path.stat().st_mtime for path in results) >= max(path.stat().st_mtime for path in sources)
+def content_of(path: Path) -> str:
+    """A digest of a file's content. Asked for again it is known, as long as the file's size and time stay."""
+    state = path.stat()
+    return _content(path, state.st_size, state.st_mtime_ns)
+
+
+@lru_cache(maxsize=64)
+def _content(path: Path, _size: int, _time: int) -> str:
+    with open(path, "rb") as stream:
+        return hashlib.file_digest(stream, "blake2b").hexdigest()[:16]

@@ -25,10 +25,10 @@ from typing import Any, Literal
 
 import bpy
 
+from ..core import processes
 from ..core.errors import DISK_FULL, EngineError, FitFlareError, RunError, refusal
 from ..core.files import write_json
 from ..core.progress import STOP_FILE
-from . import processes
 
 State = Literal["running", "done", "failed", "stopped"]
 

@@ -37,8 +37,8 @@ class OfCamera(Protocol):
 
 class FrameRenderer(OfCamera, Protocol):
     """What renders one frame. fingerprint: changes whenever this frame's picture would, beyond the whole's; empty
-    where nothing is this frame's alone. words: edits that the frame comes with, for `LookEdits.parse`. rest_is_made:
-    whether what `finished` writes beside the layers is there. finished: its layers, already in the space asked for, as
+    where nothing is this frame's alone. words: edits that the frame comes with, for `LookEdits.parse`. rest: the
+    files that `finished` writes beside the layers. finished: its layers, already in the space asked for, as
     they are to be written."""
 
     @property
@@ -46,7 +46,7 @@ class FrameRenderer(OfCamera, Protocol):
     @property
     def words(self) -> Sequence[str]: ...
     @property
-    def rest_is_made(self) -> bool: ...
+    def rest(self) -> Sequence[Path]: ...
     def finished(self, layers: FrameLayers, camera: Camera) -> FrameLayers: ...
 
 
@@ -73,7 +73,7 @@ class _OfView:
     renderer: Renderer
     camera: Camera
     words: tuple[str, ...] = ()
-    rest_is_made: bool = True
+    rest: tuple[Path, ...] = ()
 
     @property
     def fingerprint(self) -> str:
@@ -123,8 +123,8 @@ def bake_frames(source: Sequenced, frames: Sequence[Frame], cameras: Mapping[str
     """Write the layers of `frames`, each by its own renderer, under `out`; returns the content of bake.json.
 
     Frames that an earlier bake with the same settings finished are left as they are, and stay in the record.
-    Raises RunError where `out` holds layers made with other settings, unless `overwrite`; SettingsError for
-    edits that make no sense; Cancelled when asked to stop.
+    Raises RunError where `out` holds layers made with other settings, unless `overwrite`, or another bake begins to
+    write such there; SettingsError for edits that make no sense; Cancelled when asked to stop.
     """
     settings, progress, out = settings or BakeSettings(), progress or Progress(), Path(out)
     keyed = settings.keyed.and_always(settings.edits)
@@ -145,8 +145,12 @@ def bake_frames(source: Sequenced, frames: Sequence[Frame], cameras: Mapping[str
         own = {"inputs": inputs} if inputs else {}
         return {"view": frame.view, "frame": frame.number, **own, **made_from}
 
-    done = [frame for frame in frames if _is_made(out / frame.file, notes(frame)) and of_frame(frame).rest_is_made]
-    record = _add_to_record(out, made_from, names, [_entry(out, frame) for frame in done])
+    def entry(frame: Frame) -> dict[str, Any]:
+        return _entry(out, frame, of_frame(frame).rest)
+
+    done = [frame for frame in frames if _is_made(out / frame.file, notes(frame))
+            and all(path.is_file() for path in of_frame(frame).rest)]
+    record = _add_to_record(out, made_from, names, [entry(frame) for frame in done])
     progress.stage("bake", len(frames), len(done))
 
     def made(frame: Frame) -> FrameLayers:
@@ -159,10 +163,11 @@ def bake_frames(source: Sequenced, frames: Sequence[Frame], cameras: Mapping[str
         if frame in done:
             continue
         path = out / frame.file
+        _record_of_this(out, made_from, names)  # before a frame of another bake is written over
         remove_partial_of(path)
         # Not kept in a name: at 4K the layers of one frame are half a gigabyte.
         write_layers(path, made(frame), half=settings.half, chromaticities=space.chromaticities, notes=notes(frame))
-        record = _add_to_record(out, made_from, names, [_entry(out, frame)])
+        record = _add_to_record(out, made_from, names, [entry(frame)])
         progress.advance()
     return record
 
@@ -194,7 +199,8 @@ def _begin(out: Path, made_from: dict[str, Any], names: dict[str, str], overwrit
             raise RunError(f"{out} holds layers that were baked from another fit or with other settings; "
                            f"choose another folder, or overwrite them (--overwrite).")
         for entry in record["frames"]:  # a mixture of two bakes would pass for one sequence
-            (out / entry["file"]).unlink(missing_ok=True)
+            for file in (entry["file"], *entry.get("rest", ())):
+                (out / file).unlink(missing_ok=True)
         (out / RECORD).unlink()
 
 
@@ -210,18 +216,29 @@ def _is_made(path: Path, wanted: Mapping[str, Any]) -> bool:
     return all(notes.get(name) == value for name, value in json.loads(json.dumps(wanted)).items())
 
 
-def _entry(out: Path, frame: Frame) -> dict[str, Any]:
+def _entry(out: Path, frame: Frame, rest: Sequence[Path]) -> dict[str, Any]:
     width, height = picture_size(out / frame.file)
-    return {"file": frame.file, "frame": frame.number, "view": frame.view, "width": width, "height": height}
+    beside = {"rest": [path.relative_to(out).as_posix() for path in rest]} if rest else {}
+    return {"file": frame.file, "frame": frame.number, "view": frame.view, "width": width, "height": height, **beside}
+
+
+def _record_of_this(out: Path, made_from: dict[str, Any], names: dict[str, str]) -> dict[str, Any]:
+    """bake.json, {} where there is none or it lists nothing. Raises RunError where it lists what was made otherwise."""
+    found = read_record(out) if (out / RECORD).exists() else {}
+    if not found.get("frames"):
+        return {}
+    if (found["made_from"], found["layers"]) != (json.loads(json.dumps(made_from)), names):
+        raise RunError(f"Another bake, of another fit or with other settings, writes to {out} meanwhile; choose "
+                       "another folder for this one.")
+    return found
 
 
 def _add_to_record(out: Path, made_from: dict[str, Any], names: dict[str, str],
                    entries: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """bake.json with these entries beside those of others who write to this folder."""
+    """bake.json with these entries beside those of others who write to this folder. Raises RunError where it tells of
+    frames that were made with other settings since this bake began."""
     with locked(out / LOCK):
-        found = read_record(out) if (out / RECORD).exists() else {}
-        if found.get("made_from") != json.loads(json.dumps(made_from)):
-            found = {}
+        found = _record_of_this(out, made_from, names)
         known = {entry["file"]: entry for entry in found.get("frames", []) if (out / entry["file"]).is_file()}
         known.update({entry["file"]: entry for entry in entries})
         frames = sorted(known.values(), key=lambda entry: (Path(entry["file"]).parent.as_posix(), entry["frame"]))
@@ -238,7 +255,8 @@ def read_record(out: Path | str) -> dict[str, Any]:
     record = read_json(path, RunError)
     try:
         for entry in record["frames"]:
-            inside(out, entry["file"], RunError)
+            for file in (entry["file"], *entry.get("rest", ())):
+                inside(out, file, RunError)
             int(entry["frame"]), int(entry["width"]), int(entry["height"])
         if record["version"] != VERSION or not isinstance(record["made_from"], dict):
             raise ValueError(f"version {record['version']}")

@@ -95,7 +95,7 @@ class _OfFrame:
 
     renderer: ShotRenderer
     one: ShotFrame
-    rest_is_made: bool = True
+    rest: tuple[Path, ...] = ()
 
     @property
     def fingerprint(self) -> str:

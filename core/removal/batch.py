@@ -2,22 +2,21 @@
 """Removal of many plates: one after the other, past those that cannot be read, resumable."""
 from __future__ import annotations
 
-import hashlib
 import itertools
 from collections.abc import Container, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 from ..errors import FrameError, SettingsError
-from ..files import are_newer, check_apart, locked, read_json, remove_partial_of, write_json
+from ..files import check_apart
 from ..pictures import pictures_below
 from ..progress import Progress
 from .inference import Remover
 from .mattes import Mattes
 from .plates import write_flare, write_plate
+from .record import Record, made_from
 from .steady import Sequences, by_number
 
-RECORD, LOCK = "remove.json", ".remove.lock"
 TOLD = 20  # failures that are spelled out in the last sentence
 
 
@@ -48,8 +47,8 @@ def plates_of(inputs: Iterable[Path], apart_from: Iterable[Path | None] = ()) ->
 def remove_all(inputs: Sequence[Path], folder: Path, remover: Remover, progress: Progress, *,
                flare_folder: Path | None = None, mattes: Mattes | None = None, overwrite: bool = False,
                wanted: Container[Path] | None = None, stills: bool = False) -> dict[str, Any]:
-    """Clean every plate into `folder`; a plate whose result is there, newer than it and made in the same way (weights,
-    matte, options: remove.json there says how), is left as it is.
+    """Clean every plate into `folder`; one whose result is there, made from the same plate, neighbours and matte in the
+    same way (`Record`), is left as it is.
 
     mattes: where the flares are; None to have them found anywhere. wanted: names below the output folder of those to be
     cleaned; None for all. stills: each by itself, in place of in line with its neighbours.
@@ -61,7 +60,7 @@ def remove_all(inputs: Sequence[Path], folder: Path, remover: Remover, progress:
     results = {name: [folder / name, *([flare_folder / name.with_suffix(".exr")] if flare_folder else [])]
                for _, name in plates}
     check_apart([path for path, _ in plates], itertools.chain.from_iterable(results.values()))
-    made_before = _record(folder)
+    record = Record(folder)
     sequences = Sequences(remover, [] if stills else [path for path, _ in plates])
     if wanted is not None:
         plates = [(path, name) for path, name in plates if name in wanted]
@@ -71,13 +70,12 @@ def remove_all(inputs: Sequence[Path], folder: Path, remover: Remover, progress:
     for path, name in sorted(plates, key=lambda plate: (plate[0].parent, by_number(plate[0]))):
         try:
             matte = [mattes.path(name)] if mattes else []
-            how = _how(remover, matte, stills)
-            same = made_before.get(name.as_posix(), how) == how
-            if not overwrite and same and are_newer(results[name], [path, *matte]):
+            how = made_from(remover.described, [path, *sequences.beside(path), *matte])
+            if not overwrite and record.is_made(name, how, results[name]):
                 kept += 1
             else:
+                record.begin(name, how, results[name], overwrite)
                 _remove(path, name, results[name], remover, sequences, mattes)
-                _add_to_record(folder, name.as_posix(), how)
                 made += 1
         except (FrameError, OSError, MemoryError) as problem:
             failed.append(str(problem) or f"{path} does not fit into memory.")
@@ -92,32 +90,9 @@ def remove_all(inputs: Sequence[Path], folder: Path, remover: Remover, progress:
     return {"plates": str(folder), "made": made, "kept": kept}
 
 
-def _how(remover: Remover, matte: Sequence[Path], stills: bool) -> str:
-    """A short text of all that a clean plate depends on besides the plate."""
-    digest = hashlib.sha256(repr((remover.described, stills)).encode())
-    for path in matte:
-        digest.update(path.read_bytes())
-    return digest.hexdigest()[:16]
-
-
-def _record(folder: Path) -> dict[str, str]:
-    """How each plate in the folder was made, by its name below it; {} where that is not written down."""
-    try:
-        return {str(name): str(how) for name, how in read_json(folder / RECORD, FrameError)["plates"].items()}
-    except (FrameError, AttributeError, KeyError, TypeError):
-        return {}
-
-
-def _add_to_record(folder: Path, name: str, how: str) -> None:
-    with locked(folder / LOCK):
-        write_json(folder / RECORD, {"plates": dict(sorted({**_record(folder), name: how}.items()))})
-
-
 def _remove(path: Path, name: Path, results: Sequence[Path], remover: Remover, sequences: Sequences,
             mattes: Mattes | None) -> None:
     """results: the clean plate's path, and the flare's where it is wanted."""
-    for result in results:
-        remove_partial_of(result)  # of a task that was killed
     plate, told = sequences.read(path)
     height, width = plate.codes.shape[:2]
     codes, flare = remover.remove(plate, mattes.read(name, width, height) if mattes else None, told)

@@ -2,6 +2,7 @@
 """The flare-free frames of a capture, made once and kept in its folder removed/."""
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 from ..capture import Capture
@@ -40,6 +41,9 @@ def remove_from(capture: Capture, remover: Remover, progress: Progress) -> Path:
             progress.advance()
         patiently(work.rename, target)
     except OSError as problem:
+        if target.is_dir():  # another fit of this capture was first
+            shutil.rmtree(work, ignore_errors=True)
+            return target
         raise CaptureError(f"{work} cannot be written ({problem.strerror or problem}); copy the capture to where it "
                            "can, or make removed/ there with `remove`.") from problem
     return target

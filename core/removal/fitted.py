@@ -19,25 +19,27 @@ from numpy.typing import NDArray
 from ..capture import Capture, View
 from ..capture.discs import clipped_discs
 from ..errors import CaptureError
-from ..files import are_newer, check_apart, inside, remove_partial_of
+from ..files import check_apart, inside
 from ..metrics.evaluation import Renderer
 from ..pictures import linear_from_srgb, srgb_from_linear
 from ..progress import Progress
 from .inference import CLIPPED
 from .plates import Plate, read_plate, write_flare, write_plate
+from .record import Record, made_from
 
 Pixels = NDArray[np.float32]
 
 
 def remove_fitted(fitted: Renderer, capture: Capture, views: Sequence[View], folder: Path, progress: Progress, *,
                   flare_folder: Path | None = None, overwrite: bool = False,
-                  made_by: Path | None = None, above_white: bool = False) -> dict[str, Any]:
+                  made_by: str = "", above_white: bool = False) -> dict[str, Any]:
     """Write the views' frames without the fitted flare below `folder`, each under its own name, in its own kind and
-    depth; those that are there and newer than the frame and `made_by`, the fit's file, their flares too where those are
-    wanted, are kept, unless `overwrite`. above_white: whether the fit was shown light above white.
+    depth; those that are there, made from the same frame, camera and lights by the same fit, their flares too where
+    those are wanted, are kept, unless `overwrite`. made_by: changes whenever the fit's pictures would. above_white:
+    whether the fit was shown light above white.
 
     Raises CaptureError for frames with lens distortion, which the flare was not fitted with, SettingsError where frames
-    would be overwritten, FrameError for a frame that cannot be read.
+    would be overwritten, FrameError for a frame that cannot be read or whose plate in `folder` is not from here.
     """
     if any(view.lens for view in views):
         raise CaptureError(f"The frames of {capture.folder} are distorted by their lens, and the flare was fitted "
@@ -45,9 +47,13 @@ def remove_fitted(fitted: Renderer, capture: Capture, views: Sequence[View], fol
     results = [_results(view, folder, flare_folder) for view in views]
     check_apart([capture.frame_path(view) for view in capture.views], itertools.chain.from_iterable(results))
     progress.stage("remove", len(views))
+    record, lights = Record(folder), [(light.name, light.xyz.tolist()) for light in capture.lights]
     made = 0
     for view, targets in zip(views, results, strict=True):
-        if overwrite or not are_newer(targets, [capture.frame_path(view), *([made_by] if made_by else [])]):
+        name = Path(view.name)
+        how = made_from(repr((made_by, view.camera.numbers, lights)), [capture.frame_path(view)])
+        if overwrite or not record.is_made(name, how, targets):
+            record.begin(name, how, targets, overwrite)
             _remove(fitted, capture, view, targets, above_white)
             made += 1
         progress.advance()
@@ -67,8 +73,6 @@ def _results(view: View, folder: Path, flare_folder: Path | None) -> list[Path]:
 
 def _remove(fitted: Renderer, capture: Capture, view: View, results: Sequence[Path], above_white: bool) -> None:
     """results: the clean plate's path, and the flare's where it is wanted."""
-    for result in results:
-        remove_partial_of(result)  # of a task that was killed
     plate = read_plate(capture.frame_path(view))
     height, width = plate.codes.shape[:2]
     camera = view.camera if view.camera.size == (width, height) else view.camera.scaled(width, height)

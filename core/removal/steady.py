@@ -78,13 +78,17 @@ class Sequences:
                 self._beside[path] = those[max(at - REACH, 0):at] + those[at + 1:at + 1 + REACH]
         self._kept: OrderedDict[Path, Calm | None] = OrderedDict()
 
+    def beside(self, path: Path) -> Sequence[Path]:
+        """The neighbours that count for a plate, in their order."""
+        return self._beside.get(path, ())
+
     def read(self, path: Path) -> tuple[Plate, Told]:
         """The plate, and what is told of it.
 
         Its neighbours are read before it, so that one plate is in memory at a time; each is told of once. Those that
         cannot be read are passed over. Raises FrameError where the plate itself cannot.
         """
-        about = [self._of(other) for other in self._beside.get(path, ())]
+        about = [self._of(other) for other in self.beside(path)]
         plate = read_plate(path)
         here = self._kept.get(path) or self._keep(path, calm(self._remover.tell(plate)))
         return plate, steadied(here, [other for other in about if other is not None])

@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +17,7 @@ from numpy.typing import NDArray
 from ..bake.frames import Frame, layers_file, numbered, plates_by_number
 from ..capture import Camera, Capture, Light, View, read_lights
 from ..errors import CaptureError, SettingsError
+from ..files import content_of
 from ..gaussians.ply import read_ply
 from ..gaussians.scene import SceneGaussians
 from ..lights.detection import Detector
@@ -51,18 +51,8 @@ class TargetFrame:
 
     def described(self) -> str:
         """Changes whenever the frame would; its plate counts by name and content, so that mirrored disks agree."""
-        plate = None
-        if self.plate:
-            state = self.plate.stat()
-            plate = self.plate.name, _content(self.plate, state.st_size, state.st_mtime_ns)
+        plate = (self.plate.name, content_of(self.plate)) if self.plate else None
         return repr((self.frame, plate)) + self.shot.described()
-
-
-@lru_cache(maxsize=64)
-def _content(path: Path, _size: int, _time: int) -> str:
-    """A digest of a file. Neighbours ask for it too: those that were read of late are kept."""
-    with open(path, "rb") as stream:
-        return hashlib.file_digest(stream, "blake2b").hexdigest()[:16]
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,10 +86,10 @@ def of_pictures(paths: Sequence[Path], look: Look, lights: Mapping[str, tuple[fl
                 centre: tuple[float, float] | None = None, seen: Mapping[str, Seen] | None = None) -> Target:
     """Pictures with a light each in 2D: `lights` in pixels by name, else what `detector` finds.
 
-    focal: in pixels (default: the training camera's field of view); centre: principal point in pixels (default: the
-    middle). distances: of each source, at which its flare is as bright as it was learned. seen: what each source was
-    learned from; a light that was found shows the source that stood most like it. Raises SettingsError where
-    a picture has no light, and for two of one name.
+    focal: in pixels (default: the training camera's field of view, turned where the picture is); centre: principal
+    point in pixels (default: the middle). distances: of each source, at which its flare is as bright as it was learned.
+    seen: what each source was learned from; a light that was found shows the source that stood most like it. Raises
+    SettingsError where a picture has no light, and for two of one name.
     """
     by_name = {path.name: path for path in paths}
     if len(by_name) < len(paths):
@@ -111,8 +101,9 @@ def of_pictures(paths: Sequence[Path], look: Look, lights: Mapping[str, tuple[fl
         path = by_name[frame.view]
         window = window_of(path)
         width, height = window.frame
-        fx = focal or look.camera.fx * width / look.camera.width
-        fy = (focal or look.camera.fy * width / look.camera.width) * window.aspect
+        larger = _larger(window.frame, (look.camera.width, look.camera.height))
+        fx = focal or look.camera.fx * larger
+        fy = (focal or look.camera.fy * larger) * window.aspect
         cx, cy = centre or (width / 2, height / 2)
         camera = on_plate(Camera(width, height, fx, fy, cx, cy, np.eye(4)), path)
         found = dict(lights) or _detected(path, detector)
@@ -135,6 +126,13 @@ def of_pictures(paths: Sequence[Path], look: Look, lights: Mapping[str, tuple[fl
     if missing := set(wanted) - set(target.lights):
         raise SettingsError(f"The pictures have no light {min(missing)!r}; they have {', '.join(target.lights)}.")
     return target
+
+
+def _larger(size: tuple[int, int], source: tuple[int, int]) -> float:
+    """How many times as many pixels a picture has across the source's field of view: by the width; where one is upright
+    and the other is not by the long sides, since that is how a camera is turned."""
+    turned = (size[0] < size[1]) != (source[0] < source[1])
+    return max(size) / max(source) if turned else size[0] / source[0]
 
 
 def _detected(path: Path, detector: Detector | None) -> dict[str, tuple[float, float]]:

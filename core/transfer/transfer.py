@@ -22,6 +22,7 @@ from ..bake.frames import Frame
 from ..bake.layers import FrameLayers, Rendered
 from ..capture import Camera
 from ..colour import ColourSpace, colour_space
+from ..errors import SettingsError
 from ..files import check_apart, remove_partial_of
 from ..fit.rendering import as_tensors, pose_and_intrinsics, render_scene
 from ..flare.compositing import decode, encode, splat_flare
@@ -184,10 +185,18 @@ class Transfer:
         cameras = {one.frame.view: one.shot.camera for one in self.target.frames}
         if settings.half and self._has_full_float():
             settings = replace(settings, half=False)
-        flared = [path for one in self.target.frames if (path := one.flared(Path(out) / FRAMES)) is not None]
-        check_apart([one.plate for one in self.target.frames if one.plate is not None], flared)
+        self._check_apart(Path(out))
         return bake_frames(self, frames, cameras, out, lambda frame: self.of_frame(frame, space, Path(out) / FRAMES),
                            settings, progress, overwrite=overwrite)
+
+    def _check_apart(self, out: Path) -> None:
+        """Raises SettingsError where results would be written over plates, or among them: layers in a folder of plates
+        would be plates the next time."""
+        plates = [one.plate for one in self.target.frames if one.plate is not None]
+        flared = [path for one in self.target.frames if (path := one.flared(out / FRAMES)) is not None]
+        check_apart(plates, [*flared, *(out / one.frame.file for one in self.target.frames)])
+        if out.resolve() in {path.resolve().parent for path in plates}:
+            raise SettingsError(f"The layers would lie among the plates, in {out}; choose another folder for them.")
 
     def _has_full_float(self) -> bool:
         """By the first plate of each kind of file."""
@@ -222,10 +231,10 @@ class _OfFrame:
         return self._one.shot.edits
 
     @property
-    def rest_is_made(self) -> bool:
-        """Whether the plate with its flare is there, where one is written."""
+    def rest(self) -> Sequence[Path]:
+        """The plate with its flare, where one is written."""
         target = self._one.flared(self._out) if self._out is not None else None
-        return target is None or target.is_file()
+        return [] if target is None else [target]
 
     def render(self, camera: Camera, edits: LookEdits | None = None) -> Rendered:
         """Scene, flare of each light, depth; scene-linear Rec. 709."""

@@ -75,7 +75,6 @@ def _by_run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     from ...core.bake.frames import numbered
     from ...core.capture import Capture
     from ...core.fit import Run
-    from ...core.fit.run import FLARE
     from ...core.removal.fitted import remove_fitted
 
     network = (words.weights, words.working_size, words.keep_glare, words.matte, words.stills, words.base)
@@ -89,7 +88,7 @@ def _by_run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     chosen = frames.asked(numbered([view.name for view in capture.views]), words.frames, progress)
     wanted = {frame.view for frame in chosen}
     return remove_fitted(fitted, capture, [view for view in capture.views if view.name in wanted], words.out, progress,
-                         flare_folder=words.flare, overwrite=words.overwrite, made_by=fitted.folder / FLARE,
+                         flare_folder=words.flare, overwrite=words.overwrite, made_by=fitted.fingerprint,
                          above_white=fitted.settings.display_white > 1)
 
 

@@ -324,6 +324,36 @@ def test_a_record_cannot_reach_outside_its_folder(tmp_path: Path) -> None:
     assert treasure.read_text() == "mine"
 
 
+def test_what_lies_beside_layers_cannot_be_outside_either(tmp_path: Path) -> None:
+    out, treasure = tmp_path / "out", tmp_path / "treasure.png"
+    record = bake(FakeRenderer(), FRAMES[:1], CAMERAS, out)
+    treasure.write_text("mine")
+    record["frames"][0]["rest"] = ["../treasure.png"]
+    write_json(out / RECORD, record)
+    with pytest.raises(RunError):
+        bake(another_fit(), FRAMES[:1], CAMERAS, out, overwrite=True)
+    assert treasure.read_text() == "mine"
+
+
+@pytest.mark.parametrize("after", [1, 2])
+def test_bakes_at_once_with_other_settings_do_not_mix(tmp_path: Path, after: int) -> None:
+    """The one that comes second to a frame is refused, and writes over none of the other's."""
+    class Meanwhile(FakeRenderer):
+        def render(self, camera: Camera, edits: LookEdits | None = None) -> FakeRendering:
+            if len(self.rendered) == after - 1:
+                bake(another_fit(), FRAMES, CAMERAS, tmp_path, overwrite=True)
+            return super().render(camera, edits)
+
+    first = Meanwhile()
+    with pytest.raises(RunError, match="Another bake, of another fit or with other settings"):
+        bake(first, FRAMES, CAMERAS, tmp_path)
+    assert len(first.rendered) == after
+    assert len(read_record(tmp_path)["frames"]) == 3
+    again = another_fit()
+    bake(again, FRAMES, CAMERAS, tmp_path)
+    assert again.rendered == [after], "the frame that was being written"
+
+
 def test_a_bake_that_came_to_nothing_is_in_nobody_s_way(tmp_path: Path) -> None:
     class Broken(FakeRenderer):
         fingerprint = "broken"

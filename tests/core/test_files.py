@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import errno
 import os
+import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -11,20 +13,23 @@ import pytest
 
 from core.errors import CaptureError, SettingsError, refusal
 from core.files import (
-    are_newer,
     atomic_folder,
     atomic_path,
     check_apart,
+    content_of,
     inside,
     locked,
     patiently,
     plain_name,
     read_json,
+    remove_partial,
     remove_partial_of,
     rounded,
     write_json,
     write_text,
 )
+
+ROOT = Path(__file__).resolve().parents[2]
 
 
 def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
@@ -169,13 +174,49 @@ def test_a_folder_is_there_whole_or_not_at_all(tmp_path: Path) -> None:
 
 
 def test_what_a_killed_process_left_of_a_file_can_be_removed(tmp_path: Path) -> None:
-    target, other = tmp_path / "layers.0001.exr", tmp_path / "layers.0002.exr"
-    with atomic_path(target) as mine, atomic_path(other) as theirs:
+    """And what a living one is writing cannot: on a farm a task may be given again while its worker still lives."""
+    target = tmp_path / "layers.0001.exr"
+    writes = ("import sys, time\nfrom core.files import atomic_path\n"
+              "with atomic_path(sys.argv[1]):\n    print('begun', flush=True)\n    time.sleep(60)")
+    other = subprocess.Popen([sys.executable, "-c", writes, str(target)], cwd=ROOT, stdout=subprocess.PIPE)
+    assert other.stdout is not None and other.stdout.readline() == b"begun\n"
+    with atomic_path(target) as mine, atomic_path(tmp_path / "layers.0002.exr") as next_one:
         assert mine.suffix == ".exr"
         remove_partial_of(target)
-        assert not mine.exists()
-        assert theirs.exists()
-        mine.touch()
+        remove_partial(tmp_path)
+        assert len(list(tmp_path.iterdir())) == 3, "mine, theirs, and the next one"
+        other.kill()
+        other.communicate()
+        remove_partial_of(target)
+        assert sorted(tmp_path.iterdir()) == sorted([mine, next_one])
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["layers.0001.exr", "layers.0002.exr"]
+
+
+def test_what_another_machine_writes_stays_for_an_hour(tmp_path: Path) -> None:
+    target, theirs = tmp_path / "a.exr", tmp_path / f".partial-a.exr-{os.getpid()}@01234567-abc.exr"
+    theirs.touch()
+    remove_partial_of(target)
+    assert theirs.exists()
+    os.utime(theirs, (time.time() - 4000,) * 2)
+    remove_partial_of(target)
+    assert not theirs.exists()
+
+
+def test_a_long_name_leaves_room_for_its_partial_one(tmp_path: Path) -> None:
+    target = tmp_path / ("\u6f22" * 80 + ".png")  # three bytes each, of 255 that a name may have
+    with atomic_path(target) as partial:
+        assert len(os.fsencode(partial.name)) < 200
+    assert target.exists()
+
+
+def test_a_file_is_known_by_its_content(tmp_path: Path) -> None:
+    path, copy = tmp_path / "a", tmp_path / "b"
+    for one in (path, copy):
+        one.write_bytes(b"one")
+    assert content_of(path) == content_of(copy)
+    path.write_bytes(b"another")
+    os.utime(path, (1, 1))
+    assert content_of(path) != content_of(copy)
 
 
 def test_a_lock_is_held_by_one_and_outlives_no_one(tmp_path: Path) -> None:
@@ -214,11 +255,3 @@ def test_what_is_written_can_be_read_by_those_whom_the_system_lets(tmp_path: Pat
     finally:
         os.umask(mask)
     assert (tmp_path / "a.json").stat().st_mode & 0o777 == 0o644
-
-
-def test_the_oldest_of_several_results_counts(tmp_path: Path) -> None:
-    for name, at in (("source", 100), ("clean", 200), ("flare", 50)):
-        (tmp_path / name).touch()
-        os.utime(tmp_path / name, (at, at))
-    assert are_newer([tmp_path / "clean"], [tmp_path / "source"])
-    assert not are_newer([tmp_path / "clean", tmp_path / "flare"], [tmp_path / "source"])

@@ -2,31 +2,20 @@
 """Processes of an earlier session: known again, and told from others that have come by their numbers."""
 from __future__ import annotations
 
-import importlib.util
 import os
 import subprocess
 import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
-from blenders import ROOT
 
-
-@pytest.fixture(scope="module")
-def processes() -> Any:
-    spec = importlib.util.spec_from_file_location("processes", ROOT / "flare_addon" / "processes.py")
-    assert spec is not None
-    assert spec.loader is not None
-    found = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(found)  # without the add-on, whose modules need Blender
-    return found
+from core import processes
 
 
 @pytest.fixture(params=["this system's way", "by ps"])
-def sleeper(request: pytest.FixtureRequest, processes: Any, monkeypatch: pytest.MonkeyPatch,
+def sleeper(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch,
             tmp_path: Path) -> Iterator[tuple[subprocess.Popen[bytes], float]]:
     """A process, and when it was started."""
     if request.param == "by ps":
@@ -39,7 +28,7 @@ def sleeper(request: pytest.FixtureRequest, processes: Any, monkeypatch: pytest.
     process.wait()
 
 
-def test_the_same_and_another_of_its_number(processes: Any, sleeper: tuple[subprocess.Popen[bytes], float]) -> None:
+def test_the_same_and_another_of_its_number(sleeper: tuple[subprocess.Popen[bytes], float]) -> None:
     process, started = sleeper
     assert processes.runs(process.pid)
     assert processes.is_same(process.pid, started)
@@ -51,14 +40,14 @@ def test_the_same_and_another_of_its_number(processes: Any, sleeper: tuple[subpr
 
 
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="needs /proc")
-def test_one_that_ended_unasked_does_not_run(processes: Any) -> None:
+def test_one_that_ended_unasked_does_not_run() -> None:
     process = subprocess.Popen([sys.executable, "-c", ""])
     time.sleep(1)  # not waited for: its number is not given out yet
     assert not processes.runs(process.pid)
     process.wait()
 
 
-def test_ages_as_ps_tells_them(processes: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ages_as_ps_tells_them(monkeypatch: pytest.MonkeyPatch) -> None:
     for told, age in (("      03:07\n", 187), ("1-02:03:04", 93784), ("   12:00:00", 43200)):
         monkeypatch.setattr(processes.subprocess, "run",
                             lambda *_words, told=told, **_options: subprocess.CompletedProcess([], 0, told))

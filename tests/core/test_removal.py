@@ -22,12 +22,13 @@ from core.errors import FrameError, RunError, SettingsError
 from core.pictures import read_exr, read_picture, write_exr, write_png
 from core.progress import Progress
 from core.removal import inference, weights
-from core.removal.batch import RECORD, plates_of, remove_all
+from core.removal.batch import plates_of, remove_all
 from core.removal.inference import FlareMap, Remover, Told, carried_up, flare_light
 from core.removal.mattes import Mattes
 from core.removal.network import LEVELS, SHOWN, RemovalNetwork, seen
 from core.removal.plates import Plate, read_plate, write_plate
 from core.removal.recipe import Recipe, as_dict
+from core.removal.record import RECORD, Record, made_from
 
 TINY = Recipe(widths=(8, 8, 8, 8, 8))
 
@@ -63,6 +64,7 @@ def picture(height: int = 60, width: int = 90, top: int = 255, dtype: type = np.
 
 
 def write_codes(path: Path, codes: NDArray[np.generic]) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
     assert cv2.imwrite(str(path), codes[..., ::-1] if codes.ndim == 3 and codes.shape[2] == 3 else codes)
     return path
 
@@ -447,13 +449,13 @@ def test_what_is_faint_is_taken_where_it_is_marked(tmp_path: Path) -> None:
 def test_a_plate_is_made_again_when_it_would_come_out_otherwise(tmp_path: Path, everywhere: Path,
                                                                 nowhere: Path) -> None:
     """By other weights, options or mattes, whatever the times of their files."""
-    (tmp_path / "in").mkdir()
-    write_codes(tmp_path / "in" / "a.png", picture())
-    with pytest.raises(FrameError, match=r"b\.png is missing"):
-        remove_all([tmp_path / "in" / "b.png"], tmp_path / "none", Remover(everywhere, working_size=64), Progress())
+    for name in "ab":
+        write_codes(tmp_path / "in" / f"{name}.png", picture())
+    with pytest.raises(FrameError, match=r"c\.png is missing"):
+        remove_all([tmp_path / "in" / "c.png"], tmp_path / "none", Remover(everywhere, working_size=64), Progress())
     for name, values in (("left", 0), ("right", 255)):
-        (tmp_path / name).mkdir()
-        write_codes(tmp_path / name / "a.png", np.full((60, 90, 3), values, np.uint8))
+        for plate in "ab":
+            write_codes(tmp_path / name / f"{plate}.png", np.full((60, 90, 3), values, np.uint8))
 
     def made(remover: Remover, matte: str = "", **options: bool) -> int:
         mattes = Mattes(tmp_path / matte) if matte else None
@@ -461,12 +463,59 @@ def test_a_plate_is_made_again_when_it_would_come_out_otherwise(tmp_path: Path, 
         return int(found["made"])
 
     first = Remover(everywhere, working_size=64)
-    assert [made(first), made(first)] == [1, 0]
+    assert [made(first), made(first)] == [2, 0]
     for remover in (Remover(nowhere, working_size=64), Remover(everywhere, working_size=96),
                     Remover(everywhere, working_size=64, keep_glare=True), first):
-        assert [made(remover), made(remover)] == [1, 0]
+        assert [made(remover), made(remover)] == [2, 0]
     assert [made(first, "left"), made(first, "left"), made(first, "right"), made(first), made(first, stills=True)] == [
-        1, 0, 1, 1, 1]
+        2, 0, 2, 2, 2]
+
+
+def test_a_plate_is_made_again_when_it_or_a_neighbour_is_another(tmp_path: Path, everywhere: Path) -> None:
+    """Whatever the times of the files: a plate may be replaced by an older one."""
+    for number in range(1, 13):
+        write_codes(tmp_path / "in" / f"{number}.png", picture())
+    remover = Remover(everywhere, working_size=64)
+
+    def made(**options: bool) -> set[str]:
+        before = {path.name: path.stat().st_mtime_ns for path in (tmp_path / "out").glob("*.png")}
+        remove_all([tmp_path / "in"], tmp_path / "out", remover, Progress(), **options)
+        return {path.stem for path in (tmp_path / "out").glob("*.png")
+                if path.stat().st_mtime_ns != before.get(path.name)}
+
+    assert len(made()) == 12
+    os.utime(tmp_path / "in" / "3.png", (2e9, 2e9))
+    assert not made(), "its content is what counts"
+    write_codes(tmp_path / "in" / "3.png", np.full((60, 90, 3), 40, np.uint8))
+    os.utime(tmp_path / "in" / "3.png", (1, 1))
+    assert made() == set("1234567"), "as far as it is looked at"
+    assert len(made(stills=True)) == 12
+    write_codes(tmp_path / "in" / "3.png", picture())
+    assert made(stills=True) == {"3"}
+
+
+def test_what_is_not_from_here_is_not_written_over(tmp_path: Path, everywhere: Path) -> None:
+    source, remover = write_codes(tmp_path / "in" / "a.png", picture()), Remover(everywhere, working_size=64)
+    work = write_codes(tmp_path / "out" / "a.png", np.zeros((60, 90, 3), np.uint8)).read_bytes()
+    with pytest.raises(FrameError, match=r"a\.png is there, and remove\.json beside it does not tell of it"):
+        remove_all([source], tmp_path / "out", remover, Progress())
+    assert (tmp_path / "out" / "a.png").read_bytes() == work
+    assert remove_all([source], tmp_path / "out", remover, Progress(), overwrite=True)["made"] == 1
+    assert remove_all([source], tmp_path / "out", remover, Progress())["kept"] == 1
+    (tmp_path / "out" / RECORD).unlink()
+    with pytest.raises(FrameError, match="choose another folder"):
+        remove_all([source], tmp_path / "out", remover, Progress())
+
+
+def test_a_plate_that_was_begun_is_made(tmp_path: Path, everywhere: Path) -> None:
+    """A kill after the record, before the plate: what an earlier way made there is not taken for it."""
+    source, remover = write_codes(tmp_path / "in" / "a.png", picture()), Remover(everywhere, working_size=64)
+    remove_all([source], tmp_path / "out", remover, Progress())
+    other = Remover(everywhere, working_size=96)
+    how = made_from(other.described, [source])
+    Record(tmp_path / "out").begin(Path("a.png"), how, [tmp_path / "out" / "a.png"], overwrite=False)
+    assert not (tmp_path / "out" / "a.png").exists()
+    assert remove_all([source], tmp_path / "out", other, Progress())["made"] == 1
 
 
 def test_a_matte_painted_on_nothing_is_its_alpha(tmp_path: Path) -> None:
@@ -489,10 +538,14 @@ def test_every_plate_has_its_own_matte(tmp_path: Path, everywhere: Path) -> None
         remove_all([tmp_path / "in"], tmp_path / "out", remover, Progress(), mattes=mattes)
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["a.png", "b.png", RECORD]
     assert np.array_equal(cv2.imread(str(tmp_path / "out" / "b.png")), cv2.imread(str(tmp_path / "in" / "b.png")))
-    os.utime(tmp_path / "mattes" / "a.png", (2e9, 2e9))
-    plates = [tmp_path / "in" / "a.png", tmp_path / "in" / "b.png"]
-    made = remove_all(plates, tmp_path / "out", remover, Progress(), mattes=mattes)
-    assert (made["made"], made["kept"]) == (1, 1), "a matte that was painted again"
+    _matte(tmp_path / "mattes" / "c.png", 90, 60)
+    mattes = Mattes(tmp_path / "mattes")
+    for made, kept in ((1, 2), (0, 3)):
+        found = remove_all([tmp_path / "in"], tmp_path / "out", remover, Progress(), mattes=mattes)
+        assert (found["made"], found["kept"]) == (made, kept)
+    _matte(tmp_path / "mattes" / "a.png", 45, 30)
+    found = remove_all([tmp_path / "in"], tmp_path / "out", remover, Progress(), mattes=mattes)
+    assert (found["made"], found["kept"]) == (1, 2), "a matte that was painted again"
 
 
 def test_mattes_that_make_no_sense(tmp_path: Path) -> None:
@@ -535,8 +588,8 @@ def test_what_is_there_is_kept(tmp_path: Path, everywhere: Path) -> None:
     assert remove_all([source], tmp_path / "out", remover, Progress())["made"] == 1
     assert remove_all([source], tmp_path / "out", remover, Progress())["kept"] == 1
     assert remove_all([source], tmp_path / "out", remover, Progress(), overwrite=True)["made"] == 1
-    os.utime(tmp_path / "out" / "plate.png", (1, 1))
-    assert remove_all([source], tmp_path / "out", remover, Progress())["made"] == 1, "the plate is newer"
+    (tmp_path / "out" / "plate.png").unlink()
+    assert remove_all([source], tmp_path / "out", remover, Progress())["made"] == 1
 
 
 def test_inputs_that_make_no_sense(tmp_path: Path, everywhere: Path) -> None:

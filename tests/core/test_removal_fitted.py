@@ -14,11 +14,12 @@ import pytest
 from core.capture import Camera, Capture
 from core.capture.discs import clipped_discs
 from core.colour import ColourSpace, colour_space
-from core.errors import CaptureError, SettingsError
+from core.errors import CaptureError, FrameError, SettingsError
 from core.pictures import linear_from_srgb, read_exr, read_picture, write_exr
 from core.progress import Progress
 from core.removal.fitted import remove_fitted, without
 from core.removal.plates import Plate, read_plate
+from core.removal.record import RECORD
 from tests.core.flared import LIGHT, flare, flared_capture
 
 
@@ -175,17 +176,33 @@ def test_an_exr_frame_stays_one_in_its_own_colours(capture: Capture, tmp_path: P
     np.testing.assert_allclose(taken, flare(view.camera), atol=2e-3)
 
 
+def test_plates_of_another_fit_or_capture_are_made_again(capture: Capture, tmp_path: Path) -> None:
+    """By what they come from, whatever the times of files: of another fit, frame, camera or light, or by a network."""
+    def made(one: Capture, fit: str = "first", **options: bool) -> int:
+        found = remove_fitted(Exact(), one, one.views, tmp_path / "clean", Progress(), made_by=fit, **options)
+        return int(found["made"])
+
+    assert [made(capture), made(capture), made(capture, "second"), made(capture)] == [3, 0, 3, 3]
+    shutil.copytree(capture.folder, tmp_path / "again")
+    other = Capture.open(tmp_path / "again")
+    assert made(other) == 0, "the same capture elsewhere"
+    frame = other.frame_path(other.views[1])
+    shutil.copyfile(other.frame_path(other.views[0]), frame)
+    os.utime(frame, (1, 1))
+    assert made(other) == 1
+    lights = tmp_path / "again" / "lights.json"
+    lights.write_text(lights.read_text(encoding="utf-8").replace("0.3", "0.31"), encoding="utf-8")
+    assert made(Capture.open(tmp_path / "again")) == 3
+    (tmp_path / "clean" / RECORD).unlink()
+    with pytest.raises(FrameError, match="may be someone's work"):
+        made(capture)
+    assert made(capture, overwrite=True) == 3
+
+
 def test_flares_that_are_asked_for_later_are_made(capture: Capture, tmp_path: Path) -> None:
     for flares, made in ((None, 3), (tmp_path / "flare", 3), (tmp_path / "flare", 0)):
         found = remove_fitted(Exact(), capture, capture.views, tmp_path / "clean", Progress(), flare_folder=flares)
         assert found["made"] == made
-    fit = tmp_path / "flare.flare"
-    for later, made in ((-10, 0), (10, 3)):
-        fit.touch()
-        now = (tmp_path / "clean" / capture.views[0].name).stat().st_mtime
-        os.utime(fit, (now + later, now + later))
-        found = remove_fitted(Exact(), capture, capture.views, tmp_path / "clean", Progress(), made_by=fit)
-        assert found["made"] == made, "a fit that has gone on since has other flares"
     with pytest.raises(SettingsError, match="overwritten"):
         linear = _as_exr(capture, tmp_path / "exr", colour_space("linear"))
         remove_fitted(Exact(), linear, linear.views, tmp_path / "other", Progress(),

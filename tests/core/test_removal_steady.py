@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 
 from core.errors import FrameError
 from core.progress import Progress
-from core.removal.batch import RECORD, remove_all
+from core.removal.batch import remove_all
 from core.removal.inference import Remover, Told
 from core.removal.plates import Plate
+from core.removal.record import RECORD
 from core.removal.steady import REACH, Sequences, by_number, calm, steadied
 
 Pixels = NDArray[np.float32]

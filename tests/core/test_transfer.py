@@ -12,11 +12,12 @@ import OpenEXR
 import pytest
 import torch
 
-from core.bake.bake import BakeSettings
+from core.bake.bake import RECORD, BakeSettings
 from core.bake.exr import read_layers
 from core.capture import Camera, Capture
 from core.colour import colour_space
 from core.errors import RunError, SettingsError
+from core.files import write_json
 from core.flare import file as flare_file
 from core.flare.file import FlareFile, TrainingCamera
 from core.gaussians import SceneGaussians
@@ -108,6 +109,17 @@ def test_on_to_a_picture_the_flare_goes_to_the_light(look: Look, tmp_path: Path)
     assert np.linalg.norm(one.shot.lights[0].xyz) == pytest.approx(4.0)
     with pytest.raises(SettingsError, match="No light was found"):
         of_pictures([tmp_path / "plate.0007.png"], look, {}, {}, {name(look): 4.0})
+
+
+@pytest.mark.parametrize(("size", "expected"), [((96, 54), 70 * 96 / 64), ((54, 96), 70 * 96 / 64),
+                                                ((128, 32), 140.0), ((60, 60), 70 * 60 / 64)])
+def test_an_upright_picture_is_of_a_camera_that_was_turned(look: Look, tmp_path: Path, size: tuple[int, int],
+                                                           expected: float) -> None:
+    """Its focal length is that of the picture that lies, not that of its narrow side."""
+    write_png(tmp_path / "a.png", np.full((size[1], size[0], 3), 0.2))
+    found = of_pictures([tmp_path / "a.png"], look, {"sun": (20.0, 12.0)}, {}, {name(look): 4.0})
+    assert look.camera.width == 64 and look.camera.fx == 70
+    assert found.frames[0].shot.camera.fx == pytest.approx(expected)
 
 
 def test_lights_that_were_found_show_what_stood_most_like_them() -> None:
@@ -396,6 +408,38 @@ def test_no_plate_is_written_over_and_none_is_lost(flare: Path, look: Look, tmp_
     (tmp_path / "out" / "frames" / "plate.png").unlink()
     transfer.bake(tmp_path / "out")
     assert (tmp_path / "out" / "frames" / "plate.png").read_bytes() == flared
+
+
+@pytest.mark.parametrize("overwrite", [False, True])
+def test_layers_do_not_lie_among_plates(flare: Path, look: Look, tmp_path: Path, overwrite: bool) -> None:
+    """They would be written over, or be plates themselves the next time."""
+    for kind in ("exr", "png"):
+        plate = tmp_path / kind / ("layers.0001.exr" if kind == "exr" else "shot.0001.png")
+        plate.parent.mkdir()
+        if kind == "exr":
+            write_exr(plate, dict.fromkeys("RGB", np.full((40, 60), 0.2)))
+            write_json(plate.parent / RECORD, {"version": 1, "made_from": {}, "layers": {}, "frames": [
+                {"file": plate.name, "frame": 1, "width": 60, "height": 40}]})
+        else:
+            write_png(plate, np.full((40, 60, 3), 0.2))
+        before = {path.name: path.read_bytes() for path in plate.parent.iterdir()}
+        with pytest.raises(SettingsError, match=r"would be overwritten|among the plates"):
+            Transfer(flare, plate_target(plate, look)).bake(plate.parent, overwrite=overwrite)
+        assert {path.name: path.read_bytes() for path in plate.parent.iterdir()} == before
+
+
+def test_what_is_made_again_leaves_no_frames_of_before(flare: Path, look: Look, tmp_path: Path) -> None:
+    folder = make_capture(tmp_path / "capture", views=3)
+    (folder / "lights.json").write_text('{"lights": [{"name": "sun", "xyz": [0.2, -0.3, 0.5]}]}')
+    target = of_capture(Capture.open(folder), look, {})
+    Transfer(flare, target).bake(tmp_path / "out")
+    assert len(list((tmp_path / "out" / "frames").iterdir())) == 3
+    (tmp_path / "out" / "frames" / "notes.txt").touch()
+    Transfer(flare, target).bake(tmp_path / "out", [target.frames[1].frame], BakeSettings(edits=("*.intensity=3",)),
+                                 overwrite=True)
+    plate = target.frames[1].plate
+    assert plate is not None
+    assert {path.name for path in (tmp_path / "out" / "frames").iterdir()} == {plate.name, "notes.txt"}
 
 
 def test_layers_in_a_space_with_a_curve_are_refused(flare: Path, look: Look, tmp_path: Path) -> None:

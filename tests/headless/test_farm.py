@@ -25,7 +25,7 @@ from core.fit import fit, preset
 from core.fit.settings import changed
 from core.look import read
 from core.look.shot import PlacedLight, Shot, ShotFrame
-from core.removal.batch import RECORD
+from core.removal.record import RECORD
 from core.removal.weights import IN_THE_BOX
 
 ROOT = Path(__file__).resolve().parents[2]

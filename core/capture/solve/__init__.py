@@ -86,9 +86,11 @@ def solve(source: Path | str, out: Path | str, settings: SolveSettings | None = 
     began = time.monotonic()
     request = {"source": _fingerprint(source), "settings": {**asdict(settings), "keep_work": False}}
     finished = _claim(source, out, request, progress)
-    if finished is not None:
-        return finished
     work = out / WORK
+    if finished is not None:
+        if not settings.keep_work:
+            shutil.rmtree(work, ignore_errors=True)
+        return finished
     chosen, left_out = shots.gather(source, work, settings.frames, settings.size, progress)
     solved = mapping.solve(chosen, work, settings, shots.is_video(source), progress)
     world.align(solved.model)
@@ -96,6 +98,7 @@ def solve(source: Path | str, out: Path | str, settings: SolveSettings | None = 
     if missing:
         names = ", ".join(Path(chosen[i].file).name for i in missing[:12]) + (", …" if len(missing) > 12 else "")
         progress.say(f"{len(missing)} of {len(chosen)} frames found no place in the model and are left out: {names}.")
+    (out / REPORT).unlink(missing_ok=True)  # it tells of what is about to be replaced
     develop.write(chosen, solved, out, work, settings.output_size, progress)
     data = report.figures(chosen, solved, left_out, request, time.monotonic() - began)
     report.picture(solved, out / PICTURE)

@@ -1,0 +1,58 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What each clean plate of a folder was made from and how, in remove.json there, so that one is kept as long as it
+would come out the same, and whatever else lies there is not taken for one."""
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from ..errors import FrameError
+from ..files import content_of, locked, read_json, remove_partial_of, write_json
+
+RECORD = "remove.json"
+LOCK = ".remove.lock"
+
+
+def made_from(maker: str, sources: Iterable[Path]) -> str:
+    """A short text that changes whenever a plate would: what makes it, and the content of all files that it depends on.
+    One that cannot be read counts as such."""
+    digest = hashlib.sha256(maker.encode())
+    for path in sources:
+        try:
+            digest.update(content_of(path).encode())
+        except OSError:
+            digest.update(b"none")
+    return digest.hexdigest()[:16]
+
+
+class Record:
+    """The plates below a folder by their names there; any number of processes may add to it."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._before = self._read()
+
+    def is_made(self, name: Path, how: str, results: Sequence[Path]) -> bool:
+        """Whether all files of a plate are there, made in this way (`made_from`)."""
+        return self._before.get(name.as_posix()) == how and all(path.is_file() for path in results)
+
+    def begin(self, name: Path, how: str, results: Sequence[Path], overwrite: bool) -> None:
+        """Before the files of a plate are written: what was there of it goes, so that a kill leaves no older ones under
+        what is now written down. Raises FrameError for a plate that is not from here, unless `overwrite`."""
+        if not overwrite and name.as_posix() not in self._before and results[0].exists():
+            raise FrameError(f"{results[0]} is there, and {RECORD} beside it does not tell of it: it may be someone's "
+                             "work; choose another folder, or have it written over (--overwrite).")
+        for path in results:
+            remove_partial_of(path)
+            path.unlink(missing_ok=True)
+        with locked(self._folder / LOCK):
+            write_json(self._folder / RECORD, {"plates": dict(sorted({**self._read(), name.as_posix(): how}.items()))})
+
+    def _read(self) -> dict[str, str]:
+        """{} where it is not written down."""
+        try:
+            told = read_json(self._folder / RECORD, FrameError)["plates"]
+            return {str(name): str(how) for name, how in told.items()}
+        except (FrameError, AttributeError, KeyError, TypeError):
+            return {}

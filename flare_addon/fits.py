@@ -102,7 +102,7 @@ def resume(scene: Any) -> Job:
     if folder is None or not (folder / CONFIG).is_file():
         raise RunError(f"There is no fit to go on with in {folder}; start a new one.")
     with contextlib.suppress(OSError):
-        capture = Path((folder / "capture.txt").read_text(encoding="utf-8").strip())
+        capture = Path((folder / "capture.txt").read_text(encoding="utf-8").removesuffix("\n"))
     if capture is None or not capture.is_dir():
         raise CaptureError(f"The capture {capture} that this fit was begun with is not there; put it back, or start a "
                            "new fit.")

@@ -128,7 +128,7 @@ class LightFlare(nn.Module):
 
     def _colours(self, sh: Tensor, means: Tensor, rotation: Tensor) -> Tensor:
         rays = torch.cat([means, torch.ones_like(means[:, :1])], -1)
-        return colours(rays @ rotation, sh.reshape(len(sh), -1, 3), self.form.sh_degree)
+        return colours(rays @ rotation, sh.unflatten(-1, (-1, 3)), self.form.sh_degree)
 
 
 def _rings(raw: Tensor) -> Tensor:

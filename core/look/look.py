@@ -187,7 +187,7 @@ class LightLook:
         with np.errstate(over="ignore"):
             opacities = 1 / (1 + np.exp(-(rows["opacity_logits"] + change["opacity_logits"])[:, 0]))
         rays = np.concatenate([means, np.ones_like(means[:, :1])], -1) @ view.rotation
-        sh = (rows["sh"] + change["sh"]).reshape(len(means), -1, 3)
+        sh = (rows["sh"] + change["sh"]).reshape(len(means), (self.form.sh_degree + 1) ** 2, 3)
         rings = arcs = None
         if form.rings:
             raw = rows["rings"] + change["rings"]

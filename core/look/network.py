@@ -64,7 +64,7 @@ class HashGrid:
 def frequency_encoding(values: Floats, bands: int = BANDS) -> Floats:
     """sin and cos of 2^k pi x for k < bands (Mildenhall et al. 2020, eq. 4): (n, d) to (n, 2 * bands * d)."""
     octaves = (math.pi * 2.0 ** np.arange(bands)).astype(np.float32)
-    angles = (values[..., None] * octaves).reshape(len(values), -1)
+    angles = (values[..., None] * octaves).reshape(len(values), values.shape[1] * bands)
     return np.concatenate([np.sin(angles), np.cos(angles)], -1)
 
 

@@ -30,7 +30,9 @@ from core.fit.settings import SplitSettings, changed
 from core.fit.sky import COUNT, with_sky
 from core.fit.splitting import from_below, is_found, nearness, scene_beside_flare
 from core.fit.trainer import Trainer
+from core.flare.model import OURS, PAPER
 from core.gaussians.rendering import NEAR
+from core.look import LookEdits, draw
 from core.look.look import FORM_BOUNDS
 from core.pictures import read_picture, write_png
 from core.progress import Progress
@@ -321,6 +323,21 @@ def test_a_sky_lies_about_the_points_in_colours_that_the_frames_have(capture: Ca
     assert found.rgb[len(capture.points):].max() <= round(255 * brightest)
     seen = [view.camera.contains(*view.camera.project(added)) for view in views]
     assert np.any(seen, 0).all()
+
+
+@pytest.mark.parametrize("model", ["paper", "ours"])
+def test_a_light_of_which_nothing_is_left_has_no_flare(tmp_path: Path, capture: Capture, model: Any) -> None:
+    """A lamp without a flare: all its Gaussians fade and are pruned."""
+    settings = replace(quick(40), flare=replace(quick(40).flare, form=PAPER if model == "paper" else OURS))
+    settings = changed(settings, {"flare.density.prune_below": 1.0})
+    run = fit(capture, settings, tmp_path / "run")
+    assert run.flare is not None and run.look is not None and run.flare.model.count == 0
+    camera = capture.views[0].camera
+    assert not run.render(camera).flare_by_light["lamp"].any()
+    assert run.elements == {"lamp": []}
+    edited = run.render(camera, LookEdits.parse(["lamp.scale=2"], run.lights, run.elements))
+    assert not edited.flare_by_light["lamp"].any()
+    assert not draw(run.look.evaluate(camera.world_to_camera).values(), camera.intrinsics, *camera.size).any()
 
 
 def test_ours_runs_in_linear_light(tmp_path: Path, capture: Capture) -> None:

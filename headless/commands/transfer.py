@@ -13,6 +13,7 @@ from .. import frames, jobs
 from ..command import Command, Step
 from .bake import size, space_options
 
+MOST_SMOOTH = 1000  # frames
 QUERIES = ("source", "target", "blend")
 PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".exr")
 
@@ -126,8 +127,8 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
 
 def _check_numbers(words: argparse.Namespace) -> None:
     """Raises SettingsError for what is no sensible number."""
-    if words.smooth < 0 or not 0 < words.scale < math.inf:
-        raise SettingsError("--smooth is 0 or more, and --scale a number above 0.")
+    if not 0 <= words.smooth <= MOST_SMOOTH or not 0 < words.scale < math.inf:
+        raise SettingsError(f"--smooth is from 0 to {MOST_SMOOTH}, and --scale a number above 0.")
     if words.focal is not None and not 0 < words.focal < math.inf:
         raise SettingsError(f"--focal {words.focal} is not a length in pixels above 0.")
     if not 0 <= words.radius < math.inf:

@@ -280,6 +280,25 @@ def test_a_folder_that_cannot_be_used_is_no_obstacle(tmp_path: Path, monkeypatch
     assert not folder.is_relative_to(tmp_path) and os.access(folder, os.W_OK)
 
 
+def test_a_folder_of_its_own_is_gone_with_the_process(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    (tmp_path / "temporary").mkdir()
+    unusable = {"FIT_FLARE_CACHE": str(tmp_path / "file"), "TMPDIR": str(tmp_path / "temporary")}
+    folder, hits = _compile_elsewhere(unusable)
+    assert folder.parent == tmp_path / "temporary" and hits == 0
+    assert not list((tmp_path / "temporary").glob("fit_flare_*"))
+
+
+def test_a_user_without_a_home_is_no_obstacle(monkeypatch: pytest.MonkeyPatch) -> None:
+    def none() -> Path:
+        raise RuntimeError("Could not determine home directory.")
+
+    for name in ("FIT_FLARE_CACHE", "XDG_CACHE_HOME", "LOCALAPPDATA"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(compilation.Path, "home", none)
+    assert os.access(compilation._cache_folder(), os.W_OK)
+
+
 def test_an_error_in_any_thread_reaches_the_caller() -> None:
     calls = []
 

@@ -92,6 +92,7 @@ def test_misuse_is_status_2_and_one_sentence(words: list[str], capfd: pytest.Cap
     ["transfer", "no.flare", "--to", "a.png", "--out", "{tmp}/o", "--light", "nan,20"],
     ["transfer", "no.flare", "--to", "a.png", "--out", "{tmp}/o", "--focal", "0"],
     ["transfer", "no.flare", "--to", "a.png", "--out", "{tmp}/o", "--scale", "inf"],
+    ["transfer", "no.flare", "--to", "a.png", "--out", "{tmp}/o", "--smooth", "99999999999"],
     ["compose", "{capture}", "--out", "{capture}"],
     ["train-removal", "--backgrounds", "{capture}", "--out", "{tmp}/o", "--threads", "-1"],
     *(["train-removal", "--backgrounds", "{capture}", "--out", "{tmp}/o", "--set", change] for change in (

@@ -8,8 +8,10 @@ which is another inside Blender, and which numba stores.
 """
 from __future__ import annotations
 
+import atexit
 import hashlib
 import os
+import shutil
 import sys
 import tempfile
 from collections.abc import Callable
@@ -49,12 +51,19 @@ def _fingerprint() -> str:
 def _cache_folder() -> Path:
     """A folder that can be written to, by this user only: machine code is loaded from it. Where there is none,
     one for this process alone."""
-    folder = Path(os.environ.get("FIT_FLARE_CACHE") or _user_folder()) / "kernels" / _fingerprint()
     try:
+        folder = Path(os.environ.get("FIT_FLARE_CACHE") or _user_folder()) / "kernels" / _fingerprint()
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-    except OSError:
-        return Path(tempfile.mkdtemp(prefix="fit_flare_"))
-    return folder if os.access(folder, os.W_OK) else Path(tempfile.mkdtemp(prefix="fit_flare_"))
+    except (OSError, RuntimeError):  # of a user without a home
+        return _own_folder()
+    return folder if os.access(folder, os.W_OK) else _own_folder()
+
+
+def _own_folder() -> Path:
+    """Of this process alone, gone with it."""
+    folder = tempfile.mkdtemp(prefix="fit_flare_")
+    atexit.register(shutil.rmtree, folder, True)
+    return Path(folder)
 
 
 CACHE_FOLDER = _cache_folder()

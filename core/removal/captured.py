@@ -12,6 +12,7 @@ from ..files import inside, patiently
 from ..progress import Progress
 from .inference import Remover
 from .plates import write_plate
+from .record import Record, made_from
 from .steady import Sequences
 
 UNFINISHED = "removed.unfinished"
@@ -30,13 +31,16 @@ def remove_from(capture: Capture, remover: Remover, progress: Progress) -> Path:
         raise CaptureError(f"{target} is there already; remove it, and the frames are cleaned again.")
     progress.stage("remove", len(capture.views))
     sequences = Sequences(remover, [capture.frame_path(view) for view in capture.views])
+    record = Record(work)
     try:
         for view in capture.views:
-            name = Path(view.name)
-            result = inside(work, str(name.with_suffix(".png") if name.suffix.lower() in _LOSSY else name),
-                            CaptureError)
-            if not result.is_file():
-                plate, told = sequences.read(capture.frame_path(view))
+            frame, name = capture.frame_path(view), Path(view.name)
+            name = name.with_suffix(".png") if name.suffix.lower() in _LOSSY else name
+            result = inside(work, str(name), CaptureError)
+            how = made_from(remover.described, [frame, *sequences.beside(frame)])
+            if not record.is_made(name, how, [result]):
+                record.begin(name, how, [result], overwrite=True)
+                plate, told = sequences.read(frame)
                 write_plate(result, plate, remover.remove(plate, told=told)[0])
             progress.advance()
         patiently(work.rename, target)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import os
+import shutil
 import struct
 import zlib
 from pathlib import Path
@@ -17,18 +18,21 @@ import torch
 from numpy.typing import NDArray
 
 from core import tiff
+from core.capture import Capture
 from core.colour.spaces import AP1
-from core.errors import FrameError, RunError, SettingsError
+from core.errors import Cancelled, FrameError, RunError, SettingsError
 from core.pictures import read_exr, read_picture, write_exr, write_png
 from core.progress import Progress
 from core.removal import inference, weights
 from core.removal.batch import plates_of, remove_all
+from core.removal.captured import UNFINISHED, remove_from
 from core.removal.inference import FlareMap, Remover, Told, carried_up, flare_light
 from core.removal.mattes import Mattes
 from core.removal.network import LEVELS, SHOWN, RemovalNetwork, seen
 from core.removal.plates import Plate, read_plate, write_plate
 from core.removal.recipe import Recipe, as_dict
 from core.removal.record import RECORD, Record, made_from
+from tests.core.captures import make_capture
 
 TINY = Recipe(widths=(8, 8, 8, 8, 8))
 
@@ -505,6 +509,43 @@ def test_what_is_not_from_here_is_not_written_over(tmp_path: Path, everywhere: P
     (tmp_path / "out" / RECORD).unlink()
     with pytest.raises(FrameError, match="choose another folder"):
         remove_all([source], tmp_path / "out", remover, Progress())
+
+
+def test_what_a_fit_has_cleaned_may_be_cleaned_again(tmp_path: Path, everywhere: Path) -> None:
+    """A capture's removed/ says what made it, as every folder of clean plates does; a stopped one is gone on with."""
+    capture, remover = Capture.open(make_capture(tmp_path / "capture", views=3)), Remover(everywhere, working_size=64)
+    shutil.rmtree(capture.folder / "removed", ignore_errors=True)
+
+    class Stopped(Progress):
+        def advance(self, steps: int = 1, **figures: float) -> None:
+            self.request_stop()
+            super().advance(steps, **figures)
+
+    with pytest.raises(Cancelled):
+        remove_from(capture, remover, Stopped())
+    first = next((capture.folder / UNFINISHED).rglob("*.png"))
+    begun = first.stat().st_mtime_ns
+    made = remove_from(capture, remover, Progress())
+    assert (made / first.name).stat().st_mtime_ns == begun
+    frames = [capture.frame_path(view) for view in capture.views]
+    assert remove_all(frames, made, remover, Progress())["kept"] == 3
+    assert remove_all(frames, made, Remover(everywhere, working_size=96), Progress())["made"] == 3
+
+
+def test_a_fit_that_was_second_takes_what_the_first_has_cleaned(tmp_path: Path, everywhere: Path) -> None:
+    capture = Capture.open(make_capture(tmp_path / "capture", views=3))
+    shutil.rmtree(capture.folder / "removed", ignore_errors=True)
+    remover = Remover(everywhere, working_size=64)
+
+    class Meanwhile(Progress):
+        def advance(self, steps: int = 1, **figures: float) -> None:
+            if not (capture.folder / "removed").exists():
+                remove_from(capture, remover, Progress())
+            super().advance(steps, **figures)
+
+    assert remove_from(capture, remover, Meanwhile()) == capture.folder / "removed"
+    assert not (capture.folder / UNFINISHED).exists()
+    assert Capture.open(capture.folder).has_removed
 
 
 def test_a_plate_that_was_begun_is_made(tmp_path: Path, everywhere: Path) -> None:

@@ -265,7 +265,8 @@ def _scores(made: Run | _SceneAlone, folder: Path, settings: FitSettings, progre
     capture = Capture.open(folder)
     held_out = capture.split(settings.holdout)[1]
     frames = Frames(capture, settings.width)
-    found = evaluate(made, capture, {view: frames.camera(view) for view in held_out}, progress)
+    found = evaluate(made, capture, {view: frames.camera(view) for view in held_out}, progress,
+                     frames.inside)
     scores: dict[str, Any] = {layer: part for layer, part in found.items() if isinstance(part, dict)}
     if settings.mode == "3dgs":  # what it calls a flare is nothing at all
         scores = {layer: part for layer, part in scores.items() if not layer.startswith("flare")}

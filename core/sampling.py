@@ -20,7 +20,9 @@ PIXEL = 1 / 12
 """px², the variance of a pixel's own square: with less than that, thin Gaussians fall between the pixels' middles."""
 SAME = 1e-3
 """Grids whose sizes differ by less than this share are one."""
-MOST_PIXELS = 1 << 24
+NEARLY = 0.95
+"""As fine as a grid has to be for what was learned on it to be rendered once, as it is."""
+MOST_PIXELS = 1 << 23
 """Of a picture that is rendered larger than it was asked for."""
 
 
@@ -56,7 +58,7 @@ class Sampling:
         """How many times as large a scene is rendered for a picture of this size that is coarser than the frames, to be
         averaged: so many that nothing falls between its pixels, and as many as `MOST_PIXELS` leave."""
         fineness = self.fineness(focal_length)
-        if fineness >= 1:
+        if fineness >= NEARLY:
             return 1
         return max(min(math.ceil(1 / fineness), math.isqrt(MOST_PIXELS // (width * height))), 1)
 

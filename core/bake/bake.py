@@ -163,7 +163,8 @@ def bake_frames(source: Sequenced, frames: Sequence[Frame], cameras: Mapping[str
         if frame in done:
             continue
         path = out / frame.file
-        _record_of_this(out, made_from, names)  # before a frame of another bake is written over
+        if (out / RECORD).exists():  # before a frame of another bake is written over
+            _check_is_of_this(read_json(out / RECORD, RunError), out, made_from, names)
         remove_partial_of(path)
         # Not kept in a name: at 4K the layers of one frame are half a gigabyte.
         write_layers(path, made(frame), half=settings.half, chromaticities=space.chromaticities, notes=notes(frame))
@@ -222,15 +223,12 @@ def _entry(out: Path, frame: Frame, rest: Sequence[Path]) -> dict[str, Any]:
     return {"file": frame.file, "frame": frame.number, "view": frame.view, "width": width, "height": height, **beside}
 
 
-def _record_of_this(out: Path, made_from: dict[str, Any], names: dict[str, str]) -> dict[str, Any]:
-    """bake.json, {} where there is none or it lists nothing. Raises RunError where it lists what was made otherwise."""
-    found = read_record(out) if (out / RECORD).exists() else {}
-    if not found.get("frames"):
-        return {}
-    if (found["made_from"], found["layers"]) != (json.loads(json.dumps(made_from)), names):
+def _check_is_of_this(record: Mapping[str, Any], out: Path, made_from: dict[str, Any], names: dict[str, str]) -> None:
+    """Raises RunError where bake.json lists what was made otherwise."""
+    described = json.loads(json.dumps(made_from)), names
+    if record.get("frames") and (record.get("made_from"), record.get("layers")) != described:
         raise RunError(f"Another bake, of another fit or with other settings, writes to {out} meanwhile; choose "
                        "another folder for this one.")
-    return found
 
 
 def _add_to_record(out: Path, made_from: dict[str, Any], names: dict[str, str],
@@ -238,7 +236,8 @@ def _add_to_record(out: Path, made_from: dict[str, Any], names: dict[str, str],
     """bake.json with these entries beside those of others who write to this folder. Raises RunError where it tells of
     frames that were made with other settings since this bake began."""
     with locked(out / LOCK):
-        found = _record_of_this(out, made_from, names)
+        found = read_record(out) if (out / RECORD).exists() else {}
+        _check_is_of_this(found, out, made_from, names)
         known = {entry["file"]: entry for entry in found.get("frames", []) if (out / entry["file"]).is_file()}
         known.update({entry["file"]: entry for entry in entries})
         frames = sorted(known.values(), key=lambda entry: (Path(entry["file"]).parent.as_posix(), entry["frame"]))

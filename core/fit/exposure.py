@@ -25,10 +25,12 @@ LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
 
 def spread(capture: Capture, views: Sequence[View], frames: Frames) -> float:
     """Stops by which the frames' exposures differ, but for the darkest and the brightest tenth of the frames. 0 where
-    too few points or frames tell."""
+    too few points or frames tell, or points have no colours."""
     points = capture.points
     chosen = slice(None, None, max(len(points) // POINTS, 1))
     known = linear_from_srgb(points.rgb[chosen] / np.float32(255)) @ LUMINANCE
+    if not np.ptp(known) > 0:  # a cloud without colours
+        return 0.0
     stops = []
     for view in views[:: max(len(views) // ASKED, 1)]:
         camera, frame, removed = frames.targets(view)

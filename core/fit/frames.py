@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..borders import DARKEST, Inside, inside_borders
+from ..borders import DARKEST, LEAST, Borders, Inside
 from ..capture import Camera, Capture, View
 from ..errors import CaptureError
 from ..pictures import Picture
@@ -77,11 +77,12 @@ class Frames:
             stored = self._stored(view, "frame", self.capture.frame)
             if stored is None or stored.max() <= DARKEST * scale:  # faded out
                 continue
-            inside = inside_borders(stored, lambda line: line / scale)
-            found = inside if found is None else found.joined(inside)
-            if found == Inside.whole(*size):
+            borders = Borders.of(stored, lambda line: line / scale)
+            found = borders if found is None else found.common(borders)
+            if max(found) < LEAST:
                 return None
-        return None if found is None else found.less(SOFT, *size)
+        inside = None if found is None else found.inside(*size, SOFT)
+        return None if inside is None or inside.size == size else inside
 
     def targets(self, view: View) -> Targets:
         """Camera, frame and flare-free frame of a view, without the borders."""

@@ -13,6 +13,7 @@ import math
 from contextlib import nullcontext
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import Parameter
@@ -41,6 +42,8 @@ CLEAR_EVERY = 50
 """Iterations between two looks at how much of the lights the scene leaves (`visibility.clear_shares`)."""
 UNTOLD = 0.01
 """Difference of display values between frame and flare-free frame below which nothing is told of a flare."""
+SAME_PLACE = 1e-5
+"""Share of the extent within which a light that was given is where it was."""
 RATE_ABOVE_WHITE = 3.0
 """Times the rate of a scene's colours where frames go on above white: theirs is a longer way. Lamps of 32 times white
 end a sixth off instead of three fifths (`desk`, preset draft)."""
@@ -347,10 +350,10 @@ class Trainer:
         """Raises RunError where the state was made with other lights: flares belong to lights by their order. States of
         earlier versions do not say with which."""
         begun, given = state.get("lights"), self._given_lights()
-        if begun is not None and begun != given:
-            raise RunError(f"{self.capture.folder / 'lights.json'} has changed since the fit began "
-                           f"({_difference(begun, given)}); put the old one back, or begin the fit anew in another "
-                           "folder.")
+        changed = "" if begun is None else _difference(begun, given, SAME_PLACE * self.extent)
+        if changed:
+            raise RunError(f"{self.capture.folder / 'lights.json'} has changed since the fit began ({changed}); put "
+                           "the old one back, or begin the fit anew in another folder.")
 
 
 def _load_parameters(parameters: dict[str, Parameter], state: State) -> None:
@@ -359,13 +362,15 @@ def _load_parameters(parameters: dict[str, Parameter], state: State) -> None:
         parameter.data = state[name].clone().to(parameter.dtype)
 
 
-def _difference(begun: list[Any], given: list[Any]) -> str:
-    """What has changed in a list of [name, [x, y, z]]: the names, or else the first place."""
+def _difference(begun: list[Any], given: list[Any], apart: float) -> str:
+    """What has changed in a list of [name, [x, y, z]], or "": the names, or else the first place, by more than `apart`
+    or what Blender's own numbers round to."""
     before, after = ([name for name, _ in lights] for lights in (begun, given))
     if before != after:
         return f"its lights were {', '.join(map(repr, before))}, and are {', '.join(map(repr, after))} now"
-    return next(f"{name!r} was at {old}, and is at {new} now"
-                for (name, old), (_, new) in zip(begun, given, strict=True) if old != new)
+    return next((f"{name!r} was at {old}, and is at {new} now"
+                 for (name, old), (_, new) in zip(begun, given, strict=True)
+                 if not np.allclose(old, new, rtol=1e-6, atol=apart)), "")
 
 
 def _decayed(first: float, last: float, progress: float) -> float:

@@ -3,7 +3,7 @@
 
     look = read("lamp.flare")
     seen = look.evaluate(world_to_camera, edits=LookEdits.parse(["lamp.intensity=2"], look.names))
-    picture = draw(seen.values(), intrinsics, 960, 540)
+    picture = draw(seen.values(), intrinsics, 960, 540, look.blend, look.sampling)
 
     container.py   the safetensors file
     network.py     hash grids and the deformation network

@@ -31,18 +31,22 @@ def remove_from(capture: Capture, remover: Remover, progress: Progress) -> Path:
         raise CaptureError(f"{target} is there already; remove it, and the frames are cleaned again.")
     progress.stage("remove", len(capture.views))
     sequences = Sequences(remover, [capture.frame_path(view) for view in capture.views])
-    record = Record(work)
+    record, results = Record(work), []
     try:
         for view in capture.views:
             frame, name = capture.frame_path(view), Path(view.name)
             name = name.with_suffix(".png") if name.suffix.lower() in _LOSSY else name
             result = inside(work, str(name), CaptureError)
+            results.append(result)
             how = made_from(remover.described, [frame, *sequences.beside(frame)])
             if not record.is_made(name, how, [result]):
                 record.begin(name, how, [result], overwrite=True)
                 plate, told = sequences.read(frame)
                 write_plate(result, plate, remover.remove(plate, told=told)[0])
             progress.advance()
+        if not target.exists() and not all(path.is_file() for path in results):
+            raise CaptureError(f"Another fit cleans the frames of {capture.folder} in another way at the same time; "
+                               "wait for it, and start this one again.")
         patiently(work.rename, target)
     except OSError as problem:
         if target.is_dir():  # another fit of this capture was first

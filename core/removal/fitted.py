@@ -77,7 +77,9 @@ def _remove(fitted: Renderer, capture: Capture, view: View, results: Sequence[Pa
     height, width = plate.codes.shape[:2]
     camera = view.camera if view.camera.size == (width, height) else view.camera.scaled(width, height)
     layers = fitted.render(camera)
-    flare = np.sum([np.zeros((height, width, 3), np.float32), *layers.flare_by_light.values()], axis=0)
+    flare = np.zeros((height, width, 3), np.float32)
+    part = plate.inside.part  # the borders, which were not fitted, stay
+    flare[part] = np.sum([flare, *layers.flare_by_light.values()], axis=0)[part]
     scene = layers.scene
     if plate.encoding == "linear":  # the fit was shown Rec. 709
         flare, scene = plate.space.from_linear(flare), plate.space.from_linear(scene)

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from ..errors import FrameError
-from ..files import content_of, locked, read_json, remove_partial_of, write_json
+from ..files import content_of, locked, patiently, read_json, remove_partial_of, write_json
 
 RECORD = "remove.json"
 LOCK = ".remove.lock"
@@ -27,27 +27,30 @@ def made_from(maker: str, sources: Iterable[Path]) -> str:
 
 
 class Record:
-    """The plates below a folder by their names there; any number of processes may add to it."""
+    """The plates below a folder by their names there. Any number of processes may add to it, also ones that make the
+    same plates: it is read anew each time."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
-        self._before = self._read()
 
     def is_made(self, name: Path, how: str, results: Sequence[Path]) -> bool:
         """Whether all files of a plate are there, made in this way (`made_from`)."""
-        return self._before.get(name.as_posix()) == how and all(path.is_file() for path in results)
+        return self._read().get(name.as_posix()) == how and all(path.is_file() for path in results)
 
     def begin(self, name: Path, how: str, results: Sequence[Path], overwrite: bool) -> None:
-        """Before the files of a plate are written: what was there of it goes, so that a kill leaves no older ones under
-        what is now written down. Raises FrameError for a plate that is not from here, unless `overwrite`."""
-        if not overwrite and name.as_posix() not in self._before and results[0].exists():
-            raise FrameError(f"{results[0]} is there, and {RECORD} beside it does not tell of it: it may be someone's "
-                             "work; choose another folder, or have it written over (--overwrite).")
+        """Before the files of a plate are written: what was made there in another way goes, so that a kill leaves none
+        under what is now written down. Raises FrameError for a plate that is not from here, unless `overwrite`."""
+        with locked(self._folder / LOCK):
+            before = self._read()
+            if before.get(name.as_posix()) != how:
+                if not overwrite and name.as_posix() not in before and results[0].exists():
+                    raise FrameError(f"{results[0]} is there, and {RECORD} beside it does not tell of it: it may be "
+                                     "someone's work; choose another folder, or have it written over (--overwrite).")
+                for path in results:
+                    patiently(path.unlink, True)
+                write_json(self._folder / RECORD, {"plates": dict(sorted({**before, name.as_posix(): how}.items()))})
         for path in results:
             remove_partial_of(path)
-            path.unlink(missing_ok=True)
-        with locked(self._folder / LOCK):
-            write_json(self._folder / RECORD, {"plates": dict(sorted({**self._read(), name.as_posix(): how}.items()))})
 
     def _read(self) -> dict[str, str]:
         """{} where it is not written down."""

@@ -18,6 +18,7 @@ from ..gaussians.scene import COEFFICIENTS, SceneGaussians
 from ..gaussians.spherical_harmonics import dc_from_colour
 from ..look import Look, LookEdits, PlaneGaussians, ViewOfLight
 from ..look.plane import PLANE_DEPTH, joined
+from ..sampling import DILATION, Sampling, dilation
 
 PRESET_VERSION = 1
 _APART = 1e-5  # share of the depth between one Gaussian and the next, so that a sort by depth keeps their order
@@ -26,13 +27,14 @@ _MOST_OPAQUE = 0.99
 
 
 def flare_scene(
-    flares: Mapping[str, PlaneGaussians], camera: Camera
+    flares: Mapping[str, PlaneGaussians], camera: Camera, sampling: Sampling | None = None
 ) -> tuple[SceneGaussians, dict[str, NDArray[np.float32]]]:
     """One frame's flare as 3D Gaussians of the world, just before the camera (paper, "Flare Representation").
 
-    They are flat, face the camera at depth 0.21, and project to what the look shows. Returned beside them, which 3DGS
-    itself has no word for, (n,) each: ring_r0 and ring_w, 0 and 1 for a plain Gaussian; and of a flare with arcs arc_0
-    and arc_1, in deviations along the first and second axis.
+    They are flat, face the camera at depth 0.21, and project to what the look shows, with the low-pass that other
+    programs add: that of the grid they were learned on (`sampling`) is larger in a finer picture, and the rest of it
+    lies in them. Returned beside them, which 3DGS itself has no word for, (n,) each: ring_r0 and ring_w, 0 and 1 for a
+    plain Gaussian; and of a flare with arcs arc_0 and arc_1, in deviations along the first and second axis.
     """
     whole = joined(list(flares.values())) or _nothing()
     n = len(whole)
@@ -40,7 +42,9 @@ def flare_scene(
     local = np.concatenate([whole.means, np.ones((n, 1))], 1) * depth[:, None]
     to_world = camera.world_to_camera[:3, :3].T
     means = local @ to_world.T + camera.position
+    rest = max(dilation(sampling, camera.focal_length) - DILATION, 0.0)
     xx, xy, yy = whole.covariances.T.astype(np.float64)
+    xx, yy = xx + rest / camera.fx**2, yy + rest / camera.fy**2
     variances, axes = np.linalg.eigh(np.stack([xx, xy, xy, yy], -1).reshape(-1, 2, 2))
     deviations = np.sqrt(np.maximum(variances, 1e-14)) * depth[:, None]
     scales = np.concatenate([deviations, _FLAT * depth[:, None]], 1)
@@ -71,9 +75,10 @@ def _nothing() -> PlaneGaussians:
     return PlaneGaussians(*(np.zeros(shape, np.float32) for shape in ((0, 2), (0, 3), (0,), (0, 3))))
 
 
-def write_flare_ply(path: Path | str, flares: Mapping[str, PlaneGaussians], camera: Camera, blend: str) -> None:
+def write_flare_ply(path: Path | str, flares: Mapping[str, PlaneGaussians], camera: Camera, blend: str,
+                    sampling: Sampling | None = None) -> None:
     """One frame's flare as a 3DGS PLY; what `flare_scene` has besides, and what it means in the header."""
-    scene, more = flare_scene(flares, camera)
+    scene, more = flare_scene(flares, camera, sampling)
     arcs = "" if "arc_0" not in more else ", times exp(arc_0 u + arc_1 v) and one at its peak, r^2 = u^2 + v^2"
     write_ply(path, scene, extra=more, comments=(
         "Fit Flare: the flare of one frame, as its camera sees it",

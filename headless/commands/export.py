@@ -56,7 +56,7 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     for frame in wanted:
         camera = cameras[frame.view]
         write_flare_ply(words.out / frame.file.replace("layers.", "flare.").replace(".exr", ".ply"),
-                        look.evaluate(camera.world_to_camera, edits=edits), camera, look.blend)
+                        look.evaluate(camera.world_to_camera, edits=edits), camera, look.blend, look.sampling)
         progress.advance()
     progress.say(f"{len(wanted)} frames of Gaussians are in {words.out}.")
     return {"ply": str(words.out), "frames": len(wanted)}

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from core.borders import Inside, inside_borders
+from core.borders import LEAST, Borders, Inside, inside_borders
 from core.capture import Capture
 from core.fit import fit
 from core.fit.frames import SOFT, Frames
@@ -52,16 +52,31 @@ def test_what_jpeg_makes_of_a_border_is_one() -> None:
     assert 15 <= found.top <= 16 and 80 <= found.bottom <= 81, "but for the line that rings"
 
 
-@pytest.mark.parametrize("why", ["one side alone", "unlike", "one line", "grey", "grain", "all of it"])
+@pytest.mark.parametrize("why", ["one side alone", "one line", "grey", "grain", "a ghost", "next to nothing left",
+                                 "all of it"])
 def test_what_is_dark_for_another_reason_is_no_border(why: str) -> None:
     inner = np.maximum(np.asarray(picture(0, SIZE), np.uint8), 40)
-    whole = {"one side alone": bordered(inner, 20, 0, 0, 0), "unlike": bordered(inner, 20, 8, 0, 0),
+    ghost = bordered(inner, 20, 20, 0, 0)
+    ghost[0, 5] = ghost[-1, 9] = 120
+    whole = {"one side alone": bordered(inner, 20, 0, 0, 0), "a ghost": ghost,
+             "next to nothing left": bordered(inner[:8], 40, 40, 0, 0),
              "one line": bordered(inner, 1, 1, 1, 1), "grey": bordered(inner, 8, 8, 0, 0, 60),
              "grain": bordered(inner, 8, 8, 0, 0), "all of it": np.zeros_like(inner)}[why]
     if why == "grain":
         noise = np.random.default_rng(0).integers(0, 20, whole.shape).astype(np.uint8)
         whole = np.where(whole == 0, noise, whole)
-    assert inside_borders(whole, lambda line: line / 255) == Inside.whole(*whole.shape[1::-1])
+    assert inside_borders(whole, lambda line: line / 255) == Inside(0, whole.shape[0], 0, whole.shape[1])
+
+
+def test_a_night_sky_makes_no_border_wider() -> None:
+    """Nor are frames with one another picture than those beside them."""
+    inner = np.maximum(np.asarray(picture(0, SIZE), np.uint8), 40)
+    for sky in (0, 1, 10, 30):
+        dark = inner.copy()
+        dark[:sky] = 0
+        found = inside_borders(bordered(dark, 12, 12, 0, 0), lambda line: line / 255)
+        assert found.bottom == 12 + SIZE[1] and 12 <= found.top <= 12 + LEAST
+    assert Borders(40, 12, 0, 0).common(Borders(12, 12, 3, 0)) == Borders(12, 12, 0, 0)
 
 
 @pytest.mark.parametrize("kind", ["8 bit", "float"])

@@ -52,6 +52,14 @@ def test_a_drift_is_found_and_told(capture: Capture, tmp_path: Path, stops: floa
     assert len(told) == 1
 
 
+def test_points_without_colours_tell_nothing(capture: Capture, tmp_path: Path) -> None:
+    drifting = exposed(capture, tmp_path / "a", 0.7)
+    points = drifting.folder / "sparse" / "0" / "points3D.txt"
+    rows = [line.split() for line in points.read_text(encoding="utf-8").splitlines()]
+    points.write_text("".join(" ".join([*row[:4], "128", "128", "128", *row[7:]]) + "\n" for row in rows))
+    assert spread_of(Capture.open(drifting.folder)) == 0
+
+
 def test_without_points_that_tell_nothing_is_said(capture: Capture, tmp_path: Path) -> None:
     drifting = exposed(capture, tmp_path / "a", 0.7)
     for path in (drifting.folder / "images").iterdir():

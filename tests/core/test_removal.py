@@ -2,11 +2,13 @@
 """Removal of flares from plates: what is kept, what is taken, and what cannot be read."""
 from __future__ import annotations
 
+import contextlib
 import io
 import json
 import os
 import shutil
 import struct
+import threading
 import zlib
 from pathlib import Path
 
@@ -509,6 +511,51 @@ def test_what_is_not_from_here_is_not_written_over(tmp_path: Path, everywhere: P
     (tmp_path / "out" / RECORD).unlink()
     with pytest.raises(FrameError, match="choose another folder"):
         remove_all([source], tmp_path / "out", remover, Progress())
+
+
+def test_a_plate_that_another_process_has_made_meanwhile_stays(tmp_path: Path) -> None:
+    """A farm may give a task again while its first worker lives: what it makes in the same way is neither taken away
+    nor taken for someone's work."""
+    plate = write_codes(tmp_path / "out" / "b.png", picture())
+    plate.unlink()
+    second = Record(tmp_path / "out")
+    first = Record(tmp_path / "out")
+    first.begin(Path("b.png"), "one way", [plate], overwrite=False)
+    write_codes(plate, picture())
+    assert second.is_made(Path("b.png"), "one way", [plate])
+    for overwrite in (False, True):
+        second.begin(Path("b.png"), "one way", [plate], overwrite)
+        assert plate.exists()
+    second.begin(Path("b.png"), "another way", [plate], overwrite=False)
+    assert not plate.exists() and not first.is_made(Path("b.png"), "one way", [plate])
+
+
+def test_two_fits_that_clean_one_capture_at_once(tmp_path: Path, everywhere: Path) -> None:
+    """Frame by frame in turns: whichever is first, removed/ is whole."""
+    capture, remover = Capture.open(make_capture(tmp_path / "capture", views=4)), Remover(everywhere, working_size=64)
+    turn, failed = threading.Barrier(2), []
+
+    class InTurns(Progress):
+        def advance(self, steps: int = 1, **figures: float) -> None:
+            with contextlib.suppress(threading.BrokenBarrierError):
+                turn.wait(5)
+            super().advance(steps, **figures)
+
+    def clean() -> None:
+        try:
+            remove_from(capture, remover, InTurns())
+        except Exception as problem:
+            failed.append(problem)
+        turn.abort()
+
+    both = [threading.Thread(target=clean) for _ in range(2)]
+    for one in both:
+        one.start()
+    for one in both:
+        one.join()
+    assert not failed and not (capture.folder / UNFINISHED).exists()
+    assert len(list((capture.folder / "removed").glob("*.png"))) == 4
+    assert Capture.open(capture.folder).has_removed
 
 
 def test_what_a_fit_has_cleaned_may_be_cleaned_again(tmp_path: Path, everywhere: Path) -> None:

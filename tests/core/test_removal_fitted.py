@@ -199,6 +199,23 @@ def test_plates_of_another_fit_or_capture_are_made_again(capture: Capture, tmp_p
     assert made(capture, overwrite=True) == 3
 
 
+def test_borders_stay_as_they_are(capture: Capture, tmp_path: Path) -> None:
+    """They are no part of what was fitted: not those of video levels either."""
+    shutil.copytree(capture.folder, tmp_path / "boxed")
+    for path in (tmp_path / "boxed" / "images").iterdir():
+        codes = cv2.imread(str(path))
+        codes[:7] = codes[-7:] = 16
+        cv2.imwrite(str(path), codes)
+    boxed = Capture.open(tmp_path / "boxed")
+    remove_fitted(Exact(), boxed, boxed.views[:1], tmp_path / "clean", Progress(), flare_folder=tmp_path / "flare")
+    name = boxed.views[0].name
+    before, after = (cv2.imread(str(folder / name)) for folder in (boxed.folder / "images", tmp_path / "clean"))
+    taken = read_picture(tmp_path / "flare" / Path(name).with_suffix(".exr")).pixels
+    for rows in (slice(0, 7), slice(-7, None)):
+        assert np.array_equal(after[rows], before[rows]) and not taken[rows].any()
+    assert (after[7:-7] != before[7:-7]).mean() > 0.1
+
+
 def test_flares_that_are_asked_for_later_are_made(capture: Capture, tmp_path: Path) -> None:
     for flares, made in ((None, 3), (tmp_path / "flare", 3), (tmp_path / "flare", 0)):
         found = remove_fitted(Exact(), capture, capture.views, tmp_path / "clean", Progress(), flare_folder=flares)

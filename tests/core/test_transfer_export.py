@@ -15,19 +15,21 @@ from core.gaussians import rasterization
 from core.gaussians.ply import read_ply
 from core.gaussians.projection import rotation_matrices
 from core.look import PlaneGaussians, ViewOfLight, draw, read
+from core.sampling import Sampling
 from core.transfer.export import _part, flare_scene, preset, write_flare_ply, write_preset
 from tests.core.flared import cameras
 from tests.core.test_look import saved
 
 
+@pytest.mark.parametrize("sampling", [None, Sampling(70.0, 70.0), Sampling(25.0, 35.0)])
 @pytest.mark.parametrize("blend", ["over", "add"])
-def test_the_ply_of_a_frame_renders_as_the_flare(blend: str, tmp_path: Path) -> None:
+def test_the_ply_of_a_frame_renders_as_the_flare(blend: str, sampling: Sampling | None, tmp_path: Path) -> None:
     """Without rings, which 3DGS has no word for; "over", which is what a 3DGS renderer does."""
     form = replace(PAPER if blend == "over" else OURS, rings=False)
     saved(tmp_path / "a.flare", form, 2, blend)
     look, camera = read(tmp_path / "a.flare"), cameras(3)[0]
     seen = look.evaluate(camera.world_to_camera)
-    write_flare_ply(tmp_path / "flare.ply", seen, camera, blend)
+    write_flare_ply(tmp_path / "flare.ply", seen, camera, blend, sampling)
     scene = read_ply(tmp_path / "flare.ply")
     assert len(scene) == look.count
     with torch.no_grad():
@@ -35,7 +37,7 @@ def test_the_ply_of_a_frame_renders_as_the_flare(blend: str, tmp_path: Path) -> 
             scene.means, scene.quaternions, scene.scales, scene.opacities, scene.sh,
             torch.from_numpy(camera.world_to_camera).float(), torch.from_numpy(camera.intrinsics).float(),
             camera.width, camera.height, kernels="torch").colour.numpy()
-    expected = draw(seen.values(), camera.intrinsics, camera.width, camera.height, "over")
+    expected = draw(seen.values(), camera.intrinsics, camera.width, camera.height, "over", sampling)
     assert expected.max() > 0.05
     np.testing.assert_allclose(shown, expected, atol=2e-3)
 

@@ -44,7 +44,8 @@ def remove_from(capture: Capture, remover: Remover, progress: Progress) -> Path:
                 plate, told = sequences.read(frame)
                 write_plate(result, plate, remover.remove(plate, told=told)[0])
             progress.advance()
-        if not target.exists() and not all(path.is_file() for path in results):
+        # In this order: what is missing because another has just renamed its folder is in `target` by then.
+        if not all(path.is_file() for path in results) and not target.exists():
             raise CaptureError(f"Another fit cleans the frames of {capture.folder} in another way at the same time; "
                                "wait for it, and start this one again.")
         patiently(work.rename, target)

@@ -15,9 +15,9 @@ EVEN, SHARE = 4 / 255, 0.98
 """Display value by which a border's pixels differ from its colour, and the share of a line for which that holds; the
 others, which JPEG makes beside the picture, may differ by three times as much."""
 LEAST = 2
-"""Lines."""
+"""Lines of a border."""
 SMALLEST = 16
-"""Pixels: what is left of a picture has that many at least each way."""
+"""Pixels each way that are left of a picture at least."""
 
 
 class Borders(NamedTuple):

@@ -26,6 +26,8 @@ Encoding = Literal["srgb", "linear"]
 Pixels = NDArray[np.float32]
 
 SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".tif", ".tiff", ".exr"})
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+"""Of linear Rec. 709 channels."""
 LARGEST = 500_000_000  # pixels; a header that claims more is damaged or hostile
 
 

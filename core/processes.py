@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Processes that an earlier Blender started, known by their number and by when they began: systems give the numbers
-of ended processes out again."""
+"""Other processes, known by their number, and by when they began: systems give the numbers of ended ones out again."""
 from __future__ import annotations
 
 import os

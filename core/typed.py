@@ -8,6 +8,11 @@ import types
 import typing
 from typing import Any, Literal
 
+MOST_SEED = 2**31 - 1
+"""The greatest seed that every library takes."""
+WHOLE_DIGITS = 18
+"""Of a whole number that 64 bits hold in any case."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Bounds:

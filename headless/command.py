@@ -13,12 +13,10 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from ..core.progress import Progress
+from ..core.typed import MOST_SEED
 
 Side = Literal["engine", "blender"]
 Run = Callable[[argparse.Namespace, Progress], dict[str, Any]]
-
-
-MOST_SEED = 2**31 - 1
 
 
 def seed(text: str) -> int:

@@ -136,6 +136,7 @@ def bake_frames(source: Sequenced, frames: Sequence[Frame], cameras: Mapping[str
         made_from["space"] = [settings.space, settings.config]
     if keyed.frames:
         made_from["keyed"] = keyed.described()["frames"]
+    made_from = json.loads(json.dumps(made_from))  # as it is read again
     names = layer_names(source.lights)
     _begin(out, made_from, names, overwrite)
 
@@ -145,12 +146,9 @@ def bake_frames(source: Sequenced, frames: Sequence[Frame], cameras: Mapping[str
         own = {"inputs": inputs} if inputs else {}
         return {"view": frame.view, "frame": frame.number, **own, **made_from}
 
-    def entry(frame: Frame) -> dict[str, Any]:
-        return _entry(out, frame, of_frame(frame).rest)
-
     done = [frame for frame in frames if _is_made(out / frame.file, notes(frame))
             and all(path.is_file() for path in of_frame(frame).rest)]
-    record = _add_to_record(out, made_from, names, [entry(frame) for frame in done])
+    record = _add_to_record(out, made_from, names, [_entry(out, frame, of_frame(frame).rest) for frame in done])
     progress.stage("bake", len(frames), len(done))
 
     def made(frame: Frame) -> FrameLayers:
@@ -168,7 +166,7 @@ def bake_frames(source: Sequenced, frames: Sequence[Frame], cameras: Mapping[str
         remove_partial_of(path)
         # Not kept in a name: at 4K the layers of one frame are half a gigabyte.
         write_layers(path, made(frame), half=settings.half, chromaticities=space.chromaticities, notes=notes(frame))
-        record = _add_to_record(out, made_from, names, [entry(frame)])
+        record = _add_to_record(out, made_from, names, [_entry(out, frame, of_frame(frame).rest)])
         progress.advance()
     return record
 
@@ -189,7 +187,7 @@ def _begin(out: Path, made_from: dict[str, Any], names: dict[str, str], overwrit
         if not (out / RECORD).exists():  # another task has just cleared it away
             return
         record = read_record(out)
-        same = record["made_from"] == json.loads(json.dumps(made_from))
+        same = record["made_from"] == made_from
         if (same and record["layers"] == names) or not record["frames"]:
             return
         if same and not overwrite:
@@ -214,7 +212,7 @@ def _is_made(path: Path, wanted: Mapping[str, Any]) -> bool:
         notes = read_description(path)
     except (FrameError, OSError):
         return False
-    return all(notes.get(name) == value for name, value in json.loads(json.dumps(wanted)).items())
+    return all(notes.get(name) == value for name, value in wanted.items())
 
 
 def _entry(out: Path, frame: Frame, rest: Sequence[Path]) -> dict[str, Any]:
@@ -225,8 +223,7 @@ def _entry(out: Path, frame: Frame, rest: Sequence[Path]) -> dict[str, Any]:
 
 def _check_is_of_this(record: Mapping[str, Any], out: Path, made_from: dict[str, Any], names: dict[str, str]) -> None:
     """Raises RunError where bake.json lists what was made otherwise."""
-    described = json.loads(json.dumps(made_from)), names
-    if record.get("frames") and (record.get("made_from"), record.get("layers")) != described:
+    if record.get("frames") and (record.get("made_from"), record.get("layers")) != (made_from, names):
         raise RunError(f"Another bake, of another fit or with other settings, writes to {out} meanwhile; choose "
                        "another folder for this one.")
 

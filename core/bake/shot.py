@@ -16,10 +16,9 @@ from typing import Any
 import numpy as np
 
 from ..capture.camera import Camera
-from ..fit.rendering import as_tensors, pose_and_intrinsics, render_scene
+from ..fit.rendering import render_scene, splat_look
 from ..fit.run import Run
 from ..flare.compositing import layers as linear_layers
-from ..flare.compositing import splat_flare
 from ..flare.visibility import of_clear, visible_share
 from ..look import LookEdits, read
 from ..look.shot import PlacedLight, Shot, ShotFrame, evaluate
@@ -60,11 +59,8 @@ class ShotRenderer:
 
         placed = [self._behind_the_scene(light, camera) for light in one.lights]
         with torch.no_grad():
-            _, intrinsics = pose_and_intrinsics(camera)
-            flares = {name: splat_flare(as_tensors(found), intrinsics, *camera.size, self.look.blend,
-                                        sampling=self.look.sampling)
-                      for name, found in evaluate(self.look, camera.world_to_camera, placed, edits,
-                                                  self.shot.query).items()}
+            seen = evaluate(self.look, camera.world_to_camera, placed, edits, self.shot.query)
+            flares = {name: splat_look(self.look, found, camera) for name, found in seen.items()}
             dark = torch.zeros(camera.height, camera.width, 3)
             scene, white = (None, 1.0) if self.run is None else (render_scene(self.run.scene, camera),
                                                                  self.run.scene.display_white)

@@ -17,7 +17,7 @@ from ..gaussians.ply import read_ply
 from ..gaussians.scene import SceneGaussians
 from ..lights.snap import Sight, sight, snapped
 from ..pictures import Picture, holds_floats
-from .frames import Frames
+from .frames import Frames, thinned
 from .settings import FitSettings
 from .sky import with_sky
 
@@ -100,7 +100,7 @@ def _sights(views: tuple[View, ...], frames: Frames) -> list[Sight]:
     """Of some of the views with flare-free frames, small, which is all that placing lights takes. The frames are those
     that the fit looks at, so that none is decoded twice."""
     found = []
-    for view in views[:: max(len(views) // SNAP_VIEWS, 1)]:
+    for view in thinned(views, SNAP_VIEWS):
         camera, frame, removed = frames.targets(view)
         if removed is not None:
             small = camera.scaled(min(SNAP_WIDTH, camera.width))

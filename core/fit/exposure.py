@@ -8,8 +8,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..capture import Capture, View
-from ..pictures import linear_from_srgb
-from .frames import Frames
+from ..pictures import LUMINANCE, linear_from_srgb
+from .frames import Frames, colours_at, thinned
 
 UNLIKE = 0.5
 """Stops, the spread over the frames, from which on it is told. Captures of one exposure have 0.05 to 0.2, with flares
@@ -20,7 +20,6 @@ DARK, BRIGHT = 0.05, 0.9
 """Display values between which pixels tell."""
 RARE = 0.1
 """Share of the frames, to either side, that do not count."""
-LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
 
 
 def spread(capture: Capture, views: Sequence[View], frames: Frames) -> float:
@@ -29,15 +28,13 @@ def spread(capture: Capture, views: Sequence[View], frames: Frames) -> float:
     points = capture.points
     chosen = slice(None, None, max(len(points) // POINTS, 1))
     known = linear_from_srgb(points.rgb[chosen] / np.float32(255)) @ LUMINANCE
-    if not np.ptp(known) > 0:  # a cloud without colours
+    xyz, known = points.xyz[chosen][known > 0], known[known > 0]
+    if not len(known) or not np.ptp(known) > 0:  # a cloud without colours
         return 0.0
     stops = []
-    for view in views[:: max(len(views) // ASKED, 1)]:
+    for view in thinned(views, ASKED):
         camera, frame, removed = frames.targets(view)
-        pixels, depth = camera.project(points.xyz[chosen])
-        seen = camera.contains(pixels, depth) & (known > 0)
-        x, y = np.minimum(pixels[seen].astype(int), np.array(camera.size) - 1).T
-        shown = (frame if removed is None else removed).numpy()[y, x]
+        seen, shown = colours_at(xyz, camera, frame if removed is None else removed)
         tells = ((shown > DARK) & (shown < BRIGHT)).all(-1)
         if tells.sum() >= FEWEST:
             stops.append(float(np.median(np.log2(linear_from_srgb(shown[tells]) @ LUMINANCE / known[seen][tells]))))

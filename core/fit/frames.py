@@ -2,8 +2,8 @@
 """The pictures a fit looks at, at the size and in the encoding in which it does."""
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -20,6 +20,23 @@ ASKED = 12
 """Frames, about, that are asked for their borders."""
 SOFT = 1
 """Lines beside a border that hold some of it at another size."""
+
+
+T = TypeVar("T")
+
+
+def thinned(items: Sequence[T], number: int) -> Sequence[T]:
+    """About so many of them, evenly: fewer than twice as many."""
+    return items[:: max(len(items) // number, 1)]
+
+
+def colours_at(xyz: NDArray[Any], camera: Camera, picture: Tensor) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
+    """Which (n,) of the points (n, 3), in the world, lie on the camera's frame, and what a picture of it shows there,
+    (m, 3)."""
+    pixels, depth = camera.project(xyz)
+    inside = camera.contains(pixels, depth)
+    x, y = np.minimum(pixels[inside].astype(int), np.array(camera.size) - 1).T
+    return inside, picture.numpy()[y, x]
 
 
 class Targets(NamedTuple):
@@ -44,6 +61,7 @@ class Frames:
         self.capture = capture
         self.display_white = display_white
         self._width = width
+        self._codes = 65535 / display_white  # 16 bit keeps the smoothness of linear footage at half the size of float
         self.cache = PictureCache(memory)
         self.reference = "removed" if capture.has_removed else "truth" if capture.has_truth else ""
         self.inside = self._inside()
@@ -68,16 +86,15 @@ class Frames:
     def _inside(self) -> Inside | None:
         """What lies inside the borders that all frames have, at the working size; None where they have none, or are of
         several sizes."""
-        views, scale = self.capture.views, 65535 / self.display_white
-        sizes = {self.camera(view).size for view in views}
+        sizes = {self.camera(view).size for view in self.capture.views}
         if len(sizes) != 1:
             return None
         size, found = sizes.pop(), None
-        for view in views[:: max(len(views) // ASKED, 1)]:
+        for view in thinned(self.capture.views, ASKED):
             stored = self._stored(view, "frame", self.capture.frame)
-            if stored is None or stored.max() <= DARKEST * scale:  # faded out
+            if stored is None or stored.max() <= DARKEST * self._codes:  # faded out
                 continue
-            borders = Borders.of(stored, lambda line: line / scale)
+            borders = Borders.of(stored, lambda line: line / self._codes)
             found = borders if found is None else found.common(borders)
             if max(found) < LEAST:
                 return None
@@ -113,7 +130,7 @@ class Frames:
             return None
         if self.inside is not None:
             stored = stored[self.inside.part]
-        return torch.from_numpy(stored.astype(np.float32)) / (65535 / self.display_white)
+        return torch.from_numpy(stored.astype(np.float32)) / self._codes
 
     def _stored(self, view: View, kind: str,
                 decode: Callable[[View, tuple[int, int]], Picture | None]) -> NDArray[np.uint16] | None:
@@ -124,7 +141,6 @@ class Frames:
             picture = decode(view, self.camera(view).size)
             if picture is None:
                 return None
-            # 16 bit keeps the smoothness of linear footage at half the size of float.
-            stored = (picture.display(self.display_white) * (65535 / self.display_white) + 0.5).astype(np.uint16)
+            stored = (picture.display(self.display_white) * self._codes + 0.5).astype(np.uint16)
             self.cache.put(name, stored)
         return stored

@@ -113,6 +113,12 @@ def _edited(look: Look, edits: LookEdits, camera: Camera,
     return {name: as_tensors(one) for name, one in shown.items()}
 
 
+def splat_look(look: Look, gaussians: LookGaussians, camera: Camera) -> Splats:
+    """Gaussians of a look laid on the camera's picture, as on the grid they were learned on."""
+    _, intrinsics = pose_and_intrinsics(camera)
+    return splat_flare(as_tensors(gaussians), intrinsics, *camera.size, look.blend, sampling=look.sampling)
+
+
 def as_tensors(one: LookGaussians) -> PlaneGaussians:
     """A look's Gaussians as the rasterizer takes them."""
     means, covariances, opacities, colours = (

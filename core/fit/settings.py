@@ -25,7 +25,7 @@ from ..flare.visibility import VisibilitySettings
 from ..gaussians.densification import ClassicSettings, McmcSettings
 from ..look.look import FORM_BOUNDS, MOST_GAUSSIANS
 from ..pictures import srgb_from_linear
-from ..typed import Bounds, field_of, table_of
+from ..typed import MOST_SEED, WHOLE_DIGITS, Bounds, field_of, table_of
 
 Mode = Literal["default", "split", "unsup", "in-flare", "2d", "3dgs"]
 Preset = Literal["draft", "standard", "high", "paper"]
@@ -206,7 +206,7 @@ def _is_holdout(holdout: str | int | None) -> bool:
     """Whether text that reads as a number is one that can be counted to: `Capture.split` takes it for that."""
     if not isinstance(holdout, str) or not holdout.strip().lstrip("+-").isdigit():
         return True
-    return re.fullmatch(r"[+-]?\d{1,18}", holdout.strip()) is not None
+    return re.fullmatch(rf"[+-]?\d{{1,{WHOLE_DIGITS}}}", holdout.strip()) is not None
 
 
 # ---- what the numbers may be ----------------------------------------------------------------------
@@ -219,8 +219,6 @@ _BETWEEN = Bounds(0, 1, above=True, below=True)  # has a logit
 _AMOUNT = Bounds(0, _LARGE)  # a weight, or a rate: at 0 what it is of stays as it is
 _POSITIVE = Bounds(0, _LARGE, above=True)  # a rate that falls by a ratio, or is refused at 0 by its optimiser
 
-MOST_SEED = 2**31 - 1
-"""The greatest that every library takes; `headless.command` has it too, where there is no torch."""
 BOUNDS: dict[str, Bounds] = {
     "iterations": Bounds(1, 10**9), "width": _FROM_0, "seed": Bounds(0, MOST_SEED), "ssim_share": _SHARE,
     "apart": _SHARE, "holdout": _FROM_0, "white": Bounds(1, 65504), "checkpoint_every_s": _AMOUNT,

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ..capture import Capture, View
 from ..capture.colmap import PointCloud
-from .frames import Frames
+from .frames import Frames, colours_at, thinned
 
 COUNT = 2000
 FAR = 3.0
@@ -28,22 +28,17 @@ def with_sky(capture: Capture, views: tuple[View, ...], frames: Frames) -> Point
     middle = np.mean([view.camera.position for view in views], 0)
     radius = FAR * float(np.quantile(np.linalg.norm(points.xyz - middle, axis=1), 0.95))
     xyz = middle + radius * _directions(COUNT)
-    seen = np.full((len(views[:: _step(views)]), COUNT, 3), np.nan, np.float32)
-    for row, view in zip(seen, views[:: _step(views)], strict=True):
+    asked = thinned(views, VIEWS)
+    seen = np.full((len(asked), COUNT, 3), np.nan, np.float32)
+    for row, view in zip(seen, asked, strict=True):
         camera, frame, _ = frames.targets(view)
-        pixels, depth = camera.project(xyz)
-        inside = camera.contains(pixels, depth)
-        x, y = np.minimum(pixels[inside].astype(int), np.array(camera.size) - 1).T
-        row[inside] = frame.numpy()[y, x]
+        inside, shown = colours_at(xyz, camera, frame)
+        row[inside] = shown
     found = np.isfinite(seen[..., 0]).any(0)
     colours = np.nanquantile(seen[:, found], FROM_BELOW, axis=0)
     rgb = np.concatenate([points.rgb, (colours.clip(0, 1) * 255 + 0.5).astype(np.uint8)])
     return PointCloud(np.concatenate([points.xyz, xyz[found].astype(np.float32)]), rgb,
                       np.concatenate([points.error, np.zeros(int(found.sum()), np.float32)]))
-
-
-def _step(views: tuple[View, ...]) -> int:
-    return max(len(views) // VIEWS, 1)
 
 
 def _directions(count: int) -> NDArray[np.float64]:

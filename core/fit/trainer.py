@@ -32,7 +32,7 @@ from ..gaussians.ordering import morton_order
 from . import exposure
 from .beginning import first_flare, first_scene, moved_lights
 from .checkpoint import State
-from .frames import Frames, Targets
+from .frames import Frames, Targets, thinned
 from .rendering import render_flare, render_scene
 from .settings import FitSettings
 from .splitting import HeadStart, from_below, is_found, scene_beside_flare
@@ -154,9 +154,8 @@ class Trainer:
         visibility = self.settings.flare.occluded_by_scene
         if self.flare is None or visibility is None or self.iteration % CLEAR_EVERY != 1:
             return
-        poses = [torch.from_numpy(view.camera.world_to_camera) for view in self.views]
-        chosen = poses[:: max(len(poses) // ASKED, 1)]
-        self.flare.clear.copy_(clear_shares(self.scene, self.flare, chosen, visibility, self.settings.kernels))
+        poses = [torch.from_numpy(view.camera.world_to_camera) for view in thinned(self.views, ASKED)]
+        self.flare.clear.copy_(clear_shares(self.scene, self.flare, poses, visibility, self.settings.kernels))
 
     @torch.no_grad()
     def _look_for_scene(self) -> None:
@@ -168,7 +167,7 @@ class Trainer:
             return targets.frame - render_scene(self.scene, targets.camera, self.settings.kernels,
                                                 sh_degree=self._sh_degree(), depth=False).colour
 
-        asked = self.views[:: max(len(self.views) // ASKED, 1)]
+        asked = thinned(self.views, ASKED)
         if not is_found((missing(self.frames.targets(view)) for view in asked), self.settings.split.found):
             self._head_start.goes_on()
 

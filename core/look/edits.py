@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import SettingsError
-from ..pictures import linear_from_srgb, srgb_from_linear
+from ..pictures import LUMINANCE, linear_from_srgb, srgb_from_linear
 from .elements import Element
 from .plane import Floats, PlaneGaussians, joined
 
@@ -37,7 +37,6 @@ Gain = tuple[float, float, float]
 
 ALL = "*"
 _WHITE: Gain = (1.0, 1.0, 1.0)
-_LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 _HEX = re.compile(r"#[0-9A-Fa-f]{6}")
 _FACTORS = ("intensity", "saturation", "scale", "spread", "streak")
 _FLAGS = ("mute", "solo")
@@ -77,7 +76,7 @@ class Edit:
     @property
     def matrix(self) -> NDArray[np.float64]:
         """(3, 3) from linear R, G, B to linear R, G, B: saturation, then tint and intensity."""
-        grey = np.tile(_LUMINANCE, (3, 1))
+        grey = np.tile(LUMINANCE, (3, 1))
         mixed = self.saturation * np.eye(3) + (1 - self.saturation) * grey
         return self.intensity * np.array(self.tint)[:, None] * mixed
 

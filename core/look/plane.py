@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..pictures import LUMINANCE
 from ..sampling import Sampling, dilation
 
 Floats = NDArray[np.float32]
@@ -61,7 +62,7 @@ class PlaneGaussians:
     @property
     def energy(self) -> Floats:
         """(n,) luminance each adds to the plane: opacity times the profile's area times luminance."""
-        luminance = np.maximum(self.colours, 0) @ np.array([0.2126, 0.7152, 0.0722], np.float32)
+        luminance = np.maximum(self.colours, 0) @ LUMINANCE.astype(np.float32)
         xx, xy, yy = self.covariances.T
         area = 2 * np.pi * np.sqrt(np.maximum(xx * yy - xy * xy, 0))
         if self.rings is not None:  # a ring's area: radius times width, that of the plain profile for r0 = 0

@@ -24,8 +24,8 @@ from ..capture import Camera
 from ..colour import ColourSpace, colour_space
 from ..errors import SettingsError
 from ..files import check_apart, remove_partial_of
-from ..fit.rendering import as_tensors, pose_and_intrinsics, render_scene
-from ..flare.compositing import decode, encode, splat_flare
+from ..fit.rendering import render_scene, splat_look
+from ..flare.compositing import decode, encode
 from ..flare.compositing import layers as linear_layers
 from ..flare.visibility import VisibilitySettings, of_clear, visible_share
 from ..gaussians import Splats
@@ -112,7 +112,6 @@ class Transfer:
         """Each light's splats in a frame, under `camera`; of the lights that show something."""
         shot = self.target.frames[index].shot
         names = [light.name for light in shot.lights]
-        _, intrinsics = pose_and_intrinsics(camera)
         shown: dict[str, Splats] = {}
         for light in shot.lights:
             if edits is not None and not edits.shows(light.name, names):
@@ -123,8 +122,7 @@ class Transfer:
                 share=self.share(index, light.name) if view.depth > 0 else 0.0, edits=edits, name=light.name,
                 scale=self.settings.scale, fixed=self._fixed.get(light.name))
             if found is not None:
-                shown[light.name] = splat_flare(as_tensors(found), intrinsics, *camera.size, self.look.blend,
-                                                sampling=self.look.sampling)
+                shown[light.name] = splat_look(self.look, found, camera)
         return shown
 
     def share(self, index: int, light: str) -> float:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from ...core.errors import SettingsError
 from ...core.files import WRITTEN_BY_HAND
 from ...core.progress import Progress
+from ...core.typed import WHOLE_DIGITS
 from .. import jobs
 from ..command import Command, Step, seed
 from .lights import with_lights
@@ -23,8 +24,6 @@ MODES = ("default", "split", "unsup", "in-flare", "2d", "3dgs")
 MODELS = ("paper", "ours")
 BLENDS = ("over", "add")
 DECODED_BYTES = 1 << 26
-HOLDOUT_DIGITS = 18
-"""Digits of a number of views at most."""
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -145,7 +144,7 @@ def holdout(text: str | None) -> str | int | None:
     """A number, or a file's absolute path, since a run is opened again from anywhere."""
     if text is None:
         return None
-    if text.isdecimal() and len(text) <= HOLDOUT_DIGITS:
+    if text.isdecimal() and len(text) <= WHOLE_DIGITS:
         return int(text)
     path = Path(text)
     if text.isdecimal() or not path.is_file():

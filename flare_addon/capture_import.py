@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -28,6 +28,9 @@ from .paths import stored
 SENSOR = 36.0  # mm
 UP = {"Z": (0.0, 0.0, 0.0), "-Y": (-math.pi / 2, 0.0, 0.0), "Y": (math.pi / 2, 0.0, 0.0)}
 """Rotation of the root by the axis that is up in the capture."""
+
+EXPOSURE = "fit_flare.exposure"
+"""RNA path on a camera object."""
 
 Placement = Literal["animated", "each"]
 _NUMBER = re.compile(r"(\d+)(?=\D*$)")
@@ -135,6 +138,7 @@ def _cameras(collection: Any, root: Any, capture: Capture, settings: ImportSetti
         label = "Camera" if folder == "." else f"Camera {folder}"
         if settings.cameras == "animated":
             camera = _camera(collection, root, label, views[0], aspect, 0.15 * capture.extent)
+            camera.fit_flare.view = folder
             _animate(camera, views, [number[view.name] for view in views], aspect)
             if settings.frames and not _footage(camera, capture, views, [number[view.name] for view in views]):
                 notes.append(f"The frames of {label} have no common numbering, so only the first is shown behind it; "
@@ -143,6 +147,7 @@ def _cameras(collection: Any, root: Any, capture: Capture, settings: ImportSetti
         else:
             for view in views:
                 camera = _camera(collection, root, Path(view.name).stem, view, aspect, 0.08 * capture.extent)
+                camera.fit_flare.view = view.name
                 if settings.frames:
                     _backdrop(camera, bpy.data.images.load(str(capture.frame_path(view)), check_existing=True))
                 made.append(camera)
@@ -175,6 +180,33 @@ def _animate(camera: Any, views: Sequence[View], numbers: Sequence[int], aspect:
     lenses = np.array([cameras.lens_of(view.camera, SENSOR, aspect) for view in views])
     if np.ptp(lenses, axis=0).max() > 1e-6:
         keys(camera.data, {"lens": lenses[:, :1], "shift_x": lenses[:, 1:2], "shift_y": lenses[:, 2:]}, numbers)
+
+
+def expose(root: Any, exposures: Mapping[str, float]) -> None:
+    """Have the cameras of an imported capture show flares as its frames were exposed, by the names of the views; an
+    animated camera gets a key at each. Without any all are as usual again."""
+    for camera in root.children:
+        state = camera.fit_flare
+        if camera.type != "CAMERA" or not state.view:
+            continue
+        for curves in _curves_of(camera):  # of an earlier fit
+            for curve in [curve for curve in curves if curve.data_path == EXPOSURE]:
+                curves.remove(curve)
+        state.exposure = exposures.get(state.view, 1.0)
+        for frame in numbered(exposures):
+            if Path(frame.view).parent.as_posix() == state.view:
+                state.exposure = exposures[frame.view]
+                camera.keyframe_insert(EXPOSURE, frame=frame.number)
+
+
+def _curves_of(block: Any) -> list[Any]:
+    """The collections of F-curves that animate a data block."""
+    action = block.animation_data.action if block.animation_data else None
+    if action is None:
+        return []
+    if bpy.app.version < (4, 4, 0):
+        return [action.fcurves]
+    return [bag.fcurves for layer in action.layers for strip in layer.strips for bag in strip.channelbags]
 
 
 def keys(block: Any, channels: dict[str, NDArray[Any]], frames: Sequence[int]) -> None:

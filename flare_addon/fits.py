@@ -8,8 +8,10 @@ from typing import Any
 
 import bpy
 
+from ..core import exposures
 from ..core.errors import CaptureError, FitFlareError, RunError
 from . import engine, jobs, lights, looks
+from .capture_import import expose
 from .jobs import Job
 from .paths import absolute, stored
 
@@ -128,6 +130,8 @@ def finished(job: Job) -> None:
             try:
                 look = looks.use(scene, folder / FLARE)
                 lights.follow(scene, {light.name: light.xyz for light in look.lights}, capture_of(scene))
+                if scene.fit_flare.root is not None:
+                    expose(scene.fit_flare.root, exposures.read(folder))
             except FitFlareError as problem:
                 job.error = str(problem)
     _remember("Fit")

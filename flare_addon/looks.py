@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.errors import FlareFileError
+from ..core.exposures import brightness
 from ..core.look import Edit, Look, LookEdits, PlaneGaussians, read
 from ..core.look.look import Query
 from ..core.look.shot import PlacedLight, evaluate
@@ -172,7 +174,9 @@ def seen(scene: Any, depsgraph: Any, camera: Any) -> dict[str, PlaneGaussians]:
     """What every flare of the scene shows in a camera at the present frame. Raises FlareFileError."""
     look = look_of(scene)
     pose, lights = placed(scene, depsgraph, camera)
-    return evaluate(look, pose, lights, edits_of(scene.fit_flare), query_of(scene.fit_flare))
+    found = evaluate(look, pose, lights, edits_of(scene.fit_flare), query_of(scene.fit_flare))
+    times = np.float32(brightness(camera.evaluated_get(depsgraph).fit_flare.exposure, look.blend))
+    return {name: replace(one, colours=times * one.colours) for name, one in found.items()}
 
 
 # ---- occlusion ------------------------------------------------------------------------------------

@@ -220,6 +220,10 @@ class FITFLARE_PT_look(_Part, bpy.types.Panel):
         if looks.twice(state):
             lines(layout, f"Two flares have the name {looks.twice(state)}: rename one.", "ERROR")
         _sliders(layout, state.master)
+        if scene.camera is not None:
+            column = layout.column()
+            column.use_property_split = True
+            column.prop(scene.camera.fit_flare, "exposure", text="Camera Exposure")
         layout.prop(state, "occlusion")
         row = layout.row()
         rows = max(min(len(state.lights), 6), 2)

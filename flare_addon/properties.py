@@ -21,6 +21,7 @@ from bpy.props import (
     StringProperty,
 )
 
+from ..core.exposures import LEAST
 from ..core.look import Edit
 
 # From 4.5 on a path that may be relative to the .blend has to say so; before, the word is unknown.
@@ -193,12 +194,17 @@ class FITFLARE_PG_scene(bpy.types.PropertyGroup):
 
 
 class FITFLARE_PG_object(bpy.types.PropertyGroup):
-    """Of a light object."""
+    """Of a light object, or a camera's."""
 
     is_light: BoolProperty(  # type: ignore[valid-type]
         name="Light of the Capture", description="The fit learns a flare for this object", default=False)
     light: StringProperty(name="Light Name", description="Name of the light in lights.json and the .flare")  # type: ignore[valid-type]
     is_points: BoolProperty()  # type: ignore[valid-type]
+    view: StringProperty(name="Frame", description="Name of the frame of the capture that this camera is")  # type: ignore[valid-type]
+    exposure: FloatProperty(  # type: ignore[valid-type]
+        name="Exposure", description="Light on this camera's frame, in parts of a usual one's: its flare is as much "
+        "brighter. A fit sets and animates it for a capture whose exposure changes", default=1.0, min=LEAST,
+        max=1 / LEAST, soft_min=0.1, soft_max=10.0, update=redraw)
 
 
 _CLASSES = (FITFLARE_PG_master, FITFLARE_PG_element, FITFLARE_PG_light, FITFLARE_PG_scene, FITFLARE_PG_object)

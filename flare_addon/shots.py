@@ -64,7 +64,8 @@ def frame_of(scene: Any, depsgraph: Any, camera: Any, frame: int) -> ShotFrame:
     if scene.fit_flare.bake_live:
         edits = without_live(edits)
     words = edits.words()
-    return ShotFrame(frame, camera.name, replace(core, world_to_camera=pose), tuple(lights), tuple(words))
+    seen_by = replace(core, world_to_camera=pose, exposure=evaluated.fit_flare.exposure)
+    return ShotFrame(frame, camera.name, seen_by, tuple(lights), tuple(words))
 
 
 def without_live(edits: LookEdits) -> LookEdits:

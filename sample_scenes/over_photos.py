@@ -3,9 +3,10 @@
 
 The capture has images/ and sparse/0 (cameras without distortion, or with it: frames are undistorted). A
 light is put at a place in its world, its flare is traced for every view and added in linear light, and the
-result is clipped and stored as a frame. The new capture has those in images/, the untouched photographs in
-removed/, the flares in truth/flare, lights.json, and cameras scaled to the new size. What a photograph
-shows in front of the light hides nothing: the visible share is 1 in every view.
+result is clipped and stored as a frame; where the photographs' exposure changes the flare's does too. The new
+capture has those in images/, the untouched photographs in removed/, the flares in truth/flare, lights.json, and
+cameras scaled to the new size. What a photograph shows in front of the light hides nothing: the visible share is
+1 in every view.
 """
 from __future__ import annotations
 
@@ -19,8 +20,12 @@ from numpy.typing import NDArray
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from core.capture import Capture
+from core.capture.colmap import Observed, write_model
+from core.capture.lens import Lens
 from core.errors import FitFlareError
 from core.files import write_json
+from core.fit import exposure
+from core.fit.frames import Frames
 from core.pictures import linear_from_srgb, read_picture, srgb_from_linear, write_png
 from core.progress import Progress, TerminalProgress, stoppable
 from sample_scenes.flares import LOOKS, Look, render_flare
@@ -30,6 +35,7 @@ from sample_scenes.layers import FLARE_LEVEL, write_layer
 def add_flares(capture: Capture, out: Path, look: Look, light: NDArray[np.float64], colour: tuple[float, ...],
                intensity: float, width: int, progress: Progress) -> None:
     """Write the new capture; views that are there already are kept. light: world coordinates (3,)."""
+    capture = capture.exposed(exposure.found(capture, Frames(capture, width)))
     progress.stage("flares", len(capture.views))
     for view in capture.views:
         stem = Path(view.name).stem
@@ -40,7 +46,7 @@ def add_flares(capture: Capture, out: Path, look: Look, light: NDArray[np.float6
             photo = np.round(capture.frame(view, camera.size).display() * 255) / np.float32(255)
             pose = view.camera.world_to_camera
             flare = render_flare(look, camera, pose[:3, :3] @ light + pose[:3, 3], colour=colour,
-                                 intensity=intensity)
+                                 intensity=intensity * camera.exposure)
             write_layer(layer, flare, FLARE_LEVEL)
             flare = read_picture(layer).pixels  # as stored, so that the files agree
             write_png(clean, photo)
@@ -51,23 +57,14 @@ def add_flares(capture: Capture, out: Path, look: Look, light: NDArray[np.float6
 
 
 def _write_model(capture: Capture, folder: Path, width: int) -> None:
-    """Cameras at the new size and the capture's points, as a COLMAP model."""
-    import pycolmap
-
-    model = pycolmap.Reconstruction()
-    for number, view in enumerate(capture.views, 1):
+    """Cameras at the new size, the capture's points, and which were found in which photograph."""
+    frames = []
+    for view in capture.views:
         camera = view.camera.scaled(width)
-        model.add_camera_with_trivial_rig(pycolmap.Camera(
-            model="PINHOLE", width=camera.width, height=camera.height, camera_id=number,
-            params=[camera.fx, camera.fy, camera.cx, camera.cy]))
-        image = pycolmap.Image(name=f"{Path(view.name).stem}.png", keypoints=np.zeros((0, 2)), camera_id=number,
-                               image_id=number)
-        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(view.camera.world_to_camera[:3]))
-    for xyz, rgb, error in zip(capture.points.xyz, capture.points.rgb, capture.points.error, strict=True):
-        number = model.add_point3D(xyz.astype(float), pycolmap.Track(), rgb)
-        model.points3D[number].error = float(error)
-    folder.mkdir(parents=True, exist_ok=True)
-    model.write(folder)
+        lens = Lens("PINHOLE", (camera.fx, camera.fy, camera.cx, camera.cy), *camera.size)
+        pixels, _ = camera.project(capture.points.xyz[view.points])
+        frames.append(Observed(f"{Path(view.name).stem}.png", lens, camera.world_to_camera, pixels, view.points))
+    write_model(folder, frames, capture.points)
 
 
 def main() -> int:

@@ -17,7 +17,8 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """Size in pixels, intrinsics in pixels, and `world_to_camera` (4, 4), a rigid motion."""
+    """Size in pixels, intrinsics in pixels, and `world_to_camera` (4, 4), a rigid motion. exposure: times the light of
+    its capture's usual frame."""
 
     width: int
     height: int
@@ -26,6 +27,7 @@ class Camera:
     cx: float
     cy: float
     world_to_camera: Floats
+    exposure: float = 1.0
 
     @property
     def size(self) -> tuple[int, int]:
@@ -35,7 +37,8 @@ class Camera:
     @property
     def numbers(self) -> tuple[Any, ...]:
         """All of it as plain numbers, which change whenever its picture would."""
-        return self.size, self.intrinsics.tolist(), self.world_to_camera.tolist()
+        unusual = () if self.exposure == 1 else (self.exposure,)
+        return self.size, self.intrinsics.tolist(), self.world_to_camera.tolist(), *unusual
 
     @property
     def intrinsics(self) -> Floats:

@@ -16,12 +16,14 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from copy import copy
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..errors import CaptureError, FrameError
 from ..files import inside, read_json
@@ -39,11 +41,13 @@ HOLDOUT = 8  # every 8th view is held out where nothing else is said, as 3DGS an
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """One frame: its name, the pinhole camera of the undistorted picture, and the file's lens (None: none)."""
+    """One frame: its name, the pinhole camera of the undistorted picture, the file's lens (None: none), and the indices
+    (n,) of the capture's points that were found in it, where the solve tells."""
 
     name: str
     camera: Camera
     lens: Lens | None
+    points: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,6 +107,13 @@ class Capture:
         if (folder / "split.json").exists():
             capture.split(None)
         return capture
+
+    def exposed(self, exposures: Mapping[str, float]) -> Capture:
+        """The same, views being exposed so many times as usual, by name."""
+        same = copy(self)
+        same.views = tuple(replace(view, camera=replace(view.camera, exposure=exposures.get(view.name, 1.0)))
+                           for view in self.views)
+        return same
 
     # What was filmed.
 
@@ -347,7 +358,7 @@ def _view(name: str, frame: Posed, size: tuple[int, int]) -> View:
     fx, fy, cx, cy = lens.pinhole
     camera = Camera(lens.width, lens.height, fx, fy, cx, cy, frame.world_to_camera)
     straight = lens.model in PINHOLES
-    return View(name, camera if size == camera.size else camera.scaled(*size), None if straight else lens)
+    return View(name, camera if size == camera.size else camera.scaled(*size), None if straight else lens, frame.points)
 
 
 def _siblings(folder: Path, views: Sequence[View]) -> dict[str, Path]:

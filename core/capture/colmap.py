@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -43,11 +43,13 @@ class PointCloud:
 
 @dataclass(frozen=True, eq=False)
 class Posed:
-    """A frame as a model names it: its name, the lens it was seen through, and its pose (4, 4)."""
+    """A frame as a model names it: its name, the lens it was seen through, its pose (4, 4), and the indices (n,) of the
+    points that were found in it, where a model tells."""
 
     name: str
     lens: Lens
     world_to_camera: Floats
+    points: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
 
 
 def find_model(folder: Path, places: tuple[str, ...] = ("sparse/0", "sparse")) -> Path | None:
@@ -65,11 +67,12 @@ def read_model(folder: Path) -> tuple[list[Posed], PointCloud]:
     """
     lenses = _read(folder, "cameras", _cameras_bin, _cameras_txt)
     images = _read(folder, "images", _images_bin, _images_txt)
-    points = _read(folder, "points3D", _points_bin, _points_txt)
+    points, known = _read(folder, "points3D", _points_bin, _points_txt) or (PointCloud.empty(), np.zeros(0, np.int64))
+    order = np.argsort(known, kind="stable")
     if not images:
         raise CaptureError(f"{_path(folder, 'images')} holds no images; the solve registered no frame.")
     posed = []
-    for name, camera, quaternion, translation in images:
+    for name, camera, quaternion, translation, seen in images:
         if camera not in lenses:
             raise CaptureError(f"{_path(folder, 'images')} gives {name} the camera {camera}, which "
                                f"{_path(folder, 'cameras')} does not have.")
@@ -82,8 +85,16 @@ def read_model(folder: Path) -> tuple[list[Posed], PointCloud]:
             raise CaptureError(f"{where} the quaternion's length is {length:.4g}, so it is no rotation; "
                                "solve the cameras again.")
         pose[:3, :3], pose[:3, 3] = rotation_from_quaternion(quaternion), translation
-        posed.append(Posed(name, lenses[camera], pose))
-    return posed, points if points is not None else PointCloud.empty()
+        posed.append(Posed(name, lenses[camera], pose, _indices(seen, known, order)))
+    return posed, points
+
+
+def _indices(seen: NDArray[np.int64], known: NDArray[np.int64], order: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Where the numbers `seen` stand among those that are `known`, which `order` sorts; others are left out."""
+    if not len(known):
+        return order
+    places = order[np.searchsorted(known, seen, sorter=order).clip(max=len(known) - 1)]
+    return np.unique(places[known[places] == seen])
 
 
 @dataclass(frozen=True, eq=False)
@@ -230,7 +241,9 @@ def _add_lens(lenses: dict[int, Lens], path: Path, camera: int, lens: Lens) -> N
     lenses[camera] = check_lens(lens, f"{path}, camera {camera}:")
 
 
-Image = tuple[str, int, tuple[float, ...], tuple[float, ...]]  # name, camera, quaternion, translation
+Image = tuple[str, int, tuple[float, ...], tuple[float, ...], NDArray[np.int64]]
+"""Name, camera, quaternion, translation, and the numbers of the points that were found in it."""
+_FOUND = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
 
 
 def _images_bin(file: _Bytes) -> list[Image]:
@@ -238,13 +251,15 @@ def _images_bin(file: _Bytes) -> list[Image]:
     for _ in range(file.count(73)):
         values = file.take("idddddddi")
         name = file.name()
-        file.skip(24 * file.count(24))  # the 2D points
-        images.append((name, values[8], values[1:5], values[5:8]))
+        count = file.count(_FOUND.itemsize)
+        found = np.frombuffer(file.data, _FOUND, count, file.at)["point"]
+        file.skip(count * _FOUND.itemsize)
+        images.append((name, values[8], values[1:5], values[5:8], found))
     return images
 
 
 def _images_txt(path: Path, lines: list[str]) -> list[Image]:
-    """Two lines an image; the second, of 2D points, may be empty and is not needed."""
+    """Two lines an image; the second, of 2D points, may be empty."""
     images: list[Image] = []
     rest = iter(enumerate(lines, 1))
     for number, line in rest:
@@ -255,44 +270,59 @@ def _images_txt(path: Path, lines: list[str]) -> list[Image]:
             raise CaptureError(f"{path}, line {number}: an image takes ten values (number, quaternion, "
                                f"translation, camera, name), not {len(words)}.")
         _, *pose, camera = _numbers(path, number, words[:9], "iqqqqtttc")
-        images.append((words[9].strip(), camera, tuple(pose[:4]), tuple(pose[4:])))
-        if next(rest, None) is None:
+        second = next(rest, None)
+        if second is None:
             raise CaptureError(f"{path} is truncated: the line of 2D points after {words[9].strip()} is missing.")
+        images.append((words[9].strip(), camera, tuple(pose[:4]), tuple(pose[4:]), _found(second[1])))
     return images
 
 
-def _points_bin(file: _Bytes) -> PointCloud:
+def _found(line: str) -> NDArray[np.int64]:
+    """The points' numbers of x, y, number, x, y, number, ...; none where it says something else: it is a help only."""
+    try:
+        return np.array([int(word) for word in line.split()[2::3]], np.int64)
+    except (ValueError, OverflowError):
+        return np.zeros(0, np.int64)
+
+
+Points = tuple[PointCloud, NDArray[np.int64]]
+"""And the number of each."""
+
+
+def _points_bin(file: _Bytes) -> Points:
     number = file.count(51)
     record = struct.Struct("<Q3d3BdQ")
     values = np.empty((number, 4), np.float64)
-    rgb = np.empty((number, 3), np.uint8)
+    rgb, numbers = np.empty((number, 3), np.uint8), np.empty(number, np.uint64)
     data, at = file.data, file.at
     for i in range(number):
         if at + record.size > len(data):
             break
-        _, x, y, z, r, g, b, error, track = record.unpack_from(data, at)
+        numbers[i], x, y, z, r, g, b, error, track = record.unpack_from(data, at)
         values[i] = x, y, z, error
         rgb[i] = r, g, b
         at += record.size + 8 * track
     else:
         if at <= len(data):
-            return _cloud(file.path, values, rgb)
+            return _cloud(file.path, values, rgb), numbers.view(np.int64)
     file.need(len(data) + 1)
     raise AssertionError  # need() has raised
 
 
-def _points_txt(path: Path, lines: list[str]) -> PointCloud:
-    values, rgb = [], []
+def _points_txt(path: Path, lines: list[str]) -> Points:
+    values, rgb, numbers = [], [], []
     for number, line in _rows(lines):
         words = line.split(maxsplit=8)
         if len(words) < 8:
             raise CaptureError(f"{path}, line {number}: a point takes at least eight values, not {len(words)}.")
-        _, x, y, z, *colour, error = _numbers(path, number, words[:8], "ixyziiie")
+        own, x, y, z, *colour, error = _numbers(path, number, words[:8], "ixyziiie")
         if not all(0 <= c <= 255 for c in colour):
             raise CaptureError(f"{path}, line {number}: the colour {colour} is not within 0 to 255.")
         values.append((x, y, z, error))
         rgb.append(colour)
-    return _cloud(path, np.array(values, np.float64).reshape(-1, 4), np.array(rgb, np.uint8).reshape(-1, 3))
+        numbers.append(own if abs(own) < 2**63 else 0)
+    cloud = _cloud(path, np.array(values, np.float64).reshape(-1, 4), np.array(rgb, np.uint8).reshape(-1, 3))
+    return cloud, np.array(numbers, np.int64)
 
 
 def _cloud(path: Path, values: Floats, rgb: NDArray[np.uint8]) -> PointCloud:

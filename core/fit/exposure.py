@@ -1,53 +1,159 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Whether frames are exposed alike, as a fit takes them to be: by how bright each shows the capture's points."""
+"""How each frame of a capture is exposed, by how bright it shows the capture's points.
+
+A camera left to itself darkens the picture as a lamp comes into it, which is where its flare begins; to a fit that
+takes the exposure to be fixed the difference is flare. What a frame shows of points is a straight line over what is
+known of them: the slope is its exposure, while a veil of flare only lifts the line.
+"""
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..capture import Capture, View
 from ..pictures import LUMINANCE, linear_from_srgb
 from .frames import Frames, colours_at, thinned
 
-UNLIKE = 0.5
-"""Stops, the spread over the frames, from which on it is told. Captures of one exposure have 0.05 to 0.2, with flares
-that come and go; the sample with 0.7 stops to either side has 1.3, and loses 5 dB of its flare by that."""
-ASKED, POINTS, FEWEST = 24, 4000, 50
-"""Frames and points that are looked at, and of how many points at least a frame has to show."""
+UNLIKE = 0.25
+"""Stops, the spread over the frames, from which on they are taken to be exposed otherwise."""
+SURE = 0.1
+"""Stops, the standard error from which on a frame does not tell its exposure."""
+ASKED, FEWEST = 100, 50
+"""About as many frames are looked at first, and so many points at least a frame has to show. What a solve says of the
+points' colours is of no use: they follow the exposure of the few frames that each was found in."""
 DARK, BRIGHT = 0.05, 0.9
 """Display values between which pixels tell."""
 RARE = 0.1
 """Share of the frames, to either side, that do not count."""
+ROUNDS, REFINED = 20, 3
+SOFT = 0.05
+"""Linear light that is added to what errors are parts of: those of dark points are rounding."""
+
+Floats = NDArray[np.float64]
+Indices = NDArray[np.int64]
 
 
-def spread(capture: Capture, views: Sequence[View], frames: Frames) -> float:
-    """Stops by which the frames' exposures differ, but for the darkest and the brightest tenth of the frames. 0 where
-    too few points or frames tell, or points have no colours."""
-    points = capture.points
-    chosen = slice(None, None, max(len(points) // POINTS, 1))
-    known = linear_from_srgb(points.rgb[chosen] / np.float32(255)) @ LUMINANCE
-    xyz, known = points.xyz[chosen][known > 0], known[known > 0]
-    if not len(known) or not np.ptp(known) > 0:  # a cloud without colours
+def found(capture: Capture, frames: Frames) -> dict[str, float]:
+    """Of each view, times the light of the frame in the middle; empty where all are exposed alike, or too few tell.
+    Views that do not tell are taken for as exposed as the nearest, by name, that do."""
+    stops = np.zeros(0)
+    for views in dict.fromkeys((tuple(thinned(capture.views, ASKED)), capture.views)):  # all only where some differ
+        seen = Seen.of(capture, views, frames)
+        stops = seen.stops()
+        if spread(stops) < UNLIKE:
+            return {}
+    tells = np.flatnonzero(np.isfinite(stops))
+    filled = np.interp(np.arange(len(stops)), tells, stops[tells]) - np.median(stops[tells])
+    return {view.name: round(float(2**one), 6) for view, one in zip(capture.views, filled, strict=True)}
+
+
+def spread(stops: Floats) -> float:
+    """Stops by which exposures (n,) differ, but for the darkest and the brightest tenth; 0 where fewer than three, or
+    half of all, tell (the others are not finite)."""
+    tells = stops[np.isfinite(stops)]
+    if len(tells) < max(3, len(stops) / 2):
         return 0.0
-    stops = []
-    for view in thinned(views, ASKED):
-        camera, frame, removed = frames.targets(view)
-        seen, shown = colours_at(xyz, camera, frame if removed is None else removed)
-        tells = ((shown > DARK) & (shown < BRIGHT)).all(-1)
-        if tells.sum() >= FEWEST:
-            stops.append(float(np.median(np.log2(linear_from_srgb(shown[tells]) @ LUMINANCE / known[seen][tells]))))
-    if len(stops) < 3:
-        return 0.0
-    low, high = np.quantile(stops, (RARE, 1 - RARE))
+    low, high = np.quantile(tells, (RARE, 1 - RARE))
     return float(high - low)
 
 
-def says(capture: Capture, views: Sequence[View], frames: Frames) -> tuple[str, ...]:
+def says(exposures: Mapping[str, float]) -> tuple[str, ...]:
     """Sentences for the person who asked for the fit."""
-    stops = spread(capture, views, frames)
-    if not (math.isfinite(stops) and stops >= UNLIKE):
+    if not exposures:
         return ()
-    return (f"The frames' exposure seems to change, by about {stops:.1f} stops; a fit takes it to be fixed, and finds "
-            "a flare in the difference: bring the frames to one exposure first.",)
+    stops = spread(np.log2(list(exposures.values())))
+    return (f"The frames' exposure changes, by about {stops:.1f} stops: each is fitted, baked and scored as it was "
+            "exposed, and the flare is that of a frame in the middle.",)
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What views show of points: (n,) luminances, scene-linear, each of a view, by its place among `count`, and of a
+    point, by its index."""
+
+    count: int
+    views: Indices
+    points: Indices
+    light: Floats
+
+    @classmethod
+    def of(cls, capture: Capture, views: Sequence[View], frames: Frames) -> Seen:
+        """Where the solve found the points, neither too dark nor clipped, in the flare-free frames if there are any."""
+        parts = [(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0))]
+        for number, view in enumerate(views):
+            if not len(view.points):
+                continue
+            camera, frame, removed = frames.targets(view)
+            inside, shown = colours_at(capture.points.xyz[view.points], camera, frame if removed is None else removed)
+            tells = ((shown > DARK) & (shown < BRIGHT)).all(-1)
+            points = view.points[inside][tells]
+            light = linear_from_srgb(shown[tells]).astype(np.float64) @ LUMINANCE
+            parts.append((np.full(len(points), number), points, light))
+        numbers, points, light = (np.concatenate(part) for part in zip(*parts, strict=True))
+        return cls(len(views), numbers, points, light)
+
+    def stops(self) -> Floats:
+        """Exposure of each view (count,); not finite where it does not tell. What the points show in a view of the
+        usual exposure is found along with it."""
+        usual = self._usual()
+        for _ in range(REFINED):
+            slopes, veils = self._lines(usual)
+            usual = _medians((self.light - veils[self.views]) / slopes[self.views], self.points, len(usual))
+        return np.log2(self._lines(usual)[0])
+
+    def _usual(self) -> Floats:
+        """Luminance of each point in a view of the usual exposure, by index, as if there were no veils."""
+        light, stops = np.log2(self.light), np.zeros(self.count)
+        most = int(self.points.max(initial=-1)) + 1
+        for _ in range(ROUNDS):
+            usual = _medians(light - stops[self.views], self.points, most)
+            stops = _medians(light - usual[self.points], self.views, self.count)
+        return np.asarray(2**usual)
+
+    def _lines(self, usual: Floats) -> tuple[Floats, Floats]:
+        """Slope and veil of each view (count,), given the points' usual luminances; not finite where it does not
+        tell."""
+        lines = np.full((2, self.count), np.nan)
+        for number in range(self.count):
+            own = self.views == number
+            known, shown = usual[self.points[own]], self.light[own]
+            there = np.isfinite(known)
+            if there.sum() >= FEWEST:
+                line, error = _line(known[there], shown[there])
+                if line[0] > 0 and error / line[0] < SURE * np.log(2):
+                    lines[:, number] = line
+        return lines[0], lines[1]
+
+
+def _medians(values: Floats, groups: Indices, count: int) -> Floats:
+    """(count,): the (lower) median of each group's values that are finite; not finite for groups without any."""
+    there = np.isfinite(values)
+    values, groups = values[there], groups[there]
+    order = np.lexsort((values, groups))
+    begins = np.searchsorted(groups[order], np.arange(count + 1))
+    first, sizes = begins[:-1], np.diff(begins)
+    found = np.full(count, np.nan)
+    found[sizes > 0] = values[order][(first + (sizes - 1) // 2)[sizes > 0]]
+    return found
+
+
+def _line(known: Floats, shown: Floats) -> tuple[Floats, float]:
+    """(slope, veil) of shown = slope * known + veil, both (n,) linear light, and the slope's standard error. Errors
+    count in parts of the light, and less the larger they are (Cauchy's weights): the glow about a light lifts the
+    points beside it."""
+    columns = np.stack([known, np.ones_like(known)], 1)
+    parts = 1 / (known.clip(min=0) + SOFT) ** 2
+    line = np.array([np.median(shown / known.clip(min=SOFT)), 0.0])
+    for _ in range(ROUNDS):
+        errors = (shown - columns @ line) ** 2 * parts
+        trust = 1 / (1 + errors / (2.2 * np.median(errors) + 1e-12))
+        weights = trust * parts
+        product = columns.T @ (weights[:, None] * columns)
+        if np.linalg.cond(product) > 1e9:  # points of one brightness
+            return np.zeros(2), np.inf
+        line = np.linalg.solve(product, columns.T @ (weights * shown))
+    scatter = weights @ (shown - columns @ line) ** 2 / max(trust.sum() - 2, 1)
+    return line, float(np.sqrt(scatter * np.linalg.inv(product)[0, 0]))

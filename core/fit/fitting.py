@@ -47,12 +47,12 @@ def fit(capture: Capture, settings: FitSettings, folder: Path | str, progress: P
         if run.finished:
             progress.say(f"The fit in {folder} is finished already.")
             return run
-        trainer = Trainer(capture, run.settings)
+        trainer = Trainer(capture, run.settings, run.exposures)
         remove_partial(folder)
     else:
         settings, said = with_white(settings.checked(), capture)
         trainer = Trainer(capture, settings)  # before anything is written: it may refuse the capture
-        run = Run.create(folder, settings, capture.folder)
+        run = Run.create(folder, settings, capture.folder, trainer.exposures)
     path = folder / CHECKPOINT
     if continued and path.exists():
         trainer.load_state(checkpoint.load(path))

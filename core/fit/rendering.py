@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ..capture import Camera
-from ..flare.compositing import Blend, Layers, decode, encode, joined, layers, splat_flare
+from ..flare.compositing import Blend, Layers, decode, encode, exposed, joined, layers, splat_flare
 from ..flare.model import FlareModel
 from ..flare.placement import PlaneGaussians
 from ..flare.visibility import VisibilitySettings, visible_shares
@@ -52,7 +52,8 @@ def render_flare(flare: FlareModel | None, blend: Blend, camera: Camera, kernels
     gaussians = joined(flare(pose, _shares(flare, pose, scene, visibility, kernels)))
     if gaussians is None:
         return None
-    return splat_flare(gaussians, intrinsics, camera.width, camera.height, blend, kernels=kernels)
+    return splat_flare(gaussians, intrinsics, camera.width, camera.height, blend, kernels=kernels,
+                       exposure=camera.exposure)
 
 
 def _shares(flare: FlareModel, pose: Tensor, scene: SceneGaussians | None, visibility: VisibilitySettings | None,
@@ -75,7 +76,7 @@ def render(scene: SceneGaussians, flare: FlareModel | None, blend: Blend, camera
         shares = _shares(flare, pose, scene, visibility, kernels)
         gaussians = flare(pose, shares) if look is None or edits is None else _edited(look, edits, camera, shares)
         flares = {name: splat_flare(one, intrinsics, camera.width, camera.height, blend, kernels=kernels,
-                                    sampling=sampling)
+                                    sampling=sampling, exposure=camera.exposure)
                   for name, one in gaussians.items()}
     parts = layers(rendering.colour, flares, blend, scene.display_white)
     return RenderedView(rendering, flares, encode(parts.composite.clamp_min(0)).clamp(0, 1), parts)
@@ -83,8 +84,15 @@ def render(scene: SceneGaussians, flare: FlareModel | None, blend: Blend, camera
 
 def render_scene(scene: SceneGaussians, camera: Camera, kernels: Kernels = "auto", *, sh_degree: int | None = None,
                  depth: bool = True) -> Rendering:
-    """A scene as the camera of the frames that it was fitted to would show it at this camera's size: where that is
-    coarser than theirs, each pixel is the mean, in linear light, of those of a larger picture."""
+    """A scene as the camera of the frames that it was fitted to would show it at this camera's size and exposure."""
+    found = _sampled(scene, camera, kernels, sh_degree, depth)
+    return found if camera.exposure == 1 else replace(found, colour=exposed(found.colour, camera.exposure))
+
+
+def _sampled(scene: SceneGaussians, camera: Camera, kernels: Kernels, sh_degree: int | None,
+             depth: bool) -> Rendering:
+    """At the camera's size: where that is coarser than what the scene was fitted to, each pixel is the mean, in linear
+    light, of those of a larger picture."""
     samples = 1 if scene.sampling is None else scene.sampling.samples(camera.focal_length, *camera.size)
     if samples == 1:
         return scene.render(camera, sh_degree, kernels=kernels, depth=depth)
@@ -116,7 +124,8 @@ def _edited(look: Look, edits: LookEdits, camera: Camera,
 def splat_look(look: Look, gaussians: LookGaussians, camera: Camera) -> Splats:
     """Gaussians of a look laid on the camera's picture, as on the grid they were learned on."""
     _, intrinsics = pose_and_intrinsics(camera)
-    return splat_flare(as_tensors(gaussians), intrinsics, *camera.size, look.blend, sampling=look.sampling)
+    return splat_flare(as_tensors(gaussians), intrinsics, *camera.size, look.blend, sampling=look.sampling,
+                       exposure=camera.exposure)
 
 
 def as_tensors(one: LookGaussians) -> PlaneGaussians:

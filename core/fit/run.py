@@ -3,6 +3,7 @@
 
     config.toml   every setting, resolved
     capture.txt   the capture's folder
+    exposures.json   times the usual light that each frame was exposed to, where they differ
     flare.flare   the flare            scene.ply   the scene, standard 3DGS
     checkpoint/   state.safetensors    what a resumed fit needs
     metrics.jsonl one line of figures now and then; preview.png, preview_small.png; eval.json; log.txt
@@ -18,9 +19,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..capture import Camera
+from .. import exposures
+from ..capture import Camera, Capture
 from ..errors import RunError
-from ..files import write_text
+from ..files import write_json, write_text
 from ..flare import file as flare_file
 from ..flare.file import FlareFile
 from ..gaussians.ply import read_ply
@@ -66,9 +68,10 @@ class Run:
         self.capture_folder = capture_folder
 
     @classmethod
-    def create(cls, folder: Path | str, settings: FitSettings, capture_folder: Path) -> Run:
-        """A new run folder, with its settings written. RunError where the folder holds a run already, or the capture's
-        name cannot be written down."""
+    def create(cls, folder: Path | str, settings: FitSettings, capture_folder: Path,
+               exposed: Mapping[str, float] | None = None) -> Run:
+        """A new run folder, with its settings written. exposed: its `exposures`. RunError where the folder holds a run
+        already, or the capture's name cannot be written down."""
         folder = Path(folder)
         if (folder / CONFIG).exists():
             raise RunError(f"{folder} holds a run already; go on with it by --resume, or choose another folder.")
@@ -77,6 +80,9 @@ class Run:
             raise RunError(f"The name of the capture's folder, {str(run.capture_folder)!r}, is not UTF-8 and cannot be "
                            "written down; rename it.")
         write_text(folder / CAPTURE, f"{run.capture_folder}\n")
+        (folder / exposures.FILE).unlink(missing_ok=True)  # of a fit that was killed as it began
+        if exposed:
+            write_json(folder / exposures.FILE, dict(exposed))
         write_config(folder / CONFIG, settings)
         return run
 
@@ -92,6 +98,16 @@ class Run:
         except OSError as problem:
             raise RunError(f"{folder / CAPTURE} cannot be read ({problem.strerror}); start the fit anew.") from problem
         return cls(folder, settings, capture)
+
+    @cached_property
+    def exposures(self) -> dict[str, float]:
+        """By view, times the usual light; empty where all frames are exposed alike. Raises RunError."""
+        return exposures.read(self.folder)
+
+    def capture(self, given: Path | None = None, *, need_frames: bool = True) -> Capture:
+        """What it was fitted to, from the folder given or where it was then, its frames exposed as the fit found them.
+        Raises RunError, CaptureError, FrameError."""
+        return Capture.open(self.find_capture(given), need_frames=need_frames).exposed(self.exposures)
 
     def find_capture(self, given: Path | None) -> Path:
         """The folder of its capture: the one given, else the one it was fitted to. RunError where that is gone."""

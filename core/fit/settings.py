@@ -154,6 +154,7 @@ class FitSettings:
     ssim_share is 1 - lambda of the paper's loss. `apart`: share of the iterations at the beginning in which the
     flare is put before the flare-free frames instead of the scene; 0 in the paper. `holdout`: a number N (every N-th
     view is held out; 0: none), a split file's name, or None (the capture's split.json, else every 8th).
+    exposure: "found" looks for frames that are exposed otherwise than most, "fixed" takes all for alike.
     `white`: scene-linear light at which frames are clipped; None where a fit has yet to look whether its frames hold
     more than 1, which only float frames can, and in runs of versions that clipped all there.
     """
@@ -167,6 +168,7 @@ class FitSettings:
     apart: float = 0.0
     holdout: str | int | None = None
     white: float | None = None
+    exposure: Literal["found", "fixed"] = "found"
     kernels: Literal["auto", "torch", "tiles", "cpu", "cuda"] = "auto"
     checkpoint_every_s: float = 60.0
     preview_every: int = 1000

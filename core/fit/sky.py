@@ -7,10 +7,12 @@ flare, a flare would be there first: it costs nothing to paint a sky with one th
 from __future__ import annotations
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from ..capture import Capture, View
 from ..capture.colmap import PointCloud
+from ..flare.compositing import exposed
 from .frames import Frames, colours_at, thinned
 
 COUNT = 2000
@@ -33,7 +35,7 @@ def with_sky(capture: Capture, views: tuple[View, ...], frames: Frames) -> Point
     for row, view in zip(seen, asked, strict=True):
         camera, frame, _ = frames.targets(view)
         inside, shown = colours_at(xyz, camera, frame)
-        row[inside] = shown
+        row[inside] = exposed(torch.from_numpy(shown), 1 / camera.exposure).numpy()
     found = np.isfinite(seen[..., 0]).any(0)
     colours = np.nanquantile(seen[:, found], FROM_BELOW, axis=0)
     rgb = np.concatenate([points.rgb, (colours.clip(0, 1) * 255 + 0.5).astype(np.uint8)])

@@ -10,6 +10,7 @@ All randomness is a function of (seed, iteration): a resumed fit goes on as if i
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from contextlib import nullcontext
 from typing import Any
 
@@ -21,7 +22,7 @@ from torch.nn import Parameter
 from ..capture import Capture, View
 from ..capture.discs import clipped_discs
 from ..errors import CaptureError, RunError
-from ..flare.compositing import composite
+from ..flare.compositing import clipped, composite
 from ..flare.density import clone_and_prune
 from ..flare.model import FlareModel
 from ..flare.visibility import clear_shares, uncovering
@@ -57,11 +58,17 @@ class Trainer:
     Raises CaptureError where the capture lacks what the mode needs.
     """
 
-    def __init__(self, capture: Capture, settings: FitSettings) -> None:
+    def __init__(self, capture: Capture, settings: FitSettings, exposures: Mapping[str, float] | None = None) -> None:
+        """exposures: of the views, by name, where that is known already."""
         torch.manual_seed(settings.seed)
         self.settings = settings
-        self.capture = capture
         self.frames = Frames(capture, settings.width, display_white=settings.display_white)
+        if exposures is None:
+            exposures = exposure.found(capture, self.frames) if settings.exposure == "found" else {}
+        self.exposures = exposures
+        """Times the usual light, by view; empty where all frames are exposed alike."""
+        capture = capture.exposed(exposures)
+        self.capture = capture
         self.views, _ = capture.split(settings.holdout)
         self.iteration = 0
         self.scene_is_fitted = not settings.scene.frozen
@@ -70,7 +77,7 @@ class Trainer:
                                "or fit with --mode unsup.")
         self.scene = first_scene(capture, settings, self.views, self.frames)
         self.flare = None if settings.mode == "3dgs" else first_flare(capture, self.views, self.frames, settings)
-        self.says = (*self.frames.says, *exposure.says(capture, self.views, self.frames),
+        self.says = (*self.frames.says, *exposure.says(self.exposures),
                      *(() if self.flare is None else moved_lights(capture, self.flare)))
         self.extent = capture.extent
         self._head_start = HeadStart(settings.split, len(self.views), settings.iterations)
@@ -88,25 +95,26 @@ class Trainer:
         targets = self.frames.targets(self._view())
         self._set_rates()
         scene = render_scene(self.scene, targets.camera, settings.kernels, sh_degree=self._sh_degree(), depth=False)
+        shown = self._as_filmed(scene.colour)
         self._look_for_lights()
         self._look_for_scene()
         alone = self._scene_alone(targets)
         flare = None if alone else render_flare(self.flare, settings.blend, targets.camera, settings.kernels,
                                                 scene=self.scene, visibility=settings.flare.occluded_by_scene)
         sources = self._sources(targets)
-        picture = composite(self._behind_flare(targets, scene.colour, sources), flare, settings.blend,
+        picture = composite(self._behind_flare(targets, shown, sources), flare, settings.blend,
                             self.frames.display_white)
         weight = 1 - settings.ssim_share
-        loss = (scene.colour.new_zeros(()) if alone else
+        loss = (shown.new_zeros(()) if alone else
                 l1_ssim(picture, self._joint_target(targets, picture.detach(), sources), weight))
         figures = {"loss": float(loss.detach())}
-        clean = self._scene_target(targets, picture, scene.colour)
+        clean = self._scene_target(targets, picture, shown)
         if clean is not None and self.scene_is_fitted:
-            scene_loss = l1_ssim(scene.colour, clean, weight)
+            scene_loss = l1_ssim(shown, clean, weight)
             figures["scene_loss"] = float(scene_loss.detach())
             loss = loss + scene_loss
         elif settings.mode == "split" and self.scene_is_fitted:
-            scene_loss = self._split_loss(targets, scene.colour, sources, alone)
+            scene_loss = self._split_loss(targets, shown, sources, alone)
             figures["scene_loss"] = float(scene_loss.detach())
             loss = loss + scene_loss
         if not all(map(math.isfinite, figures.values())):
@@ -134,6 +142,10 @@ class Trainer:
         if not alone:  # Gaussians that nothing has taught are neither many nor faint
             self._change_flare_density()
         return figures
+
+    def _as_filmed(self, scene: Tensor) -> Tensor:
+        """A scene's picture, clipped where that of another frame, exposed for less, is not."""
+        return clipped(scene, self.frames.display_white) if self.exposures else scene
 
     @property
     def _rendered_once(self) -> bool:
@@ -164,8 +176,9 @@ class Trainer:
             return
 
         def missing(targets: Targets) -> Tensor:
-            return targets.frame - render_scene(self.scene, targets.camera, self.settings.kernels,
-                                                sh_degree=self._sh_degree(), depth=False).colour
+            scene = render_scene(self.scene, targets.camera, self.settings.kernels, sh_degree=self._sh_degree(),
+                                 depth=False)
+            return targets.frame - self._as_filmed(scene.colour)
 
         asked = thinned(self.views, ASKED)
         if not is_found((missing(self.frames.targets(view)) for view in asked), self.settings.split.found):

@@ -18,6 +18,7 @@ from typing import Any, Literal, NamedTuple
 import torch
 from torch import Tensor
 
+from ..exposures import brightness
 from ..gaussians import Splats, over, splat
 from ..gaussians.rasterizer import Kernels, Resolution
 from ..sampling import Sampling
@@ -29,15 +30,16 @@ Blend = Literal["over", "add"]
 
 def splat_flare(gaussians: PlaneGaussians, intrinsics: Tensor, width: int, height: int, blend: Blend, *,
                 kernels: Kernels = "auto", resolution: Resolution = "full",
-                sampling: Sampling | None = None) -> Splats:
+                sampling: Sampling | None = None, exposure: float = 1.0) -> Splats:
     """The flare's colour (height, width, 3) and transmittance (height, width) under these intrinsics. sampling: the
-    grid on which it was learned, so that it looks alike at every size.
+    grid on which it was learned, so that it looks alike at every size. exposure: times the light that was learned.
 
     The colour is in display space for `over` and scene-linear for `add`.
     """
     centres, covariances = placement.pixels(gaussians, intrinsics, sampling)
     arcs = None if gaussians.arcs is None else placement.slopes(gaussians.arcs, covariances, intrinsics)
-    return splat(centres, covariances, gaussians.opacities, gaussians.colours, width, height,
+    colours = gaussians.colours if exposure == 1 else brightness(exposure, blend) * gaussians.colours
+    return splat(centres, covariances, gaussians.opacities, colours, width, height,
                  rings=gaussians.rings, arcs=arcs, blend=blend, kernels=kernels, resolution=resolution)
 
 
@@ -79,6 +81,32 @@ def encode(linear: Tensor) -> Tensor:
     """Linear light, not negative, to sRGB display values; above 1 the curve goes on."""
     return torch.where(linear <= 0.0031308, linear * 12.92,
                        1.055 * linear.clamp_min(0.0031308) ** (1 / 2.4) - 0.055)
+
+
+def exposed(display: Tensor, exposure: float) -> Tensor:
+    """Display values, not negative, of `exposure` times the light; above 1 the curve goes on."""
+    shown: Tensor = display if exposure == 1 else _Exposed.apply(display, exposure)
+    return shown
+
+
+def clipped(display: Tensor, white: float) -> Tensor:
+    """As a camera clips it, with the gradient passed on as it is: see `composite`."""
+    return display - (display - white).clamp_min(0).detach()
+
+
+class _Exposed(torch.autograd.Function):
+    """encode(exposure * decode(display)), by the powers of which the slopes are made too."""
+
+    @staticmethod
+    def forward(ctx: Any, display: Tensor, exposure: float) -> Tensor:
+        linear, within = _decoded(display)
+        shown, slope = _encoded(linear.mul_(exposure))
+        ctx.save_for_backward(within.mul_(exposure).mul_(slope))
+        return shown
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
+        return gradient * ctx.saved_tensors[0], None
 
 
 class _LightAdded(torch.autograd.Function):

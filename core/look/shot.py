@@ -113,7 +113,8 @@ class Shot:
         """Write what `read` reads."""
         frames = [{"frame": one.frame, "name": one.name, "width": one.camera.width, "height": one.camera.height,
                    "intrinsics": [one.camera.fx, one.camera.fy, one.camera.cx, one.camera.cy],
-                   "world_to_camera": one.camera.world_to_camera.tolist(), "edits": list(one.edits),
+                   "world_to_camera": one.camera.world_to_camera.tolist(), "exposure": one.camera.exposure,
+                   "edits": list(one.edits),
                    "lights": [{"name": light.name, "source": light.source, "xyz": light.xyz.tolist(),
                                "share": light.share} for light in one.lights]} for one in self.frames]
         write_json(path, {"version": VERSION, "flare": str(self.flare), "run": str(self.run) if self.run else None,
@@ -147,9 +148,9 @@ class Shot:
 def _frame(entry: Mapping[str, Any], data: Mapping[str, Any]) -> ShotFrame:
     width, height = (int(entry.get(key, data.get(key))) for key in ("width", "height"))
     fx, fy, cx, cy = (_number(value) for value in entry["intrinsics"])
-    pose = np.array(entry["world_to_camera"], np.float64)
+    pose, exposure = np.array(entry["world_to_camera"], np.float64), _number(entry.get("exposure", 1.0))
     if not (0 < width <= _LARGEST and 0 < height <= _LARGEST and fx > 0 and fy > 0 and pose.shape == (4, 4)
-            and np.isfinite(pose).all()):
+            and np.isfinite(pose).all() and exposure > 0):
         raise ValueError(f"frame {entry['frame']} has no sensible camera")
     lights = tuple(PlacedLight(str(one["name"]), str(one["source"]), np.array([_number(x) for x in one["xyz"]]),
                                _number(one.get("share", 1.0))) for one in entry["lights"])
@@ -157,8 +158,8 @@ def _frame(entry: Mapping[str, Any], data: Mapping[str, Any]) -> ShotFrame:
         raise ValueError("a light has no place")
     if not all(isinstance(word, str) for word in entry.get("edits", [])):
         raise ValueError("edits are a list of texts")
-    return ShotFrame(int(entry["frame"]), str(entry.get("name", "Camera")), Camera(width, height, fx, fy, cx, cy, pose),
-                     lights, tuple(entry.get("edits", [])))
+    return ShotFrame(int(entry["frame"]), str(entry.get("name", "Camera")),
+                     Camera(width, height, fx, fy, cx, cy, pose, exposure), lights, tuple(entry.get("edits", [])))
 
 
 def _number(value: Any) -> float:

@@ -53,7 +53,6 @@ def space_options(parser: argparse.ArgumentParser) -> None:
 def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     from ...core.bake.bake import BakeSettings, bake
     from ...core.bake.frames import numbered
-    from ...core.capture import Capture
     from ...core.fit.run import Run
     from ...core.look import KeyedEdits
 
@@ -68,7 +67,7 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     made = Run.open(words.run)
     if not made.finished:
         raise RunError(f"{words.run} is not finished; go on with it by `fit --resume` first.")
-    capture = Capture.open(made.find_capture(words.capture), need_frames=False)
+    capture = made.capture(words.capture, need_frames=False)
     cameras = {view.name: view.camera for view in capture.views}
     wanted = frames.asked(numbered(cameras), words.frames, progress)
     if words.jobs != 1:

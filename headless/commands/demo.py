@@ -67,7 +67,7 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     _check_earlier(out / "run", settings, capture)
     made = fit_capture(capture, settings, out / "run", progress, resume=True)
     result = evaluate.scores_of(made.folder, progress)
-    cameras = {view.name: view.camera for view in capture.views}
+    cameras = {view.name: view.camera for view in made.capture(need_frames=False).views}
     bake(made, numbered(cameras), cameras, out / "layers", progress=progress, overwrite=True)
     _write_sheet(capture, made.settings.holdout, out)
     progress.say(f"In {out} there are now the run, the layers of {len(cameras)} frames (EXR), and {SHEET}; "

@@ -26,14 +26,13 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
 def scores_of(folder: Path, progress: Progress, *, which: str = "held-out",
               capture_folder: Path | None = None) -> dict[str, Any]:
     """Score a run's views, write its eval.json, show the table."""
-    from ...core.capture import Capture
     from ...core.files import write_json
     from ...core.fit.frames import Frames
     from ...core.fit.run import EVALUATION, Run
     from ...core.metrics.evaluation import evaluate, table
 
     made = Run.open(folder)
-    capture = Capture.open(made.find_capture(capture_folder))
+    capture = made.capture(capture_folder)
     train, held_out = capture.split(made.settings.holdout)
     views = {"held-out": held_out, "train": train, "all": capture.views}[which]
     if not views:

@@ -73,7 +73,6 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
 
 def _by_run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     from ...core.bake.frames import numbered
-    from ...core.capture import Capture
     from ...core.fit import Run
     from ...core.removal.fitted import remove_fitted
 
@@ -84,7 +83,7 @@ def _by_run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     fitted = Run.open(words.run)
     if fitted.settings.mode == "3dgs":
         raise RunError(fitted.without_flare)
-    capture = Capture.open(fitted.find_capture(words.capture))
+    capture = fitted.capture(words.capture)
     chosen = frames.asked(numbered([view.name for view in capture.views]), words.frames, progress)
     wanted = {frame.view for frame in chosen}
     return remove_fitted(fitted, capture, [view for view in capture.views if view.name in wanted], words.out, progress,

@@ -98,6 +98,12 @@ def test_cameras_see_points_where_the_footage_has_them(facts: Any, kind: str) ->
     assert facts[f"pixels off, {kind}"] < 0.002
 
 
+@pytest.mark.parametrize("kind", ["animated", "each"])
+def test_cameras_are_exposed_as_a_fit_has_found_the_frames(facts: Any, kind: str) -> None:
+    assert facts[f"exposed, {kind}"] == [0.5, 1.5, 2.5, 3.5, 4.5]
+    assert facts[f"as usual, {kind}"] == [1.0, 1.0]
+
+
 def test_an_import_is_whole(facts: Any) -> None:
     assert facts["objects, animated"] == ["Camera", "Points", "capture Root", "lamp"]
     assert facts["objects, each"] == ["0000", "0001", "0002", "0003", "0004", "Points", "capture Root", "lamp"]
@@ -149,6 +155,20 @@ def test_the_overlay_draws_what_the_look_defines(facts: Any) -> None:
     assert facts["overlay off"] < 0.015
     assert facts["cropped off"] < 0.015
     assert facts["outside"]
+
+
+def test_what_is_shown_and_baked_is_as_bright_as_the_camera_is_exposed(made: tuple[Any, Path], tmp_path: Path) -> None:
+    facts, base = made
+    off, brightest = facts["brighter"]
+    assert off < 1e-6 < brightest
+    shot = Shot.read(base / "exposed.json")
+    assert shot.frames[0].camera.exposure == 2.0
+    usual = replace(shot, frames=tuple(replace(one, camera=replace(one.camera, exposure=1.0)) for one in shot.frames))
+    for name, one in (("exposed", shot), ("usual", usual)):
+        bake_shot(one, tmp_path / name, half=False)
+    exposed, plain = (read_layers(tmp_path / name / "layers.0002.exr").flare for name in ("exposed", "usual"))
+    assert plain.max() > 0.05
+    np.testing.assert_allclose(exposed, 2 * plain, rtol=1e-5)
 
 
 def test_a_shot_has_the_captures_own_numbers(facts: Any) -> None:

@@ -1,71 +1,283 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Frames that are not exposed alike are told of before they are fitted."""
+"""Frames that are exposed otherwise than most are found, and fitted, baked and scored as they were exposed."""
 from __future__ import annotations
 
+import json
 import shutil
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+import torch
+from numpy.typing import NDArray
 
-from core.capture import Capture
-from core.fit.exposure import says, spread
+from core.capture import Camera, Capture
+from core.errors import Cancelled, RunError
+from core.files import write_text
+from core.fit import Run, exposure, fit
 from core.fit.frames import Frames
 from core.fit.trainer import Trainer
-from core.pictures import linear_from_srgb, srgb_from_linear
-from tests.core.flared import flared_capture
-from tests.core.test_fit import quick
+from core.flare.compositing import clipped, decode, encode, exposed
+from core.pictures import linear_from_srgb, srgb_from_linear, write_png
+from core.progress import Progress
+from tests.core.flared import cameras, flared_capture
+from tests.core.test_fit import StopAt, quick
+
+Light = NDArray[np.float32]
+SCALE, SIDE, COUNT = 3, 20, 12
+"""The cameras' frames are 192x120 pixels; the wall has so many tiles a side, and there are so many frames."""
 
 
-@pytest.fixture(scope="module")
-def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
-    return Capture.open(flared_capture(tmp_path_factory.mktemp("steady") / "capture", dots=400))
-
-
-def exposed(capture: Capture, folder: Path, stops: float) -> Capture:
-    """The capture with every other frame so much brighter and the others as much darker."""
-    shutil.copytree(capture.folder, folder)
-    for number, view in enumerate(capture.views):
-        for kind in ("images", "removed"):
-            path = folder / kind / view.name
-            light = linear_from_srgb(cv2.imread(str(path)) / np.float32(255)) * 2 ** (stops * (-1) ** number)
-            cv2.imwrite(str(path), (srgb_from_linear(light).clip(0, 1) * 255).astype(np.uint8))
+def wall(folder: Path, filmed: Callable[[int, Light], Light]) -> Capture:
+    """A capture of a wall of tiles, each with a point, at the origin. filmed: the light of a frame, by its number and
+    what comes from the wall, (height, width, 3) scene-linear."""
+    tiles = np.random.default_rng(3).uniform(0.05, 0.6, (SIDE, SIDE, 3)).astype(np.float32)
+    across = (np.arange(SIDE) + 0.5) / SIDE * 4 - 2
+    xyz = np.stack([*np.meshgrid(across, across, indexing="ij"), np.zeros((SIDE, SIDE))], -1).reshape(-1, 3)
+    lines = []
+    for number, camera in enumerate(seen.scaled(SCALE * seen.width) for seen in cameras(COUNT)):
+        centres = np.stack(np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5), -1)
+        rays = camera.rays(centres.reshape(-1, 2))
+        met = camera.position - rays * (camera.position[2] / rays[:, 2:])
+        tile = ((met[:, :2] + 2) / 4 * SIDE).astype(int).clip(0, SIDE - 1)
+        light = tiles[tile[:, 0], tile[:, 1]].reshape(camera.height, camera.width, 3)
+        write_png(folder / "images" / f"{number:04d}.png", srgb_from_linear(filmed(number, light)).clip(0, 1))
+        lines.append(_image(number, camera, xyz))
+    model = folder / "sparse" / "0"
+    write_text(model / "cameras.txt", f"1 PINHOLE {camera.width} {camera.height} {camera.fx} {camera.fy} {camera.cx} "
+                                      f"{camera.cy}\n")
+    write_text(model / "images.txt", "".join(lines))
+    write_text(model / "points3D.txt", "".join(f"{i + 1} {x} {y} {z} 128 128 128 0.5\n"
+                                               for i, (x, y, z) in enumerate(xyz)))
     return Capture.open(folder)
 
 
-def spread_of(capture: Capture) -> float:
-    return spread(capture, capture.views, Frames(capture))
+def _image(number: int, camera: Camera, xyz: NDArray[np.float64]) -> str:
+    """Two lines of images.txt, with the points that are on the frame."""
+    from core.capture.camera import quaternion_from_rotation
+
+    pixels, depth = camera.project(xyz)
+    found = " ".join(f"{pixels[i, 0]} {pixels[i, 1]} {i + 1}" for i in np.flatnonzero(camera.contains(pixels, depth)))
+    pose = [*quaternion_from_rotation(camera.world_to_camera[:3, :3]), *camera.world_to_camera[:3, 3]]
+    return f"{number + 1} {' '.join(map(str, pose))} 1 {number:04d}.png\n{found}\n"
 
 
-def test_frames_of_one_exposure_are_steady(capture: Capture, tmp_path: Path) -> None:
-    assert spread_of(capture) < 0.2
-    assert spread_of(exposed(capture, tmp_path / "a", 0.0)) < 0.2
-    assert not says(capture, capture.views, Frames(capture))
+def found(capture: Capture) -> dict[str, float]:
+    return exposure.found(capture, Frames(capture))
 
 
-@pytest.mark.parametrize("stops", [0.3, 0.7])
-def test_a_drift_is_found_and_told(capture: Capture, tmp_path: Path, stops: float) -> None:
-    drifting = exposed(capture, tmp_path / "a", stops)
-    assert spread_of(drifting) == pytest.approx(2 * stops, abs=0.4 * stops)
-    told = [text for text in Trainer(drifting, quick(5)).says if "exposure seems to change" in text]
-    assert len(told) == 1
+def test_frames_of_one_exposure_are_left_alone(tmp_path: Path) -> None:
+    assert not found(wall(tmp_path / "a", lambda _number, light: light))
+    noise = np.random.default_rng(1).uniform(0.9, 1.1, (COUNT, 1, 1, 3)).astype(np.float32)
+    grain = np.random.default_rng(2).uniform(0.8, 1.25, (SCALE * 40, SCALE * 64, 1)).astype(np.float32)
+    assert not found(wall(tmp_path / "b", lambda number, light: light * np.roll(grain, 7 * number, 1)))
+    assert not found(wall(tmp_path / "c", lambda number, light: light * noise[number])), "a drift of colour"
 
 
-def test_points_without_colours_tell_nothing(capture: Capture, tmp_path: Path) -> None:
-    drifting = exposed(capture, tmp_path / "a", 0.7)
-    points = drifting.folder / "sparse" / "0" / "points3D.txt"
-    rows = [line.split() for line in points.read_text(encoding="utf-8").splitlines()]
-    points.write_text("".join(" ".join([*row[:4], "128", "128", "128", *row[7:]]) + "\n" for row in rows))
-    assert spread_of(Capture.open(drifting.folder)) == 0
+@pytest.mark.parametrize("veil", [0.0, 0.1])
+def test_what_changes_is_found_whatever_veil_lies_over_it(tmp_path: Path, veil: float) -> None:
+    """A camera left to itself: the more flare, the less it is exposed."""
+    stops = 0.6 * np.sin(np.arange(COUNT))
+    capture = wall(tmp_path / "a", lambda number, light: (light + veil * (stops[number] < 0)) * 2 ** stops[number])
+    told = np.log2(list(found(capture).values()))
+    assert told == pytest.approx(stops - np.median(stops), abs=0.06)
 
 
-def test_without_points_that_tell_nothing_is_said(capture: Capture, tmp_path: Path) -> None:
-    drifting = exposed(capture, tmp_path / "a", 0.7)
-    for path in (drifting.folder / "images").iterdir():
-        cv2.imwrite(str(path), np.zeros_like(cv2.imread(str(path))))
-    shutil.rmtree(drifting.folder / "removed")
-    shutil.rmtree(drifting.folder / "truth")
-    dark = Capture.open(drifting.folder)
-    assert spread_of(dark) == 0
-    assert spread(dark, dark.views[:2], Frames(dark)) == 0
+def test_a_veil_by_itself_is_no_exposure(tmp_path: Path) -> None:
+    assert not found(wall(tmp_path / "a", lambda number, light: light + np.float32(0.15 * (number % 2))))
+
+
+def test_what_a_light_glows_on_does_not_count(tmp_path: Path) -> None:
+    def glowing(number: int, light: Light) -> Light:
+        lit = light.copy()
+        lit[:, : lit.shape[1] // 4] += 0.3 * (number % 3)
+        return lit * 2 ** (0.5 * (-1) ** number)
+
+    told = np.log2(list(found(wall(tmp_path / "a", glowing)).values()))
+    assert told[::2].mean() - told[1::2].mean() == pytest.approx(1.0, abs=0.1)
+    assert max(told[::2].std(), told[1::2].std()) < 0.1
+
+
+def test_frames_that_tell_nothing_are_as_the_next(tmp_path: Path) -> None:
+    def filmed(number: int, light: Light) -> Light:
+        return light * (0.0 if number == 3 else 2.0 if number < 6 else 1.0)
+
+    told = found(wall(tmp_path / "a", filmed))
+    assert told["0003.png"] == pytest.approx(told["0002.png"], rel=0.02)
+    assert told["0003.png"] / told["0009.png"] == pytest.approx(2, rel=0.05)
+
+
+def test_without_what_a_solve_has_found_nothing_is_told(tmp_path: Path) -> None:
+    capture = wall(tmp_path / "a", lambda number, light: light * 2.0 ** (number % 2))
+    assert found(capture)
+    model = capture.folder / "sparse" / "0" / "images.txt"
+    poses = model.read_text(encoding="utf-8").splitlines()[::2]
+    write_text(model, "".join(f"{pose}\n\n" for pose in poses))
+    assert not found(Capture.open(capture.folder))
+    (capture.folder / "sparse" / "0" / "points3D.txt").unlink()
+    assert not found(Capture.open(capture.folder))
+
+
+def test_frames_that_are_all_black_tell_nothing(tmp_path: Path) -> None:
+    assert not found(wall(tmp_path / "a", lambda _number, light: 0 * light))
+
+
+# ---- fits -----------------------------------------------------------------------------------------
+
+STOPS = 0.7
+
+
+@pytest.fixture(scope="module")
+def drifting(tmp_path_factory: pytest.TempPathFactory) -> tuple[Capture, dict[str, float]]:
+    """A capture with a flare, every other frame brighter and the others as much darker; and how much."""
+    folder = tmp_path_factory.mktemp("drifting") / "capture"
+    capture, exposures = Capture.open(flared_capture(folder)), {}
+    shutil.rmtree(folder / "truth")
+    for number, view in enumerate(capture.views):
+        exposures[view.name] = 2 ** (STOPS * (-1) ** (number // 2))
+        for kind in ("images", "removed"):
+            path = folder / kind / view.name
+            light = linear_from_srgb(cv2.imread(str(path)) / np.float32(255)) * exposures[view.name]
+            cv2.imwrite(str(path), (srgb_from_linear(light).clip(0, 1) * 255 + 0.5).astype(np.uint8))
+    return Capture.open(folder), exposures
+
+
+def flare_error(capture: Capture, run: Run) -> float:
+    """Mean square over the views, display values."""
+    errors = []
+    for view in run.capture().views:
+        layers = run.render(view.camera)
+        clean = capture.removed(view)
+        assert clean is not None
+        told, filmed = ((np.clip(srgb_from_linear(sum(layers.flare_by_light.values(), clean.linear())), 0, 1)),
+                        capture.frame(view).display())
+        errors.append(float(np.square(told - filmed).mean()))
+    return float(np.mean(errors))
+
+
+@pytest.mark.parametrize("mode", ["default", "split"])
+def test_a_fit_goes_by_them(drifting: tuple[Capture, dict[str, float]], tmp_path: Path, mode: str,
+                            monkeypatch: pytest.MonkeyPatch) -> None:
+    capture, exposures = drifting
+    monkeypatch.setattr(exposure, "found", lambda *_: exposures)
+    fixed = fit(capture, quick(120, mode=mode, exposure="fixed"), tmp_path / "fixed")
+    assert not (fixed.folder / "exposures.json").exists()
+    told: list[str] = []
+    as_found = fit(capture, quick(120, mode=mode), tmp_path / "found", Recorded(told))
+    assert any("exposure changes, by about 1.4 stops" in text for text in told)
+    assert as_found.exposures == exposures
+    assert flare_error(capture, as_found) < 0.7 * flare_error(capture, fixed)
+
+
+class Recorded(Progress):
+    """Keeps what is said."""
+
+    def __init__(self, texts: list[str]) -> None:
+        super().__init__()
+        self.texts = texts
+
+    def say(self, text: str) -> None:
+        self.texts.append(text)
+
+
+@pytest.mark.parametrize("blend", ["add", "over"])
+def test_a_view_is_rendered_as_it_was_exposed(drifting: tuple[Capture, dict[str, float]], tmp_path: Path, blend: str,
+                                              monkeypatch: pytest.MonkeyPatch) -> None:
+    capture, exposures = drifting
+    monkeypatch.setattr(exposure, "found", lambda *_: exposures)
+    run = Run.open(fit(capture, quick(20, blend=blend), tmp_path / "run").folder)
+    view = next(view for view in run.capture(need_frames=False).views if exposures[view.name] < 1)
+    own, usual = run.render(view.camera), run.render(replace(view.camera, exposure=1.0))
+    inside = usual.scene.max(-1) < 0.99  # what is clipped in the one is not in the other
+    assert own.scene[inside] == pytest.approx(exposures[view.name] * usual.scene[inside], abs=1e-4)
+    flare, of_usual = (sum(one.flare_by_light.values()) for one in (own, usual))
+    assert np.abs(of_usual).max() > 1e-3
+    if blend == "add":
+        assert flare == pytest.approx(exposures[view.name] * of_usual, rel=1e-4, abs=1e-5)
+    else:
+        assert 0.3 < np.abs(flare).sum() / np.abs(of_usual).sum() < 0.9
+
+
+def test_a_fit_that_was_stopped_goes_on_with_them(drifting: tuple[Capture, dict[str, float]], tmp_path: Path,
+                                                  monkeypatch: pytest.MonkeyPatch) -> None:
+    capture, exposures = drifting
+    monkeypatch.setattr(exposure, "found", lambda *_: exposures)
+    whole = fit(capture, quick(30), tmp_path / "whole")
+    with pytest.raises(Cancelled):
+        fit(capture, quick(30), tmp_path / "run", StopAt(12))
+    monkeypatch.setattr(exposure, "found", lambda *_: pytest.fail("they are known"))
+    assert fit(capture, quick(30), tmp_path / "run", resume=True).fingerprint == whole.fingerprint
+
+
+def test_a_fit_without_them_is_not_given_any_later(drifting: tuple[Capture, dict[str, float]], tmp_path: Path,
+                                                   monkeypatch: pytest.MonkeyPatch) -> None:
+    """Runs of versions that did not look."""
+    capture, exposures = drifting
+    monkeypatch.setattr(exposure, "found", lambda *_: {})
+    with pytest.raises(Cancelled):
+        fit(capture, quick(30), tmp_path / "run", StopAt(12))
+    monkeypatch.setattr(exposure, "found", lambda *_: exposures)
+    assert fit(capture, quick(30), tmp_path / "run", resume=True).exposures == {}
+
+
+@pytest.mark.parametrize("content", ['{"0000.png": 0}', '{"0000.png": "1"}', '{"0000.png": 1e9}', '{"0000.png": NaN}',
+                                     "[1]", "{"])
+def test_a_damaged_list_is_told(drifting: tuple[Capture, dict[str, float]], tmp_path: Path, content: str) -> None:
+    run = Run.create(tmp_path / "run", quick(10), drifting[0].folder, {"0000.png": 1.5})
+    assert Run.open(run.folder).exposures == {"0000.png": 1.5}
+    (run.folder / "exposures.json").write_text(content, encoding="utf-8")
+    with pytest.raises(RunError, match=r"exposures\.json"):
+        _ = Run.open(run.folder).exposures
+
+
+def test_what_a_killed_beginning_left_is_not_taken(drifting: tuple[Capture, dict[str, float]], tmp_path: Path) -> None:
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "exposures.json").write_text(json.dumps({"0000.png": 1.5}), encoding="utf-8")
+    assert Run.create(tmp_path / "run", quick(10), drifting[0].folder).exposures == {}
+
+
+def test_a_trainer_shows_each_view_its_own(drifting: tuple[Capture, dict[str, float]]) -> None:
+    capture, exposures = drifting
+    trainer = Trainer(capture, quick(5), exposures)
+    assert {view.name: view.camera.exposure for view in trainer.views}.items() <= exposures.items()
+    targets = trainer.frames.targets(trainer.views[0])
+    assert targets.camera.exposure == exposures[trainer.views[0].name]
+    assert capture.views[0].camera.exposure == 1
+
+
+# ---- the arithmetic -------------------------------------------------------------------------------
+
+
+def test_exposing_is_done_in_light() -> None:
+    display = torch.linspace(0, 1.2, 25)
+    assert exposed(display, 1.0) is display
+    for times in (0.4, 2.5):
+        assert torch.allclose(exposed(display, times), encode(times * decode(display)), atol=1e-6)
+
+
+def test_gradients_of_exposing() -> None:
+    display = torch.tensor([0.01, 0.03, 0.2, 0.7, 1.1], dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda one: exposed(one, 1.7), display)
+
+
+def test_what_is_clipped_can_come_down_again() -> None:
+    display = torch.tensor([0.5, 1.4], requires_grad=True)
+    shown = clipped(display, 1.0)
+    shown.sum().backward()
+    assert shown.tolist() == [0.5, 1.0]
+    assert display.grad is not None
+    assert display.grad.tolist() == [1.0, 1.0]
+
+
+def test_a_camera_of_usual_exposure_has_the_numbers_it_had() -> None:
+    """Bakes of earlier versions are kept."""
+    camera = cameras(1)[0]
+    numbers: Any = camera.numbers
+    assert len(numbers) == 3
+    assert replace(camera, exposure=2.0).numbers[:3] == numbers
+    assert replace(camera, exposure=2.0).numbers != numbers
+    assert replace(camera, exposure=2.0).scaled(32).exposure == 2.0

@@ -25,7 +25,7 @@ from core.capture.solve.world import up_direction
 from core.errors import Cancelled, CaptureError
 from core.pictures import Picture
 from core.progress import Progress
-from tests.core.captures import look_at, orbit
+from tests.core.captures import look_at, make_capture, orbit
 
 SIZE = (320, 240)
 QUICK = SolveSettings(features=800)
@@ -372,12 +372,30 @@ def test_models_are_written_as_read(tmp_path: Path) -> None:
     posed, again = read_model(tmp_path)
     for one, frame in zip(posed, frames, strict=True):
         assert one.name == frame.name and one.lens.params == lens.params
+        assert one.points.tolist() == [0, 2, 4]
         np.testing.assert_allclose(one.world_to_camera, frame.world_to_camera, atol=1e-12)
     np.testing.assert_array_equal(again.xyz, cloud.xyz)
     np.testing.assert_array_equal(again.rgb, cloud.rgb)
     theirs = pycolmap.Reconstruction(str(tmp_path))
     assert theirs.num_reg_images() == 3 and theirs.points3D[3].track.length() == 3
     assert theirs.images[2].points2D[1].point3D_id == 3
+    text = tmp_path / "text"
+    text.mkdir()
+    theirs.write_text(str(text))
+    posed, cloud = read_model(text)
+    kept = {float(cloud.xyz[index, 0]) for index in posed[1].points}
+    assert kept == {float(again.xyz[index, 0]) for index in (0, 2, 4)}, "the numbers are not the indices"
+
+
+def test_points_that_a_model_lists_and_lacks_are_left_out(tmp_path: Path) -> None:
+    folder = make_capture(tmp_path / "c")
+    images = folder / "sparse" / "0" / "images.txt"
+    lines = images.read_text(encoding="utf-8").splitlines()
+    poses = [line for line in lines if len(line.split()) == 10]
+    images.write_text("\n".join(f"{pose}\n{found}" for pose, found in zip(poses, (
+        "1 1 1 2 2 -1 3 3 5 4 4 5", "1 1 999 2 2 99999999999999999999", "what is this", ""), strict=True)) + "\n",
+        encoding="utf-8")
+    assert [view.points.tolist() for view in Capture.open(folder).views] == [[0, 4], [], [], []]
 
 
 def rotated(rng: np.random.Generator) -> NDArray[np.float64]:

@@ -56,6 +56,17 @@ for kind, up, scale in (("animated", "Z", 1.0), ("each", "-Y", 2.5)):
         found = blenders_own(scene, camera, cloud @ to_world[:3, :3].T + to_world[:3, 3])
         worst = max(worst, float(np.abs(expected - found)[depth > 0.3].max()))
     facts[f"pixels off, {kind}"] = worst
+    fitted = part("flare_addon.capture_import")
+    fitted.expose(root, {view.name: 0.5 + number for number, view in enumerate(original.views)})
+    found = []
+    for frame in frames:
+        scene.frame_set(frame.number)
+        camera = scene.camera if kind == "animated" else scene.objects[Path(frame.view).stem]
+        found.append(shots.frame_of(scene, bpy.context.evaluated_depsgraph_get(), camera, frame.number).camera.exposure)
+    facts[f"exposed, {kind}"] = found
+    fitted.expose(root, {})
+    scene.frame_set(frames[2].number)
+    facts[f"as usual, {kind}"] = [camera.fit_flare.exposure, scene.camera.fit_flare.exposure]
     facts[f"objects, {kind}"] = sorted(item.name for item in scene.objects)
     back = scene.camera.data.background_images[0]
     facts[f"background, {kind}"] = [back.image.source, back.frame_method, Path(back.image.filepath).name]
@@ -218,6 +229,14 @@ cropped = overlay.window_of(overlay.Frame(-40, -30, 3 * core.width, 3 * core.hei
 rows = slice(3 * core.height - 30 - 80, 3 * core.height - 30)  # the frame reaches 10 pixels above the region
 facts["cropped off"] = far_off(drawn(cropped), expected[rows, 40:140])
 facts["outside"] = overlay.window_of(overlay.Frame(500, 0, 64, 40), (100, 80), core) is None
+
+# What is shown and what is baked are as bright as the frame was exposed.
+scene.camera.fit_flare.exposure = 2.0
+brighter = overlay.joined(list(looks.seen(scene, bpy.context.evaluated_depsgraph_get(), scene.camera).values()))
+facts["brighter"] = [far_off(brighter.colours, 2 * gaussians.colours), float(np.abs(gaussians.colours).max())]
+exposed_shot = shots.of_scene(scene, [scene.camera], [2], Path(flare), None)
+exposed_shot.write(Path(out) / "exposed.json")
+scene.camera.fit_flare.exposure = 1.0
 
 # ---- a shot, and the same by hand ------------------------------------------------------------------
 state.occlusion = True

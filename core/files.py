@@ -33,26 +33,30 @@ _OF_DEVICES = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\.|$)", re.IGNORECASE)
 
 
 @contextlib.contextmanager
-def atomic_path(target: Path | str) -> Iterator[Path]:
-    """A temporary path beside `target`, renamed on to it when the block ends well and removed when not.
+def atomic_path(target: Path | str, turn: contextlib.AbstractContextManager[None] | None = None) -> Iterator[Path]:
+    """A temporary path beside `target`, renamed on to it when the block ends well and removed when not. turn: held
+    while it is renamed.
 
     The temporary name keeps the suffix, since writers choose their format by it.
     """
     target = Path(target)
     target.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(prefix=_partial_of(target) + _writer(), suffix=target.suffix, dir=target.parent)
-    os.close(handle)
-    temporary = Path(name)
+    temporary = target
     try:
+        handle, name = tempfile.mkstemp(prefix=_partial_of(target) + _writer(), suffix=target.suffix, dir=target.parent)
+        os.close(handle)
+        temporary = Path(name)
         yield temporary
         _share(temporary, 0o666)
-        patiently(temporary.replace, target)
+        with turn or contextlib.nullcontext():
+            patiently(temporary.replace, target)
     except OSError as problem:  # a write to an open file does not say which
-        if problem.filename in (None, str(temporary)):
+        if problem.filename is None or _PARTIAL in str(problem.filename):
             problem.filename = str(target)
         raise
     finally:
-        temporary.unlink(missing_ok=True)
+        if temporary != target:
+            temporary.unlink(missing_ok=True)
 
 
 def rounded(value: float) -> float:
@@ -120,11 +124,12 @@ def remove_partial_of(target: Path | str) -> None:
 def locked(lock: Path | str, stale_s: float = 10.0) -> Iterator[None]:
     """Hold a lock file while a short block runs, so that processes of one folder take turns, on shared disks too.
 
-    A lock older than `stale_s` belonged to a process that was killed, and is taken over.
+    A lock older than `stale_s` belonged to a process that was killed, and is taken over; so is one that stays the same
+    for so long, whatever the clocks say.
     """
     lock = Path(lock)
     lock.parent.mkdir(parents=True, exist_ok=True)
-    refused = 0
+    refused, seen, since = 0, 0, time.monotonic()
     while True:
         try:
             os.close(os.open(lock, os.O_CREAT | os.O_EXCL | os.O_WRONLY))
@@ -132,7 +137,10 @@ def locked(lock: Path | str, stale_s: float = 10.0) -> Iterator[None]:
         except (FileExistsError, PermissionError) as problem:
             time.sleep(0.01)
             try:
-                if time.time() - lock.stat().st_mtime > stale_s:
+                state = lock.stat()
+                if state.st_mtime_ns != seen:
+                    seen, since = state.st_mtime_ns, time.monotonic()
+                if max(time.time() - state.st_mtime, time.monotonic() - since) > stale_s:
                     lock.unlink(missing_ok=True)
             except FileNotFoundError:
                 # Windows refuses while another one is removing it; a folder that may not be written refuses for ever.
@@ -190,11 +198,20 @@ def read_json(path: Path | str, error: type[FitFlareError]) -> Any:
     """The content of a JSON file; `error` with one sentence where it cannot be had."""
     path = Path(path)
     try:
-        return json.loads(path.read_text(encoding=WRITTEN_BY_HAND))
+        return json.loads(path.read_text(encoding=WRITTEN_BY_HAND), object_pairs_hook=_without_doubles)
     except OSError as problem:
         raise error(f"{path} cannot be read: {problem.strerror or problem}.") from problem
     except (ValueError, RecursionError) as problem:
         raise error(f"{path} is not valid JSON ({problem}); mend it or make it again.") from problem
+
+
+def _without_doubles(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Raises ValueError for a name that is given twice, of which json keeps the last."""
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        names = [name for name, _ in pairs]
+        raise ValueError(f"it has {next(name for name in names if names.count(name) > 1)!r} twice")
+    return found
 
 
 def plain_name(name: str) -> str:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import errno
 import os
 from collections.abc import Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO, Literal
@@ -21,6 +22,7 @@ from numpy.typing import NDArray
 from . import exr, jpeg, tiff
 from .errors import FrameError
 from .files import atomic_path
+from .typed import is_utf8
 
 Encoding = Literal["srgb", "linear"]
 Pixels = NDArray[np.float32]
@@ -338,8 +340,9 @@ def _rec709(path: Path, pixels: Pixels) -> Pixels:
 
 
 def write_exr(path: Path | str, channels: Mapping[str, NDArray[Any]], *, half: bool = True,
-              header: Mapping[str, Any] | None = None) -> None:
-    """Write one part, scanlines, ZIP; each channel (height, width). Full names as given ("scene.R").
+              header: Mapping[str, Any] | None = None, turn: AbstractContextManager[None] | None = None) -> None:
+    """Write one part, scanlines, ZIP; each channel (height, width). Full names as given ("scene.R"). turn: see
+    `atomic_path`.
 
     `half` stores 16 bit floats; channels that end in ".Z" stay 32 bit, since depth needs the range.
     """
@@ -351,14 +354,18 @@ def write_exr(path: Path | str, channels: Mapping[str, NDArray[Any]], *, half: b
         return np.ascontiguousarray(pixels, np.float32)
 
     attributes = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **(header or {})}
-    save_exr(path, attributes, {name: stored(name, pixels) for name, pixels in channels.items()})
+    save_exr(path, attributes, {name: stored(name, pixels) for name, pixels in channels.items()}, turn)
 
 
-def save_exr(path: Path | str, header: Mapping[str, Any], channels: Mapping[str, NDArray[Any]]) -> None:
-    """Write one part as it is given. Raises OSError where the system refuses, a full disk among that."""
+def save_exr(path: Path | str, header: Mapping[str, Any], channels: Mapping[str, NDArray[Any]],
+             turn: AbstractContextManager[None] | None = None) -> None:
+    """Write one part as it is given. turn: see `atomic_path`. Raises OSError where the system refuses, a full disk
+    among that; FrameError for a path that the library cannot be told."""
     import OpenEXR
 
-    with atomic_path(path) as temporary, OpenEXR.File(dict(header), dict(channels)) as file:
+    if not is_utf8(str(path)):
+        raise FrameError(f"The path {str(path)!r} is not UTF-8, and no EXR can be written there; rename its folder.")
+    with atomic_path(path, turn) as temporary, OpenEXR.File(dict(header), dict(channels)) as file:
         try:
             file.write(str(temporary))
         except RuntimeError as problem:  # how the library hands on what the system refused, by its words alone

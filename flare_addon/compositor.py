@@ -22,6 +22,7 @@ import bpy
 from ..core.bake.folder import LayerFolder
 from ..core.errors import FrameError
 from ..core.files import atomic_path
+from ..core.pictures import exr_is_cut_off
 
 GROUP = "Fit Flare"
 LAYERS = "Fit Flare Layers"
@@ -476,10 +477,28 @@ def render_frames(scene: Any, frames: Iterable[int], path_of: Callable[[int, str
         for suffix in (".exr", ".png"):
             _set_format(scene.render.image_settings, suffix)
             with atomic_path(path_of(frame, suffix)) as temporary:
-                _render_result().save_render(str(temporary), scene=scene)
-                if not temporary.stat().st_size:
-                    raise FrameError(f"Blender could not write frame {frame} to {temporary.parent}.")
+                try:
+                    _render_result().save_render(str(temporary), scene=scene)
+                except RuntimeError as problem:
+                    raise _unwritten(temporary) from problem
+                if not _is_whole(temporary):
+                    raise _unwritten(temporary)
         done(frame)
+
+
+_PNG_END = b"IEND\xaeB`\x82"
+
+
+def _is_whole(path: Path) -> bool:
+    """Of a picture that Blender has written: it does not say so when a disk fills up meanwhile."""
+    if path.suffix == ".exr":
+        return path.stat().st_size > 0 and not exr_is_cut_off(path)
+    return path.read_bytes().endswith(_PNG_END)
+
+
+def _unwritten(path: Path) -> FrameError:
+    return FrameError(f"Blender could not write a whole file to {path.parent}; make room there, or choose another "
+                      "folder.")
 
 
 def _render_result() -> Any:
@@ -502,12 +521,17 @@ def save_beside(path: Path) -> None:
     versions = preferences.save_version
     preferences.save_version = 0  # no .blend1 of a file that is made anew
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        bpy.ops.wm.save_as_mainfile(filepath=os.fspath(path))
-        for image in bpy.data.images:
-            if image.source == "SEQUENCE":
-                with contextlib.suppress(ValueError):
-                    image.filepath = bpy.path.relpath(bpy.path.abspath(image.filepath))
-        bpy.ops.wm.save_as_mainfile(filepath=os.fspath(path))
+        with atomic_path(path) as temporary:
+            try:
+                bpy.ops.wm.save_as_mainfile(filepath=os.fspath(temporary))
+                for image in bpy.data.images:
+                    if image.source == "SEQUENCE":
+                        with contextlib.suppress(ValueError):
+                            image.filepath = bpy.path.relpath(bpy.path.abspath(image.filepath))
+                bpy.ops.wm.save_as_mainfile(filepath=os.fspath(temporary))
+                with bpy.data.libraries.load(os.fspath(temporary)):
+                    pass  # it can be read again: Blender does not say so when a disk fills up meanwhile
+            except (RuntimeError, OSError) as problem:
+                raise _unwritten(temporary) from problem
     finally:
         preferences.save_version = versions

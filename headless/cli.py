@@ -14,13 +14,13 @@ import traceback
 from collections.abc import Iterator, Sequence
 from typing import Any, NoReturn, TextIO
 
-from ..core.errors import Cancelled, EngineError, FitFlareError, refusal
+from ..core.errors import Cancelled, EngineError, FitFlareError, SettingsError, refusal
 from ..core.progress import JsonProgress, OpenJdProgress, Progress, TerminalProgress, stoppable
 from . import hand_off
 from .command import Command, Step
 from .commands import COMMANDS
 
-DONE, FAILED, MISUSED, STOPPED = 0, 1, 2, hand_off.STOPPED
+DONE, FAILED, MISUSED, STOPPED = 0, 1, hand_off.MISUSED, hand_off.STOPPED
 
 _DESCRIPTION = """\
 Takes lens flares out of footage, learns them, and gives them back as layers.
@@ -34,13 +34,9 @@ Status at the end: 0 done; 1 it could not be done, the last line says why; 2 the
 `COMMAND --help` tells more."""
 
 
-class Misuse(FitFlareError):
-    """Words on the command line that make no sense."""
-
-
 class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
-        raise Misuse(f"{message[0].upper()}{message[1:]} (see {self.prog} --help).")
+        raise SettingsError(f"{message[0].upper()}{message[1:]} (see {self.prog} --help).")
 
 
 def parser() -> argparse.ArgumentParser:
@@ -74,7 +70,7 @@ def main(words: Sequence[str]) -> int:
 
     An option with nothing behind its "=" counts as not given: the templates of farms cannot leave one out.
     """
-    words = [word for word in words if not (word.startswith("--") and word.endswith("="))]
+    words = [word for word in words if not (word.startswith("--") and word.find("=") == len(word) - 1)]
     if not words:
         parser().print_help(sys.stderr)
         return MISUSED
@@ -88,6 +84,8 @@ def main(words: Sequence[str]) -> int:
 def _status(words: Sequence[str], progress: Progress) -> int:
     arguments = argparse.Namespace(words=list(words))
     try:
+        if "" in words:
+            raise SettingsError("One of the words is empty; leave it out, or name what it is to be.")
         arguments = parser().parse_args(words, arguments)
         with stoppable(progress):
             result = _run(COMMANDS[arguments.command], arguments, words, progress)
@@ -96,7 +94,7 @@ def _status(words: Sequence[str], progress: Progress) -> int:
         return DONE
     except SystemExit as end:  # --help
         return int(end.code or 0)
-    except Misuse as problem:
+    except SettingsError as problem:
         progress.error(str(problem))
         return MISUSED
     except (Cancelled, KeyboardInterrupt) as stop:

@@ -21,14 +21,14 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from ..core.errors import Cancelled, EngineError, FitFlareError
+from ..core.errors import Cancelled, EngineError, FitFlareError, SettingsError
 from ..core.progress import Progress
 from .command import Side
 
 ROOT = Path(__file__).resolve().parents[1]
 RUN = ROOT / "headless" / "run.py"
 WINDOWS = os.name == "nt"
-STOPPED = 130  # the status of a process that was asked to stop, and did
+MISUSED, STOPPED = 2, 130  # statuses: the words made no sense; it was asked to stop, and did
 PATIENCE_S = 60.0  # for a stopped process to write what it must
 
 
@@ -154,12 +154,18 @@ def own_group() -> dict[str, Any]:
     return {"start_new_session": True}
 
 
+def with_options(words: Sequence[str], *added: str) -> list[str]:
+    """The command's words with options more, before the "--" after which there are none."""
+    end = words.index("--") if "--" in words else len(words)
+    return [*words[:end], *added, *words[end:]]
+
+
 def run_there(command: Sequence[str], words: Sequence[str], step: str, progress: Progress) -> dict[str, Any]:
     """Run one step of the command `words` in another process and return its result.
 
     Raises Cancelled when that process was stopped, and FitFlareError with its own sentence when it failed.
     """
-    whole = [*command, *words, "--step", step, "--progress", "json"]
+    whole = [*command, *with_options(words, "--step", step, "--progress", "json")]
     with tempfile.TemporaryFile() as noise:
         try:
             child = subprocess.Popen(whole, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=noise,
@@ -179,7 +185,7 @@ def run_there(command: Sequence[str], words: Sequence[str], step: str, progress:
             sys.stderr.write("".join(noise.read().decode("utf-8", "replace").splitlines(keepends=True)[-40:]))
             raise EngineError(f"{Path(whole[0]).name} ended with status {child.returncode} during {step}; "
                               "its last words stand above.")
-        raise Cancelled(error) if child.returncode == STOPPED else FitFlareError(error)
+        raise {STOPPED: Cancelled, MISUSED: SettingsError}.get(child.returncode, FitFlareError)(error)
 
 
 def _relayed(child: subprocess.Popen[str], progress: Progress) -> tuple[dict[str, Any], str | None]:

@@ -89,8 +89,8 @@ def run_parts(words: argparse.Namespace, step: str, parts: Sequence[Sequence[str
         while ended < len(parts) and (past_failures or not errors):
             while len(children) < len(parts) and len(children) - ended < jobs:
                 noises.append(tempfile.TemporaryFile())  # noqa: SIM115 - closed below, when its process has ended
-                whole = [sys.executable, str(hand_off.RUN), *words.words, "--step", step, *parts[len(children)],
-                         "--progress", "json"]
+                own = hand_off.with_options(words.words, "--step", step, *parts[len(children)], "--progress", "json")
+                whole = [sys.executable, str(hand_off.RUN), *own]
                 children.append(subprocess.Popen(whole, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
                                                  stderr=noises[-1], encoding="utf-8", errors="replace",
                                                  env=environment, **hand_off.own_group()))

@@ -42,6 +42,20 @@ def words() -> list[str]:
     return sys.argv[1:]
 
 
+def open_streams() -> None:
+    """What a daemon or a scheduler has closed leads nowhere, and what a terminal cannot show is shown as "?"."""
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # takes the lowest number that is free: this one
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(number, "r" if number == 0 else "w", closefd=False))  # noqa: SIM115
+    for stream in (sys.stdout, sys.stderr):
+        if hasattr(stream, "reconfigure"):
+            stream.reconfigure(errors="replace")
+
+
 def leave(status: int) -> None:
     """End the process. Blender as a Python module may hang at interpreter exit (seen with 4.5)."""
     sys.stdout.flush()
@@ -55,6 +69,7 @@ def leave(status: int) -> None:
 if __name__ == "__mp_main__":  # a process that one of ours has spawned, which looks up our modules by name
     load()
 if __name__ == "__main__":
+    open_streams()
     package = load()
     importlib.import_module(f"{package}.core.numeric_environment").prepare_for_numpy_and_torch()
     leave(importlib.import_module(f"{package}.headless.cli").main(words()))

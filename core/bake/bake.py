@@ -6,9 +6,10 @@ processes may make frames of one folder. `bake.json` lists what is whole; it is 
 """
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
@@ -157,15 +158,22 @@ def bake_frames(source: Sequenced, frames: Sequence[Frame], cameras: Mapping[str
             asked = LookEdits.parse([*one.words, *asked.words()], source.lights, source.elements)
         return one.finished(_layers(one, camera, asked, source.lights).in_space(space), camera)
 
+    @contextlib.contextmanager
+    def in_turn() -> Iterator[None]:
+        """While a frame takes its name: nobody else writes here, and the folder is still this bake's."""
+        with locked(out / LOCK):
+            _check_is_of_this(out, made_from, names)
+            yield
+
     for frame in frames:
         if frame in done:
             continue
         path = out / frame.file
-        if (out / RECORD).exists():  # before a frame of another bake is written over
-            _check_is_of_this(read_json(out / RECORD, RunError), out, made_from, names)
+        _check_is_of_this(out, made_from, names)  # before it is rendered in vain
         remove_partial_of(path)
         # Not kept in a name: at 4K the layers of one frame are half a gigabyte.
-        write_layers(path, made(frame), half=settings.half, chromaticities=space.chromaticities, notes=notes(frame))
+        write_layers(path, made(frame), half=settings.half, chromaticities=space.chromaticities, notes=notes(frame),
+                     turn=in_turn())
         record = _add_to_record(out, made_from, names, [_entry(out, frame, of_frame(frame).rest)])
         progress.advance()
     return record
@@ -180,27 +188,22 @@ def _layers(renderer: OfCamera, camera: Camera, edits: LookEdits, lights: Sequen
 
 
 def _begin(out: Path, made_from: dict[str, Any], names: dict[str, str], overwrite: bool) -> None:
-    """Refuse, or clear away, what was made otherwise."""
-    if not (out / RECORD).exists():
-        return
+    """Have the folder for this bake: refuse, or clear away, what was made otherwise."""
     with locked(out / LOCK):
-        if not (out / RECORD).exists():  # another task has just cleared it away
+        record = read_record(out) if (out / RECORD).exists() else None
+        if record is not None and (record["made_from"], record["layers"]) == (made_from, names):
             return
-        record = read_record(out)
-        same = record["made_from"] == made_from
-        if (same and record["layers"] == names) or not record["frames"]:
-            return
-        if same and not overwrite:
-            raise RunError(f"{out} holds layers of the lights {', '.join(record['layers'])}, and these frames have "
-                           f"{', '.join(names) or 'none'}: one sequence has the same in all frames. Give all frames at "
-                           "once, or another folder, or overwrite them (--overwrite).")
-        if not overwrite:
+        if record is not None and record["frames"] and not overwrite:
+            if record["made_from"] == made_from:
+                raise RunError(f"{out} holds layers of the lights {', '.join(record['layers'])}, and these frames have "
+                               f"{', '.join(names) or 'none'}: one sequence has the same in all frames. Give all "
+                               "frames at once, or another folder, or overwrite them (--overwrite).")
             raise RunError(f"{out} holds layers that were baked from another fit or with other settings; "
-                           f"choose another folder, or overwrite them (--overwrite).")
-        for entry in record["frames"]:  # a mixture of two bakes would pass for one sequence
+                           "choose another folder, or overwrite them (--overwrite).")
+        for entry in record["frames"] if record is not None else ():  # a mixture would pass for one sequence
             for file in (entry["file"], *entry.get("rest", ())):
                 (out / file).unlink(missing_ok=True)
-        (out / RECORD).unlink()
+        write_json(out / RECORD, {"version": VERSION, "made_from": made_from, "layers": names, "frames": []})
 
 
 def _is_made(path: Path, wanted: Mapping[str, Any]) -> bool:
@@ -221,9 +224,12 @@ def _entry(out: Path, frame: Frame, rest: Sequence[Path]) -> dict[str, Any]:
     return {"file": frame.file, "frame": frame.number, "view": frame.view, "width": width, "height": height, **beside}
 
 
-def _check_is_of_this(record: Mapping[str, Any], out: Path, made_from: dict[str, Any], names: dict[str, str]) -> None:
-    """Raises RunError where bake.json lists what was made otherwise."""
-    if record.get("frames") and (record.get("made_from"), record.get("layers")) != (made_from, names):
+def _check_is_of_this(out: Path, made_from: dict[str, Any], names: dict[str, str]) -> None:
+    """Raises RunError where another bake has begun in the folder, with other settings, since this one did."""
+    if not (out / RECORD).exists():
+        return
+    record = read_record(out)
+    if (record["made_from"], record["layers"]) != (made_from, names):
         raise RunError(f"Another bake, of another fit or with other settings, writes to {out} meanwhile; choose "
                        "another folder for this one.")
 
@@ -233,8 +239,8 @@ def _add_to_record(out: Path, made_from: dict[str, Any], names: dict[str, str],
     """bake.json with these entries beside those of others who write to this folder. Raises RunError where it tells of
     frames that were made with other settings since this bake began."""
     with locked(out / LOCK):
+        _check_is_of_this(out, made_from, names)
         found = read_record(out) if (out / RECORD).exists() else {}
-        _check_is_of_this(found, out, made_from, names)
         known = {entry["file"]: entry for entry in found.get("frames", []) if (out / entry["file"]).is_file()}
         known.update({entry["file"]: entry for entry in entries})
         frames = sorted(known.values(), key=lambda entry: (Path(entry["file"]).parent.as_posix(), entry["frame"]))
@@ -257,6 +263,6 @@ def read_record(out: Path | str) -> dict[str, Any]:
         if record["version"] != VERSION or not isinstance(record["made_from"], dict):
             raise ValueError(f"version {record['version']}")
         dict(record["layers"]).items()
-    except (KeyError, TypeError, ValueError) as problem:
+    except (ArithmeticError, KeyError, TypeError, ValueError) as problem:
         raise RunError(f"{path} is damaged or from another version ({problem!r}); bake into a new folder.") from problem
     return record

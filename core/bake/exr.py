@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +23,10 @@ VERSION = 1
 
 
 def write_layers(path: Path | str, layers: FrameLayers, *, half: bool = True,
-                 notes: Mapping[str, Any] | None = None, chromaticities: Chromaticities | None = REC_709) -> None:
-    """Write a frame's layers atomically, ZIP compressed; depth stays 32 bit when the rest is `half`.
+                 notes: Mapping[str, Any] | None = None, chromaticities: Chromaticities | None = REC_709,
+                 turn: AbstractContextManager[None] | None = None) -> None:
+    """Write a frame's layers atomically, ZIP compressed; depth stays 32 bit when the rest is `half`. turn: see
+    `atomic_path`.
 
     notes: JSON-able entries for the header (view, frame, …). chromaticities: of the layers' linear space.
     """
@@ -32,7 +35,7 @@ def write_layers(path: Path | str, layers: FrameLayers, *, half: bool = True,
     header: dict[str, Any] = {"software": "Fit Flare", ATTRIBUTE: description}
     if chromaticities is not None:
         header["chromaticities"] = chromaticities
-    write_exr(path, layers.channels(), half=half, header=header)
+    write_exr(path, layers.channels(), half=half, header=header, turn=turn)
 
 
 def read_description(path: Path | str) -> dict[str, Any]:

@@ -233,7 +233,8 @@ def _change(text: str, what: str, value: str) -> Edit:
     signed = what == "rotation"
     if len(numbers) != wanted or not all(abs(number) <= _LARGEST and (signed or number >= 0) for number in numbers):
         kind = "one number" if wanted == 1 else "three numbers (or #rrggbb)"
-        raise SettingsError(f"The edit {text!r} needs {kind} {'' if signed else 'of 0 or more '}after the equals sign.")
+        least = -_LARGEST if signed else 0
+        raise SettingsError(f"The edit {text!r} needs {kind} from {least:g} to {_LARGEST:g} after the equals sign.")
     if what in _FLAGS and numbers[0] not in (0, 1):
         raise SettingsError(f"The edit {text!r} needs 0 or 1 after the equals sign.")
     value_of: Any = tuple(numbers) if what == "tint" else bool(numbers[0]) if what in _FLAGS else numbers[0]

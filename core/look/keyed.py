@@ -8,6 +8,7 @@ numbers run in straight lines; before the first and after the last they stay.
 """
 from __future__ import annotations
 
+import re
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -33,7 +34,11 @@ class KeyedEdits:
         try:
             if strange := set(data) - {"set", "frames"}:
                 raise ValueError(f"it has {', '.join(sorted(map(repr, strange)))}")
-            frames = {int(number): _words(words) for number, words in data.get("frames", {}).items()}
+            frames: dict[int, tuple[str, ...]] = {}
+            for number, words in data.get("frames", {}).items():
+                if not re.fullmatch(r"-?\d{1,9}", number) or int(number) in frames:
+                    raise ValueError(f"{number!r} is no frame number, or stands there twice")
+                frames[int(number)] = _words(words)
             return cls(_words(data.get("set", [])), dict(sorted(frames.items())))
         except (AttributeError, TypeError, ValueError) as problem:
             raise SettingsError(f'{path} should read {{"set": ["lamp.intensity=2"], "frames": {{"1": [...]}}}} '

@@ -31,6 +31,7 @@ from .plane import PlaneGaussians
 
 VERSION = 1
 _LARGEST = 1 << 15  # pixels of a side
+_MOST_FRAMES = 10**9
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,7 +134,7 @@ class Shot:
             here = Path(path).parent
             run = here / data["run"] if data.get("run") else None
             return cls(here / data["flare"], frames, data.get("query", "target"), run, bool(data.get("live")))
-        except (AttributeError, KeyError, TypeError, ValueError, np.linalg.LinAlgError) as problem:
+        except (ArithmeticError, AttributeError, KeyError, TypeError, ValueError, np.linalg.LinAlgError) as problem:
             raise SettingsError(f"{path} is not a shot that can be rendered ({problem!r}); "
                                 "export it again.") from problem
 
@@ -158,7 +159,10 @@ def _frame(entry: Mapping[str, Any], data: Mapping[str, Any]) -> ShotFrame:
         raise ValueError("a light has no place")
     if not all(isinstance(word, str) for word in entry.get("edits", [])):
         raise ValueError("edits are a list of texts")
-    return ShotFrame(int(entry["frame"]), str(entry.get("name", "Camera")),
+    number = _number(entry["frame"])
+    if number != int(number) or not 0 <= number < _MOST_FRAMES:
+        raise ValueError(f"the frame {entry['frame']!r} is no number of a file")
+    return ShotFrame(int(number), str(entry.get("name", "Camera")),
                      Camera(width, height, fx, fy, cx, cy, pose, exposure), lights, tuple(entry.get("edits", [])))
 
 

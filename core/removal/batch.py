@@ -7,7 +7,7 @@ from collections.abc import Container, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from ..errors import FrameError, SettingsError
+from ..errors import DISK_FULL, FrameError, SettingsError, refusal
 from ..files import check_apart
 from ..pictures import pictures_below
 from ..progress import Progress
@@ -78,7 +78,10 @@ def remove_all(inputs: Sequence[Path], folder: Path, remover: Remover, progress:
                 _remove(path, name, results[name], remover, sequences, mattes)
                 made += 1
         except (FrameError, OSError, MemoryError) as problem:
-            failed.append(str(problem) or f"{path} does not fit into memory.")
+            if isinstance(problem, OSError) and problem.errno in DISK_FULL:
+                raise  # none of the others would fit either
+            failed.append(refusal(problem) if isinstance(problem, OSError) else
+                          str(problem) or f"{path} does not fit into memory.")
             progress.say(f"Left out: {failed[-1]}")
         progress.advance()
     if kept:

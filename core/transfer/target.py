@@ -91,6 +91,7 @@ def of_pictures(paths: Sequence[Path], look: Look, lights: Mapping[str, tuple[fl
     seen: what each source was learned from; a light that was found shows the source that stood most like it. Raises
     SettingsError where a picture has no light, and for two of one name.
     """
+    paths = list(dict.fromkeys(paths))
     by_name = {path.name: path for path in paths}
     if len(by_name) < len(paths):
         twin = next(path for path in paths if by_name[path.name] != path)

@@ -96,6 +96,9 @@ def run_shot(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
 
     if words.edits or words.keyed:
         raise SettingsError("The edits of a shot stand in its file; --set and --edits are for runs.")
+    for name in ("scene", "lights", "capture", "blend"):
+        if getattr(words, name):
+            raise SettingsError(f"--{name} is not for a shot, whose file says all; leave it out.")
     shot = Shot.read(words.run).sized(*size(words.size))
     wanted = frames.asked([Frame("", one.frame, "") for one in shot.frames], words.frames, progress)
     if words.jobs != 1:

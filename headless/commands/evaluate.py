@@ -39,8 +39,8 @@ def scores_of(folder: Path, progress: Progress, *, which: str = "held-out",
         raise RunError(f"{folder} held no view out; score others with --views train or all.")
     frames = Frames(capture, made.settings.width)
     scores = evaluate(made, capture, {view: frames.camera(view) for view in views}, progress, frames.inside)
+    progress.say(table(scores))  # first, since the folder may be one that is not to be written
     write_json(made.folder / EVALUATION, scores)
-    progress.say(table(scores))
     return {"eval": str(made.folder / EVALUATION),
             "scores": {layer: part for layer, part in scores.items() if isinstance(part, dict)}}
 

@@ -48,6 +48,8 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     cameras = {view.name: view.camera for view in Capture.open(folder, need_frames=False).views}
     wanted = frames.asked(numbered(cameras), words.frames, progress)
     if words.kind == "preset":
+        if words.frames is not None and len(wanted) > 1:
+            raise SettingsError(f"A preset is of one frame, and --frames {words.frames} are {len(wanted)}; name one.")
         pose = cameras[wanted[0].view].world_to_camera
         write_preset(words.out, look, {light.name: ViewOfLight.of(pose, light.xyz) for light in look.lights}, edits)
         progress.say(f"The preset is {words.out}.")

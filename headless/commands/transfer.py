@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import hashlib
 import math
 from pathlib import Path
 from typing import Any
@@ -115,7 +116,7 @@ def shot_path(words: argparse.Namespace) -> Path:
     """Where Blender's part leaves the shot; chunks of one shot each have their own."""
     if words.shot:
         return Path(words.shot)
-    part = f".{words.frames.replace(',', '_')}" if words.frames else ""
+    part = f".{hashlib.sha256(words.frames.encode()).hexdigest()[:8]}" if words.frames else ""
     return Path(words.out) / f"shot{part}.json"
 
 

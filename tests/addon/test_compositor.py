@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import sys
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -133,3 +134,10 @@ def test_the_saved_file_shows_the_same_elsewhere_and_without_us(made: Made, blen
         assert_half_equal(rgb(tmp_path / "again" / f"{number}.exr"), rgb(made.out / "changed" / f"{number}.exr"))
     before, after = made.out / "changed" / f"{NUMBERS[-1]}.png", tmp_path / "again" / "last.png"
     np.testing.assert_array_equal(rgb(after), rgb(before))
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="files are kept from growing in another way elsewhere")
+def test_a_file_that_does_not_fit_the_disk_is_told_and_not_left(made: Made) -> None:
+    refused, left = made.facts["full"]
+    assert [sentence.startswith("Blender could not write a whole file to ") for sentence in refused] == [True, True]
+    assert left == []

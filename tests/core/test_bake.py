@@ -351,7 +351,19 @@ def test_bakes_at_once_with_other_settings_do_not_mix(tmp_path: Path, after: int
     assert len(read_record(tmp_path)["frames"]) == 3
     again = another_fit()
     bake(again, FRAMES, CAMERAS, tmp_path)
-    assert again.rendered == [after], "the frame that was being written"
+    assert again.rendered == [], "nothing of the other's was lost, the frame that was being written least of all"
+
+
+def test_of_two_bakes_that_begin_in_one_new_folder_one_is_refused(tmp_path: Path) -> None:
+    """Neither has a frame yet when the other begins."""
+    class Meanwhile(FakeRenderer):
+        def render(self, camera: Camera, edits: LookEdits | None = None) -> FakeRendering:
+            bake(another_fit(), FRAMES, CAMERAS, tmp_path)
+            return super().render(camera, edits)
+
+    with pytest.raises(RunError, match="Another bake, of another fit or with other settings"):
+        bake(Meanwhile(), FRAMES, CAMERAS, tmp_path)
+    assert {read_description(tmp_path / frame.file)["renderer"] for frame in FRAMES} == {"another"}
 
 
 def test_a_bake_that_came_to_nothing_is_in_nobody_s_way(tmp_path: Path) -> None:

@@ -2,11 +2,13 @@
 """Files are whole or absent, and names stay inside their folder."""
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -227,6 +229,48 @@ def test_a_lock_is_held_by_one_and_outlives_no_one(tmp_path: Path) -> None:
         with locked(lock, stale_s=0.05):  # as if the holder had been killed
             assert time.monotonic() - started >= 0.04
     assert not lock.exists()
+
+
+def test_a_lock_out_of_the_future_outlives_no_one_either(tmp_path: Path) -> None:
+    """A clock was set back, or another machine's goes before."""
+    lock = tmp_path / ".lock"
+    lock.touch()
+    os.utime(lock, (time.time() + 3600, time.time() + 3600))
+    started = time.monotonic()
+    with locked(lock, stale_s=0.1):
+        assert 0.09 <= time.monotonic() - started < 5
+
+
+def test_a_name_that_json_has_twice_is_told(tmp_path: Path) -> None:
+    """The first of both would be lost."""
+    (tmp_path / "a.json").write_text('{"frames": {"6": [1], "7": [], "6": [2]}}')
+    with pytest.raises(CaptureError, match="it has '6' twice"):
+        read_json(tmp_path / "a.json", CaptureError)
+
+
+def test_a_file_takes_its_name_in_turn(tmp_path: Path) -> None:
+    seen = []
+
+    @contextlib.contextmanager
+    def turn() -> Iterator[None]:
+        seen.append((tmp_path / "a").exists())
+        yield
+        seen.append((tmp_path / "a").exists())
+
+    with atomic_path(tmp_path / "a", turn()) as temporary:
+        temporary.write_text("whole")
+        assert seen == []
+    assert seen == [False, True]
+
+
+def test_where_nothing_may_be_written_the_file_itself_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(**_: object) -> None:
+        raise PermissionError(errno.EACCES, "Permission denied", str(tmp_path / ".partial-eval.json-1"))
+
+    monkeypatch.setattr("core.files.tempfile.mkstemp", refuse)
+    with pytest.raises(PermissionError) as problem, atomic_path(tmp_path / "eval.json"):
+        pytest.fail("there is nothing to write to")
+    assert problem.value.filename == str(tmp_path / "eval.json")
 
 
 def test_a_folder_that_may_not_be_written_is_told_in_the_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

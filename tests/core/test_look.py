@@ -386,7 +386,8 @@ def test_keyed_edits_run_between_frames(tmp_path: Path) -> None:
     np.testing.assert_allclose(strength, [0, 0, 0.5, 1, 1])
     assert [again.at(frame, ["lamp"]).light("lamp").mute for frame in (10, 19, 20)] == [False, False, True]
     assert again.at(15, ["lamp"]).light("lamp").scale == 2
-    for text in ("[]", '{"set": "a"}', '{"frames": {"x": []}}', "{"):
+    for text in ("[]", '{"set": "a"}', '{"frames": {"x": []}}', "{", '{"frames": {"6": [], "06": []}}',
+                 '{"frames": {"6": [], "6": []}}', '{"frames": {"1_0": []}}', '{"frames": {"9999999999": []}}'):
         (tmp_path / "edits.json").write_text(text)
         with pytest.raises(SettingsError, match=r"edits\.json"):
             KeyedEdits.read(tmp_path / "edits.json")
@@ -443,7 +444,11 @@ def test_a_shot_is_read_as_it_was_written(tmp_path: Path) -> None:
     assert again.sized(128, None).frames[0].camera.size == (128, 80)
     text = (tmp_path / "shot.json").read_text()
     for old, new in (('"version": 1', '"version": 2'), ('"share": 1.0', '"share": "x"'), ('"frames"', '"frame"'),
-                     ('"width": 64', '"width": -1'), ('"query": "target"', '"query": "moon"')):
+                     ('"width": 64', '"width": -1'), ('"query": "target"', '"query": "moon"'),
+                     ('"frame": 1', '"frame": 1e400'), ('"frame": 1', '"frame": 1.5'), ('"frame": 1', '"frame": -5'),
+                     ('"frame": 1', '"frame": 1e30'), ('"width": 64', '"width": 1e400'),
+                     ('"share": 1.0', '"share": 1' + 400 * "0"), ('"exposure": 1.0', '"exposure": 0')):
+        assert old in text
         (tmp_path / "bad.json").write_text(text.replace(old, new))
         with pytest.raises(SettingsError, match=r"bad\.json"):
             Shot.read(tmp_path / "bad.json")

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import os
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -141,9 +143,17 @@ def test_a_picture_shrinks_in_light() -> None:
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs the device that is always full, which Linux has")
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere all names are Unicode")
+def test_a_folder_that_is_not_utf8_is_refused_by_name(tmp_path: Path) -> None:
+    folder = tmp_path / os.fsdecode(b"caf\xe9")
+    with pytest.raises(FrameError, match="is not UTF-8"):
+        write_exr(folder / "a.exr", {"R": np.zeros((2, 2), np.float32)})
+    assert not folder.exists()
+
+
 def test_a_full_disk_is_told_as_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     @contextlib.contextmanager
-    def full(_target: Path) -> Iterator[Path]:
+    def full(_target: Path, _turn: object = None) -> Iterator[Path]:
         yield Path("/dev/full")
 
     monkeypatch.setattr(pictures, "atomic_path", full)

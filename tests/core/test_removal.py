@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import io
 import json
 import os
@@ -11,6 +12,7 @@ import struct
 import threading
 import zlib
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -25,7 +27,7 @@ from core.colour.spaces import AP1
 from core.errors import Cancelled, FrameError, RunError, SettingsError
 from core.pictures import read_exr, read_picture, write_exr, write_png
 from core.progress import Progress
-from core.removal import inference, weights
+from core.removal import batch, inference, weights
 from core.removal.batch import plates_of, remove_all
 from core.removal.captured import UNFINISHED, remove_from
 from core.removal.inference import FlareMap, Remover, Told, carried_up, flare_light
@@ -668,6 +670,27 @@ def test_bad_plates_do_not_stop_the_others(tmp_path: Path, everywhere: Path) -> 
     assert f"{len(bad)} of {len(bad) + 1} plates" in str(told.value)
     assert all(path.name in str(told.value) for path in bad)
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["good.png", RECORD]
+
+
+def test_a_full_disk_ends_the_batch(tmp_path: Path, nowhere: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """None of the others would fit; what else the system refuses is told in its own sentence."""
+    for name in ("a", "b", "c"):
+        write_codes(tmp_path / "in" / f"{name}.png", picture())
+    tried: list[str] = []
+
+    def refused(number: int) -> Any:
+        def remove(path: Path, *_: object) -> None:
+            tried.append(path.name)
+            raise OSError(number, os.strerror(number), str(path))
+        return remove
+
+    monkeypatch.setattr(batch, "_remove", refused(errno.ENOSPC))
+    with pytest.raises(OSError) as full:
+        remove_all([tmp_path / "in"], tmp_path / "out", Remover(nowhere, working_size=64), Progress())
+    assert (full.value.errno, tried) == (errno.ENOSPC, ["a.png"])
+    monkeypatch.setattr(batch, "_remove", refused(errno.EACCES))
+    with pytest.raises(FrameError, match=r"3 of 3 plates could not be cleaned: The system refused: Permission denied"):
+        remove_all([tmp_path / "in"], tmp_path / "out", Remover(nowhere, working_size=64), Progress())
 
 
 def test_what_is_there_is_kept(tmp_path: Path, everywhere: Path) -> None:

@@ -107,6 +107,8 @@ def test_on_to_a_picture_the_flare_goes_to_the_light(look: Look, tmp_path: Path)
     np.testing.assert_allclose(pixels[0], (90.0, 20.0), atol=1e-9)
     assert depth[0] > 0
     assert np.linalg.norm(one.shot.lights[0].xyz) == pytest.approx(4.0)
+    twice = of_pictures(2 * [tmp_path / "plate.0007.png"], look, {"sun": (90.0, 20.0)}, {}, {name(look): 4.0})
+    assert len(twice.frames) == 1
     with pytest.raises(SettingsError, match="No light was found"):
         of_pictures([tmp_path / "plate.0007.png"], look, {}, {}, {name(look): 4.0})
 

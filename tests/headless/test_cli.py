@@ -62,9 +62,18 @@ def test_misuse_is_status_2_and_one_sentence(words: list[str], capfd: pytest.Cap
 
 @pytest.mark.parametrize("words", [
     ["eval", "no/run"], ["bake", "no/run", "--out", "{tmp}/o"], ["fit", "no/capture", "--out", "{tmp}/o"],
-    ["demo", "--capture", "no/capture", "--out", "{tmp}/o"],
+    ["demo", "--capture", "no/capture", "--out", "{tmp}/o"], ["engine", "--engine", "no/python"],
+    ["transfer", "no.flare", "--to", "a.png", "--out", "{tmp}/o", "--light", "nan,20"],
+])
+def test_what_cannot_be_done_is_status_1_and_one_sentence(words: list[str], capture: Path, tmp_path: Path,
+                                                          capfd: pytest.CaptureFixture[str]) -> None:
+    _is_refused(words, 1, capture, tmp_path, capfd)
+
+
+@pytest.mark.parametrize("words", [
     ["fit", "{capture}", "--out", "{tmp}/o", "--holdout", "no.json"],
     ["fit", "{capture}", "--out", "{tmp}/o", "--iterations", "0"],
+    ["fit", "{capture}", "--out", ""], ["bake", "", "--out", "{tmp}/o"],
     ["fit", "{capture}", "--out", "{tmp}/o", "--size", "-4"],
     ["fit", "{capture}", "--out", "{tmp}/o", "--set", "flare"],
     ["fit", "{capture}", "--out", "{tmp}/o", "--set", "flare.colour=1"],
@@ -88,8 +97,6 @@ def test_misuse_is_status_2_and_one_sentence(words: list[str], capfd: pytest.Cap
     ["lights", "{capture}", "--keep", "--boxes", "dino"],
     ["fit", "--list", "no.txt", "--out", "{tmp}/o", "--jobs", "0"],
     ["solve", "{capture}/images", "--out", "{tmp}/o", "--lights", "Lamp"],
-    ["engine", "--engine", "no/python"],
-    ["transfer", "no.flare", "--to", "a.png", "--out", "{tmp}/o", "--light", "nan,20"],
     ["transfer", "no.flare", "--to", "a.png", "--out", "{tmp}/o", "--focal", "0"],
     ["transfer", "no.flare", "--to", "a.png", "--out", "{tmp}/o", "--scale", "inf"],
     ["transfer", "no.flare", "--to", "a.png", "--out", "{tmp}/o", "--smooth", "99999999999"],
@@ -99,9 +106,15 @@ def test_misuse_is_status_2_and_one_sentence(words: list[str], capfd: pytest.Cap
         "learning_rate=abc", "stages=5", "polish=abc", "bank=1.5", "seed=-1", "pixels=NaN", "decay=-1", "canvas=abc",
         "clean=7", "average=9", "own_share=abc", "blocks=[1,2]")),
 ])
-def test_bad_input_is_status_1_and_one_sentence(words: list[str], capture: Path, tmp_path: Path,
-                                                capfd: pytest.CaptureFixture[str]) -> None:
-    assert cli.main([word.format(tmp=tmp_path, capture=capture) for word in words]) == 1
+def test_what_makes_no_sense_is_status_2_and_one_sentence(words: list[str], capture: Path, tmp_path: Path,
+                                                          capfd: pytest.CaptureFixture[str]) -> None:
+    """A farm need not repeat it."""
+    _is_refused(words, 2, capture, tmp_path, capfd)
+
+
+def _is_refused(words: list[str], status: int, capture: Path, tmp_path: Path,
+                capfd: pytest.CaptureFixture[str]) -> None:
+    assert cli.main([word.format(tmp=tmp_path, capture=capture) for word in words]) == status
     told = capfd.readouterr().err
     assert told.startswith("error: ")
     assert told.count("\n") == 1
@@ -168,6 +181,33 @@ def test_events_have_standard_output_for_themselves(monkeypatch: pytest.MonkeyPa
     assert "a library prints" in told.err
     assert cli.main(["try"]) == 0
     assert "a library prints" in capfd.readouterr().out
+
+
+@pytest.mark.parametrize("closed", [(1,), (2,), (0, 1, 2)])
+def test_streams_that_are_closed_are_not_missed(closed: tuple[int, ...]) -> None:
+    """Daemons and schedulers start programs so."""
+    for extra in ([], ["--progress", "json"]):
+        words = [sys.executable, str(cli.hand_off.RUN), "engine", *extra]
+        launcher = f"import os; [os.close(n) for n in {closed}]; os.execv({words[0]!r}, {words!r})"
+        done = subprocess.run([sys.executable, "-c", launcher], capture_output=True, check=False)
+        assert done.returncode == 0, done.stderr
+        assert bool(done.stdout) == (1 not in closed and bool(extra))
+
+
+def test_help_is_shown_on_a_terminal_of_ascii() -> None:
+    environment = {**os.environ, "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0", "LC_ALL": "C"}
+    done = subprocess.run([sys.executable, str(cli.hand_off.RUN), "--help"], capture_output=True, env=environment,
+                          check=False)
+    assert (done.returncode, done.stderr) == (0, b"")
+    assert b"COMMAND" in done.stdout
+
+
+def test_an_option_may_end_with_an_equals_sign(capture: Path, tmp_path: Path,
+                                               capfd: pytest.CaptureFixture[str]) -> None:
+    """Only one with nothing behind its own is left out."""
+    assert cli.main(["bake", str(tmp_path / "no run"), "--out=o=", "--frames="]) == 1
+    assert "is not the folder of a run" in capfd.readouterr().err
+    assert cli.main(["fit", str(capture), "--out", str(tmp_path / "o"), "--set=flare.count="]) == 2
 
 
 def test_a_farm_is_told_names_of_any_script(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from fit_flare.core.errors import Cancelled, EngineError, FitFlareError
+from fit_flare.core.errors import Cancelled, EngineError, FitFlareError, SettingsError
 from fit_flare.core.progress import Progress, stoppable
 from fit_flare.headless import hand_off
 
@@ -149,10 +149,19 @@ def test_events_of_the_other_process_become_ours(tmp_path: Path) -> None:
     assert heard.lines == [("bake", 5, 2), (4, {"loss": 0.5}), "äh"]
 
 
-def test_its_error_is_ours(tmp_path: Path) -> None:
-    code = "tell(type='error', text='The lamp is broken.')\nsys.exit(1)"
-    with pytest.raises(FitFlareError, match=r"^The lamp is broken\.$"):
+@pytest.mark.parametrize(("status", "error"), [(1, FitFlareError), (2, SettingsError), (130, Cancelled)])
+def test_its_error_is_ours(tmp_path: Path, status: int, error: type[FitFlareError]) -> None:
+    code = f"tell(type='error', text='The lamp is broken.')\nsys.exit({status})"
+    with pytest.raises(FitFlareError, match=r"^The lamp is broken\.$") as problem:
         hand_off.run_there(child(tmp_path, code), [], "x", Heard())
+    assert type(problem.value) is error
+
+
+def test_options_stand_before_what_ends_them(tmp_path: Path) -> None:
+    """Behind "--" all words are names of files."""
+    code = "tell(type='result', data={'words': sys.argv[1:]})\n"
+    result = hand_off.run_there(child(tmp_path, code), ["remove", "--out", "o", "--", "-a.png"], "remove", Heard())
+    assert result["words"] == ["remove", "--out", "o", "--step", "remove", "--progress", "json", "--", "-a.png"]
 
 
 def test_its_crash_is_told_with_its_last_words(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -46,6 +46,12 @@ def test_shares(numbers: list[int], count: int, expected: list[str]) -> None:
 
 
 @pytest.mark.usefixtures("program")
+def test_names_behind_two_dashes_stay_names() -> None:
+    words = argparse.Namespace(words=["remove", "--", "bad", "--frames"])
+    jobs.run_parts(words, "remove", [["--frames", "fine"]], 1, 1, Progress(), past_failures=True)
+
+
+@pytest.mark.usefixtures("program")
 def test_every_failed_process_is_told_those_without_a_reason_too(capfd: pytest.CaptureFixture[str]) -> None:
     run("fine", "fine")
     with pytest.raises(FitFlareError) as problem:

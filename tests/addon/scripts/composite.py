@@ -93,6 +93,26 @@ try:
 except compositor.FrameError as problem:
     facts["cropped"] = [str(problem), compositor.find_node(scene) is None]
 
+# A disk that fills up, which Blender does not tell of: files may not grow beyond a limit.
+if sys.platform == "linux":
+    import resource
+    import signal
+
+    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    scene.render.use_border = scene.render.use_crop_to_border = False
+    full, before = out / "full", resource.getrlimit(resource.RLIMIT_FSIZE)
+    refused = []
+    for write in (lambda: render(scene, "full", sorted(layers.files)[:1]),
+                  lambda: compositor.save_beside(full / "compositor.blend")):
+        resource.setrlimit(resource.RLIMIT_FSIZE, (1000, before[1]))
+        try:
+            write()
+        except compositor.FrameError as problem:
+            refused.append(str(problem))
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    facts["full"] = [refused, [path.name for path in full.iterdir()]]
+
 print(json.dumps(facts))
 sys.stdout.flush()
 os._exit(0)

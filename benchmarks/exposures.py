@@ -14,7 +14,6 @@ import math
 import sys
 import tempfile
 from collections.abc import Mapping
-from copy import copy
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -66,13 +65,6 @@ class Drifting(Capture):
         return None if picture is None else replace(picture, pixels=picture.pixels * np.float32(self.times[view.name]))
 
 
-def as_filmed_alone(capture: Capture) -> Capture:
-    """The same without flare-free frames and exact layers, by which exposures would be found more easily."""
-    alone = copy(capture)
-    alone._removed = alone._truth_scene = alone._truth_flare = {}
-    return alone
-
-
 def scores(run: Run, capture: Capture) -> list[str]:
     """PSNR of each layer, dB, means over the views that were held out."""
     _, views = capture.exposed(run.exposures).split(run.settings.holdout)
@@ -92,7 +84,7 @@ def compared(capture: Capture, mode: str, words: argparse.Namespace) -> list[lis
                            ("drifting", drifting, "found")):
         settings = replace(preset(words.preset, mode=mode), width=words.size, exposure=way)  # type: ignore[arg-type]
         with tempfile.TemporaryDirectory() as place:
-            run = fit(as_filmed_alone(one) if mode == "split" else one, settings, Path(place) / "run")
+            run = fit(one, settings, Path(place) / "run")
             rows.append([mode, name, way, *scores(run, one), _off(run.exposures, stops if one is drifting else {})])
     return rows
 

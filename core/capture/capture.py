@@ -167,12 +167,22 @@ class Capture:
 
         Where the cameras share one place, but for rounding: the median distance of the points from it, or 1.
         """
-        centre = self.centre
-        reach = max(float(np.linalg.norm(view.camera.position - centre)) for view in self.views)
-        away = float(np.median(np.linalg.norm(self.points.xyz - centre, axis=1))) if len(self.points) else 0.0
-        # A tripod's positions differ by rounding, or by what a solve leaves: that is no path.
-        least = max(1e-3 * away, 1e-9 * (1 + float(np.abs(centre).max())))
-        return 1.1 * reach if reach > least else away or 1.0
+        return self._away or 1.0 if self.only_turns else 1.1 * self._reach
+
+    @property
+    def only_turns(self) -> bool:
+        """Whether all cameras share one place, as on a tripod. Theirs differ by rounding, or by what a solve leaves."""
+        return self._reach <= max(1e-3 * self._away, 1e-9 * (1 + float(np.abs(self.centre).max())))
+
+    @property
+    def _reach(self) -> float:
+        """Of the cameras from their middle."""
+        return max(float(np.linalg.norm(view.camera.position - self.centre)) for view in self.views)
+
+    @property
+    def _away(self) -> float:
+        """Of the points from there, in the median; 0 without points."""
+        return float(np.median(np.linalg.norm(self.points.xyz - self.centre, axis=1))) if len(self.points) else 0.0
 
     def view(self, name: str) -> View:
         """The view of that name; CaptureError where there is none."""

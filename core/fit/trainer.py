@@ -31,7 +31,7 @@ from ..gaussians.loss import l1_ssim
 from ..gaussians.optimiser import Adam
 from ..gaussians.ordering import morton_order
 from . import exposure
-from .beginning import first_flare, first_scene, moved_lights
+from .beginning import doubts, first_flare, first_scene, moved_lights
 from .checkpoint import State
 from .frames import Frames, Targets, thinned
 from .rendering import render_flare, render_scene
@@ -62,7 +62,8 @@ class Trainer:
         """exposures: of the views, by name, where that is known already."""
         torch.manual_seed(settings.seed)
         self.settings = settings
-        self.frames = Frames(capture, settings.width, display_white=settings.display_white)
+        self.frames = Frames(capture, settings.width, display_white=settings.display_white,
+                             alone=not settings.supervised)
         if exposures is None:
             exposures = exposure.found(capture, self.frames) if settings.exposure == "found" else {}
         self.exposures = exposures
@@ -78,6 +79,7 @@ class Trainer:
         self.scene = first_scene(capture, settings, self.views, self.frames)
         self.flare = None if settings.mode == "3dgs" else first_flare(capture, self.views, self.frames, settings)
         self.says = (*self.frames.says, *exposure.says(self.exposures),
+                     *doubts(capture, settings, self.views, self.frames),
                      *(() if self.flare is None else moved_lights(capture, self.flare)))
         self.extent = capture.extent
         self._head_start = HeadStart(settings.split, len(self.views), settings.iterations)

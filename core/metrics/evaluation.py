@@ -201,5 +201,12 @@ def table(scores: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
+def worse_than_none(scores: dict[str, Any]) -> bool:
+    """Whether an empty flare would score more, by eval.json."""
+    flare = scores.get("flare", {})
+    found, empty = flare.get("psnr"), flare.get("empty_psnr")
+    return found is not None and empty is not None and found < empty
+
+
 def _cell(value: float | None, decimals: int) -> str:
     return "-" if value is None else f"{value:.{decimals}f}"

@@ -2,14 +2,16 @@
 """A capture's frames without the flare that a fit has found in them.
 
 What a fit knows of a flare it knows from all views together, which is more than any single plate says. Its flare is
-taken from a plate in linear light. Where the plate is clipped, nothing is left of what lay under the flare: there the
+taken from a plate in linear light, of each light as much as the plate shows of it. Where the plate is clipped, nothing is left of what lay under the flare: there the
 fitted scene stands in, as far as it is brighter. The lights' own clipped discs stay as they are; where the fit was
 shown light above white the scene stands in there too, so that a lamp keeps the light that is its own.
 """
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +30,17 @@ from .plates import Plate, read_plate, write_flare, write_plate
 from .record import Record, made_from
 
 Pixels = NDArray[np.float32]
+Floats = NDArray[np.float64]
+
+ASKED = 100_000
+"""Pixels of a plate, about, that are asked how much of each light's flare is there."""
+HALF = 0.5
+"""Part of a flare below which it is told that there is less of it."""
+ROUNDS, SWEEPS = 8, 50
+FAINT = 0.01
+"""Linear light, below which errors count by their squares."""
+KEPT = 1e-4
+"""How much, a pixel, counts what was fitted: more than the plate does for flares of a thousandth of white."""
 
 
 def remove_fitted(fitted: Renderer, capture: Capture, views: Sequence[View], folder: Path, progress: Progress, *,
@@ -48,15 +61,19 @@ def remove_fitted(fitted: Renderer, capture: Capture, views: Sequence[View], fol
     check_apart([capture.frame_path(view) for view in capture.views], itertools.chain.from_iterable(results))
     progress.stage("remove", len(views))
     record, lights = Record(folder), [(light.name, light.xyz.tolist()) for light in capture.lights]
-    made = 0
+    made, dim = 0, Counter[str]()
     for view, targets in zip(views, results, strict=True):
         name = Path(view.name)
         how = made_from(repr((made_by, view.camera.numbers, lights)), [capture.frame_path(view)])
         if overwrite or not record.is_made(name, how, targets):
             record.begin(name, how, targets, overwrite)
-            _remove(fitted, capture, view, targets, above_white)
+            parts = _remove(fitted, capture, view, targets, above_white)
+            dim.update(light for light, part in parts.items() if part < HALF)
             made += 1
         progress.advance()
+    for light, count in dim.items():
+        progress.say(f"{count} of {made} frames show less than half of the flare that {light!r} has in the fit; no "
+                     "more than they show was taken from them.")
     if made < len(views):
         progress.say(f"{len(views) - made} plates were in {folder} already; --overwrite makes them again.")
     progress.say(f"{len(views)} clean plates are in {folder}.")
@@ -71,18 +88,23 @@ def _results(view: View, folder: Path, flare_folder: Path | None) -> list[Path]:
     return [plate, inside(flare_folder, str(Path(view.name).with_suffix(".exr")), CaptureError)]
 
 
-def _remove(fitted: Renderer, capture: Capture, view: View, results: Sequence[Path], above_white: bool) -> None:
-    """results: the clean plate's path, and the flare's where it is wanted."""
+def _remove(fitted: Renderer, capture: Capture, view: View, results: Sequence[Path],
+            above_white: bool) -> dict[str, float]:
+    """results: the clean plate's path, and the flare's where it is wanted. Gives the part of each light's flare that
+    was there."""
     plate = read_plate(capture.frame_path(view))
     height, width = plate.codes.shape[:2]
     camera = view.camera if view.camera.size == (width, height) else view.camera.scaled(width, height)
     layers = fitted.render(camera)
     flare = np.zeros((height, width, 3), np.float32)
     part = plate.inside.part  # the borders, which were not fitted, stay
-    flare[part] = np.sum([flare, *layers.flare_by_light.values()], axis=0)[part]
-    scene = layers.scene
+    flares, scene = layers.flare_by_light, layers.scene
     if plate.encoding == "linear":  # the fit was shown Rec. 709
-        flare, scene = plate.space.from_linear(flare), plate.space.from_linear(scene)
+        flares = {light: plate.space.from_linear(one) for light, one in flares.items()}
+        scene = plate.space.from_linear(scene)
+    parts = _parts(plate, scene, flares)
+    for light, one in flares.items():
+        flare[part] += np.float32(parts[light]) * one[part]
     lights = clipped_discs(_display(plate), camera, [light.xyz for light in capture.lights])
     if above_white and plate.encoding == "linear":
         clean = without(plate, flare, scene, lights)
@@ -91,6 +113,45 @@ def _remove(fitted: Renderer, capture: Capture, view: View, results: Sequence[Pa
     write_plate(results[0], plate, clean)
     for result in results[1:]:
         write_flare(result, plate, flare)
+    return parts
+
+
+def _parts(plate: Plate, scene: Pixels, flares: Mapping[str, Pixels]) -> dict[str, float]:
+    """Of each light's flare the part, 0..1, that the plate holds beside the scene, in the sense of least absolute
+    errors: a light that is switched off, or hidden by what the fit knows nothing of, leaves no dark flare."""
+    if not flares:
+        return {}
+    part = plate.inside.part
+    step = max(round(math.sqrt(math.prod(plate.codes.shape[:2]) / ASKED)), 1)
+    shown, below, *over = (one[part][::step, ::step] for one in (_light(plate), scene, *flares.values()))
+    clipped = linear_from_srgb(np.array(CLIPPED)) if plate.encoding == "srgb" else np.inf
+    tells = (shown < clipped).all(-1)
+    left = (shown - below)[tells].ravel().astype(np.float64)
+    columns = np.stack([one[tells].ravel() for one in over], 1).astype(np.float64)
+    parts, weights = np.ones(len(flares)), np.ones(len(left))
+    held = KEPT * len(left) * np.eye(len(flares))
+    for _ in range(ROUNDS):
+        weighted = columns.T * weights
+        parts = _least_squares(weighted @ columns + held, weighted @ left + held.sum(1), parts)
+        weights = 1 / (np.abs(left - columns @ parts) + FAINT)
+    return dict(zip(flares, parts.tolist(), strict=True))
+
+
+def _least_squares(product: Floats, goal: Floats, begin: Floats) -> Floats:
+    """x (n,) within 0..1 that product x = goal comes nearest to, one coordinate after the other."""
+    found = begin.copy()
+    for _ in range(SWEEPS):
+        for at in range(len(found)):
+            rest = goal[at] - product[at] @ found + product[at, at] * found[at]
+            found[at] = min(max(rest / product[at, at], 0.0), 1.0)
+    return found
+
+
+def _light(plate: Plate) -> Pixels:
+    """Linear light of the codes."""
+    if plate.encoding == "srgb":
+        return linear_from_srgb(_display(plate))
+    return np.nan_to_num(plate.codes.astype(np.float32), nan=0.0, posinf=65504.0, neginf=0.0)
 
 
 def _display(plate: Plate) -> Pixels:
@@ -104,12 +165,10 @@ def without(plate: Plate, flare: Pixels, scene: Pixels, hidden: NDArray[np.bool_
     """The plate's codes less a flare, given linear light of flare and scene as (height, width, 3); kept to the last bit
     where there is no flare, and where they are no numbers. The scene stands in where the plate is clipped and where,
     (height, width), what lies under the flare is `hidden` otherwise."""
+    light = _light(plate)
+    clipped = np.zeros((*light.shape[:2], 1), bool)
     if plate.encoding == "srgb":
-        display = _display(plate)
-        light, clipped = linear_from_srgb(display), display.max(-1, keepdims=True) >= CLIPPED
-    else:
-        light = np.nan_to_num(plate.codes.astype(np.float32), nan=0.0, posinf=65504.0, neginf=0.0)
-        clipped = np.zeros((*light.shape[:2], 1), bool)
+        clipped = _display(plate).max(-1, keepdims=True) >= CLIPPED
     if hidden is not None:
         clipped = clipped | hidden[..., None]
     less = light - flare

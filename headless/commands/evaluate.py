@@ -29,7 +29,7 @@ def scores_of(folder: Path, progress: Progress, *, which: str = "held-out",
     from ...core.files import write_json
     from ...core.fit.frames import Frames
     from ...core.fit.run import EVALUATION, Run
-    from ...core.metrics.evaluation import evaluate, table
+    from ...core.metrics.evaluation import evaluate, table, worse_than_none
 
     made = Run.open(folder)
     capture = made.capture(capture_folder)
@@ -40,6 +40,9 @@ def scores_of(folder: Path, progress: Progress, *, which: str = "held-out",
     frames = Frames(capture, made.settings.width)
     scores = evaluate(made, capture, {view: frames.camera(view) for view in views}, progress, frames.inside)
     progress.say(table(scores))  # first, since the folder may be one that is not to be written
+    if worse_than_none(scores):
+        progress.say("The flare is farther from what was filmed than none at all would be: look at preview.png before "
+                     "anything is made of it; docs/handbook/first_fit.md says what footage a fit can use.")
     write_json(made.folder / EVALUATION, scores)
     return {"eval": str(made.folder / EVALUATION),
             "scores": {layer: part for layer, part in scores.items() if isinstance(part, dict)}}

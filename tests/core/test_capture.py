@@ -285,6 +285,7 @@ def test_the_extent_of_a_tripod_is_that_of_its_points(slip: float, offset: float
     tripod = Capture(whole.folder, views, points, frames={view.name: whole.folder for view in views})
     away = np.linalg.norm(whole.points.xyz - (0.4, 0.1, -5), axis=1)
     assert tripod.extent == pytest.approx(np.median(away), rel=0.05)
+    assert tripod.only_turns and not whole.only_turns
 
 
 def test_the_cache_is_bounded_and_serves(tmp_path: Path) -> None:

@@ -15,9 +15,9 @@ from core.capture import Camera, Capture
 from core.capture.discs import clipped_discs
 from core.colour import ColourSpace, colour_space
 from core.errors import CaptureError, FrameError, SettingsError
-from core.pictures import linear_from_srgb, read_exr, read_picture, write_exr
+from core.pictures import linear_from_srgb, read_exr, read_picture, srgb_from_linear, write_exr, write_png
 from core.progress import Progress
-from core.removal.fitted import remove_fitted, without
+from core.removal.fitted import _parts, remove_fitted, without
 from core.removal.plates import Plate, read_plate
 from core.removal.record import RECORD
 from tests.core.flared import LIGHT, flare, flared_capture
@@ -30,15 +30,35 @@ class Layers:
 
 
 class Exact:
-    """A fit that found the very flare, by two lights."""
+    """A fit of the capture, or of a copy, that found the very scene and flare, by two lights."""
 
-    def __init__(self) -> None:
-        self.rendered = 0
+    def __init__(self, capture: Capture) -> None:
+        self.capture, self.rendered = capture, 0
 
     def render(self, camera: Camera) -> Layers:
         self.rendered += 1
         whole = flare(camera)
-        return Layers(np.full_like(whole, 0.25), {"a": whole * 0.25, "b": whole * 0.75})
+        return Layers(scene_of(self.capture, camera), {"a": whole * 0.25, "b": whole * 0.75})
+
+
+def scene_of(capture: Capture, camera: Camera) -> np.ndarray:
+    """The exact one."""
+    view = next(one for one in capture.views
+                if np.allclose(one.camera.world_to_camera, camera.world_to_camera, atol=1e-9))
+    scene = capture.truth_scene(view)
+    assert scene is not None
+    return scene.linear()
+
+
+class Told(Progress):
+    """Keeps what is said."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.texts: list[str] = []
+
+    def say(self, text: str) -> None:
+        self.texts.append(text)
 
 
 @pytest.fixture
@@ -47,7 +67,7 @@ def capture(tmp_path: Path) -> Capture:
 
 
 def test_the_exact_flare_leaves_the_exact_scene(capture: Capture, tmp_path: Path) -> None:
-    out, fitted = tmp_path / "clean", Exact()
+    out, fitted = tmp_path / "clean", Exact(capture)
     found = remove_fitted(fitted, capture, capture.views, out, Progress(), flare_folder=tmp_path / "flare")
     assert found["made"] == 3
     for view in capture.views:
@@ -64,6 +84,38 @@ def test_the_exact_flare_leaves_the_exact_scene(capture: Capture, tmp_path: Path
     assert remove_fitted(fitted, capture, capture.views, out, Progress())["kept"] == 3
     assert fitted.rendered == 3, "what is there is not made again"
     assert remove_fitted(fitted, capture, capture.views[:1], out, Progress(), overwrite=True)["made"] == 1
+
+
+def test_a_light_that_is_off_leaves_no_dark_flare(capture: Capture, tmp_path: Path) -> None:
+    """And one that shines half as much half of it."""
+    for view, share in zip(capture.views, (0.0, 0.5, 1.0), strict=True):
+        light = scene_of(capture, view.camera) + np.float32(share) * flare(view.camera)
+        write_png(capture.frame_path(view), srgb_from_linear(light).clip(0, 1))
+    dimmed = Capture.open(capture.folder)
+    told = Told()
+    remove_fitted(Exact(capture), dimmed, dimmed.views, tmp_path / "clean", told)
+    assert [text for text in told.texts if "1 of 3 frames show less than half of the flare that 'a'" in text]
+    for view in dimmed.views:
+        clean = read_picture(tmp_path / "clean" / view.name).linear()
+        lit = (dimmed.frame(view).display().max(-1) < 0.95) & (flare(view.camera).max(-1) > 0.02)
+        assert lit.sum() > 50
+        assert np.abs(clean - scene_of(capture, view.camera))[lit].max() < 0.012
+
+
+def test_each_light_has_its_own_part() -> None:
+    random = np.random.default_rng(1)
+    scene, *flares = (random.random((80, 120, 3)).astype(np.float32) * top for top in (0.2, 0.3, 0.3))
+    wrong = np.where(random.random((80, 120, 1)) < 0.2, 0.2, 0).astype(np.float32)  # what the scene has not
+    faint, missing = np.full_like(scene, 1e-4), np.zeros_like(scene)
+    lights = {"on": flares[0], "dim": flares[1], "faint": faint, "hidden": missing}
+    plate = Plate(Path("a.exr"), scene + flares[0] + 0.3 * flares[1] + wrong, "linear")
+    found = _parts(plate, scene, lights)
+    assert found["on"] == pytest.approx(1, abs=0.05)
+    assert found["dim"] == pytest.approx(0.3, abs=0.05)
+    assert found["faint"] == pytest.approx(1, abs=0.05), "what does not show is as it was fitted"
+    assert found["hidden"] == 1
+    assert _parts(plate, scene, {}) == {}
+    assert _parts(Plate(Path("a.exr"), 3 * plate.codes, "linear"), scene, lights)["on"] == 1, "never more"
 
 
 def test_where_the_plate_is_clipped_the_scene_stands_in() -> None:
@@ -87,11 +139,11 @@ def test_a_light_s_own_disc_stays(capture: Capture, tmp_path: Path) -> None:
     cv2.imwrite(str(capture.frame_path(view)), codes)
 
     class Bright(Exact):
-        def render(self, camera: Camera) -> Layers:
-            flare = np.ones((camera.height, camera.width, 3), np.float32)
-            return Layers(np.zeros_like(flare), {"lamp": flare})
+        def render(self, _camera: Camera) -> Layers:
+            filmed = capture.frame(view).linear()
+            return Layers(np.zeros_like(filmed), {"lamp": filmed})
 
-    remove_fitted(Bright(), capture, [view], tmp_path / "clean", Progress())
+    remove_fitted(Bright(capture), capture, [view], tmp_path / "clean", Progress())
     clean = cv2.imread(str(tmp_path / "clean" / view.name))
     assert (clean[int(y), int(x)] == 255).all()
     assert (clean[2, 3] == 0).all(), "white far from every light is flare"
@@ -106,9 +158,9 @@ def test_above_white_a_lamp_keeps_its_own_light_and_loses_its_flare(tmp_path: Pa
 
         def render(self, camera: Camera) -> Layers:
             view = next(one for one in capture.views if one.camera is camera)
-            scene = capture.truth_scene(view)
-            assert scene is not None
-            return Layers(scene.linear(), {"lamp": flare(camera) * 8 + np.float32(self.lamp)})
+            discs = clipped_discs(capture.frame(view).display(), camera, LIGHT[None])
+            lamp = np.float32(self.lamp) * discs[..., None]
+            return Layers(scene_of(capture, camera), {"lamp": flare(camera) * 8 + lamp})
 
     for lamp, tolerance in ((0.0, 0.02), (100.0, 0.02)):  # the very flare, and one that would take the lamp away
         for shown in (True, False):
@@ -134,7 +186,7 @@ def test_floats_keep_what_is_above_white_below_black_or_no_number() -> None:
 
 def test_what_cannot_be_done_is_said_before_anything_is_written(capture: Capture, tmp_path: Path) -> None:
     with pytest.raises(SettingsError, match="another folder"):
-        remove_fitted(Exact(), capture, capture.views, capture.folder / "images", Progress())
+        remove_fitted(Exact(capture), capture, capture.views, capture.folder / "images", Progress())
     bent = tmp_path / "bent"
     shutil.copytree(capture.folder, bent)
     cameras = bent / "sparse" / "0" / "cameras.txt"
@@ -143,7 +195,7 @@ def test_what_cannot_be_done_is_said_before_anything_is_written(capture: Capture
     cameras.write_text("\n".join(lines) + "\n", encoding="utf-8")
     distorted = Capture.open(bent)
     with pytest.raises(CaptureError, match="distorted"):
-        remove_fitted(Exact(), distorted, distorted.views, tmp_path / "clean", Progress())
+        remove_fitted(Exact(capture), distorted, distorted.views, tmp_path / "clean", Progress())
     assert not (tmp_path / "clean").exists()
 
 
@@ -165,7 +217,8 @@ def _as_exr(capture: Capture, folder: Path, space: ColourSpace) -> Capture:
 def test_an_exr_frame_stays_one_in_its_own_colours(capture: Capture, tmp_path: Path, space: str) -> None:
     view = capture.views[0]
     linear = _as_exr(capture, tmp_path / "exr", colour_space(space))
-    remove_fitted(Exact(), linear, linear.views[:1], tmp_path / "clean", Progress(), flare_folder=tmp_path / "flare")
+    remove_fitted(Exact(capture), linear, linear.views[:1], tmp_path / "clean", Progress(),
+                  flare_folder=tmp_path / "flare")
     name = linear.views[0].name
     clean = read_plate(tmp_path / "clean" / name)
     assert clean.encoding == "linear" and clean.codes.dtype == np.float32 and clean.space.name == space
@@ -179,7 +232,7 @@ def test_an_exr_frame_stays_one_in_its_own_colours(capture: Capture, tmp_path: P
 def test_plates_of_another_fit_or_capture_are_made_again(capture: Capture, tmp_path: Path) -> None:
     """By what they come from, whatever the times of files: of another fit, frame, camera or light, or by a network."""
     def made(one: Capture, fit: str = "first", **options: bool) -> int:
-        found = remove_fitted(Exact(), one, one.views, tmp_path / "clean", Progress(), made_by=fit, **options)
+        found = remove_fitted(Exact(capture), one, one.views, tmp_path / "clean", Progress(), made_by=fit, **options)
         return int(found["made"])
 
     assert [made(capture), made(capture), made(capture, "second"), made(capture)] == [3, 0, 3, 3]
@@ -207,7 +260,8 @@ def test_borders_stay_as_they_are(capture: Capture, tmp_path: Path) -> None:
         codes[:7] = codes[-7:] = 16
         cv2.imwrite(str(path), codes)
     boxed = Capture.open(tmp_path / "boxed")
-    remove_fitted(Exact(), boxed, boxed.views[:1], tmp_path / "clean", Progress(), flare_folder=tmp_path / "flare")
+    remove_fitted(Exact(capture), boxed, boxed.views[:1], tmp_path / "clean", Progress(),
+                  flare_folder=tmp_path / "flare")
     name = boxed.views[0].name
     before, after = (cv2.imread(str(folder / name)) for folder in (boxed.folder / "images", tmp_path / "clean"))
     taken = read_picture(tmp_path / "flare" / Path(name).with_suffix(".exr")).pixels
@@ -218,9 +272,10 @@ def test_borders_stay_as_they_are(capture: Capture, tmp_path: Path) -> None:
 
 def test_flares_that_are_asked_for_later_are_made(capture: Capture, tmp_path: Path) -> None:
     for flares, made in ((None, 3), (tmp_path / "flare", 3), (tmp_path / "flare", 0)):
-        found = remove_fitted(Exact(), capture, capture.views, tmp_path / "clean", Progress(), flare_folder=flares)
+        found = remove_fitted(Exact(capture), capture, capture.views, tmp_path / "clean", Progress(),
+                              flare_folder=flares)
         assert found["made"] == made
     with pytest.raises(SettingsError, match="overwritten"):
         linear = _as_exr(capture, tmp_path / "exr", colour_space("linear"))
-        remove_fitted(Exact(), linear, linear.views, tmp_path / "other", Progress(),
+        remove_fitted(Exact(capture), linear, linear.views, tmp_path / "other", Progress(),
                       flare_folder=linear.folder / "images")

@@ -6,11 +6,10 @@ and the sharpest frame of each is taken: blur costs features, and even spacing k
 """
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +19,7 @@ from ...files import read_json, write_json
 from ...pictures import Picture, Pixels, picture_size, pictures_in, read_picture, write_png
 from ...progress import Progress
 from .exif import read_exif, upright
+from .video import Video
 
 VIDEOS = frozenset({".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".mts", ".m2ts", ".wmv"})
 CLIPPED = 0.98  # of full scale: at or above it the sensor says nothing about the surface
@@ -132,7 +132,9 @@ def _from_video(source: Path, work: Path, number: int, size: int,
     """Two passes: the sharpness of every frame, then the chosen ones."""
     import cv2
 
-    with _Video(source) as video:
+    with Video(source) as video:
+        for sentence in video.says:
+            progress.say(sentence)
         progress.stage("choose frames", video.length)
         scores = []
         for frame in video:
@@ -144,7 +146,7 @@ def _from_video(source: Path, work: Path, number: int, size: int,
     progress.stage("read frames", len(chosen))
     shots = []
     wanted = set(chosen)
-    with _Video(source) as video:
+    with Video(source) as video:
         for index, frame in enumerate(video):
             if index in wanted:
                 picture = Picture(frame[..., ::-1].astype(np.float32) / np.float32(255), "srgb")
@@ -154,31 +156,6 @@ def _from_video(source: Path, work: Path, number: int, size: int,
                 _write_small(picture, work, file.name, size)
                 progress.advance()
     return shots, []
-
-
-class _Video:
-    """The frames of a video, (h, w, 3) uint8 B G R, in order."""
-
-    def __init__(self, path: Path) -> None:
-        import cv2
-
-        self._reader = cv2.VideoCapture(str(path))
-        if not self._reader.isOpened():
-            raise CaptureError(f"{path} is not a video this program can decode; convert it to MP4 (H.264).")
-        self.length = max(int(self._reader.get(cv2.CAP_PROP_FRAME_COUNT)), 0)
-
-    def __enter__(self) -> _Video:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._reader.release()
-
-    def __iter__(self) -> Iterator[Any]:
-        while True:
-            good, frame = self._reader.read()
-            if not good:
-                return
-            yield frame
 
 
 def _write_small(picture: Picture, work: Path, name: str, size: int) -> None:

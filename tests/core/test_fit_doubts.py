@@ -1,0 +1,71 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What is told of footage that a flare can hardly be told from, and that mode split looks at frames alone."""
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from core.capture import Capture
+from core.fit import fit, preset
+from core.fit.beginning import doubts
+from core.fit.frames import Frames
+from core.metrics.evaluation import worse_than_none
+from tests.core.flared import flared_capture
+from tests.core.test_fit import quick
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
+    return Capture.open(flared_capture(tmp_path_factory.mktemp("doubts") / "capture"))
+
+
+def told(capture: Capture, mode: str = "split", count: int = 12) -> list[str]:
+    frames = Frames(capture, display_white=4.0)
+    return [text.split(":")[0] for text in doubts(capture, preset("draft", mode=mode), capture.views[:count], frames)]
+
+
+def test_nothing_is_told_of_footage_as_it_should_be(capture: Capture) -> None:
+    assert told(capture) == told(capture, "default") == []
+
+
+def test_a_camera_that_only_turns_is_told_where_parallax_has_to_tell(capture: Capture) -> None:
+    views = []
+    for view in capture.views:
+        pose = view.camera.world_to_camera.copy()
+        pose[:3, 3] = 0
+        views.append(replace(view, camera=replace(view.camera, world_to_camera=pose)))
+    frames = {view.name: capture.frame_path(view) for view in capture.views}
+    tripod = Capture(capture.folder, views, capture.points, capture.lights, frames=frames)
+    assert told(tripod) == ["The camera only turns"]
+    assert told(tripod, "default") == []
+
+
+def test_few_frames_are_told(capture: Capture) -> None:
+    assert [text.split(",")[0] for text in told(capture, count=11)] == ["11 frames are few to learn a flare from"]
+    assert told(capture, "3dgs", count=11) == []
+
+
+@pytest.mark.parametrize(("gain", "doubted"), [(0.01, True), (1.0, False), (3.0, False), (40.0, True)])
+def test_float_frames_far_from_middle_grey_are_told(gain: float, doubted: bool, tmp_path: Path) -> None:
+    capture = Capture.open(flared_capture(tmp_path / "capture", dots=400, float_gain=gain))
+    frames = Frames(capture, display_white=20.0)
+    found = doubts(capture, preset("draft", mode="split"), capture.views, frames)
+    assert [text.startswith("The frames' light is ") for text in found] == [True] * doubted
+
+
+def test_mode_split_goes_by_the_frames_alone(capture: Capture, tmp_path: Path) -> None:
+    """Whatever flare-free frames and exact layers lie beside them."""
+    bare = tmp_path / "bare"
+    shutil.copytree(capture.folder, bare, ignore=shutil.ignore_patterns("removed", "truth"))
+    with_them, without = (fit(one, quick(40, mode="split"), tmp_path / name)
+                          for name, one in (("with", capture), ("without", Capture.open(bare))))
+    assert with_them.fingerprint == without.fingerprint
+
+
+@pytest.mark.parametrize(("found", "empty", "worse"), [(20.0, 24.0, True), (25.0, 24.0, False), (None, 24.0, False)])
+def test_a_flare_that_is_worse_than_none_is_known(found: float | None, empty: float, worse: bool) -> None:
+    assert worse_than_none({"flare": {"psnr": found, "empty_psnr": empty}}) == worse
+    assert not worse_than_none({"composite": {"psnr": 20.0}})

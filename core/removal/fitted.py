@@ -2,9 +2,10 @@
 """A capture's frames without the flare that a fit has found in them.
 
 What a fit knows of a flare it knows from all views together, which is more than any single plate says. Its flare is
-taken from a plate in linear light, of each light as much as the plate shows of it. Where the plate is clipped, nothing is left of what lay under the flare: there the
-fitted scene stands in, as far as it is brighter. The lights' own clipped discs stay as they are; where the fit was
-shown light above white the scene stands in there too, so that a lamp keeps the light that is its own.
+taken from a plate in linear light, of each light as much as the plate shows of it. Where the plate is clipped, nothing
+is left of what lay under the flare: there the fitted scene stands in, as far as it is brighter. The lights' own clipped
+discs stay as they are; where the fit was shown light above white the scene stands in there too, so that a lamp keeps
+the light that is its own.
 """
 from __future__ import annotations
 

@@ -23,8 +23,8 @@ from core.fit.frames import Frames
 from core.fit.trainer import Trainer
 from core.flare.compositing import clipped, decode, encode, exposed
 from core.pictures import linear_from_srgb, srgb_from_linear, write_png
-from core.progress import Progress
 from tests.core.flared import cameras, flared_capture
+from tests.core.heard import Heard
 from tests.core.test_fit import StopAt, quick
 
 Light = NDArray[np.float32]
@@ -166,22 +166,11 @@ def test_a_fit_goes_by_them(drifting: tuple[Capture, dict[str, float]], tmp_path
     monkeypatch.setattr(exposure, "found", lambda *_: exposures)
     fixed = fit(capture, quick(120, mode=mode, exposure="fixed"), tmp_path / "fixed")
     assert not (fixed.folder / "exposures.json").exists()
-    told: list[str] = []
-    as_found = fit(capture, quick(120, mode=mode), tmp_path / "found", Recorded(told))
-    assert any("exposure changes, by about 1.4 stops" in text for text in told)
+    heard = Heard()
+    as_found = fit(capture, quick(120, mode=mode), tmp_path / "found", heard)
+    assert any("exposure changes, by about 1.4 stops" in text for text in heard.texts)
     assert as_found.exposures == exposures
     assert flare_error(capture, as_found) < 0.7 * flare_error(capture, fixed)
-
-
-class Recorded(Progress):
-    """Keeps what is said."""
-
-    def __init__(self, texts: list[str]) -> None:
-        super().__init__()
-        self.texts = texts
-
-    def say(self, text: str) -> None:
-        self.texts.append(text)
 
 
 @pytest.mark.parametrize("blend", ["add", "over"])

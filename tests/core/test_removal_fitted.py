@@ -21,6 +21,7 @@ from core.removal.fitted import _parts, remove_fitted, without
 from core.removal.plates import Plate, read_plate
 from core.removal.record import RECORD
 from tests.core.flared import LIGHT, flare, flared_capture
+from tests.core.heard import Heard
 
 
 @dataclass
@@ -48,17 +49,6 @@ def scene_of(capture: Capture, camera: Camera) -> np.ndarray:
     scene = capture.truth_scene(view)
     assert scene is not None
     return scene.linear()
-
-
-class Told(Progress):
-    """Keeps what is said."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.texts: list[str] = []
-
-    def say(self, text: str) -> None:
-        self.texts.append(text)
 
 
 @pytest.fixture
@@ -92,7 +82,7 @@ def test_a_light_that_is_off_leaves_no_dark_flare(capture: Capture, tmp_path: Pa
         light = scene_of(capture, view.camera) + np.float32(share) * flare(view.camera)
         write_png(capture.frame_path(view), srgb_from_linear(light).clip(0, 1))
     dimmed = Capture.open(capture.folder)
-    told = Told()
+    told = Heard()
     remove_fitted(Exact(capture), dimmed, dimmed.views, tmp_path / "clean", told)
     assert [text for text in told.texts if "1 of 3 frames show less than half of the flare that 'a'" in text]
     for view in dimmed.views:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -20,13 +21,14 @@ from core.capture.lens import Lens
 from core.capture.solve import SolveSettings, solve
 from core.capture.solve.exif import read_exif, upright
 from core.capture.solve.pairs import choose_matching, choose_pairs
-from core.capture.solve.shots import choose, usable
+from core.capture.solve.shots import choose, gather, usable
 from core.capture.solve.video import Video
 from core.capture.solve.world import up_direction
 from core.errors import Cancelled, CaptureError
 from core.pictures import Picture
 from core.progress import Progress
 from tests.core.captures import look_at, make_capture, orbit
+from tests.core.heard import Heard
 
 SIZE = (320, 240)
 QUICK = SolveSettings(features=800)
@@ -422,6 +424,26 @@ def test_an_upright_telephone_s_video_stands_upright(tmp_path: Path) -> None:
         frame = next(iter(video))
     assert frame.shape == (6 * STRIPE, 96, 3)
     assert np.abs(frame[STRIPE // 2, 48, ::-1].astype(int) - PATCHES[0]).max() <= 5
+
+
+@pytest.mark.parametrize(("apart", "told"), [(0, 0), (1, 1)])
+@pytest.mark.parametrize("as_video", [True, False])
+def test_interlaced_footage_is_told(apart: int, told: int, as_video: bool, tmp_path: Path) -> None:
+    """Every other line of the frame after."""
+    frames = [render(camera) for camera in orbit(8, size=SIZE, arc=0.9)]
+    for first, second in pairwise(list(frames)):
+        if apart:
+            first[1::2] = second[1::2]
+    if as_video:
+        source = write_video(tmp_path / "shot.mp4", frames)
+    else:
+        source = tmp_path / "frames"
+        source.mkdir()
+        for number, frame in enumerate(frames):
+            cv2.imwrite(str(source / f"{number:03d}.png"), frame)
+    heard = Heard()
+    gather(source, tmp_path / "work", 6, 480, heard)
+    assert sum("interlaced" in text for text in heard.texts) == told
 
 
 @pytest.mark.parametrize("content", [b"", b"no video at all", None])

@@ -486,14 +486,16 @@ def render_frames(scene: Any, frames: Iterable[int], path_of: Callable[[int, str
         done(frame)
 
 
-_PNG_END = b"IEND\xaeB`\x82"
+_ENDS = {".png": b"IEND", ".blend": b"ENDB"}
+_LAST_BLOCK = 32
+"""Bytes at most of a file's last block, which begins with its name or has it before a checksum."""
 
 
 def _is_whole(path: Path) -> bool:
-    """Of a picture that Blender has written: it does not say so when a disk fills up meanwhile."""
+    """Of a file that Blender has written: it does not say so when a disk fills up meanwhile."""
     if path.suffix == ".exr":
         return path.stat().st_size > 0 and not exr_is_cut_off(path)
-    return path.read_bytes().endswith(_PNG_END)
+    return _ENDS[path.suffix] in path.read_bytes()[-_LAST_BLOCK:]
 
 
 def _unwritten(path: Path) -> FrameError:
@@ -528,10 +530,10 @@ def save_beside(path: Path) -> None:
                     if image.source == "SEQUENCE":
                         with contextlib.suppress(ValueError):
                             image.filepath = bpy.path.relpath(bpy.path.abspath(image.filepath))
-                bpy.ops.wm.save_as_mainfile(filepath=os.fspath(temporary))
-                with bpy.data.libraries.load(os.fspath(temporary)):
-                    pass  # it can be read again: Blender does not say so when a disk fills up meanwhile
-            except (RuntimeError, OSError) as problem:
+                bpy.ops.wm.save_as_mainfile(filepath=os.fspath(temporary), compress=False)
+            except RuntimeError as problem:
                 raise _unwritten(temporary) from problem
+            if not _is_whole(temporary):
+                raise _unwritten(temporary)
     finally:
         preferences.save_version = versions

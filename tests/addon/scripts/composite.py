@@ -99,7 +99,8 @@ if sys.platform == "linux":
     import signal
 
     signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-    scene.render.use_border = scene.render.use_crop_to_border = False
+    scene = empty()
+    compositor.set_up(scene, layers)
     full, before = out / "full", resource.getrlimit(resource.RLIMIT_FSIZE)
     refused = []
     for write in (lambda: render(scene, "full", sorted(layers.files)[:1]),

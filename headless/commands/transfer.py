@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import hashlib
 import math
+import re
 from pathlib import Path
 from typing import Any
 
@@ -116,7 +117,10 @@ def shot_path(words: argparse.Namespace) -> Path:
     """Where Blender's part leaves the shot; chunks of one shot each have their own."""
     if words.shot:
         return Path(words.shot)
-    part = f".{hashlib.sha256(words.frames.encode()).hexdigest()[:8]}" if words.frames else ""
+    part = words.frames or ""
+    if not re.fullmatch(r"[\d,-]{0,60}", part):  # no file has such a name everywhere
+        part = hashlib.sha256(part.encode()).hexdigest()[:8]
+    part = f".{part.replace(',', '_')}" if part else ""
     return Path(words.out) / f"shot{part}.json"
 
 

@@ -146,7 +146,7 @@ def test_a_light_given_beside_its_flare_is_put_there(tmp_path: Path) -> None:
         run = fit(capture, quick(4, **{"flare.snap": snap}), tmp_path / f"run {snap}", heard)
         off = np.linalg.norm(run.flare.model.positions.numpy()[0] - lamp.xyz)
         assert off < 0.1 if snap else off > 0.35
-    assert [text.split(" was put")[0] for text in heard.texts] == ["The light 'lamp'"]
+    assert [text.split(" was put")[0] for text in heard.texts if " was put" in text] == ["The light 'lamp'"]
 
 
 def test_stopped_and_resumed_is_bit_for_bit_the_unbroken_fit(tmp_path: Path, capture: Capture) -> None:

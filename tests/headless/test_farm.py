@@ -139,7 +139,7 @@ def test_fits_over_a_list_of_captures(capture: Path, tmp_path: Path, capfd: pyte
         Preset="draft", Set="iterations=3")
     assert (tmp_path / "runs" / capture.name / "flare.flare").is_file()
     words = [sys.executable, RUN, "fit", "--list", listed, "--out", tmp_path / "runs", "--resume"]
-    assert cli.main([*map(str, words[2:]), "--entry", "3"]) == 1
+    assert cli.main([*map(str, words[2:]), "--entry", "3"]) == 2
     assert "lists 2 captures; --entry 3 is none of them" in capfd.readouterr().err
     # All of the list, one after the other: the first cannot be, the second is made all the same.
     listed.write_text(f"{tmp_path / 'absent'}\n{capture}\n")

@@ -42,7 +42,7 @@ def test_training_is_stopped_by_its_length_and_goes_on(backgrounds: Path, tmp_pa
     assert cli.main(["remove", str(backgrounds), "--out", str(tmp_path / "clean"), "--weights", weights]) == 0
     assert {path.name for path in (tmp_path / "clean").iterdir()} == {"a.png", "b.png", "remove.json"}
     assert cli.main(["train-removal", "--backgrounds", str(backgrounds), "--out", str(tmp_path / "x"),
-                     "--set", "speed=3"]) == 1
+                     "--set", "speed=3"]) == 2
     assert "speed" in capsys.readouterr().err
 
 
@@ -89,7 +89,7 @@ def test_scores_of_pairs(tmp_path: Path, backgrounds: Path, capsys: pytest.Captu
     scores = json.loads((tmp_path / "eval" / "eval.json").read_text(encoding="utf-8"))
     assert scores["mean"]["count"] == 2
     assert (tmp_path / "eval" / "worst.png").exists()
-    assert cli.main(["eval-removal", "--out", str(tmp_path)]) == 1
+    assert cli.main(["eval-removal", "--out", str(tmp_path)]) == 2
     assert "--synthetic" in capsys.readouterr().err
     assert cli.main(["eval-removal", "--out", str(tmp_path / "made"), "--synthetic", "1", "--size", "96", "64",
                      "--backgrounds", str(backgrounds), "--all-backgrounds"]) == 0
@@ -110,7 +110,7 @@ def test_fit_does_without_flare_free_frames_where_there_are_none(capture: Path, 
     assert sorted(path.name for path in clean.iterdir()) == [*filmed[:2], RECORD]
     for words in (["remove", "--out", str(clean)], ["remove", str(bare), "--run", str(run), "--out", str(clean)],
                   ["remove", "--run", str(run), "--out", str(clean), "--keep-glare"]):
-        assert cli.main(words) == 1
+        assert cli.main(words) == 2
         assert "--run" in capsys.readouterr().err
 
 

@@ -62,7 +62,7 @@ def test_on_to_a_picture(run: Run, made: Path, tmp_path: Path) -> None:
     assert list(layers.flares) == ["sun"]
     assert layers.flare.max() > 0
     assert read_picture(tmp_path / "out" / "frames" / "plate.png").size == (96, 54)
-    problem = run("transfer", made, "--to", tmp_path / "plate.png", "--out", tmp_path / "none", status=1)[-1]
+    problem = run("transfer", made, "--to", tmp_path / "plate.png", "--out", tmp_path / "none", status=2)[-1]
     assert "No light was found in" in problem["text"]
 
 
@@ -71,12 +71,12 @@ def test_options_that_a_target_has_no_use_for_are_refused(run: Run, made: Path, 
     for target, *words in ((tmp_path / "plate.png", "--light", "9,9", "--scene", "x.ply"),
                            (tmp_path / "plate.png", "--light", "9,9", "--plates", tmp_path),
                            (capture, "--light", "9,9"), (capture, "--plates", tmp_path), (made, "--focal", "90")):
-        problem = run("transfer", made, "--to", target, *words, "--out", tmp_path / "none", status=1)[-1]["text"]
+        problem = run("transfer", made, "--to", target, *words, "--out", tmp_path / "none", status=2)[-1]["text"]
         assert "as the target; leave it out." in problem
     for words, sentence in ((("--light", "a=1,2", "--light", "a=3,4"), "names 'a' twice"),
                             (("--light", "a=1,2", "--use", "b=lamp"), "have no light 'b'")):
         problem = run("transfer", made, "--to", tmp_path / "plate.png", *words, "--out", tmp_path / "x",
-                      status=1)[-1]["text"]
+                      status=2)[-1]["text"]
         assert sentence in problem
     assert not (tmp_path / "none").exists()
 
@@ -109,7 +109,7 @@ def test_a_bare_flare_is_baked_as_its_run_is(run: Run, made: Path, capture: Path
     assert not layers.scene.any()
     assert layers.flare.max() > 0
     assert read_description(tmp_path / "flare" / "layers.0003.exr")["space"] == ["acescg", None]
-    sentence = run("bake", made / "flare.flare", "--out", tmp_path / "none", status=1)[-1]["text"]
+    sentence = run("bake", made / "flare.flare", "--out", tmp_path / "none", status=2)[-1]["text"]
     assert "--capture" in sentence
     assert "--blend" in sentence
 
@@ -181,6 +181,17 @@ def test_on_to_a_blend_its_objects_hide_the_light(run: Run, made: Path, blend: P
     # A chunk alone, as a farm makes it, is the same: its neighbours are looked at too.
     run("transfer", made, "--to", blend, "--out", tmp_path / "part", "--frames", "4-4", "--float")
     assert (tmp_path / "part" / "layers.0004.exr").read_bytes() == (out / "layers.0004.exr").read_bytes()
+
+
+def test_a_shot_of_frames_that_are_no_file_s_name_has_one(run: Run, made: Path, blend: Path, tmp_path: Path) -> None:
+    """Steps have a colon, and a long list is longer than a name may be."""
+    names = set()
+    for number, frames in enumerate(("1-9:8", ",".join(map(str, [1, 9] * 60)))):
+        run("transfer", made, "--to", blend, "--out", tmp_path / f"{number}", "--frames", frames)
+        assert (tmp_path / f"{number}" / "layers.0009.exr").is_file()
+        names.add(next((tmp_path / f"{number}").glob("shot.*.json")).name)
+    assert len(names) == 2
+    assert all(len(name) < 30 and ":" not in name for name in names)
 
 
 def test_a_bare_flare_is_baked_for_a_blend(run: Run, made: Path, blend: Path, tmp_path: Path) -> None:

@@ -37,6 +37,8 @@ ASKED = 100_000
 """Pixels of a plate, about, that are asked how much of each light's flare is there."""
 HALF = 0.5
 """Part of a flare below which it is told that there is less of it."""
+UNEVEN = 1.25
+"""Times that a plate's scene may be brighter or darker than it was fitted: what `core.fit.exposure` leaves."""
 ROUNDS, SWEEPS = 8, 50
 FAINT = 0.01
 """Linear light, below which errors count by their squares."""
@@ -119,32 +121,34 @@ def _remove(fitted: Renderer, capture: Capture, view: View, results: Sequence[Pa
 
 def _parts(plate: Plate, scene: Pixels, flares: Mapping[str, Pixels]) -> dict[str, float]:
     """Of each light's flare the part, 0..1, that the plate holds beside the scene, in the sense of least absolute
-    errors: a light that is switched off, or hidden by what the fit knows nothing of, leaves no dark flare."""
+    errors: a light that is switched off, or hidden by what the fit knows nothing of, leaves no dark flare. The scene
+    may be a little brighter or darker than it was fitted, or a frame exposed for less would seem to lack flare."""
     if not flares:
         return {}
     part = plate.inside.part
     step = max(round(math.sqrt(math.prod(plate.codes.shape[:2]) / ASKED)), 1)
-    shown, below, *over = (one[part][::step, ::step] for one in (_light(plate), scene, *flares.values()))
+    shown, *layers = (one[part][::step, ::step] for one in (_light(plate), scene, *flares.values()))
     clipped = linear_from_srgb(np.array(CLIPPED)) if plate.encoding == "srgb" else np.inf
     tells = (shown < clipped).all(-1)
-    left = (shown - below)[tells].ravel().astype(np.float64)
-    columns = np.stack([one[tells].ravel() for one in over], 1).astype(np.float64)
-    parts, weights = np.ones(len(flares)), np.ones(len(left))
-    held = KEPT * len(left) * np.eye(len(flares))
+    light = shown[tells].ravel().astype(np.float64)
+    columns = np.stack([one[tells].ravel() for one in layers], 1).astype(np.float64)
+    low, high = np.array([[1 / UNEVEN, UNEVEN], *len(flares) * [[0.0, 1.0]]]).T
+    parts, weights = np.ones(len(layers)), np.ones(len(light))
+    held = KEPT * max(len(light), 1) * np.eye(len(layers))  # of a plate that is white all over nothing else tells
     for _ in range(ROUNDS):
         weighted = columns.T * weights
-        parts = _least_squares(weighted @ columns + held, weighted @ left + held.sum(1), parts)
-        weights = 1 / (np.abs(left - columns @ parts) + FAINT)
-    return dict(zip(flares, parts.tolist(), strict=True))
+        parts = _least_squares(weighted @ columns + held, weighted @ light + held.sum(1), parts, low, high)
+        weights = 1 / (np.abs(light - columns @ parts) + FAINT)
+    return dict(zip(flares, parts[1:].tolist(), strict=True))
 
 
-def _least_squares(product: Floats, goal: Floats, begin: Floats) -> Floats:
-    """x (n,) within 0..1 that product x = goal comes nearest to, one coordinate after the other."""
+def _least_squares(product: Floats, goal: Floats, begin: Floats, low: Floats, high: Floats) -> Floats:
+    """x (n,) between two bounds that product x = goal comes nearest to, one coordinate after the other."""
     found = begin.copy()
     for _ in range(SWEEPS):
         for at in range(len(found)):
             rest = goal[at] - product[at] @ found + product[at, at] * found[at]
-            found[at] = min(max(rest / product[at, at], 0.0), 1.0)
+            found[at] = min(max(rest / product[at, at], low[at]), high[at])
     return found
 
 

@@ -105,7 +105,26 @@ def test_each_light_has_its_own_part() -> None:
     assert found["faint"] == pytest.approx(1, abs=0.05), "what does not show is as it was fitted"
     assert found["hidden"] == 1
     assert _parts(plate, scene, {}) == {}
+    for uneven in (0.9, 1.1):  # a frame that is exposed a little otherwise, or a scene that was fitted so
+        other = _parts(Plate(Path("a.exr"), plate.codes * np.float32(uneven), "linear"), scene, lights)
+        assert other["on"] == pytest.approx(1, abs=0.12)
+        assert other["dim"] == pytest.approx(0.3, abs=0.12)
     assert _parts(Plate(Path("a.exr"), 3 * plate.codes, "linear"), scene, lights)["on"] == 1, "never more"
+
+
+def test_a_plate_that_is_white_all_over_stays_a_picture() -> None:
+    white = Plate(Path("a.png"), np.full((8, 8, 3), 255, np.uint8), "srgb")
+    scene, light = np.full((8, 8, 3), 0.5, np.float32), np.full((8, 8, 3), 0.25, np.float32)
+    assert _parts(white, scene, {"lamp": light}) == {"lamp": 1.0}
+
+
+def test_a_faint_flare_is_not_lost_in_a_frame_that_is_a_little_dark() -> None:
+    random = np.random.default_rng(2)
+    scene = random.uniform(0.05, 0.6, (60, 90, 3)).astype(np.float32)
+    ghosts = np.where(random.random((60, 90, 1)) < 0.1, 0.06, 0).astype(np.float32) * np.ones(3, np.float32)
+    for stops in (-0.15, -0.05, 0.1):
+        codes = (scene + ghosts) * np.float32(2**stops)
+        assert _parts(Plate(Path("a.exr"), codes, "linear"), scene, {"lamp": ghosts})["lamp"] > 0.85
 
 
 def test_where_the_plate_is_clipped_the_scene_stands_in() -> None:

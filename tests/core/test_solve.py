@@ -370,7 +370,7 @@ STRIPE = 128
 
 def patches(path: Path, height: int, weights: tuple[float, float], told: bytes = b"") -> Path:
     """A video of upright stripes whose codes are those that luma of these weights, of red and blue, makes of PATCHES.
-    OpenCV writes by BT.601's. told: put behind the file."""
+    OpenCV writes by BT.601's. told: put into its description."""
     def luma_and_differences(red: float, blue: float) -> NDArray[np.float64]:
         green = 1 - red - blue
         return np.array([[red, green, blue], [-red / 2 / (1 - blue), -green / 2 / (1 - blue), 0.5],
@@ -382,15 +382,21 @@ def patches(path: Path, height: int, weights: tuple[float, float], told: bytes =
     for _ in range(3):
         writer.write(np.ascontiguousarray(frame[..., ::-1]))
     writer.release()
-    path.write_bytes(path.read_bytes() + told)
+    data = bytearray(path.read_bytes())
+    at = data.find(b"moov") - 4
+    if told:
+        size = int.from_bytes(data[at:at + 4], "big")
+        assert at + size == len(data), "the last box"
+        data[at:at + 4] = (size + len(told)).to_bytes(4, "big")
+    path.write_bytes(data + told)
     return path
 
 
 def box(transfer: int, matrix: int) -> bytes:
-    """A `colr` box in one that players pass over."""
+    """A `colr` box in one that players pass over, for the end of a file's `moov`."""
     colours = b"colrnclx" + b"".join(number.to_bytes(2, "big") for number in (1, transfer, matrix)) + b"\0"
     inner = (len(colours) + 4).to_bytes(4, "big") + colours
-    return (len(inner) + 8).to_bytes(4, "big") + b"free" + inner
+    return (len(inner) + 8).to_bytes(4, "big") + b"udta" + inner
 
 
 @pytest.mark.parametrize(("height", "weights", "told"), [
@@ -404,6 +410,20 @@ def test_the_colours_of_a_video_are_those_that_players_show(height: int, weights
     assert len(frames) == 3
     shown = frames[-1][height // 2, STRIPE // 2::STRIPE, ::-1].astype(int)
     assert np.abs(shown - PATCHES).max() <= 5, "24 by the wrong matrix"
+
+
+@pytest.mark.parametrize(("suffix", "codec"), [("mkv", "FFV1"), ("avi", "MJPG"), ("mov", "png ")])
+def test_colours_that_are_read_as_they_are_stay(suffix: str, codec: str, tmp_path: Path) -> None:
+    """RGB itself, and JPEG, which is of BT.601 at any size."""
+    frame = np.repeat(np.repeat(PATCHES.astype(np.uint8)[None, :, ::-1], 256, 1), 720, 0)
+    path = tmp_path / f"a.{suffix}"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*codec), 25, (frame.shape[1], 720))
+    for _ in range(2):
+        writer.write(np.ascontiguousarray(frame))
+    writer.release()
+    with Video(path) as video:
+        shown = next(iter(video))[360, 128::256, ::-1].astype(int)
+    assert np.abs(shown - PATCHES).max() <= 5
 
 
 @pytest.mark.parametrize(("transfer", "name"), [(16, "PQ"), (18, "HLG")])

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The frames of a video, upright and in the colours that players show.
 
-OpenCV (4.11) reads the colours of every video by the matrix of standard definition (ITU-R BT.601), whatever its file
-says; those of a high definition one come out up to a tenth off. So they are brought from there to the matrix that the
-file names or, where it names none, to the one that its size stands for.
+OpenCV (4.11) reads luma and colour differences by the matrix of standard definition (ITU-R BT.601), whatever the file
+says; the colours of a high definition video come out up to a tenth off. So they are brought from there to the matrix
+that the file names or, where it names none, to the one that its size stands for. Motion JPEG is BT.601 at any size, and
+some files hold RGB itself: those are left as they are.
 """
 from __future__ import annotations
 
-import mmap
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -17,11 +17,12 @@ from numpy.typing import NDArray
 
 from ...errors import CaptureError
 
-HIGH_DEFINITION = 720
-"""Lines from which on a video that does not say otherwise is of BT.709."""
+WIDE, HIGH = 1280, 576
+"""Pixels of the long side from which on, or of the short one above which, a video that says nothing is of BT.709."""
 WEIGHTS = {"BT.601": (0.299, 0.114), "BT.709": (0.2126, 0.0722), "BT.2020": (0.2627, 0.0593)}
 """Of red and blue in the luma."""
 MATRICES = {1: "BT.709", 5: "BT.601", 6: "BT.601", 9: "BT.2020"}
+MOVIE_BYTES = 1 << 24
 HIGH_RANGE = {16: "PQ", 18: "HLG"}
 """By the numbers of ITU-T H.273: matrix coefficients, transfer characteristics."""
 
@@ -39,9 +40,7 @@ class Video:
         self._reader.set(cv2.CAP_PROP_ORIENTATION_AUTO, 1)  # a telephone held upright
         self.length = max(int(self._reader.get(cv2.CAP_PROP_FRAME_COUNT)), 0)
         transfer, matrix = _told(path)
-        short = min(self._reader.get(cv2.CAP_PROP_FRAME_WIDTH), self._reader.get(cv2.CAP_PROP_FRAME_HEIGHT))
-        standard = MATRICES.get(matrix, "BT.709" if short >= HIGH_DEFINITION else "BT.601")
-        self._colours = None if standard == "BT.601" else _from_601(*WEIGHTS[standard])
+        self._colours = None if self._is_as_read() else _from_601(MATRICES.get(matrix) or self._usual())
         self.says = () if transfer not in HIGH_RANGE else (
             f"{path} is of high dynamic range ({HIGH_RANGE[transfer]}), and is read as if it were not: a flare fitted "
             "to it is not that of the lens; convert it to EXR frames, or to standard range, first.",)
@@ -63,26 +62,60 @@ class Video:
             yield frame if self._colours is None else cv2.transform(frame, self._colours)
 
 
+    def _is_as_read(self) -> bool:
+        """Whether OpenCV's colours are those of the file: it holds RGB, or Motion JPEG."""
+        import cv2
+
+        pixels, codec = (int(self._reader.get(name)).to_bytes(8, "little", signed=True).upper()
+                         for name in (cv2.CAP_PROP_CODEC_PIXEL_FORMAT, cv2.CAP_PROP_FOURCC))
+        return b"RGB" in pixels or b"BGR" in pixels or codec[:4] in (b"MJPG", b"JPEG", b"MJPA", b"MJPB")
+
+    def _usual(self) -> str:
+        """The standard of its size."""
+        import cv2
+
+        sides = [self._reader.get(name) for name in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)]
+        return "BT.709" if max(sides) >= WIDE or min(sides) > HIGH else "BT.601"
+
+
 def _told(path: Path) -> tuple[int, int]:
     """Transfer characteristics and matrix coefficients that an MP4's or QuickTime's `colr` box names; 2, which stands
     for unspecified, where there is none."""
-    with open(path, "rb") as stream:
-        if not stream.seek(0, 2):
-            return 2, 2
-        with mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as data:
-            for kind in (b"colrnclx", b"colrnclc"):
-                at = data.find(kind)
-                if 0 <= at <= len(data) - 14:
-                    return int.from_bytes(data[at + 10:at + 12], "big"), int.from_bytes(data[at + 12:at + 14], "big")
+    movie = _movie(path) if path.suffix.lower() in (".mp4", ".mov", ".m4v") else b""
+    for kind in (b"colrnclx", b"colrnclc"):
+        at = movie.find(kind)
+        if 0 <= at <= len(movie) - 14:
+            return int.from_bytes(movie[at + 10:at + 12], "big"), int.from_bytes(movie[at + 12:at + 14], "big")
     return 2, 2
 
 
-def _from_601(red: float, blue: float) -> NDArray[np.float32]:
-    """(3, 3), B G R: from what BT.601 makes of luma and colour differences to what these weights make of them."""
+def _movie(path: Path) -> bytes:
+    """The box `moov`, which describes the tracks, with its first megabytes; empty where there is none. It stands behind
+    the pictures in what cameras write, which are passed over."""
+    with open(path, "rb") as stream:
+        at, end = 0, stream.seek(0, 2)
+        while at + 8 <= end:
+            stream.seek(at)
+            size, kind = int.from_bytes(stream.read(4), "big"), stream.read(4)
+            if kind == b"moov":
+                return stream.read(min(size, MOVIE_BYTES))
+            size = int.from_bytes(stream.read(8), "big") if size == 1 else size
+            if size < 8:  # 0 reaches to the end
+                break
+            at += size
+    return b""
+
+
+def _from_601(standard: str) -> NDArray[np.float32] | None:
+    """(3, 3), B G R: from what BT.601 makes of luma and colour differences to what a standard makes of them; None where
+    that is the same."""
+    if standard == "BT.601":
+        return None
+
     def differences(red: float, blue: float) -> NDArray[np.float64]:
         luma = np.array([red, 1 - red - blue, blue])
         return np.stack([luma, (np.array([0, 0, 1]) - luma) / (2 - 2 * blue),
                          (np.array([1, 0, 0]) - luma) / (2 - 2 * red)])
 
-    matrix = np.linalg.inv(differences(red, blue)) @ differences(*WEIGHTS["BT.601"])
+    matrix = np.linalg.inv(differences(*WEIGHTS[standard])) @ differences(*WEIGHTS["BT.601"])
     return matrix[::-1, ::-1].astype(np.float32)

@@ -2,7 +2,6 @@
 """Fits: started, found again, and what they leave taken into the scene."""
 from __future__ import annotations
 
-import contextlib
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +9,7 @@ import bpy
 
 from ..core import exposures
 from ..core.errors import CaptureError, FitFlareError, RunError
+from ..core.look import Look
 from . import engine, jobs, lights, looks
 from .capture_import import expose
 from .jobs import Job
@@ -103,8 +103,7 @@ def resume(scene: Any) -> Job:
     capture, folder = capture_of(scene), folder_of(scene)
     if folder is None or not (folder / CONFIG).is_file():
         raise RunError(f"There is no fit to go on with in {folder}; start a new one.")
-    with contextlib.suppress(OSError):
-        capture = Path((folder / "capture.txt").read_text(encoding="utf-8").removesuffix("\n"))
+    capture = _begun_with(folder) or capture
     if capture is None or not capture.is_dir():
         raise CaptureError(f"The capture {capture} that this fit was begun with is not there; put it back, or start a "
                            "new fit.")
@@ -120,6 +119,32 @@ def _run(scene: Any, capture: Path, folder: Path) -> Job:
     return engine.run("fit", folder, words)
 
 
+def show(scene: Any, folder: Path) -> Look:
+    """The flare of a run in the scene, its cameras exposed as their frames were. Raises FlareFileError, RunError."""
+    look = looks.use(scene, folder / FLARE)
+    expose_cameras(scene, folder)
+    return look
+
+
+def expose_cameras(scene: Any, folder: Path | None) -> None:
+    """The imported cameras, as the run in a folder found the frames that they are; nothing where it is a run of another
+    capture. Raises RunError."""
+    capture = capture_of(scene)
+    if folder is None or capture is None or scene.fit_flare.root is None:
+        return
+    begun = _begun_with(folder)
+    if begun is not None and begun.is_dir() and capture.is_dir() and begun.samefile(capture):
+        expose(scene.fit_flare.root, exposures.read(folder))
+
+
+def _begun_with(folder: Path) -> Path | None:
+    """The capture of a run; None where its folder does not say."""
+    try:
+        return Path((folder / "capture.txt").read_text(encoding="utf-8").removesuffix("\n"))
+    except OSError:
+        return None
+
+
 def finished(job: Job) -> None:
     """Show the flare of a fit that ended well, in every scene that has this run."""
     if job.state != "done":
@@ -128,10 +153,8 @@ def finished(job: Job) -> None:
         folder = folder_of(scene)
         if folder is not None and folder == job.folder:
             try:
-                look = looks.use(scene, folder / FLARE)
+                look = show(scene, folder)
                 lights.follow(scene, {light.name: light.xyz for light in look.lights}, capture_of(scene))
-                if scene.fit_flare.root is not None:
-                    expose(scene.fit_flare.root, exposures.read(folder))
             except FitFlareError as problem:
                 job.error = str(problem)
     _remember("Fit")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.errors import FlareFileError
-from ..core.exposures import brightness
 from ..core.look import Edit, Look, LookEdits, PlaneGaussians, read
 from ..core.look.look import Query
 from ..core.look.shot import PlacedLight, evaluate
@@ -175,8 +173,8 @@ def seen(scene: Any, depsgraph: Any, camera: Any) -> dict[str, PlaneGaussians]:
     look = look_of(scene)
     pose, lights = placed(scene, depsgraph, camera)
     found = evaluate(look, pose, lights, edits_of(scene.fit_flare), query_of(scene.fit_flare))
-    times = np.float32(brightness(camera.evaluated_get(depsgraph).fit_flare.exposure, look.blend))
-    return {name: replace(one, colours=times * one.colours) for name, one in found.items()}
+    exposure = camera.evaluated_get(depsgraph).fit_flare.exposure
+    return {name: one.exposed(exposure, look.blend) for name, one in found.items()}
 
 
 # ---- occlusion ------------------------------------------------------------------------------------

@@ -36,8 +36,11 @@ def of_scene(scene: Any, chosen: Sequence[Any], frames: Sequence[int], flare: Pa
     """The shot of these camera objects at these frames; of none the scene's own, which markers on the timeline may
     change from frame to frame, under the name of the first. The scene's current frame is put back.
 
-    Raises CaptureError for a camera that is no perspective camera, FlareFileError for a bad .flare.
+    Raises CaptureError for a camera that is no perspective camera, FlareFileError for a bad .flare, SettingsError for
+    frames below 0, which files have no numbers for.
     """
+    if min(frames, default=0) < 0:
+        raise SettingsError(f"Layers of the frame {min(frames)} have no name; begin the frames to bake at 0 or later.")
     view_layer = bpy.context.view_layer if bpy.context.scene == scene else scene.view_layers[0]
     before, subframe = scene.frame_current, scene.frame_subframe
     made: list[ShotFrame] = []

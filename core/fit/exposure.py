@@ -7,13 +7,16 @@ known of them: the slope is its exposure, while a veil of flare only lifts the l
 """
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..capture import Capture, View
+from ..exposures import LEAST
 from ..pictures import LUMINANCE, linear_from_srgb
 from .frames import Frames, colours_at, thinned
 
@@ -21,14 +24,16 @@ UNLIKE = 0.25
 """Stops, the spread over the frames, from which on they are taken to be exposed otherwise."""
 SURE = 0.1
 """Stops, the standard error from which on a frame does not tell its exposure."""
-ASKED, FEWEST = 100, 50
-"""About as many frames are looked at first, and so many points at least a frame has to show. What a solve says of the
-points' colours is of no use: they follow the exposure of the few frames that each was found in."""
+ASKED = 40
+"""About as many frames are looked at first."""
+FEWEST, POINTS = 50, 500
+"""Points that a frame has to show at least, and about as many of them that are looked at. What a solve says of their
+colours is of no use: they follow the exposure of the few frames that each was found in."""
 DARK, BRIGHT = 0.05, 0.9
 """Display values between which pixels tell."""
 RARE = 0.1
 """Share of the frames, to either side, that do not count."""
-ROUNDS, REFINED = 20, 3
+ROUNDS, REFINED, SETTLED = 20, 3, 1e-3
 SOFT = 0.05
 """Linear light that is added to what errors are parts of: those of dark points are rounding."""
 
@@ -39,15 +44,23 @@ Indices = NDArray[np.int64]
 def found(capture: Capture, frames: Frames) -> dict[str, float]:
     """Of each view, times the light of the frame in the middle; empty where all are exposed alike, or too few tell.
     Views that do not tell are taken for as exposed as the nearest, by name, that do."""
-    stops = np.zeros(0)
-    for views in dict.fromkeys((tuple(thinned(capture.views, ASKED)), capture.views)):  # all only where some differ
-        seen = Seen.of(capture, views, frames)
-        stops = seen.stops()
-        if spread(stops) < UNLIKE:
-            return {}
+    stops = Seen.of(capture, thinned(capture.views, ASKED), frames).stops()
+    if spread(stops) >= UNLIKE and len(stops) < len(capture.views):  # all only where some differ
+        stops = Seen.of(capture, capture.views, frames).stops()
+    if spread(stops) < UNLIKE:
+        return {}
+    filled = _filled(stops, [Path(view.name).parent for view in capture.views]) - np.nanmedian(stops)
+    times = 2 ** filled.clip(math.log2(LEAST), -math.log2(LEAST))
+    return {view.name: round(float(one), 6) for view, one in zip(capture.views, times, strict=True)}
+
+
+def _filled(stops: Floats, folders: Sequence[Path]) -> Floats:
+    """Those that do not tell by the nearest that does, of the same folder if there is one: a camera's, often."""
     tells = np.flatnonzero(np.isfinite(stops))
-    filled = np.interp(np.arange(len(stops)), tells, stops[tells]) - np.median(stops[tells])
-    return {view.name: round(float(2**one), 6) for view, one in zip(capture.views, filled, strict=True)}
+    def nearest(at: int) -> int:
+        return int(min(tells, key=lambda other: (folders[other] != folders[at], abs(other - at))))
+
+    return np.asarray(stops[[nearest(at) for at in range(len(stops))]])
 
 
 def spread(stops: Floats) -> float:
@@ -82,14 +95,16 @@ class Seen:
     @classmethod
     def of(cls, capture: Capture, views: Sequence[View], frames: Frames) -> Seen:
         """Where the solve found the points, neither too dark nor clipped, in the flare-free frames if there are any."""
+        step = max(int(np.median([len(view.points) for view in views])) // POINTS, 1)  # the same points of all views
         parts = [(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0))]
         for number, view in enumerate(views):
-            if not len(view.points):
+            chosen = view.points[view.points % step == 0]
+            if not len(chosen):
                 continue
             camera, frame, removed = frames.targets(view)
-            inside, shown = colours_at(capture.points.xyz[view.points], camera, frame if removed is None else removed)
+            inside, shown = colours_at(capture.points.xyz[chosen], camera, frame if removed is None else removed)
             tells = ((shown > DARK) & (shown < BRIGHT)).all(-1)
-            points = view.points[inside][tells]
+            points = chosen[inside][tells]
             light = linear_from_srgb(shown[tells]).astype(np.float64) @ LUMINANCE
             parts.append((np.full(len(points), number), points, light))
         numbers, points, light = (np.concatenate(part) for part in zip(*parts, strict=True))
@@ -109,8 +124,10 @@ class Seen:
         light, stops = np.log2(self.light), np.zeros(self.count)
         most = int(self.points.max(initial=-1)) + 1
         for _ in range(ROUNDS):
-            usual = _medians(light - stops[self.views], self.points, most)
+            before, usual = stops, _medians(light - stops[self.views], self.points, most)
             stops = _medians(light - usual[self.points], self.views, self.count)
+            if np.allclose(before, stops, atol=SETTLED, equal_nan=True):
+                break
         return np.asarray(2**usual)
 
     def _lines(self, usual: Floats) -> tuple[Floats, Floats]:
@@ -135,9 +152,9 @@ def _medians(values: Floats, groups: Indices, count: int) -> Floats:
     order = np.lexsort((values, groups))
     begins = np.searchsorted(groups[order], np.arange(count + 1))
     first, sizes = begins[:-1], np.diff(begins)
-    found = np.full(count, np.nan)
-    found[sizes > 0] = values[order][(first + (sizes - 1) // 2)[sizes > 0]]
-    return found
+    medians = np.full(count, np.nan)
+    medians[sizes > 0] = values[order][(first + (sizes - 1) // 2)[sizes > 0]]
+    return medians
 
 
 def _line(known: Floats, shown: Floats) -> tuple[Floats, float]:

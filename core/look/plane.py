@@ -7,12 +7,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..exposures import brightness
 from ..pictures import LUMINANCE
 from ..sampling import Sampling, dilation
 
@@ -45,6 +46,10 @@ class PlaneGaussians:
 
     def __len__(self) -> int:
         return len(self.means)
+
+    def exposed(self, exposure: float, blend: Literal["over", "add"]) -> PlaneGaussians:
+        """As a frame shows them that was exposed to so many times the usual light."""
+        return replace(self, colours=np.float32(brightness(exposure, blend)) * self.colours)
 
     def kept(self, rows: Any) -> PlaneGaussians:
         """The Gaussians of these rows (a mask or numbers)."""

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import bpy
 
-from .. import capture_export
+from .. import capture_export, fits
 from ..capture_import import ImportSettings, import_capture
 from ..reports import NO_CAMERA, Action
 
@@ -60,6 +60,7 @@ class FITFLARE_OT_import_capture(Action, bpy.types.Operator):
             chosen = Path(bpy.path.abspath(self.directory))
         settings = ImportSettings(self.cameras, self.up, self.scale, self.frames, self.points, self.match_scene)
         made = import_capture(context.scene, chosen, settings)
+        fits.expose_cameras(context.scene, fits.folder_of(context.scene))
         for note in made.notes:
             self.report({"WARNING"}, note)
         self.report({"INFO"}, f"{chosen.name}: cameras {len(made.cameras)}, lights {len(made.lights)}")

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import bpy
 
-from .. import engine, fits, jobs, looks
+from .. import engine, fits, jobs
 from ..reports import NO_CAPTURE, Action
 
 _keymaps: list[tuple[object, object]] = []
@@ -169,7 +169,7 @@ class FITFLARE_OT_use_result(Action, bpy.types.Operator):
     def act(self, context: bpy.types.Context) -> None:
         folder = fits.folder_of(context.scene)
         assert folder is not None
-        looks.use(context.scene, folder / fits.FLARE)
+        fits.show(context.scene, folder)
 
 
 def _show(context: bpy.types.Context, kind: str, give: object) -> None:

@@ -45,7 +45,10 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
         raise SettingsError(f"{words.flare} says nothing of cameras; name a capture with --capture.")
     look = read(words.flare / FLARE if words.flare.is_dir() else words.flare)
     edits = LookEdits.parse(words.edits, look.names, look.element_names)
-    cameras = {view.name: view.camera for view in Capture.open(folder, need_frames=False).views}
+    capture = Capture.open(folder, need_frames=False)
+    if words.flare.is_dir():
+        capture = capture.exposed(Run.open(words.flare).exposures)
+    cameras = {view.name: view.camera for view in capture.views}
     wanted = frames.asked(numbered(cameras), words.frames, progress)
     if words.kind == "preset":
         if words.frames is not None and len(wanted) > 1:
@@ -57,8 +60,10 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     progress.stage("export", len(wanted))
     for frame in wanted:
         camera = cameras[frame.view]
-        write_flare_ply(words.out / frame.file.replace("layers.", "flare.").replace(".exr", ".ply"),
-                        look.evaluate(camera.world_to_camera, edits=edits), camera, look.blend, look.sampling)
+        flares = {light: one.exposed(camera.exposure, look.blend)
+                  for light, one in look.evaluate(camera.world_to_camera, edits=edits).items()}
+        write_flare_ply(words.out / frame.file.replace("layers.", "flare.").replace(".exr", ".ply"), flares, camera,
+                        look.blend, look.sampling)
         progress.advance()
     progress.say(f"{len(wanted)} frames of Gaussians are in {words.out}.")
     return {"ply": str(words.out), "frames": len(wanted)}

@@ -277,9 +277,8 @@ def target_of(words: argparse.Namespace, flare: Path, training: list[Any] | None
         return targets.of_capture(Capture.open(words.cameras, need_frames=False), look, wanted, lights=lights,
                                   scene=to[0], shown=True)
     if kind == "run":
-        made = Run.open(to[0])
-        capture = Capture.open(words.cameras or made.capture_folder, need_frames=False)
-        capture = capture if words.cameras else capture.exposed(made.exposures)
+        capture = (Capture.open(words.cameras, need_frames=False) if words.cameras else
+                   Run.open(to[0]).capture(need_frames=False))
         return targets.of_capture(capture, look, wanted, lights=lights, scene=words.scene or to[0] / SCENE, shown=True)
     if to[0].is_dir() and not any(to[0].iterdir()):
         raise CaptureError(f"{to[0]} is empty: neither pictures nor a capture; name what the flare goes on to.")

@@ -102,6 +102,8 @@ def test_cameras_see_points_where_the_footage_has_them(facts: Any, kind: str) ->
 def test_cameras_are_exposed_as_a_fit_has_found_the_frames(facts: Any, kind: str) -> None:
     assert facts[f"exposed, {kind}"] == [0.5, 1.5, 2.5, 3.5, 4.5]
     assert facts[f"as usual, {kind}"] == [1.0, 1.0]
+    assert facts[f"own run, {kind}"] == 4.0
+    assert facts[f"other run, {kind}"] == 1.0
 
 
 def test_an_import_is_whole(facts: Any) -> None:

@@ -20,6 +20,7 @@ from core.errors import Cancelled, RunError
 from core.files import write_text
 from core.fit import Run, exposure, fit
 from core.fit.frames import Frames
+from core.fit.sky import with_sky
 from core.fit.trainer import Trainer
 from core.flare.compositing import clipped, decode, encode, exposed
 from core.pictures import linear_from_srgb, srgb_from_linear, write_png
@@ -102,13 +103,28 @@ def test_what_a_light_glows_on_does_not_count(tmp_path: Path) -> None:
     assert max(told[::2].std(), told[1::2].std()) < 0.1
 
 
-def test_frames_that_tell_nothing_are_as_the_next(tmp_path: Path) -> None:
+def test_frames_that_tell_nothing_are_as_the_nearest(tmp_path: Path) -> None:
+    """Not as something between: a light is switched on from one frame to the next."""
     def filmed(number: int, light: Light) -> Light:
-        return light * (0.0 if number == 3 else 2.0 if number < 6 else 1.0)
+        return light * (0.0 if number in (4, 5, 6, 7) else 2.0 if number < 6 else 1.0)
 
     told = found(wall(tmp_path / "a", filmed))
-    assert told["0003.png"] == pytest.approx(told["0002.png"], rel=0.02)
-    assert told["0003.png"] / told["0009.png"] == pytest.approx(2, rel=0.05)
+    for dark, next_to in ((4, 3), (5, 3), (6, 8), (7, 8)):
+        assert told[f"{dark:04d}.png"] == told[f"{next_to:04d}.png"]
+    assert told["0003.png"] / told["0008.png"] == pytest.approx(2, rel=0.05)
+
+
+def test_a_camera_that_tells_nothing_is_not_taken_for_another() -> None:
+    assert exposure._filled(np.array([1.0, np.nan, np.nan, 3.0]), [Path(name) for name in ("a", "a", "b", "b")]
+                            ).tolist() == [1.0, 1.0, 3.0, 3.0]
+
+
+def test_what_is_found_can_be_read_again(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Even where the solve makes nonsense of it."""
+    capture = wall(tmp_path / "a", lambda number, light: light * 2.0 ** (number % 2))
+    monkeypatch.setattr(exposure.Seen, "stops", lambda _: np.linspace(-30, 30, COUNT))
+    run = Run.create(tmp_path / "run", quick(10), capture.folder, found(capture))
+    assert len(Run.open(run.folder).exposures) == COUNT
 
 
 def test_without_what_a_solve_has_found_nothing_is_told(tmp_path: Path) -> None:
@@ -236,6 +252,27 @@ def test_a_trainer_shows_each_view_its_own(drifting: tuple[Capture, dict[str, fl
     targets = trainer.frames.targets(trainer.views[0])
     assert targets.camera.exposure == exposures[trainer.views[0].name]
     assert capture.views[0].camera.exposure == 1
+
+
+def test_where_exposures_differ_a_scene_is_clipped_as_its_frames_are(drifting: tuple[Capture, dict[str, float]]
+                                                                     ) -> None:
+    """What one frame shows below white may be above it in another."""
+    capture, exposures = drifting
+    bright = torch.full((2, 2, 3), 1.5)
+    assert float(Trainer(capture, quick(5), exposures)._as_filmed(bright).max()) == 1
+    assert Trainer(capture, quick(5), {})._as_filmed(bright) is bright
+
+
+def test_the_sky_begins_as_a_usual_frame_shows_it(drifting: tuple[Capture, dict[str, float]], tmp_path: Path) -> None:
+    capture, exposures = drifting
+    steady = Capture.open(flared_capture(tmp_path / "steady"))
+
+    def sky(one: Capture) -> NDArray[np.float64]:
+        points = with_sky(one, one.views, Frames(one))
+        return linear_from_srgb(points.rgb[len(one.points):] / np.float32(255)).mean(0)
+
+    off, off_without = (np.abs(sky(one) / sky(steady) - 1).mean() for one in (capture.exposed(exposures), capture))
+    assert off < 0.5 * off_without
 
 
 # ---- the arithmetic -------------------------------------------------------------------------------

@@ -64,6 +64,18 @@ for kind, up, scale in (("animated", "Z", 1.0), ("each", "-Y", 2.5)):
         camera = scene.camera if kind == "animated" else scene.objects[Path(frame.view).stem]
         found.append(shots.frame_of(scene, bpy.context.evaluated_depsgraph_get(), camera, frame.number).camera.exposure)
     facts[f"exposed, {kind}"] = found
+    # A run of this capture exposes cameras that are imported later, too; one of another does not.
+    fits = part("flare_addon.fits")
+    earlier = Path(out) / f"earlier run, {kind}"
+    earlier.mkdir()
+    (earlier / "exposures.json").write_text('{"0001.png": 4.0}')
+    for name, of in (("own", capture), ("other", out)):
+        (earlier / "capture.txt").write_text(f"{of}\n")
+        fitted.expose(root, {})
+        fits.expose_cameras(scene, earlier)
+        scene.frame_set(frames[1].number)
+        camera = scene.camera if kind == "animated" else scene.objects["0001"]
+        facts[f"{name} run, {kind}"] = camera.fit_flare.exposure
     fitted.expose(root, {})
     scene.frame_set(frames[2].number)
     facts[f"as usual, {kind}"] = [camera.fit_flare.exposure, scene.camera.fit_flare.exposure]

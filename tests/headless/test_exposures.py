@@ -1,0 +1,90 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Every command that shows the views of a run shows them as the fit found them exposed."""
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from fit_flare.headless import cli
+
+from core.bake.exr import read_layers
+from core.capture import Capture
+from core.fit import fit, preset
+from core.fit.settings import changed
+from core.gaussians.ply import read_ply
+from core.pictures import linear_from_srgb, read_picture, srgb_from_linear, write_png
+
+TIMES = 1.6
+
+
+@pytest.fixture(scope="module")
+def runs(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """A run of a capture whose second frame is darker, and the same with what a fit notes of that."""
+    base = tmp_path_factory.mktemp("exposed")
+    shutil.copytree(capture, base / "capture", ignore=shutil.ignore_patterns("removed", "truth"))
+    frame = base / "capture" / "images" / "0001.png"
+    write_png(frame, srgb_from_linear(linear_from_srgb(read_picture(frame).pixels) / TIMES))
+    settings = changed(preset("draft", iterations=60, mode="split"), {"flare.count": 60, "flare.occlusion": False,
+                                                                      "holdout": 4})
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    plain = fit(Capture.open(base / "capture"), settings, base / "plain").folder
+    torch.set_num_threads(before)
+    shutil.copytree(plain, base / "told")
+    (base / "told" / "exposures.json").write_text(json.dumps({"0001.png": 1 / TIMES}))
+    return plain, base / "told"
+
+
+def test_bake(runs: tuple[Path, Path], tmp_path: Path) -> None:
+    for run in runs:
+        assert cli.main(["bake", str(run), "--out", str(tmp_path / run.name), "--frames", "1-2", "--float"]) == 0
+    plain, told = ([read_layers(tmp_path / run.name / f"layers.000{number}.exr").flare for number in (1, 2)]
+                   for run in runs)
+    assert plain[0].max() > 1e-3
+    np.testing.assert_allclose(told[0] * TIMES, plain[0], rtol=1e-4, atol=1e-6)
+    np.testing.assert_array_equal(told[1], plain[1])
+
+
+def test_eval(runs: tuple[Path, Path]) -> None:
+    scores = []
+    for run in runs:
+        assert cli.main(["eval", str(run), "--views", "train"]) == 0
+        scores.append({view["name"]: view["composite"]["psnr"]
+                       for view in json.loads((run / "eval.json").read_text())["views"]})
+    plain, told = scores
+    assert told["0001.png"] > plain["0001.png"] + 1
+    assert {name: score for name, score in told.items() if name != "0001.png"} == {
+        name: score for name, score in plain.items() if name != "0001.png"}
+
+
+def test_remove(runs: tuple[Path, Path], tmp_path: Path) -> None:
+    for run in runs:
+        words = ["remove", "--run", str(run), "--out", str(tmp_path / run.name), "--frames", "1-2", "--flare",
+                 str(tmp_path / run.name / "flares")]
+        assert cli.main(words) == 0
+    plain, told = ([read_picture(tmp_path / run.name / "flares" / f"000{number}.exr").pixels for number in (1, 2)]
+                   for run in runs)
+    assert np.abs(told[0] - plain[0]).max() > 1e-3
+    np.testing.assert_array_equal(told[1], plain[1])
+
+
+def test_export(runs: tuple[Path, Path], tmp_path: Path) -> None:
+    for run in runs:
+        assert cli.main(["export", str(run), "--as", "ply", "--out", str(tmp_path / run.name), "--frames", "1-2"]) == 0
+    plain, told = ([read_ply(tmp_path / run.name / f"flare.000{number}.ply").sh for number in (1, 2)] for run in runs)
+    assert not torch.allclose(told[0], plain[0], atol=1e-4)
+    assert torch.equal(told[1], plain[1])
+
+
+def test_transfer_on_to_the_run(runs: tuple[Path, Path], tmp_path: Path) -> None:
+    for run in runs:
+        assert cli.main(["transfer", str(runs[0] / "flare.flare"), "--to", str(run), "--out", str(tmp_path / run.name),
+                         "--frames", "1-2", "--float"]) == 0
+    plain, told = ([read_layers(tmp_path / run.name / f"layers.000{number}.exr").scene for number in (1, 2)]
+                   for run in runs)
+    assert 1.2 < plain[0].mean() / told[0].mean() < 1.8
+    np.testing.assert_array_equal(told[1], plain[1])

@@ -223,7 +223,7 @@ class FITFLARE_PT_look(_Part, bpy.types.Panel):
         if scene.camera is not None:
             column = layout.column()
             column.use_property_split = True
-            column.prop(scene.camera.fit_flare, "exposure", text="Camera Exposure")
+            column.prop(scene.camera.fit_flare, "exposure")
         layout.prop(state, "occlusion")
         row = layout.row()
         rows = max(min(len(state.lights), 6), 2)

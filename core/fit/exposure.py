@@ -57,6 +57,7 @@ def found(capture: Capture, frames: Frames) -> dict[str, float]:
 def _filled(stops: Floats, folders: Sequence[Path]) -> Floats:
     """Those that do not tell by the nearest that does, of the same folder if there is one: a camera's, often."""
     tells = np.flatnonzero(np.isfinite(stops))
+
     def nearest(at: int) -> int:
         return int(min(tells, key=lambda other: (folders[other] != folders[at], abs(other - at))))
 

@@ -24,7 +24,7 @@ from core.capture.colmap import Observed, write_model
 from core.capture.lens import Lens
 from core.errors import FitFlareError
 from core.files import write_json
-from core.fit import exposure
+from core.fit import metering
 from core.fit.frames import Frames
 from core.pictures import linear_from_srgb, read_picture, srgb_from_linear, write_png
 from core.progress import Progress, TerminalProgress, stoppable
@@ -35,7 +35,7 @@ from sample_scenes.layers import FLARE_LEVEL, write_layer
 def add_flares(capture: Capture, out: Path, look: Look, light: NDArray[np.float64], colour: tuple[float, ...],
                intensity: float, width: int, progress: Progress) -> None:
     """Write the new capture; views that are there already are kept. light: world coordinates (3,)."""
-    capture = capture.exposed(exposure.found(capture, Frames(capture, width)))
+    capture = capture.exposed(metering.found(capture, Frames(capture, width)))
     progress.stage("flares", len(capture.views))
     for view in capture.views:
         stem = Path(view.name).stem

@@ -4,7 +4,6 @@ first."""
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -17,7 +16,7 @@ from ..flare.model import FlareModel, LightFlare, ViewOfLight
 from ..gaussians.ply import read_ply
 from ..gaussians.scene import SceneGaussians
 from ..lights.snap import Sight, sight, snapped
-from ..pictures import LUMINANCE, Picture, holds_floats, linear_from_srgb
+from ..pictures import Picture, holds_floats
 from .frames import Frames, thinned
 from .settings import FitSettings
 from .sky import with_sky
@@ -28,13 +27,6 @@ that is less than usual: worlds of small units, metres about a watch, are fitted
 NEAREST_POINTS = 10_000  # that are looked at
 SNAP_WIDTH, SNAP_VIEWS = 160, 40
 """Pixels of the pictures that lights are placed by, and about how many of them."""
-FEW = 12
-"""Views: of 6 the sample's flare comes to 28.8 dB, of 50 to 33.6."""
-ASKED = 8
-"""About as many frames are asked for their light."""
-GREY, FAR_FROM_GREY = 0.18, 3.0
-"""Scene-linear light in the middle of a usual frame, and stops from there at which a fit does badly: the sample's
-frames as EXR times 16, or a sixteenth, leave nine tenths of the flare unfound."""
 WHITEST = 64.0
 """Scene-linear light at which frames that hold light above white are clipped: six stops above it, as far as cameras
 reach; a fit that is shown a rendered sun is not drawn to it alone."""
@@ -141,24 +133,6 @@ def with_white(settings: FitSettings, capture: Capture) -> tuple[FitSettings, tu
 
 def _is_above_white(capture: Capture, view: View) -> bool:
     return holds_floats(capture.frame_path(view)) and bool(capture.frame(view).pixels.max() > 1)
-
-
-def doubts(capture: Capture, settings: FitSettings, views: Sequence[View], frames: Frames) -> tuple[str, ...]:
-    """Sentences on footage that a flare can hardly be told from."""
-    found = []
-    if settings.mode == "split" and capture.only_turns:
-        found.append("The camera only turns: without parallax scene and flare cannot be told apart; give flare-free "
-                     "frames in removed/, or footage for which the camera moves.")
-    if settings.mode != "3dgs" and len(views) < FEW:
-        found.append(f"{len(views)} frames are few to learn a flare from, which shows itself by how it changes with "
-                     "the lights' places in the picture; it will be worse than it could be from twenty or more.")
-    if all(holds_floats(capture.frame_path(view)) for view in views):
-        light = [linear_from_srgb(frames.frame(view).numpy()) @ LUMINANCE for view in thinned(views, ASKED)]
-        middle = float(np.median([np.median(one) for one in light]))
-        if middle > 0 and abs(math.log2(middle / GREY)) > FAR_FROM_GREY:
-            found.append(f"The frames' light is {middle:.2g} in the middle, where a fit expects about {GREY:g}: what "
-                         "is far brighter or darker is learned badly. Bring the files' exposure there first.")
-    return tuple(found)
 
 
 def moved_lights(capture: Capture, flare: FlareModel) -> tuple[str, ...]:

@@ -30,9 +30,10 @@ from ..gaussians.densification import Classic, Mcmc, Strategy
 from ..gaussians.loss import l1_ssim
 from ..gaussians.optimiser import Adam
 from ..gaussians.ordering import morton_order
-from . import exposure
-from .beginning import doubts, first_flare, first_scene, moved_lights
+from . import metering
+from .beginning import first_flare, first_scene, moved_lights
 from .checkpoint import State
+from .doubts import doubts
 from .frames import Frames, Targets, thinned
 from .rendering import render_flare, render_scene
 from .settings import FitSettings
@@ -65,7 +66,7 @@ class Trainer:
         self.frames = Frames(capture, settings.width, display_white=settings.display_white,
                              alone=not settings.supervised)
         if exposures is None:
-            exposures = exposure.found(capture, self.frames) if settings.exposure == "found" else {}
+            exposures = metering.found(capture, self.frames) if settings.exposure == "found" else {}
         self.exposures = exposures
         """Times the usual light, by view; empty where all frames are exposed alike."""
         capture = capture.exposed(exposures)
@@ -78,7 +79,7 @@ class Trainer:
                                "or fit with --mode unsup.")
         self.scene = first_scene(capture, settings, self.views, self.frames)
         self.flare = None if settings.mode == "3dgs" else first_flare(capture, self.views, self.frames, settings)
-        self.says = (*self.frames.says, *exposure.says(self.exposures),
+        self.says = (*self.frames.says, *metering.says(self.exposures),
                      *doubts(capture, settings, self.views, self.frames),
                      *(() if self.flare is None else moved_lights(capture, self.flare)))
         self.extent = capture.extent

@@ -38,7 +38,7 @@ ASKED = 100_000
 HALF = 0.5
 """Part of a flare below which it is told that there is less of it."""
 UNEVEN = 1.25
-"""Times that a plate's scene may be brighter or darker than it was fitted: what `core.fit.exposure` leaves."""
+"""Times that a plate's scene may be brighter or darker than it was fitted: what `core.fit.metering` leaves."""
 ROUNDS, SWEEPS = 8, 50
 FAINT = 0.01
 """Linear light, below which errors count by their squares."""

@@ -10,7 +10,7 @@ import pytest
 
 from core.capture import Capture
 from core.fit import fit, preset
-from core.fit.beginning import doubts
+from core.fit.doubts import doubts
 from core.fit.frames import Frames
 from core.metrics.evaluation import worse_than_none
 from tests.core.flared import flared_capture

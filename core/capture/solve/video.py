@@ -22,9 +22,11 @@ WIDE, HIGH = 1280, 576
 WEIGHTS = {"BT.601": (0.299, 0.114), "BT.709": (0.2126, 0.0722), "BT.2020": (0.2627, 0.0593)}
 """Of red and blue in the luma."""
 MATRICES = {1: "BT.709", 5: "BT.601", 6: "BT.601", 9: "BT.2020"}
-MOVIE_BYTES = 1 << 24
 HIGH_RANGE = {16: "PQ", 18: "HLG"}
 """By the numbers of ITU-T H.273: matrix coefficients, transfer characteristics."""
+UNSPECIFIED = 2
+MOVIE_BYTES = 1 << 24
+"""Of a file's description that are looked at."""
 
 
 class Video:
@@ -61,7 +63,6 @@ class Video:
                 return
             yield frame if self._colours is None else cv2.transform(frame, self._colours)
 
-
     def _is_as_read(self) -> bool:
         """Whether OpenCV's colours are those of the file: it holds RGB, or Motion JPEG."""
         import cv2
@@ -79,14 +80,14 @@ class Video:
 
 
 def _told(path: Path) -> tuple[int, int]:
-    """Transfer characteristics and matrix coefficients that an MP4's or QuickTime's `colr` box names; 2, which stands
-    for unspecified, where there is none."""
+    """Transfer characteristics and matrix coefficients that an MP4's or QuickTime's `colr` box names; UNSPECIFIED where
+    there is none."""
     movie = _movie(path) if path.suffix.lower() in (".mp4", ".mov", ".m4v") else b""
     for kind in (b"colrnclx", b"colrnclc"):
         at = movie.find(kind)
         if 0 <= at <= len(movie) - 14:
             return int.from_bytes(movie[at + 10:at + 12], "big"), int.from_bytes(movie[at + 12:at + 14], "big")
-    return 2, 2
+    return UNSPECIFIED, UNSPECIFIED
 
 
 def _movie(path: Path) -> bytes:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from core.capture import Camera, Capture
 from core.errors import Cancelled, RunError
 from core.files import write_text
-from core.fit import Run, exposure, fit
+from core.fit import Run, fit, metering
 from core.fit.frames import Frames
 from core.fit.sky import with_sky
 from core.fit.trainer import Trainer
@@ -68,7 +68,7 @@ def _image(number: int, camera: Camera, xyz: NDArray[np.float64]) -> str:
 
 
 def found(capture: Capture) -> dict[str, float]:
-    return exposure.found(capture, Frames(capture))
+    return metering.found(capture, Frames(capture))
 
 
 def test_frames_of_one_exposure_are_left_alone(tmp_path: Path) -> None:
@@ -115,14 +115,14 @@ def test_frames_that_tell_nothing_are_as_the_nearest(tmp_path: Path) -> None:
 
 
 def test_a_camera_that_tells_nothing_is_not_taken_for_another() -> None:
-    assert exposure._filled(np.array([1.0, np.nan, np.nan, 3.0]), [Path(name) for name in ("a", "a", "b", "b")]
+    assert metering._filled(np.array([1.0, np.nan, np.nan, 3.0]), [Path(name) for name in ("a", "a", "b", "b")]
                             ).tolist() == [1.0, 1.0, 3.0, 3.0]
 
 
 def test_what_is_found_can_be_read_again(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Even where the solve makes nonsense of it."""
     capture = wall(tmp_path / "a", lambda number, light: light * 2.0 ** (number % 2))
-    monkeypatch.setattr(exposure.Seen, "stops", lambda _: np.linspace(-30, 30, COUNT))
+    monkeypatch.setattr(metering.Seen, "stops", lambda _: np.linspace(-30, 30, COUNT))
     run = Run.create(tmp_path / "run", quick(10), capture.folder, found(capture))
     assert len(Run.open(run.folder).exposures) == COUNT
 
@@ -179,7 +179,7 @@ def flare_error(capture: Capture, run: Run) -> float:
 def test_a_fit_goes_by_them(drifting: tuple[Capture, dict[str, float]], tmp_path: Path, mode: str,
                             monkeypatch: pytest.MonkeyPatch) -> None:
     capture, exposures = drifting
-    monkeypatch.setattr(exposure, "found", lambda *_: exposures)
+    monkeypatch.setattr(metering, "found", lambda *_: exposures)
     fixed = fit(capture, quick(120, mode=mode, exposure="fixed"), tmp_path / "fixed")
     assert not (fixed.folder / "exposures.json").exists()
     heard = Heard()
@@ -193,7 +193,7 @@ def test_a_fit_goes_by_them(drifting: tuple[Capture, dict[str, float]], tmp_path
 def test_a_view_is_rendered_as_it_was_exposed(drifting: tuple[Capture, dict[str, float]], tmp_path: Path, blend: str,
                                               monkeypatch: pytest.MonkeyPatch) -> None:
     capture, exposures = drifting
-    monkeypatch.setattr(exposure, "found", lambda *_: exposures)
+    monkeypatch.setattr(metering, "found", lambda *_: exposures)
     run = Run.open(fit(capture, quick(20, blend=blend), tmp_path / "run").folder)
     view = next(view for view in run.capture(need_frames=False).views if exposures[view.name] < 1)
     own, usual = run.render(view.camera), run.render(replace(view.camera, exposure=1.0))
@@ -210,11 +210,11 @@ def test_a_view_is_rendered_as_it_was_exposed(drifting: tuple[Capture, dict[str,
 def test_a_fit_that_was_stopped_goes_on_with_them(drifting: tuple[Capture, dict[str, float]], tmp_path: Path,
                                                   monkeypatch: pytest.MonkeyPatch) -> None:
     capture, exposures = drifting
-    monkeypatch.setattr(exposure, "found", lambda *_: exposures)
+    monkeypatch.setattr(metering, "found", lambda *_: exposures)
     whole = fit(capture, quick(30), tmp_path / "whole")
     with pytest.raises(Cancelled):
         fit(capture, quick(30), tmp_path / "run", StopAt(12))
-    monkeypatch.setattr(exposure, "found", lambda *_: pytest.fail("they are known"))
+    monkeypatch.setattr(metering, "found", lambda *_: pytest.fail("they are known"))
     assert fit(capture, quick(30), tmp_path / "run", resume=True).fingerprint == whole.fingerprint
 
 
@@ -222,10 +222,10 @@ def test_a_fit_without_them_is_not_given_any_later(drifting: tuple[Capture, dict
                                                    monkeypatch: pytest.MonkeyPatch) -> None:
     """Runs of versions that did not look."""
     capture, exposures = drifting
-    monkeypatch.setattr(exposure, "found", lambda *_: {})
+    monkeypatch.setattr(metering, "found", lambda *_: {})
     with pytest.raises(Cancelled):
         fit(capture, quick(30), tmp_path / "run", StopAt(12))
-    monkeypatch.setattr(exposure, "found", lambda *_: exposures)
+    monkeypatch.setattr(metering, "found", lambda *_: exposures)
     assert fit(capture, quick(30), tmp_path / "run", resume=True).exposures == {}
 
 

@@ -20,13 +20,13 @@ import torch
 from numpy.typing import NDArray
 
 from ..errors import FrameError, SettingsError
-from ..pictures import SUFFIXES, read_picture
+from ..pictures import SUFFIXES, linear_from_srgb, read_picture
+from ..video import VIDEOS, Video
 from .pairs import Bank, Layers
 from .synthesis.layers import flare
 from .synthesis.prescription import Prescription
 
 Random = np.random.Generator
-VIDEOS = frozenset({".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v"})
 
 
 class SynthesisBank:
@@ -137,18 +137,12 @@ def _frame_of(path: Path, random: Random) -> NDArray[np.float32]:
     """A picture's linear light, or that of a random frame of a clip."""
     if path.suffix.lower() not in VIDEOS:
         return read_picture(path).linear()
-    import cv2
-
-    clip = cv2.VideoCapture(str(path))
-    try:
-        count = int(clip.get(cv2.CAP_PROP_FRAME_COUNT))
-        clip.set(cv2.CAP_PROP_POS_FRAMES, int(random.integers(max(count, 1))))
-        done, frame = clip.read()
-    finally:
-        clip.release()
-    if not done:
+    with Video(path) as clip:
+        clip.seek(int(random.integers(max(clip.length, 1))))
+        frame = next(iter(clip), None)
+    if frame is None:
         raise FrameError(f"{path} is no clip that can be read; convert it to pictures.")
-    return np.power(frame[..., ::-1].astype(np.float32) / 255, np.float32(2.2))
+    return np.asarray(linear_from_srgb(frame[..., ::-1].astype(np.float32) / 255), np.float32)
 
 
 class Mixed:

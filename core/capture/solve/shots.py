@@ -18,10 +18,9 @@ from ...errors import CaptureError, FrameError
 from ...files import read_json, write_json
 from ...pictures import Picture, Pixels, picture_size, pictures_in, read_picture, write_png
 from ...progress import Progress
+from ...video import VIDEOS, Video
 from .exif import read_exif, upright
-from .video import Video
 
-VIDEOS = frozenset({".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".mts", ".m2ts", ".wmv"})
 COMBED, SOME = 1.1, 0.25
 """Times, in more than which part of the frames. Photographs have 0.6 to 0.8, moving fields 1.5 to 2.3."""
 CLIPPED = 0.98  # of full scale: at or above it the sensor says nothing about the surface

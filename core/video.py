@@ -15,8 +15,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...errors import CaptureError
+from .errors import FrameError
 
+VIDEOS = frozenset({".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".mts", ".m2ts", ".wmv"})
+"""Suffixes."""
 WIDE, HIGH = 1280, 576
 """Pixels of the long side from which on, or of the short one above which, a video that says nothing is of BT.709."""
 WEIGHTS = {"BT.601": (0.299, 0.114), "BT.709": (0.2126, 0.0722), "BT.2020": (0.2627, 0.0593)}
@@ -30,14 +32,17 @@ MOVIE_BYTES = 1 << 24
 
 
 class Video:
-    """The frames of a video, (h, w, 3) uint8 B G R, in order. Raises CaptureError where there are none to be had."""
+    """The frames of a video, (h, w, 3) uint8 B G R, in order. Raises FrameError where there are none to be had."""
+
+    length: int
+    """Frames, as the file has it, which may be too many; 0 where it does not say."""
 
     def __init__(self, path: Path) -> None:
         import cv2
 
         self._reader = cv2.VideoCapture(str(path))
         if not self._reader.isOpened():
-            raise CaptureError(f"{path} cannot be decoded: it is cut off, or not a video that this program knows; copy "
+            raise FrameError(f"{path} cannot be decoded: it is cut off, or not a video that this program knows; copy "
                                "it again, or convert it to MP4 (H.264).")
         self._reader.set(cv2.CAP_PROP_ORIENTATION_AUTO, 1)  # a telephone held upright
         self.length = max(int(self._reader.get(cv2.CAP_PROP_FRAME_COUNT)), 0)
@@ -62,6 +67,12 @@ class Video:
             if not good:
                 return
             yield frame if self._colours is None else cv2.transform(frame, self._colours)
+
+    def seek(self, number: int) -> None:
+        """Go on from that frame, counted from 0."""
+        import cv2
+
+        self._reader.set(cv2.CAP_PROP_POS_FRAMES, number)
 
     def _is_as_read(self) -> bool:
         """Whether OpenCV's colours are those of the file: it holds RGB, or Motion JPEG."""

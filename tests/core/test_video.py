@@ -1,0 +1,119 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Videos: their colours are those that players show, they stand upright, and what cannot be read is told."""
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from core.errors import FrameError
+from core.pictures import linear_from_srgb
+from core.removal.bank import OwnFlares
+from core.video import Video
+
+PATCHES = np.array([(200, 60, 40), (40, 180, 60), (50, 70, 210), (128, 128, 128), (230, 200, 40), (240, 240, 240)])
+"""Red, green, blue."""
+STRIPE = 128
+
+
+def patches(path: Path, height: int, weights: tuple[float, float], told: bytes = b"") -> Path:
+    """A video of upright stripes whose codes are those that luma of these weights, of red and blue, makes of PATCHES.
+    OpenCV writes by BT.601's. told: put into its description."""
+    def luma_and_differences(red: float, blue: float) -> NDArray[np.float64]:
+        green = 1 - red - blue
+        return np.array([[red, green, blue], [-red / 2 / (1 - blue), -green / 2 / (1 - blue), 0.5],
+                         [0.5, -green / 2 / (1 - red), -blue / 2 / (1 - red)]])
+
+    mixed = PATCHES @ (np.linalg.inv(luma_and_differences(0.299, 0.114)) @ luma_and_differences(*weights)).T
+    frame = np.repeat(np.repeat(mixed.clip(0, 255).round().astype(np.uint8)[None], STRIPE, 1), height, 0)
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), 25, (frame.shape[1], height))
+    for _ in range(3):
+        writer.write(np.ascontiguousarray(frame[..., ::-1]))
+    writer.release()
+    data = bytearray(path.read_bytes())
+    at = data.find(b"moov") - 4
+    if told:
+        size = int.from_bytes(data[at:at + 4], "big")
+        assert at + size == len(data), "the last box"
+        data[at:at + 4] = (size + len(told)).to_bytes(4, "big")
+    path.write_bytes(data + told)
+    return path
+
+
+def box(transfer: int, matrix: int) -> bytes:
+    """A `colr` box in one that players pass over, for the end of a file's `moov`."""
+    colours = b"colrnclx" + b"".join(number.to_bytes(2, "big") for number in (1, transfer, matrix)) + b"\0"
+    inner = (len(colours) + 4).to_bytes(4, "big") + colours
+    return (len(inner) + 8).to_bytes(4, "big") + b"udta" + inner
+
+
+@pytest.mark.parametrize(("height", "weights", "told"), [
+    (360, (0.299, 0.114), b""), (720, (0.2126, 0.0722), b""), (360, (0.2126, 0.0722), box(1, 1)),
+    (720, (0.299, 0.114), box(1, 6)), (720, (0.2627, 0.0593), box(1, 9))])
+def test_the_colours_of_a_video_are_those_that_players_show(height: int, weights: tuple[float, float], told: bytes,
+                                                             tmp_path: Path) -> None:
+    with Video(patches(tmp_path / "a.mp4", height, weights, told)) as video:
+        frames = list(video)
+        assert video.says == ()
+    assert len(frames) == 3
+    shown = frames[-1][height // 2, STRIPE // 2::STRIPE, ::-1].astype(int)
+    assert np.abs(shown - PATCHES).max() <= 5, "24 by the wrong matrix"
+
+
+@pytest.mark.parametrize(("suffix", "codec"), [("mkv", "FFV1"), ("avi", "MJPG"), ("mov", "png ")])
+def test_colours_that_are_read_as_they_are_stay(suffix: str, codec: str, tmp_path: Path) -> None:
+    """RGB itself, and JPEG, which is of BT.601 at any size."""
+    frame = np.repeat(np.repeat(PATCHES.astype(np.uint8)[None, :, ::-1], 256, 1), 720, 0)
+    path = tmp_path / f"a.{suffix}"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*codec), 25, (frame.shape[1], 720))
+    for _ in range(2):
+        writer.write(np.ascontiguousarray(frame))
+    writer.release()
+    with Video(path) as video:
+        shown = next(iter(video))[360, 128::256, ::-1].astype(int)
+    assert np.abs(shown - PATCHES).max() <= 5
+
+
+@pytest.mark.parametrize(("transfer", "name"), [(16, "PQ"), (18, "HLG")])
+def test_high_dynamic_range_is_told(transfer: int, name: str, tmp_path: Path) -> None:
+    with Video(patches(tmp_path / "a.mp4", 64, (0.299, 0.114), box(transfer, 9))) as video:
+        assert len(video.says) == 1
+        assert name in video.says[0]
+
+
+def test_an_upright_telephone_s_video_stands_upright(tmp_path: Path) -> None:
+    path = patches(tmp_path / "a.mp4", 96, (0.299, 0.114))
+    data = bytearray(path.read_bytes())
+    at = data.find(b"tkhd") + 4 + 40
+    turned = (0, 1 << 16, 0, -(1 << 16), 0, 0, 96 << 16, 0, 1 << 30)
+    data[at:at + 36] = b"".join(number.to_bytes(4, "big", signed=True) for number in turned)
+    path.write_bytes(data)
+    with Video(path) as video:
+        frame = next(iter(video))
+    assert frame.shape == (6 * STRIPE, 96, 3)
+    assert np.abs(frame[STRIPE // 2, 48, ::-1].astype(int) - PATCHES[0]).max() <= 5
+
+
+@pytest.mark.parametrize("content", [b"", b"no video at all", None])
+def test_what_is_no_video_or_cut_off_is_told(content: bytes | None, tmp_path: Path) -> None:
+    path = patches(tmp_path / "a.mp4", 64, (0.299, 0.114))
+    path.write_bytes(path.read_bytes()[:200] if content is None else content)
+    with pytest.raises(FrameError, match=r"a\.mp4 cannot be decoded: it is cut off, or"):
+        Video(path)
+
+
+def test_a_clip_of_a_flare_trains_in_its_own_colours(tmp_path: Path) -> None:
+    """Of high definition."""
+    path = tmp_path / "clips" / "flare.mp4"
+    path.parent.mkdir()
+    patches(path, 720, (0.2126, 0.0722))
+    own = OwnFlares(path.parent, 256)
+    layers = own.draw(np.random.default_rng(0))
+    high, wide = np.nonzero(layers.rest.sum(-1) > 0.01)
+    shown = layers.rest[high.min():high.max() + 1, wide.min():wide.max() + 1]
+    columns = ((np.arange(6) + 0.5) / 6 * shown.shape[1]).astype(int)
+    truth = linear_from_srgb(PATCHES / 255)
+    assert np.abs(shown[len(shown) // 2, columns] - truth).max() < 0.04

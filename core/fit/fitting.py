@@ -51,7 +51,7 @@ def fit(capture: Capture, settings: FitSettings, folder: Path | str, progress: P
         remove_partial(folder)
     else:
         settings, said = with_white(settings.checked(), capture)
-        trainer = Trainer(capture, settings)  # before anything is written: it may refuse the capture
+        trainer = Trainer(capture, settings, progress=progress)  # before anything is written: it may refuse the capture
         run = Run.create(folder, settings, capture.folder, trainer.exposures)
     path = folder / CHECKPOINT
     if continued and path.exists():

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from ..capture import Capture, View
 from ..exposures import LEAST
 from ..pictures import LUMINANCE, linear_from_srgb
+from ..progress import Progress
 from .frames import Frames, colours_at, thinned
 
 UNLIKE = 0.25
@@ -41,12 +42,14 @@ Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 
-def found(capture: Capture, frames: Frames) -> dict[str, float]:
+def found(capture: Capture, frames: Frames, progress: Progress | None = None) -> dict[str, float]:
     """Of each view, times the light of the frame in the middle; empty where all are exposed alike, or too few tell.
-    Views that do not tell are taken for as exposed as the nearest, by name, that do."""
-    stops = Seen.of(capture, thinned(capture.views, ASKED), frames).stops()
+    Views that do not tell are taken for as exposed as the nearest, by name, that do. Raises Cancelled when asked to
+    stop."""
+    progress = progress or Progress()
+    stops = Seen.of(capture, thinned(capture.views, ASKED), frames, progress).stops()
     if spread(stops) >= UNLIKE and len(stops) < len(capture.views):  # all only where some differ
-        stops = Seen.of(capture, capture.views, frames).stops()
+        stops = Seen.of(capture, capture.views, frames, progress).stops()
     if spread(stops) < UNLIKE:
         return {}
     filled = _filled(stops, [Path(view.name).parent for view in capture.views]) - np.nanmedian(stops)
@@ -94,11 +97,13 @@ class Seen:
     light: Floats
 
     @classmethod
-    def of(cls, capture: Capture, views: Sequence[View], frames: Frames) -> Seen:
+    def of(cls, capture: Capture, views: Sequence[View], frames: Frames, progress: Progress) -> Seen:
         """Where the solve found the points, neither too dark nor clipped, in the flare-free frames if there are any."""
         step = max(int(np.median([len(view.points) for view in views])) // POINTS, 1)  # the same points of all views
         parts = [(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0))]
+        progress.stage("look at exposures", len(views))
         for number, view in enumerate(views):
+            progress.advance()
             chosen = view.points[view.points % step == 0]
             if not len(chosen):
                 continue

@@ -30,6 +30,7 @@ from ..gaussians.densification import Classic, Mcmc, Strategy
 from ..gaussians.loss import l1_ssim
 from ..gaussians.optimiser import Adam
 from ..gaussians.ordering import morton_order
+from ..progress import Progress
 from . import metering
 from .beginning import first_flare, first_scene, moved_lights
 from .checkpoint import State
@@ -56,17 +57,18 @@ ASKED = 40
 class Trainer:
     """Scene and flare of a capture under optimisation: `step` by `step`, with `state` and `load_state`.
 
-    Raises CaptureError where the capture lacks what the mode needs.
+    Raises CaptureError where the capture lacks what the mode needs, Cancelled when asked to stop.
     """
 
-    def __init__(self, capture: Capture, settings: FitSettings, exposures: Mapping[str, float] | None = None) -> None:
+    def __init__(self, capture: Capture, settings: FitSettings, exposures: Mapping[str, float] | None = None,
+                 progress: Progress | None = None) -> None:
         """exposures: of the views, by name, where that is known already."""
         torch.manual_seed(settings.seed)
         self.settings = settings
         self.frames = Frames(capture, settings.width, display_white=settings.display_white,
                              alone=not settings.supervised)
         if exposures is None:
-            exposures = metering.found(capture, self.frames) if settings.exposure == "found" else {}
+            exposures = metering.found(capture, self.frames, progress) if settings.exposure == "found" else {}
         self.exposures = exposures
         """Times the usual light, by view; empty where all frames are exposed alike."""
         capture = capture.exposed(exposures)

@@ -69,16 +69,17 @@ def quick(iterations: int = 40, **changes: Any) -> FitSettings:
 
 
 class StopAt(Progress):
-    """Asks for a stop once the given number of steps were made."""
+    """Asks for a stop once the given number of steps of a stage were made."""
 
-    def __init__(self, steps: int) -> None:
+    def __init__(self, steps: int, stage: str = "fit") -> None:
         super().__init__()
-        self.steps = steps
+        self.steps, self.counted = steps, stage
 
     def advance(self, steps: int = 1, **figures: float) -> None:
-        self.steps -= steps
-        if self.steps <= 0:
-            self.request_stop()
+        if self._stage == self.counted:
+            self.steps -= steps
+            if self.steps <= 0:
+                self.request_stop()
         super().advance(steps, **figures)
 
 

@@ -218,6 +218,13 @@ def test_a_fit_that_was_stopped_goes_on_with_them(drifting: tuple[Capture, dict[
     assert fit(capture, quick(30), tmp_path / "run", resume=True).fingerprint == whole.fingerprint
 
 
+def test_a_fit_may_be_stopped_while_they_are_looked_for(drifting: tuple[Capture, dict[str, float]],
+                                                        tmp_path: Path) -> None:
+    with pytest.raises(Cancelled, match="look at exposures"):
+        fit(drifting[0], quick(10), tmp_path / "run", StopAt(3, "look at exposures"))
+    assert not (tmp_path / "run").exists()
+
+
 def test_a_fit_without_them_is_not_given_any_later(drifting: tuple[Capture, dict[str, float]], tmp_path: Path,
                                                    monkeypatch: pytest.MonkeyPatch) -> None:
     """Runs of versions that did not look."""

@@ -27,7 +27,7 @@ from ..metrics.evaluation import Renderer
 from ..pictures import linear_from_srgb, srgb_from_linear
 from ..progress import Progress
 from .inference import CLIPPED
-from .plates import Plate, read_plate, write_flare, write_plate
+from .plates import Plate, finite, read_plate, write_flare, write_plate
 from .record import Record, made_from
 
 Pixels = NDArray[np.float32]
@@ -156,7 +156,7 @@ def _light(plate: Plate) -> Pixels:
     """Linear light of the codes."""
     if plate.encoding == "srgb":
         return linear_from_srgb(_display(plate))
-    return np.nan_to_num(plate.codes.astype(np.float32), nan=0.0, posinf=65504.0, neginf=0.0)
+    return finite(plate.codes)
 
 
 def _display(plate: Plate) -> Pixels:

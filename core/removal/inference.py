@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from ..errors import SettingsError
 from ..pictures import Encoding, linear_from_srgb
 from .network import MULTIPLE, RemovalNetwork
-from .plates import Plate
+from .plates import Plate, finite
 from .weights import IN_THE_BOX, load
 
 Pixels = NDArray[np.float32]
@@ -207,12 +207,12 @@ def _reduced(codes: NDArray[Any], encoding: Encoding, top: float, width: int, he
 
 
 def _light(codes: NDArray[Any], encoding: Encoding, top: float) -> Pixels:
-    """Linear light; what is not a finite number counts as black here."""
+    """Linear light."""
     if encoding == "srgb":
         if codes.dtype == np.uint8:
             return _TABLE[codes]
         return np.power(codes.astype(np.float32) / np.float32(top), np.float32(GAMMA))
-    return np.nan_to_num(codes.astype(np.float32), nan=0.0, posinf=65504.0, neginf=0.0)
+    return finite(codes)
 
 
 def _display(light: Pixels) -> Pixels:

@@ -89,6 +89,11 @@ class Plate:
         return {name: header[name] for name in _PLACING if name in header}
 
 
+def finite(codes: NDArray[Any]) -> NDArray[np.float32]:
+    """Linear light of float codes; what is no number counts as black, what is infinite as the most that halfs hold."""
+    return np.nan_to_num(codes.astype(np.float32), nan=0.0, posinf=65504.0, neginf=0.0)
+
+
 def read_plate(path: Path | str) -> Plate:
     """Read PNG, JPEG, TIFF or EXR as it is stored. Floats that are not finite are kept.
 

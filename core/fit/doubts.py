@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What is told, before a fit begins, of footage that a flare can hardly be learned from."""
+"""What is told of footage that a flare can hardly be learned from, before a fit begins and as it ends."""
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -19,6 +19,11 @@ ASKED = 8
 GREY, FAR_FROM_GREY = 0.18, 3.0
 """Scene-linear light in the middle of a usual frame, and stops from there at which a fit does badly: the sample's
 frames as EXR times 16, or a sixteenth, leave nine tenths of the flare unfound."""
+
+UNLIKE, FEW_UNLIKE = 4.0, 0.1
+"""Times the usual loss, at which a frame does not look like what the others make of it; in more than which part of the
+frames it is the fit that is bad."""
+NAMED = 5
 
 
 def doubts(capture: Capture, settings: FitSettings, views: Sequence[View], frames: Frames) -> tuple[str, ...]:
@@ -37,3 +42,14 @@ def doubts(capture: Capture, settings: FitSettings, views: Sequence[View], frame
             found.append(f"The frames' light is {middle:.2g} in the middle, where a fit expects about {GREY:g}: what "
                          "is far brighter or darker is learned badly. Bring the files' exposure there first.")
     return tuple(found)
+
+
+def unlike(losses: Mapping[str, float]) -> tuple[str, ...]:
+    """A sentence on the few frames, by name, whose loss at the end of a fit is many times that of most."""
+    usual = float(np.median(list(losses.values()))) if losses else 0.0
+    names = [name for name, loss in losses.items() if loss > UNLIKE * usual]
+    if not names or len(names) > max(FEW_UNLIKE * len(losses), 1):
+        return ()
+    more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
+    return (f"{', '.join(names[:NAMED])}{more}: what the fit makes of the shot does not look like it; it may be of "
+            "another scene, or its camera be wrong. Take it out of the capture, and fit again.",)

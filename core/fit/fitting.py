@@ -19,6 +19,7 @@ from ..progress import Progress
 from ..sampling import Sampling
 from . import checkpoint
 from .beginning import with_white
+from .doubts import unlike
 from .preview import row, spread, write_preview, write_small
 from .rendering import render
 from .run import CHECKPOINT, FLARE, LOG, METRICS, PREVIEW, SCENE, SMALL_PREVIEW, Run
@@ -71,6 +72,9 @@ def fit(capture: Capture, settings: FitSettings, folder: Path | str, progress: P
             _log(run, f"stopped at iteration {trainer.iteration}")
             raise
         _finish(trainer, run)
+    for text in unlike(trainer.losses):
+        progress.say(text)
+        _log(run, text)
     _log(run, f"finished at iteration {trainer.iteration}")
     return run
 

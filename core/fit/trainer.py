@@ -75,6 +75,8 @@ class Trainer:
         self.capture = capture
         self.views, _ = capture.split(settings.holdout)
         self.iteration = 0
+        self.losses: dict[str, float] = {}
+        """Of each view, by name, when it was last looked at."""
         self.scene_is_fitted = not settings.scene.frozen
         if settings.supervised and not self.frames.reference and self.scene_is_fitted:
             raise CaptureError(f"{capture.folder} has no flare-free frames (removed/); run remove on it first, "
@@ -97,7 +99,8 @@ class Trainer:
         """One iteration on the next view; the loss and its parts."""
         self.iteration += 1
         settings = self.settings
-        targets = self.frames.targets(self._view())
+        view = self._view()
+        targets = self.frames.targets(view)
         self._set_rates()
         scene = render_scene(self.scene, targets.camera, settings.kernels, sh_degree=self._sh_degree(), depth=False)
         shown = self._as_filmed(scene.colour)
@@ -122,6 +125,7 @@ class Trainer:
             scene_loss = self._split_loss(targets, shown, sources, alone)
             figures["scene_loss"] = float(scene_loss.detach())
             loss = loss + scene_loss
+        self.losses[view.name] = sum(figures.values())
         if not all(map(math.isfinite, figures.values())):
             raise RunError(f"The fit diverged at iteration {self.iteration}; start it anew with lower learning rates.")
         if self.scene_is_fitted:

@@ -6,14 +6,17 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from core.capture import Capture
 from core.fit import fit, preset
-from core.fit.doubts import doubts
+from core.fit.doubts import doubts, unlike
 from core.fit.frames import Frames
 from core.metrics.evaluation import worse_than_none
-from tests.core.flared import flared_capture
+from core.pictures import write_png
+from tests.core.flared import HEIGHT, WIDTH, flared_capture
+from tests.core.heard import Heard
 from tests.core.test_fit import quick
 
 
@@ -63,6 +66,26 @@ def test_mode_split_goes_by_the_frames_alone(capture: Capture, tmp_path: Path) -
     with_them, without = (fit(one, quick(40, mode="split"), tmp_path / name)
                           for name, one in (("with", capture), ("without", Capture.open(bare))))
     assert with_them.fingerprint == without.fingerprint
+
+
+def test_a_frame_of_another_scene_is_named(tmp_path: Path) -> None:
+    folder = flared_capture(tmp_path / "capture")
+    heard = Heard()
+    fit(Capture.open(folder), quick(120, mode="split"), tmp_path / "sound", heard)
+    assert not any("does not look like it" in text for text in heard.texts)
+    tiles = np.random.default_rng(5).random((4, 8, 3)).repeat(HEIGHT // 4, 0).repeat(WIDTH // 8, 1)
+    write_png(folder / "images" / "0005.png", tiles)
+    fit(Capture.open(folder), quick(120, mode="split"), tmp_path / "odd", heard)
+    assert [text.split(":")[0] for text in heard.texts if "does not look like it" in text] == ["0005.png"]
+
+
+def test_where_many_frames_are_bad_none_is_blamed() -> None:
+    losses = {f"{number}.png": 0.1 for number in range(40)}
+    assert unlike(losses) == unlike({}) == ()
+    assert unlike({**losses, "a": 0.39, "b": 0.41})[0].startswith("b: ")
+    few = {f"odd {number}": 1.0 for number in range(4)}
+    assert "odd 0, odd 1, odd 2, odd 3: " in unlike({**losses, **few})[0]
+    assert unlike({**losses, **few, "odd 4": 1.0}) == ()
 
 
 @pytest.mark.parametrize(("found", "empty", "worse"), [(20.0, 24.0, True), (25.0, 24.0, False), (None, 24.0, False)])

@@ -115,6 +115,12 @@ class Capture:
                            for view in self.views)
         return same
 
+    def lit(self, places: Mapping[str, Floats]) -> Capture:
+        """The same, lights being at those places (3,), by name."""
+        same = copy(self)
+        same.lights = tuple(replace(light, xyz=places.get(light.name, light.xyz)) for light in self.lights)
+        return same
+
     # What was filmed.
 
     def frame(self, view: View, size: tuple[int, int] | None = None) -> Picture:

@@ -105,9 +105,13 @@ class Run:
         return exposures.read(self.folder)
 
     def capture(self, given: Path | None = None, *, need_frames: bool = True) -> Capture:
-        """What it was fitted to, from the folder given or where it was then, its frames exposed as the fit found them.
-        Raises RunError, CaptureError, FrameError."""
-        return Capture.open(self.find_capture(given), need_frames=need_frames).exposed(self.exposures)
+        """What it was fitted to, from the folder given or where it was then; the exposures of its frames and the places
+        of its lights are those that the fit found. Raises RunError, CaptureError, FrameError."""
+        found = Capture.open(self.find_capture(given), need_frames=need_frames).exposed(self.exposures)
+        if not (self.folder / FLARE).is_file() or self.flare is None:
+            return found
+        model = self.flare.model
+        return found.lit(dict(zip(model.names, model.positions.numpy().astype(np.float64), strict=True)))
 
     def find_capture(self, given: Path | None) -> Path:
         """The folder of its capture: the one given, else the one it was fitted to. RunError where that is gone."""

@@ -147,6 +147,7 @@ def test_a_light_given_beside_its_flare_is_put_there(tmp_path: Path) -> None:
         run = fit(capture, quick(4, **{"flare.snap": snap}), tmp_path / f"run {snap}", heard)
         off = np.linalg.norm(run.flare.model.positions.numpy()[0] - lamp.xyz)
         assert off < 0.1 if snap else off > 0.35
+        assert np.linalg.norm(run.capture().lights[0].xyz - run.flare.model.positions.numpy()[0]) < 1e-6
     assert [text.split(" was put")[0] for text in heard.texts if " was put" in text] == ["The light 'lamp'"]
 
 

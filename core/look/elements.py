@@ -144,7 +144,7 @@ def _along(mu: Floats, energy: Floats) -> list[NDArray[np.int64]]:
     edges = np.linspace(low, high, bins + 1)
     density, _ = np.histogram(mu, edges, weights=energy)
     reach = np.arange(-12, 13) * (high - low) / bins
-    density = np.convolve(density, np.exp(-0.5 * (reach / SMOOTH) ** 2), "same")
+    density = np.convolve(density, np.exp(-0.5 * (reach / SMOOTH) ** 2))[12:-12]
     cuts: list[float] = []
     peak, valley, at = density[0], density[0], 0
     for number, value in enumerate(density):

@@ -58,6 +58,7 @@ class ColouredPlate:
 
     def with_light(self, light: Pixels) -> NDArray[Any]:
         """Codes of the plate with light (height, width, 3), scene-linear Rec. 709, added."""
+        light = self.plate.shown(light)
         if self.space.is_linear:
             values = self.values + self.space.from_linear(light)
         else:

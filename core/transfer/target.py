@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from ..bake.frames import Frame, layers_file, numbered, plates_by_number
 from ..capture import Camera, Capture, Light, View, read_lights
+from ..colour import ColourSpace
 from ..errors import CaptureError, SettingsError
 from ..files import content_of
 from ..gaussians.ply import read_ply
@@ -273,8 +274,12 @@ def sized(target: Target, width: int | None, height: int | None) -> Target:
         replace(one, shot=replace(one.shot, camera=one.shot.camera.scaled(width, height))) for one in target.frames))
 
 
-def background(one: TargetFrame, size: tuple[int, int]) -> NDArray[np.float32] | None:
-    """The undistorted plate in linear Rec. 709 at `size`, where the plate's own file cannot be used; else None."""
+def background(one: TargetFrame, size: tuple[int, int], space: ColourSpace | None) -> NDArray[np.float32] | None:
+    """The undistorted plate in linear Rec. 709 at `size`, where the plate's own file cannot be used; else None. space:
+    that its numbers are in, where its file is not to say."""
     if one.undistorted is None:
         return None
-    return np.asarray(one.undistorted().resized(*size).linear(), np.float32)
+    picture = one.undistorted()
+    if space is not None:
+        picture = Picture(space.to_linear(picture.pixels), "linear")
+    return np.asarray(picture.resized(*size).linear(), np.float32)

@@ -250,7 +250,9 @@ class _OfFrame:
         target, one = self._transfer.target, self._one
         nothing = np.zeros((camera.height, camera.width), np.float32)
         if one.plate is not None:
-            straight = background(one, camera.size)
+            space = self._transfer.settings.plate_space
+            straight = background(one, camera.size,
+                                  None if space == AUTO else colour_space(space, self._transfer.config))
             if straight is not None:
                 return straight, nothing
             plate = self._transfer.plate(one)

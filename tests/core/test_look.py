@@ -184,6 +184,13 @@ def test_gaussians_are_grouped_by_kind_and_place() -> None:
     assert sum(element.energy for element in found.values()) == pytest.approx(1, abs=1e-5)
 
 
+def test_ghosts_close_to_each_other_are_cut_where_they_part() -> None:
+    """Within less than a kernel's reach of one another."""
+    mu = np.array([0, 0.005, 0.01, 0.1, 0.105, 0.11], np.float32)
+    found = grouping.group(plane(mu.tolist()), mu)
+    assert sorted(element.members.tolist() for element in found) == [[0, 1, 2], [3, 4, 5]]
+
+
 def test_every_gaussian_has_one_element_whatever_they_are() -> None:
     random = np.random.default_rng(2)
     for count in (0, 1, 2, 400):

@@ -24,7 +24,7 @@ from core.gaussians import SceneGaussians
 from core.gaussians.ply import write_ply
 from core.look import KeyedEdits, Look, ViewOfLight, read
 from core.look.shot import PlacedLight, Shot, ShotFrame
-from core.pictures import read_exr, srgb_from_linear, write_exr, write_png
+from core.pictures import linear_from_srgb, read_exr, srgb_from_linear, write_exr, write_png
 from core.removal.plates import Plate
 from core.transfer import query as queries
 from core.transfer.plates import ColouredPlate
@@ -468,6 +468,21 @@ def test_on_to_a_capture_and_in_chunks(flare: Path, look: Look, tmp_path: Path) 
             assert (tmp_path / "parts" / path.relative_to(tmp_path / "whole")).read_bytes() == path.read_bytes()
     with pytest.raises(RunError, match="other settings"):
         Transfer(flare, target, TransferSettings(query="source")).bake(tmp_path / "whole")
+
+
+@pytest.mark.parametrize(("model", "params"), [("PINHOLE", None), ("OPENCV", (57.6, 57.6, 32, 24, 0.02, 0, 0, 0))])
+def test_the_space_that_plates_are_said_to_be_in_counts(model: str, params: Any, flare: Path, look: Look,
+                                                        tmp_path: Path) -> None:
+    """With a lens that distorts as well, whose frames are straightened first."""
+    folder = make_capture(tmp_path / "capture", views=3, model=model, params=params)
+    (folder / "lights.json").write_text('{"lights": [{"name": "sun", "xyz": [0.2, -0.3, 0.5]}]}')
+    scenes = []
+    for space in ("srgb", "linear"):
+        target = of_capture(Capture.open(folder), look, {})
+        transfer = Transfer(flare, target, TransferSettings(plate_space=space))
+        scenes.append(transfer.of_frame(target.frames[1].frame).render(target.frames[1].shot.camera).scene)
+    np.testing.assert_allclose(scenes[0], linear_from_srgb(scenes[1]), atol=0.01)
+    assert np.abs(scenes[0] - scenes[1]).mean() > 0.1
 
 
 def test_edits_go_by_the_target_s_lights(flare: Path, look: Look, tmp_path: Path) -> None:

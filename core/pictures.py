@@ -245,16 +245,20 @@ def window_of(path: Path | str) -> Window:
 
 def _framed(path: Path, pixels: Pixels) -> Pixels:
     """The frame of an EXR's pixels (height, width, 3)."""
-    window = window_of(path)
+    return framed(pixels, window_of(path))
+
+
+def framed(pixels: Pixels, window: Window) -> Pixels:
+    """The frame of pixels (height, width, ...) that lie in a window of it, 0 where there are none."""
     if window.is_frame:
         return pixels
     (width, height), (x, y) = window.frame, window.origin
-    framed = np.zeros((height, width, 3), np.float32)
+    whole = np.zeros((height, width, *pixels.shape[2:]), np.float32)
     left, top = max(x, 0), max(y, 0)
     right, bottom = min(x + window.size[0], width), min(y + window.size[1], height)
     if right > left and bottom > top:
-        framed[top:bottom, left:right] = pixels[top - y:bottom - y, left - x:right - x]
-    return framed
+        whole[top:bottom, left:right] = pixels[top - y:bottom - y, left - x:right - x]
+    return whole
 
 
 def _size_from_header(stream: BinaryIO) -> tuple[int, int] | None:

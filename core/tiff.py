@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import struct
 from collections.abc import Container, Iterator, Mapping
+from pathlib import Path
 from typing import BinaryIO, Literal, NamedTuple
 
 import numpy as np
@@ -93,6 +94,13 @@ def with_tags(data: bytes, tags: Mapping[int, Tag]) -> bytes:
     whole[4:8] = struct.pack(order + "I", len(whole))
     whole += struct.pack(order + "H", len(kept)) + b"".join(kept) + following
     return bytes(whole)
+
+
+def is_premultiplied(path: Path) -> bool:
+    """Whether a file's colours are multiplied with its alpha already, as it says."""
+    with open(path, "rb") as stream:
+        told = read_tags(stream, (EXTRA_SAMPLES,))
+    return EXTRA_SAMPLES in told and int(told[EXTRA_SAMPLES].values[0]) == PREMULTIPLIED
 
 
 def as_stored(data: bytes) -> bytes:

@@ -9,7 +9,7 @@ from typing import Any
 
 from ..errors import DISK_FULL, FrameError, SettingsError, refusal
 from ..files import check_apart
-from ..pictures import pictures_below
+from ..pictures import pictures_below, window_of
 from ..progress import Progress
 from .inference import Remover
 from .mattes import Mattes
@@ -97,8 +97,7 @@ def _remove(path: Path, name: Path, results: Sequence[Path], remover: Remover, s
             mattes: Mattes | None) -> None:
     """results: the clean plate's path, and the flare's where it is wanted."""
     plate, told = sequences.read(path)
-    height, width = plate.codes.shape[:2]
-    codes, flare = remover.remove(plate, mattes.read(name, width, height) if mattes else None, told)
+    codes, flare = remover.remove(plate, mattes.read(name, window_of(path)) if mattes else None, told)
     write_plate(results[0], plate, codes)
     for result in results[1:]:
         write_flare(result, plate, flare)

@@ -24,7 +24,7 @@ from ..capture.discs import clipped_discs
 from ..errors import CaptureError
 from ..files import check_apart, inside
 from ..metrics.evaluation import Renderer
-from ..pictures import linear_from_srgb, srgb_from_linear
+from ..pictures import linear_from_srgb, srgb_from_linear, window_of
 from ..progress import Progress
 from .inference import CLIPPED
 from .plates import Plate, finite, read_plate, write_flare, write_plate
@@ -97,7 +97,9 @@ def _remove(fitted: Renderer, capture: Capture, view: View, results: Sequence[Pa
     was there."""
     plate = read_plate(capture.frame_path(view))
     height, width = plate.codes.shape[:2]
-    camera = view.camera if view.camera.size == (width, height) else view.camera.scaled(width, height)
+    window = window_of(capture.frame_path(view))  # an EXR's pixels may be more than those of the frame, or fewer
+    camera = view.camera if view.camera.size == window.frame else view.camera.scaled(*window.frame)
+    camera = camera if window.is_frame else camera.cropped(*window.origin, *window.size)
     layers = fitted.render(camera)
     flare = np.zeros((height, width, 3), np.float32)
     part = plate.inside.part  # the borders, which were not fitted, stay
@@ -105,6 +107,7 @@ def _remove(fitted: Renderer, capture: Capture, view: View, results: Sequence[Pa
     if plate.encoding == "linear":  # the fit was shown Rec. 709
         flares = {light: plate.space.from_linear(one) for light, one in flares.items()}
         scene = plate.space.from_linear(scene)
+    flares, scene = {light: plate.shown(one) for light, one in flares.items()}, plate.shown(scene)
     parts = _parts(plate, scene, flares)
     for light, one in flares.items():
         flare[part] += np.float32(parts[light]) * one[part]

@@ -102,6 +102,7 @@ class Remover:
         if not found.empty:
             filmed, clean, taken = (one[plate.inside.part] for one in (plate.codes, codes, flare))
             for rows, light in carried_up(found, filmed, plate.encoding, plate.top):
+                light = plate.shown(light)
                 if matte is not None:
                     light *= matte[plate.inside.part][rows, :, None]
                 clean[rows] = _less(filmed[rows], light, plate.encoding, plate.top)

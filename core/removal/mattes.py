@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FrameError, SettingsError
-from ..pictures import pictures_below
+from ..pictures import Window, framed, pictures_below, window_of
+from ..tiff import is_premultiplied
 from .plates import read_plate
 
 ASPECT = 0.01
@@ -36,22 +37,28 @@ class Mattes:
             raise FrameError(f"{name} has no matte in {self.given}; add one (black, where no flare is to be taken).")
         return found
 
-    def read(self, name: Path, width: int, height: int) -> NDArray[np.float32]:
+    def read(self, name: Path, plate: Window) -> NDArray[np.float32]:
         """(height, width), 0..1: the brightest channel of the plate's matte, by its alpha where it has one. Raises
         FrameError for a damaged one, and for one of another shape."""
         import cv2
 
         path = self.path(name)
-        matte = read_plate(path)
-        rows, columns = matte.codes.shape[:2]
+        matte, own = read_plate(path), window_of(path)
+        values = np.nan_to_num(matte.codes.max(-1).astype(np.float32) / np.float32(matte.top), nan=0.0, posinf=1.0)
+        # Painted on nothing, which counts as black.
+        if matte.alpha is not None and matte.encoding == "srgb" and not is_premultiplied(path):
+            values = values * (matte.alpha.astype(np.float32) / np.float32(matte.top))
+        if own.is_frame and own.size == plate.size:  # painted on the very pixels of the plate, overscan and all
+            return np.clip(values, 0, 1)
+        (columns, rows), (width, height) = own.frame, plate.frame
         if abs(columns * height / (rows * width) - 1) > ASPECT:
             raise FrameError(f"{path} is {columns} x {rows} pixels, another shape than its plate of {width} x "
                              f"{height}; make it for that plate.")
-        values = np.nan_to_num(matte.codes.max(-1).astype(np.float32) / np.float32(matte.top), nan=0.0, posinf=1.0)
-        if matte.alpha is not None and matte.encoding == "srgb":  # painted on nothing, which counts as black
-            values = values * (matte.alpha.astype(np.float32) / np.float32(matte.top))
+        values = framed(values, own)
         if (columns, rows) != (width, height):
             values = np.asarray(cv2.resize(values, (width, height), interpolation=cv2.INTER_LINEAR), np.float32)
+        x, y = plate.origin
+        values = framed(values, Window(plate.frame, (-x, -y), plate.size))
         return np.clip(values, 0, 1)
 
 

@@ -26,6 +26,7 @@ from ..colour import ColourSpace, colour_space, space_of_chromaticities
 from ..errors import FrameError
 from ..files import atomic_path
 from ..pictures import (
+    LUMINANCE,
     SUFFIXES,
     Encoding,
     exr_parts,
@@ -63,6 +64,10 @@ class Plate:
     def top(self) -> float:
         """The code that means 1."""
         return float(np.iinfo(self.codes.dtype).max) if self.codes.dtype.kind == "u" else 1.0
+
+    def shown(self, light: NDArray[np.float32]) -> NDArray[np.float32]:
+        """What of linear light (height, width, 3) such a plate shows: all of it, or its luminance where it is grey."""
+        return np.repeat(light @ LUMINANCE.astype(np.float32)[:, None], 3, -1) if self.grey else light
 
     @cached_property
     def inside(self) -> Inside:
@@ -216,6 +221,8 @@ def _write_exr(path: Path, plate: Plate, codes: NDArray[Any]) -> None:
     header = {name: value for name, value in plate.rest["header"].items() if name not in ("channels", "chunkCount")}
     header["type"] = OpenEXR.scanlineimage
     header.pop("tiles", None)
+    if header.get("compression") in (OpenEXR.DWAA_COMPRESSION, OpenEXR.DWAB_COMPRESSION):  # loses some at each writing
+        header["compression"] = OpenEXR.ZIP_COMPRESSION
     save_exr(path, header, channels)
 
 

@@ -25,7 +25,7 @@ from core import tiff
 from core.capture import Capture
 from core.colour.spaces import AP1
 from core.errors import Cancelled, FrameError, RunError, SettingsError
-from core.pictures import read_exr, read_picture, write_exr, write_png
+from core.pictures import Window, read_exr, read_picture, write_exr, write_png
 from core.progress import Progress
 from core.removal import batch, inference, weights
 from core.removal.batch import plates_of, remove_all
@@ -581,6 +581,23 @@ def test_what_a_fit_has_cleaned_may_be_cleaned_again(tmp_path: Path, everywhere:
     assert remove_all(frames, made, Remover(everywhere, working_size=96), Progress())["made"] == 3
 
 
+def test_frames_without_leading_noughts_are_told_once_each(tmp_path: Path, everywhere: Path,
+                                                           monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those beside a frame are those of the numbers beside its own, and it is cleaned in that order."""
+    folder = make_capture(tmp_path / "capture", views=24)
+    model = folder / "sparse" / "0" / "images.txt"
+    words = model.read_text()
+    for number in range(24):
+        (folder / "images" / f"{number:04d}.png").rename(folder / "images" / f"{number}.png")
+        words = words.replace(f" {number:04d}.png", f" {number}.png")
+    model.write_text(words)
+    remover, told = Remover(everywhere, working_size=64), []
+    tell = remover.tell
+    monkeypatch.setattr(remover, "tell", lambda plate: told.append(plate.path.name) or tell(plate))
+    remove_from(Capture.open(folder), remover, Progress())
+    assert len(told) == len(set(told)) == 24
+
+
 def test_a_fit_that_was_second_takes_what_the_first_has_cleaned(tmp_path: Path, everywhere: Path) -> None:
     capture = Capture.open(make_capture(tmp_path / "capture", views=3))
     shutil.rmtree(capture.folder / "removed", ignore_errors=True)
@@ -608,11 +625,82 @@ def test_a_plate_that_was_begun_is_made(tmp_path: Path, everywhere: Path) -> Non
     assert remove_all([source], tmp_path / "out", other, Progress())["made"] == 1
 
 
+def whole(width: int, height: int) -> Window:
+    return Window((width, height), (0, 0), (width, height))
+
+
+def test_a_matte_lies_where_its_file_and_the_plate_s_say(tmp_path: Path) -> None:
+    """Cropped to what is painted, or of the frame alone where the plate has overscan, or of all of that."""
+    painted = np.zeros((60, 90), np.float32)
+    painted[20:30, 50:70] = 1
+    cropped = {"dataWindow": ((50, 20), (69, 29)), "displayWindow": ((0, 0), (89, 59))}
+    header = {name: tuple(np.array(corner, np.int32) for corner in corners) for name, corners in cropped.items()}
+    write_exr(tmp_path / "cropped.exr", {"Y": painted[20:30, 50:70]}, header=header)
+    write_exr(tmp_path / "whole.exr", {"Y": painted})
+    write_exr(tmp_path / "half.exr", {"Y": painted[::2, ::2]})
+    overscan = Window((110, 72), (-10, -6), (90, 60))
+    for name, off in (("cropped.exr", 0), ("whole.exr", 0), ("half.exr", 1)):
+        for window in (whole(90, 60), overscan):
+            found = Mattes(tmp_path / name).read(Path("a.exr"), window)
+            assert found.shape == window.size[::-1]
+            high, wide = np.nonzero(found > 0.5)
+            corners = np.array([wide.min(), wide.max(), high.min(), high.max()]) + np.repeat(window.origin, 2)
+            assert np.abs(corners - (50, 69, 20, 29)).max() <= off
+    write_exr(tmp_path / "pixels.exr", {"Y": np.pad(painted, ((6, 6), (10, 10)))})
+    found = Mattes(tmp_path / "pixels.exr").read(Path("a.exr"), overscan)
+    np.testing.assert_array_equal(found[6:-6, 10:-10], painted)
+
+
+def test_a_matte_that_is_multiplied_with_its_alpha_is_not_so_twice(tmp_path: Path) -> None:
+    painted = np.full((60, 90, 4), 128, np.uint8)
+    encoded = cv2.imencode(".tif", painted)[1].tobytes()
+    for kind, told in ((tiff.PREMULTIPLIED, 128 / 255), (tiff.STRAIGHT, (128 / 255) ** 2)):
+        (tmp_path / "matte.tif").write_bytes(tiff.with_tags(encoded, {tiff.EXTRA_SAMPLES: tiff.short(kind)}))
+        found = Mattes(tmp_path / "matte.tif").read(Path("a.png"), whole(90, 60))
+        np.testing.assert_allclose(found, told, atol=1e-3)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".exr"])
+def test_a_grey_plate_loses_the_luminance_of_a_flare(suffix: str, tmp_path: Path,
+                                                     monkeypatch: pytest.MonkeyPatch, everywhere: Path) -> None:
+    """A blue one too, and the flare that is written is what the plate has lost."""
+    remover = Remover(everywhere, working_size=64)
+    blue = np.zeros((64, 96, 3), np.float32)
+    blue[..., 2] = 0.2
+    monkeypatch.setattr(remover, "added", lambda display: blue[:display.shape[0], :display.shape[1]])
+    path = tmp_path / f"a{suffix}"
+    if suffix == ".png":
+        cv2.imwrite(str(path), np.full((64, 96), 180, np.uint8))
+    else:
+        write_exr(path, {"Y": np.full((64, 96), 0.5, np.float32)})
+    plate = read_plate(path)
+    assert plate.grey
+    codes, flare = remover.remove(plate)
+    assert (codes < plate.codes).all()
+    assert np.ptp(codes, -1).max() == 0
+    assert np.ptp(flare.astype(np.float32), -1).max() < 1e-3
+
+
+@pytest.mark.parametrize("compression", ["DWAA", "DWAB", "B44", "ZIP"])
+def test_what_stays_of_an_exr_stays_whatever_its_compression(compression: str, tmp_path: Path) -> None:
+    random = np.random.default_rng(0)
+    noise = cv2.GaussianBlur(random.random((64, 96, 4)).astype(np.float32), (0, 0), 1.5).astype(np.float16)
+    write_exr(tmp_path / "a.exr", {name: noise[..., k] for k, name in enumerate(("R", "G", "B", "mask.R"))},
+              header={"compression": getattr(OpenEXR, f"{compression}_COMPRESSION")})
+    plate = read_plate(tmp_path / "a.exr")
+    codes = plate.codes.copy()
+    codes[40:44, 60:64] *= np.float16(0.5)
+    write_plate(tmp_path / "b.exr", plate, codes)
+    again = read_plate(tmp_path / "b.exr")
+    np.testing.assert_array_equal(again.codes[:32], plate.codes[:32])
+    np.testing.assert_array_equal(again.rest["channels"]["mask.R"], plate.rest["channels"]["mask.R"])
+
+
 def test_a_matte_painted_on_nothing_is_its_alpha(tmp_path: Path) -> None:
     painted = np.full((60, 90, 4), 255, np.uint8)
     painted[:, :45, 3] = 0
     cv2.imwrite(str(tmp_path / "matte.png"), painted)
-    found = Mattes(tmp_path / "matte.png").read(Path("a.png"), 90, 60)
+    found = Mattes(tmp_path / "matte.png").read(Path("a.png"), whole(90, 60))
     assert not found[:, :45].any()
     assert found[:, 45:].min() == 1
 
@@ -643,7 +731,7 @@ def test_mattes_that_make_no_sense(tmp_path: Path) -> None:
         Mattes(tmp_path / "none.png")
     matte = Mattes(_matte(tmp_path / "mattes" / "a.png", 60, 60))
     with pytest.raises(FrameError, match="another shape"):
-        matte.read(Path("a.png"), 90, 60)
+        matte.read(Path("a.png"), whole(90, 60))
     _matte(tmp_path / "mattes" / "a.tif", 60, 60)
     with pytest.raises(SettingsError, match="keep one"):
         Mattes(tmp_path / "mattes")

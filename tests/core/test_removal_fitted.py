@@ -15,7 +15,7 @@ from core.capture import Camera, Capture
 from core.capture.discs import clipped_discs
 from core.colour import ColourSpace, colour_space
 from core.errors import CaptureError, FrameError, SettingsError
-from core.pictures import linear_from_srgb, read_exr, read_picture, srgb_from_linear, write_exr, write_png
+from core.pictures import LUMINANCE, linear_from_srgb, read_exr, read_picture, srgb_from_linear, write_exr, write_png
 from core.progress import Progress
 from core.removal.fitted import _parts, remove_fitted, without
 from core.removal.plates import Plate, read_plate
@@ -74,6 +74,46 @@ def test_the_exact_flare_leaves_the_exact_scene(capture: Capture, tmp_path: Path
     assert remove_fitted(fitted, capture, capture.views, out, Progress())["kept"] == 3
     assert fitted.rendered == 3, "what is there is not made again"
     assert remove_fitted(fitted, capture, capture.views[:1], out, Progress(), overwrite=True)["made"] == 1
+
+
+class Glow:
+    """A fit that found a glow, the same by each of two lights, on an even scene; of any camera."""
+
+    def render(self, camera: Camera) -> Layers:
+        x = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx
+        y = (np.arange(camera.height)[:, None] + 0.5 - camera.cy) / camera.fy
+        glow = 0.15 * np.exp(-((x - 0.1) ** 2 + (y + 0.05) ** 2) / 0.02)
+        layer = (glow[..., None] * np.array([1, 0.5, 0.25])).astype(np.float32)
+        return Layers(np.full_like(layer, 0.2), {"a": layer, "b": layer})
+
+
+def test_overscan_and_frames_cut_to_a_part_lose_the_flare_where_it_is(tmp_path: Path) -> None:
+    capture = Capture.open(flared_capture(tmp_path / "capture", count=3, float_gain=1.0))
+    corners = ((-8, -4, 71, 43), (10, 5, 49, 29), (0, 0, 63, 39))
+    for view, (left, top, right, bottom) in zip(capture.views, corners, strict=True):
+        layers = Glow().render(view.camera.cropped(left, top, right - left + 1, bottom - top + 1))
+        light = layers.scene + sum(layers.flare_by_light.values())
+        write_exr(capture.frame_path(view), {name: light[..., k] for k, name in enumerate("RGB")}, header={
+            "dataWindow": (np.array([left, top], np.int32), np.array([right, bottom], np.int32)),
+            "displayWindow": (np.array([0, 0], np.int32), np.array([63, 39], np.int32))})
+    capture = Capture.open(capture.folder)
+    remove_fitted(Glow(), capture, capture.views, tmp_path / "clean", Progress())
+    for view in capture.views:
+        clean = read_exr(tmp_path / "clean" / view.name)
+        assert max(float(np.abs(clean[name] - 0.2).max()) for name in "RGB") < 2e-3
+
+
+def test_grey_frames_lose_the_luminance_of_the_flare(tmp_path: Path) -> None:
+    capture = Capture.open(flared_capture(tmp_path / "capture", count=3))
+    for view in capture.views:
+        layers = Glow().render(view.camera)
+        light = (layers.scene + sum(layers.flare_by_light.values())) @ LUMINANCE
+        cv2.imwrite(str(capture.frame_path(view)), np.round(srgb_from_linear(light) * 255).astype(np.uint8))
+    remove_fitted(Glow(), capture, capture.views, tmp_path / "clean", Progress())
+    for view in capture.views:
+        codes = cv2.imread(str(tmp_path / "clean" / view.name), cv2.IMREAD_UNCHANGED)
+        assert codes.ndim == 2
+        assert np.abs(linear_from_srgb(codes.astype(np.float32) / 255) - 0.2).max() < 5e-3
 
 
 def test_a_light_that_is_off_leaves_no_dark_flare(capture: Capture, tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from ...core.errors import SettingsError
+from ...core.files import patiently
 from ...core.look import LookEdits
 from ...core.progress import Progress
 from .. import frames
@@ -56,6 +57,7 @@ def frames_of(folder: Path, out: Path, progress: Progress, *, wanted: str | None
     compositor.plain_view(scene)
     node.inputs["Intensity"].default_value = intensity
     node.inputs["Tint"].default_value = (*colour, 1.0)
+    _keep(out.resolve() / BLEND, progress)
     compositor.save_beside(out.resolve() / BLEND)
     progress.stage("compose", len(numbers))
     compositor.render_frames(scene, numbers, lambda number, suffix: out.resolve() / f"frame.{number:04d}{suffix}",
@@ -63,10 +65,18 @@ def frames_of(folder: Path, out: Path, progress: Progress, *, wanted: str | None
     return {"frames": str(out), "blend": str(out / BLEND), "blender": bpy.app.version_string}
 
 
+def _keep(blend: Path, progress: Progress) -> None:
+    """Somebody may have worked in the .blend of before: it gets the name that Blender itself gives to such."""
+    if blend.exists():
+        patiently(blend.replace, blend.with_suffix(".blend1"))
+        progress.say(f"{blend} was there already, and is {blend.with_suffix('.blend1').name} now.")
+
+
 COMMAND = Command(
     "compose", "Puts baked layers together in Blender's compositor and renders the frames.",
     f"""Builds the node group "Fit Flare" over LAYERS and writes frame.####.exr (half float, scene-linear),
-frame.####.png (sRGB) and {BLEND}, which opens in Blender and shows the same.
+frame.####.png (sRGB) and {BLEND}, which opens in Blender and shows the same; one of before is kept
+beside it as compositor.blend1.
 
   run.py compose build/demo/layers --out build/frames --intensity 1.5 --tint 1,0.8,0.6""",
     arguments, (Step("compose", "blender", run),))

@@ -122,10 +122,9 @@ def place(words: argparse.Namespace) -> tuple[Path, Path]:
     folders = listed(words.listed)
     if not 1 <= words.entry <= len(folders):
         raise SettingsError(f"{words.listed} lists {len(folders)} captures; --entry {words.entry} is none of them.")
-    names = [folder.name for folder in folders]
-    chosen = folders[words.entry - 1]
-    name = chosen.name if names.count(chosen.name) == 1 else f"{words.entry:03d}_{chosen.name}"
-    return chosen, words.out / name
+    names = [folder.resolve().name if folder.name in ("", "..") else folder.name for folder in folders]
+    name = names[words.entry - 1]
+    return folders[words.entry - 1], words.out / (name if names.count(name) == 1 else f"{words.entry:03d}_{name}")
 
 
 def listed(path: Path) -> list[Path]:

@@ -16,7 +16,7 @@ from fit_flare.core.fit import settings as fit_settings
 from fit_flare.core.progress import Progress
 from fit_flare.headless import cli
 from fit_flare.headless.command import MOST_SEED, Command, Step
-from fit_flare.headless.commands import COMMANDS, bake, fit
+from fit_flare.headless.commands import COMMANDS, bake, compose, fit
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -35,6 +35,27 @@ def test_every_command_explains_itself(name: str, capsys: pytest.CaptureFixture[
     assert COMMANDS[name].summary in told
     assert "run.py " + name in told.split("options:")[0].split("\n\n", 1)[1], "an example of its use"
     assert "--progress" in told
+
+
+def test_runs_of_a_list_lie_below_the_folder_for_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever the list calls the captures."""
+    (tmp_path / "shoot" / "lists").mkdir(parents=True)
+    (tmp_path / "shoot" / "lists" / "list.txt").write_text("..\n.\n../b\n")
+    monkeypatch.chdir(tmp_path / "shoot" / "lists")
+    for listed in (tmp_path / "shoot" / "lists" / "list.txt", Path("list.txt")):
+        named = [fit.place(argparse.Namespace(listed=listed, entry=entry, out=Path("runs")))[1] for entry in (1, 2, 3)]
+        assert named == [Path("runs/shoot"), Path("runs/lists"), Path("runs/b")]
+
+
+def test_a_compositor_of_before_is_kept(tmp_path: Path) -> None:
+    blend = tmp_path / "compositor.blend"
+    compose._keep(blend, Progress())
+    assert not list(tmp_path.iterdir())
+    for work in ("first", "second"):
+        blend.write_text(work)
+        compose._keep(blend, Progress())
+        assert [path.read_text() for path in tmp_path.iterdir()] == [work]
+        assert (tmp_path / "compositor.blend1").exists()
 
 
 def test_the_list_of_commands(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:

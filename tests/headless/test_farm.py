@@ -158,7 +158,7 @@ def test_a_transfer_in_chunks(capture: Path, made: Path, tmp_path: Path) -> None
         PlacedLight("sun", name, read(flare).lights[0].xyz + 3.0 * number),)) for number, view in enumerate(views, 1)))
     shot.write(tmp_path / "shot.json")
     job("transfer.yaml", "Record", "--run-dependencies", Flare=flare, To=tmp_path / "shot.json", Out=tmp_path / "out",
-        Frames="1-4", FramesPerTask=2, Query="blend")
+        Frames="1-4", FramesPerTask=2, Query="blend", Set="")
     record = read_record(tmp_path / "out")
     assert [entry["frame"] for entry in record["frames"]] == [1, 2, 3, 4]
     assert not list((tmp_path / "out").rglob(".*"))

@@ -14,6 +14,7 @@ from ..errors import RunError
 from .batches import Batch
 from .learners import ALONE, Learner, add_up
 from .network import RemovalNetwork
+from .optimiser import Optimiser
 from .pairs import Pair
 from .recipe import Recipe
 
@@ -40,20 +41,16 @@ class Trainer:
         torch.manual_seed(recipe.seed)
         self.network = RemovalNetwork(recipe.widths, recipe.blocks).to(self.device)
         self.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # twice as fast here
-        self.optimiser = torch.optim.AdamW(self.network.parameters(), recipe.learning_rate,
-                                           weight_decay=recipe.decay, fused=True)
+        self.optimiser = Optimiser(self.network, recipe.decay)
         self.averaged = {name: value.detach().clone() for name, value in self.network.state_dict().items()}
         self.begun_with: dict[str, Tensor] = {}
 
     def step(self, batch: Batch) -> dict[str, float]:
         """One iteration; its figures."""
         recipe = self.recipe
-        for group in self.optimiser.param_groups:
-            group["lr"] = recipe.rate(self.iteration)
-        self.optimiser.zero_grad(set_to_none=True)
         figures = self._backward(batch)
         torch.nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
-        self.optimiser.step()
+        self.optimiser.step(recipe.rate(self.iteration))
         # The first steps' weights are not worth keeping for as long as later ones'.
         kept = min(recipe.average, (self.iteration + 1) / (self.iteration + 10))
         with torch.no_grad():
@@ -131,8 +128,7 @@ class Trainer:
         state = {f"network.{name}": value for name, value in self.network.state_dict().items()}
         state |= {f"averaged.{name}": value for name, value in self.averaged.items()}
         state |= {f"begun.{name}": value for name, value in self.begun_with.items()}
-        for (name, _), moments in zip(self.network.named_parameters(), self.optimiser.state.values(), strict=False):
-            state |= {f"moment.{key}.{name}": moments[key] for key in ("exp_avg", "exp_avg_sq", "step")}
+        state |= self.optimiser.state()
         return {name: value.detach().cpu().contiguous() for name, value in state.items()}
 
     def load_state(self, state: Mapping[str, Tensor], iteration: int) -> None:
@@ -157,10 +153,7 @@ class Trainer:
                                for name, value in state.items() if name.startswith("begun.")}
         else:
             self.begun_with = {name: value.clone() for name, value in self.averaged.items()}
-        for name, parameter in self.network.named_parameters():
-            if f"moment.step.{name}" in state:
-                moments = {key: state[f"moment.{key}.{name}"].to(self.device) for key in ("exp_avg", "exp_avg_sq")}
-                self.optimiser.state[parameter] = {**moments, "step": state[f"moment.step.{name}"]}
+        self.optimiser.load_state(state)
 
 
 def _precision(on: torch.device) -> Any:

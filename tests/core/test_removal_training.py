@@ -22,6 +22,8 @@ from core.removal.backgrounds import Backgrounds
 from core.removal.bank import OwnFlares
 from core.removal.batches import Batch, Batches, drawn_ahead
 from core.removal.learners import ALONE, Learner, add_up, shared
+from core.removal.network import RemovalNetwork
+from core.removal.optimiser import Optimiser
 from core.removal.recipe import Recipe, as_dict, from_dict
 from core.removal.synthesis.prescription import built_in
 from core.removal.trainer import Trainer
@@ -121,13 +123,32 @@ def test_a_handful_of_pairs_is_learned() -> None:
     batch = Batches(recipe, backgrounds(), built_in())[0]
     figures = {}
     for _ in range(120):
-        for group in trainer.optimiser.param_groups:
-            group["lr"] = 3e-3
         loss, figures = trainer.loss(batch)
-        trainer.optimiser.zero_grad()
         loss.backward()
-        trainer.optimiser.step()
+        trainer.optimiser.step(3e-3)
     assert figures["error"] < 0.2 * figures["untouched"]
+
+
+def test_the_steps_of_hidden_weights_are_as_long_in_every_direction() -> None:
+    """And as long as AdamW's usually are, a fifth of the rate; other weights take AdamW's, whose first is the rate."""
+    recipe = Recipe(widths=(16, 16, 16, 16, 16), decay=0)
+    trainer = Trainer(recipe)
+    before = {name: value.detach().clone() for name, value in trainer.network.named_parameters()}
+    for parameter in trainer.network.parameters():
+        parameter.grad = torch.randn_like(parameter) * torch.rand(parameter.shape[-1]) ** 4
+    trainer.optimiser.step(1e-2)
+    steps = {name: value.detach() - before[name] for name, value in trainer.network.named_parameters()}
+    hidden = steps["enter.2.0.first.weight"].permute(0, 2, 3, 1).flatten(1)
+    assert float(torch.linalg.matrix_norm(hidden, -2) / torch.linalg.matrix_norm(hidden, 2)) > 0.6
+    assert float(hidden.square().mean().sqrt()) == pytest.approx(0.2e-2, rel=0.3)
+    for name in ("see.2.weight", "head.weight", "attention.0.place.weight", "enter.2.0.first.bias"):
+        assert float(steps[name].abs().median()) == pytest.approx(1e-2, rel=0.05)
+    assert all(parameter.grad is None for parameter in trainer.network.parameters())
+
+
+def test_weights_that_lie_otherwise_are_refused() -> None:
+    with pytest.raises(ValueError, match="channels last"):
+        Optimiser(RemovalNetwork((16,) * 5, (0, 0, 1, 0, 0)), 0.0)
 
 
 def test_stages_of_a_training() -> None:

@@ -2,6 +2,7 @@
 """The CPU kernels as a piece of machinery: the same result on every machine, thread count and start."""
 from __future__ import annotations
 
+import errno
 import math
 import os
 import subprocess
@@ -287,6 +288,21 @@ def test_a_folder_of_its_own_is_gone_with_the_process(tmp_path: Path) -> None:
     folder, hits = _compile_elsewhere(unusable)
     assert folder.parent == tmp_path / "temporary" and hits == 0
     assert not list((tmp_path / "temporary").glob("fit_flare_*"))
+
+
+def test_a_full_disk_under_the_kernels_is_no_obstacle(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(compilation, "CACHE_FOLDER", tmp_path)
+    twice = compilation.kernel(doubled)
+    monkeypatch.setattr(twice._cache._cache_file, "save", full)
+    assert twice(2.0) == 4.0
+    assert not list(tmp_path.rglob("*.nbc"))
+
+
+def doubled(value: float) -> float:
+    return 2 * value
 
 
 def test_a_user_without_a_home_is_no_obstacle(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,6 +9,7 @@ which is another inside Blender, and which numba stores.
 from __future__ import annotations
 
 import atexit
+import contextlib
 import hashlib
 import os
 import shutil
@@ -74,9 +75,20 @@ def kernel(function: Callable[..., Any]) -> Any:
     config: Any = numba.config  # numba asks for the folder here, when a function is declared
     before, config.CACHE_DIR = config.CACHE_DIR, str(CACHE_FOLDER)
     try:
-        return numba.njit(nogil=True, cache=True, **OPTIONS)(function)
+        made = numba.njit(nogil=True, cache=True, **OPTIONS)(function)
     finally:
         config.CACHE_DIR = before
+    made._cache.save_overload = _where_there_is_room(made._cache.save_overload)
+    return made
+
+
+def _where_there_is_room(save: Callable[..., None]) -> Callable[..., None]:
+    """A full disk under the folder costs the next start its time, not this one its work."""
+    def saved(*words: Any) -> None:
+        with contextlib.suppress(OSError):
+            save(*words)
+
+    return saved
 
 
 def inlined(function: Callable[..., Any]) -> Any:

@@ -92,6 +92,34 @@ class Progress:
         pass
 
 
+def _tell(stream: TextIO, line: str) -> None:
+    """A disk too full for what is told is no reason to end: the work goes on, or says so by its own failure."""
+    try:
+        stream.write(f"{line}\n")
+        stream.flush()
+    except OSError as problem:
+        if problem.errno not in DISK_FULL:
+            raise
+
+
+def let_go(stream: TextIO) -> None:
+    """Leave nothing in the stream that a full disk refuses: Python would try it again at exit, and fail by it."""
+    try:
+        stream.flush()
+    except OSError as problem:
+        if problem.errno not in DISK_FULL:
+            raise
+        number, nowhere = stream.fileno(), os.open(os.devnull, os.O_WRONLY)
+        before = os.dup(number)
+        os.dup2(nowhere, number)
+        try:
+            stream.flush()
+        finally:
+            os.dup2(before, number)
+            os.close(before)
+            os.close(nowhere)
+
+
 class _Lines:
     """A line every ten seconds and at the end, in place of tqdm's bar."""
 
@@ -107,7 +135,7 @@ class _Lines:
         self._done += steps
         if self._done >= self._total or time.monotonic() - self._shown > 10:
             self._shown = time.monotonic()
-            print(f"{self._name}: {self._done}/{self._total}{self._figures}", file=self._stream, flush=True)
+            _tell(self._stream, f"{self._name}: {self._done}/{self._total}{self._figures}")
 
     def clear(self) -> None:
         """Lines leave nothing to clear."""
@@ -150,11 +178,11 @@ class TerminalProgress(Progress):
             self.close()
         elif self._bar is not None:
             self._bar.clear()
-        print(text, file=self._stream, flush=True)
+        _tell(self._stream, text)
 
     def error(self, text: str) -> None:
         self.close()
-        print(f"error: {text}", file=self._stream, flush=True)
+        _tell(self._stream, f"error: {text}")
 
     def close(self) -> None:
         if self._bar is not None:
@@ -171,13 +199,7 @@ class JsonProgress(Progress):
         self._last = 0.0
 
     def _send(self, **event: Any) -> None:
-        try:
-            self._stream.write(json.dumps(event) + "\n")
-            self._stream.flush()
-        except OSError as problem:
-            # A disk too full for the events is no reason to end: the work goes on, or says so by its own failure.
-            if problem.errno not in DISK_FULL:
-                raise
+        _tell(self._stream, json.dumps(event))
 
     def _show_stage(self) -> None:
         self._last = 0.0
@@ -215,7 +237,7 @@ class OpenJdProgress(Progress):
         self._last = 0.0
 
     def _line(self, kind: str, text: str) -> None:
-        print(f"openjd_{kind}: {' '.join(text.split())}", file=self._stream, flush=True)
+        _tell(self._stream, f"openjd_{kind}: {' '.join(text.split())}")
 
     def _show_stage(self) -> None:
         self._shown, self._last = -1, 0.0

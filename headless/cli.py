@@ -15,7 +15,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any, NoReturn, TextIO
 
 from ..core.errors import Cancelled, EngineError, FitFlareError, SettingsError, refusal
-from ..core.progress import JsonProgress, OpenJdProgress, Progress, TerminalProgress, stoppable
+from ..core.progress import JsonProgress, OpenJdProgress, Progress, TerminalProgress, let_go, stoppable
 from . import hand_off
 from .command import Command, Step
 from .commands import COMMANDS
@@ -71,13 +71,17 @@ def main(words: Sequence[str]) -> int:
     An option with nothing behind its "=" counts as not given: the templates of farms cannot leave one out.
     """
     words = [word for word in words if not (word.startswith("--") and word.find("=") == len(word) - 1)]
-    if not words:
-        parser().print_help(sys.stderr)
-        return MISUSED
     try:
-        with _progress(words) as progress:
-            return _status(words, progress)
-    except OSError:  # whoever listened has gone, or the disk that keeps the events is full
+        if words:
+            with _progress(words) as progress:
+                status = _status(words, progress)
+        else:
+            parser().print_help(sys.stderr)
+            status = MISUSED
+        let_go(sys.stdout)
+        let_go(sys.stderr)
+        return status
+    except OSError:  # whoever listened has gone
         return FAILED
 
 
@@ -147,8 +151,9 @@ def _pointed_at(target: int) -> Iterator[TextIO]:
     try:
         with os.fdopen(os.dup(before), "w", encoding="utf-8") as stream:
             yield stream
+            let_go(stream)
     finally:
-        sys.stdout.flush()
+        let_go(sys.stdout)
         os.dup2(before, 1)
         os.close(before)
 

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from core.errors import Cancelled
-from core.progress import STOP_FILE, JsonProgress, OpenJdProgress, Progress, TerminalProgress, stoppable
+from core.progress import STOP_FILE, JsonProgress, OpenJdProgress, Progress, TerminalProgress, let_go, stoppable
 
 
 def test_json_lines_are_whole_and_in_order() -> None:
@@ -67,13 +67,25 @@ class Gone(io.StringIO):
         raise BrokenPipeError
 
 
-def test_a_disk_too_full_for_events_does_not_end_the_work() -> None:
-    progress = JsonProgress(FullDisk())
+@pytest.mark.parametrize("kind", [JsonProgress, OpenJdProgress, TerminalProgress])
+def test_a_disk_too_full_for_what_is_told_does_not_end_the_work(kind: type[Progress]) -> None:
+    progress = kind(FullDisk())
     progress.stage("fit", 2)
     progress.advance(2)
+    progress.say("Half of it.")
     progress.error("The disk is full.")
     with pytest.raises(BrokenPipeError):
-        JsonProgress(Gone()).say("hello")
+        kind(Gone()).say("hello")
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="only Linux has a disk that is always full")
+def test_what_a_full_disk_refuses_is_let_go() -> None:
+    stream = open("/dev/full", "w")  # noqa: SIM115 - closed below, which tries what is left in it again
+    stream.write("a line")
+    let_go(stream)
+    with pytest.raises(OSError, match="No space"):
+        os.write(stream.fileno(), b"it leads where it led")
+    stream.close()
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

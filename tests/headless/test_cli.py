@@ -215,6 +215,16 @@ def test_streams_that_are_closed_are_not_missed(closed: tuple[int, ...]) -> None
         assert bool(done.stdout) == (1 not in closed and bool(extra))
 
 
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="only Linux has a disk that is always full")
+@pytest.mark.parametrize(("options", "full"), [("", "2"), ("--progress json", "1"),
+                                               ("--progress openjd", "1")])
+def test_a_full_disk_under_the_log_is_no_failure(options: str, full: str) -> None:
+    run = f"'{sys.executable}' '{cli.hand_off.RUN}'"
+    done = subprocess.run(f"{run} engine {options} {full}>/dev/full", shell=True, capture_output=True, check=False)
+    assert (done.returncode, done.stderr) == (0, b"")
+    assert subprocess.run(f"{run} fly {options} {full}>/dev/full", shell=True, check=False).returncode == 2
+
+
 def test_help_is_shown_on_a_terminal_of_ascii() -> None:
     environment = {**os.environ, "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0", "LC_ALL": "C"}
     done = subprocess.run([sys.executable, str(cli.hand_off.RUN), "--help"], capture_output=True, env=environment,

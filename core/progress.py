@@ -14,6 +14,7 @@ writes one JSON object a line for the add-on and other programs:
 from __future__ import annotations
 
 import contextlib
+import errno
 import importlib.util
 import json
 import os
@@ -30,6 +31,7 @@ from .errors import DISK_FULL, Cancelled
 STOP_FILE = "FIT_FLARE_STOP"
 """Of the environment: the path of a file which, when it is there, asks a command to stop."""
 STOP_FILE_EVERY_S = 0.3
+_UNTOLD = (*DISK_FULL, errno.EIO)  # the latter of a terminal that is gone
 
 
 class Progress:
@@ -93,21 +95,23 @@ class Progress:
 
 
 def _tell(stream: TextIO, line: str) -> None:
-    """A disk too full for what is told is no reason to end: the work goes on, or says so by its own failure."""
+    """A disk too full for what is told is no reason to end: the work goes on, or says so by its own failure. A terminal
+    that is gone has its own way of asking for the end."""
     try:
         stream.write(f"{line}\n")
         stream.flush()
     except OSError as problem:
-        if problem.errno not in DISK_FULL:
+        if problem.errno not in _UNTOLD:
             raise
 
 
 def let_go(stream: TextIO) -> None:
-    """Leave nothing in the stream that a full disk refuses: Python would try it again at exit, and fail by it."""
+    """Leave nothing in the stream that a full disk or a terminal that is gone refuses: Python would try it again at
+    exit, and fail by it."""
     try:
         stream.flush()
     except OSError as problem:
-        if problem.errno not in DISK_FULL:
+        if problem.errno not in _UNTOLD:
             raise
         number, nowhere = stream.fileno(), os.open(os.devnull, os.O_WRONLY)
         before = os.dup(number)
@@ -261,8 +265,7 @@ class OpenJdProgress(Progress):
 
 @contextlib.contextmanager
 def stoppable(progress: Progress) -> Iterator[Progress]:
-    """Let SIGINT, SIGTERM, (Windows) CTRL_BREAK and a file where STOP_FILE says ask the work to stop at its next step.
-    """
+    """Let `stop_signals` and a file where STOP_FILE says ask the work to stop at its next step."""
     with _stopped_by_file(progress), _stopped_by_signals(progress):
         yield progress
 
@@ -290,22 +293,33 @@ def _stopped_by_file(progress: Progress) -> Iterator[Progress]:
         watcher.join()
 
 
+def stop_signals() -> list[int]:
+    """SIGINT, SIGTERM, (Windows) CTRL_BREAK; and where the system has it SIGHUP, of a terminal that is gone, unless
+    nohup has it ignored."""
+    names = ("SIGINT", "SIGTERM", "SIGBREAK", "SIGHUP")
+    numbers = [getattr(signal, name) for name in names if hasattr(signal, name)]
+    return [number for number in numbers if not _is_hangup(number) or signal.getsignal(number) is not signal.SIG_IGN]
+
+
+def _is_hangup(number: int) -> bool:
+    return number == getattr(signal, "SIGHUP", None)
+
+
 @contextlib.contextmanager
 def _stopped_by_signals(progress: Progress) -> Iterator[Progress]:
     """Only the main thread may set signal handlers; elsewhere this changes nothing."""
     if threading.current_thread() is not threading.main_thread():
         yield progress
         return
-    names = ("SIGINT", "SIGTERM", "SIGBREAK")
-    signals = [getattr(signal, name) for name in names if hasattr(signal, name)]
-    before = {number: signal.getsignal(number) for number in signals}
+    before = {number: signal.getsignal(number) for number in stop_signals()}
 
     def ask(number: int, _frame: Any) -> None:
         progress.request_stop()
-        # A second signal gets the system's own, immediate, answer.
-        signal.signal(number, signal.SIG_DFL)
+        # A second signal gets the system's own, immediate, answer. That a terminal is gone both the system and the
+        # shell tell.
+        signal.signal(number, signal.SIG_IGN if _is_hangup(number) else signal.SIG_DFL)
 
-    for number in signals:
+    for number in before:
         signal.signal(number, ask)
     try:
         yield progress

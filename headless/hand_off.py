@@ -22,7 +22,7 @@ from types import FrameType
 from typing import Any
 
 from ..core.errors import Cancelled, EngineError, FitFlareError, SettingsError
-from ..core.progress import Progress
+from ..core.progress import Progress, stop_signals
 from .command import Side
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -227,18 +227,20 @@ def _event(line: str) -> dict[str, Any]:
 @contextlib.contextmanager
 def _stops_passed_on(child: subprocess.Popen[str]) -> Iterator[None]:
     """Signals that ask this process to stop reach the child too; it has a process group of its own."""
-    names = ("SIGINT", "SIGTERM", "SIGBREAK")
-    numbers = [getattr(signal, name) for name in names if hasattr(signal, name)]
-    before = {number: signal.getsignal(number) for number in numbers}
+    before = {number: signal.getsignal(number) for number in stop_signals()}
+    told: list[int] = []
 
     def pass_on(number: int, frame: FrameType | None) -> None:
-        _interrupt(child)
+        # A second stop ends the child at once, and a lost terminal's signal often comes with another.
+        if not told or number != getattr(signal, "SIGHUP", None):
+            _interrupt(child)
+        told.append(number)
         handler = before[number]
         if callable(handler):
             handler(number, frame)
 
     try:
-        for number in numbers:
+        for number in before:
             signal.signal(number, pass_on)
     except ValueError:  # not the main thread, which alone may do this
         yield

@@ -21,6 +21,7 @@ import torch.distributed as dist
 from torch import Tensor
 
 from ..errors import RunError
+from ..progress import stop_signals
 
 LOOPBACK = {"linux": "lo", "darwin": "lo0"}
 """Name of the interface that reaches this machine alone."""
@@ -97,8 +98,8 @@ def begin_process(_number: int = 0) -> None:
     import cv2
 
     cv2.setNumThreads(1)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    for number in stop_signals():
+        signal.signal(number, signal.SIG_IGN)
 
 
 def _other(learner: Learner, store: str, begun: Event, threads: int, learn: Callable[..., None],

@@ -7,6 +7,8 @@ import io
 import json
 import os
 import signal
+import subprocess
+import sys
 import threading
 import time
 from pathlib import Path
@@ -15,6 +17,8 @@ import pytest
 
 from core.errors import Cancelled
 from core.progress import STOP_FILE, JsonProgress, OpenJdProgress, Progress, TerminalProgress, let_go, stoppable
+
+ROOT = Path(__file__).resolve().parents[2]
 
 
 def test_json_lines_are_whole_and_in_order() -> None:
@@ -88,7 +92,8 @@ def test_what_a_full_disk_refuses_is_let_go() -> None:
     stream.close()
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP")
+                                    if hasattr(signal, name)])
 def test_signals_ask_for_a_stop_and_handlers_come_back(number: int) -> None:
     before = signal.getsignal(number)
     progress = Progress()
@@ -97,6 +102,59 @@ def test_signals_ask_for_a_stop_and_handlers_come_back(number: int) -> None:
         with pytest.raises(Cancelled):
             progress.advance()
     assert signal.getsignal(number) is before
+
+
+ON_A_TERMINAL = """
+import fcntl, sys, termios, time
+from pathlib import Path
+from core.errors import Cancelled
+from core.progress import TerminalProgress, let_go, stoppable
+
+fcntl.ioctl(0, termios.TIOCSCTTY, 0)
+progress = TerminalProgress()
+try:
+    with stoppable(progress):
+        progress.stage("fit", 10**9)
+        while True:
+            progress.say("a step")
+            progress.advance()
+            time.sleep(0.01)
+except Cancelled as stop:
+    progress.error(str(stop))
+    let_go(sys.stderr)
+    Path(sys.argv[1]).write_text("whole")
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "openpty") or sys.platform == "darwin", reason="of Linux's terminals")
+def test_work_whose_terminal_is_closed_stops_as_asked(tmp_path: Path) -> None:
+    ours, theirs = os.openpty()
+    words = [sys.executable, "-c", ON_A_TERMINAL, str(tmp_path / "saved")]
+    with subprocess.Popen(words, cwd=ROOT, stdin=theirs, stdout=theirs, stderr=theirs, start_new_session=True) as work:
+        os.close(theirs)
+        while b"a step" not in os.read(ours, 1000):
+            pass
+        os.close(ours)
+        assert work.wait(20) == 0
+    assert (tmp_path / "saved").read_text() == "whole"
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="Windows has no such signal")
+def test_a_lost_terminal_is_told_twice_and_not_at_all_under_nohup() -> None:
+    progress = Progress()
+    with stoppable(progress):
+        os.kill(os.getpid(), signal.SIGHUP)
+        os.kill(os.getpid(), signal.SIGHUP)
+        with pytest.raises(Cancelled):
+            progress.check()
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with stoppable(progress := Progress()):
+            os.kill(os.getpid(), signal.SIGHUP)
+            progress.check()
+        assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, before)
 
 
 def test_openjd_lines_are_a_farm_s() -> None:

@@ -176,8 +176,12 @@ def test_a_program_that_cannot_start_is_a_sentence(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(os.name == "nt", reason="signals to oneself end the process on Windows")
-def test_a_stop_reaches_the_other_process_which_ends_by_itself(tmp_path: Path) -> None:
+@pytest.mark.parametrize("numbers", [["SIGTERM"], ["SIGHUP", "SIGHUP"], ["SIGTERM", "SIGHUP"]])
+def test_a_stop_reaches_the_other_process_which_ends_by_itself(tmp_path: Path, numbers: list[str]) -> None:
+    """Once: a second one would end it before it has saved."""
     code = ("def stop(*_):\n"
+            "    signal.signal(signal.SIGINT, signal.SIG_DFL)\n"
+            "    time.sleep(0.3)\n"
             "    tell(type='say', text='saving')\n"
             "    open(sys.argv[1], 'w').write('whole')\n"
             "    tell(type='error', text='Stopped.')\n"
@@ -188,7 +192,8 @@ def test_a_stop_reaches_the_other_process_which_ends_by_itself(tmp_path: Path) -
 
     class Stopping(Heard):
         def _show_stage(self) -> None:
-            os.kill(os.getpid(), signal.SIGTERM)
+            for number in numbers:
+                os.kill(os.getpid(), getattr(signal, number))
 
     heard, began = Stopping(), time.monotonic()
     with pytest.raises(Cancelled), stoppable(heard):

@@ -233,9 +233,9 @@ def plain_name(name: str) -> str:
 
 
 def _is_file_name(part: str) -> bool:
-    """Whether any file system would take it: 255 bytes of UTF-8 at most, no lone surrogates."""
+    """Whether any file system would take it: 255 bytes at most, and as Python has the names that are not UTF-8."""
     try:
-        return len(part.encode()) <= 255
+        return len(os.fsencode(part)) <= 255
     except UnicodeEncodeError:
         return False
 

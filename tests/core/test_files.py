@@ -152,6 +152,15 @@ def test_names_that_lead_out_are_refused(tmp_path: Path, name: str) -> None:
         inside(tmp_path, name, CaptureError)
 
 
+def test_a_name_need_not_be_utf_8_but_one_that_a_disk_takes(tmp_path: Path) -> None:
+    assert inside(tmp_path, os.fsdecode(b"pl\xe9.png"), CaptureError).parent == tmp_path
+    for name in (256 * "a", 128 * "\u00e9", "\ud800"):
+        if os.name == "nt" and name == "\ud800":
+            continue  # of which Windows makes a name
+        with pytest.raises(CaptureError, match="not inside the folder"):
+            inside(tmp_path, name, CaptureError)
+
+
 def test_links_that_lead_out_are_refused(tmp_path: Path) -> None:
     folder = tmp_path / "images"
     folder.mkdir()

@@ -2,6 +2,7 @@
 """A flare on other frames: where it stands, what it shows, when it is not there, and what it leaves alone."""
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ import OpenEXR
 import pytest
 import torch
 
-from core.bake.bake import RECORD, BakeSettings
+from core.bake.bake import RECORD, BakeSettings, read_record
 from core.bake.exr import read_layers
 from core.capture import Camera, Capture
 from core.colour import colour_space
@@ -410,6 +411,22 @@ def test_no_plate_is_written_over_and_none_is_lost(flare: Path, look: Look, tmp_
     (tmp_path / "out" / "frames" / "plate.png").unlink()
     transfer.bake(tmp_path / "out")
     assert (tmp_path / "out" / "frames" / "plate.png").read_bytes() == flared
+
+
+def test_a_plate_whose_name_is_not_utf_8_is_made_and_known_again(flare: Path, look: Look, tmp_path: Path) -> None:
+    plate = tmp_path / os.fsdecode(b"pl\xe9_0001.png")
+    try:
+        write_png(plate, np.full((40, 60, 3), 0.2))
+    except OSError:
+        pytest.skip("this disk has no such names")
+    transfer = Transfer(flare, plate_target(plate, look))
+    record = transfer.bake(tmp_path / "out")
+    flared = tmp_path / "out" / "frames" / plate.name
+    assert record["frames"][0]["rest"] == [f"frames/{plate.name}"] and read_record(tmp_path / "out") == record
+    made = flared.stat().st_mtime_ns
+    assert transfer.bake(tmp_path / "out") == record and flared.stat().st_mtime_ns == made
+    transfer.bake(tmp_path / "out", settings=BakeSettings(edits=("*.intensity=3",)), overwrite=True)
+    assert flared.stat().st_mtime_ns != made
 
 
 @pytest.mark.parametrize("overwrite", [False, True])

@@ -53,8 +53,8 @@ def remove_all(inputs: Sequence[Path], folder: Path, remover: Remover, progress:
     mattes: where the flares are; None to have them found anywhere. wanted: names below the output folder of those to be
     cleaned; None for all. stills: each by itself, in place of in line with its neighbours.
 
-    Raises SettingsError before anything is written, and FrameError after everything was tried, with a list of
-    the plates that failed.
+    Raises SettingsError before anything is written, FrameError at once where the folder may not be written to, and
+    FrameError after everything was tried, with a list of the plates that failed.
     """
     plates = plates_of(inputs, [folder, flare_folder, mattes.given if mattes else None])
     results = {name: [folder / name, *([flare_folder / name.with_suffix(".exr")] if flare_folder else [])]
@@ -80,6 +80,9 @@ def remove_all(inputs: Sequence[Path], folder: Path, remover: Remover, progress:
         except (FrameError, OSError, MemoryError) as problem:
             if isinstance(problem, OSError) and problem.errno in DISK_FULL:
                 raise  # none of the others would fit either
+            if isinstance(problem, OSError) and record.is_refused(problem):
+                raise FrameError(f"{folder} cannot be written to ({problem.strerror}); choose another folder for the "
+                                 "clean plates, or have the rights to this one.") from problem
             failed.append(refusal(problem) if isinstance(problem, OSError) else
                           str(problem) or f"{path} does not fit into memory.")
             progress.say(f"Left out: {failed[-1]}")

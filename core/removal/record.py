@@ -3,6 +3,7 @@
 would come out the same, and whatever else lies there is not taken for one."""
 from __future__ import annotations
 
+import errno
 import hashlib
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -51,6 +52,13 @@ class Record:
                 write_json(self._folder / RECORD, {"plates": dict(sorted({**before, name.as_posix(): how}.items()))})
         for path in results:
             remove_partial_of(path)
+
+    def is_refused(self, problem: OSError) -> bool:
+        """Whether it is the folder itself that may not be written, whichever plate is next."""
+        if not isinstance(problem, PermissionError) and problem.errno != errno.EROFS:
+            return False
+        own = (self._folder / LOCK, self._folder / RECORD, self._folder, *self._folder.parents)
+        return problem.filename is not None and Path(problem.filename) in own
 
     def _read(self) -> dict[str, str]:
         """{} where it is not written down."""

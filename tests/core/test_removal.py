@@ -781,6 +781,26 @@ def test_a_full_disk_ends_the_batch(tmp_path: Path, nowhere: Path, monkeypatch: 
         remove_all([tmp_path / "in"], tmp_path / "out", Remover(nowhere, working_size=64), Progress())
 
 
+@pytest.mark.parametrize("number", [errno.EACCES, errno.EROFS])
+def test_a_folder_that_may_not_be_written_ends_the_batch(tmp_path: Path, nowhere: Path, number: int,
+                                                         monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("a", "b", "c"):
+        write_codes(tmp_path / "in" / f"{name}.png", picture())
+    opened, tried = os.open, []
+
+    def refuse(path: Any, *words: Any, **options: Any) -> int:
+        if Path(path).parent != tmp_path / "out":
+            return opened(path, *words, **options)
+        tried.append(path)
+        raise OSError(number, os.strerror(number), path)
+
+    monkeypatch.setattr("core.files._REFUSALS", 0)
+    monkeypatch.setattr("core.files.os.open", refuse)
+    with pytest.raises(FrameError, match=r"^[^ ]*out cannot be written to \([^)]*\); choose another folder"):
+        remove_all([tmp_path / "in"], tmp_path / "out", Remover(nowhere, working_size=64), Progress())
+    assert len(tried) == 1
+
+
 def test_what_is_there_is_kept(tmp_path: Path, everywhere: Path) -> None:
     source = write_codes(tmp_path / "plate.png", picture())
     remover = Remover(everywhere, working_size=64)

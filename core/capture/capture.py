@@ -337,10 +337,15 @@ def read_lights(path: Path) -> tuple[Light, ...]:
         if name in lights:
             raise CaptureError(f"{path} has two lights with the name {name!r}; rename one.")
         xyz = entry.get("xyz")
-        if not isinstance(xyz, list) or len(xyz) != 3 or not all(_is_finite(x) for x in xyz):
+        if not is_place(xyz):
             raise CaptureError(f"{path}, {name!r}: xyz should be three finite numbers.")
         lights[name] = Light(name, np.array(xyz, np.float64))
     return tuple(lights.values())
+
+
+def is_place(xyz: Any) -> bool:
+    """Whether it is three finite numbers, as JSON has them."""
+    return isinstance(xyz, list) and len(xyz) == 3 and all(_is_finite(x) for x in xyz)
 
 
 def _is_finite(value: Any) -> bool:

@@ -11,6 +11,7 @@ list was taken out by hand and stays out.
 """
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ import numpy as np
 
 from ..capture import read_lights
 from ..capture.camera import Camera
+from ..capture.capture import is_place
 from ..errors import CaptureError
 from ..files import read_json, rounded, write_json
 from .gather import FoundLight
@@ -33,10 +35,10 @@ def check_replaceable(path: Path) -> None:
         return
     read_lights(path)  # checks it
     data = read_json(path, CaptureError)
-    places = [place for place in data.get("found", []) if isinstance(place, list)]
+    places = _places_in(data, path)
     own = [str(entry["name"]) for number, entry in enumerate(data["lights"], 1) if not (
         "support" in entry and entry["name"] == f"light{number}"
-        and any(np.allclose(entry["xyz"], place, rtol=1e-3, atol=1e-5) for place in places if len(place) == 3))]
+        and any(np.allclose(entry["xyz"], place, rtol=1e-3, atol=1e-5) for place in places))]
     if own:
         raise CaptureError(f"{path} has lights that were not found here ({', '.join(own)}); add --keep to leave them "
                            "as they are, or remove the file to look for all anew.")
@@ -53,10 +55,9 @@ def write_lights(path: Path, found: Sequence[FoundLight], views: Sequence[tuple[
     if keep and path.exists():
         read_lights(path)  # checks it
         data = read_json(path, CaptureError)
-        entries = list(data["lights"])
-        found_before = data.get("found", [])
-        if not all(isinstance(xyz, list) and len(xyz) == 3 for xyz in found_before):
-            raise CaptureError(f"{path}: found should be a list of places; remove that entry.")
+        entries, found_before = list(data["lights"]), _places_in(data, path)
+        for entry in entries:
+            _check_writable(entry, path)
     known = [*(entry["xyz"] for entry in entries), *found_before]
     for light in found:
         if any(_one(light.xyz, xyz, views) for xyz in known):
@@ -66,6 +67,24 @@ def write_lights(path: Path, found: Sequence[FoundLight], views: Sequence[tuple[
     places += [xyz for xyz in found_before if not any(_one(place, xyz, views) for place in places)]
     write_json(path, {"lights": entries, "found": places})
     return entries
+
+
+def _places_in(data: dict[str, Any], path: Path) -> list[list[float]]:
+    """What an earlier run found. Raises CaptureError where that is no list of places."""
+    places = data.get("found", [])
+    if not isinstance(places, list) or not all(is_place(place) for place in places):
+        raise CaptureError(f"{path}: found should be a list of places, each of three finite numbers; remove that "
+                           "entry.")
+    return places
+
+
+def _check_writable(entry: dict[str, Any], path: Path) -> None:
+    """Raises CaptureError for NaN and infinity, which are read and cannot be written again."""
+    try:
+        json.dumps(entry, allow_nan=False)
+    except ValueError as problem:
+        raise CaptureError(f"{path}, {entry['name']!r}: one of the numbers is not finite; mend it or remove it."
+                           ) from problem
 
 
 def _entry(light: FoundLight, name: str) -> dict[str, Any]:

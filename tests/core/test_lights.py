@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from core.capture import Camera, Capture
 from core.errors import CaptureError, EngineError, SettingsError
 from core.lights import Detection, Exposure, GatherSettings, detector_for, find_lights, gather, record, union
-from core.lights.file import write_lights
+from core.lights.file import check_replaceable, write_lights
 from core.lights.find import _from_one_view
 from core.lights.gather import FoundLight, without_ghosts
 from core.lights.ghosts import find_blobs, gather_ghosts
@@ -332,6 +332,23 @@ class TestFile:
         with pytest.raises(CaptureError, match=r"lights\.json"):
             write_lights(path, [], [], keep=True)
         assert path.read_text() == "{"
+
+    @pytest.mark.parametrize(("old", "new"), [
+        ('"found": [', '"found": null, "before": ['), ('"found": [', '"found": [["a", 1, 2], '),
+        ('"found": [', '"found": [[NaN, 1, 2], '), ('"found": [', '"found": [[1, 2], '),
+        ('"uncertainty": ', '"uncertainty": NaN, "before": ')])
+    def test_what_a_hand_has_put_there_is_told(self, tmp_path: Path, old: str, new: str) -> None:
+        path, views = tmp_path / "lights.json", named(orbit(12, size=SIZE))
+        found = self.found((0.4, -0.5, 0.3))
+        write_lights(path, found, views)
+        damaged = path.read_text().replace(old, new)
+        path.write_text(damaged)
+        with pytest.raises(CaptureError, match=r"lights\.json.*(list of places|is not finite)"):
+            write_lights(path, found, views, keep=True)
+        assert path.read_text() == damaged
+        if "found" in new:
+            with pytest.raises(CaptureError, match="list of places"):
+                check_replaceable(path)
 
 
 def lit_capture(folder: Path, views: int, places: list[tuple[float, float, float]]) -> Path:

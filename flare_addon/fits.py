@@ -141,7 +141,7 @@ def _begun_with(folder: Path) -> Path | None:
     """The capture of a run; None where its folder does not say."""
     try:
         return Path((folder / "capture.txt").read_text(encoding="utf-8").removesuffix("\n"))
-    except OSError:
+    except (OSError, UnicodeDecodeError):
         return None
 
 

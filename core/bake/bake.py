@@ -21,6 +21,7 @@ from ..files import inside, locked, read_json, remove_partial_of, write_json
 from ..look import KeyedEdits, LookEdits
 from ..pictures import exr_is_cut_off, picture_size
 from ..progress import Progress
+from ..typed import value_of
 from .exr import read_description, write_layers
 from .frames import Frame
 from .layers import FrameLayers, Rendering, layer_names, layers_of
@@ -257,12 +258,16 @@ def read_record(out: Path | str) -> dict[str, Any]:
     record = read_json(path, RunError)
     try:
         for entry in record["frames"]:
-            for file in (entry["file"], *entry.get("rest", ())):
+            rest = entry.get("rest", [])
+            if not isinstance(rest, list):
+                raise TypeError(f"rest {rest!r:.100}")
+            for file in (entry["file"], *rest):
                 inside(out, file, RunError)
-            int(entry["frame"]), int(entry["width"]), int(entry["height"])
+            for name in ("frame", "width", "height"):
+                value_of(int, entry[name])
         if record["version"] != VERSION or not isinstance(record["made_from"], dict):
             raise ValueError(f"version {record['version']}")
         dict(record["layers"]).items()
-    except (ArithmeticError, KeyError, TypeError, ValueError) as problem:
+    except (AttributeError, KeyError, TypeError, ValueError) as problem:
         raise RunError(f"{path} is damaged or from another version ({problem!r}); bake into a new folder.") from problem
     return record

@@ -97,6 +97,10 @@ class Run:
             capture = Path((folder / CAPTURE).read_text(encoding="utf-8").removesuffix("\n"))
         except OSError as problem:
             raise RunError(f"{folder / CAPTURE} cannot be read ({problem.strerror}); start the fit anew.") from problem
+        except UnicodeDecodeError as problem:
+            raise RunError(f"{folder / CAPTURE} is not UTF-8 text; start the fit anew.") from problem
+        if not capture.name:  # of an empty file it would be the working folder
+            raise RunError(f"{folder / CAPTURE} names no capture; start the fit anew.")
         return cls(folder, settings, capture)
 
     @cached_property

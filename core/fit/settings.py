@@ -357,6 +357,8 @@ def read_config(path: Path) -> FitSettings:
     """The settings of a run. Raises RunError where the file is missing, damaged, or holds unknown names."""
     try:
         data = tomllib.loads(path.read_text(encoding=WRITTEN_BY_HAND))
+        if "mode" not in data:  # what is cut off would pass for settings that are left as they come
+            raise ValueError("it has no mode")
         return table_of(FitSettings, data).checked()
     except OSError as problem:
         raise RunError(f"{path} cannot be read ({problem.strerror}); is this the folder of a run?") from problem

@@ -305,7 +305,13 @@ def test_plates_have_the_numbers_of_their_names(tmp_path: Path) -> None:
 
 def test_a_damaged_record_is_one_sentence(tmp_path: Path) -> None:
     good = bake(FakeRenderer(), FRAMES[:1], CAMERAS, tmp_path)
-    for text in ("", "[]", "{}", '{"version": 99}'):
+    whole = (tmp_path / RECORD).read_text()
+    number, file = f'"frame": {FRAMES[0].number}', f'"file": "{FRAMES[0].file}"'
+    damaged = [whole.replace(old, new) for old, new in (
+        (number, '"frame": "3"'), (number, '"frame": true'), (file, '"file": 5'), (file, f'{file}, "rest": "ab"'),
+        (file, f'{file}, "rest": [5]'))]
+    for text in ("", "[]", "{}", '{"version": 99}', *damaged):
+        assert text != whole
         (tmp_path / RECORD).write_text(text)
         with pytest.raises(RunError, match=r"bake\.json"):
             bake(FakeRenderer(), FRAMES[:1], CAMERAS, tmp_path)

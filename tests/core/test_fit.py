@@ -390,6 +390,14 @@ def test_a_run_finds_its_capture_by_any_name(tmp_path: Path, capture: Capture, n
     assert found.find_capture(None).samefile(tmp_path / name)
 
 
+@pytest.mark.parametrize("damage", [b"", b"\n", b"/cap\xff\n"])
+def test_a_run_that_does_not_say_of_what_is_refused(tmp_path: Path, capture: Capture, damage: bytes) -> None:
+    made = Run.create(tmp_path / "run", quick(), capture.folder)
+    (made.folder / "capture.txt").write_bytes(damage)
+    with pytest.raises(RunError, match=r"capture\.txt (names no capture|is not UTF-8)"):
+        Run.open(made.folder)
+
+
 def test_a_capture_whose_name_cannot_be_written_down_is_refused(tmp_path: Path, capture: Capture) -> None:
     try:
         folder = Path(shutil.copytree(capture.folder, tmp_path / os.fsdecode(b"cap\xff")))

@@ -102,7 +102,9 @@ def test_nonsense_is_refused_with_the_name(name: str, value: Any) -> None:
         changed(preset("draft"), {name: value})
 
 
-@pytest.mark.parametrize("text", ["iterations = [", "unknown = 1", "iterations = \"many\"", "[flare]\nform = 3"])
+@pytest.mark.parametrize("text", [
+    "", "iterations = 100", "mode = \"split\"\niterations = [", "mode = \"split\"\nunknown = 1",
+    "mode = \"split\"\niterations = \"many\"", "mode = \"split\"\n[flare]\nform = 3"])
 def test_a_damaged_config_is_refused_by_name(tmp_path: Path, text: str) -> None:
     path = tmp_path / "config.toml"
     path.write_text(text)

@@ -269,7 +269,7 @@ def test_frames_that_share_nothing(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("case", ["absent", "empty", "two", "broken", "text", "own images", "own folder", "theirs",
-                                  "file"])
+                                  "file", "damaged"])
 def test_nothing_to_solve(tmp_path: Path, case: str) -> None:
     source, out = tmp_path / "frames", tmp_path / "out"
     if case not in ("absent", "text"):
@@ -291,6 +291,9 @@ def test_nothing_to_solve(tmp_path: Path, case: str) -> None:
         (out / "sparse" / "0").mkdir(parents=True)
     elif case == "file":
         out.write_text("")
+    elif case == "damaged":
+        out.mkdir()
+        (out / "solve.json").write_text("[]")
     before = sorted(tmp_path.rglob("*"))
     with pytest.raises(CaptureError) as caught:
         solve(source, out, QUICK)

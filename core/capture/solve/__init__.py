@@ -128,6 +128,8 @@ def _claim(source: Path, out: Path, request: dict[str, Any], progress: Progress)
     theirs = [name for name in ("images", "sparse", "transforms.json") if (out / name).exists()]
     if (out / REPORT).is_file():
         report = read_json(out / REPORT, CaptureError)
+        if not isinstance(report, dict):
+            raise CaptureError(f"{out / REPORT} is not the report of a solve; choose another folder for the capture.")
         if report.get("request") == request:
             progress.say(f"{out} is solved already.")
             return dict(report)

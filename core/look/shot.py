@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -131,6 +132,11 @@ class Shot:
             if data.get("query", "target") not in get_args(Query):
                 raise ValueError(f"query {data['query']!r}")
             frames = tuple(_frame(entry, data) for entry in data["frames"])
+            if not frames:
+                raise ValueError("it has no frames")
+            twice = [one for one, count in Counter((one.name, one.frame) for one in frames).items() if count > 1]
+            if twice:
+                raise ValueError(f"frame {twice[0][1]} of {twice[0][0]!r} is listed twice")
             here = Path(path).parent
             run = here / data["run"] if data.get("run") else None
             return cls(here / data["flare"], frames, data.get("query", "target"), run, bool(data.get("live")))
@@ -147,26 +153,38 @@ class Shot:
 
 
 def _frame(entry: Mapping[str, Any], data: Mapping[str, Any]) -> ShotFrame:
-    width, height = (int(entry.get(key, data.get(key))) for key in ("width", "height"))
+    width, height = (_whole(entry.get(key, data.get(key))) for key in ("width", "height"))
     fx, fy, cx, cy = (_number(value) for value in entry["intrinsics"])
-    pose, exposure = np.array(entry["world_to_camera"], np.float64), _number(entry.get("exposure", 1.0))
+    pose = np.array([[_number(value) for value in row] for row in entry["world_to_camera"]])
+    exposure = _number(entry.get("exposure", 1.0))
     if not (0 < width <= _LARGEST and 0 < height <= _LARGEST and fx > 0 and fy > 0 and pose.shape == (4, 4)
-            and np.isfinite(pose).all() and exposure > 0):
+            and exposure > 0):
         raise ValueError(f"frame {entry['frame']} has no sensible camera")
     lights = tuple(PlacedLight(str(one["name"]), str(one["source"]), np.array([_number(x) for x in one["xyz"]]),
                                _number(one.get("share", 1.0))) for one in entry["lights"])
     if any(light.xyz.shape != (3,) for light in lights):
         raise ValueError("a light has no place")
+    if not all(0 <= light.share <= 1 for light in lights):
+        raise ValueError("the share of a light lies between 0 and 1")
     if not all(isinstance(word, str) for word in entry.get("edits", [])):
         raise ValueError("edits are a list of texts")
-    number = _number(entry["frame"])
-    if number != int(number) or not 0 <= number < _MOST_FRAMES:
-        raise ValueError(f"the frame {entry['frame']!r} is no number of a file")
-    return ShotFrame(int(number), str(entry.get("name", "Camera")),
+    number = _whole(entry["frame"])
+    if not 0 <= number < _MOST_FRAMES:
+        raise ValueError(f"the frame {number} is no number of a file")
+    return ShotFrame(number, str(entry.get("name", "Camera")),
                      Camera(width, height, fx, fy, cx, cy, pose, exposure), lights, tuple(entry.get("edits", [])))
 
 
+def _whole(value: Any) -> int:
+    number = _number(value)
+    if number != int(number):
+        raise ValueError(f"{value!r} is no whole number")
+    return int(number)
+
+
 def _number(value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise TypeError(f"{value!r:.100} is no number")
     number = float(value)
     if not math.isfinite(number):
         raise ValueError("a number is not finite")

@@ -454,7 +454,11 @@ def test_a_shot_is_read_as_it_was_written(tmp_path: Path) -> None:
                      ('"width": 64', '"width": -1'), ('"query": "target"', '"query": "moon"'),
                      ('"frame": 1', '"frame": 1e400'), ('"frame": 1', '"frame": 1.5'), ('"frame": 1', '"frame": -5'),
                      ('"frame": 1', '"frame": 1e30'), ('"width": 64', '"width": 1e400'),
-                     ('"share": 1.0', '"share": 1' + 400 * "0"), ('"exposure": 1.0', '"exposure": 0')):
+                     ('"share": 1.0', '"share": 1' + 400 * "0"), ('"exposure": 1.0', '"exposure": 0'),
+                     ('"frame": 1', '"frame": true'), ('"frame": 1', '"frame": "1"'), ('"frame": 1', '"frame": 2'),
+                     ('"width": 64', '"width": "64"'), ('"width": 64', '"width": 64.5'), ('0.0,', '"0.0",'),
+                     ('"share": 1.0', '"share": true'), ('"share": 1.0', '"share": 1.5'),
+                     ('"share": 1.0', '"share": -0.5'), ('"frames": [', '"frames": [], "before": [')):
         assert old in text
         (tmp_path / "bad.json").write_text(text.replace(old, new))
         with pytest.raises(SettingsError, match=r"bad\.json"):

@@ -84,7 +84,7 @@ def write_flare_ply(path: Path | str, flares: Mapping[str, PlaneGaussians], came
         "Fit Flare: the flare of one frame, as its camera sees it",
         "light adds, colours are scene-linear" if blend == "add" else "light covers, colours are display values",
         f"profile exp(-(r - ring_r0)^2 / (2 ring_w^2)){arcs}, r the Mahalanobis distance",
-        f"lights {' '.join(flares)}"))
+        f"lights {' '.join(' '.join(name.split()) for name in flares)}"))  # a line of the header is one comment
 
 
 def preset(look: Look, view: Mapping[str, ViewOfLight], edits: LookEdits | None = None) -> dict[str, Any]:

@@ -77,6 +77,15 @@ def test_a_flare_out_of_sight_is_an_empty_ply(tmp_path: Path) -> None:
     assert len(read_ply(tmp_path / "flare.ply")) == 0
 
 
+def test_a_light_s_name_of_several_lines_stays_in_the_header(tmp_path: Path) -> None:
+    saved(tmp_path / "a.flare", OURS, 1)
+    look, camera = read(tmp_path / "a.flare"), cameras(3)[1]
+    seen = next(iter(look.evaluate(camera.world_to_camera).values()))
+    write_flare_ply(tmp_path / "flare.ply", {"left\nelement lamp\r": seen, "right": seen}, camera, look.blend)
+    assert len(read_ply(tmp_path / "flare.ply")) == 2 * look.count
+    assert b"\ncomment lights left element lamp right\n" in (tmp_path / "flare.ply").read_bytes()
+
+
 def test_a_preset_says_where_and_how_bright(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """One Gaussian of each kind at a known place."""
     saved(tmp_path / "a.flare", OURS, 1, count=4)

@@ -14,7 +14,7 @@ from ..progress import Progress
 from .inference import Remover
 from .mattes import Mattes
 from .plates import write_flare, write_plate
-from .record import Record, made_from
+from .record import RECORD, Record, made_from
 from .steady import Sequences, by_number
 
 TOLD = 20  # failures that are spelled out in the last sentence
@@ -23,18 +23,21 @@ TOLD = 20  # failures that are spelled out in the last sentence
 def plates_of(inputs: Iterable[Path], apart_from: Iterable[Path | None] = ()) -> list[tuple[Path, Path]]:
     """(file, name below the output folder) of pictures, and of the pictures in folders.
 
-    apart_from: files and folders in these folders that hold no plates: the results of an earlier run, mattes. Raises
-    SettingsError where there are none, or where two would be written to one name.
+    apart_from: files and folders in these folders that hold no plates: the results of this run, mattes. Clean plates of
+    an earlier one, which its record tells, are none either, unless their own folder is given. Raises SettingsError
+    where there are none, or where two would be written to one name.
     """
     found: dict[Path, Path] = {}
     others = [other.resolve() for other in apart_from if other is not None]
     for given in inputs:
         if given.is_dir():
             inner = [other for other in others if given.resolve() in other.parents]
+            inner += [record.parent.resolve() for record in given.rglob(RECORD) if record.parent != given]
             files = [(path, path.relative_to(given)) for path in pictures_below(given)
                      if not any(path.resolve().is_relative_to(other) for other in inner)]
             if not files:
-                raise SettingsError(f"{given} holds no pictures; give a folder with PNG, JPEG, TIFF or EXR files.")
+                raise SettingsError(f"{given} holds no pictures, or results alone; give a folder with PNG, JPEG, "
+                                    "TIFF or EXR files.")
         else:
             files = [(given, Path(given.name))]
         for path, name in files:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("plates", type=Path, nargs="*", metavar="PLATE",
-                        help="pictures (PNG, JPEG, TIFF, EXR), or folders of them")
+                        help="pictures (PNG, JPEG, TIFF, EXR), or folders of them; clean plates in these are left out")
     parser.add_argument("--run", type=Path, metavar="RUN",
                         help="instead of PLATE: the frames of the capture that this run was fitted to, less the flare "
                              "that it found in them")

@@ -850,6 +850,19 @@ def test_results_mattes_and_hidden_files_below_a_folder_are_no_plates_of_it(tmp_
     assert sorted(path.name for path in (shot / "clean").rglob("*")) == ["a.png", RECORD]
 
 
+def test_clean_plates_of_an_earlier_run_are_no_plates_of_the_next(tmp_path: Path, everywhere: Path) -> None:
+    shot, remover = tmp_path / "shot", Remover(everywhere, working_size=64)
+    write_codes(shot / "day" / "a.png", picture())
+    for out in ("clean", "day/clean2"):
+        assert remove_all([shot], shot / out, remover, Progress())["made"] == 1
+        assert [path.name for path in (shot / out).rglob("*.png")] == ["a.png"]
+    again = remove_all([shot / "clean"], tmp_path / "again", remover, Progress())
+    assert again["made"] == 1, "they are where their folder is given"
+    (shot / "day" / "a.png").unlink()
+    with pytest.raises(SettingsError, match="no pictures, or results alone"):
+        plates_of([shot])
+
+
 def _luminance_and_chroma(path: Path) -> None:
     """An EXR of 8 x 8 pixels, 2 x 2 of them with one RY, in 16 bit floats without compression."""
     def attribute(name: bytes, kind: bytes, value: bytes) -> bytes:

@@ -81,7 +81,8 @@ def gather(source: Path, work: Path, number: int, size: int, progress: Progress)
 
     `number`: how many (0: all of a folder, 150 of a video); `size`: long side of the small pictures.
     Returns the shots, in order, and sentences about frames that had to be left out. What an earlier run
-    wrote is taken as it is. Raises CaptureError where there is nothing to choose from.
+    wrote is taken as it is. Raises CaptureError where there is nothing to choose from, FrameError for a video that
+    cannot be read.
     """
     record = work / "shots.json"
     if record.is_file():

@@ -75,8 +75,8 @@ def solve(source: Path | str, out: Path | str, settings: SolveSettings | None = 
     Frames that cannot be read, and those that find no place in the largest model, are left out and named.
     An earlier run with the same source and settings is taken up where it stopped.
 
-    Raises CaptureError where there is nothing to solve or no parallax to solve it by, FrameError for a video that cannot
-    be read, Cancelled when asked to stop, EngineError without pycolmap.
+    Raises CaptureError where there is nothing to solve or no parallax to solve it by, FrameError for a video
+    that cannot be read, Cancelled when asked to stop, EngineError without pycolmap.
     """
     from . import develop, mapping, report, shots, world
 

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ...core.errors import SettingsError
+from ...core.errors import CaptureError, SettingsError
 from ...core.progress import Progress
 from ..command import Command, Step, seed
 
@@ -70,10 +71,14 @@ def with_lights(capture: Capture, progress: Progress) -> Capture:
 
 def _find(capture: Capture, detector: Detector, progress: Progress, settings: GatherSettings | None = None, *,
           gaussians: tuple[Any, Any] | None = None, keep: bool = False) -> dict[str, Any]:
-    """Finds, writes down, and says what was found; returns the report."""
+    """Finds, writes down, and says what was found; returns the report. Raises CaptureError, before it looks, where
+    nothing may be written down."""
     from ...core.lights import find_lights, record
     from ...core.lights.find import REPORT, SHEETS
 
+    if not os.access(capture.folder, os.W_OK):
+        raise CaptureError(f"{capture.folder} cannot be written to, where {LIGHTS} belongs; copy the capture to where "
+                           "it can, or have the rights to it.")
     findings = find_lights(capture, detector, progress, settings, gaussians=gaussians)
     report = record(capture, findings, keep=keep)
     for sentence in findings.says:

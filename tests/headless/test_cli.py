@@ -11,12 +11,14 @@ from pathlib import Path
 from typing import Any, get_args
 
 import pytest
-from fit_flare.core.errors import Cancelled, FitFlareError, SettingsError
+from fit_flare.core.capture import Capture
+from fit_flare.core.capture.colmap import PointCloud
+from fit_flare.core.errors import Cancelled, CaptureError, FitFlareError, SettingsError
 from fit_flare.core.fit import settings as fit_settings
 from fit_flare.core.progress import Progress
 from fit_flare.headless import cli
 from fit_flare.headless.command import MOST_SEED, Command, Step
-from fit_flare.headless.commands import COMMANDS, bake, compose, fit
+from fit_flare.headless.commands import COMMANDS, bake, compose, fit, lights
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -45,6 +47,14 @@ def test_runs_of_a_list_lie_below_the_folder_for_them(tmp_path: Path, monkeypatc
     for listed in (tmp_path / "shoot" / "lists" / "list.txt", Path("list.txt")):
         named = [fit.place(argparse.Namespace(listed=listed, entry=entry, out=Path("runs")))[1] for entry in (1, 2, 3)]
         assert named == [Path("runs/shoot"), Path("runs/lists"), Path("runs/b")]
+
+
+def test_a_capture_that_may_not_be_written_to_is_told_before_lights_are_looked_for(
+        tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "access", lambda path, mode: (Path(path), mode) != (tmp_path, os.W_OK))
+    monkeypatch.setattr("fit_flare.core.lights.find_lights", lambda *_: pytest.fail("it looked"))
+    with pytest.raises(CaptureError, match=r"cannot be written to, where lights\.json belongs"):
+        lights.with_lights(Capture(tmp_path, (), PointCloud.empty()), Progress())
 
 
 def test_a_compositor_of_before_is_kept(tmp_path: Path) -> None:

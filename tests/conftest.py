@@ -1,5 +1,21 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Tests run as the commands do, with the same environment for numpy and torch."""
+import signal
+from collections.abc import Iterator
+
+import pytest
+
 from core.numeric_environment import prepare_for_numpy_and_torch
 
 prepare_for_numpy_and_torch()
+
+
+@pytest.fixture
+def hangups_are_heard() -> Iterator[None]:
+    """Here and by what is started from here, also where the tests themselves run under `nohup`."""
+    if not hasattr(signal, "SIGHUP"):
+        yield
+        return
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    yield
+    signal.signal(signal.SIGHUP, before)

@@ -127,19 +127,24 @@ except Cancelled as stop:
 
 
 @pytest.mark.skipif(not hasattr(os, "openpty") or sys.platform == "darwin", reason="of Linux's terminals")
+@pytest.mark.usefixtures("hangups_are_heard")
 def test_work_whose_terminal_is_closed_stops_as_asked(tmp_path: Path) -> None:
     ours, theirs = os.openpty()
     words = [sys.executable, "-c", ON_A_TERMINAL, str(tmp_path / "saved")]
     with subprocess.Popen(words, cwd=ROOT, stdin=theirs, stdout=theirs, stderr=theirs, start_new_session=True) as work:
         os.close(theirs)
-        while b"a step" not in os.read(ours, 1000):
-            pass
-        os.close(ours)
-        assert work.wait(20) == 0
+        try:
+            while b"a step" not in os.read(ours, 1000):
+                pass
+            os.close(ours)
+            assert work.wait(20) == 0
+        finally:
+            work.kill()
     assert (tmp_path / "saved").read_text() == "whole"
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="Windows has no such signal")
+@pytest.mark.usefixtures("hangups_are_heard")
 def test_a_lost_terminal_is_told_twice_and_not_at_all_under_nohup() -> None:
     progress = Progress()
     with stoppable(progress):

@@ -177,6 +177,7 @@ def test_a_program_that_cannot_start_is_a_sentence(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(os.name == "nt", reason="signals to oneself end the process on Windows")
 @pytest.mark.parametrize("numbers", [["SIGTERM"], ["SIGHUP", "SIGHUP"], ["SIGTERM", "SIGHUP"]])
+@pytest.mark.usefixtures("hangups_are_heard")
 def test_a_stop_reaches_the_other_process_which_ends_by_itself(tmp_path: Path, numbers: list[str]) -> None:
     """Once: a second one would end it before it has saved."""
     code = ("def stop(*_):\n"

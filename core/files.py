@@ -38,12 +38,12 @@ def atomic_path(target: Path | str, turn: contextlib.AbstractContextManager[None
     """A temporary path beside `target`, renamed on to it when the block ends well and removed when not. turn: held
     while it is renamed.
 
-    The temporary name keeps the suffix, since writers choose their format by it. Of a symbolic link the file that it
-    names is written, and the link stays.
+    The temporary name keeps the suffix, since writers choose their format by it. A symbolic link becomes a file of its
+    own: what it names may be another run's.
     """
     target = Path(target)
     target.parent.mkdir(parents=True, exist_ok=True)
-    target = temporary = _named_by(target)
+    temporary = target
     try:
         handle, name = tempfile.mkstemp(prefix=_partial_of(target) + _writer(), suffix=target.suffix, dir=target.parent)
         os.close(handle)
@@ -61,9 +61,9 @@ def atomic_path(target: Path | str, turn: contextlib.AbstractContextManager[None
             temporary.unlink(missing_ok=True)
 
 
-def _named_by(target: Path) -> Path:
-    """The file that a symbolic link names, there or not; any other path as it is. Raises OSError for a link that leads
-    back to itself."""
+def named_by(target: Path) -> Path:
+    """The file that a symbolic link names, there or not; any other path as it is. For what people keep and link by
+    hand. Raises OSError for a link that leads back to itself."""
     if not target.is_symlink():
         return target
     named = Path(os.path.realpath(target))
@@ -127,7 +127,7 @@ def _is_being_written(partial: Path) -> bool:
 def remove_partial_of(target: Path | str) -> None:
     """Remove what a killed process left of `target` half written. What another one is writing stays: on a farm a task
     may be given again while its first worker still lives."""
-    target = _named_by(Path(target))
+    target = Path(target)
     for path in target.parent.glob(f"{glob.escape(_partial_of(target))}*"):
         if not _is_being_written(path):
             path.unlink(missing_ok=True)

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from ..core.capture import read_lights
 from ..core.errors import CaptureError
-from ..core.files import read_json, rounded, write_json
+from ..core.files import named_by, read_json, rounded, write_json
 from . import cameras
 from .capture_import import add_light
 
@@ -103,7 +103,7 @@ def write(scene: Any, folder: Path) -> int:
         xyz = [rounded(float(value)) for value in place_of(item, scene.fit_flare.root, matrix)]
         lights.append({**known.get(name, {}), "name": name, "xyz": xyz})
     if lights != data.get("lights"):
-        write_json(path, {**data, "lights": lights})
+        write_json(named_by(path), {**data, "lights": lights})
     return len(lights)
 
 

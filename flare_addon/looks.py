@@ -232,7 +232,7 @@ def share_seen(scene: Any, depsgraph: Any, eye: Any, light: Any, own: set[str], 
             if left <= 0:
                 break
         share += weight * clear
-    return share
+    return min(share, 1.0)  # of rounding
 
 
 def _is_unseen(thing: Any) -> bool:

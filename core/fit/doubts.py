@@ -23,6 +23,8 @@ frames as EXR times 16, or a sixteenth, leave nine tenths of the flare unfound."
 UNLIKE, FEW_UNLIKE = 4.0, 0.1
 """Times the usual loss, at which a frame does not look like what the others make of it; in more than which part of the
 frames it is the fit that is bad."""
+SEEN = 0.01
+"""Loss below which nothing is unlike."""
 NAMED = 5
 
 
@@ -47,7 +49,7 @@ def doubts(capture: Capture, settings: FitSettings, views: Sequence[View], frame
 def unlike(losses: Mapping[str, float]) -> tuple[str, ...]:
     """A sentence on the few frames, by name, whose loss at the end of a fit is many times that of most."""
     usual = float(np.median(list(losses.values()))) if losses else 0.0
-    names = [name for name, loss in losses.items() if loss > UNLIKE * usual]
+    names = [name for name, loss in losses.items() if loss > max(UNLIKE * usual, SEEN)]
     if not names or len(names) > max(FEW_UNLIKE * len(losses), 1):
         return ()
     more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""

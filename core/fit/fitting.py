@@ -37,7 +37,8 @@ def fit(capture: Capture, settings: FitSettings, folder: Path | str, progress: P
     With `resume` an unfinished run in `folder` goes on from its checkpoint, with the settings it was begun
     with, and gives the fit that an unbroken one gives; without a run there, one is begun.
 
-    Raises CaptureError, RunError, SettingsError, and Cancelled when asked to stop (after a checkpoint).
+    Raises CaptureError, RunError, SettingsError, and Cancelled when asked to stop (after a checkpoint, if
+    it has begun).
     """
     progress, folder = progress or Progress(), Path(folder)
     continued = resume and (folder / "config.toml").exists()
@@ -72,7 +73,7 @@ def fit(capture: Capture, settings: FitSettings, folder: Path | str, progress: P
             _log(run, f"stopped at iteration {trainer.iteration}")
             raise
         _finish(trainer, run)
-    for text in unlike(trainer.losses):
+    for text in unlike(trainer.losses) if len(trainer.losses) == len(trainer.views) else ():
         progress.say(text)
         _log(run, text)
     _log(run, f"finished at iteration {trainer.iteration}")

@@ -334,6 +334,7 @@ class Trainer:
     def state(self) -> State:
         """All that a resumed fit needs, as `checkpoint.save` takes it."""
         state: State = {"iteration": self.iteration, "alone_until": self._head_start.until,
+                        "losses": [[name, loss] for name, loss in self.losses.items()],
                         "scene": dict(self.scene.state_dict()),
                         "scene_adam": self.scene_adam.state_dict(), "strategy": self.strategy.state_dict()}
         if self.flare is not None and self.flare_adam is not None and self.grid_adam is not None:
@@ -348,6 +349,7 @@ class Trainer:
         fit was given have changed."""
         try:
             self.iteration, self._head_start.until = int(state["iteration"]), int(state["alone_until"])
+            self.losses = {name: float(loss) for name, loss in state.get("losses", [])}
             _load_parameters(dict(self.scene.named_parameters()), state["scene"])
             self.scene_adam.load_state_dict(state["scene_adam"])
             self.strategy.load_state_dict(state["strategy"])

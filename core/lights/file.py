@@ -22,7 +22,7 @@ from ..capture import read_lights
 from ..capture.camera import Camera
 from ..capture.capture import is_place
 from ..errors import CaptureError
-from ..files import read_json, rounded, write_json
+from ..files import named_by, read_json, rounded, write_json
 from .gather import FoundLight
 
 NEAR = 0.02  # of the frame's diagonal: projections nearer than this are one light
@@ -65,7 +65,7 @@ def write_lights(path: Path, found: Sequence[FoundLight], views: Sequence[tuple[
         entries.append(_entry(light, _free_name({entry["name"] for entry in entries})))
     places = [[rounded(float(x)) for x in light.xyz] for light in found]
     places += [xyz for xyz in found_before if not any(_one(place, xyz, views) for place in places)]
-    write_json(path, {"lights": entries, "found": places})
+    write_json(named_by(path), {"lights": entries, "found": places})
     return entries
 
 

@@ -32,7 +32,8 @@ def plates_of(inputs: Iterable[Path], apart_from: Iterable[Path | None] = ()) ->
     for given in inputs:
         if given.is_dir():
             inner = [other for other in others if given.resolve() in other.parents]
-            inner += [record.parent.resolve() for record in given.rglob(RECORD) if record.parent != given]
+            inner += [plate for record in given.rglob(RECORD) if record.parent != given
+                      for plate in Record(record.parent).plates()]
             files = [(path, path.relative_to(given)) for path in pictures_below(given)
                      if not any(path.resolve().is_relative_to(other) for other in inner)]
             if not files:

@@ -53,6 +53,10 @@ class Record:
         for path in results:
             remove_partial_of(path)
 
+    def plates(self) -> list[Path]:
+        """The paths of what it lists, there or not."""
+        return [(self._folder / name).resolve() for name in self._read()]
+
     def is_refused(self, problem: OSError) -> bool:
         """Whether it is the folder itself that may not be written, whichever plate is next."""
         if not isinstance(problem, PermissionError) and problem.errno != errno.EROFS:

@@ -14,7 +14,7 @@ from ..errors import RunError
 from .batches import Batch
 from .learners import ALONE, Learner, add_up
 from .network import RemovalNetwork
-from .optimiser import Optimiser
+from .optimiser import Optimiser, has_bfloat16
 from .pairs import Pair
 from .recipe import Recipe
 
@@ -157,7 +157,4 @@ class Trainer:
 
 
 def _precision(on: torch.device) -> Any:
-    """bfloat16 where it is fast: on processors without it torch's convolutions take 9 times as long as in float32."""
-    if on.type == "cpu" and not torch.cpu.get_capabilities().get("avx512_bf16"):
-        return nullcontext()
-    return torch.autocast(on.type, dtype=torch.bfloat16)
+    return torch.autocast(on.type, dtype=torch.bfloat16) if has_bfloat16(on) else nullcontext()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import itertools
 from pathlib import Path
 from typing import Any
 
@@ -66,17 +67,19 @@ def frames_of(folder: Path, out: Path, progress: Progress, *, wanted: str | None
 
 
 def _keep(blend: Path, progress: Progress) -> None:
-    """Somebody may have worked in the .blend of before: it gets the name that Blender itself gives to such."""
+    """Somebody may have worked in the .blend of before: it gets a name such as Blender itself gives, a free one."""
     if blend.exists():
-        patiently(blend.replace, blend.with_suffix(".blend1"))
-        progress.say(f"{blend} was there already, and is {blend.with_suffix('.blend1').name} now.")
+        names = (blend.with_suffix(f".blend{number}") for number in itertools.count(1))
+        kept = next(name for name in names if not name.exists())
+        patiently(blend.rename, kept)
+        progress.say(f"{blend} was there already, and is {kept.name} now.")
 
 
 COMMAND = Command(
     "compose", "Puts baked layers together in Blender's compositor and renders the frames.",
     f"""Builds the node group "Fit Flare" over LAYERS and writes frame.####.exr (half float, scene-linear),
 frame.####.png (sRGB) and {BLEND}, which opens in Blender and shows the same; one of before is kept
-beside it as compositor.blend1.
+beside it as compositor.blend1, .blend2 and so on.
 
   run.py compose build/demo/layers --out build/frames --intensity 1.5 --tint 1,0.8,0.6""",
     arguments, (Step("compose", "blender", run),))

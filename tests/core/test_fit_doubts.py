@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from core.capture import Capture
+from core.errors import Cancelled
 from core.fit import fit, preset
 from core.fit.doubts import doubts, unlike
 from core.fit.frames import Frames
@@ -17,7 +18,7 @@ from core.metrics.evaluation import worse_than_none
 from core.pictures import write_png
 from tests.core.flared import HEIGHT, WIDTH, flared_capture
 from tests.core.heard import Heard
-from tests.core.test_fit import quick
+from tests.core.test_fit import StopAt, quick
 
 
 @pytest.fixture(scope="module")
@@ -75,7 +76,9 @@ def test_a_frame_of_another_scene_is_named(tmp_path: Path) -> None:
     assert not any("does not look like it" in text for text in heard.texts)
     tiles = np.random.default_rng(5).random((4, 8, 3)).repeat(HEIGHT // 4, 0).repeat(WIDTH // 8, 1)
     write_png(folder / "images" / "0005.png", tiles)
-    fit(Capture.open(folder), quick(120, mode="split"), tmp_path / "odd", heard)
+    with pytest.raises(Cancelled):
+        fit(Capture.open(folder), quick(120, mode="split"), tmp_path / "odd", StopAt(118))
+    fit(Capture.open(folder), quick(120, mode="split"), tmp_path / "odd", heard, resume=True)
     assert [text.split(":")[0] for text in heard.texts if "does not look like it" in text] == ["0005.png"]
 
 
@@ -86,6 +89,7 @@ def test_where_many_frames_are_bad_none_is_blamed() -> None:
     few = {f"odd {number}": 1.0 for number in range(4)}
     assert "odd 0, odd 1, odd 2, odd 3: " in unlike({**losses, **few})[0]
     assert unlike({**losses, **few, "odd 4": 1.0}) == ()
+    assert unlike({"a": 0.0, "b": 0.0, "c": 1e-4}) == (), "nothing that can be seen"
 
 
 @pytest.mark.parametrize(("found", "empty", "worse"), [(20.0, 24.0, True), (25.0, 24.0, False), (None, 24.0, False)])

@@ -94,6 +94,7 @@ def test_what_a_full_disk_refuses_is_let_go() -> None:
 
 @pytest.mark.parametrize("number", [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP")
                                     if hasattr(signal, name)])
+@pytest.mark.usefixtures("hangups_are_heard")
 def test_signals_ask_for_a_stop_and_handlers_come_back(number: int) -> None:
     before = signal.getsignal(number)
     progress = Progress()

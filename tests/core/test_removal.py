@@ -858,7 +858,10 @@ def test_clean_plates_of_an_earlier_run_are_no_plates_of_the_next(tmp_path: Path
         assert [path.name for path in (shot / out).rglob("*.png")] == ["a.png"]
     again = remove_all([shot / "clean"], tmp_path / "again", remover, Progress())
     assert again["made"] == 1, "they are where their folder is given"
-    (shot / "day" / "a.png").unlink()
+    write_codes(shot / "clean" / "own.png", picture())
+    assert {name for _, name in plates_of([shot])} == {Path("day/a.png"), Path("clean/own.png")}, "no result"
+    for name in ("day/a.png", "clean/own.png"):
+        (shot / name).unlink()
     with pytest.raises(SettingsError, match="no pictures, or results alone"):
         plates_of([shot])
 

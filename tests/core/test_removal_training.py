@@ -17,7 +17,7 @@ from core.errors import Cancelled, RunError, SettingsError
 from core.metrics.lpips import Lpips
 from core.pictures import Pixels, write_png
 from core.progress import Progress
-from core.removal import evaluation, training, weights
+from core.removal import evaluation, optimiser, training, weights
 from core.removal.backgrounds import Backgrounds
 from core.removal.bank import OwnFlares
 from core.removal.batches import Batch, Batches, drawn_ahead
@@ -144,6 +144,27 @@ def test_the_steps_of_hidden_weights_are_as_long_in_every_direction() -> None:
     for name in ("see.2.weight", "head.weight", "attention.0.place.weight", "enter.2.0.first.bias"):
         assert float(steps[name].abs().median()) == pytest.approx(1e-2, rel=0.05)
     assert all(parameter.grad is None for parameter in trainer.network.parameters())
+
+
+@pytest.mark.parametrize("fast", [True, False])
+def test_muon_s_steps_are_torch_s(fast: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In bfloat16, and where that is slow in float32."""
+    monkeypatch.setattr(optimiser, "has_bfloat16", lambda _on: fast)
+    recipe = Recipe(widths=(16, 16, 24, 16, 16), decay=0.1)
+    trainer = Trainer(recipe)
+    name = "up.1.weight"
+    weight = dict(trainer.network.named_parameters())[name]
+    theirs = torch.nn.Parameter(weight.detach().permute(0, 2, 3, 1).flatten(1).clone())
+    muon = torch.optim.Muon([theirs], 1e-2, weight_decay=0.1, adjust_lr_fn="match_rms_adamw")
+    for _ in range(3):
+        for parameter in trainer.network.parameters():
+            parameter.grad = torch.randn_like(parameter)
+        theirs.grad = weight.grad.permute(0, 2, 3, 1).flatten(1).clone()  # type: ignore[union-attr]
+        trainer.optimiser.step(1e-2)
+        muon.step()
+    ours = weight.detach().permute(0, 2, 3, 1).flatten(1)
+    assert float((ours - theirs).abs().max()) < (1e-6 if fast else 5e-4)
+    assert float(theirs.abs().max()) > 1e-2
 
 
 def test_weights_that_lie_otherwise_are_refused() -> None:

@@ -64,8 +64,8 @@ def test_a_compositor_of_before_is_kept(tmp_path: Path) -> None:
     for work in ("first", "second"):
         blend.write_text(work)
         compose._keep(blend, Progress())
-        assert [path.read_text() for path in tmp_path.iterdir()] == [work]
-        assert (tmp_path / "compositor.blend1").exists()
+        assert not blend.exists()
+    assert [path.read_text() for path in sorted(tmp_path.iterdir())] == ["first", "second"]
 
 
 def test_the_list_of_commands(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:

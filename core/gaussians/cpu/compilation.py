@@ -78,12 +78,13 @@ def kernel(function: Callable[..., Any]) -> Any:
         made = numba.njit(nogil=True, cache=True, **OPTIONS)(function)
     finally:
         config.CACHE_DIR = before
-    made._cache.save_overload = _where_there_is_room(made._cache.save_overload)
+    if hasattr(made, "_cache"):  # not where numba is told to compile nothing
+        made._cache.save_overload = _where_there_is_room(made._cache.save_overload)
     return made
 
 
 def _where_there_is_room(save: Callable[..., None]) -> Callable[..., None]:
-    """A full disk under the folder costs the next start its time, not this one its work."""
+    """A folder that is full, or that the system refuses, costs the next start its time, not this one its work."""
     def saved(*words: Any) -> None:
         with contextlib.suppress(OSError):
             save(*words)

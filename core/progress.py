@@ -31,7 +31,7 @@ from .errors import DISK_FULL, Cancelled
 STOP_FILE = "FIT_FLARE_STOP"
 """Of the environment: the path of a file which, when it is there, asks a command to stop."""
 STOP_FILE_EVERY_S = 0.3
-_UNTOLD = (*DISK_FULL, errno.EIO)  # the latter of a terminal that is gone
+_NO_LISTENER = (*DISK_FULL, errno.EIO)  # the latter of a terminal that is gone
 
 
 class Progress:
@@ -101,17 +101,17 @@ def _tell(stream: TextIO, line: str) -> None:
         stream.write(f"{line}\n")
         stream.flush()
     except OSError as problem:
-        if problem.errno not in _UNTOLD:
+        if problem.errno not in _NO_LISTENER:
             raise
 
 
-def let_go(stream: TextIO) -> None:
+def flush_or_drop(stream: TextIO) -> None:
     """Leave nothing in the stream that a full disk or a terminal that is gone refuses: Python would try it again at
     exit, and fail by it."""
     try:
         stream.flush()
     except OSError as problem:
-        if problem.errno not in _UNTOLD:
+        if problem.errno not in _NO_LISTENER:
             raise
         number, nowhere = stream.fileno(), os.open(os.devnull, os.O_WRONLY)
         before = os.dup(number)
@@ -298,10 +298,11 @@ def stop_signals() -> list[int]:
     nohup has it ignored."""
     names = ("SIGINT", "SIGTERM", "SIGBREAK", "SIGHUP")
     numbers = [getattr(signal, name) for name in names if hasattr(signal, name)]
-    return [number for number in numbers if not _is_hangup(number) or signal.getsignal(number) is not signal.SIG_IGN]
+    return [number for number in numbers if not is_hangup(number) or signal.getsignal(number) is not signal.SIG_IGN]
 
 
-def _is_hangup(number: int) -> bool:
+def is_hangup(number: int) -> bool:
+    """Whether a signal says that the terminal is gone."""
     return number == getattr(signal, "SIGHUP", None)
 
 
@@ -317,7 +318,7 @@ def _stopped_by_signals(progress: Progress) -> Iterator[Progress]:
         progress.request_stop()
         # A second signal gets the system's own, immediate, answer. That a terminal is gone both the system and the
         # shell tell.
-        signal.signal(number, signal.SIG_IGN if _is_hangup(number) else signal.SIG_DFL)
+        signal.signal(number, signal.SIG_IGN if is_hangup(number) else signal.SIG_DFL)
 
     for number in before:
         signal.signal(number, ask)

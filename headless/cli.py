@@ -15,7 +15,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any, NoReturn, TextIO
 
 from ..core.errors import Cancelled, EngineError, FitFlareError, SettingsError, refusal
-from ..core.progress import JsonProgress, OpenJdProgress, Progress, TerminalProgress, let_go, stoppable
+from ..core.progress import JsonProgress, OpenJdProgress, Progress, TerminalProgress, flush_or_drop, stoppable
 from . import hand_off
 from .command import Command, Step
 from .commands import COMMANDS
@@ -78,8 +78,8 @@ def main(words: Sequence[str]) -> int:
         else:
             parser().print_help(sys.stderr)
             status = MISUSED
-        let_go(sys.stdout)
-        let_go(sys.stderr)
+        flush_or_drop(sys.stdout)
+        flush_or_drop(sys.stderr)
         return status
     except OSError:  # whoever listened has gone
         return FAILED
@@ -151,9 +151,9 @@ def _pointed_at(target: int) -> Iterator[TextIO]:
     try:
         with os.fdopen(os.dup(before), "w", encoding="utf-8") as stream:
             yield stream
-            let_go(stream)
+            flush_or_drop(stream)
     finally:
-        let_go(sys.stdout)
+        flush_or_drop(sys.stdout)
         os.dup2(before, 1)
         os.close(before)
 

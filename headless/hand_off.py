@@ -22,7 +22,7 @@ from types import FrameType
 from typing import Any
 
 from ..core.errors import Cancelled, EngineError, FitFlareError, SettingsError
-from ..core.progress import Progress, stop_signals
+from ..core.progress import Progress, is_hangup, stop_signals
 from .command import Side
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -232,7 +232,7 @@ def _stops_passed_on(child: subprocess.Popen[str]) -> Iterator[None]:
 
     def pass_on(number: int, frame: FrameType | None) -> None:
         # A second stop ends the child at once, and a lost terminal's signal often comes with another.
-        if not told or number != getattr(signal, "SIGHUP", None):
+        if not told or not is_hangup(number):
             _interrupt(child)
         told.append(number)
         handler = before[number]

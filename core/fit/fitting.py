@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from collections.abc import Iterable
 from pathlib import Path
 
 import torch
@@ -59,9 +60,7 @@ def fit(capture: Capture, settings: FitSettings, folder: Path | str, progress: P
     if continued and path.exists():
         trainer.load_state(checkpoint.load(path))
     else:
-        for text in (*said, *trainer.says):
-            progress.say(text)
-            _log(run, text)
+        _say((*said, *trainer.says), run, progress)
     _forget_after(folder / METRICS, trainer.iteration)
     _log(run, f"begun at iteration {trainer.iteration} of {run.settings.iterations}")
     progress.stage("fit", run.settings.iterations, trainer.iteration)
@@ -73,11 +72,17 @@ def fit(capture: Capture, settings: FitSettings, folder: Path | str, progress: P
             _log(run, f"stopped at iteration {trainer.iteration}")
             raise
         _finish(trainer, run)
-    for text in unlike(trainer.losses) if len(trainer.losses) == len(trainer.views) else ():
-        progress.say(text)
-        _log(run, text)
+    if len(trainer.losses) == len(trainer.views):  # each has been looked at
+        _say(unlike(trainer.losses), run, progress)
     _log(run, f"finished at iteration {trainer.iteration}")
     return run
+
+
+def _say(texts: Iterable[str], run: Run, progress: Progress) -> None:
+    """To the person who watches, and to the log."""
+    for text in texts:
+        progress.say(text)
+        _log(run, text)
 
 
 def _check_capture(run: Run, capture: Capture) -> None:

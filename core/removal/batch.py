@@ -15,7 +15,7 @@ from .inference import Remover
 from .mattes import Mattes
 from .plates import write_flare, write_plate
 from .record import RECORD, Record, made_from
-from .steady import Sequences, by_number
+from .steady import Sequences, shot_order
 
 TOLD = 20  # failures that are spelled out in the last sentence
 
@@ -71,7 +71,7 @@ def remove_all(inputs: Sequence[Path], folder: Path, remover: Remover, progress:
     progress.stage("remove", len(plates))
     failed: list[str] = []
     made = kept = 0
-    for path, name in sorted(plates, key=lambda plate: (plate[0].parent, by_number(plate[0]))):
+    for path, name in sorted(plates, key=lambda plate: shot_order(plate[0])):
         try:
             matte = [mattes.path(name)] if mattes else []
             how = made_from(remover.described, [path, *sequences.beside(path), *matte])

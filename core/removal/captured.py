@@ -13,7 +13,7 @@ from ..progress import Progress
 from .inference import Remover
 from .plates import write_plate
 from .record import Record, made_from
-from .steady import Sequences, by_number
+from .steady import Sequences, shot_order
 
 UNFINISHED = "removed.unfinished"
 """Where they are until they are all there: half a removed/ would be taken for a whole one."""
@@ -33,8 +33,7 @@ def remove_from(capture: Capture, remover: Remover, progress: Progress) -> Path:
     sequences = Sequences(remover, [capture.frame_path(view) for view in capture.views])
     record, results = Record(work), []
     try:
-        for view in sorted(capture.views, key=lambda one: (capture.frame_path(one).parent,
-                                                           by_number(capture.frame_path(one)))):
+        for view in sorted(capture.views, key=lambda one: shot_order(capture.frame_path(one))):
             frame, name = capture.frame_path(view), Path(view.name)
             name = name.with_suffix(".png") if name.suffix.lower() in _LOSSY else name
             result = inside(work, str(name), CaptureError)

@@ -53,7 +53,7 @@ class Optimiser:
 
     def _muon_step(self, rows: Tensor, gradient: Tensor, momentum: Tensor, rate: float) -> None:
         momentum.lerp_(gradient, 1 - MOMENTUM)
-        direction = alike_in_every_direction(gradient.lerp(momentum, MOMENTUM))
+        direction = orthogonalised(gradient.lerp(momentum, MOMENTUM))
         rows.mul_(1 - rate * self._decay).sub_(direction, alpha=rate * LENGTH * math.sqrt(max(rows.shape)))
 
     def state(self) -> dict[str, Tensor]:
@@ -78,7 +78,7 @@ class Optimiser:
                 self._adam.state[parameter][moment] = value.to(parameter.device, copy=True)
 
 
-def alike_in_every_direction(matrix: Tensor) -> Tensor:
+def orthogonalised(matrix: Tensor) -> Tensor:
     """(n, m), float32: the same singular vectors, singular values between about 0.7 and 1.2."""
     found = matrix.to(torch.bfloat16 if has_bfloat16(matrix.device) else torch.float32)
     found = found.mT if matrix.shape[0] > matrix.shape[1] else found

@@ -112,3 +112,8 @@ class Sequences:
 def by_number(path: Path) -> list[tuple[int, str]]:
     """A key that sorts paths by the numbers in their names: a2 before a10."""
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", path.name)]
+
+
+def shot_order(path: Path) -> tuple[Path, list[tuple[int, str]]]:
+    """For sorting plates of any folders: in this order `Sequences` has the neighbours of each at hand."""
+    return path.parent, by_number(path)

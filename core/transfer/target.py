@@ -254,8 +254,7 @@ def on_plate(camera: Camera, plate: Path) -> Camera:
         raise SettingsError(f"{plate} has pixels beyond its frame, or lacks some of it, and its frame of "
                             f"{window.frame[0]} x {window.frame[1]} is not the camera's {camera.width} x "
                             f"{camera.height}; give plates of the camera's size, or cut them to the frame.")
-    (width, height), (x, y) = window.size, window.origin
-    return replace(camera, width=width, height=height, cx=camera.cx - x, cy=camera.cy - y)
+    return camera.cropped(*window.origin, *window.size)
 
 
 def _by_number(folder: Path) -> dict[int, Path]:

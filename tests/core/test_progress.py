@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 from core.errors import Cancelled
-from core.progress import STOP_FILE, JsonProgress, OpenJdProgress, Progress, TerminalProgress, let_go, stoppable
+from core.progress import STOP_FILE, JsonProgress, OpenJdProgress, Progress, TerminalProgress, flush_or_drop, stoppable
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -83,10 +83,10 @@ def test_a_disk_too_full_for_what_is_told_does_not_end_the_work(kind: type[Progr
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="only Linux has a disk that is always full")
-def test_what_a_full_disk_refuses_is_let_go() -> None:
+def test_what_a_full_disk_refuses_is_flush_or_drop() -> None:
     stream = open("/dev/full", "w")  # noqa: SIM115 - closed below, which tries what is left in it again
     stream.write("a line")
-    let_go(stream)
+    flush_or_drop(stream)
     with pytest.raises(OSError, match="No space"):
         os.write(stream.fileno(), b"it leads where it led")
     stream.close()
@@ -109,7 +109,7 @@ ON_A_TERMINAL = """
 import fcntl, sys, termios, time
 from pathlib import Path
 from core.errors import Cancelled
-from core.progress import TerminalProgress, let_go, stoppable
+from core.progress import TerminalProgress, flush_or_drop, stoppable
 
 fcntl.ioctl(0, termios.TIOCSCTTY, 0)
 progress = TerminalProgress()
@@ -122,7 +122,7 @@ try:
             time.sleep(0.01)
 except Cancelled as stop:
     progress.error(str(stop))
-    let_go(sys.stderr)
+    flush_or_drop(sys.stderr)
     Path(sys.argv[1]).write_text("whole")
 """
 

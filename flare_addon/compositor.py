@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -20,9 +21,11 @@ from typing import Any
 import bpy
 
 from ..core.bake.folder import LayerFolder
+from ..core.colour.ocio import REC_709_LINEAR
 from ..core.errors import FrameError
 from ..core.files import atomic_path
-from ..core.pictures import exr_is_cut_off
+from ..core.pictures import exr_is_cut_off, exr_is_rec709
+from . import curves
 
 GROUP = "Fit Flare"
 LAYERS = "Fit Flare Layers"
@@ -30,8 +33,14 @@ PLATE = "Fit Flare Footage"
 VIEWER = "Fit Flare Viewer"
 RENDER = "Fit Flare Render"
 SIZE = "Fit Flare Size"
+_OURS = (GROUP, LAYERS, PLATE, SIZE, VIEWER, RENDER)
 NOTE = "fit_flare_compositor"  # a property of the scene: what was there before
+PLAIN_VIEWS = ("Standard", "Un-tone-mapped")  # of Blender's own colour configuration, and of ACES'
 _GAIN = " Gain"
+_OF_AN_INPUT = re.compile(rf'nodes\["{GROUP}"\]\.inputs\[(\d+)\]\.default_value')
+_LIVE = re.compile(r"fit_flare\.(master|lights\[\d+\])\.(intensity|tint|mute|solo)$")
+_OF_A_LIGHT = re.compile(r'fit_flare\.lights\[(?:(\d+)|"(.*)")\]\.intensity')
+_TO_THE_END = 1048574  # frames, the most that Blender has; those without a file are without flare
 _POINTING = ("image", "frame_start", "frame_offset", "frame_duration", "use_auto_refresh")
 
 _GROUPS_ARE_TREES = bpy.app.version >= (5, 0, 0)
@@ -181,8 +190,11 @@ def set_up(scene: Any, layers: LayerFolder, *, keep_image: bool = False, plate: 
     if scene.render.use_border and scene.render.use_crop_to_border:
         raise FrameError(f"The scene {scene.name!r} renders a region cut out of the frame, where layers of whole "
                          "frames do not fit; switch Crop to Render Region off in its output properties.")
+    there = tree_of(scene)
+    if NOTE in scene and (there is None or not any(name in there.nodes for name in _OURS)):
+        del scene[NOTE]  # our nodes were deleted by hand: what was noted is of another compositor
     note = _note(scene)
-    tree = tree_of(scene) or _new_tree(scene, keep_image)
+    tree = there or _new_tree(scene, keep_image)
     source = tree.nodes.get(LAYERS)
     pointed = None if source is None else {name: getattr(source, name) for name in _POINTING}
     if source is None:
@@ -198,35 +210,76 @@ def set_up(scene: Any, layers: LayerFolder, *, keep_image: bool = False, plate: 
     node = tree.nodes.get(GROUP)
     if node is None:
         node = _named(_node(tree, "CompositorNodeGroup", -2, 0), GROUP)
-    sliders = {socket.name: _value(node, socket.name) for socket in node.inputs
-               if socket.name in ("Intensity", "Tint") or socket.name.endswith(_GAIN)}
-    _undriven(tree)
+    _undriven(scene)
+    numbered = [socket.name for socket in node.inputs]
+    sliders = {name: (_value(node, name), _source(node.inputs[name])) for name in numbered
+               if name in ("Intensity", "Tint") or name.endswith(_GAIN)}
     node.node_tree = node_group(names)
-    for name, value in sliders.items():
+    numbers = {socket.name: number for number, socket in enumerate(node.inputs)}
+    curves.renumber(tree, f'nodes["{GROUP}"].inputs',
+                    lambda number: numbers.get(numbered[number]) if number < len(numbered) else number)
+    for link in [link for socket in node.inputs for link in socket.links if socket.name != "Scene"]:
+        tree.links.remove(link)  # by its number it may lead to another slider now
+    for name, (value, fed) in sliders.items():
         if name in node.inputs:
             node.inputs[name].default_value = value
+            if fed is not None:
+                tree.links.new(fed, node.inputs[name])
     for name in names:
         tree.links.new(sockets[name], node.inputs[name])
     end = _output(tree)
-    before = end.links[0].from_socket if end.is_linked else None
-    if before is not None and before.node == node:  # set up earlier: what the scene is was chosen then
-        before = node.inputs["Scene"].links[0].from_socket if node.inputs["Scene"].is_linked else None
-    keep = keep_image and before is not None and before.node != source and before.node.name not in (PLATE, SIZE)
-    scene_socket = before if keep else sockets["scene"]
+    before = _source(end)
+    inside = before is not None and _is_behind(before.node, node)  # set up earlier, perhaps with other nodes behind it
+    if inside or before is None or before.node.name in _OURS:
+        before = _under(tree, node, scene[NOTE])
+    if before is not None:
+        scene[NOTE].update({"from": before.node.name, "socket": before.identifier})
+    scene_socket = sockets["scene"]
     if plate is not None:
         scene_socket = _footage(tree, plate).outputs["Image"]
-    elif keep_image and not keep:
-        scene_socket = _render(tree).outputs["Image"]
+    elif keep_image:
+        scene_socket = before or _render(tree).outputs["Image"]
     if (size := tree.nodes.get(SIZE)) is not None:
         tree.nodes.remove(size)
     if scene_socket is not None and scene_socket.node.name in (LAYERS, PLATE):
         scene_socket = _named(_of_render_size(tree, scene_socket, -3, 1), SIZE).outputs[0]
     tree.links.new(scene_socket, node.inputs["Scene"])
-    tree.links.new(node.outputs["Image"], end)
+    if not inside or end.links[0].from_node == node:
+        tree.links.new(node.outputs["Image"], end)
     if not any(other.bl_idname == "CompositorNodeViewer" for other in tree.nodes):
         viewer = _named(_node(tree, "CompositorNodeViewer", 1, -1), VIEWER)  # what the backdrop shows
         tree.links.new(node.outputs["Image"], viewer.inputs["Image"])
     return node
+
+
+def _source(socket: Any) -> Any:
+    """The output socket that feeds an input, None where nothing does."""
+    return socket.links[0].from_socket if socket is not None and socket.is_linked else None
+
+
+def _is_behind(one: Any, node: Any) -> bool:
+    """Whether a node is `node`, or shows something of it."""
+    seen: set[str] = set()
+    left = [one]
+    while left:
+        here = left.pop()
+        if here == node:
+            return True
+        if here.name not in seen:
+            seen.add(here.name)
+            left += [link.from_node for socket in here.inputs for link in socket.links]
+    return False
+
+
+def _under(tree: Any, node: Any, note: Any) -> Any:
+    """The output socket of what someone has under the flare: what feeds our node, or fed the output before it. None
+    where that is nothing, or is behind the flare, from where it would make a cycle."""
+    had = tree.nodes.get(note["from"])
+    noted = next((one for one in had.outputs if one.identifier == note["socket"]), None) if had else None
+    for socket in (_source(node.inputs.get("Scene")), noted):
+        if socket is not None and socket.node.name not in _OURS and not _is_behind(socket.node, node):
+            return socket
+    return None
 
 
 def _take_back(scene: Any, tree: Any, source: Any, pointed: dict[str, Any] | None, note: dict[str, Any]) -> None:
@@ -264,35 +317,78 @@ def _footage(tree: Any, plate: tuple[Any, int, int, int]) -> Any:
 # ---- wired to the panel ---------------------------------------------------------------------------
 
 
-def wire(scene: Any, gains: dict[str, str]) -> None:
-    """Drive the node's sliders from the panel's: gains by layer, the name of the light whose sliders they are.
+def wire(scene: Any, gains: dict[str, int]) -> None:
+    """Drive the node's sliders from the panel's: gains by layer, the number of the flare whose sliders they are.
 
-    Intensity, Tint, Mute and Solo of all lights and of each are live then; the layers must hold none of them.
+    Intensity, Tint, Mute and Solo of all lights and of each are live then; the layers must hold none of them. A layer
+    without a flare shows as it was baked.
     """
-    tree, node = tree_of(scene), find_node(scene)
-    _undriven(tree)
-    names = list(dict.fromkeys(gains.values()))
+    node = find_node(scene)
+    _undriven(scene)
     _drive(scene, node, "Intensity", -1, "i*(1-m)", {"i": "master.intensity", "m": "master.mute"})
     for channel in range(3):
         _drive(scene, node, "Tint", channel, "t", {"t": f"master.tint[{channel}]"})
-    solos = {f"s{number}": f'lights["{_quoted(name)}"].solo' for number, name in enumerate(names)}
-    for layer, name in gains.items():
-        if gain_of(layer) not in node.inputs:
-            continue
-        path = f'lights["{_quoted(name)}"]'
-        own = f"s{names.index(name)}"
+    solos = {f"s{number}": f"lights[{number}].solo" for number in sorted(set(gains.values()))}
+    for layer, number in gains.items():
+        path, own = f"lights[{number}]", f"s{number}"
         most = f"max({','.join(solos)})" if len(solos) > 1 else own
         for channel in range(3):
             _drive(scene, node, gain_of(layer), channel, f"i*t*(1-m)*({own} if {most} else 1)",
                    {"i": f"{path}.intensity", "t": f"{path}.tint[{channel}]", "m": f"{path}.mute", **solos})
 
 
-def _quoted(name: str) -> str:
-    """A name inside the quotes of an RNA path."""
-    return str(bpy.utils.escape_identifier(name))
+def wired(scene: Any) -> dict[str, int]:
+    """By layer, the number of the flare whose sliders drive its Gain."""
+    node, found = find_node(scene), {}
+    names = [item.name for item in scene.fit_flare.lights]
+    for curve in drivers(scene):
+        socket, variable = _driven(node, curve), curve.driver.variables.get("i")
+        target = variable.targets[0] if variable else None
+        match = _OF_A_LIGHT.fullmatch(target.data_path) if target and target.id == scene else None
+        if socket is None or match is None or not socket.name.endswith(_GAIN):
+            continue
+        name = bpy.utils.unescape_identifier(match[2] or "")
+        if match[1] or name in names:
+            found[socket.name.removesuffix(_GAIN)] = int(match[1]) if match[1] else names.index(name)
+    return found
+
+
+def go_by_numbers(scene: Any) -> None:
+    """Have drivers of an earlier version, which went by the names of the flares, go by their numbers: a flare that was
+    renamed lost its own."""
+    tree = tree_of(scene)
+    if tree is None or tree.library is not None or scene.library is not None:
+        return
+    if any(target.id == scene and 'lights["' in target.data_path for curve in drivers(scene)
+           for variable in curve.driver.variables for target in variable.targets):
+        for item in scene.fit_flare.lights:
+            item.identity = item.identity or item.name  # as the layers of that version have it
+        wire(scene, wired(scene))
+
+
+def is_animated(scene: Any) -> bool:
+    """Whether keys or drivers move sliders of the panel that drive the node's."""
+    own = scene.animation_data.drivers if scene.animation_data is not None else ()
+    return any(_LIVE.match(curve.data_path) for some in (*curves.of(scene), own) for curve in some)
+
+
+def drivers(scene: Any) -> list[Any]:
+    """The drivers of the node's sliders."""
+    tree = tree_of(scene)
+    if tree is None or tree.animation_data is None:
+        return []
+    return [curve for curve in tree.animation_data.drivers if curve.data_path.startswith(f'nodes["{GROUP}"]')]
+
+
+def _driven(node: Any, curve: Any) -> Any:
+    """The input that a driver drives, None where there is no such."""
+    match = _OF_AN_INPUT.fullmatch(curve.data_path)
+    return node.inputs[int(match[1])] if node and match and int(match[1]) < len(node.inputs) else None
 
 
 def _drive(scene: Any, node: Any, name: str, index: int, expression: str, variables: dict[str, str]) -> None:
+    if name not in node.inputs:  # someone has renamed it
+        return
     curve = node.inputs[name].driver_add("default_value", index)
     driver = curve.driver
     driver.type = "SCRIPTED"
@@ -304,12 +400,17 @@ def _drive(scene: Any, node: Any, name: str, index: int, expression: str, variab
     driver.expression = expression  # of the plain kind that needs no permission to run
 
 
-def _undriven(tree: Any) -> None:
-    """Take our drivers out of a tree."""
-    if tree.animation_data is not None:
-        for curve in list(tree.animation_data.drivers):
-            if curve.data_path.startswith(f'nodes["{GROUP}"]'):
-                tree.animation_data.drivers.remove(curve)
+def _undriven(scene: Any) -> None:
+    """Take the drivers of the node's sliders out, and put back what they drove: a slider would keep what it was last
+    driven to, a flare that was muted or has lost its driver be gone for good."""
+    node = find_node(scene)
+    for curve in drivers(scene):
+        socket, channel = _driven(node, curve), curve.array_index
+        tree_of(scene).animation_data.drivers.remove(curve)
+        if socket is not None and isinstance(socket.default_value, float):
+            socket.default_value = 1.0
+        elif socket is not None:
+            socket.default_value[channel] = 1.0
 
 
 # ---- and away again -------------------------------------------------------------------------------
@@ -326,7 +427,7 @@ def _note(scene: Any) -> dict[str, Any]:
 def _before(tree: Any) -> dict[str, Any]:
     """The names of a tree's nodes, and what fed its output."""
     end = _output(tree, make=False)
-    fed = end.links[0].from_socket if end is not None and end.is_linked else None
+    fed = _source(end)
     return {"nodes": "\n".join(node.name for node in tree.nodes if node.name not in (GROUP, LAYERS)),
             "drivers": tree.animation_data is not None,
             "from": fed.node.name if fed else "", "socket": fed.identifier if fed else ""}
@@ -342,27 +443,29 @@ def remove(scene: Any) -> None:
         raise FrameError(f"The scene {scene.name!r} has no compositor of Fit Flare to remove.")
     note = dict(scene[NOTE]) if NOTE in scene else {**_note(scene), **_before(tree), "nodes": None}
     group, images = node.node_tree, [tree.nodes[name].image for name in (LAYERS, PLATE) if tree.nodes.get(name)]
-    entry = node.inputs["Scene"]
-    inner = entry.links[0].from_socket if entry.is_linked else None  # what someone may have put there since
-    _undriven(tree)
+    below = _under(tree, node, note)
+    if below is None and not note["tree"]:
+        below = _render(tree).outputs["Image"]
+    for fed in [link.to_socket for link in tree.links if link.from_node == node
+                and (link.from_socket.name == "Image" or link.to_node.bl_idname == _END)]:
+        if below is not None:
+            tree.links.new(below, fed)
+    _undriven(scene)
     if not note.get("drivers", True) and tree.animation_data is not None and not tree.animation_data.drivers:
         tree.animation_data_clear()
-    for name in (GROUP, LAYERS, PLATE, SIZE, VIEWER, RENDER):
-        if (ours := tree.nodes.get(name)) is not None:
-            inner = None if inner is not None and inner.node == ours else inner
+    for name in _OURS:
+        ours = tree.nodes.get(name)
+        if ours is not None and not (name == RENDER and any(one.is_linked for one in ours.outputs)):
             tree.nodes.remove(ours)
-    if not note["tree"]:
+    if not note["tree"] and all(one.bl_idname in (_END, "CompositorNodeViewer") or one.name == RENDER
+                                for one in tree.nodes):
         _discard_tree(scene, tree, bool(note["use_nodes"]))
-    else:
-        had = tree.nodes.get(note["from"]) if note["from"] else None
-        fed = next((one for one in had.outputs if one.identifier == note["socket"]), None) if had else inner
-        end = _output(tree, make=False)
-        if fed is not None and end is not None:
-            tree.links.new(fed, end)
+    elif note["tree"]:
         if note.get("nodes") is not None:
             known = note["nodes"].split("\n")
             for extra in [one for one in tree.nodes if one.name not in known and one.bl_idname == _END]:
-                tree.nodes.remove(extra)
+                if not any(socket.is_linked for socket in extra.inputs):
+                    tree.nodes.remove(extra)
         if not _GROUPS_ARE_TREES:
             scene.use_nodes = bool(note["use_nodes"])
     if NOTE in scene:
@@ -421,7 +524,8 @@ def _new_tree(scene: Any, keep_image: bool) -> Any:
 
 def _output(tree: Any, make: bool = True) -> Any:
     """The input socket that the final picture goes into; where there is none it is made, or None."""
-    found = [node for node in tree.nodes if node.bl_idname == _END]
+    found = sorted((node for node in tree.nodes if node.bl_idname == _END),  # 4.x does not tell which one counts
+                   key=lambda node: not getattr(node, "is_active_output", False))
     if not make:
         return found[0].inputs[0] if found and len(found[0].inputs) else None
     if _GROUPS_ARE_TREES and not any(getattr(item, "in_out", "") == "OUTPUT" for item in tree.interface.items_tree):
@@ -438,9 +542,26 @@ def _point_at(node: Any, layers: LayerFolder) -> None:
         with contextlib.suppress(ValueError):  # another drive than the .blend's: the path stays absolute
             image.filepath = bpy.path.relpath(image.filepath)
     node.image = image
+    if exr_is_rec709(layers.files[layers.first]):  # a studio's configuration may take EXRs for another space
+        known = _spaces(image)
+        if space := next((one for one in REC_709_LINEAR if one in known), ""):
+            image.colorspace_settings.name = space
     node.frame_start, node.frame_offset = layers.first, layers.first - 1
-    node.frame_duration = layers.last - layers.first + 1
+    node.frame_duration = _TO_THE_END  # of the layers' own range the last one would be shown ever after
     node.use_auto_refresh = True
+
+
+def misread(scene: Any) -> str:
+    """A sentence where the colour configuration has no space for the light of the layers, "" where it has."""
+    image = tree_of(scene).nodes[LAYERS].image
+    if not exr_is_rec709(bpy.path.abspath(image.filepath)) or any(one in _spaces(image) for one in REC_709_LINEAR):
+        return ""
+    return ("The colour configuration has no space of linear Rec. 709, which the layers are in; they are read as "
+            f"{image.colorspace_settings.name}, and their colours are wrong.")
+
+
+def _spaces(image: Any) -> set[str]:
+    return {item.identifier for item in image.colorspace_settings.bl_rna.properties["name"].enum_items}
 
 
 # ---- frames ---------------------------------------------------------------------------------------
@@ -455,11 +576,23 @@ def match_scene(scene: Any, layers: LayerFolder, size: tuple[int, int]) -> None:
     render.resolution_percentage = 100
 
 
-def plain_view(scene: Any) -> None:
-    """Show pictures in sRGB with no look and no dithering, as the footage was; Blender's own view is AgX."""
-    view = scene.view_settings
-    view.view_transform, view.look, view.exposure, view.gamma = "Standard", "None", 0.0, 1.0
+def plain_view(scene: Any) -> str:
+    """Show pictures with no look and no dithering, as the footage was. Returns what `show_as_filmed` does."""
     scene.render.dither_intensity = 0.0
+    return show_as_filmed(scene)
+
+
+def show_as_filmed(scene: Any) -> str:
+    """Show pictures as they are on the screen that they were made for; Blender's own view is AgX. Returns a sentence
+    where the colour configuration has no view for it, "" where it has."""
+    view = scene.view_settings
+    view.look, view.exposure, view.gamma = "None", 0.0, 1.0
+    for name in PLAIN_VIEWS:
+        with contextlib.suppress(TypeError):  # the configuration has none of that name
+            view.view_transform = name
+            return ""
+    return (f"The colour configuration has no view {' or '.join(PLAIN_VIEWS)}, which shows footage as it is; it is "
+            f"shown by {view.view_transform}: choose another in the scene's colour management.")
 
 
 def render_frames(scene: Any, frames: Iterable[int], path_of: Callable[[int, str], Path],

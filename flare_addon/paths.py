@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import Any
 
 import bpy
 
@@ -20,10 +21,11 @@ def stored(path: Path) -> str:
     return _relative(Path(os.path.normpath(path.absolute())), bpy.data.filepath)
 
 
-def absolute(text: str) -> Path:
+def absolute(text: str, library: Any = None) -> Path:
     """Of such a path the place on disk, without `..`: below a linked folder that would lead elsewhere, and the same
-    place would have several names."""
-    return Path(os.path.normpath(bpy.path.abspath(text.replace("\\", "/") if text.startswith("//") else text)))
+    place would have several names. library: of what is linked from another .blend, which its paths start from."""
+    text = text.replace("\\", "/") if text.startswith("//") else text
+    return Path(os.path.normpath(bpy.path.abspath(text, library=library)))
 
 
 def _relative(path: Path, blend: str) -> str:
@@ -41,14 +43,16 @@ def _relative(path: Path, blend: str) -> str:
 
 @bpy.app.handlers.persistent
 def _remap(blend: str, *_: object) -> None:
-    """Before a save: relative paths from where the file goes."""
+    """Before a save: relative paths from where the file goes; of a file that is saved for the first time all become
+    relative."""
     _before.clear()
-    if not blend or not bpy.data.filepath or Path(blend).parent == Path(bpy.data.filepath).parent:
+    first = not bpy.data.filepath
+    if not blend or (not first and Path(blend).parent == Path(bpy.data.filepath).parent):
         return
     for scene in (scene for scene in bpy.data.scenes if scene.library is None):
         for name in OURS:
             text = getattr(scene.fit_flare, name)
-            if text.startswith("//"):
+            if text and text.startswith("//") != first:
                 _before[scene.name, name] = text
                 setattr(scene.fit_flare, name, _relative(absolute(text), blend))
 

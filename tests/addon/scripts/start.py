@@ -35,6 +35,18 @@ def empty() -> Any:
     return bpy.context.scene
 
 
+def artists_tree(scene: Any) -> Any:
+    """A compositor of the scene's own, without nodes."""
+    if bpy.app.version >= (5, 0, 0):
+        tree = scene.compositing_node_group = bpy.data.node_groups.new("Mine", "CompositorNodeTree")
+        tree.interface.new_socket("Image", in_out="OUTPUT", socket_type="NodeSocketColor")
+    else:
+        scene.use_nodes = True
+        tree = scene.node_tree
+        tree.nodes.clear()
+    return tree
+
+
 def refusal(call: Callable[[], Any]) -> str:
     """The error report of an operator that refuses; "" where it did not. A traceback fails the script."""
     with contextlib.redirect_stderr(io.StringIO()) as noise:

@@ -8,7 +8,7 @@ from pathlib import Path
 import bpy
 
 sys.path.insert(0, str(Path(__file__).parent))
-from start import empty, install, leave, part
+from start import artists_tree, empty, install, leave, part
 
 package, flare, layers, out = sys.argv[1:5]
 install(package)
@@ -34,24 +34,13 @@ def dump(scene):
             "sockets": [item.name for item in tree.interface.items_tree]}
 
 
-def new_tree(scene):
-    if GROUPS:
-        tree = scene.compositing_node_group = bpy.data.node_groups.new("Mine", "CompositorNodeTree")
-        tree.interface.new_socket("Image", in_out="OUTPUT", socket_type="NodeSocketColor")
-    else:
-        scene.use_nodes = True
-        tree = scene.node_tree
-        tree.nodes.clear()
-    return tree
-
-
 def bare(_scene):
     """No compositor at all."""
 
 
 def grey(scene):
     """A colour through a blur to the output, animated."""
-    tree = new_tree(scene)
+    tree = artists_tree(scene)
     colour = tree.nodes.new("CompositorNodeRGB")
     colour.outputs[0].default_value = (0.25, 0.5, 0.75, 1)
     colour.outputs[0].keyframe_insert("default_value", frame=1)
@@ -63,7 +52,7 @@ def grey(scene):
 
 def unused(scene):
     """A tree without an output."""
-    new_tree(scene).nodes.new("CompositorNodeRGB")
+    artists_tree(scene).nodes.new("CompositorNodeRGB")
 
 
 for make in (bare, grey, unused):

@@ -1,0 +1,59 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The compositor among an artist's own nodes: they stay, wherever they are and whatever is pressed."""
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from blenders import Blender
+
+from core.bake.exr import write_layers
+from core.bake.layers import FrameLayers
+
+SCRIPT = Path(__file__).parent / "scripts" / "artists_nodes.py"
+SCENE, FLARE, PLATE = 0.125, 0.25, 0.5
+
+
+@pytest.fixture(scope="session")
+def facts(blender: Blender, tmp_path_factory: pytest.TempPathFactory) -> Any:
+    base = tmp_path_factory.mktemp("artists_nodes")
+    scene, flare = (np.full((8, 16, 3), value, np.float32) for value in (SCENE, FLARE))
+    write_layers(base / "layers" / "layers.0001.exr", FrameLayers(scene, {"lamp": flare}, scene[..., 0]))
+    return blender.run(SCRIPT, base / "layers", base / "out", user=base / "user")
+
+
+def test_what_was_built_round_it_stays_when_it_goes(facts: Any) -> None:
+    assert facts["with our own tree"] == 2 * (PLATE + FLARE)
+    assert facts["our own tree, removed"] == [2 * PLATE, ["Grade", "Sky"]]
+    assert facts["render goes on"]
+    assert facts["made since"] == [PLATE, ["Plate"]]
+    assert facts["set up again"] == [PLATE, ["Plate"]]
+
+
+@pytest.mark.parametrize(("over", "below"), [("present", PLATE), ("scene", SCENE)])
+def test_nodes_behind_it_stay_when_it_is_set_up_again_or_goes(facts: Any, over: str, below: float) -> None:
+    assert facts[f"graded, {over}"] == [2 * (below + FLARE)] * 2
+    assert facts[f"graded, {over}, removed"] == [2 * PLATE, ["Grade", "Plate"]]
+
+
+def test_a_cycle_of_an_earlier_set_up_is_put_right(facts: Any) -> None:
+    assert facts["a cycle"] is None
+    assert facts["no cycle"] == PLATE + FLARE
+
+
+def test_the_present_image_is_found_again_after_the_baked_scene(facts: Any) -> None:
+    graded = 2 * PLATE
+    assert facts["over"] == [graded + FLARE, SCENE + FLARE, graded + FLARE, graded]
+
+
+def test_the_output_that_counts_gets_the_flare(facts: Any) -> None:
+    if "two outputs" not in facts:
+        pytest.skip("Blender 4 does not tell which of two Composite nodes counts")
+    assert facts["two outputs"] == [PLATE + FLARE, PLATE]
+
+
+def test_it_is_shown_and_goes_where_a_slider_was_renamed(facts: Any) -> None:
+    assert facts["renamed in the panel"] == ["Tint"]
+    assert facts["renamed sockets"] == [PLATE, ["Plate"]]

@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Under a studio's colour configuration, as ACES' is: nothing fails, and layers keep their colours."""
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from blenders import Blender
+from test_work import a_flare
+
+from core.bake.exr import write_layers
+from core.bake.layers import FrameLayers
+from core.pictures import read_exr
+from tests.core.flared import HEIGHT, WIDTH, flared_capture
+
+SCRIPT = Path(__file__).parent / "scripts" / "studio.py"
+REC_709 = """
+  - !<ColorSpace>
+    name: Linear Rec.709 (sRGB)
+    to_scene_reference: !<MatrixTransform> {matrix: [0.439632981919, 0.382988698152, 0.177378319929, 0,
+      0.089776443959, 0.813439428749, 0.096784127293, 0, 0.017541170383, 0.111546553302, 0.870912276314, 0,
+      0, 0, 0, 1]}
+"""
+CONFIGURATION = """ocio_profile_version: 2
+strictparsing: true
+roles: {default: raw, scene_linear: ACEScg, data: raw, color_picking: sRGB, aces_interchange: ACES2065-1}
+file_rules:
+  - !<Rule> {name: Default, colorspace: ACEScg}
+displays:
+  sRGB - Display:
+    - !<View> {name: ACES 1.0 - SDR Video, colorspace: sRGB}
+    - !<View> {name: VIEW, colorspace: sRGB}
+colorspaces:
+  - !<ColorSpace>
+    name: ACES2065-1
+  - !<ColorSpace>
+    name: ACEScg
+    to_scene_reference: !<MatrixTransform> {matrix: [0.695452241357, 0.140678696470, 0.163869062172, 0,
+      0.044794563372, 0.859671118456, 0.095534318172, 0, -0.005525882558, 0.004025210306, 1.001500672252, 0,
+      0, 0, 0, 1]}
+  - !<ColorSpace>
+    name: sRGB
+    to_scene_reference: !<ExponentTransform> {value: [2.2, 2.2, 2.2, 1]}
+  - !<ColorSpace>
+    name: raw
+    isdata: true
+"""
+RED_IN_ACESCG = 0.61310, 0.07019, 0.02062  # of linear Rec. 709, by ACES' own matrix
+
+
+def run(blender: Blender, package: Path, base: Path, configuration: str) -> tuple[Any, np.ndarray]:
+    black = np.zeros((HEIGHT, WIDTH, 3), np.float32)
+    red = black + np.array([1, 0, 0], np.float32)
+    write_layers(base / "layers" / "layers.0001.exr", FrameLayers(black, {"lamp": red}, black[..., 0]))
+    (base / "config.ocio").write_text(configuration)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("OCIO", str(base / "config.ocio"))
+        facts = blender.run(SCRIPT, package, flared_capture(base / "capture", 3), a_flare(base / "lamp.flare"),
+                            base / "layers", base, user=base / "user")
+    channels = read_exr(base / "shown.exr")
+    return facts, np.stack([channels[name] for name in "RGB"], -1)
+
+
+def test_layers_keep_their_colours(blender: Blender, package: Path, tmp_path: Path) -> None:
+    configuration = CONFIGURATION.replace("VIEW", "Un-tone-mapped") + REC_709.strip("\n")
+    facts, shown = run(blender, package, tmp_path, configuration)
+    assert facts == {"import": [["FINISHED"], "Un-tone-mapped"], "misread": ""}
+    np.testing.assert_allclose(shown, np.broadcast_to(RED_IN_ACESCG, shown.shape), atol=1e-3)
+
+
+def test_what_a_configuration_lacks_is_told(blender: Blender, package: Path, tmp_path: Path) -> None:
+    facts, _ = run(blender, package, tmp_path, CONFIGURATION.replace("VIEW", "Log"))
+    assert facts["import"] == [["FINISHED"], "ACES 1.0 - SDR Video"]
+    assert "no space of linear Rec. 709" in facts["misread"]

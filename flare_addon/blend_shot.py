@@ -11,25 +11,25 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import bpy
 import numpy as np
 
 from ..core.errors import CaptureError
 from ..core.files import write_json
 from ..core.look.shot import PlacedLight, Shot, ShotFrame
 from . import cameras, capture_export, lights, looks
+from .objects import collections_shown, matrix_of
 
 KINDS = ("POINT", "SPOT", "AREA", "SUN")
 
 
 def shot_of(scene: Any, flare: Path, names: Sequence[str], frames: Sequence[int], *, radius: float = 0.0,
-            occlusion: bool = True, done: Callable[[], None] = lambda: None) -> Shot:
+            done: Callable[[], None] = lambda: None) -> Shot:
     """The scene's active camera at these frames. names: of objects that are lights; none: the scene's lamps.
 
     radius: of the lights' discs for the soft edge of shadows, world units; 0: a share of the distance. The shot's
     coordinates are Blender's world. Raises CaptureError for a scene without a camera, light, or named object.
     """
-    import bpy
-
     things = _lights(scene, names)
     made = []
     for frame in frames:
@@ -40,7 +40,7 @@ def shot_of(scene: Any, flare: Path, names: Sequence[str], frames: Sequence[int]
         camera = scene.camera.evaluated_get(depsgraph)
         core = cameras.core_camera(camera.data, camera.matrix_world, scene.render)
         eye = camera.matrix_world.translation
-        placed = tuple(_placed(scene, depsgraph, thing, eye, radius, occlusion) for thing in things)
+        placed = tuple(_placed(scene, depsgraph, thing, eye, radius) for thing in things)
         made.append(ShotFrame(frame, scene.camera.name, core, placed))
         done()
     return Shot(flare, tuple(made))
@@ -52,17 +52,19 @@ def _lights(scene: Any, names: Sequence[str]) -> list[Any]:
         if missing:
             raise CaptureError(f"The scene {scene.name!r} has no object {missing[0]!r}; name lights as it does.")
         return [scene.objects[name] for name in names]
+    rendered = {thing.name for layer in scene.view_layers
+                for shown in collections_shown(layer.layer_collection, "hide_render") for thing in shown.objects}
     found = [thing for thing in scene.objects if thing.type == "LIGHT" and thing.data.type in KINDS
-             and not thing.hide_render]
+             and not thing.hide_render and thing.name in rendered]
     if not found:
         raise CaptureError(f"The scene {scene.name!r} has no lights; name objects with --lights.")
     return found
 
 
-def _placed(scene: Any, depsgraph: Any, thing: Any, eye: Any, radius: float, occlusion: bool) -> PlacedLight:
+def _placed(scene: Any, depsgraph: Any, thing: Any, eye: Any, radius: float) -> PlacedLight:
     item = SimpleNamespace(target=thing, radius=radius or _radius(thing))
-    share = looks.visible_share(scene, depsgraph, eye, item) if occlusion else 1.0
-    where = np.array(lights.stands(thing, thing.evaluated_get(depsgraph).matrix_world, eye), np.float64)
+    share = looks.visible_share(scene, depsgraph, eye, item)
+    where = np.array(lights.stands(thing, matrix_of(thing, depsgraph), eye), np.float64)
     return PlacedLight(thing.name, thing.name, where, float(share))
 
 
@@ -94,9 +96,9 @@ def capture_of(scene: Any, plates: Mapping[int, Path], folder: Path, names: Sequ
     capture_export.write_points(folder / "points.ply", points)
     things = _lights(scene, names) if names or any(thing.type == "LIGHT" for thing in scene.objects) else []
     if things:
-        eye = scene.camera.matrix_world.translation
+        eye, depsgraph = scene.camera.matrix_world.translation, bpy.context.evaluated_depsgraph_get()
         write_json(folder / "lights.json", {"lights": [
-            {"name": thing.name, "xyz": list(map(float, lights.stands(thing, thing.matrix_world, eye)))}
+            {"name": thing.name, "xyz": list(map(float, lights.stands(thing, matrix_of(thing, depsgraph), eye)))}
             for thing in things]})
     write_json(folder / "transforms.json",
                {"camera_model": "PINHOLE", "ply_file_path": "points.ply", "frames": entries})

@@ -40,8 +40,11 @@ def render_size(render: Any) -> tuple[int, int]:
 def intrinsics_of(data: Any, render: Any) -> tuple[float, float, float, float]:
     """fx, fy, cx, cy in pixels of the render, of a perspective camera's data.
 
-    Raises CaptureError for an orthographic or panoramic camera.
+    Raises CaptureError for an orthographic or panoramic camera, and for data of another object than a camera.
     """
+    if getattr(data, "sensor_fit", None) is None:
+        raise CaptureError("The scene's active camera is an object of another kind; choose a camera in the scene's "
+                           "properties.")
     if data.type != "PERSP":
         raise CaptureError(f"The camera {data.name!r} is not a perspective camera; a flare needs one.")
     width, height = render_size(render)

@@ -2,11 +2,13 @@
 """Light objects: which there are, and how they become the lights.json of a fit."""
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from mathutils import Vector
 from numpy.typing import ArrayLike
 
 from ..core.capture import read_lights
@@ -14,20 +16,41 @@ from ..core.errors import CaptureError
 from ..core.files import named_by, read_json, rounded, write_json
 from . import cameras
 from .capture_import import add_light
+from .objects import matrix_of, view_layer_of
+from .paths import absolute
 
 SUN_DISTANCE = 1e4
 """Scene units at which a sun is from who looks."""
 
+_listed: dict[Path, tuple[tuple[int, int], tuple[str, ...]]] = {}
+
 
 def of_scene(scene: Any) -> list[Any]:
-    """The objects of the scene that stand for lights, by name of the light."""
-    found = [item for item in scene.objects if item.fit_flare.is_light]
+    """The objects of the scene that stand for lights of its capture, by name of the light."""
+    root = scene.fit_flare.root
+    found = [item for item in scene.objects if item.fit_flare.is_light and not _is_of_another(item, root)]
     return sorted(found, key=lambda item: name_of(item).casefold())
+
+
+def _is_of_another(light: Any, root: Any) -> bool:
+    """Whether a light belongs to another capture that was imported than the one `root` carries."""
+    parent = light.parent if root is not None else None
+    while parent is not None and parent != root:
+        if parent.fit_flare.is_root:
+            return True
+        parent = parent.parent
+    return False
 
 
 def name_of(light: Any) -> str:
     """The light's name in lights.json."""
     return light.fit_flare.light or light.name
+
+
+def _depsgraph_of(scene: Any) -> Any:
+    layer = view_layer_of(scene)
+    layer.update()
+    return layer.depsgraph
 
 
 def place_of(light: Any, root: Any, matrix: Any = None) -> Any:
@@ -39,8 +62,6 @@ def place_of(light: Any, root: Any, matrix: Any = None) -> Any:
 def stands(light: Any, matrix: Any, eye: Any) -> Any:
     """Where a light is for who looks from `eye`, in the world, `matrix` being its matrix_world: a sun is far away
     against its direction, wherever its object is put."""
-    from mathutils import Vector
-
     if light.type == "LIGHT" and light.data.type == "SUN":
         return eye + (matrix.to_3x3() @ Vector((0.0, 0.0, 1.0))).normalized() * SUN_DISTANCE
     return matrix.translation.copy()
@@ -81,9 +102,10 @@ def free_name(name: str, taken: set[str]) -> str:
 
 
 def write(scene: Any, folder: Path) -> int:
-    """Write the scene's lights to the capture's lights.json; how many. Entries keep what else was said of them.
+    """Write the scene's lights to the capture's lights.json; how many there are then. Entries keep what else was said
+    of them, and lights that the scene has never had stay.
 
-    Raises CaptureError where there are none or two have one name.
+    Raises CaptureError where there are none, two have one name, or one is where nobody knows.
     """
     objects = of_scene(scene)
     if not objects:
@@ -96,15 +118,49 @@ def write(scene: Any, folder: Path) -> int:
     data: dict[str, Any] = read_json(path, CaptureError) if path.is_file() else {}
     known = {entry.get("name"): entry for entry in data.get("lights", []) if isinstance(entry, dict)}
     eye = scene.camera.matrix_world.translation if scene.camera is not None else objects[0].matrix_world.translation
-    lights = []
+    lights, depsgraph = [known[name] for name in unknown(scene, folder)], _depsgraph_of(scene)
     for item, name in zip(objects, names, strict=True):
-        matrix = item.matrix_world.copy()
+        matrix = matrix_of(item, depsgraph).copy()
         matrix.translation = stands(item, matrix, eye)
         xyz = [rounded(float(value)) for value in place_of(item, scene.fit_flare.root, matrix)]
         lights.append({**known.get(name, {}), "name": name, "xyz": xyz})
     if lights != data.get("lights"):
         write_json(named_by(path), {**data, "lights": lights})
+    remember(scene)
     return len(lights)
+
+
+def remember(scene: Any) -> None:
+    """Note the names of the scene's lights: one that the scene has had and has no more was taken out on purpose."""
+    state = scene.fit_flare
+    names = {*state.known_lights.split("\n"), *map(name_of, of_scene(scene))} - {""}
+    if not state.is_property_set("known_lights") and state.capture:  # a .blend of the version before: it had them all
+        with contextlib.suppress(CaptureError):
+            names |= {light.name for light in read_lights(absolute(state.capture, scene.library) / "lights.json")}
+    state.known_lights = "\n".join(sorted(names))
+
+
+def unknown(scene: Any, folder: Path) -> list[str]:
+    """Names of the lights in the capture's lights.json that the scene has never had: found by the engine while the
+    .blend was closed, or by a command. None where a .blend of the version before says nothing of those it had."""
+    if not scene.fit_flare.is_property_set("known_lights"):
+        return []
+    found = _names_in(folder / "lights.json")
+    had = {*scene.fit_flare.known_lights.split("\n"), *map(name_of, of_scene(scene))} if found else set()
+    return [name for name in found if name not in had]
+
+
+def _names_in(path: Path) -> tuple[str, ...]:
+    """The names in a lights.json, which is read again where it is another: the panel asks at each redraw. None where it
+    cannot be read."""
+    try:
+        stat = path.stat()
+        state = (stat.st_mtime_ns, stat.st_size)
+        if path not in _listed or _listed[path][0] != state:
+            _listed[path] = (state, tuple(light.name for light in read_lights(path)))
+        return _listed[path][1]
+    except (OSError, CaptureError):
+        return ()
 
 
 def reload(scene: Any, folder: Path) -> int:
@@ -116,12 +172,19 @@ def reload(scene: Any, folder: Path) -> int:
         if light.name in there:
             item = there[light.name]
             if item.parent == root:
-                item.location = light.xyz.tolist()
+                _put(item, light.xyz)
         else:
             collection = root.users_collection[0] if root is not None and root.users_collection else scene.collection
             size = max((item.empty_display_size for item in there.values() if item.type == "EMPTY"), default=0.2)
             there[light.name] = add_light(collection, root, light.name, light.xyz, size)
+    remember(scene)
     return len(found)
+
+
+def _put(light: Any, xyz: ArrayLike) -> None:
+    """Move a child of the root to a point (3,) of the capture's coordinates; one that was parented where it stood, as
+    Ctrl+P does it, has a place of its own."""
+    light.location = light.matrix_parent_inverse.inverted_safe() @ Vector(np.asarray(xyz).tolist())
 
 
 def follow(scene: Any, places: Mapping[str, ArrayLike], capture: Path | None) -> None:
@@ -134,4 +197,5 @@ def follow(scene: Any, places: Mapping[str, ArrayLike], capture: Path | None) ->
         if name in places and name in given and item.parent == scene.fit_flare.root and item.animation_data is None:
             where = place_of(item, scene.fit_flare.root)
             if np.allclose(where, given[name], atol=1e-4) and not np.allclose(where, places[name], atol=1e-4):
-                item.location = np.asarray(places[name]).tolist()
+                _put(item, places[name])
+    view_layer_of(scene).update()

@@ -26,7 +26,6 @@ from . import cameras, looks
 
 LEVELS = (1, 2, 4, 8, 16)
 TEXELS = 4.0  # deviations of a Gaussian's narrow side at the level it is drawn in
-MOST_TEXELS = 1 << 14
 
 Floats = NDArray[np.float32]
 

@@ -61,6 +61,11 @@ def _draw() -> None:
         gpu.state.depth_test_set("NONE")
 
 
+def forget() -> None:
+    """Let go of the clouds that were drawn."""
+    _batches.clear()
+
+
 def register() -> None:
     global _handle
     if not bpy.app.background:
@@ -72,4 +77,4 @@ def unregister() -> None:
     if _handle is not None:
         bpy.types.SpaceView3D.draw_handler_remove(_handle, "WINDOW")
         _handle = None
-    _batches.clear()
+    forget()

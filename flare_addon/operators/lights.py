@@ -37,6 +37,8 @@ class FITFLARE_OT_lights_from_selected(Action, bpy.types.Operator):
     def why_not(cls, context: bpy.types.Context) -> str:
         if not context.selected_objects:
             return "Select the objects that are lights first"
+        if any(item.library is not None for item in context.selected_objects):
+            return "Of what is linked from another file, make library overrides first"
         return ""
 
     def execute(self, context: bpy.types.Context) -> set[str]:
@@ -47,7 +49,7 @@ class FITFLARE_OT_lights_from_selected(Action, bpy.types.Operator):
 
 
 class FITFLARE_OT_remove_light(bpy.types.Operator):
-    """Take this light out; an empty that stood for nothing else is deleted"""
+    """Take this light out; an empty that was made for it is deleted, other objects stay"""
 
     bl_idname = "fit_flare.remove_light"
     bl_label = "Remove Light"
@@ -60,8 +62,9 @@ class FITFLARE_OT_remove_light(bpy.types.Operator):
         if light is None:
             self.report({"ERROR"}, f"The light {self.object!r} is not in this scene any more.")
             return {"CANCELLED"}
+        lights.remember(context.scene)
         light.fit_flare.is_light = False
-        if light.type == "EMPTY" and not light.children:
+        if light.fit_flare.is_made and not light.children:
             bpy.data.objects.remove(light)
         return {"FINISHED"}
 
@@ -85,7 +88,28 @@ class FITFLARE_OT_find_lights(Action, bpy.types.Operator):
         fits.find_lights(context.scene)
 
 
-_CLASSES = (FITFLARE_OT_add_light, FITFLARE_OT_lights_from_selected, FITFLARE_OT_remove_light, FITFLARE_OT_find_lights)
+class FITFLARE_OT_use_lights(Action, bpy.types.Operator):
+    """Bring the lights that were found since into the scene"""
+
+    bl_idname = "fit_flare.use_lights"
+    bl_label = "Use Found Lights"
+    bl_options = {"REGISTER", "UNDO"}
+
+    @classmethod
+    def why_not(cls, context: bpy.types.Context) -> str:
+        capture = fits.capture_of(context.scene)
+        if capture is None or not capture.is_dir():
+            return NO_CAPTURE
+        return "" if lights.unknown(context.scene, capture) else "All lights that were found are in the scene"
+
+    def act(self, context: bpy.types.Context) -> None:
+        capture = fits.capture_of(context.scene)
+        assert capture is not None
+        lights.reload(context.scene, capture)
+
+
+_CLASSES = (FITFLARE_OT_add_light, FITFLARE_OT_lights_from_selected, FITFLARE_OT_remove_light, FITFLARE_OT_find_lights,
+            FITFLARE_OT_use_lights)
 
 
 register, unregister = bpy.utils.register_classes_factory(_CLASSES)

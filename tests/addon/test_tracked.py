@@ -46,3 +46,8 @@ def test_what_renders_do_not_show_hides_nothing(facts: Any) -> None:
     assert facts["behind a wall"] == 0
     assert facts["that renders do not show"] == pytest.approx(1)
     assert facts["that cameras do not see"] == pytest.approx(1)
+
+
+def test_a_lamp_does_not_hide_itself_as_an_instance(facts: Any) -> None:
+    assert facts["in its own asset"] == pytest.approx(1)
+    assert facts["behind another lamp of its asset"] == 0

@@ -161,4 +161,23 @@ facts["that renders do not show"] = share()
 wall.hide_render, wall.visible_camera = False, False
 facts["that cameras do not see"] = share()
 
+
+# ---- a lamp that is an instance of an asset -----------------------------------------------------------
+scene = empty()
+camera = bpy.data.objects.new("Camera", bpy.data.cameras.new("Camera"))
+scene.collection.objects.link(camera)
+scene.camera = camera
+asset, shade = bpy.data.collections.new("Asset"), bpy.data.meshes.new("Shade")
+shade.from_pydata([(-1, -1, -1), (1, -1, -1), (1, -1, 1), (-1, -1, 1)], [], [(0, 1, 2, 3)])
+asset.objects.link(bpy.data.objects.new("Shade", shade))
+placed = [bpy.data.objects.new(name, None) for name in ("Lamp", "Lamp before it")]
+for distance, thing in zip((10, 5), placed, strict=True):
+    scene.collection.objects.link(thing)
+    thing.instance_type, thing.instance_collection, thing.location.y = "COLLECTION", asset, distance
+item = scene.fit_flare.lights.add()
+item.name, item.source, item.target = "lamp", "lamp", placed[0]
+eye = camera.matrix_world.translation
+facts["behind another lamp of its asset"] = share()
+bpy.data.objects.remove(placed[1])
+facts["in its own asset"] = share()
 leave(facts)

@@ -1,0 +1,210 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Inside Blender: lights that are switched off, parented, found, moved by a fit. Words: the zip, a capture, a .flare of
+it, a folder."""
+from __future__ import annotations
+
+import contextlib
+import json
+import shutil
+import sys
+from functools import partial
+from pathlib import Path
+from types import SimpleNamespace
+
+import bpy
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parent))
+from start import empty, install, leave, part
+
+package, capture, flare, out = sys.argv[1], *map(Path, sys.argv[2:5])
+install(package)
+sys.path.remove(str(Path(__file__).parent))
+ops = bpy.ops.fit_flare
+fits, lights, looks, shots = (part(f"flare_addon.{name}") for name in ("fits", "lights", "looks", "shots"))
+read_lights, errors = part("core.capture").read_lights, part("core.errors")
+facts: dict[str, object] = {}
+
+
+def linked(name: str, data: object = None) -> object:
+    made = bpy.data.objects.new(name, data)
+    bpy.context.scene.collection.objects.link(made)
+    return made
+
+
+def places(frames: list[int]) -> list[list[float]]:
+    """Where the only flare's light is in a shot."""
+    shot = shots.of_scene(scene, [], frames, flare, None)
+    return [np.round(frame.lights[0].xyz, 3).tolist() for frame in shot.frames]
+
+
+# ---- switched off in the viewport -------------------------------------------------------------------
+for how in ("visible", "disabled", "excluded"):
+    scene = empty()
+    scene.camera = linked("Camera", bpy.data.cameras.new("Camera"))
+    car, lamp = linked("Car"), bpy.data.objects.new("Headlamp", None)
+    inner = bpy.data.collections.new("Lamps")
+    scene.collection.children.link(inner)
+    inner.objects.link(lamp)
+    lamp.parent, lamp.location = car, (0, 1, 0)
+    car.keyframe_insert("location", frame=1)
+    car.location.x = 10
+    car.keyframe_insert("location", frame=11)
+    ops.open_flare(filepath=str(flare))
+    scene.fit_flare.lights[0].target = lamp
+    lamp.hide_viewport = how == "disabled"
+    bpy.context.view_layer.layer_collection.children["Lamps"].exclude = how == "excluded"
+    facts[f"on a car, {how}"] = places([1, 11])
+    scene.frame_set(11)
+    lamp.fit_flare.is_light = True
+    lights.write(scene, out)
+    facts[f"written, {how}"] = read_lights(out / "lights.json")[0].xyz.round(3).tolist()
+lamp.keyframe_insert("hide_render", frame=1)
+lamp["share"] = 1.0
+lamp.driver_add('["share"]').driver.expression = "frame"
+facts["blinking"] = places([1, 11])
+lamp.keyframe_insert("location", frame=1)
+try:
+    places([1])
+except errors.FitFlareError as problem:
+    facts["moved by itself"] = str(problem)
+
+# ---- parented where it stood ------------------------------------------------------------------------
+scene = empty()
+ops.import_capture(directory=str(capture), up="-Y", scale=2.0)
+root, bulb = scene.fit_flare.root, linked("Bulb")
+bulb.location = (1, 2, 3)
+bpy.context.view_layer.update()
+bulb.parent, bulb.matrix_parent_inverse = root, root.matrix_world.inverted()
+lights.take([bulb], {"lamp"})
+bpy.context.view_layer.update()
+before = bulb.matrix_world.translation.copy()
+lights.write(scene, capture)
+lights.reload(scene, capture)
+bpy.context.view_layer.update()
+facts["parented, brought back"] = [(bulb.matrix_world.translation - before).length < 1e-4,
+                                   bool(np.allclose(before, (1, 2, 3), atol=1e-4))]
+
+# ---- an empty of one's own ---------------------------------------------------------------------------
+ops.remove_light(object="Bulb")
+ops.add_light(name="made")
+ops.remove_light(object="made")
+facts["left by X"] = ["Bulb" in scene.objects, "made" in bpy.data.objects]
+
+# ---- lamps that are not rendered --------------------------------------------------------------------
+scene = empty()
+for name in ("On", "Off", "Excluded"):
+    group = bpy.data.collections.new(name)
+    scene.collection.children.link(group)
+    group.objects.link(bpy.data.objects.new(f"Lamp {name}", bpy.data.lights.new(name, "POINT")))
+bpy.data.collections["Off"].hide_render = True
+bpy.context.view_layer.layer_collection.children["Excluded"].exclude = True
+facts["lamps"] = [thing.name for thing in part("flare_addon.blend_shot")._lights(scene, ())]
+
+# ---- an empty as the camera, and another file -------------------------------------------------------
+ops.open_flare(filepath=str(flare))
+scene.fit_flare.lights[0].target = scene.objects["Lamp On"]
+scene.camera = linked("No Camera")
+facts["no camera"] = ops.pick_light.poll()
+try:
+    shots.of_scene(scene, [], [1], flare, None)
+except errors.FitFlareError as problem:
+    facts["an empty"] = str(problem)
+overlay, points = part("flare_addon.overlay"), part("flare_addon.points")
+overlay.problem, points._batches["Points", 3] = "That is wrong.", None
+empty()
+facts["another file"] = [overlay.problem, len(points._batches)]
+
+# ---- lamps of a linked asset ------------------------------------------------------------------------
+scene = empty()
+asset = bpy.data.collections.new("Asset")
+scene.collection.children.link(asset)
+asset.objects.link(bpy.data.objects.new("Streetlamp", None))
+bpy.ops.wm.save_as_mainfile(filepath=str(out / "asset.blend"))
+facts["linked"] = {}
+for how in ("linked", "overridden"):
+    scene = empty()
+    with bpy.data.libraries.load(str(out / "asset.blend"), link=True) as (_, wanted):
+        wanted.collections = ["Asset"]
+    scene.collection.children.link(wanted.collections[0])
+    if how == "overridden":
+        wanted.collections[0].override_hierarchy_create(scene, bpy.context.view_layer)
+    bpy.context.view_layer.update()
+    for thing in scene.objects:
+        thing.select_set((thing.override_library is not None) == (how == "overridden"))
+    possible = ops.lights_from_selected.poll()
+    if possible:
+        ops.lights_from_selected()
+    bpy.ops.wm.save_as_mainfile(filepath=str(out / f"{how}.blend"))
+    bpy.ops.wm.open_mainfile(filepath=str(out / f"{how}.blend"))
+    facts["linked"][how] = [possible, [lights.name_of(item) for item in lights.of_scene(bpy.context.scene)]]
+
+# ---- a click in the picture -------------------------------------------------------------------------
+library = part("flare_addon.operators.library")
+frame_in, library.overlay.frame_in = overlay.frame_in, lambda *_words: overlay.Frame(100, 50, 200, 100)
+view, panel = (SimpleNamespace(type=kind, x=left, y=0, width=width, height=300)
+               for kind, left, width in (("WINDOW", 10, 500), ("UI", 260, 250)))
+area = SimpleNamespace(as_pointer=lambda: 7, regions=[view, panel],
+                       spaces=SimpleNamespace(active=SimpleNamespace(type="VIEW_3D", region_3d=None)))
+left: list[object] = []
+context = SimpleNamespace(screen=SimpleNamespace(areas=[area]), scene=bpy.context.scene,
+                          temp_override=lambda **_words: contextlib.nullcontext(),
+                          window=SimpleNamespace(cursor_modal_restore=lambda: left.append("cursor")),
+                          workspace=SimpleNamespace(status_text_set=left.append))
+facts["clicks"] = {}
+for how, x, y in (("beside the picture", 50, 100), ("below the view", 150, -5), ("on the panel", 300, 100),
+                  ("on the light", 160, 75), ("the camera is gone", 160, 75), ("the view is gone", 160, 75)):
+    kind = library.FITFLARE_OT_pick_light
+    operator = SimpleNamespace(_area=7, execute=lambda _context: {"FINISHED"},
+                               why_not=lambda _context, how=how: "No" if how == "the camera is gone" else "")
+    operator._pick, operator.cancel = partial(kind._pick, operator), partial(kind.cancel, operator)
+    if how == "the view is gone":
+        context.screen.areas.clear()
+    left.clear()
+    result = kind.modal(operator, context, SimpleNamespace(type="LEFTMOUSE", value="PRESS", mouse_x=x, mouse_y=y))
+    facts["clicks"][how] = [list(result), left == ["cursor", None]]
+    if how == "on the light":
+        facts["clicked"] = [operator.x, operator.y]
+overlay.frame_in = frame_in
+
+# ---- a fit that has ended while the .blend was closed -----------------------------------------------
+learned = part("core.look").read(flare).lights[0].xyz
+run = out / "run"
+run.mkdir()
+shutil.copy(flare, run / fits.FLARE)
+(run / "config.toml").write_text("")
+(run / "capture.txt").write_text(f"{capture}\n")
+for how in ("open", "closed"):
+    scene = empty()
+    ops.import_capture(directory=str(capture))
+    lamp = scene.objects["lamp"]
+    lamp.location = [learned[0] + 0.5, *learned[1:]]
+    bpy.context.view_layer.update()
+    lights.write(scene, capture)
+    scene.fit_flare.run = str(run)
+    if how == "open":
+        job = part("flare_addon.jobs").Job("fit", run, 0, None)
+        job.state = "done"
+        fits.finished(job)
+    else:
+        assert ops.use_result() == {"FINISHED"}
+    facts[f"fitted, {how}"] = [bool(np.allclose(lights.place_of(lamp, scene.fit_flare.root), learned, atol=1e-4)),
+                               scene.fit_flare.native]
+
+# ---- lights that were found while the .blend was closed ---------------------------------------------
+path = capture / "lights.json"
+content = json.loads(path.read_text())
+path.write_text(json.dumps({"lights": [*content["lights"], {"name": "found", "xyz": [1, 2, 3], "score": 0.5}]}))
+facts["found"] = lights.unknown(scene, capture)
+lights.write(scene, capture)
+facts["kept"] = [entry for entry in json.loads(path.read_text())["lights"] if entry["name"] == "found"]
+ops.use_lights()
+facts["used"] = [[lights.name_of(item) for item in lights.of_scene(scene)], lights.unknown(scene, capture)]
+ops.remove_light(object="found")
+lights.write(scene, capture)
+facts["taken out"] = [[light.name for light in read_lights(path)], lights.unknown(scene, capture)]
+scene.fit_flare.property_unset("known_lights")
+path.write_text(json.dumps({"lights": [*content["lights"], {"name": "found", "xyz": [1, 2, 3]}]}))
+lights.write(scene, capture)
+facts["of the version before"] = [light.name for light in read_lights(path)]
+leave(facts)

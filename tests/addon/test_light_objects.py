@@ -1,0 +1,87 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Lights are where they stand, whatever is switched off, and where a fit puts them; none is lost."""
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from blenders import Blender
+from test_work import a_flare
+
+from tests.core.flared import flared_capture
+
+SCRIPTS = Path(__file__).parent / "scripts"
+
+
+@pytest.fixture(scope="session")
+def facts(blender: Blender, package: Path, tmp_path_factory: pytest.TempPathFactory) -> Any:
+    base = tmp_path_factory.mktemp("lights")
+    capture, flare = flared_capture(base / "capture", 5), a_flare(base / "lamp.flare")
+    (base / "out").mkdir()
+    return blender.run(SCRIPTS / "lights.py", package, capture, flare, base / "out", user=base / "user")
+
+
+@pytest.mark.parametrize("how", ["visible", "disabled", "excluded"])
+def test_a_light_that_is_switched_off_goes_with_its_parent(facts: Any, how: str) -> None:
+    assert facts[f"on a car, {how}"] == [[0, 1, 0], [10, 1, 0]]
+    assert facts[f"written, {how}"] == [10, 1, 0]
+
+
+def test_one_that_is_animated_and_stands_still_is_not_refused(facts: Any) -> None:
+    assert facts["blinking"] == [[0, 1, 0], [10, 1, 0]]
+
+
+def test_one_that_is_moved_by_itself_is_refused(facts: Any) -> None:
+    assert facts["moved by itself"].startswith("'Headlamp' is switched off in the viewport")
+
+
+def test_a_light_parented_where_it_stood_stays_there(facts: Any) -> None:
+    assert facts["parented, brought back"] == [True, True]
+
+
+@pytest.mark.parametrize("how", ["open", "closed"])
+def test_lights_follow_a_fit_however_it_is_taken_in(facts: Any, how: str) -> None:
+    assert facts[f"fitted, {how}"] == [True, True], "where it was learned, and known to be of this capture"
+
+
+def test_found_lights_are_kept_until_they_are_used_or_taken_out(facts: Any) -> None:
+    assert "found" in facts["found"]
+    assert facts["kept"] == [{"name": "found", "xyz": [1, 2, 3], "score": 0.5}]
+    names, left = facts["used"]
+    assert "found" in names and not left
+    names, left = facts["taken out"]
+    assert "found" not in names and not left
+    assert "found" not in facts["of the version before"]
+
+
+def test_only_an_empty_that_was_made_for_a_light_goes_with_it(facts: Any) -> None:
+    assert facts["left by X"] == [True, False]
+
+
+def test_lamps_that_are_not_rendered_do_not_flare(facts: Any) -> None:
+    assert facts["lamps"] == ["Lamp On"]
+
+
+def test_an_empty_is_no_camera(facts: Any) -> None:
+    assert not facts["no camera"]
+    assert facts["an empty"].startswith("The scene's active camera is an object of another kind")
+
+
+def test_another_file_begins_anew(facts: Any) -> None:
+    assert facts["another file"] == ["", 0]
+
+
+def test_a_light_is_picked_in_the_picture_alone(facts: Any) -> None:
+    """And whatever ends it, cursor and status line are as they were."""
+    clicks = facts["clicks"]
+    for beside in ("beside the picture", "below the view", "on the panel"):
+        assert clicks[beside] == [["PASS_THROUGH"], False]
+    assert clicks["on the light"] == [["FINISHED"], True]
+    assert facts["clicked"] == [0.25, 0.75]
+    for gone in ("the camera is gone", "the view is gone"):
+        assert clicks[gone] == [["CANCELLED"], True]
+
+
+def test_lamps_of_a_linked_asset_are_lights_by_an_override(facts: Any) -> None:
+    assert facts["linked"] == {"linked": [False, []], "overridden": [True, ["Streetlamp"]]}

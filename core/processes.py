@@ -15,12 +15,13 @@ SLACK_S = 5.0
 
 
 def is_same(pid: int, started: float) -> bool:
-    """Whether the process that was written down at `started`, seconds since the epoch, still runs.
+    """Whether the process that was begun and written down at `started`, seconds since the epoch, still runs.
 
-    One that began later has come by its number.
+    One that began later has come by its number; so has one that began earlier, where what was written down is of
+    another machine or of the time before it was started anew.
     """
     began = _began(pid)
-    return began is not None and began <= started + SLACK_S
+    return began is not None and abs(began - started) <= SLACK_S
 
 
 def runs(pid: int) -> bool:

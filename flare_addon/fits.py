@@ -2,6 +2,7 @@
 """Fits: started, found again, and what they leave taken into the scene."""
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -9,28 +10,35 @@ import bpy
 
 from ..core import exposures
 from ..core.errors import CaptureError, FitFlareError, RunError
-from ..core.look import Look
+from ..core.look import Look, read
 from . import engine, jobs, lights, looks
 from .capture_import import expose
 from .jobs import Job
 from .paths import absolute, stored
 
-FLARE, PREVIEW, CHECKPOINT, CONFIG = "flare.flare", "preview_small.png", "checkpoint/state.safetensors", "config.toml"
+FLARE, SCENE, PREVIEW, CONFIG = "flare.flare", "scene.ply", "preview_small.png", "config.toml"
 
 
 def folder_of(scene: Any) -> Path | None:
     """The run's folder; None where none is chosen."""
-    return absolute(scene.fit_flare.run) if scene.fit_flare.run else None
+    return absolute(scene.fit_flare.run, scene.library) if scene.fit_flare.run else None
 
 
 def capture_of(scene: Any) -> Path | None:
     """The capture's folder; None where none is chosen."""
-    return absolute(scene.fit_flare.capture) if scene.fit_flare.capture else None
+    return absolute(scene.fit_flare.capture, scene.library) if scene.fit_flare.capture else None
 
 
 def job_of(scene: Any) -> Job | None:
     """The fit that runs or ran in the scene's run folder."""
     return jobs.find(folder_of(scene))
+
+
+def jobs_of(scene: Any) -> list[Job | None]:
+    """The scene's fit, search for lights and cleaning, where there is or was one."""
+    capture = capture_of(scene)
+    of_capture = [] if capture is None else [jobs.find(capture / "lights"), cleaning_of(capture)]
+    return [job_of(scene), *of_capture]
 
 
 def state_of(scene: Any) -> str:
@@ -120,8 +128,12 @@ def _run(scene: Any, capture: Path, folder: Path) -> Job:
 
 
 def show(scene: Any, folder: Path) -> Look:
-    """The flare of a run in the scene, its cameras exposed as their frames were. Raises FlareFileError, RunError."""
-    look = looks.use(scene, folder / FLARE)
+    """The flare of a run in the scene, its lights where the fit has put them, its cameras exposed as their frames were.
+    Raises FlareFileError, CaptureError, RunError."""
+    path = folder / FLARE
+    # Before the look is used, which asks where the lights are.
+    lights.follow(scene, {light.name: light.xyz for light in read(path).lights}, capture_of(scene))
+    look = looks.use(scene, path)
     expose_cameras(scene, folder)
     return look
 
@@ -137,6 +149,22 @@ def expose_cameras(scene: Any, folder: Path | None) -> None:
         expose(scene.fit_flare.root, exposures.read(folder))
 
 
+def leave_another(scene: Any) -> None:
+    """Let go of a run of another capture than the scene's present one; it goes on, and its folder stays."""
+    folder, capture = folder_of(scene), capture_of(scene)
+    if folder is not None and capture is not None and not _may_be_of(folder, capture):
+        scene.fit_flare.run = ""
+
+
+def _may_be_of(folder: Path, capture: Path) -> bool:
+    """Whether a run is of a capture. One whose own is gone may be of one that has its name: that may have been moved;
+    one that does not say may be of any."""
+    begun = _begun_with(folder)
+    if begun is None:
+        return True
+    return begun.samefile(capture) if begun.is_dir() and capture.is_dir() else begun.name == capture.name
+
+
 def _begun_with(folder: Path) -> Path | None:
     """The capture of a run; None where its folder does not say."""
     try:
@@ -149,21 +177,19 @@ def finished(job: Job) -> None:
     """Show the flare of a fit that ended well, in every scene that has this run."""
     if job.state != "done":
         return
-    for scene in bpy.data.scenes:
-        folder = folder_of(scene)
-        if folder is not None and folder == job.folder:
-            try:
-                look = show(scene, folder)
-                lights.follow(scene, {light.name: light.xyz for light in look.lights}, capture_of(scene))
-            except FitFlareError as problem:
-                job.error = str(problem)
-    _remember("Fit")
+    scenes = [scene for scene in bpy.data.scenes if folder_of(scene) == job.folder]
+    for scene in scenes:
+        try:
+            show(scene, job.folder)
+        except FitFlareError as problem:
+            job.error = str(problem)
+    _remember("Fit", scenes)
 
 
-def _remember(what: str) -> None:
-    """An undo step for what a timer changed, so that undoing what came later does not take it away too."""
+def _remember(what: str, scenes: Sequence[Any]) -> None:
+    """An undo step for what a timer changed in scenes, so that undoing what came later does not take it away too."""
     manager = bpy.context.window_manager
-    if bpy.app.background or not manager.windows:
+    if bpy.app.background or not manager.windows or not scenes:
         return
     with bpy.context.temp_override(window=manager.windows[0]):
         bpy.ops.ed.undo_push(message=f"Fit Flare: {what}")
@@ -176,6 +202,7 @@ def find_lights(scene: Any) -> Job:
         raise CaptureError("There is no capture yet; import one first.")
     if lights.of_scene(scene):
         lights.write(scene, capture)
+    lights.remember(scene)
     return engine.run("lights", capture / "lights", ["lights", capture, "--keep"])
 
 
@@ -205,10 +232,11 @@ def _cleaning_folder(capture: Path) -> Path:
 def cleaning(scene: Any, capture: Path) -> list[object]:
     """The engine's words for it: a finished fit knows the flare of all frames, a network sees a few at a time, and by
     a matte where there is one."""
-    if state_of(scene) == "finished":
-        return ["remove", "--run", folder_of(scene), "--out", capture / "removed"]
+    folder = folder_of(scene)
+    if folder is not None and state_of(scene) == "finished" and _may_be_of(folder, capture):
+        return ["remove", "--run", folder, "--out", capture / "removed"]
     given = scene.fit_flare.matte
-    matte = ["--matte", absolute(given)] if given else []
+    matte = ["--matte", absolute(given, scene.library)] if given else []
     glow = ["--keep-glare"] if scene.fit_flare.keep_glow else []
     return ["remove", capture / "images", "--out", capture / "removed", *matte, *glow]
 
@@ -217,25 +245,25 @@ def cleaned(job: Job) -> None:
     """Fits of the scenes with this capture go by the clean frames from now on."""
     if job.state != "done":
         return
-    for scene in bpy.data.scenes:
-        capture = capture_of(scene)
-        if capture is not None and _cleaning_folder(capture) == job.folder:
-            scene.fit_flare.mode = "default"
-    _remember("Clean Frames")
+    scenes = [scene for scene in bpy.data.scenes
+              if (capture := capture_of(scene)) is not None and _cleaning_folder(capture) == job.folder]
+    for scene in scenes:
+        scene.fit_flare.mode = "default"
+    _remember("Clean Frames", scenes)
 
 
 def lights_found(job: Job) -> None:
     """Bring found lights into every scene with this capture."""
     if job.state != "done":
         return
-    for scene in bpy.data.scenes:
-        capture = capture_of(scene)
-        if capture is not None and capture / "lights" == job.folder:
-            try:
-                lights.reload(scene, capture)
-            except FitFlareError as problem:
-                job.error = str(problem)
-    _remember("Lights")
+    scenes = [scene for scene in bpy.data.scenes
+              if (capture := capture_of(scene)) is not None and capture / "lights" == job.folder]
+    for scene in scenes:
+        try:
+            lights.reload(scene, job.folder.parent)
+        except FitFlareError as problem:
+            job.error = str(problem)
+    _remember("Lights", scenes)
 
 
 jobs.FINISHERS.update({"fit": finished, "lights": lights_found, "clean": cleaned})

@@ -1,20 +1,22 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Work of the engine, watched from Blender: a process of its own whose events land in a file.
 
-    FOLDER/job.json       what was started, in which words, and the process's number
+    FOLDER/job.json       what was started, in which words, on which machine, and the process's number
     FOLDER/events.jsonl   its events, one JSON object a line (core/progress.py)
     FOLDER/engine.log     what else it said
     FOLDER/stop           there when it has been asked to stop
 
 A file, not a pipe: the process needs nobody to read it, so Blender can be saved, closed and opened again
 meanwhile, and finds the work by its folder. A timer looks at what is new in the file, a few kilobytes at a
-time, so the window never waits. Without a window the same calls wait for the end.
+time, so the window never waits. Without a window the same calls wait for the end. Of work on another machine, in a
+folder that both see, the events alone tell whether it goes on.
 """
 from __future__ import annotations
 
 import contextlib
 import json
 import os
+import platform
 import shutil
 import signal
 import subprocess
@@ -34,11 +36,13 @@ State = Literal["running", "done", "failed", "stopped"]
 
 RECORD, EVENTS, LOG, STOP = "job.json", "events.jsonl", "engine.log", "stop"
 WINDOWS = os.name == "nt"
+HOST = platform.node()
 STOPPED = 130  # the status of a command that was stopped (headless/cli.py)
 EVERY_S = 0.2
 NICENESS = 5
 TAB = "Fit Flare"  # of the sidebar
 AT_ONCE = 1 << 16  # bytes of events read at a time
+SILENT_S = 3600.0  # another machine's engine that has told nothing for so long has died
 FULL = 1 << 16  # a disk with fewer bytes free is full
 
 FINISHERS: dict[str, Callable[[Job], None]] = {}
@@ -51,8 +55,8 @@ class Job:
     """One command of the engine. done, total: steps of `stage`; left_s: seconds left, None where unknown."""
 
     def __init__(self, kind: str, folder: Path, pid: int, process: subprocess.Popen[bytes] | None,
-                 words: Sequence[str] = ()) -> None:
-        self.kind, self.folder, self.pid = kind, folder, pid
+                 words: Sequence[str] = (), host: str = HOST) -> None:
+        self.kind, self.folder, self.pid, self.host = kind, folder, pid, host
         self.words = [word for word in words if word != "--overwrite"]
         self.state: State = "running"
         self.stage, self.done, self.total, self.left_s = "starting", 0, 0, None
@@ -80,11 +84,12 @@ class Job:
         """Take in what is new; whether anything was."""
         if not self.running:
             return False
+        before = self._at
         alive = self._alive()  # asked first: what was written before the end is then read below
-        news = self._read()
+        self._read()
         if alive:
             self._watched = True
-            return news
+            return self._at > before
         while self._read():
             pass
         self._end()
@@ -96,14 +101,15 @@ class Job:
         """Ask it to stop; it keeps what it has, and ends by itself.
 
         By a file, since on Windows a signal reaches only who shares a console; elsewhere by a signal too, which is
-        heard in start-up, and of which a second one ends what does not answer.
+        heard in start-up, and of which a second one ends what does not answer. On another machine the number is
+        another process's, so there the file is all.
         """
         if not self.running or not self._alive():
             return
         self.stage = "stopping"
         with contextlib.suppress(OSError):
             (self.folder / STOP).touch()
-        if not WINDOWS:
+        if not WINDOWS and self.host == HOST:
             with contextlib.suppress(OSError):
                 os.kill(self.pid, signal.SIGINT)
 
@@ -142,7 +148,17 @@ class Job:
     def _alive(self) -> bool:
         if self._process is not None:
             return self._process.poll() is None
+        if self.host != HOST:
+            while self._read():
+                pass
+            return not (self._has_result or self.error or self._silent())
         return self.pid > 0 and processes.runs(self.pid)
+
+    def _silent(self) -> bool:
+        try:
+            return time.time() - (self.folder / EVENTS).stat().st_mtime > SILENT_S
+        except OSError:
+            return True
 
     def _end(self) -> None:
         """The process is gone."""
@@ -153,6 +169,10 @@ class Job:
             self.state = "stopped"
         elif self.error:
             self.state = "failed"
+        elif self.host != HOST and self.folder.is_dir():
+            self.state = "failed"
+            self.error = (f"The engine on {self.host} has told nothing for an hour; see there whether it works in "
+                          f"{self.folder}.")
         elif not self.folder.is_dir():
             self.state, self.error = "failed", f"The folder {self.folder} was removed while the engine worked in it."
         elif _is_full(self.folder):  # then its last words found no room either
@@ -205,7 +225,7 @@ def start(kind: str, folder: Path, command: Sequence[str], environment: Mapping[
                                             STOP_FILE: str((folder / STOP).absolute())}, **apart)
         _yield_to_the_window(process.pid)
         try:
-            write_json(folder / RECORD, {"kind": kind, "pid": process.pid, "started": time.time(),
+            write_json(folder / RECORD, {"kind": kind, "host": HOST, "pid": process.pid, "started": time.time(),
                                           "words": [str(word) for word in words]})
         except OSError:
             process.kill()  # nobody would find it again
@@ -242,9 +262,9 @@ def find(folder: Path | str | None) -> Job | None:
         return known
     try:
         record = json.loads((folder / RECORD).read_text(encoding="utf-8"))
-        pid = int(record["pid"])
-        job = Job(str(record["kind"]), folder, pid if processes.is_same(pid, float(record["started"])) else 0, None,
-                  list(map(str, record.get("words", ()))))
+        pid, host = int(record["pid"]), str(record.get("host", HOST))  # the version before wrote none
+        here = host == HOST and processes.is_same(pid, float(record["started"]))
+        job = Job(str(record["kind"]), folder, pid if here else 0, None, list(map(str, record.get("words", ()))), host)
     except (OSError, ValueError, KeyError, TypeError):
         return None
     _jobs[_key(folder)] = job

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import bpy
 
-from .. import engine, fits, jobs
+from .. import engine, fits, jobs, shots
 from ..reports import NO_CAPTURE, Action
 
 _keymaps: list[tuple[object, object]] = []
@@ -88,7 +88,7 @@ class FITFLARE_OT_cancel(bpy.types.Operator):
 
 
 class FITFLARE_OT_cancel_by_key(bpy.types.Operator):
-    """Stop what the engine does, where the mouse is over the panel"""
+    """Stop what the engine does for this scene, where the mouse is over the panel and nothing plays"""
 
     bl_idname = "fit_flare.cancel_by_key"
     bl_label = "Cancel Fit Flare"
@@ -96,12 +96,14 @@ class FITFLARE_OT_cancel_by_key(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        region = context.region
-        return (region is not None and region.type == "UI" and bool(jobs.running())
-                and getattr(region, "active_panel_category", "") == "Fit Flare")
+        region, screen = context.region, context.screen
+        return (region is not None and region.type == "UI"
+                and getattr(region, "active_panel_category", "") == "Fit Flare"
+                and not (screen is not None and screen.is_animation_playing)  # which ESC is to stop then
+                and bool(shots.jobs_of(context.scene)))
 
-    def execute(self, _context: bpy.types.Context) -> set[str]:
-        for job in jobs.running():
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        for job in shots.jobs_of(context.scene):
             job.stop()
         self.report({"INFO"}, "Stopping; what is done is kept")
         return {"FINISHED"}

@@ -33,6 +33,7 @@ def test_the_same_and_another_of_its_number(sleeper: tuple[subprocess.Popen[byte
     assert processes.runs(process.pid)
     assert processes.is_same(process.pid, started)
     assert not processes.is_same(process.pid, started - 3600), "it began after that which was written down"
+    assert not processes.is_same(process.pid, started + 3600), "it began before that which was written down"
     process.kill()
     process.wait()
     assert not processes.runs(process.pid)

@@ -1,0 +1,86 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Inside Blender: work that other machines, files and scenes have begun. Words: the zip, a folder."""
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from types import SimpleNamespace
+
+sys.path.insert(0, str(Path(__file__).parent))
+from start import empty, install, leave, part
+
+package, out = sys.argv[1], Path(sys.argv[2])
+install(package)
+sys.path.remove(str(Path(__file__).parent))
+jobs = part("flare_addon.jobs")
+facts: dict[str, object] = {}
+signal.signal(signal.SIGINT, signal.SIG_DFL)  # a test run in the background has it ignored, and so would what it starts
+sleeper = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(100)"])
+RESULT = '{"type": "result", "data": {}}\n'
+GOES_ON = '{"type": "progress", "stage": "fit", "done": 4, "total": 8, "left_s": 1, "figures": {}}\n'
+
+
+def begun(name: str, events: str, **record: object) -> Path:
+    """A folder as an engine leaves it that was started elsewhere, or by an earlier Blender."""
+    folder = out / name
+    folder.mkdir(parents=True)
+    (folder / jobs.EVENTS).write_text(events)
+    (folder / jobs.RECORD).write_text(json.dumps(
+        {"kind": "fit", "pid": sleeper.pid, "started": time.time(), "words": []} | record))
+    return folder
+
+
+# ---- another machine --------------------------------------------------------------------------------
+ended = []
+jobs.FINISHERS["fit"] = lambda job: ended.append(job.folder.name)
+facts["ended elsewhere"] = jobs.find(begun("ended elsewhere", RESULT, host="another")).state
+far = jobs.find(begun("goes on elsewhere", GOES_ON, host="another"))
+facts["goes on elsewhere"] = [far.state, far.done]
+far.stop()
+facts["asked elsewhere"] = [(far.folder / jobs.STOP).exists(), far.stage]
+with open(far.folder / jobs.EVENTS, "a") as stream:
+    stream.write('{"type": "error", "text": "Stopped during fit as asked; what is done is kept."}\n')
+far.poll()
+facts["stopped elsewhere"] = [far.poll(), far.state, ended]
+silent = begun("silent", GOES_ON, host="another")
+os.utime(silent / jobs.EVENTS, (0, time.time() - 2 * jobs.SILENT_S))
+facts["silent elsewhere"] = [jobs.find(silent).state, jobs.find(silent).error]
+
+# ---- this machine -----------------------------------------------------------------------------------
+facts["written by the version before"] = jobs.find(begun("old", GOES_ON)).state
+later = jobs.find(begun("later", GOES_ON, started=time.time() + 3600))  # as when this machine was started anew since
+facts["its number is an older process's"] = later.state
+facts["the stranger lives"] = sleeper.poll() is None
+
+# ---- of this scene, and of none ---------------------------------------------------------------------
+sleepers = [subprocess.Popen([sys.executable, "-c", "import time; time.sleep(100)"]) for _ in range(3)]
+own, other, bake = (begun(name, GOES_ON, pid=process.pid, kind=kind) for name, process, kind in zip(
+    ("own", "other", "layers"), sleepers, ("fit", "fit", "bake"), strict=True))
+shots, scene = part("flare_addon.shots"), empty()
+scene.fit_flare.run = str(own)
+for folder in (own, other, bake):
+    jobs.find(folder)
+facts["of the scene"] = [job.folder.name for job in shots.jobs_of(scene)]
+facts["of none"] = [job.folder.name for job in shots.unnamed() if job.folder != out / "old"]
+cancel = part("flare_addon.operators.fit").FITFLARE_OT_cancel_by_key
+over = SimpleNamespace(region=SimpleNamespace(type="UI", active_panel_category="Fit Flare"), scene=scene,
+                       screen=SimpleNamespace(is_animation_playing=True))
+facts["ESC while it plays"] = cancel.poll(over)
+over.screen.is_animation_playing = False
+facts["ESC"] = cancel.poll(over)
+cancel.execute(SimpleNamespace(report=lambda *_words: None), over)
+sleepers[0].wait(20)
+facts["stopped by ESC"] = [process.poll() is not None for process in sleepers]
+scene.fit_flare.run = ""
+facts["ESC without work of its own"] = cancel.poll(over)
+for process in sleepers:
+    process.kill()
+    process.wait()
+sleeper.kill()
+sleeper.wait()
+leave(facts)

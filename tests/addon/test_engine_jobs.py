@@ -1,0 +1,48 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Work of the engine that others have begun: known for what it is, and nobody else's process is ended for it."""
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import pytest
+from blenders import Blender
+
+pytestmark = pytest.mark.skipif(os.name == "nt", reason="what stands for an engine hears signals, not files")
+
+SCRIPTS = Path(__file__).parent / "scripts"
+
+
+@pytest.fixture(scope="session")
+def facts(blender: Blender, package: Path, tmp_path_factory: pytest.TempPathFactory) -> Any:
+    base = tmp_path_factory.mktemp("jobs")
+    return blender.run(SCRIPTS / "jobs.py", package, base / "out", user=base / "user")
+
+
+def test_work_of_another_machine_goes_by_what_it_tells(facts: Any) -> None:
+    assert facts["ended elsewhere"] == "done"
+    assert facts["goes on elsewhere"] == ["running", 4]
+    assert facts["asked elsewhere"] == [True, "stopping"]
+    assert facts["stopped elsewhere"] == [False, "stopped", ["goes on elsewhere"]]
+    state, error = facts["silent elsewhere"]
+    assert state == "failed"
+    assert error.startswith("The engine on another has told nothing for an hour")
+
+
+def test_another_process_of_the_number_is_left_alone(facts: Any) -> None:
+    assert facts["the stranger lives"]
+    assert facts["its number is an older process's"] == "failed"
+    assert facts["written by the version before"] == "running"
+
+
+def test_work_that_no_scene_names_can_be_seen(facts: Any) -> None:
+    assert facts["of the scene"] == ["own"]
+    assert facts["of none"] == ["other", "layers"]
+
+
+def test_escape_stops_what_this_scene_does_unless_it_plays(facts: Any) -> None:
+    assert not facts["ESC while it plays"]
+    assert facts["ESC"]
+    assert facts["stopped by ESC"] == [True, False, False]
+    assert not facts["ESC without work of its own"]

@@ -8,21 +8,27 @@
     looks.py            .flare, flares, occlusion         overlay.py, points.py   what is drawn in the viewport
     shots.py            what is baked                     compositor.py    layers back together
     library.py          flares for other shots            paths.py         files of a .blend that moves
+    objects.py          where objects stand               curves.py        animation of what is moved
     operators/, panels.py   buttons and panels
 """
 from __future__ import annotations
 
 import bpy
 
-from . import fits, jobs, looks, operators, overlay, panels, paths, points, preferences, properties
+from . import compositor, fits, jobs, looks, operators, overlay, panels, paths, points, preferences, properties
 
 _MODULES = (properties, preferences, operators, panels, points, overlay, paths)
 
 
 @bpy.app.handlers.persistent
 def _loaded(_path: str) -> None:
-    """Another file: nothing that was read for the last one stays."""
+    """Another file: nothing that was read for the last one stays, and what it has of an earlier version is brought
+    up to this one."""
     looks.forget()
+    points.forget()
+    overlay.problem = ""
+    for scene in bpy.data.scenes:
+        compositor.go_by_numbers(scene)
 
 
 def register() -> None:

@@ -85,7 +85,8 @@ def export(scene: Any, folder: Path) -> int:
     write_json(folder / "transforms.json",
                {"camera_model": "PINHOLE", "ply_file_path": "points.ply", "frames": entries})
     state = scene.fit_flare
-    state.capture, state.root, state.mode = stored(folder), None, "split"
+    state.capture, state.root, state.mode, state.footage = stored(folder), None, "split", "images"
+    state.known_lights = ""  # those of an earlier capture are other lights, whatever their names
     return len(entries)
 
 
@@ -97,7 +98,8 @@ def entry_of(scene: Any, camera: Any, frame: int, path: Path, folder: Path) -> d
     name = f"images/{frame:06d}{path.suffix.lower()}"
     target = folder / name
     target.parent.mkdir(parents=True, exist_ok=True)
-    if not target.exists():
+    if not _is_copy(target, path):
+        target.unlink(missing_ok=True)  # not written into: it may be linked to an earlier plate
         try:
             os.link(path, target)
         except OSError:  # another disk, or a file system without links
@@ -105,6 +107,14 @@ def entry_of(scene: Any, camera: Any, frame: int, path: Path, folder: Path) -> d
     pose = cameras.camera_to_world(evaluated.matrix_world) @ cameras.FLIP
     return {"file_path": name, "w": core.width, "h": core.height, "fl_x": core.fx, "fl_y": core.fy, "cx": core.cx,
             "cy": core.cy, **distortion_of(camera, path), "transform_matrix": pose.tolist()}
+
+
+def _is_copy(target: Path, path: Path) -> bool:
+    """Whether a capture's picture is the plate, or a copy of it as it is now."""
+    if not target.exists():
+        return False
+    copied, plate = target.stat(), path.stat()
+    return target.samefile(path) or (copied.st_size, copied.st_mtime) == (plate.st_size, plate.st_mtime)
 
 
 _OTHER_DISTORTION = {"DIVISION": ("division_k1", "division_k2"), "NUKE": ("nuke_k1", "nuke_k2"),

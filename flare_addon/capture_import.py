@@ -18,12 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.bake.frames import numbered
-from ..core.capture import Capture, PointCloud, View
+from ..core.capture import Capture, PointCloud, Twins, View
 from ..core.capture.camera import quaternion_from_rotation
 from ..core.errors import CaptureError
-from . import cameras
+from . import cameras, curves
 from .cameras import FLIP
-from .paths import stored
+from .compositor import show_as_filmed
+from .paths import absolute, stored
 
 SENSOR = 36.0  # mm
 UP = {"Z": (0.0, 0.0, 0.0), "-Y": (-math.pi / 2, 0.0, 0.0), "Y": (math.pi / 2, 0.0, 0.0)}
@@ -89,12 +90,15 @@ def import_capture(scene: Any, folder: Path | str, settings: ImportSettings | No
     lights = tuple(add_light(collection, root, light.name, light.xyz, 0.02 * capture.extent)
                    for light in capture.lights)
     state = scene.fit_flare
-    state.capture, state.root = stored(folder), root
+    if state.root is not None:
+        state.root.fit_flare.is_root = True  # the version before did not say so
+    root.fit_flare.is_root = True
+    state.capture, state.root, state.footage = stored(folder), root, "images"
+    state.known_lights = "\n".join(light.name for light in capture.lights)
     state.mode = "default" if capture.has_removed or capture.has_truth else "split"
     scene.camera = made[0]
     if settings.match_scene:
-        view = scene.view_settings  # footage is shown as it is, not through AgX
-        view.view_transform, view.look, view.exposure, view.gamma = "Standard", "None", 0.0, 1.0
+        notes += [note for note in [show_as_filmed(scene)] if note]
     if not lights:
         notes.append("The capture has no lights yet; find or add them in the panel Lights.")
     if any(view.lens for view in capture.views) and settings.frames:
@@ -108,7 +112,7 @@ def add_light(collection: Any, root: Any, name: str, xyz: Any, size: float) -> A
     light.empty_display_type, light.empty_display_size = "SPHERE", size
     light.location = [float(value) for value in xyz]
     light.show_name = True
-    light.fit_flare.is_light, light.fit_flare.light = True, name
+    light.fit_flare.is_light, light.fit_flare.is_made, light.fit_flare.light = True, True, name
     return light
 
 
@@ -189,24 +193,14 @@ def expose(root: Any, exposures: Mapping[str, float]) -> None:
         state = camera.fit_flare
         if camera.type != "CAMERA" or not state.view:
             continue
-        for curves in _curves_of(camera):  # of an earlier fit
-            for curve in [curve for curve in curves if curve.data_path == EXPOSURE]:
-                curves.remove(curve)
+        for own in curves.of(camera):  # of an earlier fit
+            for curve in [curve for curve in own if curve.data_path == EXPOSURE]:
+                own.remove(curve)
         state.exposure = exposures.get(state.view, 1.0)
         for frame in numbered(exposures):
             if Path(frame.view).parent.as_posix() == state.view:
                 state.exposure = exposures[frame.view]
                 camera.keyframe_insert(EXPOSURE, frame=frame.number)
-
-
-def _curves_of(block: Any) -> list[Any]:
-    """The collections of F-curves that animate a data block."""
-    action = block.animation_data.action if block.animation_data else None
-    if action is None:
-        return []
-    if bpy.app.version < (4, 4, 0):
-        return [action.fcurves]
-    return [bag.fcurves for layer in action.layers for strip in layer.strips for bag in strip.channelbags]
 
 
 def keys(block: Any, channels: dict[str, NDArray[Any]], frames: Sequence[int]) -> None:
@@ -252,14 +246,13 @@ def _footage(camera: Any, capture: Capture, views: Sequence[View], numbers: Sequ
 
 
 def show_footage(scene: Any, which: str) -> int:
-    """Show the frames of the capture's folder images/ or removed/ behind its cameras; how many images changed.
-
-    A frame that has no twin there stays as it is. Twins may have another suffix.
-    """
+    """Show the frames of the capture's folder images/ or removed/ behind its cameras; how many images changed. A frame
+    that has no twin there stays as it is."""
     root, folder = scene.fit_flare.root, scene.fit_flare.capture
     if root is None or not folder:
         return 0
-    base = Path(bpy.path.abspath(folder))
+    base = absolute(folder, scene.library)
+    twins = Twins(base / which) if (base / which).is_dir() else None
     changed = 0
     for camera in (item for item in root.children if item.type == "CAMERA"):
         for back in camera.data.background_images:
@@ -270,11 +263,9 @@ def show_footage(scene: Any, which: str) -> int:
                           if path.is_relative_to((base / name).resolve())), None)
             if inner is None:
                 continue
-            twin = base / which / inner
-            choices = [twin, *(twin.with_suffix(suffix) for suffix in (".png", ".jpg", ".exr", ".tif"))]
-            found = next((one for one in choices if one.is_file()), None)
-            if found is not None and found.resolve() != path:
-                back.image.filepath = stored(found)
+            twin = twins.of(inner) if twins is not None else None
+            if twin is not None and (base / which / twin).resolve() != path:
+                back.image.filepath = stored(base / which / twin)
                 changed += 1
     return changed
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +15,9 @@ from ..core.errors import FlareFileError
 from ..core.look import Edit, Look, LookEdits, PlaneGaussians, read
 from ..core.look.look import Query
 from ..core.look.shot import PlacedLight, evaluate
-from . import cameras
+from . import cameras, compositor, curves
 from .lights import name_of, of_scene, place_of, stands
+from .objects import matrix_of
 from .paths import absolute
 from .properties import edit_of
 
@@ -28,7 +30,7 @@ _cache: dict[str, tuple[tuple[float, int], Look | str]] = {}
 
 def path_of(scene: Any) -> Path | None:
     """The .flare of the scene; None where none is chosen."""
-    return absolute(scene.fit_flare.flare) if scene.fit_flare.flare else None
+    return absolute(scene.fit_flare.flare, scene.library) if scene.fit_flare.flare else None
 
 
 def look_of(scene: Any) -> Look:
@@ -53,11 +55,10 @@ def look_of(scene: Any) -> Look:
     return known[1]
 
 
-def use(scene: Any, path: Path | str, targets: dict[str, Any] | None = None) -> Look:
+def use(scene: Any, path: Path | str) -> Look:
     """Show a .flare in the scene: one flare for each of its lights, at the light object of that name.
 
-    targets: objects by the .flare's light, where the names do not say it. Edits of flares that stay are kept.
-    Raises FlareFileError.
+    Edits of flares that stay are kept. Raises FlareFileError.
     """
     path = Path(path)
     look = read(path)
@@ -70,23 +71,30 @@ def use(scene: Any, path: Path | str, targets: dict[str, Any] | None = None) -> 
         with contextlib.suppress(ValueError):
             state.flare = bpy.path.relpath(str(path))
     objects = {name_of(item): item for item in of_scene(scene)}
-    if targets is None:
-        targets = {name: objects[name] for name in look.names if name in objects}
     if before != state.flare:
         for index in reversed(range(len(state.lights))):
             if state.lights[index].source not in look.names:
-                state.lights.remove(index)
+                remove(scene, index)
     for light in look.lights:
         item = next((one for one in state.lights if one.source == light.name), None)
         if item is None:
             item = state.lights.add()
             item.name = item.source = light.name
-        if item.target is None and light.name in targets:
-            item.target = targets[light.name]
+        if item.target is None and light.name in objects:
+            item.target = objects[light.name]
         _elements(item, light)
     state.light = min(state.light, max(len(state.lights) - 1, 0))
     state.native = _is_of(look, state.root, objects)
     return look
+
+
+def remove(scene: Any, number: int) -> None:
+    """Take a flare out of the scene. Those after it keep their animation, and their wires to the compositor; its own
+    layer is left there as it was baked."""
+    gains = compositor.wired(scene)
+    curves.take_out(scene.fit_flare.lights, "fit_flare.lights", number)
+    if gains:
+        compositor.wire(scene, {layer: one - (one > number) for layer, one in gains.items() if one != number})
 
 
 def _is_of(look: Look, root: Any, objects: dict[str, Any]) -> bool:
@@ -122,7 +130,7 @@ def _elements(item: Any, light: Any) -> None:
     wanted = {element.name: element.kind for element in light.elements}
     for index in reversed(range(len(item.elements))):
         if item.elements[index].name not in wanted:
-            item.elements.remove(index)
+            curves.take_out(item.elements, f"{item.path_from_id()}.elements", index)
     there = {element.name for element in item.elements}
     for name, kind in wanted.items():
         if name not in there:
@@ -152,7 +160,7 @@ def query_of(state: Any) -> Query:
 
 def placed(scene: Any, depsgraph: Any, camera: Any) -> tuple[NDArray[np.float64], list[PlacedLight]]:
     """world_to_camera (4, 4) of a camera object and the lights with their visible shares, in the coordinates
-    that the look is asked in: the capture's, or Blender's where there is no capture."""
+    that the look is asked in: the capture's, or Blender's where there is no capture. Raises CaptureError."""
     state = scene.fit_flare
     root = state.root.evaluated_get(depsgraph) if state.root is not None else None
     matrix = camera.evaluated_get(depsgraph).matrix_world
@@ -161,7 +169,7 @@ def placed(scene: Any, depsgraph: Any, camera: Any) -> tuple[NDArray[np.float64]
     for item in state.lights:
         if item.target is None or item.target.name not in scene.objects:
             continue
-        where = stands(item.target, item.target.evaluated_get(depsgraph).matrix_world, matrix.translation)
+        where = stands(item.target, matrix_of(item.target, depsgraph), matrix.translation)
         share = visible_share(scene, depsgraph, matrix.translation, item) if state.occlusion else 1.0
         xyz = (into @ np.array([*where, 1.0]))[:3]
         lights.append(PlacedLight(item.name, item.source, xyz, share))
@@ -169,7 +177,7 @@ def placed(scene: Any, depsgraph: Any, camera: Any) -> tuple[NDArray[np.float64]
 
 
 def seen(scene: Any, depsgraph: Any, camera: Any) -> dict[str, PlaneGaussians]:
-    """What every flare of the scene shows in a camera at the present frame. Raises FlareFileError."""
+    """What every flare of the scene shows in a camera at the present frame. Raises FlareFileError, CaptureError."""
     look = look_of(scene)
     pose, lights = placed(scene, depsgraph, camera)
     found = evaluate(look, pose, lights, edits_of(scene.fit_flare), query_of(scene.fit_flare))
@@ -194,16 +202,26 @@ _POINTS, _WEIGHTS = _disk()
 def visible_share(scene: Any, depsgraph: Any, eye: Any, item: Any) -> float:
     """How much of a light's disk the eye sees past the scene's objects, 0..1, by rays to points of the disk.
 
-    What stands right at the light (within 6% of the distance) is the lamp itself and hides nothing.
+    What stands right at the light (within 6% of the distance) is the lamp itself and hides nothing, and so do its
+    children and what it or they are instances of.
     """
-    where = stands(item.target, item.target.evaluated_get(depsgraph).matrix_world, eye)
-    own = {item.target.name, *(child.name for child in item.target.children_recursive)}
-    return share_seen(scene, depsgraph, eye, where, own, item.radius)
+    where = stands(item.target, matrix_of(item.target, depsgraph), eye)
+    lamp = (item.target, *item.target.children_recursive)
+    own = {thing.name for thing in lamp}
+    instances = _instances_of(depsgraph, own) if any(thing.is_instancer for thing in lamp) else set()
+    return share_seen(scene, depsgraph, eye, where, own, item.radius, instances)
 
 
-def share_seen(scene: Any, depsgraph: Any, eye: Any, light: Any, own: set[str], disk: float = 0.0) -> float:
-    """How much of a disk about the point `light` the eye sees past all objects but `own`, 0..1; its radius in world
-    units, 0 for a share of the distance."""
+def _instances_of(depsgraph: Any, parents: set[str]) -> set[tuple[str, Any]]:
+    """The instances that objects of these names show, each by its object's name and where it is."""
+    return {(one.object.original.name, one.matrix_world.copy().freeze()) for one in depsgraph.object_instances
+            if one.is_instance and one.parent.original.name in parents}
+
+
+def share_seen(scene: Any, depsgraph: Any, eye: Any, light: Any, own: set[str], disk: float = 0.0,
+               instances: Collection[tuple[str, Any]] = ()) -> float:
+    """How much of a disk about the point `light` the eye sees past all objects but `own` and these instances (name and
+    matrix_world), 0..1; its radius in world units, 0 for a share of the distance."""
     from mathutils import Vector
 
     away = light - eye
@@ -221,10 +239,12 @@ def share_seen(scene: Any, depsgraph: Any, eye: Any, light: Any, own: set[str], 
         direction = (target - eye).normalized()
         start, left, clear = Vector(eye), reach, True
         for _ in range(4):  # past the lamp's own meshes
-            hit, where, _normal, _index, thing, _matrix = scene.ray_cast(depsgraph, start, direction, distance=left)
+            hit, where, _normal, _index, thing, matrix = scene.ray_cast(depsgraph, start, direction, distance=left)
             if not hit:
                 break
-            if thing is None or not (thing.original.name in own or _is_unseen(thing)):
+            if thing is None or not (thing.original.name in own or _is_unseen(thing)
+                                     or any(thing.original.name == name and matrix == place
+                                            for name, place in instances)):
                 clear = False
                 break
             step = (where - start).length + 1e-4 * distance

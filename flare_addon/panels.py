@@ -63,6 +63,9 @@ class FITFLARE_PT_lights(_Part, bpy.types.Panel):
             draw_progress(layout, job, "Looking for lights")
         elif job is not None and job.error:
             lines(layout, job.error, "ERROR")
+        elif folder is not None and (names := lights.unknown(scene, folder)):
+            lines(layout, f"Found, and not in the scene yet: {', '.join(names)}.", "INFO")
+            layout.operator("fit_flare.use_lights", icon="IMPORT")
         column = layout.column(align=True)
         column.operator("fit_flare.find_lights", icon="VIEWZOOM")
         row = column.row(align=True)
@@ -78,6 +81,8 @@ class FITFLARE_PT_fit(_Part, bpy.types.Panel):
         layout, scene = self.layout, context.scene
         state, stage, folder = scene.fit_flare, fits.state_of(scene), fits.folder_of(scene)
         job = jobs.find(folder)
+        for other in shots.unnamed():
+            draw_progress(layout, other, f"{other.folder.name}, of no scene")
         if engine.find() is None:
             draw_engine(layout)
         if stage == "running" and job is not None:
@@ -133,6 +138,8 @@ def _cleaning(layout: Any, state: Any, capture: Any, stage: str) -> None:
         given.use_property_decorate = False
         given.prop(state, "matte")
         given.prop(state, "keep_glow")
+    if there and state.mode == "split":  # they were made while the .blend was closed
+        lines(layout, "There are clean frames: choose them as Supervision to learn from them.", "INFO")
     if not there or by_network:
         layout.operator("fit_flare.clean_frames", text="Make Clean Frames Again" if there else "Make Clean Frames",
                         icon="BRUSH_DATA")
@@ -213,7 +220,7 @@ class FITFLARE_PT_look(_Part, bpy.types.Panel):
             return
         if overlay.problem:
             lines(layout, overlay.problem, "ERROR")
-        elif scene.camera is None:
+        if scene.camera is None:
             lines(layout, "The scene has no camera to see the flare from.", "ERROR")
         elif not _through_camera(context):
             layout.operator("view3d.view_camera", text="Look through the Camera", icon="VIEW_CAMERA")
@@ -319,22 +326,20 @@ class FITFLARE_PT_bake(_Part, bpy.types.Panel):
         column.prop(state, "over")
         box.operator("fit_flare.set_up_baked", icon="NODE_COMPOSITING")
         if node is not None and node.node_tree is not None:
-            driven = node.inputs["Intensity"].is_linked or _is_driven(scene)
-            if driven:
+            sliders = [node.inputs[name] for name in ("Intensity", "Tint") if name in node.inputs]  # not renamed ones
+            wires = compositor.drivers(scene)
+            if not all(curve.driver.is_valid for curve in wires):
+                lines(box, "Some sliders of the panel Look act on it no longer: set it up again.", "ERROR")
+            elif wires or any(socket.is_linked for socket in sliders if socket.name == "Intensity"):
                 lines(box, "Set up: the sliders of the panel Look act on it.", "CHECKMARK")
             else:
                 column = box.column()
                 column.use_property_split = True
-                column.prop(node.inputs["Intensity"], "default_value", text="Intensity")
-                column.prop(node.inputs["Tint"], "default_value", text="Tint")
+                for socket in sliders:
+                    column.prop(socket, "default_value", text=socket.name)
             box.operator("fit_flare.remove_compositor", icon="X")
         else:
             box.operator("fit_flare.set_up_compositor", text="Other Layers …", icon="FILE_FOLDER")
-
-
-def _is_driven(scene: Any) -> bool:
-    tree = compositor.tree_of(scene)
-    return tree is not None and tree.animation_data is not None and bool(tree.animation_data.drivers)
 
 
 def _baked_log(layout: Any, job: jobs.Job) -> None:

@@ -27,6 +27,9 @@ from ..core.look import Edit
 # From 4.5 on a path that may be relative to the .blend has to say so; before, the word is unknown.
 PATH = {"PATH_SUPPORTS_BLEND_RELATIVE"} if bpy.app.version >= (4, 5, 0) else set()
 
+OVERRIDABLE = {"LIBRARY_OVERRIDABLE"}
+"""For what a .blend may say of an object that is linked into it: without, it would be forgotten when it is saved."""
+
 PRESETS = (
     ("draft", "Draft", "A first look in minutes: 1,500 iterations"),
     ("standard", "Standard", "Good for most shots: 3,000 iterations"),
@@ -113,6 +116,7 @@ class FITFLARE_PG_light(Edits, bpy.types.PropertyGroup):
     target: PointerProperty(  # type: ignore[valid-type]
         name="Light", description="The object that the flare comes from: move it and the flare follows",
         type=bpy.types.Object, update=redraw)
+    identity: StringProperty()  # type: ignore[valid-type]  # by which its baked layers know it under any name
     elements: CollectionProperty(type=FITFLARE_PG_element)  # type: ignore[valid-type]
     element: IntProperty(name="Element", description="The element whose sliders are shown", default=0)  # type: ignore[valid-type]
     show_elements: BoolProperty(  # type: ignore[valid-type]
@@ -132,6 +136,7 @@ class FITFLARE_PG_scene(bpy.types.PropertyGroup):
         name="Root", description="The empty that carries the imported capture: move, turn or scale it as you like",
         type=bpy.types.Object, update=redraw)
 
+    known_lights: StringProperty()  # type: ignore[valid-type]
     footage: EnumProperty(  # type: ignore[valid-type]
         name="Footage", description="Which frames are shown behind the cameras",
         items=(("images", "As Filmed", "The frames with their own flare"),
@@ -197,14 +202,18 @@ class FITFLARE_PG_object(bpy.types.PropertyGroup):
     """Of a light object, or a camera's."""
 
     is_light: BoolProperty(  # type: ignore[valid-type]
-        name="Light of the Capture", description="The fit learns a flare for this object", default=False)
-    light: StringProperty(name="Light Name", description="Name of the light in lights.json and the .flare")  # type: ignore[valid-type]
+        name="Light of the Capture", description="The fit learns a flare for this object", default=False,
+        override=OVERRIDABLE)
+    light: StringProperty(  # type: ignore[valid-type]
+        name="Light Name", description="Name of the light in lights.json and the .flare", override=OVERRIDABLE)
     is_points: BoolProperty()  # type: ignore[valid-type]
+    is_root: BoolProperty()  # type: ignore[valid-type]
+    is_made: BoolProperty()  # type: ignore[valid-type]
     view: StringProperty(name="Frame", description="Name of the frame of the capture that this camera is")  # type: ignore[valid-type]
     exposure: FloatProperty(  # type: ignore[valid-type]
         name="Exposure", description="Light on this camera's frame, in parts of a usual one's: its flare is as much "
         "brighter. A fit sets and animates it for a capture whose exposure changes", default=1.0, min=LEAST,
-        max=1 / LEAST, soft_min=0.1, soft_max=10.0, update=redraw)
+        max=1 / LEAST, soft_min=0.1, soft_max=10.0, update=redraw, override=OVERRIDABLE)
 
 
 _CLASSES = (FITFLARE_PG_master, FITFLARE_PG_element, FITFLARE_PG_light, FITFLARE_PG_scene, FITFLARE_PG_object)
@@ -214,7 +223,7 @@ def register() -> None:
     for cls in _CLASSES:
         bpy.utils.register_class(cls)
     bpy.types.Scene.fit_flare = PointerProperty(type=FITFLARE_PG_scene)
-    bpy.types.Object.fit_flare = PointerProperty(type=FITFLARE_PG_object)
+    bpy.types.Object.fit_flare = PointerProperty(type=FITFLARE_PG_object, override=OVERRIDABLE)
 
 
 def unregister() -> None:

@@ -6,15 +6,19 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from uuid import uuid4
 
 import bpy
 
-from ..core.errors import CaptureError, RunError, SettingsError
-from ..core.files import write_json
+from ..core.bake import bake as bakes
+from ..core.bake.frames import layers_file
+from ..core.errors import CaptureError, FrameError, RunError, SettingsError
+from ..core.files import digest_of, write_json
 from ..core.look import Edit, LookEdits
 from ..core.look.shot import Shot, ShotFrame
-from . import cameras, engine, fits, looks
+from . import cameras, engine, fits, jobs, looks
 from .jobs import Job
+from .objects import view_layer_of
 from .paths import absolute, stored
 
 SHOT = "shot.json"
@@ -36,12 +40,12 @@ def of_scene(scene: Any, chosen: Sequence[Any], frames: Sequence[int], flare: Pa
     """The shot of these camera objects at these frames; of none the scene's own, which markers on the timeline may
     change from frame to frame, under the name of the first. The scene's current frame is put back.
 
-    Raises CaptureError for a camera that is no perspective camera, FlareFileError for a bad .flare, SettingsError for
-    frames below 0, which files have no numbers for.
+    Raises CaptureError for a camera that is no perspective camera, and for a light that is switched off in the viewport
+    and moved there; FlareFileError for a bad .flare, SettingsError for frames below 0, which files have no numbers for.
     """
     if min(frames, default=0) < 0:
         raise SettingsError(f"Layers of the frame {min(frames)} have no name; begin the frames to bake at 0 or later.")
-    view_layer = bpy.context.view_layer if bpy.context.scene == scene else scene.view_layers[0]
+    view_layer = view_layer_of(scene)
     before, subframe = scene.frame_current, scene.frame_subframe
     made: list[ShotFrame] = []
     try:
@@ -79,6 +83,16 @@ def without_live(edits: LookEdits) -> LookEdits:
     return LookEdits(kept(edits.master), {name: kept(edit) for name, edit in edits.lights.items()}, edits.elements)
 
 
+def live_of(state: Any, names: Sequence[str]) -> dict[str, list[str]]:
+    """What is written of flares whose colour is left to the compositor: the names of their layers, and what they are
+    known by when they have others."""
+    identities = {}
+    for item in state.lights:
+        item.identity = item.identity or uuid4().hex
+        identities[item.name] = item.identity
+    return {"lights": list(names), "identities": [identities[name] for name in names]}
+
+
 def layers_folder(scene: Any, create: bool = False) -> Path:
     """The folder of the layers: as chosen, or beside the .blend or the flare."""
     state = scene.fit_flare
@@ -92,40 +106,104 @@ def layers_folder(scene: Any, create: bool = False) -> Path:
             number += 1
             folder = base / f"layers_{number}"
         state.layers = stored(folder)
-    return absolute(state.layers) if state.layers else Path()
+    return absolute(state.layers, scene.library) if state.layers else Path()
 
 
 def folder_of_camera(layers: Path, camera: Any) -> Path:
-    """Where a camera's layers are, in a folder into which one or several were baked."""
+    """Where a camera's layers are, in a folder into which the scene's own or chosen ones were baked. Raises FrameError
+    where there are only others' layers."""
     try:
         folders = Shot.read(layers / SHOT).folders
     except SettingsError:
         return layers
-    return layers / folders.get(camera.name if camera is not None else "", "")
+    name = camera.name if camera is not None else ""
+    if name not in folders and "" not in folders.values() and not any(layers.glob("*.exr")):
+        raise FrameError(f"{layers} has no layers of the camera {name!r}, only of {', '.join(map(repr, folders))}; "
+                         "bake it too, or make one of those the scene's camera. One that was renamed needs its name "
+                         "back.")
+    return layers / folders.get(name, "")
 
 
-def bake(scene: Any, chosen: Sequence[Any]) -> Job:
-    """Bake layers of these cameras through the engine, or of the scene's own. Raises FitFlareError of every kind."""
+def replaced(scene: Any, chosen: Sequence[Any]) -> list[int]:
+    """Numbers of the frames whose layers a bake would take out of the folder: they were baked from another flare, of
+    other lights or colours, and are not asked for now. Raises FitFlareError of every kind."""
+    folder, frames = layers_folder(scene), frames_of(scene)
+    if not scene.fit_flare.layers or not (folder / bakes.RECORD).exists():
+        return []
+    shot = _shot(scene, chosen, frames[:1])  # has the lights and cameras of all
+    files = {layers_file(inner, frame) for inner in shot.folders.values() for frame in frames}
+
+    def fingerprint() -> str:
+        run = shot.run
+        return shot.fingerprint("" if run is None else digest_of(run / name for name in (fits.SCENE, fits.FLARE)))
+
+    return bakes.replaced(folder, fingerprint, shot.lights, files)
+
+
+def losing(folder: Path, frames: Sequence[int]) -> str:
+    """That a bake would take these frames out of the folder of the layers, and what to do."""
+    which = f"frame {frames[0]}" if len(frames) == 1 else f"{len(frames)} frames from {frames[0]} to {frames[-1]}"
+    return (f"{folder} has layers of {which} that were baked from another flare or with other lights or colours, and "
+            "that would go: bake them too, or choose another folder for Layers.")
+
+
+def _shot(scene: Any, chosen: Sequence[Any], frames: Sequence[int]) -> Shot:
+    """What the panel asks for, at these frames."""
+    shot = of_scene(scene, chosen, frames, looks.look_of(scene).path.resolve(), _run(scene))
+    return replace(shot, apart=bool(chosen))
+
+
+def _run(scene: Any) -> Path | None:
+    """The run whose scene is baked too; None where it is not wanted. Raises RunError where there is none."""
+    if not scene.fit_flare.bake_scene:
+        return None
+    run = fits.folder_of(scene)
+    if run is None or not (run / fits.SCENE).is_file():
+        raise RunError("There is no fitted scene to bake; switch Fitted Scene Too off, or finish a fit.")
+    return run.resolve()
+
+
+def jobs_of(scene: Any) -> list[Job]:
+    """The work of the engine that goes on for a scene: its fit, search for lights, cleaning and bake."""
+    layers = jobs.find(layers_folder(scene)) if scene.fit_flare.layers else None
+    return [job for job in (*fits.jobs_of(scene), layers) if job is not None and job.running]
+
+
+def unnamed() -> list[Job]:
+    """Fits and bakes that go on and that no scene names: undoing what followed the start of one forgets it."""
+    found = [job for job in jobs.running() if job.kind in ("fit", "bake")]
+    named = [job for scene in bpy.data.scenes for job in jobs_of(scene)] if found else []
+    return [job for job in found if job not in named]
+
+
+def bake(scene: Any, chosen: Sequence[Any], *, others_may_go: bool = False) -> Job:
+    """Bake layers of these cameras through the engine, or of the scene's own. others_may_go: frames of the folder that
+    were baked otherwise and are not asked for. Raises FitFlareError of every kind."""
     if not chosen and scene.camera is None:
         raise CaptureError("The scene has no camera to bake from; add one, or import a capture.")
     engine.command()
-    look = looks.look_of(scene)
     state = scene.fit_flare
     if not any(item.target is not None for item in state.lights):
         raise RunError("No flare has a light to come from; choose an object for each in the panel Look.")
     if looks.twice(state):
         raise RunError(f"Two flares have the name {looks.twice(state)!r}; rename one in the panel Look.")
-    run = None
-    if state.bake_scene:
-        run = fits.folder_of(scene)
-        if run is None or not (run / "scene.ply").is_file():
-            raise RunError("There is no fitted scene to bake; switch Fitted Scene Too off, or finish a fit.")
-        run = run.resolve()
-    folder = layers_folder(scene, create=True)
-    shot = of_scene(scene, chosen, frames_of(scene), look.path.resolve(), run)
+    if not others_may_go and (lost := replaced(scene, chosen)):
+        raise RunError(losing(layers_folder(scene), lost))
+    shot, folder = _shot(scene, chosen, frames_of(scene)), layers_folder(scene, create=True)
     shot.write(folder / SHOT)
     if state.bake_live:
-        write_json(folder / LIVE, {"lights": list(shot.lights)})
+        write_json(folder / LIVE, live_of(state, shot.lights))
     else:
         (folder / LIVE).unlink(missing_ok=True)
     return engine.run("bake", folder, ["bake", folder / SHOT, "--out", folder, "--overwrite"])
+
+
+def baked(job: Job) -> None:
+    """Read the layers in a folder again, where Blender has them already: it would show those of before."""
+    folder = job.folder.resolve()
+    for image in bpy.data.images:
+        if image.source == "SEQUENCE" and absolute(image.filepath, image.library).resolve().is_relative_to(folder):
+            image.reload()
+
+
+jobs.FINISHERS["bake"] = baked

@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
@@ -131,8 +131,7 @@ def bake_frames(source: Sequenced, frames: Sequence[Frame], cameras: Mapping[str
     settings, progress, out = settings or BakeSettings(), progress or Progress(), Path(out)
     keyed = settings.keyed.and_always(settings.edits)
     edits = {frame.number: keyed.at(frame.number, source.lights, source.elements) for frame in frames}
-    made_from = {"renderer": source.fingerprint, "half": settings.half, "edits": list(keyed.always),
-                 "size": [settings.width, settings.height]}
+    made_from = _made_from(source.fingerprint, settings, keyed)
     space = colour_space(settings.space, settings.config)
     if settings.space != "linear" or settings.config is not None:
         made_from["space"] = [settings.space, settings.config]
@@ -186,6 +185,26 @@ def _layers(renderer: OfCamera, camera: Camera, edits: LookEdits, lights: Sequen
     if edits.colour_of_lights_only:
         return layers_of(renderer.render(camera), colours)
     return layers_of(renderer.render(camera, edits.without_colour_of_lights()), colours)
+
+
+def _made_from(fingerprint: str, settings: BakeSettings, keyed: KeyedEdits) -> dict[str, Any]:
+    return {"renderer": fingerprint, "half": settings.half, "edits": list(keyed.always),
+            "size": [settings.width, settings.height]}
+
+
+def replaced(out: Path | str, fingerprint: Callable[[], str], lights: Iterable[str],
+             files: Collection[str]) -> list[int]:
+    """Numbers of the frames that a bake of these `files` alone, with the usual settings, would take out of `out` if it
+    may overwrite: they were made otherwise, and are not made again. fingerprint: of what renders them, which takes time
+    for a large scene. Raises RunError where bake.json is damaged."""
+    if not (Path(out) / RECORD).exists():
+        return []
+    record = read_record(out)
+    others = sorted({entry["frame"] for entry in record["frames"] if entry["file"] not in files})
+    if not others:
+        return []
+    usual = _made_from(fingerprint(), BakeSettings(), KeyedEdits())
+    return [] if (record["made_from"], record["layers"]) == (usual, layer_names(lights)) else others
 
 
 def _begin(out: Path, made_from: dict[str, Any], names: dict[str, str], overwrite: bool) -> None:

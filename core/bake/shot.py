@@ -47,11 +47,7 @@ class ShotRenderer:
     @property
     def fingerprint(self) -> str:
         """Changes whenever all pictures would; what is a frame's alone, its renderer's tells."""
-        digest = hashlib.sha256(self.shot.flare.read_bytes())
-        digest.update(repr((self.shot.query, self.shot.live, self.lights)).encode())
-        if self.run is not None:
-            digest.update(self.run.fingerprint.encode())
-        return digest.hexdigest()[:16]
+        return self.shot.fingerprint(self.run.fingerprint if self.run is not None else "")
 
     def render(self, one: ShotFrame, camera: Camera, edits: LookEdits | None = None) -> Rendered:
         """The layers of a frame, under its camera at the size asked for."""

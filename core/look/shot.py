@@ -12,6 +12,7 @@ the scene it was learned from, else any.
 """
 from __future__ import annotations
 
+import hashlib
 import math
 import re
 from collections import Counter
@@ -84,13 +85,15 @@ def evaluate(look: Look, world_to_camera: Any, lights: Sequence[PlacedLight], ed
 @dataclass(frozen=True, eq=False)
 class Shot:
     """Frames to be rendered with a flare. run: the folder of the fit whose scene belongs under it, or None. live:
-    whoever lays the layers over something applies the colour of whole lights, which the edits leave out."""
+    whoever lays the layers over something applies the colour of whole lights, which the edits leave out. apart: one
+    camera's layers, too, have a folder of their own."""
 
     flare: Path
     frames: tuple[ShotFrame, ...]
     query: Query = "target"
     run: Path | None = None
     live: bool = False
+    apart: bool = False
 
     @property
     def lights(self) -> tuple[str, ...]:
@@ -99,7 +102,8 @@ class Shot:
 
     @property
     def folders(self) -> dict[str, str]:
-        """Of each camera the folder for its layers, where there are several; no two are one, on any file system."""
+        """Of each camera the folder for its layers, "" where there is but one that is not to have its own; no two are
+        one, on any file system."""
         found: dict[str, str] = {}
         for name in dict.fromkeys(frame.name for frame in self.frames):
             plain = re.sub(r"[^\w-]+", "_", name).strip("_") or "camera"
@@ -109,7 +113,15 @@ class Shot:
                 number += 1
                 folder = f"{plain}_{number}"
             found[name] = folder
-        return found if len(found) > 1 else dict.fromkeys(found, "")
+        return found if len(found) > 1 or self.apart else dict.fromkeys(found, "")
+
+    def fingerprint(self, run: str = "") -> str:
+        """Changes whenever all its pictures would; what is a frame's alone, `ShotFrame.described` tells. run: the
+        fingerprint of the fit whose scene belongs under it."""
+        digest = hashlib.sha256(self.flare.read_bytes())
+        digest.update(repr((self.query, self.live, self.lights)).encode())
+        digest.update(run.encode())
+        return digest.hexdigest()[:16]
 
     def write(self, path: Path | str) -> None:
         """Write what `read` reads."""
@@ -120,7 +132,7 @@ class Shot:
                    "lights": [{"name": light.name, "source": light.source, "xyz": light.xyz.tolist(),
                                "share": light.share} for light in one.lights]} for one in self.frames]
         write_json(path, {"version": VERSION, "flare": str(self.flare), "run": str(self.run) if self.run else None,
-                          "query": self.query, "live": self.live, "frames": frames})
+                          "query": self.query, "live": self.live, "apart": self.apart, "frames": frames})
 
     @classmethod
     def read(cls, path: Path | str) -> Shot:
@@ -139,7 +151,8 @@ class Shot:
                 raise ValueError(f"frame {twice[0][1]} of {twice[0][0]!r} is listed twice")
             here = Path(path).parent
             run = here / data["run"] if data.get("run") else None
-            return cls(here / data["flare"], frames, data.get("query", "target"), run, bool(data.get("live")))
+            return cls(here / data["flare"], frames, data.get("query", "target"), run, bool(data.get("live")),
+                       bool(data.get("apart")))
         except (ArithmeticError, AttributeError, KeyError, TypeError, ValueError, np.linalg.LinAlgError) as problem:
             raise SettingsError(f"{path} is not a shot that can be rendered ({problem!r}); "
                                 "export it again.") from problem

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import bpy
 
 from ...core.bake.folder import LayerFolder
+from ...core.bake.frames import Frame, absent
 from ...core.bake.layers import layer_names
-from ...core.errors import FrameError
+from ...core.errors import CaptureError, FrameError
 from .. import compositor, engine, jobs, looks, shots
 from ..paths import absolute
-from ..reports import NO_CAMERA, NO_FLARE, Action
+from ..reports import NO_CAMERA, NO_FLARE, Action, reported
 
 
 class FITFLARE_OT_bake(Action, bpy.types.Operator):
@@ -26,6 +28,9 @@ class FITFLARE_OT_bake(Action, bpy.types.Operator):
     selected: bpy.props.BoolProperty(  # type: ignore[valid-type]
         name="Selected Cameras", description="Bake from every selected camera, each into a folder of its own",
         default=False)
+    replace: bpy.props.BoolProperty(  # type: ignore[valid-type]
+        name="Replace Others", description="Other frames of the folder that were baked otherwise may go",
+        default=False, options={"HIDDEN", "SKIP_SAVE"})
 
     @classmethod
     def why_not(cls, context: bpy.types.Context) -> str:
@@ -38,10 +43,30 @@ class FITFLARE_OT_bake(Action, bpy.types.Operator):
             return engine.missing()
         return "A bake is running" if _baking(scene) else ""
 
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        lost: list[int] = []
+        with reported(self) as outcome:
+            lost = shots.replaced(context.scene, self._chosen(context))
+        if outcome.status == {"CANCELLED"}:
+            return outcome.status
+        self.replace = True  # none go, or someone says that they may
+        if not lost:
+            return self.execute(context)
+        return context.window_manager.invoke_confirm(
+            self, event, title="Replace Layers", confirm_text="Replace",
+            message=shots.losing(shots.layers_folder(context.scene), lost))
+
     def act(self, context: bpy.types.Context) -> None:
-        scene = context.scene
-        chosen = [item for item in context.selected_objects if item.type == "CAMERA"] if self.selected else []
-        shots.bake(scene, chosen)
+        shots.bake(context.scene, self._chosen(context), others_may_go=self.replace)
+
+    def _chosen(self, context: bpy.types.Context) -> list[Any]:
+        """The cameras to bake from; none for the scene's own. Raises CaptureError where none is selected."""
+        if not self.selected:
+            return []
+        found = [item for item in context.selected_objects if item.type == "CAMERA"]
+        if not found:
+            raise CaptureError("No camera is selected; select those to bake from.")
+        return found
 
 
 def _baking(scene: Any) -> bool:
@@ -58,7 +83,22 @@ def set_up(operator: Any, scene: Any, folder: str, *, keep_image: bool, plate: b
     if match:
         compositor.match_scene(scene, layers, layers.size())
     live = "; Intensity and Tint of the panel act on it" if wire(scene, layers) else ""
+    for told in _warnings(scene, layers, bool(live)):
+        operator.report({"WARNING"}, told)
     operator.report({"INFO"}, f"{len(layers.files)} frames of layers set up{live}")
+
+
+def _warnings(scene: Any, layers: LayerFolder, live: bool) -> Iterator[str]:
+    """What of a composite that is set up will not be as somebody may expect."""
+    there = [Frame("", number, "") for number in layers.files]
+    if bare := absent(there, f"{max(scene.frame_start, 0)}-{max(scene.frame_end, scene.frame_start, 0)}"):
+        yield (f"The scene has the frames {scene.frame_start}-{scene.frame_end}, and there are no layers of {bare}, "
+               "which are without flare; bake them too.")
+    if live and compositor.is_animated(scene):
+        yield ("Sliders that act on it are animated: they stand still where this extension is not, on a farm say; bake "
+               "without Keep Colours Live for that.")
+    if misread := compositor.misread(scene):
+        yield misread
 
 
 class FITFLARE_OT_set_up_compositor(Action, bpy.types.Operator):
@@ -115,12 +155,15 @@ def wire(scene: Any, layers: LayerFolder) -> bool:
     """Connect the panel's sliders to layers that this scene has baked without them; whether it was done."""
     folder = next((one for one in (layers.folder, layers.folder.parent) if (one / shots.LIVE).is_file()), layers.folder)
     try:
-        names = json.loads((folder / shots.LIVE).read_text(encoding="utf-8"))["lights"]
+        live = json.loads((folder / shots.LIVE).read_text(encoding="utf-8"))
+        baked = layer_names(live["lights"])
+        identities = dict(zip(live["lights"], live.get("identities", live["lights"]), strict=True))
     except (OSError, ValueError, KeyError, TypeError):
         return False
-    present = {item.name for item in scene.fit_flare.lights}
-    gains = {layer: name for name, layer in layer_names(names).items() if name in present}
-    compositor.wire(scene, gains)
+    names, known = ({getattr(item, of): number for number, item in enumerate(scene.fit_flare.lights)}
+                    for of in ("name", "identity"))
+    found = {layer: known.get(identities[name], names.get(name)) for name, layer in baked.items()}
+    compositor.wire(scene, {layer: number for layer, number in found.items() if number is not None})
     return True
 
 

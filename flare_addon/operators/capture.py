@@ -60,6 +60,7 @@ class FITFLARE_OT_import_capture(Action, bpy.types.Operator):
             chosen = Path(bpy.path.abspath(self.directory))
         settings = ImportSettings(self.cameras, self.up, self.scale, self.frames, self.points, self.match_scene)
         made = import_capture(context.scene, chosen, settings)
+        fits.leave_another(context.scene)
         fits.expose_cameras(context.scene, fits.folder_of(context.scene))
         for note in made.notes:
             self.report({"WARNING"}, note)
@@ -99,6 +100,7 @@ class FITFLARE_OT_capture_from_camera(Action, bpy.types.Operator):
 
     def act(self, context: bpy.types.Context) -> None:
         count = capture_export.export(context.scene, Path(bpy.path.abspath(self.directory)))
+        fits.leave_another(context.scene)
         self.report({"INFO"}, f"{count} frames are now a capture in {self.directory}")
 
 

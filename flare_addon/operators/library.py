@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import bpy
 from mathutils import Vector
@@ -88,7 +89,7 @@ class FITFLARE_OT_pick_light(Action, bpy.types.Operator):
 
     @classmethod
     def why_not(cls, context: bpy.types.Context) -> str:
-        if context.scene.camera is None:
+        if context.scene.camera is None or context.scene.camera.type != "CAMERA":
             return NO_CAMERA
         if not context.scene.fit_flare.flare:
             return "Open a flare, or apply one of the library, first"
@@ -99,32 +100,46 @@ class FITFLARE_OT_pick_light(Action, bpy.types.Operator):
         if not areas:
             self.report({"ERROR"}, "There is no 3D viewport to pick in.")
             return {"CANCELLED"}
-        self._area = max(areas, key=lambda area: area.width * area.height)
-        self._area.spaces.active.region_3d.view_perspective = "CAMERA"
+        area = max(areas, key=lambda area: area.width * area.height)
+        self._area = area.as_pointer()  # the area itself may be gone when the click comes
+        area.spaces.active.region_3d.view_perspective = "CAMERA"
         context.window_manager.modal_handler_add(self)
         context.window.cursor_modal_set("EYEDROPPER")
         context.workspace.status_text_set("Click on the light in the picture; ESC or right click to leave it")
         return {"RUNNING_MODAL"}
 
     def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
-        if event.type in {"ESC", "RIGHTMOUSE"}:
-            return self._end(context, {"CANCELLED"})
-        if event.type != "LEFTMOUSE" or event.value != "PRESS":
+        # The view may have been closed or maximised meanwhile, and the camera deleted.
+        area = next((area for area in context.screen.areas if area.as_pointer() == self._area), None)
+        if event.type in {"ESC", "RIGHTMOUSE"} or area is None or self.why_not(context):
+            self.cancel(context)
+            return {"CANCELLED"}
+        if event.type != "LEFTMOUSE" or event.value != "PRESS" or not self._pick(context, area, event):
             return {"PASS_THROUGH"}
-        region = next(region for region in self._area.regions if region.type == "WINDOW")
-        space = self._area.spaces.active
-        with context.temp_override(area=self._area, region=region, space_data=space, region_data=space.region_3d):
+        self.cancel(context)
+        return self.execute(context)
+
+    def _pick(self, context: bpy.types.Context, area: Any, event: Any) -> bool:
+        """Take the place of the mouse in the picture; whether it is over the picture."""
+        under = [region for region in area.regions if 0 <= event.mouse_x - region.x < region.width
+                 and 0 <= event.mouse_y - region.y < region.height]
+        space = area.spaces.active
+        if space.type != "VIEW_3D" or [region.type for region in under] != ["WINDOW"]:  # the sidebar may lie over it
+            return False
+        region = under[0]
+        x, y = event.mouse_x - region.x, event.mouse_y - region.y
+        with context.temp_override(area=area, region=region, space_data=space, region_data=space.region_3d):
             frame = overlay.frame_in(bpy.context, context.scene, context.scene.camera)
         if frame is None:
-            return self._end(context, {"CANCELLED"})
-        self.x = (event.mouse_x - region.x - frame.left) / frame.width
-        self.y = 1 - (event.mouse_y - region.y - frame.bottom) / frame.height
-        return self._end(context, self.execute(context))
+            return False
+        self.x, self.y = (x - frame.left) / frame.width, 1 - (y - frame.bottom) / frame.height
+        return 0 <= self.x <= 1 and 0 <= self.y <= 1
 
-    def _end(self, context: bpy.types.Context, status: set[str]) -> set[str]:
-        context.window.cursor_modal_restore()
-        context.workspace.status_text_set(None)
-        return status
+    def cancel(self, context: bpy.types.Context) -> None:
+        """Leave window and status line as they were; Blender calls it where it closes what is being picked in."""
+        if context.window is not None:  # it may be the window that is closed
+            context.window.cursor_modal_restore()
+            context.workspace.status_text_set(None)
 
     def act(self, context: bpy.types.Context) -> None:
         scene = context.scene

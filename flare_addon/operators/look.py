@@ -8,7 +8,7 @@ from typing import Any
 import bpy
 
 from ...core.errors import FitFlareError
-from .. import looks
+from .. import compositor, looks
 from ..properties import EDIT_NAMES
 from ..reports import NO_FLARE, Action
 
@@ -92,7 +92,11 @@ class FITFLARE_OT_remove_flare(Action, bpy.types.Operator):
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         state = context.scene.fit_flare
-        state.lights.remove(state.light)
+        name = state.lights[state.light].name
+        if state.light in compositor.wired(context.scene).values():
+            self.report({"WARNING"}, f"The layer of {name} stays in the compositor as it was baked; bake again to have "
+                        "it go")
+        looks.remove(context.scene, state.light)
         state.light = max(min(state.light, len(state.lights) - 1), 0)
         return {"FINISHED"}
 

@@ -16,10 +16,11 @@ from core.bake.exr import read_description, read_layers, write_layers
 from core.bake.frames import absent, chosen, numbered, plates_by_number
 from core.bake.layers import FARTHEST, FrameLayers, Rendered, layer_names, layers_of
 from core.capture.camera import Camera
+from core.colour import REC_709, colour_space
 from core.errors import Cancelled, FrameError, RunError, SettingsError
 from core.files import write_json
 from core.look import KeyedEdits, LookEdits
-from core.pictures import read_exr, write_exr
+from core.pictures import exr_is_rec709, read_exr, write_exr
 from core.progress import Progress
 
 HALF = 2.0 ** -11  # the relative rounding error of 16 bit floats
@@ -413,3 +414,11 @@ def test_colours_of_layers_are_light_and_plain_factors_exact() -> None:
                      for edit in ("saturation", "intensity"))
     assert (layers_of(rendering, vivid).flares["lamp"] >= 0).all()
     np.testing.assert_array_equal(layers_of(rendering, double).flares["lamp"], 2 * layer)
+
+
+def test_a_file_tells_whether_its_light_is_rec_709(tmp_path: Path) -> None:
+    layers = FrameLayers(np.ones((2, 3, 3), np.float32), {}, np.ones((2, 3), np.float32))
+    spaces = {"rec709": REC_709, "untold": None, "acescg": colour_space("acescg").chromaticities}
+    for name, chromaticities in spaces.items():
+        write_layers(tmp_path / f"{name}.exr", layers, chromaticities=chromaticities)
+    assert [exr_is_rec709(tmp_path / f"{name}.exr") for name in spaces] == [True, True, False]

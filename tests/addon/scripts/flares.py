@@ -1,0 +1,200 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Inside Blender: flares renamed, removed and animated while the compositor shows their layers. Words: the zip, a
+.flare, a folder of layers and live.json, one of a layer more, a folder to write."""
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+from unittest.mock import MagicMock
+
+import bpy
+
+sys.path.insert(0, str(Path(__file__).parent))
+from start import empty, install, leave, part
+
+package, flare, layers, more, out = sys.argv[1:6]
+install(package)
+sys.path.remove(str(Path(__file__).parent))
+ops = bpy.ops.fit_flare
+compositor, looks, shots, bake, panels, curves = (part(f"flare_addon.{name}") for name in (
+    "compositor", "looks", "shots", "operators.bake", "panels", "curves"))
+facts: dict[str, object] = {}
+
+
+def shot(lamps, *, over="scene"):
+    """A scene with a flare at each of these lamps, and their layers in the compositor."""
+    scene = empty()
+    scene.camera = bpy.data.objects.new("Camera", bpy.data.cameras.new("Camera"))
+    scene.collection.objects.link(scene.camera)
+    scene.render.resolution_x, scene.render.resolution_y = 16, 8
+    if hasattr(scene.render, "compositor_device"):
+        scene.render.compositor_device = "CPU"
+    compositor.plain_view(scene)
+    for name in lamps:
+        lamp = bpy.data.objects.new(name, None)
+        scene.collection.objects.link(lamp)
+        lamp.fit_flare.is_light, lamp.fit_flare.light = True, name
+    ops.open_flare(filepath=flare)
+    for name in lamps[1:]:
+        looks.add_instance(scene, scene.objects[name], "lamp")
+    scene.fit_flare.layers, scene.fit_flare.over = layers, over
+    return scene
+
+
+def shown(scene, frame=1):
+    """The middle of the picture."""
+    scene.frame_set(frame)
+    compositor.render_frames(scene, [frame], lambda _number, suffix: Path(out) / f"shown{suffix}")
+    image = bpy.data.images.load(str(Path(out) / "shown.exr"))
+    value = float(image.pixels[0])
+    bpy.data.images.remove(image)
+    return value
+
+
+def said(scene):
+    """What the panel says of the compositor."""
+    layout = MagicMock()
+    panels.FITFLARE_PT_bake._compositor(None, layout, scene)
+    return " ".join(call.kwargs["text"] for call in layout.mock_calls if call[0].endswith(".label"))
+
+
+def told(scene):
+    """What Set Up Compositor warns of."""
+    operator = MagicMock()
+    bake.set_up(operator, scene, layers, keep_image=True, plate=False)
+    return [call.args[1] for call in operator.report.mock_calls if call.args[0] == {"WARNING"}]
+
+
+def work(scene):
+    return all(curve.driver.is_valid for curve in compositor.drivers(scene))
+
+
+# ---- renamed ----------------------------------------------------------------------------------------
+scene = shot(["lamp", "key"])
+state = scene.fit_flare
+live = Path(layers) / shots.LIVE
+old = live.read_text()
+ops.set_up_baked()
+facts["both"] = shown(scene)
+state.lights[0].name = "sun"
+state.lights[0].intensity = 2
+facts["renamed"] = [shown(scene), work(scene)]
+state.lights[0].name = "lamp"
+shots.write_json(live, shots.live_of(state, ["lamp", "key"]))  # as a bake writes it
+state.lights[0].name = "sun"
+ops.set_up_baked()
+facts["renamed, set up again"] = [shown(scene), work(scene), "act on it." in said(scene)]
+live.write_text(old)
+
+# A slider that an earlier version left at what it was last driven to, its flare having another name.
+node = compositor.find_node(scene)
+state.lights[0].mute = True
+muted = shown(scene)
+state.lights[0].name, state.lights[0].identity = "moon", ""
+ops.set_up_baked()
+facts["unknown now"] = [muted, shown(scene)]
+
+# ---- removed ----------------------------------------------------------------------------------------
+scene = shot(["lamp", "key"])
+state = scene.fit_flare
+ops.set_up_baked()
+state.lights[1].intensity = 3
+state.light = 0
+ops.remove_flare()
+facts["removed"] = [shown(scene), work(scene)]
+state.lights[0].intensity = 1
+facts["removed"].append(shown(scene))
+
+# ---- drivers of an earlier version ------------------------------------------------------------------
+scene = shot(["lamp", "key"])
+state = scene.fit_flare
+ops.set_up_baked()
+for curve in compositor.drivers(scene):
+    for variable in curve.driver.variables:
+        target = variable.targets[0]
+        for number, name in enumerate(("lamp", "key")):
+            target.data_path = target.data_path.replace(f"lights[{number}]", f'lights["{name}"]')
+bpy.ops.wm.save_as_mainfile(filepath=str(Path(out) / "before.blend"))
+bpy.ops.wm.open_mainfile(filepath=str(Path(out) / "before.blend"))
+scene = bpy.context.scene
+state = scene.fit_flare
+state.lights[0].name = "sun"
+state.lights[0].intensity = 2
+facts["of an earlier version"] = [shown(scene), work(scene)]
+ops.set_up_baked()
+facts["of an earlier version"] += [shown(scene), work(scene)]
+
+# ---- dead drivers are told --------------------------------------------------------------------------
+for curve in compositor.drivers(scene):
+    for variable in curve.driver.variables:
+        variable.targets[0].data_path = "fit_flare.nothing"
+    curve.driver.expression = curve.driver.expression  # compiled again
+scene.frame_set(2)
+shown(scene)
+facts["dead"] = said(scene)
+
+# ---- keyed ------------------------------------------------------------------------------------------
+scene = shot(["lamp", "key", "rim"])
+state = scene.fit_flare
+rim = state.lights[2]
+for frame, value in ((1, 1.0), (3, 5.0)):
+    rim.intensity = value
+    rim.keyframe_insert("intensity", frame=frame)
+    state.lights[1].keyframe_insert("intensity", frame=frame)
+rim.driver_add("scale").driver.expression = "2"
+state.light = 1
+ops.remove_flare()
+scene.frame_set(3)
+facts["keyed"] = [[item.name, item.intensity, item.scale] for item in state.lights]
+looks.add_instance(scene, scene.objects["key"], "lamp")
+scene.frame_set(1)
+scene.frame_set(3)
+facts["keyed"].append([state.lights[2].intensity, state.lights[2].scale])
+
+# The node's own sliders, when a layer more comes before them.
+live.rename(live.with_suffix(".away"))
+scene = shot(["lamp"])
+ops.set_up_baked()
+tree, node = compositor.tree_of(scene), compositor.find_node(scene)
+for frame, value in ((1, 1.0), (3, 4.0)):
+    node.inputs["Intensity"].default_value = value
+    node.inputs["Intensity"].keyframe_insert("default_value", frame=frame)
+colour = tree.nodes.new("CompositorNodeRGB")
+colour.outputs[0].default_value = (0.5, 0.5, 0.5, 1)
+tree.links.new(colour.outputs[0], node.inputs["Tint"])
+facts["keyed node"] = [shown(scene, 3)]
+scene.fit_flare.layers = more
+ops.set_up_baked()
+facts["keyed node"] += [shown(scene, 3), shown(scene, 1)]
+live.with_suffix(".away").rename(live)
+
+# ---- what is told of frames without layers and of animated sliders ----------------------------------
+scene = shot(["lamp"])
+compositor._new_tree(scene, keep_image=False)
+colour = compositor.tree_of(scene).nodes.new("CompositorNodeRGB")
+colour.outputs[0].default_value = (0.5, 0.5, 0.5, 1)
+compositor.tree_of(scene).links.new(colour.outputs[0], compositor._output(compositor.tree_of(scene)))
+scene.frame_start, scene.frame_end = 1, 3
+facts["all frames"] = told(scene)
+scene.frame_start, scene.frame_end = 0, 6
+facts["too few"] = told(scene)
+facts["after the last"] = [shown(scene, frame) for frame in (3, 4, 6)]
+scene.frame_start, scene.frame_end = 1, 3
+scene.fit_flare.lights[0].keyframe_insert("scale", frame=1)
+facts["scale keyed"] = told(scene)
+scene.fit_flare.lights[0].keyframe_insert("intensity", frame=1)
+facts["intensity keyed"] = told(scene)
+
+# ---- a frame that is shown is baked again -----------------------------------------------------------
+scene = shot(["lamp"])
+ops.set_up_baked()
+first = Path(layers) / "layers.0001.exr"
+facts["baked again"] = [shown(scene)]
+kept = first.read_bytes()
+first.write_bytes((Path(out) / "again.exr").read_bytes())
+part("flare_addon.jobs").FINISHERS["bake"](SimpleNamespace(folder=Path(layers), state="done"))
+facts["baked again"].append(shown(scene))
+first.write_bytes(kept)
+
+leave(facts)

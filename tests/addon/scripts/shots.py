@@ -1,0 +1,149 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Inside Blender: layers of one shot after the other into one folder, and a second capture in a scene. Words: the zip,
+a capture, a .flare of it, a folder."""
+from __future__ import annotations
+
+import os
+import shutil
+import sys
+from pathlib import Path
+
+import bpy
+
+sys.path.insert(0, str(Path(__file__).parent))
+from start import empty, install, leave, part, refusal
+
+package, capture, flare, out = sys.argv[1], *map(Path, sys.argv[2:5])
+install(package)
+sys.path.remove(str(Path(__file__).parent))
+ops = bpy.ops.fit_flare
+shots, looks = (part(f"flare_addon.{name}") for name in ("shots", "looks"))
+write_json = part("core.files").write_json
+facts: dict[str, object] = {}
+
+
+def recorded(shot: object, numbers: range) -> None:
+    """What the engine writes down of a shot that it has baked."""
+    made = part("core.bake.bake")
+    names = part("core.bake.layers").layer_names(shot.lights)
+    write_json(folder / "bake.json", {
+        "version": 1, "made_from": {"renderer": shot.fingerprint(), "half": True, "edits": [], "size": [None, None]},
+        "layers": names, "frames": [{"file": f"layers.{number:04d}.exr", "frame": number, "view": "", "width": 8,
+                                     "height": 8} for number in numbers]})
+    assert made.read_record(folder)["frames"]
+
+
+# ---- one capture after the other --------------------------------------------------------------------
+fits, lights = part("flare_addon.fits"), part("flare_addon.lights")
+second = out / "second"
+shutil.copytree(capture, second)
+(second / "lights.json").unlink()
+run = out / "run"
+run.mkdir()
+(run / fits.FLARE).write_bytes(b"")
+(run / "capture.txt").write_text(f"{capture}\n")
+scene = empty()
+state = scene.fit_flare
+ops.import_capture(directory=str(capture))
+first, state.run = state.root, str(run)
+first.fit_flare.is_root = False  # as the version before left it
+state.footage = "removed"
+ops.import_capture(directory=str(capture))
+facts["imported again"] = [state.run == str(run), state.footage, len(lights.of_scene(scene)),
+                           lights.write(scene, capture)]
+shutil.rmtree(second / "removed", ignore_errors=True)
+(second / "removed").mkdir()
+for path in (second / "images").iterdir():
+    shutil.copy(path, second / "removed" / f"{path.stem}.TIFF")
+ops.import_capture(directory=str(second))
+state.footage = "removed"
+facts["shown of clean frames"] = {Path(bpy.path.abspath(back.image.filepath)).suffix
+                                  for item in state.root.children if item.type == "CAMERA"
+                                  for back in item.data.background_images} == {".TIFF"}
+state.footage = "images"
+facts["another imported"] = [state.run, fits.state_of(scene), len(lights.of_scene(scene))]
+state.run = str(run)
+facts["another cleaned"] = "--run" in fits.cleaning(scene, fits.capture_of(scene))
+state.root = first
+facts["the first's lights"] = len(lights.of_scene(scene))
+ops.capture_from_camera(directory=str(out / "exported"))
+facts["exported"] = [state.run, len(lights.of_scene(scene))]
+
+def refused(*_words: object) -> None:
+    """A file system without links."""
+    raise OSError
+
+
+# ---- a newer plate, from where pictures are linked and from where they have to be copied ------------
+facts["newer plates"] = []
+plate = sorted((second / "images").iterdir())[0]
+frame_of = part("flare_addon.capture_export").entry_of
+for name in ("linked", "copied"):
+    if name == "copied":
+        os.link = refused
+    entry = frame_of(scene, scene.camera, 1, plate, out / name)
+    picture = out / name / entry["file_path"]
+    newer = out / f"newer {name}" / plate.name
+    newer.parent.mkdir()
+    newer.write_bytes(b"newer")
+    before = plate.read_bytes()
+    frame_of(scene, scene.camera, 1, newer, out / name)
+    facts["newer plates"].append([picture.read_bytes() == b"newer", plate.read_bytes() == before,
+                                  sorted(path.name for path in picture.parent.iterdir())])
+
+# ---- frames of another bake -------------------------------------------------------------------------
+scene = empty()
+ops.import_capture(directory=str(capture))
+ops.open_flare(filepath=str(flare))
+folder, state = out / "layers", scene.fit_flare
+folder.mkdir(parents=True)
+state.layers = str(folder)
+begun: list[list[object]] = []
+shots.engine.run = lambda _kind, _folder, words: begun.append(words)
+shots.engine.command = lambda *_words: []
+part("flare_addon.operators.bake").engine.find = lambda: Path("python")
+recorded(shots.of_scene(scene, [], [0, 1, 2], flare, None), range(5))
+state.bake_range = "current"
+facts["as it was baked"] = [refusal(ops.bake), len(begun)]
+state.bake_live = False
+facts["colours no longer live"] = [refusal(ops.bake), len(begun), (folder / "live.json").exists()]
+facts["replaced"] = [refusal(lambda: ops.bake(replace=True)), len(begun)]
+state.bake_live, state.bake_range = True, "scene"
+state.lights[0].name = "renamed"
+facts["all anew"] = [refusal(ops.bake), len(begun)]
+state.bake_range = "current"
+facts["renamed"] = refusal(ops.bake)
+
+# ---- chosen cameras ---------------------------------------------------------------------------------
+one = shots._shot(scene, [scene.camera], [0])
+facts["one chosen"] = list(one.folders.values())
+one.write(folder / "shot.json")
+facts["one chosen, read again"] = shots.folder_of_camera(folder, scene.camera).name
+scene.camera.name = "Other"
+try:
+    shots.folder_of_camera(folder, scene.camera)
+except part("core.errors").FrameError as problem:
+    facts["renamed since"] = str(problem)
+facts["the scene's own"] = list(shots._shot(scene, [], [0]).folders.values())
+for item in scene.objects:
+    item.select_set(False)
+facts["none chosen"] = refusal(lambda: ops.bake(selected=True))
+
+# ---- a project that is saved for the first time, moved, and linked from elsewhere --------------------
+project = out / "project"
+project.mkdir()
+shutil.copy(flare, project / "my.flare")
+scene = empty()
+scene.name, scene.fit_flare.flare = "Shot", str(project / "my.flare")
+bpy.ops.wm.save_as_mainfile(filepath=str(project / "copy.blend"), copy=True)
+facts["saved as a copy"] = scene.fit_flare.flare == str(project / "my.flare")
+bpy.ops.wm.save_as_mainfile(filepath=str(project / "shot.blend"))
+project.rename(out / "moved")
+bpy.ops.wm.open_mainfile(filepath=str(out / "moved" / "shot.blend"))
+facts["saved first and moved"] = looks.path_of(bpy.context.scene) == out / "moved" / "my.flare"
+empty()
+bpy.ops.wm.save_as_mainfile(filepath=str(out / "edit.blend"))
+with bpy.data.libraries.load(str(out / "moved" / "shot.blend"), link=True) as (_, wanted):
+    wanted.scenes = ["Shot"]
+facts["linked"] = looks.path_of(wanted.scenes[0]) == out / "moved" / "my.flare"
+leave(facts)

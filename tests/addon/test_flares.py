@@ -1,0 +1,83 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Flares renamed, removed and animated: their sliders act on their own layers, and their keys stay their own."""
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from blenders import Blender
+from test_work import a_flare
+
+from core.bake.exr import write_layers
+from core.bake.layers import FrameLayers
+from core.files import write_json
+
+SCRIPT = Path(__file__).parent / "scripts" / "flares.py"
+SCENE, PLATE, LAMP, KEY, RIM = 0.125, 0.5, 0.25, 0.5, 1.0
+
+
+@pytest.fixture(scope="session")
+def facts(blender: Blender, package: Path, tmp_path_factory: pytest.TempPathFactory) -> Any:
+    base = tmp_path_factory.mktemp("flares")
+    layers, more = base / "layers", base / "more"
+    scene, lamp, key, rim = (np.full((8, 16, 3), value, np.float32) for value in (SCENE, LAMP, KEY, RIM))
+    for number in range(1, 4):
+        flares = {"lamp": lamp, "key": key}
+        write_layers(layers / f"layers.{number:04d}.exr", FrameLayers(scene, flares, scene[..., 0]))
+        write_layers(more / f"layers.{number:04d}.exr", FrameLayers(scene, {**flares, "rim": rim}, scene[..., 0]))
+    write_layers(base / "again.exr", FrameLayers(scene, {"lamp": rim, "key": key}, scene[..., 0]))
+    write_json(layers / "live.json", {"lights": ["lamp", "key"]})
+    return blender.run(SCRIPT, package, a_flare(base / "lamp.flare"), layers, more, base, user=base / "user")
+
+
+def test_a_flare_keeps_its_layer_under_another_name(facts: Any) -> None:
+    assert facts["both"] == SCENE + LAMP + KEY
+    assert facts["renamed"] == [SCENE + 2 * LAMP + KEY, True]
+    assert facts["renamed, set up again"] == [SCENE + 2 * LAMP + KEY, True, True]
+
+
+def test_a_layer_without_a_flare_shows_as_it_was_baked(facts: Any) -> None:
+    assert facts["unknown now"] == [SCENE + KEY, SCENE + LAMP + KEY]
+
+
+def test_the_others_stay_live_when_a_flare_is_removed(facts: Any) -> None:
+    assert facts["removed"] == [SCENE + LAMP + 3 * KEY, True, SCENE + LAMP + KEY]
+
+
+def test_a_file_of_an_earlier_version_keeps_its_wires(facts: Any) -> None:
+    assert facts["of an earlier version"] == [SCENE + 2 * LAMP + KEY, True] * 2
+
+
+def test_wires_that_lead_nowhere_are_told(facts: Any) -> None:
+    assert "set it up again" in facts["dead"]
+
+
+def test_keys_and_drivers_stay_with_their_flare(facts: Any) -> None:
+    lamp, rim, added = facts["keyed"]
+    assert lamp == ["lamp", 1, 1]
+    assert rim == ["rim", 5, 2]
+    assert added == [1, 1]
+
+
+def test_keys_and_links_stay_with_their_slider_of_the_node(facts: Any) -> None:
+    flare, more = (LAMP + KEY) / 2, (LAMP + KEY + RIM) / 2
+    assert facts["keyed node"] == [SCENE + 4 * flare, SCENE + 4 * more, SCENE + more]
+
+
+def test_a_frame_that_was_baked_again_is_shown(facts: Any) -> None:
+    assert facts["baked again"] == [SCENE + LAMP + KEY, SCENE + RIM + KEY]
+
+
+def test_frames_without_layers_are_told_and_without_flare(facts: Any) -> None:
+    assert facts["all frames"] == []
+    (told,) = facts["too few"]
+    assert "The scene has the frames 0-6, and there are no layers of 0,4-6," in told
+    assert facts["after the last"] == [PLATE + LAMP + KEY, PLATE, PLATE]
+
+
+def test_animated_sliders_that_a_farm_would_not_have_are_told(facts: Any) -> None:
+    assert facts["scale keyed"] == []
+    (told,) = facts["intensity keyed"]
+    assert "they stand still where this extension is not" in told

@@ -1,0 +1,57 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What was made for one shot is not taken for another's, and does not go by the way."""
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from blenders import Blender
+from test_work import a_flare
+
+from tests.core.flared import flared_capture
+
+SCRIPTS = Path(__file__).parent / "scripts"
+
+
+@pytest.fixture(scope="session")
+def facts(blender: Blender, package: Path, tmp_path_factory: pytest.TempPathFactory) -> Any:
+    base = tmp_path_factory.mktemp("shots")
+    capture, flare = flared_capture(base / "capture", 5), a_flare(base / "lamp.flare")
+    return blender.run(SCRIPTS / "shots.py", package, capture, flare, base / "out", user=base / "user")
+
+
+def test_another_capture_has_its_own_run_and_lights(facts: Any) -> None:
+    assert facts["imported again"] == [True, "images", 1, 1]
+    assert facts["another imported"] == ["", "none", 0]
+    assert facts["shown of clean frames"], "whatever the suffix, as fits find them"
+    assert not facts["another cleaned"]
+    assert facts["the first's lights"] == 1
+    assert facts["exported"] == ["", 2], "without a root all lights of the scene are where they stand"
+
+
+def test_a_capture_from_a_camera_has_the_plates_of_now(facts: Any) -> None:
+    assert facts["newer plates"] == [[True, True, ["000001.png"]]] * 2
+
+
+def test_baked_frames_do_not_go_unasked(facts: Any) -> None:
+    assert facts["as it was baked"] == ["", 1]
+    said, begun, live = facts["colours no longer live"]
+    assert "has layers of 4 frames from 1 to 4 that were baked" in said
+    assert begun == 1 and live, "neither baked nor written down as if it were"
+    assert facts["replaced"] == ["", 2]
+    assert facts["all anew"] == ["", 3], "none is left that would be another's"
+    assert "4 frames from 1 to 4" in facts["renamed"]
+
+
+def test_each_chosen_camera_has_a_folder_even_alone(facts: Any) -> None:
+    assert facts["one chosen"] == [facts["one chosen, read again"]] == ["Camera"]
+    assert facts["the scene's own"] == [""]
+    assert "has no layers of the camera 'Other', only of 'Camera'" in facts["renamed since"]
+    assert facts["none chosen"] == "No camera is selected; select those to bake from."
+
+
+def test_a_project_finds_its_files_wherever_it_goes(facts: Any) -> None:
+    assert facts["saved as a copy"], "the file that is open has no place yet"
+    assert facts["saved first and moved"]
+    assert facts["linked"]

@@ -37,6 +37,12 @@ def channel_names(stream: BinaryIO) -> list[str]:
     return names if value[at:] == b"\0" else []
 
 
+def chromaticities(stream: BinaryIO) -> tuple[float, ...] | None:
+    """Red's, green's, blue's and white's x and y; None where they are not told."""
+    value = _attributes(stream, {b"chromaticities": b"chromaticities"}).get(b"chromaticities", b"")
+    return tuple(np.frombuffer(value, "<f4").tolist()) if len(value) == 32 else None
+
+
 def is_cut_off(stream: BinaryIO) -> bool:
     """Whether the chunks of a picture of one part in lines are not all in the file. Of other kinds it is not known, and
     none of those is."""

@@ -192,6 +192,16 @@ def channel_names(path: Path | str) -> list[str]:
     return names
 
 
+def exr_is_rec709(path: Path | str) -> bool:
+    """Whether an EXR's light is linear Rec. 709, as the format has it where no chromaticities are told. Raises OSError
+    where there is no such file."""
+    from .colour import REC_709
+
+    with open(path, "rb") as stream:
+        told = exr.chromaticities(stream)
+    return told is None or bool(np.allclose(told, REC_709, atol=1e-4))
+
+
 def exr_is_cut_off(path: Path | str) -> bool:
     """Whether an EXR ends before its last lines, by its table of where they are. Raises OSError where there is no such
     file."""

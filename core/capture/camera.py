@@ -116,13 +116,6 @@ class Camera:
         with np.errstate(invalid="ignore"):
             return np.asarray((np.asarray(depth) > 0) & (at >= 0).all(axis=1) & (at <= self.size).all(axis=1))
 
-    @property
-    def field_of_view(self) -> tuple[float, float]:
-        """Horizontal and vertical angle, in radians."""
-        x = math.atan(self.cx / self.fx) + math.atan((self.width - self.cx) / self.fx)
-        y = math.atan(self.cy / self.fy) + math.atan((self.height - self.cy) / self.fy)
-        return x, y
-
 
 def rotation_from_quaternion(wxyz: ArrayLike) -> Floats:
     """(3, 3) rotation of a quaternion (w, x, y, z), normalised first (Hamilton's convention, as COLMAP)."""

@@ -382,27 +382,38 @@ def _view(name: str, frame: Posed, size: tuple[int, int]) -> View:
     return View(name, camera if size == camera.size else camera.scaled(*size), None if straight else lens, frame.points)
 
 
+class Twins:
+    """The pictures below a folder, by the names of frames elsewhere: a twin may have another suffix."""
+
+    def __init__(self, folder: Path) -> None:
+        self.pictures = pictures_below(folder)
+        self._there: dict[str, str] = {}
+        for path in self.pictures:  # by the name with the suffix in small letters
+            name = path.relative_to(folder)
+            self._there.setdefault(name.with_suffix(name.suffix.lower()).as_posix(), name.as_posix())
+
+    def of(self, frame: Path | str) -> str | None:
+        """Name below the folder of a frame's twin, None where it has none."""
+        name = Path(frame)
+        suffixes = (name.suffix.lower(), ".exr", ".png", ".tif", ".tiff", ".jpg", ".jpeg")
+        keys = (name.with_suffix(suffix).as_posix() for suffix in suffixes)
+        return next((self._there[key] for key in keys if key in self._there), None)
+
+
 def _siblings(folder: Path, views: Sequence[View]) -> dict[str, Path]:
-    """For each view the file of its name in `folder`, or of its name with another picture suffix."""
+    """For each view its twin in `folder`."""
     found: dict[str, Path] = {}
     if not folder.is_dir():
         return found
-    there: dict[str, str] = {}
-    pictures = pictures_below(folder)
-    for path in pictures:  # by the name with the suffix in small letters
-        name = path.relative_to(folder)
-        there.setdefault(name.with_suffix(name.suffix.lower()).as_posix(), name.as_posix())
+    twins = Twins(folder)
     for view in views:
         inside(folder, view.name, CaptureError)
-        name = Path(view.name)
-        suffixes = (name.suffix.lower(), ".exr", ".png", ".tif", ".tiff", ".jpg", ".jpeg")
-        keys = (name.with_suffix(suffix).as_posix() for suffix in suffixes)
-        choice = next((there[key] for key in keys if key in there), None)
-        if choice is not None:
-            found[view.name] = inside(folder, choice, CaptureError)
-    if pictures and views and not found:
-        raise CaptureError(f"{folder} holds {len(pictures)} pictures, the first {pictures[0].name}, and none has the "
-                           f"name of a frame, such as {views[0].name}; give them the frames' names.")
+        twin = twins.of(view.name)
+        if twin is not None:
+            found[view.name] = inside(folder, twin, CaptureError)
+    if twins.pictures and views and not found:
+        raise CaptureError(f"{folder} holds {len(twins.pictures)} pictures, the first {twins.pictures[0].name}, and "
+                           f"none has the name of a frame, such as {views[0].name}; give them the frames' names.")
     return found
 
 

@@ -8,7 +8,6 @@ Hash tables are stored as the rows that training touched; the others are zero. N
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -19,13 +18,12 @@ from torch import Tensor
 
 from .. import tensors as on_disk
 from ..errors import FlareFileError
-from ..look.look import MOST_GAUSSIANS
+from ..look.look import VERSION, checked
 from ..sampling import Sampling
 from .compositing import Blend
 from .deformation import QueryRange
 from .model import FlareForm, FlareModel, LightFlare
 
-VERSION = 1
 _KEY = "fit_flare"
 
 
@@ -82,14 +80,9 @@ def load(path: Path | str) -> FlareFile:
         raise FlareFileError(f"{path} is missing; choose a .flare file that a fit has written.")
     try:
         tensors, about = on_disk.read(path)
-        description = json.loads(about[_KEY])
-    except KeyError as problem:
-        raise FlareFileError(f"{path} is a safetensors file, but not a flare; choose another.") from problem
-    except (ValueError, OSError, RecursionError) as problem:
+    except (ValueError, OSError) as problem:
         raise FlareFileError(f"{path} is damaged or not a flare ({problem}); save it again.") from problem
-    version = description.get("version") if isinstance(description, dict) else None
-    if not isinstance(version, int) or version > VERSION:
-        raise FlareFileError(f"{path} was written by a newer Fit Flare (format {version}); update to open it.")
+    description = checked(path, about)
     try:
         return _unpacked(description, tensors)
     except (KeyError, TypeError, ValueError, RuntimeError) as problem:
@@ -98,8 +91,6 @@ def load(path: Path | str) -> FlareFile:
 
 def _triple(values: Any) -> tuple[float, float, float]:
     x, y, z = (float(value) for value in values)
-    if not all(map(math.isfinite, (x, y, z))):
-        raise ValueError("a range is not finite")
     return x, y, z
 
 
@@ -122,20 +113,12 @@ def _unpacked(description: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> 
             raise ValueError(f"{name} holds values that are not finite")
     flares, names, positions, clear = [], [], [], []
     for light in description["lights"]:
-        count = int(light["count"])
-        xyz = [float(value) for value in light["xyz"]]
-        if not 0 <= count <= MOST_GAUSSIANS or len(xyz) != 3 or not all(map(math.isfinite, xyz)):
-            raise ValueError("a light's description makes no sense")
         low, high, reach = (_triple(light["range"][key]) for key in ("camera_low", "camera_high", "light_high"))
-        form = FlareForm(**light["form"])
-        if not form.makes_sense:
-            raise ValueError("a light's form makes no sense")
-        flares.append(LightFlare(form, QueryRange(low, high, reach), count, torch.Generator()))
+        flares.append(LightFlare(FlareForm(**light["form"]), QueryRange(low, high, reach), int(light["count"]),
+                                 torch.Generator()))
         names.append(str(light["name"]))
-        positions.append(xyz)
+        positions.append(_triple(light["xyz"]))
         clear.append(float(light.get("clear", 1.0)))
-        if not 0 <= clear[-1] <= 1:
-            raise ValueError("a light's clear share makes no sense")
     model = FlareModel(names, torch.tensor(positions, dtype=torch.float64).reshape(-1, 3), flares)
     model.clear.copy_(torch.tensor(clear))
     state = model.flares.state_dict()
@@ -146,9 +129,7 @@ def _unpacked(description: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> 
         else:
             state[name] = tensors[name]
     model.flares.load_state_dict(state)
-    blend = description["blend"]
-    if blend not in ("over", "add"):
-        raise ValueError(f"blend {blend!r}")
-    return FlareFile(model, blend, TrainingCamera(**description["camera"]), str(description.get("licence", "")),
-                     str(description.get("notes", "")), list(description.get("elements", [])),
-                     dict(description.get("seen", {})), Sampling.read(description.get("sampling")))
+    return FlareFile(model, description["blend"], TrainingCamera(**description["camera"]),
+                     str(description.get("licence", "")), str(description.get("notes", "")),
+                     list(description.get("elements", [])), dict(description.get("seen", {})),
+                     Sampling.read(description.get("sampling")))

@@ -27,7 +27,7 @@ class PlaneGaussians(NamedTuple):
     """Gaussians on the normalised plane, ready to be splatted.
 
     means (n, 2), covariances (n, 3) as xx, xy, yy, opacities (n,) in 0..1, colours (n, 3), and rings
-    (n, 2) as r0 and w in Mahalanobis radii (METHOD section 5) or None. arcs (n, 2) or None: the way covariance b from
+    (n, 2) as r0 and w in Mahalanobis radii (ours) or None. arcs (n, 2) or None: the way covariance b from
     the mean towards the side that exp(b·d) makes brighter; a vector of the plane, which is scaled and turned as it is.
     """
 

@@ -34,13 +34,13 @@ class Findings:
 
 
 def find_lights(capture: Capture, detector: Detector, progress: Progress | None = None,
-                settings: GatherSettings | None = None, *, gaussians: tuple[ArrayLike, ArrayLike] | None = None,
-                ghosts: bool = True) -> Findings:
+                settings: GatherSettings | None = None, *,
+                gaussians: tuple[ArrayLike, ArrayLike] | None = None) -> Findings:
     """Find the lights of a capture in its frames.
 
     With `gaussians`, the means (n, 3) and opacities (n,) of a fitted scene, the lights are lifted on to it, the
-    paper's way; else the detections' rays are intersected. With `ghosts`, a capture in which no frame shows a
-    light is searched for ghosts of one out of frame.
+    paper's way; else the detections' rays are intersected. A capture in which no frame shows a light is
+    searched for ghosts of one out of frame.
     """
     progress, settings = progress or Progress(), settings or GatherSettings()
     if settings.min_views < 1:
@@ -66,7 +66,7 @@ def find_lights(capture: Capture, detector: Detector, progress: Progress | None 
         found = gather(views, detections, capture.extent, everything)
         lights = [light for light in found if _sure(light, enough, settings)]
         doubtful = [light for light in found if not _sure(light, enough, settings)]
-    if ghosts and not lights and len(views) > 1:
+    if not lights and len(views) > 1:
         lights = _follow_ghosts(capture, progress, settings.seed)
         if lights:
             says.append("No frame shows a light; one out of frame was found by its ghosts, its direction surer than "

@@ -214,12 +214,12 @@ def _worth(seen: _Sightings, places: Floats, index: NDArray[np.int64]) -> Floats
     return np.asarray(np.maximum.reduceat(gain, starts, axis=1).sum(axis=1))
 
 
-def _near(seen: _Sightings, place: Floats, open_: NDArray[np.bool_], loose: float = 1.0) -> NDArray[np.int64]:
+def _near(seen: _Sightings, place: Floats, open_: NDArray[np.bool_]) -> NDArray[np.int64]:
     """The open detections near the place's projections, one a view."""
     pixels, front = seen.project(place[None])
     off = np.linalg.norm(pixels[0, seen.view] - seen.pixel, axis=1) / seen.tolerance
     chosen: dict[int, int] = {}
-    for i in np.flatnonzero(open_ & front[0, seen.view] & (off < loose)):
+    for i in np.flatnonzero(open_ & front[0, seen.view] & (off < 1)):
         view = int(seen.view[i])
         if view not in chosen or off[i] < off[chosen[view]]:
             chosen[view] = int(i)

@@ -80,10 +80,6 @@ class Edit:
         mixed = self.saturation * np.eye(3) + (1 - self.saturation) * grey
         return self.intensity * np.array(self.tint)[:, None] * mixed
 
-    def of_colour(self) -> Edit:
-        """Its colour alone."""
-        return Edit(intensity=self.intensity, tint=self.tint, saturation=self.saturation)
-
     def of_shape(self) -> Edit:
         """All but its colour."""
         return replace(self, intensity=1.0, tint=_WHITE, saturation=1.0)

@@ -117,14 +117,6 @@ def _colour(values: Any) -> tuple[float, float, float]:
     return red, green, blue
 
 
-def owners(elements: Sequence[Element], count: int) -> NDArray[np.int64]:
-    """(count,) number of the element of each Gaussian, -1 where it has none."""
-    owner = np.full(count, -1, np.int64)
-    for number, element in enumerate(elements):
-        owner[element.members] = number
-    return owner
-
-
 def _kinds(gaussians: PlaneGaussians) -> NDArray[np.str_]:
     xx, xy, yy = gaussians.covariances.T
     half, root = (xx + yy) / 2, np.sqrt(((xx - yy) / 2) ** 2 + xy * xy)

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import FlareFileError
 from ..sampling import Sampling
-from ..typed import Bounds
+from ..typed import Bounds, table_of
 from . import container, elements
 from .edits import LookEdits, edited
 from .elements import Element
@@ -49,7 +49,7 @@ class Form:
     solid             3D Gaussians with SH colour at depth 0.21 (paper); else ellipses on the plane
     sh_degree         of the colour's view dependence, 0 to 3 (solid only)
     static_offset     a learned 2D offset of each Gaussian, the same in all views
-    rings             the radial profile exp(-(r - r0)^2 / (2 w^2)) (METHOD, section 5)
+    rings             the radial profile exp(-(r - r0)^2 / (2 w^2)) (ours; docs/interop.md)
     arcs              one side of it brighter, by exp(b·d): rings of which the lens's barrel hides a part (ellipses with
                       rings only)
     latent            width of a per-Gaussian code that the network sees
@@ -302,43 +302,68 @@ def _described(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
     return description
 
 
-def read(path: Path | str) -> Look:
-    """Read a .flare. Raises FlareFileError where it is missing, damaged, newer, or not a flare."""
-    path = Path(path)
-    tensors, metadata = container.read_tensors(path)
+def checked(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
+    """The description in a .flare's metadata, for every reader: what one refuses all do. Raises FlareFileError where
+    it is not there, newer, or makes no sense; whether the tensors fit it is the reader's to say."""
     description = _described(path, metadata)
-    for name, tensor in tensors.items():
-        if tensor.dtype.kind == "f" and not np.isfinite(tensor).all():
-            raise FlareFileError(f"{path} is damaged: {name} holds values that are not finite; save it again.")
     try:
-        blend = description["blend"]
-        if blend not in ("over", "add"):
-            raise ValueError(f"blend {blend!r}")
-        listed = description.get("elements", [])
-        lights = tuple(_light(path, number, entry, tensors, blend, listed)
-                       for number, entry in enumerate(description["lights"]))
-        camera = TrainedCamera(**description["camera"])
-        sampling = Sampling.read(description.get("sampling"))
-        if len({light.name for light in lights}) < len(lights):
+        names = [_check_light(path, entry, description.get("elements", [])) for entry in description["lights"]]
+        if len(set(names)) < len(names):
             raise ValueError("two lights have one name")
-    except (KeyError, TypeError, ValueError, IndexError, AttributeError) as problem:
-        raise FlareFileError(f"{path} is damaged: its tensors do not fit its description ({problem}).") from problem
-    return Look(path, lights, blend, camera, str(description.get("licence", "")), str(description.get("notes", "")),
-                sampling)
+        if description["blend"] not in ("over", "add"):
+            raise ValueError(f"blend {description['blend']!r}")
+        table_of(TrainedCamera, description["camera"])
+        Sampling.read(description.get("sampling"))
+        for rows in description.get("seen", {}).values():
+            if any(len([float(value) for value in row]) != 5 for row in rows):
+                raise ValueError("a training view makes no sense")
+    except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError) as problem:
+        raise FlareFileError(f"{path} is damaged: its description makes no sense ({problem}); save it again."
+                             ) from problem
+    return description
 
 
-def _light(path: Path, number: int, entry: Mapping[str, Any], tensors: Mapping[str, NDArray[Any]], blend: str,
-           listed: Any) -> LightLook:
+def _check_light(path: Path, entry: Mapping[str, Any], listed: Any) -> str:
+    """Its name."""
     strange = set(entry["form"]) - {one.name for one in fields(Form)}
     if strange:
         raise FlareFileError(f"{path} was written by a newer Fit Flare (its form has {', '.join(sorted(strange))}); "
                              "update to open it.")
+    name, count, xyz = str(entry["name"]), int(entry["count"]), [float(value) for value in entry["xyz"]]
+    if not 0 <= count <= MOST_GAUSSIANS or len(xyz) != 3 or not all(map(math.isfinite, xyz)):
+        raise ValueError("a light's description makes no sense")
+    if not Form(**entry["form"]).makes_sense:
+        raise ValueError("a light's form makes no sense")
+    if not 0 <= float(entry.get("clear", 1.0)) <= 1:
+        raise ValueError("a light's clear share makes no sense")
+    QueryRange.read(entry["range"])
+    elements.read(listed, name, count)
+    return name
+
+
+def read(path: Path | str) -> Look:
+    """Read a .flare. Raises FlareFileError where it is missing, damaged, newer, or not a flare."""
+    path = Path(path)
+    tensors, metadata = container.read_tensors(path)
+    description = checked(path, metadata)
+    for name, tensor in tensors.items():
+        if tensor.dtype.kind == "f" and not np.isfinite(tensor).all():
+            raise FlareFileError(f"{path} is damaged: {name} holds values that are not finite; save it again.")
+    blend = description["blend"]
+    try:
+        lights = tuple(_light(number, entry, tensors, blend, description.get("elements", []))
+                       for number, entry in enumerate(description["lights"]))
+    except (KeyError, TypeError, ValueError, IndexError, AttributeError) as problem:
+        raise FlareFileError(f"{path} is damaged: its tensors do not fit its description ({problem}).") from problem
+    return Look(path, lights, blend, table_of(TrainedCamera, description["camera"]),
+                str(description.get("licence", "")), str(description.get("notes", "")),
+                Sampling.read(description.get("sampling")))
+
+
+def _light(number: int, entry: Mapping[str, Any], tensors: Mapping[str, NDArray[Any]], blend: str,
+           listed: Any) -> LightLook:
     form, name, count = Form(**entry["form"]), str(entry["name"]), int(entry["count"])
     xyz = np.array([float(value) for value in entry["xyz"]], np.float64)
-    if not 0 <= count <= MOST_GAUSSIANS or xyz.shape != (3,) or not np.isfinite(xyz).all():
-        raise ValueError("a light's description makes no sense")
-    if not form.makes_sense:
-        raise ValueError("a light's form makes no sense")
     own = {key[len(f"{number}."):]: value for key, value in tensors.items() if key.startswith(f"{number}.")}
     rows = {key[len("gaussians."):]: np.asarray(value, np.float32) for key, value in own.items()
             if key.startswith("gaussians.")}
@@ -346,7 +371,7 @@ def _light(path: Path, number: int, entry: Mapping[str, Any], tensors: Mapping[s
         if rows[key].shape != (count, width):
             raise ValueError(f"{key} has the shape {rows[key].shape}")
     return LightLook(name, xyz, form, QueryRange.read(entry["range"]), rows, own, blend,
-                     elements.read(listed, name, count), min(max(float(entry.get("clear", 1.0)), 0.0), 1.0))
+                     elements.read(listed, name, count), float(entry.get("clear", 1.0)))
 
 
 def _widths(form: Form) -> dict[str, int]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What the flare's network is asked for when the flare stands elsewhere (METHOD, section 4).
+"""What the flare's network is asked for when the flare stands elsewhere (docs/transfer.md).
 
 Placement always follows the target. Appearance follows
 

@@ -256,7 +256,7 @@ def test_frequency_encoding_has_three_bands() -> None:
 
 
 def test_flare_over_scene_equals_one_joint_rasterisation() -> None:
-    """C_flare + T_flare C_scene is what 3DGS gives for both sets together (METHOD, section 1)."""
+    """C_flare + T_flare C_scene is what 3DGS gives for both sets together."""
     generator, n = random_(3), 5
     intrinsics = torch.tensor([[50.0, 0, 16], [0, 50.0, 12], [0, 0, 1]])
 

@@ -53,6 +53,12 @@ def test_what_is_near_hides_lights_however_far_they_are(distance: float) -> None
     assert share(near, light) < 0.01
 
 
+def test_a_light_that_is_near_is_hidden_by_what_is_nearer_still() -> None:
+    """Though a picture would cull it: a world of small units."""
+    assert wall().near > 0.1
+    assert share(wall(z=0.1), torch.tensor([0.0, 0.0, 0.15])) < 0.01
+
+
 def test_an_edge_through_the_light_hides_half_and_fades_smoothly() -> None:
     reach = 0.022  # Gaussians of 0.008 and the rasterizer's low-pass go on so far past the last centre
     assert share(wall(x=0.5 + reach)) == pytest.approx(0.5, abs=0.08)
@@ -101,6 +107,16 @@ def test_what_always_stands_before_a_light_does_not_hide_it() -> None:
         model.clear.copy_(clear_shares(walled, model, poses, settings, kernels="torch"))
         assert float(model.clear) == 0
         assert float(visible_shares(walled, model, torch.eye(4), settings, "torch")["sun"]) == 1
+
+
+def test_a_light_that_most_views_do_not_see_is_as_clear_as_it_is_to_the_others() -> None:
+    model = FlareModel(["sun"], LIGHT[None], [some_flare(SMALL, 4).lights[0]])
+    poses = []
+    for x in (*torch.linspace(-0.4, 0.4, 8).tolist(), 2.0, 3.0):
+        pose = torch.eye(4)
+        pose[0, 3] = -x
+        poses.append(pose)
+    assert float(clear_shares(wall(), model, poses, VisibilitySettings(radius=0.02), "torch")) > 0.99
 
 
 def test_shares_are_taken_of_what_is_clear() -> None:

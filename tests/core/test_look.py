@@ -329,6 +329,42 @@ def test_a_form_outside_of_its_bounds_is_refused_by_all_readers(name: str, tmp_p
                 reader(tmp_path / "b.flare")
 
 
+@pytest.mark.parametrize(("what", "said"), [
+    ("two lights of one name", "two lights have one name"), ("clear 1.5", "clear share makes no sense"),
+    ("clear -0.1", "clear share makes no sense"), ("clear NaN", "clear share makes no sense"),
+    ("a newer form", "newer Fit Flare .its form has spiral.; update"), ("elements 3", "is damaged"),
+    ("elements without their Gaussians", "names Gaussians that are not there"), ("seen 3", "is damaged"),
+    ("seen from nowhere", "training view makes no sense"), ("a wide camera", "'wide'"),
+    ("endless count", "is damaged")])
+def test_what_one_reader_refuses_the_other_does_for_the_same_reason(what: str, said: str, tmp_path: Path) -> None:
+    saved(tmp_path / "a.flare")
+    _, metadata = read_tensors(tmp_path / "a.flare")
+    description = json.loads(metadata["fit_flare"])
+    first, second = description["lights"]
+    match what.split():
+        case ["two", *_]:
+            second["name"] = first["name"]
+        case ["clear", value]:
+            second["clear"] = float(value)
+        case ["a", "newer", _]:
+            second["form"]["spiral"] = True
+        case ["elements" | "seen" as key, "3"]:
+            description[key] = 3
+        case ["elements", *_]:
+            description["elements"] = [{"light": second["name"], "name": "ghost", "members": [4000]}]
+        case ["seen", *_]:
+            description["seen"] = {second["name"]: [[0.0, 0.0, 4.0, 0.1, 0.1], [0.1, 0.1]]}
+        case ["a", "wide", _]:
+            description["camera"]["fx"] = "wide"
+        case _:
+            second["count"] = math.inf
+    rewritten(tmp_path / "a.flare", tmp_path / "b.flare", {"fit_flare": json.dumps(description)})
+    for reader in (read, flare_file.load):
+        reader(tmp_path / "a.flare")
+        with pytest.raises(FlareFileError, match=rf"b\.flare.*{said}"):
+            reader(tmp_path / "b.flare")
+
+
 def test_streaks_alone_are_lengthened() -> None:
     gaussians = plane([1.0], long=8.0)
     elements = grouping.group(gaussians, np.ones(1, np.float32))

@@ -273,6 +273,34 @@ def test_elsewhere_blend_is_a_mix_of_what_was_trained_and_changes_smoothly(flare
     assert steps.max() < 8 * np.median(steps) + 1e-4
 
 
+@pytest.mark.parametrize("query", ["target", "blend"])
+def test_a_light_found_a_little_beside_its_place_is_in_its_own_world_still(query: Any, flare: Path,
+                                                                           look: Look) -> None:
+    """Lights are found to a hundredth of their distance or so: the camera is where it is, and nothing is mixed."""
+    light, seen, camera = look.lights[0], queries.seen_by(flare, look.lights)[name(look)], cameras(6)[2]
+    aside = np.array([0.0, np.linalg.norm(camera.position - light.xyz), 0.0])
+
+    def asked(share: float) -> list[ViewOfLight]:
+        xyz = light.xyz + share * aside
+        view = ViewOfLight.of(camera.world_to_camera, xyz)
+        return [one for _, one in queries._asked(light, view, xyz, query, seen, 1.0, None)]
+
+    for share in (0.0, 0.01):
+        assert len(asked(share)) == 1
+        np.testing.assert_allclose(asked(share)[0].camera, camera.position, atol=1e-6)
+    assert np.linalg.norm(asked(0.05)[0].camera - camera.position) > 0.1, "elsewhere it is another world"
+
+
+def test_views_are_alike_by_the_light_s_place_and_by_its_distance() -> None:
+    """Half the plane aside is less alike than twice as far, and that less than a tenth of the plane aside."""
+    def likest(aside: float, times: float) -> str:
+        seen = queries.Seen(np.zeros((2, 3)), np.array([[0.1 + aside, 0.0], [0.1, 0.0]]), np.array([4.0, 4.0 * times]))
+        return ("aside", "farther")[int(seen.unlikeness((0.1, 0.0), 4.0).argmin())]
+
+    assert likest(0.5, 2.0) == "farther"
+    assert likest(0.1, 2.0) == "aside"
+
+
 def test_source_asks_for_one_view_throughout(flare: Path, look: Look) -> None:
     views = cameras(5)
     transfer = Transfer(flare, of_shot(shot(flare, look, views), look, {}), TransferSettings(query="source"))
@@ -388,6 +416,16 @@ def test_a_plate_of_another_frame_with_overscan_is_refused(flare: Path, look: Lo
     with pytest.raises(SettingsError, match="not the camera's 64 x 40"):
         of_shot(shot(flare, look, [replace(cameras(3)[1], width=64, height=40)] * 2), look, {},
                 plates=plate_exr(tmp_path / "plate.0001.exr", (120, 80), (-10, -10), (100, 60)).parent)
+
+
+def test_plates_may_be_of_another_size_than_the_shot_but_not_of_another_shape(flare: Path, look: Look,
+                                                                              tmp_path: Path) -> None:
+    one, plate = shot(flare, look, [cameras(3)[1]]), tmp_path / "plate.0001.png"
+    write_png(plate, np.full((80, 128, 3), 0.2))
+    assert of_shot(one, look, {}, plates=tmp_path).frames[0].plate == plate
+    write_png(plate, np.full((60, 60, 3), 0.2))
+    with pytest.raises(SettingsError, match="60 x 60 pixels and the shot 64 x 40, which is another shape"):
+        of_shot(one, look, {}, plates=tmp_path)
 
 
 def test_wide_pixels_are_not_stretched_twice(look: Look, tmp_path: Path) -> None:

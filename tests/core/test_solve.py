@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -191,6 +192,73 @@ def test_stopped_and_taken_up_again(tmp_path: Path) -> None:
     assert last.seen["find features"] == (9, 9) and last.seen["match frames"] == (36, 36)
     assert "place cameras" not in last.seen
     assert report["registered"] == 9 and len(Capture.open(out).views) == 9
+
+
+@pytest.mark.parametrize("damaged", ["request.json", "shots.json", "mapped.json", "database.db",
+                                     "models/0/points3D.bin"])
+def test_what_a_power_failure_has_damaged_is_made_again(stopped: Path, tmp_path: Path, damaged: str) -> None:
+    out, heard = tmp_path / "out", Heard()
+    shutil.copytree(stopped / "out", out)
+    file = out / ".solve" / damaged
+    file.write_bytes(file.read_bytes()[:file.stat().st_size // 2])
+    assert solve(stopped / "frames", out, QUICK, heard)["registered"] == 6
+    assert any("begins anew" in line and file.name in line for line in heard.texts), heard.texts
+
+
+@pytest.fixture(scope="module")
+def stopped(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """frames/ and out/, a solve of them that was stopped before its last stage."""
+    folder = tmp_path_factory.mktemp("stopped")
+    with pytest.raises(Cancelled):
+        solve(shoot(folder / "frames", orbit(6, size=SIZE, arc=0.6)), folder / "out", QUICK, Stopping("write frames"))
+    return folder
+
+
+class Failing(Progress):
+    """Cannot tell of the `count`-th step of a stage."""
+
+    def __init__(self, stage: str, count: int) -> None:
+        super().__init__()
+        self.at, self.count = stage, count
+
+    def advance(self, steps: int = 1, **figures: float) -> None:
+        if self._stage == self.at:
+            self.count -= 1
+            if self.count == 0:
+                raise OSError("nobody listens")
+        super().advance(steps, **figures)
+
+
+@pytest.mark.parametrize("count", [1, 5])
+def test_what_fails_while_cameras_are_placed_is_told_and_none_are_kept(stopped: Path, tmp_path: Path,
+                                                                       count: int) -> None:
+    """At the first pair, and at the last frame, when there is a model already."""
+    out, heard = tmp_path / "out", Stopping()
+    shutil.copytree(stopped / "out", out)
+    (out / ".solve" / "mapped.json").unlink()
+    with pytest.raises(OSError, match="nobody listens"):
+        solve(stopped / "frames", out, QUICK, Failing("place cameras", count))
+    assert not (out / ".solve" / "mapped.json").exists()
+    assert solve(stopped / "frames", out, QUICK, heard)["registered"] == 6
+    assert "place cameras" in heard.seen
+
+
+def test_a_mapping_that_ends_beside_a_failure_is_not_written_down(stopped: Path, tmp_path: Path,
+                                                                  monkeypatch: pytest.MonkeyPatch) -> None:
+    """pycolmap looks at its token between steps, so that it may come back with what it has."""
+    import pycolmap
+
+    def mapping(*_: Any, initial_image_pair_callback: Callable[[], None], **__: Any) -> dict[int, Any]:
+        initial_image_pair_callback()
+        return {}
+
+    out = tmp_path / "out"
+    shutil.copytree(stopped / "out", out)
+    (out / ".solve" / "mapped.json").unlink()
+    monkeypatch.setattr(pycolmap, "incremental_mapping", mapping)
+    with pytest.raises(OSError, match="nobody listens"):
+        solve(stopped / "frames", out, QUICK, Failing("place cameras", 1))
+    assert not (out / ".solve" / "mapped.json").exists()
 
 
 def test_frames_of_different_sizes(tmp_path: Path) -> None:

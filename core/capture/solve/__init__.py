@@ -26,7 +26,7 @@ from ...progress import Progress
 from ..lens import MODELS
 from .pairs import Matching
 
-REPORT, PICTURE, WORK = "solve.json", "solve.png", ".solve"
+REPORT, PICTURE, WORK, ASKED = "solve.json", "solve.png", ".solve", "request.json"
 
 
 @dataclass(frozen=True)
@@ -139,13 +139,27 @@ def _claim(source: Path, out: Path, request: dict[str, Any], progress: Progress)
                                "another folder for the capture, or remove them.")
     elif theirs and not (out / WORK).is_dir():
         raise CaptureError(f"{out} holds {theirs[0]} that did not come from a solve; give another folder.")
-    state = out / WORK / "request.json"
-    if not state.is_file() or read_json(state, CaptureError) != request:
-        shutil.rmtree(out / WORK, ignore_errors=True)
-        write_json(state, request)
-    else:
+    if _goes_on(out / WORK, request, progress):
         progress.say("Going on with the solve that was stopped.")
+    else:
+        shutil.rmtree(out / WORK, ignore_errors=True)
+        write_json(out / WORK / ASKED, request)
     return None
+
+
+def _goes_on(work: Path, request: dict[str, Any], progress: Progress) -> bool:
+    """Whether an earlier solve of the same was stopped here, and what it left is whole."""
+    from . import mapping, shots
+
+    try:
+        if not (work / ASKED).is_file() or read_json(work / ASKED, CaptureError) != request:
+            return False
+        shots.gathered(work)
+        mapping.check(work)
+    except CaptureError as problem:
+        progress.say(f"The solve begins anew: {problem}")
+        return False
+    return True
 
 
 __all__ = ["SolveSettings", "solve"]

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import shutil
+import sqlite3
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +21,7 @@ from ...files import read_json, write_json, write_text
 from ...pictures import decoded, picture_size
 from ...progress import Progress
 from ..camera import Floats
+from ..colmap import read_model
 from ..lens import MODELS, Lens
 from .pairs import choose_matching, choose_pairs
 from .shots import Shot
@@ -27,6 +29,7 @@ from .shots import Shot
 if TYPE_CHECKING:
     from . import SolveSettings
 
+DATABASE, MAPPED, FOUND = "database.db", "mapped.json", "models"  # of the work that can be gone on with
 DEFAULT_FOCAL = 1.2  # of the long side, where the file does not tell; COLMAP's own guess
 ENOUGH = 20          # frames from which a principal point can be told from a turn of the cameras
 OFF_CENTRE = 0.015   # of the long side; a principal point further from the middle is an artefact
@@ -77,7 +80,7 @@ def solve(shots: Sequence[Shot], work: Path, settings: SolveSettings, video: boo
     pycolmap = load_pycolmap()
     pycolmap.logging.minloglevel = int(pycolmap.logging.Level.ERROR)
     pycolmap.set_random_seed(settings.seed)
-    database = work / "database.db"
+    database = work / DATABASE
     _refuse_one_picture(shots, work)
     _extract(pycolmap, shots, work, database, settings, progress)
     matching = choose_matching(settings.matching, len(shots), video)
@@ -94,6 +97,22 @@ def solve(shots: Sequence[Shot], work: Path, settings: SolveSettings, video: boo
         progress.advance()
     names = {shot.name: index for index, shot in enumerate(shots)}
     return Solved(_model(largest, names), sorted((m.num_reg_images() for m in models), reverse=True), matching, pairs)
+
+
+def check(work: Path) -> None:
+    """Raises CaptureError where the database or a model of an earlier run is damaged, for instance cut off by a power
+    failure: pycolmap reads such a model without end."""
+    database = work / DATABASE
+    if database.is_file():
+        try:
+            with contextlib.closing(sqlite3.connect(database)) as opened:
+                told = opened.execute("PRAGMA quick_check").fetchone()[0]
+        except sqlite3.DatabaseError as problem:
+            told = str(problem)
+        if told != "ok":
+            raise CaptureError(f"{database} is damaged ({told}).")
+    for folder in _mapped(work) or ():
+        read_model(folder)
 
 
 def load_pycolmap() -> Any:
@@ -214,9 +233,10 @@ def _match(pycolmap: Any, shots: Sequence[Shot], work: Path, database: Path, mat
 def _map(pycolmap: Any, work: Path, database: Path, frames: int, settings: SolveSettings,
          progress: Progress) -> list[Any]:
     """Incremental mapping; all models found, by this run or an earlier one."""
-    folder, record = work / "models", work / "mapped.json"
-    if record.is_file():
-        return [pycolmap.Reconstruction(str(folder / name)) for name in read_json(record, CaptureError)]
+    before = _mapped(work)
+    if before is not None:
+        return [pycolmap.Reconstruction(str(model)) for model in before]
+    folder = work / FOUND
     options = pycolmap.IncrementalPipelineOptions()
     options.min_model_size = 3
     options.max_num_models = 8
@@ -226,14 +246,16 @@ def _map(pycolmap: Any, work: Path, database: Path, frames: int, settings: Solve
     progress.stage("place cameras", frames)
     token = pycolmap.CancellationToken()
     placed = 0
+    failures: list[Exception] = []
 
     def step(count: int) -> None:
-        # An exception may not cross pycolmap, so that a wish to stop becomes its token.
+        # An exception may not cross pycolmap: its token ends the mapping, and it is raised thereafter.
         nonlocal placed
         placed += count
         try:
             progress.advance(count if placed <= frames else 0)
-        except Exception:
+        except Exception as problem:
+            failures.append(problem)
             token.cancel()
 
     shutil.rmtree(folder, ignore_errors=True)
@@ -243,14 +265,29 @@ def _map(pycolmap: Any, work: Path, database: Path, frames: int, settings: Solve
             database, work / "small", folder, options, initial_image_pair_callback=lambda: step(2),
             next_image_callback=lambda: step(1), cancellation_token=token)
     except InterruptedError:
+        if failures:
+            raise failures[0] from None
         progress.check()
         raise
+    if failures:  # what was found by then is not all there is, and not to be taken for it by the next solve
+        raise failures[0]
     progress.check()
     for number, model in models.items():
         (folder / str(number)).mkdir(exist_ok=True)
         model.write(str(folder / str(number)))
-    write_json(record, [str(number) for number in models])
+    write_json(work / MAPPED, [str(number) for number in models])
     return list(models.values())
+
+
+def _mapped(work: Path) -> list[Path] | None:
+    """The folders of the models that were found, None where that is still to do. Raises CaptureError where what is
+    written down makes no sense."""
+    if not (work / MAPPED).is_file():
+        return None
+    names = read_json(work / MAPPED, CaptureError)
+    if not isinstance(names, list) or not all(isinstance(name, str) and name.isdecimal() for name in names):
+        raise CaptureError(f"{work / MAPPED} is damaged.")
+    return [work / FOUND / name for name in names]
 
 
 def _with_principal_point(pycolmap: Any, found: Any) -> Any:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 Matching = Literal["auto", "exhaustive", "sequential", "similar"]
 SMALL = 60    # frames; all pairs of as many are matched in two minutes on two cores
 OVERLAP = 8   # neighbours of a video frame matched one by one; beyond them distances double
+WORDS = 64    # of the vocabulary of descriptors
 
 
 def choose_matching(matching: Matching, frames: int, video: bool) -> Matching:
@@ -54,21 +55,20 @@ def most_alike(alike: NDArray[Any], number: int, apart: int) -> set[tuple[int, i
     return {(min(i, int(j)), max(i, int(j))) for i in range(frames) for j in ranked[i] if away[i, j]}
 
 
-def similarity(descriptors: Callable[[int], NDArray[np.uint8]], frames: int, seed: int = 0,
-               words: int = 64) -> NDArray[np.float32]:
+def similarity(descriptors: Callable[[int], NDArray[np.uint8]], frames: int, seed: int = 0) -> NDArray[np.float32]:
     """(frames, frames) cosine of the frames' VLAD vectors."""
     rng = np.random.default_rng(seed)
     sample = np.concatenate([_some(descriptors(i), 200, rng) for i in range(frames)]).astype(np.float32)
-    if len(sample) < words:
+    if len(sample) < WORDS:
         return np.eye(frames, dtype=np.float32)
-    vocabulary = _k_means(_some(sample, 12000, rng), words, rng)
-    vectors = np.zeros((frames, words * sample.shape[1]), np.float32)
+    vocabulary = _k_means(_some(sample, 12000, rng), WORDS, rng)
+    vectors = np.zeros((frames, WORDS * sample.shape[1]), np.float32)
     for i in range(frames):
         some = _some(descriptors(i), 2000, rng).astype(np.float32)
         if not len(some):
             continue
         nearest = _nearest(some, vocabulary)
-        summed = _sums(some - vocabulary[nearest], nearest, words)
+        summed = _sums(some - vocabulary[nearest], nearest, WORDS)
         summed /= np.maximum(np.linalg.norm(summed, axis=1, keepdims=True), 1e-9)
         vectors[i] = summed.ravel() / max(float(np.linalg.norm(summed)), 1e-9)
     return np.asarray(vectors @ vectors.T)

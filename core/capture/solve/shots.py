@@ -21,6 +21,7 @@ from ...progress import Progress
 from ...video import VIDEOS, Video
 from .exif import read_exif, upright
 
+RECORD = "shots.json"
 COMBED, SOME = 1.1, 0.25
 """Times, in more than which part of the frames. Photographs have 0.6 to 0.8, moving fields 1.5 to 2.3."""
 CLIPPED = 0.98  # of full scale: at or above it the sensor says nothing about the surface
@@ -84,10 +85,9 @@ def gather(source: Path, work: Path, number: int, size: int, progress: Progress)
     wrote is taken as it is. Raises CaptureError where there is nothing to choose from, FrameError for a video that
     cannot be read.
     """
-    record = work / "shots.json"
-    if record.is_file():
-        data = read_json(record, CaptureError)
-        return [Shot(**shot) for shot in data["shots"]], list(data["left_out"])
+    before = gathered(work)
+    if before is not None:
+        return before
     if source.is_dir():
         shots, left_out = _from_folder(source, work, number, size, progress)
     elif source.is_file() and is_video(source):
@@ -98,8 +98,19 @@ def gather(source: Path, work: Path, number: int, size: int, progress: Progress)
         why = f"; {left_out[0]}" if left_out else ""
         raise CaptureError(f"{source} gives {len(shots)} usable frames, and a solve needs at least 3 that see the "
                            f"scene from different places{why}".rstrip(".") + ".")
-    write_json(record, {"shots": [asdict(shot) for shot in shots], "left_out": left_out})
+    write_json(work / RECORD, {"shots": [asdict(shot) for shot in shots], "left_out": left_out})
     return shots, left_out
+
+
+def gathered(work: Path) -> tuple[list[Shot], list[str]] | None:
+    """What `gather` has given before, None where it has not. Raises CaptureError where that is damaged."""
+    if not (work / RECORD).is_file():
+        return None
+    data = read_json(work / RECORD, CaptureError)
+    try:
+        return [Shot(**shot) for shot in data["shots"]], list(data["left_out"])
+    except (KeyError, TypeError) as problem:
+        raise CaptureError(f"{work / RECORD} is damaged.") from problem
 
 
 def original(shot: Shot) -> Picture:

@@ -23,17 +23,17 @@ TOLD = 20  # failures that are spelled out in the last sentence
 def plates_of(inputs: Iterable[Path], apart_from: Iterable[Path | None] = ()) -> list[tuple[Path, Path]]:
     """(file, name below the output folder) of pictures, and of the pictures in folders.
 
-    apart_from: files and folders in these folders that hold no plates: the results of this run, mattes. Clean plates of
-    an earlier one, which its record tells, are none either, unless their own folder is given. Raises SettingsError
-    where there are none, or where two would be written to one name.
+    apart_from: files and folders in these folders that hold no plates: the results of this run, mattes. Clean plates
+    and flares of an earlier one, which its record tells, are none either, unless their own folder is given. Raises
+    SettingsError where there are none, or where two would be written to one name.
     """
     found: dict[Path, Path] = {}
     others = [other.resolve() for other in apart_from if other is not None]
     for given in inputs:
         if given.is_dir():
             inner = [other for other in others if given.resolve() in other.parents]
-            inner += [plate for record in given.rglob(RECORD) if record.parent != given
-                      for plate in Record(record.parent).plates()]
+            inner += [made for record in given.rglob(RECORD) if record.parent != given
+                      for made in Record(record.parent).results()]
             files = [(path, path.relative_to(given)) for path in pictures_below(given)
                      if not any(path.resolve().is_relative_to(other) for other in inner)]
             if not files:

@@ -25,6 +25,7 @@ from torch import Tensor, nn
 
 from ..errors import EngineError, RunError, SettingsError
 from ..pictures import Pixels
+from ..progress import Progress
 from . import weights
 from .inference import WORKING_SIZE, Remover, described
 
@@ -33,6 +34,7 @@ STEP = 199
 RANK = 16
 RATE = 1e-4
 ITERATIONS = 200_000
+SAVE_EVERY = 500  # iterations
 MULTIPLE = 8
 KIND = "fit-flare diffusion removal"
 
@@ -209,7 +211,7 @@ class DiffusionRemover(Remover):
 
 
 def train_diffusion(model: DiffusionRemoval, folder: Path | str, draw: Callable[[int], tuple[Pixels, Pixels]],
-                    iterations: int, progress: Any, *, resume: bool = False, save_every: int = 500,
+                    iterations: int, progress: Progress, *, resume: bool = False,
                     perceptual: Callable[[Tensor, Tensor], Tensor] | None = None) -> Path:
     """Train and write lora.safetensors, again and again; `draw` gives the pair of an iteration.
 
@@ -230,7 +232,7 @@ def train_diffusion(model: DiffusionRemoval, folder: Path | str, draw: Callable[
         for number in range(first, iterations):
             figures = trainer.step(*draw(number))
             done = number + 1
-            if done % save_every == 0:
+            if done % SAVE_EVERY == 0:
                 model.save(path, {"iteration": str(done)})
             progress.advance(1, **figures)
     finally:

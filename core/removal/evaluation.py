@@ -18,10 +18,10 @@ from typing import Any
 import numpy as np
 
 from ..errors import FrameError, SettingsError
-from ..metrics.pictures import flip, psnr, ssim
+from ..metrics.pictures import Perceptual, flip, psnr, ssim
 from ..pictures import Pixels, pictures_in, read_picture
 from ..progress import Progress
-from .backgrounds import kept_for_test
+from .backgrounds import Backgrounds, kept_for_test
 from .synthesis.prescription import Prescription, built_in
 
 INPUTS = ("input", "flare", "blend")
@@ -81,7 +81,7 @@ def _reader(path: Path, truth: Path, mask: Path | None) -> Callable[[], tuple[Pi
 
 
 def evaluate(cases: Sequence[Case], clean: Callable[[Pixels], Pixels], progress: Progress | None = None, *,
-             lpips: Callable[[Pixels, Pixels], float] | None = None) -> dict[str, Any]:
+             lpips: Perceptual | None = None) -> dict[str, Any]:
     """Scores of every case, means by category and of all; JSON-able.
 
     clean: display values (height, width, 3) to the same without flare. `gain_db` is the PSNR above the untouched
@@ -108,7 +108,7 @@ def evaluate(cases: Sequence[Case], clean: Callable[[Pixels], Pixels], progress:
 
 
 def _scores(picture: Pixels, truth: Pixels, mask: Pixels | None,
-            lpips: Callable[[Pixels, Pixels], float] | None) -> Scores:
+            lpips: Perceptual | None) -> Scores:
     small = min(picture.shape[:2]) < 11
     scores: Scores = {"psnr": psnr(picture, truth), "ssim": None if small else ssim(picture, truth),
                       "lpips": lpips(picture, truth) if lpips else None, "flip": flip(picture, truth)}
@@ -175,7 +175,8 @@ def held_out(lenses: Iterable[Prescription]) -> list[Prescription]:
     return [lens for lens in lenses if kept_for_test(lens.name)] or built_in()
 
 
-def synthetic(seed: int, count: int, backgrounds: Any, lenses: Sequence[Any], size: tuple[int, int]) -> list[Case]:
+def synthetic(seed: int, count: int, backgrounds: Backgrounds, lenses: Sequence[Prescription],
+              size: tuple[int, int]) -> list[Case]:
     """`count` cases of every class of flare, a function of the seed: the test set that needs no data but clean
     pictures. Frames are 8 bit codes."""
     from .bank import OneFlare

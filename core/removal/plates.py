@@ -42,6 +42,7 @@ _KEPT_TAGS = (tiff.ORIENTATION, tiff.EXTRA_SAMPLES, tiff.X_RESOLUTION, tiff.Y_RE
               tiff.XMP, tiff.COLOUR_PROFILE)
 _PLACING = ("chromaticities", "dataWindow", "displayWindow", "pixelAspectRatio")
 _CMYK = "is CMYK, for print; convert it to RGB"
+_JPEG_QUALITY = 97
 _JPEGS, _TIFFS = (".jpg", ".jpeg"), (".tif", ".tiff")
 
 
@@ -163,7 +164,7 @@ def _read_exr(path: Path) -> Plate:
     return Plate(path, codes, "linear", len(names) == 1, None, {"header": header, "channels": channels})
 
 
-def write_plate(path: Path | str, plate: Plate, codes: NDArray[Any], quality: int = 97) -> None:
+def write_plate(path: Path | str, plate: Plate, codes: NDArray[Any]) -> None:
     """Write `codes` in the kind and depth of `plate`, with all that belongs to it, to a path of its suffix."""
     path = Path(path)
     suffix = path.suffix.lower()
@@ -179,7 +180,7 @@ def write_plate(path: Path | str, plate: Plate, codes: NDArray[Any], quality: in
     stored: NDArray[Any] = codes[..., 0] if plate.grey else codes[..., ::-1]
     if plate.alpha is not None:
         stored = np.concatenate([stored, plate.alpha[..., None]], -1)
-    options = [cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_SAMPLING_FACTOR,
+    options = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY, cv2.IMWRITE_JPEG_SAMPLING_FACTOR,
                cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444] if suffix in _JPEGS else []
     done, data = cv2.imencode(suffix, np.ascontiguousarray(stored), options)
     if not done:

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What each clean plate of a folder was made from and how, in remove.json there, so that one is kept as long as it
-would come out the same, and whatever else lies there is not taken for one."""
+"""What each clean plate of a folder was made from and how, and where its flare is, in remove.json there, so that one is
+kept as long as it would come out the same, and whatever else lies there is not taken for one."""
 from __future__ import annotations
 
 import errno
 import hashlib
+import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
@@ -36,26 +37,32 @@ class Record:
 
     def is_made(self, name: Path, how: str, results: Sequence[Path]) -> bool:
         """Whether all files of a plate are there, made in this way (`made_from`)."""
-        return self._read().get(name.as_posix()) == how and all(path.is_file() for path in results)
+        return self._read("plates").get(name.as_posix()) == how and all(path.is_file() for path in results)
 
     def begin(self, name: Path, how: str, results: Sequence[Path], overwrite: bool) -> None:
-        """Before the files of a plate are written: what was made there in another way goes, so that a kill leaves none
-        under what is now written down. Raises FrameError for a plate that is not from here, unless `overwrite`."""
+        """Before the files of a plate are written, itself and maybe its flare: what was made there in another way goes,
+        so that a kill leaves none under what is now written down. Raises FrameError for a plate that is not from here,
+        unless `overwrite`."""
+        key = name.as_posix()
         with locked(self._folder / LOCK):
-            before = self._read()
-            if before.get(name.as_posix()) != how:
-                if not overwrite and name.as_posix() not in before and results[0].exists():
+            plates, flares = self._read("plates"), self._read("flares")
+            told = {"plates": {**plates, key: how}, "flares": {**flares}}
+            if results[1:]:
+                told["flares"][key] = _from(self._folder, results[1])
+            if plates.get(key) != how:
+                if not overwrite and key not in plates and results[0].exists():
                     raise FrameError(f"{results[0]} is there, and {RECORD} beside it does not tell of it: it may be "
                                      "someone's work; choose another folder, or have it written over (--overwrite).")
                 for path in results:
                     patiently(path.unlink, True)
-                write_json(self._folder / RECORD, {"plates": dict(sorted({**before, name.as_posix(): how}.items()))})
+            if told != {"plates": plates, "flares": flares}:
+                write_json(self._folder / RECORD, {what: dict(sorted(rows.items())) for what, rows in told.items()})
         for path in results:
             remove_partial_of(path)
 
-    def plates(self) -> list[Path]:
-        """The paths of what it lists, there or not."""
-        return [(self._folder / name).resolve() for name in self._read()]
+    def results(self) -> list[Path]:
+        """The paths of the plates and flares that it lists, there or not."""
+        return [(self._folder / name).resolve() for name in (*self._read("plates"), *self._read("flares").values())]
 
     def is_refused(self, problem: OSError) -> bool:
         """Whether it is the folder itself that may not be written, whichever plate is next."""
@@ -64,10 +71,20 @@ class Record:
         own = (self._folder / LOCK, self._folder / RECORD, self._folder, *self._folder.parents)
         return problem.filename is not None and Path(problem.filename) in own
 
-    def _read(self) -> dict[str, str]:
-        """{} where it is not written down."""
+    def _read(self, what: str) -> dict[str, str]:
+        """Of each plate how it was made ("plates"), or where from here its flare is ("flares"); {} where it is not
+        written down."""
         try:
-            told = read_json(self._folder / RECORD, FrameError)["plates"]
-            return {str(name): str(how) for name, how in told.items()}
+            told = read_json(self._folder / RECORD, FrameError)[what]
+            return {str(name): str(one) for name, one in told.items()}
         except (FrameError, AttributeError, KeyError, TypeError):
             return {}
+
+
+def _from(folder: Path, path: Path) -> str:
+    """A path as seen from a folder, which may be moved with it; as it is where that is on another drive."""
+    path = path.resolve()
+    try:
+        return Path(os.path.relpath(path, folder.resolve())).as_posix()
+    except ValueError:
+        return path.as_posix()

@@ -866,6 +866,17 @@ def test_clean_plates_of_an_earlier_run_are_no_plates_of_the_next(tmp_path: Path
         plates_of([shot])
 
 
+def test_flares_of_an_earlier_run_are_no_plates_of_the_next(tmp_path: Path, everywhere: Path) -> None:
+    shot, remover = tmp_path / "shot", Remover(everywhere, working_size=64)
+    write_codes(shot / "day" / "a.png", picture())
+    remove_all([shot], shot / "clean", remover, Progress())
+    remove_all([shot], shot / "clean", remover, Progress(), flare_folder=shot / "flare")
+    assert (shot / "flare" / "day" / "a.exr").is_file()
+    shot = shot.rename(tmp_path / "moved")
+    assert {name for _, name in plates_of([shot])} == {Path("day/a.png")}, "wherever they were moved together"
+    assert {name for _, name in plates_of([shot / "flare"])} == {Path("day/a.exr")}, "where they are given"
+
+
 def _luminance_and_chroma(path: Path) -> None:
     """An EXR of 8 x 8 pixels, 2 x 2 of them with one RY, in 16 bit floats without compression."""
     def attribute(name: bytes, kind: bytes, value: bytes) -> bytes:

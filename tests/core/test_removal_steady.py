@@ -16,7 +16,7 @@ from core.removal.batch import remove_all
 from core.removal.inference import Remover, Told
 from core.removal.plates import Plate
 from core.removal.record import RECORD
-from core.removal.steady import REACH, Sequences, by_number, calm, steadied
+from core.removal.steady import Sequences, by_number, calm, steadied
 
 Pixels = NDArray[np.float32]
 
@@ -128,7 +128,7 @@ def test_neighbours_are_those_of_the_folder(shot: Path) -> None:
     assert remover.asked == 2
 
 
-def test_a_frame_is_brought_into_line_with_those_of_both_sides(tmp_path: Path) -> None:
+def test_a_frame_is_brought_into_line_with_four_of_each_side(tmp_path: Path) -> None:
     paths = [tmp_path / f"f{number}.png" for number in range(20)]
     beside = Sequences(SimpleNamespace(), paths)._beside[paths[10]]  # type: ignore[arg-type]
-    assert list(beside) == [*paths[10 - REACH:10], *paths[11:11 + REACH]]
+    assert list(beside) == [*paths[6:10], *paths[11:15]]

@@ -17,15 +17,11 @@ from .canvas import Array, Point, Random, colour_of, uniform_log
 STOP = 256  # samples across the transform's plane; the stop fills about half of it
 
 
-def starburst(random: Random, light: Point, size: int, *, dirt: float | None = None) -> Array:
-    """(size, size, 3): the light's diffraction image, 1 near the core, falling over several decades.
-
-    dirt: 0 for a clean stop (spikes alone) to 1; drawn where not given.
-    """
+def starburst(random: Random, light: Point, size: int) -> Array:
+    """(size, size, 3): the light's diffraction image, 1 near the core, falling over several decades."""
     import cv2
 
-    dirt = random.random() ** 2 if dirt is None else dirt
-    stop = _stop(random, dirt)
+    stop = _stop(random, dirt=random.random() ** 2)
     phase = _defocus(random)
     plane = np.fft.fftshift(np.fft.fft2(stop * np.exp(1j * phase), (2 * STOP, 2 * STOP)))
     raw = (np.abs(plane) ** 2).astype(np.float32)
@@ -47,6 +43,7 @@ def starburst(random: Random, light: Point, size: int, *, dirt: float | None = N
 
 
 def _stop(random: Random, dirt: float) -> Array:
+    """(STOP, STOP): what passes; dirt: 0 for a clean stop (spikes alone) to 1."""
     import cv2
 
     at = np.linspace(-1, 1, STOP)

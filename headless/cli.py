@@ -48,11 +48,11 @@ def parser() -> argparse.ArgumentParser:
                               "lines of the Open Job Description, for farms")
     options.add_argument("--engine", metavar="PYTHON",
                          help="the Python with torch, or the folder of its virtual environment (else this one where "
-                              "it has torch, FIT_FLARE_ENGINE, the add-on's preferences, what its Set Up Engine has "
-                              "made, .venv in the repository)")
+                              "it has torch, FIT_FLARE_ENGINE, from Blender the add-on's preferences and what its Set "
+                              "Up Engine has made, .venv in the repository)")
     options.add_argument("--blender", metavar="PROGRAM",
                          help="the Blender for the steps that need one (else FIT_FLARE_BLENDER, the bpy package of "
-                              "this Python, `blender` on the PATH)")
+                              "this Python, `blender` on the PATH, the system's usual places)")
     options.add_argument("--step", help=argparse.SUPPRESS)
     whole = _Parser(prog="run.py", description=_DESCRIPTION, epilog=_EPILOGUE,
                     formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -179,7 +179,12 @@ def _run(command: Command, arguments: argparse.Namespace, words: Sequence[str], 
 
 def _run_step(step: Step, arguments: argparse.Namespace, words: Sequence[str], progress: Progress) -> dict[str, Any]:
     if arguments.step and step.side == "blender" and "bpy" not in sys.modules:
-        __import__("bpy")  # this process was started for it, in a Python that has Blender as a module
+        try:
+            __import__("bpy")  # this process was started for it, in a Python that has Blender as a module
+        except ImportError as problem:
+            raise EngineError(f"Blender's module cannot be loaded here ({problem}). On Linux it wants libraries of "
+                              "X11, on a server too: install what is named (see README.md), or name a Blender with "
+                              "--blender.") from problem
     elsewhere = step.side == "engine" and arguments.engine is not None and not arguments.step
     if hand_off.here() == step.side and not elsewhere:
         with _quiet() if step.side == "blender" else contextlib.nullcontext():

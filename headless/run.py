@@ -9,9 +9,12 @@ and puts nothing on sys.path.
 """
 from __future__ import annotations
 
+import argparse
 import importlib
 import importlib.util
 import os
+import signal
+import subprocess
 import sys
 from pathlib import Path
 
@@ -56,6 +59,24 @@ def open_streams() -> None:
             stream.reconfigure(errors="replace")
 
 
+def hand_over(package: str, words: list[str]) -> int:
+    """In a Python without numpy, which even reading the words takes: the engine's goes on in place of this one, and its
+    status is ours."""
+    errors = importlib.import_module(f"{package}.core.errors")
+    named = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
+    named.add_argument("--engine")
+    try:
+        engine = named.parse_known_args(words)[0].engine
+        command = importlib.import_module(f"{package}.headless.hand_off").engine_command(engine)
+    except (errors.FitFlareError, argparse.ArgumentError) as problem:
+        print(f"error: {problem}", file=sys.stderr)
+        return 1 if isinstance(problem, errors.FitFlareError) else 2
+    if os.name != "nt":
+        os.execv(command[0], [*command, *words])
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the other hears it too
+    return subprocess.call([*command, *words])
+
+
 def leave(status: int) -> None:
     """End the process. Blender as a Python module may hang at interpreter exit (seen with 4.5)."""
     sys.stdout.flush()
@@ -71,5 +92,7 @@ if __name__ == "__mp_main__":  # a process that one of ours has spawned, which l
 if __name__ == "__main__":
     open_streams()
     package = load()
+    if importlib.util.find_spec("numpy") is None:
+        leave(hand_over(package, words()))
     importlib.import_module(f"{package}.core.numeric_environment").prepare_for_numpy_and_torch()
     leave(importlib.import_module(f"{package}.headless.cli").main(words()))

@@ -21,7 +21,7 @@ from ..borders import Inside
 from ..capture import Camera, Capture, View
 from ..pictures import Picture, srgb_from_linear
 from ..progress import Progress
-from .pictures import flip, psnr, relative_l2, ssim
+from .pictures import Perceptual, flip, psnr, relative_l2, ssim
 
 Array = NDArray[np.float32]
 Scores = dict[str, float | None]
@@ -47,11 +47,12 @@ class Renderer(Protocol):
 
 
 def evaluate(renderer: Renderer, capture: Capture, cameras: Mapping[View, Camera],
-             progress: Progress | None = None, inside: Inside | None = None) -> dict[str, Any]:
+             progress: Progress | None = None, inside: Inside | None = None,
+             lpips: Perceptual | None = None) -> dict[str, Any]:
     """Scores of the given views, each rendered from its camera: the content of eval.json.
 
     Scene and flare are scored against truth/ where the capture has it, else against removed/, else not. inside: what
-    lies inside the frames' black borders, which alone is scored.
+    lies inside the frames' black borders, which alone is scored. lpips is null where no weights for it were given.
     Raises FrameError for pictures that cannot be read, and Cancelled when asked to stop.
     """
     progress = progress or Progress()
@@ -69,7 +70,7 @@ def evaluate(renderer: Renderer, capture: Capture, cameras: Mapping[View, Camera
         filmed = capture.frame(view, camera.size)
         scored.append((view.name, score_view(
             composite[part], rendering.scene[part], replace(filmed, pixels=filmed.pixels[part]), known, exact,
-            out_of_range(capture, view, camera.size)[part])))
+            out_of_range(capture, view, camera.size)[part], lpips)))
         progress.advance()
     size = next(iter(cameras.values())).size if cameras else (0, 0)
     return summary(reference, scored, size)
@@ -80,7 +81,8 @@ def _nothing(_view: View, _size: tuple[int, int]) -> None:
 
 
 def score_view(composite: Array, scene: Array, frame: Picture, scene_reference: Picture | None,
-               flare_truth: Picture | None = None, hidden: NDArray[np.bool_] | None = None) -> dict[str, Scores]:
+               flare_truth: Picture | None = None, hidden: NDArray[np.bool_] | None = None,
+               lpips: Perceptual | None = None) -> dict[str, Scores]:
     """Scores of one view by layer: psnr, ssim, lpips (null without weights), flip.
 
     composite, scene: scene-linear layers (height, width, 3); the rest are pictures of the same size. hidden:
@@ -88,12 +90,12 @@ def score_view(composite: Array, scene: Array, frame: Picture, scene_reference: 
     A flare also has `empty_psnr`, what no flare at all would score.
     """
     shown, clean, filmed = _display(composite), _display(scene), frame.display()
-    scores = {"composite": _picture_scores(shown, filmed)}
+    scores = {"composite": _picture_scores(shown, filmed, lpips)}
     if scene_reference is not None:
         reference = scene_reference.display()
         flare, flare_reference = displayed_flare(composite, scene), np.abs(filmed - reference)
-        scores["scene"] = _picture_scores(clean, reference)
-        scores["flare"] = {**_picture_scores(flare, flare_reference),
+        scores["scene"] = _picture_scores(clean, reference, lpips)
+        scores["flare"] = {**_picture_scores(flare, flare_reference, lpips),
                            "empty_psnr": psnr(np.zeros_like(flare), flare_reference)}
     if flare_truth is not None:
         truth, layer, keep = flare_truth.linear(), composite - scene, ~(clipped(frame) if hidden is None else hidden)
@@ -148,8 +150,9 @@ def _display(linear: Array) -> Array:
     return np.clip(srgb_from_linear(linear), 0, 1)
 
 
-def _picture_scores(image: Array, target: Array) -> Scores:
-    return {"psnr": psnr(image, target), "ssim": ssim(image, target), "lpips": None, "flip": flip(image, target)}
+def _picture_scores(image: Array, target: Array, lpips: Perceptual | None) -> Scores:
+    return {"psnr": psnr(image, target), "ssim": ssim(image, target),
+            "lpips": lpips(image, target) if lpips else None, "flip": flip(image, target)}
 
 
 def summary(reference: Reference, views: Sequence[tuple[str, dict[str, Scores]]],

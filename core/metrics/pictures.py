@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import importlib.util
 import math
+from collections.abc import Callable
 from typing import Any, Literal
 
 import numpy as np
@@ -16,6 +17,8 @@ from ..errors import SettingsError
 
 Borders = Literal["valid", "same"]
 Array = NDArray[Any]
+Perceptual = Callable[[NDArray[np.float32], NDArray[np.float32]], float]
+"""LPIPS, of two pictures of display values (height, width, 3)."""
 
 WINDOW = 11
 SIGMA = 1.5

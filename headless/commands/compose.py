@@ -55,7 +55,9 @@ def frames_of(folder: Path, out: Path, progress: Progress, *, wanted: str | None
     scene = bpy.context.scene
     node = compositor.set_up(scene, layers)
     compositor.match_scene(scene, layers, layers.size())
-    compositor.plain_view(scene)
+    for note in (compositor.plain_view(scene), compositor.misread(scene)):
+        if note:
+            progress.say(note)
     node.inputs["Intensity"].default_value = intensity
     node.inputs["Tint"].default_value = (*colour, 1.0)
     _keep(out.resolve() / BLEND, progress)

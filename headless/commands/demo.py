@@ -7,7 +7,7 @@ import shutil
 import time
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ...core.capture.capture import REMOVED
 from ...core.errors import CaptureError, RunError
@@ -17,6 +17,10 @@ from ..command import Command, Step
 from . import compose, evaluate, fit
 from .lights import LIGHTS, with_lights
 from .remove import with_removed
+
+if TYPE_CHECKING:
+    from ...core.capture import Capture
+    from ...core.fit import FitSettings
 
 ROOT = Path(__file__).resolve().parents[2]
 SAMPLE = ROOT / "sample_scenes" / "desk"
@@ -86,7 +90,7 @@ def _copy_of_sample(out: Path, remove: bool) -> Path:
     return copy
 
 
-def _check_earlier(folder: Path, settings: Any, capture: Any) -> None:
+def _check_earlier(folder: Path, settings: FitSettings, capture: Capture) -> None:
     """An earlier run is gone on with, so it must be the one that is asked for now."""
     from ...core.fit.run import CONFIG, Run
 
@@ -98,7 +102,7 @@ def _check_earlier(folder: Path, settings: Any, capture: Any) -> None:
                            "another folder with --out.")
 
 
-def _supervision(capture: Any, mode: str) -> str:
+def _supervision(capture: Capture, mode: str) -> str:
     """Where the flare-free frames come from, which the scene is learned from."""
     if mode == "split":
         return "No flare-free frame is looked at."
@@ -109,7 +113,7 @@ def _supervision(capture: Any, mode: str) -> str:
     return "There are no flare-free frames."
 
 
-def _write_sheet(capture: Any, holdout: Any, out: Path) -> None:
+def _write_sheet(capture: Capture, holdout: str | int | None, out: Path) -> None:
     """Some held-out views (or some of all), from the files that were baked."""
     from ...core.bake.bake import read_record
     from ...core.bake.exr import read_layers
@@ -131,9 +135,9 @@ def frames(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
 
 COMMAND = Command(
     "demo", "Runs the whole chain on the sample capture: lights, fit, eval, bake, composited frames.",
-    f"""Writes DIR/capture (a copy of the sample), DIR/run, DIR/layers (EXR), DIR/frames (through Blender's
-compositor), DIR/{SHEET} (frame | composite | scene | flare), and shows the table of scores. Given again,
-it goes on where it was.
+    f"""Writes DIR/capture (a copy of the sample; DIR/capture-removal with --remove), DIR/run, DIR/layers (EXR),
+DIR/frames (through Blender's compositor), DIR/{SHEET} (frame | composite | scene | flare), and shows the
+table of scores. Given again, it goes on where it was; other settings want a folder of their own.
 
   run.py demo
   blender -b -P headless/run.py -- demo""",

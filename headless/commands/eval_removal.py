@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ...core.errors import SettingsError
 from ...core.progress import Progress
 from ..command import Command, Step, seed
+
+if TYPE_CHECKING:
+    from ...core.removal.evaluation import Case
 
 SHEET, SCORES = "worst.png", "eval.json"
 
@@ -57,7 +60,7 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
             "categories": scores["categories"]}
 
 
-def _cases(words: argparse.Namespace) -> Any:
+def _cases(words: argparse.Namespace) -> list[Case]:
     from ...core.removal import evaluation
     from ...core.removal.backgrounds import read_backgrounds
     from ...core.removal.synthesis.prescription import read_lenses

@@ -17,20 +17,27 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("run", type=Path, metavar="RUN", help="folder that `fit` has written")
     parser.add_argument("--views", choices=VIEWS, default="held-out", help="which views to score (default held-out)")
     parser.add_argument("--capture", type=Path, metavar="CAPTURE", help="where the capture is, if it was moved")
+    parser.add_argument("--lpips", type=Path, metavar="DIR", help="folder with the weights of LPIPS (AlexNet, v0.1)")
 
 
 def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
-    return scores_of(words.run, progress, which=words.views, capture_folder=words.capture)
+    return scores_of(words.run, progress, which=words.views, capture_folder=words.capture,
+                     lpips_folder=words.lpips)
 
 
 def scores_of(folder: Path, progress: Progress, *, which: str = "held-out",
-              capture_folder: Path | None = None) -> dict[str, Any]:
+              capture_folder: Path | None = None, lpips_folder: Path | None = None) -> dict[str, Any]:
     """Score a run's views, write its eval.json, show the table."""
     from ...core.files import write_json
     from ...core.fit.frames import Frames
     from ...core.fit.run import EVALUATION, Run
     from ...core.metrics.evaluation import evaluate, table, worse_than_none
 
+    perceptual = None
+    if lpips_folder is not None:
+        from ...core.metrics.lpips import Lpips
+
+        perceptual = Lpips(lpips_folder)
     made = Run.open(folder)
     capture = made.capture(capture_folder)
     train, held_out = capture.split(made.settings.holdout)
@@ -38,7 +45,8 @@ def scores_of(folder: Path, progress: Progress, *, which: str = "held-out",
     if not views:
         raise RunError(f"{folder} held no view out; score others with --views train or all.")
     frames = Frames(capture, made.settings.width)
-    scores = evaluate(made, capture, {view: frames.camera(view) for view in views}, progress, frames.inside)
+    scores = evaluate(made, capture, {view: frames.camera(view) for view in views}, progress, frames.inside,
+                      perceptual)
     progress.say(table(scores))  # first, since the folder may be one that is not to be written
     if worse_than_none(scores):
         progress.say("The flare is farther from what was filmed than none at all would be: look at preview.png before "
@@ -51,8 +59,9 @@ def scores_of(folder: Path, progress: Progress, *, which: str = "held-out",
 COMMAND = Command(
     "eval", "Scores a run: composite, scene and flare, against what is known.",
     """Writes RUN/eval.json and shows its means: PSNR, SSIM (11x11 window, sigma 1.5, inside the picture), FLIP
-where the flip-evaluator package is installed. Scene and flare are scored against truth/ where the capture
-has it, else against removed/; "empty" is what no flare at all would score.
+where the flip-evaluator package is installed, LPIPS where --lpips names its weights. Scene and flare are
+scored against truth/ where the capture has it, else against removed/; "empty" is what no flare at all would
+score.
 
   run.py eval build/desk""",
     arguments, (Step("eval", "engine", run),))

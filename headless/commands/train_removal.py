@@ -3,13 +3,21 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ...core.errors import SettingsError
 from ...core.progress import Progress
 from ..command import Command, Step
 from .fit import change
+
+if TYPE_CHECKING:
+    from ...core.pictures import Pixels
+    from ...core.removal.backgrounds import Backgrounds
+    from ...core.removal.bank import OwnFlares
+    from ...core.removal.recipe import Recipe
+    from ...core.removal.synthesis.prescription import Prescription
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -83,8 +91,8 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     return {"weights": str(path)}
 
 
-def _diffusion(words: argparse.Namespace, recipe: Any, backgrounds: Any, lenses: Any, own: Any,
-               progress: Progress) -> dict[str, Any]:
+def _diffusion(words: argparse.Namespace, recipe: Recipe, backgrounds: Backgrounds,
+               lenses: Sequence[Prescription], own: OwnFlares | None, progress: Progress) -> dict[str, Any]:
     from ...core.metrics.lpips import Lpips
     from ...core.removal import diffusion
     from ...core.removal.batches import Batches
@@ -97,7 +105,7 @@ def _diffusion(words: argparse.Namespace, recipe: Any, backgrounds: Any, lenses:
         progress.say("The loss is L2 alone: no folder with the weights of LPIPS was given (--lpips).")
     batches = Batches(recipe, backgrounds, lenses, own)
 
-    def draw(number: int) -> Any:
+    def draw(number: int) -> tuple[Pixels, Pixels]:
         one = batches.pair(number, 0, 512, 512)
         return one.frame, one.gentle if words.keep_glare else one.scene
 

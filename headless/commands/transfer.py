@@ -7,13 +7,19 @@ import hashlib
 import math
 import re
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ...core.errors import CaptureError, RunError, SettingsError
 from ...core.progress import Progress
 from .. import frames, jobs
 from ..command import Command, Step
 from .bake import size, space_options
+
+if TYPE_CHECKING:
+    from ...core.capture.camera import Floats
+    from ...core.look.look import LightLook
+    from ...core.transfer.query import Seen
+    from ...core.transfer.target import Target
 
 MOST_SMOOTH = 1000  # frames
 QUERIES = ("source", "target", "blend")
@@ -164,7 +170,7 @@ def _check_options(words: argparse.Namespace, kind: str) -> None:
             raise SettingsError(f"--{name} is not for a {kind} as the target; leave it out.")
 
 
-def _made(words: argparse.Namespace, step: str, target: Any, flare: Path, training: list[Any] | None,
+def _made(words: argparse.Namespace, step: str, target: Target, flare: Path, training: list[Floats] | None,
           progress: Progress) -> dict[str, Any]:
     """The layers of a target."""
     from ...core.bake.bake import BakeSettings
@@ -218,7 +224,7 @@ def bake_flare(bake_words: argparse.Namespace, progress: Progress) -> dict[str, 
     return _made(words, "bake", of_cameras(views, read(words.flare), words.scene), words.flare, None, progress)
 
 
-def source(words: argparse.Namespace) -> tuple[Path, list[Any] | None]:
+def source(words: argparse.Namespace) -> tuple[Path, list[Floats] | None]:
     """The .flare, and the poses of its training views where they can be had."""
     from ...core.capture import Capture
     from ...core.fit.run import FLARE, Run
@@ -237,7 +243,7 @@ def source(words: argparse.Namespace) -> tuple[Path, list[Any] | None]:
     return flare, [view.camera.world_to_camera for view in views]
 
 
-def target_of(words: argparse.Namespace, flare: Path, training: list[Any] | None = None) -> Any:
+def target_of(words: argparse.Namespace, flare: Path, training: list[Floats] | None = None) -> Target:
     """The target, by what --to names. training: poses, for a .flare that does not tell."""
     from ...core.bake.frames import Frame, chosen
     from ...core.capture import Capture
@@ -293,7 +299,7 @@ def _is_of_plates(folder: Path) -> bool:
     return folder.is_dir() and not capture and bool(pictures_in(folder))
 
 
-def _usual_distance(light: Any, seen: Any) -> float:
+def _usual_distance(light: LightLook, seen: Seen | None) -> float:
     """From which training saw a light, in the middle."""
     import numpy as np
 

@@ -132,6 +132,17 @@ def test_an_exact_fit_scores_as_exact() -> None:
     assert 5 < scores["flare_linear"]["empty_psnr"] < 25
 
 
+def test_lpips_is_that_of_the_layers_as_shown() -> None:
+    scene, flare = layers()
+    frame, clean = (Picture(srgb_from_linear(light), "srgb") for light in (scene + flare, scene))
+    scores = score_view(scene + flare, scene * np.float32(0.5), frame, clean,
+                        lpips=lambda image, target: float(np.abs(image - target).mean()))
+    assert scores["composite"]["lpips"] == pytest.approx(0, abs=1e-6)
+    expected = np.abs(srgb_from_linear(scene * np.float32(0.5)) - clean.display()).mean()
+    assert scores["scene"]["lpips"] == pytest.approx(expected, abs=1e-6)
+    assert scores["flare"]["lpips"] is not None and scores["flare"]["lpips"] > 0
+
+
 def test_the_flare_is_scored_in_display_space() -> None:
     scene, flare = layers()
     frame = Picture(srgb_from_linear(scene + flare), "srgb")

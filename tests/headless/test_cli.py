@@ -7,6 +7,7 @@ import json
 import os
 import subprocess
 import sys
+import venv
 from pathlib import Path
 from typing import Any, get_args
 
@@ -17,7 +18,7 @@ from fit_flare.core.errors import Cancelled, CaptureError, FitFlareError, Settin
 from fit_flare.core.fit import settings as fit_settings
 from fit_flare.core.progress import Progress
 from fit_flare.headless import cli
-from fit_flare.headless.command import MOST_SEED, Command, Step
+from fit_flare.headless.command import Command, Step
 from fit_flare.headless.commands import COMMANDS, bake, compose, fit, lights
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -268,7 +269,6 @@ def test_a_farm_is_told_names_of_any_script(tmp_path: Path) -> None:
 def test_choices_are_those_of_the_settings() -> None:
     assert get_args(fit_settings.Preset) == fit.PRESETS
     assert get_args(fit_settings.Mode) == fit.MODES
-    assert fit_settings.MOST_SEED == MOST_SEED
 
 
 def test_settings_on_the_command_line() -> None:
@@ -293,6 +293,33 @@ def test_sizes() -> None:
     for text in ("0", "x", "12x", "-5", "1.5", "999999"):
         with pytest.raises(SettingsError):
             bake.size(text)
+
+
+def test_a_blender_that_cannot_be_loaded_is_a_sentence(tmp_path: Path) -> None:
+    (tmp_path / "bpy.py").write_text("raise ImportError('libXrender.so.1: cannot open shared object file')")
+    done = subprocess.run([sys.executable, str(ROOT / "headless" / "run.py"), "compose", str(tmp_path), "--out",
+                           str(tmp_path / "frames"), "--step", "compose"], capture_output=True, text=True, check=False,
+                          env={**os.environ, "PYTHONPATH": str(tmp_path)})
+    assert done.returncode == 1 and "libXrender.so.1" in done.stderr and "--blender" in done.stderr, done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_a_python_without_numpy_hands_over_to_the_engine(tmp_path: Path) -> None:
+    bare = tmp_path / "bare"
+    venv.create(bare, with_pip=False, symlinks=os.name != "nt")
+    python = next(path for path in (bare / "bin" / "python", bare / "Scripts" / "python.exe") if path.is_file())
+
+    def said(*words: str, **named: str) -> tuple[int, str]:
+        done = subprocess.run([str(python), str(ROOT / "headless" / "run.py"), *words], capture_output=True, text=True,
+                              check=False, env={**os.environ, **named})
+        return done.returncode, done.stdout + done.stderr
+
+    status, told = said("fit", "--help", FIT_FLARE_ENGINE=sys.executable)
+    assert status == 0 and "--holdout" in told, told
+    status, told = said("fit", str(tmp_path / "none"), "--out", str(tmp_path / "run"), "--engine", sys.executable)
+    assert status == 1 and "Traceback" not in told and "none" in told, told
+    status, told = said("engine", FIT_FLARE_ENGINE=str(tmp_path / "nowhere"))
+    assert (status, told.count("\n")) == (1, 1) and "is not a Python with torch" in told, told
 
 
 def test_reading_the_words_needs_numpy_alone() -> None:

@@ -67,7 +67,8 @@ class GradedScene(Trainer):
         self.falling.step()
         return figures
 
-    def _behind_flare(self, targets: Targets, scene: Tensor) -> Tensor:  # noqa: ARG002 - the trainer's own door
+    def _behind_flare(self, targets: Targets, scene: Tensor,  # noqa: ARG002 - the trainer's own door
+                      sources: Tensor | None) -> Tensor:  # noqa: ARG002
         return self.grids(self._number(self._view()), scene)
 
     def _number(self, view: View) -> int:

@@ -17,8 +17,9 @@ from ..errors import EngineError, SettingsError
 from .spaces import REC_709, ColourSpace, colour_space, linear_space
 from .spaces import names as built_in_names
 
-_REC_709_LINEAR = ("lin_rec709_scene", "lin_rec709", "Linear Rec.709 (sRGB)", "Linear Rec.709",
-                   "Utility - Linear - sRGB", "Utility - Linear - Rec.709", "Linear")
+REC_709_LINEAR = ("lin_rec709_scene", "lin_rec709", "Linear Rec.709 (sRGB)", "Linear Rec.709",
+                  "Utility - Linear - sRGB", "Utility - Linear - Rec.709", "Linear")
+"""What configurations call scene-linear Rec. 709."""
 _BUILT_IN = "ocio://default"
 
 
@@ -73,7 +74,7 @@ def _library() -> ModuleType:
 
 def _processor(library: ModuleType, config: Any, name: str, *, forward: bool) -> Any:
     """From the space to linear Rec. 709, or back."""
-    own = next((one for one in _REC_709_LINEAR if config.getColorSpace(one) is not None), None)
+    own = next((one for one in REC_709_LINEAR if config.getColorSpace(one) is not None), None)
     try:
         if own is not None:
             made = config.getProcessor(name, own) if forward else config.getProcessor(own, name)

@@ -10,7 +10,6 @@
 """
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -22,7 +21,7 @@ from numpy.typing import NDArray
 from .. import exposures
 from ..capture import Camera, Capture
 from ..errors import RunError
-from ..files import write_json, write_text
+from ..files import digest_of, write_json, write_text
 from ..flare import file as flare_file
 from ..flare.file import FlareFile
 from ..gaussians.ply import read_ply
@@ -164,11 +163,7 @@ class Run:
     @cached_property
     def fingerprint(self) -> str:
         """Changes whenever a picture of this run would."""
-        digest = hashlib.sha256()
-        for name in (SCENE, FLARE):
-            if (self.folder / name).is_file():
-                digest.update((self.folder / name).read_bytes())
-        return digest.hexdigest()[:16]
+        return digest_of(self.folder / name for name in (SCENE, FLARE))
 
     def view(self, camera: Camera, edits: LookEdits | None = None) -> RenderedView:
         """Scene, flares and composite as tensors."""

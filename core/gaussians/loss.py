@@ -28,7 +28,7 @@ def l1_ssim(image: Tensor, target: Tensor, lam: float, *, kernels: Literal["auto
     """lam * mean|image - target| + (1 - lam) * (1 - SSIM(image, target)), a scalar.
 
     image, target: (h, w, 3), 0..1. Differentiable by the image; the target is taken as constant.
-    lam: weight of L1 (METHOD: 0.9; 3DGS: 0.8). Raises SettingsError where the sizes differ.
+    lam: weight of L1 (the paper: 0.9; 3DGS: 0.8). Raises SettingsError where the sizes differ.
     """
     _check(image, target)
     cpu = fused(image) if kernels == "auto" else None

@@ -7,7 +7,7 @@ At a pixel centre (x + 1/2, y + 1/2), with d its offset from a Gaussian's centre
 
     q = d^T covariance^-1 d                                       squared Mahalanobis distance
     G = exp(-q / 2)                                               the plain profile, or
-    G = exp(-(sqrt(q) - r0)² / (2 w²))                            a ring (METHOD: r0 = 0, w = 1 is plain)
+    G = exp(-(sqrt(q) - r0)² / (2 w²))                            a ring (ours: r0 = 0, w = 1 is plain)
     G = G * exp(b·d - m)                                          an arc of either: brighter towards b, px^-1, where
     m = beta r0 + beta² w² / 2,  beta² = b^T covariance b         makes its peak 1 (see `levelled` of `rendering.py`)
 

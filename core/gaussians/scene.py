@@ -2,8 +2,6 @@
 """The scene as 3D Gaussians: what is optimised, in the form in which nothing needs to be constrained."""
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import torch
 from torch import Tensor, nn
@@ -12,7 +10,7 @@ from ..capture import Camera, PointCloud
 from ..errors import SettingsError
 from ..sampling import Sampling, dilation
 from . import spherical_harmonics
-from .optimiser import Rate, replace_rows
+from .optimiser import Rate
 from .ordering import nearest_distances
 from .rasterizer import Kernels, rasterization
 from .rendering import NEAR, Rendering
@@ -80,18 +78,11 @@ class SceneGaussians(nn.Module):
 
     @classmethod
     def empty(cls, n: int = 0) -> SceneGaussians:
-        """n Gaussians of zeros: something to load a state into."""
+        """n Gaussians of zeros."""
         return cls(*(torch.zeros(n, *shape) for shape in ((3,), (3,), (4,), (), (COEFFICIENTS, 3))))
 
     def __len__(self) -> int:
         return len(self.means)
-
-    def load_state_dict(self, state_dict: Any, *arguments: Any, **options: Any) -> Any:
-        """As nn.Module's, for any number of Gaussians."""
-        for name, parameter in self.named_parameters():
-            if name in state_dict:
-                replace_rows(parameter, torch.empty_like(state_dict[name], device=parameter.device))
-        return super().load_state_dict(state_dict, *arguments, **options)
 
     @property
     def scales(self) -> Tensor:

@@ -52,13 +52,15 @@ def test_what_jpeg_makes_of_a_border_is_one() -> None:
     assert 15 <= found.top <= 16 and 80 <= found.bottom <= 81, "but for the line that rings"
 
 
-@pytest.mark.parametrize("why", ["one side alone", "one line", "grey", "grain", "a ghost", "next to nothing left",
-                                 "all of it"])
+@pytest.mark.parametrize("why", ["one side alone", "one line", "grey", "grain", "faint stars", "a ghost",
+                                 "next to nothing left", "all of it"])
 def test_what_is_dark_for_another_reason_is_no_border(why: str) -> None:
     inner = np.maximum(np.asarray(picture(0, SIZE), np.uint8), 40)
     ghost = bordered(inner, 20, 20, 0, 0)
     ghost[0, 5] = ghost[-1, 9] = 120
-    whole = {"one side alone": bordered(inner, 20, 0, 0, 0), "a ghost": ghost,
+    stars = bordered(inner, 20, 20, 0, 0)
+    stars[:20, ::10] = stars[-20:, ::10] = 10
+    whole = {"one side alone": bordered(inner, 20, 0, 0, 0), "a ghost": ghost, "faint stars": stars,
              "next to nothing left": bordered(inner[:8], 40, 40, 0, 0),
              "one line": bordered(inner, 1, 1, 1, 1), "grey": bordered(inner, 8, 8, 0, 0, 60),
              "grain": bordered(inner, 8, 8, 0, 0), "all of it": np.zeros_like(inner)}[why]

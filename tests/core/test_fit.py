@@ -461,11 +461,17 @@ def test_a_light_that_the_fit_has_moved_is_still_the_one_it_was_given(capture: C
 
 def test_a_checkpoint_of_an_earlier_version_goes_on(capture: Capture) -> None:
     """It does not say which lights the fit was given."""
-    state = Trainer(capture, quick()).state()
+    earlier = Trainer(capture, quick())
+    earlier.step()
+    state = earlier.state()
     del state["lights"]
     moved = copy.copy(capture)
     moved.lights = (Light("sun", capture.lights[0].xyz + 0.1),)
-    Trainer(moved, quick()).load_state(state)
+    trainer = Trainer(moved, quick())
+    trainer.load_state(state)
+    assert trainer.iteration == 1
+    assert trainer.flare is not None and torch.equal(trainer.flare.positions, state["flare"]["positions"])
+    assert all(torch.equal(value, state["scene"][name]) for name, value in trainer.scene.state_dict().items())
 
 
 def test_a_world_of_small_units_is_fitted_as_others_are(capture: Capture) -> None:

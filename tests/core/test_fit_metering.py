@@ -114,6 +114,27 @@ def test_frames_that_tell_nothing_are_as_the_nearest(tmp_path: Path) -> None:
     assert told["0003.png"] / told["0008.png"] == pytest.approx(2, rel=0.05)
 
 
+@pytest.mark.parametrize("why", ["few points are lit", "something else lies over it"])
+def test_a_frame_that_hardly_tells_is_as_the_nearest(tmp_path: Path, why: str) -> None:
+    def filmed(number: int, light: Light) -> Light:
+        if number != 4:
+            return light * (2.0 if number < 6 else 1.0)
+        if why == "few points are lit":
+            lit = np.zeros_like(light)
+            lit[40:70, 60:90] = 1
+            return light * lit
+        other = np.random.default_rng(5).uniform(0, 0.3, (*light.shape[:2], 1)).astype(np.float32)
+        return 0.1 * light + other
+
+    told = found(wall(tmp_path / "a", filmed))
+    assert told["0004.png"] == told["0003.png"]
+
+
+def test_one_frame_that_is_lit_otherwise_leaves_the_exposure_fixed(tmp_path: Path) -> None:
+    """A flash, or lightning."""
+    assert not found(wall(tmp_path / "a", lambda number, light: light * (1.5 if number == 5 else 1.0)))
+
+
 def test_a_camera_that_tells_nothing_is_not_taken_for_another() -> None:
     assert metering._filled(np.array([1.0, np.nan, np.nan, 3.0]), [Path(name) for name in ("a", "a", "b", "b")]
                             ).tolist() == [1.0, 1.0, 3.0, 3.0]

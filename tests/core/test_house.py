@@ -2,8 +2,10 @@
 """The rules of the house that keep Blender and the engine apart."""
 from __future__ import annotations
 
+import ast
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -12,6 +14,9 @@ ROOT = Path(__file__).resolve().parents[2]
 LIGHT = ("core.errors", "core.files", "core.progress", "core.pictures", "core.capture",
          "core.bake.bake", "core.metrics.evaluation", "core.look")
 
+# From the lowest; what is not named is the ground floor, below all.
+ROOMS = ("core.capture", "core.metrics", "core.gaussians", "core.look", "core.lights", "core.flare", "core.removal",
+         "core.fit", "core.bake", "core.transfer", "flare_addon", "headless")
 
 # Kernel sets that refuse to be imported on a machine without their device.
 OPTIONAL = ("core.gaussians.cuda", "core.gaussians.warp_kernels")
@@ -20,6 +25,29 @@ OPTIONAL = ("core.gaussians.cuda", "core.gaussians.warp_kernels")
 def isolated(code: str) -> None:
     found = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
     assert found.returncode == 0, found.stderr
+
+
+def room_of(module: str) -> int:
+    """Place in ROOMS; -1 for the ground floor."""
+    return next((place for place, room in enumerate(ROOMS) if f"{module}.".startswith(f"{room}.")), -1)
+
+
+def imported(path: Path) -> Iterator[str]:
+    """The modules of ours that a file imports, at its head or in a function."""
+    package = path.relative_to(ROOT).parts[:-1]
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.ImportFrom) and node.level:
+            base = [*package[:len(package) - node.level + 1], *(node.module.split(".") if node.module else [])]
+            yield from (".".join([*base, alias.name]) for alias in node.names)
+
+
+def test_rooms_depend_downwards_only() -> None:
+    files = [path for part in ("core", "flare_addon", "headless") for path in sorted((ROOT / part).rglob("*.py"))]
+    edges = [(path, module) for path in files for module in imported(path)]
+    upwards = [f"{path.relative_to(ROOT)} imports {module}" for path, module in edges
+               if room_of(module) > room_of(".".join(path.relative_to(ROOT).with_suffix("").parts))]
+    assert not upwards
+    assert len(edges) > 500, "they are found at all"
 
 
 def test_core_imports_no_blender() -> None:

@@ -29,6 +29,7 @@ VIEW, PREFERENCES = (0, 28, 1313, 908), (168, 55, 1313, 465)
 PICTURES = {
     "preferences": ("01_preferences", PREFERENCES), "setting_up": ("11_setting_up", (168, 310, 1313, 465)),
     "imported": ("03_imported", VIEW), "fitting": ("04_fitting", VIEW), "flare": ("05_flare", VIEW),
+    "look": ("06_look_and_bake", (325, 75, 1312, 600)),
     "compositor": ("07_compositor", (0, 0, 1600, 1000)),
     "transferred": ("08_transferred", VIEW), "hidden": ("09_hidden", VIEW)}
 """The handbook's pictures: of which screenshot, and which part (left, top, right, bottom) at 1600x1000."""

@@ -102,7 +102,6 @@ STEP_SCRATCH = SCRATCH + ROOM * (11 + harmonics.ROWS)
 
 H = np.float32(-0.5 / math.log(2))
 TWO_LN2 = np.float32(2 * math.log(2))
-LN2 = np.float32(math.log(2))
 ALPHA_MIN_INVERSE = np.float32(1 / rendering.ALPHA_MIN)
 MARGIN = np.float32(1e-4)
 """Added to the reach, a power of two: rounding must not lose a pixel at the rim, where alpha is tested anyway."""

@@ -415,16 +415,6 @@ def any_of(typing_context, mask):  # noqa: ARG001
 
 
 @intrinsic
-def bits_of(typing_context, mask):  # noqa: ARG001
-    """The mask as a number, lane 0 its lowest bit."""
-
-    def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:  # noqa: ARG001
-        return builder.zext(builder.bitcast(args[0], ir.IntType(LANES)), ir.IntType(64))
-
-    return types.int64(MASKS), emit
-
-
-@intrinsic
 def as_ints(typing_context, a):  # noqa: ARG001
     """The same 32 bits a lane, read as integers."""
 

@@ -2,6 +2,8 @@
 # make test   sets everything up and runs the checks and tests
 PYTHON ?= python3.11
 PIP = -m pip --disable-pip-version-check --quiet
+# Blender's modules are hundreds of megabytes: an installation whose download broke off is begun again after a pause.
+AGAIN = sh -c 'for pause in 10 30 60 120; do "$$@" && exit; sleep $$pause; done; "$$@"' --
 
 .PHONY: demo pictures test check setup package clean
 
@@ -25,14 +27,14 @@ setup: .venv/.ready .venv-bpy45/.ready
 # The engine, with Blender as a module beside it.
 .venv/.ready: constraints.txt pyproject.toml
 	$(PYTHON) -m venv .venv
-	.venv/bin/python $(PIP) install --upgrade pip
-	.venv/bin/python $(PIP) install --group engine --group blender --group colour --group test -c constraints.txt
+	$(AGAIN) .venv/bin/python $(PIP) install --upgrade pip
+	$(AGAIN) .venv/bin/python $(PIP) install --group engine --group blender --group colour --group test -c constraints.txt
 	touch $@
 
 # An older Blender without an engine, for the tests of Blender's side.
 .venv-bpy45/.ready: constraints.txt pyproject.toml
 	$(PYTHON) -m venv .venv-bpy45
-	.venv-bpy45/bin/python $(PIP) install bpy==4.5.15 numpy==1.26.4 OpenEXR==3.5.3
+	$(AGAIN) .venv-bpy45/bin/python $(PIP) install bpy==4.5.15 numpy==1.26.4 OpenEXR==3.5.3
 	touch $@
 
 # The extension as Blender installs it.

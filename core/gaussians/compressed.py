@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from .. import ply
 from ..errors import FlareFileError
 from .scene import COEFFICIENTS, SceneGaussians
 from .spherical_harmonics import dc_from_colour
@@ -23,7 +24,6 @@ from .spherical_harmonics import dc_from_colour
 CHUNK = 256
 PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 _HEAD = 1 << 16
-_TYPES = {"float": "<f4", "uint": "<u4", "uchar": "u1", "float32": "<f4", "uint32": "<u4", "uint8": "u1"}
 _OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])  # the components that are stored, w x y z
 
 Floats = NDArray[np.float32]
@@ -71,23 +71,17 @@ def read_compressed(path: Path) -> SceneGaussians:
 
 def _tables(data: bytes) -> dict[str, NDArray[Any]]:
     """The elements by name, as structured arrays."""
-    end = data.find(b"end_header")
-    body = data.find(b"\n", end) + 1
-    elements: list[tuple[str, int, list[tuple[str, str]]]] = []
-    for line in data[:max(end, 0)].decode("ascii", "replace").splitlines():
-        match line.split():
-            case ["format", form, *_] if form != "binary_little_endian":
-                raise ValueError(f"its format is {form}")
-            case ["element", name, number]:
-                elements.append((name, int(number), []))
-            case ["property", kind, name]:
-                elements[-1][2].append((name, _TYPES[kind]))
-    tables = {}
-    for name, count, layout in elements:
-        if count < 0:
-            raise ValueError(f"{count} rows of {name}")
-        tables[name] = np.frombuffer(data, np.dtype(layout), count, body)
-        body += tables[name].nbytes
+    header = ply.read_header(data)
+    if header is None:
+        raise ValueError("its header has no end")
+    if header.form != "binary_little_endian":
+        raise ValueError(f"its format is {header.form}")
+    tables, at = {}, header.start
+    for element in header.elements:
+        if element.rows < 0:
+            raise ValueError(f"the number of rows of {element.name} is none")
+        tables[element.name] = ply.table(data, element.row("<"), element.rows, at)
+        at += tables[element.name].nbytes
     return tables
 
 

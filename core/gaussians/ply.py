@@ -11,12 +11,13 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from .. import ply
 from ..errors import FlareFileError
 from ..files import atomic_path
 from ..sampling import Sampling
@@ -30,12 +31,7 @@ NEAR_WORD, WHITE_WORD, FOCAL_WORD = "near", "white", "focal_lengths"
 two of its `sampling`, where that is known."""
 WHITE_MOST = 107.0
 """Display value, somewhat above that of the brightest half float."""
-ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
-TYPES = {
-    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2",
-    "ushort": "u2", "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4",
-    "float": "f4", "float32": "f4", "double": "f8", "float64": "f8",
-}  # fmt: skip
+ORDERS = {form: order for form, order in ply.ORDERS.items() if form != "ascii"}
 POSITION = ("x", "y", "z")
 NORMAL = ("nx", "ny", "nz")
 DC = tuple(f"f_dc_{i}" for i in range(3))
@@ -91,16 +87,15 @@ def read_ply(path: Path | str) -> SceneGaussians:
             return read_compressed(path)
         with open(path, "rb") as file:
             header = _header(path, file.read(HEADER_MAX))
-            n, layout = header.vertices, header.layout
-            kind = np.dtype([(name, header.order + code) for name, code in layout])
-            if path.stat().st_size - header.start < n * kind.itemsize:
+            n, row = header.vertices, header.row
+            if path.stat().st_size - header.start < n * row.itemsize:
                 raise FlareFileError(f"{path} is cut short: it announces {n} Gaussians; copy it again.")
             file.seek(header.start)
-            table = np.frombuffer(file.read(n * kind.itemsize), kind)
+            table = np.frombuffer(file.read(n * row.itemsize), row)
     except OSError as problem:
         raise FlareFileError(f"{path} cannot be read: {problem.strerror or problem}.") from problem
 
-    present = {name for name, _ in layout}
+    present = set(row.names or ())
     rest_names = _rest(sum(name.startswith("f_rest_") for name in present))
     if len(rest_names) not in (0, 9, 24, 45):
         raise FlareFileError(
@@ -130,11 +125,10 @@ def read_ply(path: Path | str) -> SceneGaussians:
 
 
 class _Header(NamedTuple):
-    """Byte order, number of vertices, their properties with types, where the data starts, and what our comments say."""
+    """Number of vertices, what a row of them is, where the rows start, and what our comments say."""
 
-    order: str
     vertices: int
-    layout: list[tuple[str, str]]
+    row: np.dtype[Any]
     start: int
     near: float
     display_white: float
@@ -142,38 +136,28 @@ class _Header(NamedTuple):
 
 
 def _header(path: Path, head: bytes) -> _Header:
-    end = head.find(b"\nend_header")
-    start = head.find(b"\n", end + 1) + 1
-    if not head.startswith(b"ply") or end < 0 or not start:
+    told = ply.read_header(head)
+    if told is None:
         raise FlareFileError(f"{path} is not a PLY file.")
-    order, count, element = "", -1, ""
-    layout: list[tuple[str, str]] = []
-    near, display_white = NEAR, 1.0
-    sampling = None
-    for line in head[:end].decode("ascii", "replace").splitlines()[1:]:
-        match line.split():
-            case ["format", form, _]:
-                if form not in ORDERS:
-                    raise FlareFileError(f"{path} is a PLY file in the format {form}; export it as binary.")
-                order = ORDERS[form]
-            case ["comment", word, number] if word == NEAR_WORD:
-                with contextlib.suppress(ValueError):
-                    near = float(number) if 0 < float(number) < NEAR else NEAR
-            case ["comment", word, number] if word == WHITE_WORD:
-                with contextlib.suppress(ValueError):
-                    display_white = float(number) if 1 < float(number) < WHITE_MOST else 1.0
-            case ["comment", word, least, most] if word == FOCAL_WORD:
-                with contextlib.suppress(ValueError):
-                    sampling = Sampling(float(least), float(most))
-            case ["element", name, number]:
-                if count < 0 and (name != "vertex" or not (number.isascii() and number.isdigit())):
-                    raise FlareFileError(f"{path} does not begin with its vertices; export it again.")
-                element = name
-                count = int(number) if name == "vertex" else count
-            case ["property", *words] if element == "vertex":
-                if len(words) != 2 or words[0] not in TYPES:
-                    raise FlareFileError(f"{path} has the property {' '.join(words)!r}, not a plain number.")
-                layout.append((words[1], TYPES[words[0]]))
-    if not order or not layout or len({name for name, _ in layout}) < len(layout):
+    if told.form and told.form not in ORDERS:
+        raise FlareFileError(f"{path} is a PLY file in the format {told.form}; export it as binary.")
+    vertices = told.elements[0] if told.elements else ply.Element("vertex", 0, [])
+    if vertices.name != "vertex" or vertices.rows < 0:
+        raise FlareFileError(f"{path} does not begin with its vertices; export it again.")
+    try:
+        names = [name for name, _ in vertices.layout()]
+    except ValueError as problem:
+        raise FlareFileError(f"{path} has the property {problem}, not a plain number.") from problem
+    if not told.form or not names or len(set(names)) < len(names):
         raise FlareFileError(f"{path} is not a PLY file of Gaussians.")
-    return _Header(order, count, layout, start, near, display_white, sampling)
+    near, display_white, sampling = NEAR, 1.0, None
+    for words in told.comments:
+        with contextlib.suppress(ValueError):
+            match words:
+                case [word, number] if word == NEAR_WORD:
+                    near = float(number) if 0 < float(number) < NEAR else NEAR
+                case [word, number] if word == WHITE_WORD:
+                    display_white = float(number) if 1 < float(number) < WHITE_MOST else 1.0
+                case [word, least, most] if word == FOCAL_WORD:
+                    sampling = Sampling(float(least), float(most))
+    return _Header(vertices.rows, vertices.row(ORDERS[told.form]), told.start, near, display_white, sampling)

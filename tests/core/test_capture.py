@@ -55,7 +55,7 @@ def test_binary_model_equals_text(tmp_path: Path) -> None:
 
 
 def test_transforms_json_equals_colmap(tmp_path: Path) -> None:
-    ply = b"ply\nformat binary_little_endian 1.0\nelement vertex 2\n" + b"".join(
+    ply = b"ply\nformat binary_little_endian 1.0\nelement vertex 2\ncomment end_header?\n" + b"".join(
         b"property float %c\n" % c for c in b"xyz") + b"".join(
         b"property uchar %s\n" % c for c in (b"red", b"green", b"blue")) + b"end_header\n"
     ply += np.array([1, 2, 3], "<f4").tobytes() + bytes([9, 8, 7]) + np.zeros(3, "<f4").tobytes() + bytes(3)

@@ -232,6 +232,11 @@ TRANSFORMS_CASES: dict[str, tuple[Damage, type[FitFlareError], str]] = {
 for name, ply in {
     "points not PLY": b"solid", "points without end": PLY, "points without z": PLY + b"end_header\n",
     "points of absurd count": PLY.replace(b"9", b"9" * 17) + b"property float y\nproperty float z\nend_header\nxyz",
+    "points of no count": PLY.replace(b"9", b"-9") + b"property float y\nproperty float z\nend_header\n" + bytes(108),
+    "points past 64 bits": PLY.replace(b"9", b"9" * 20) + b"property float y\nproperty float z\nend_header\nxyz",
+    "points of 5000 digits": PLY.replace(b"9", b"9" * 5000) + b"property float y\nproperty float z\nend_header\nxyz",
+    "words past 64 bits": PLY.replace(b"binary_little_endian", b"ascii").replace(b"9", b"9" * 20)
+                          + b"property float y\nproperty float z\nend_header\n1 2 3\n",
     "points cut": PLY + b"property float y\nproperty float z\nend_header\n" + bytes(50),
     "points with lists": PLY + b"property list uchar int y\nproperty float z\nend_header\n" + bytes(50),
     "points not finite": PLY + b"property float y\nproperty float z\nend_header\n" + b"\xff" * 108,

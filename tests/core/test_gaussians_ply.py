@@ -127,6 +127,7 @@ def broken() -> list[tuple[str, bytes, str]]:
         ("cut short", good.encode() + body.tobytes()[:-1], "cut short"),
         ("no body", good.encode(), "cut short"),
         ("huge count", instead("vertex 2", "vertex 99999999999999999999"), "cut short"),
+        ("count of 5000 digits", instead("vertex 2", f"vertex {'9' * 5000}"), "cut short"),
         ("negative count", instead("vertex 2", "vertex -2"), "vertices"),
         ("odd count", instead("vertex 2", "vertex ²"), "vertices"),
         ("ascii", instead("binary_little_endian", "ascii"), "ascii"),

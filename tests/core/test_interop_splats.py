@@ -98,6 +98,17 @@ def test_a_damaged_compressed_file_is_refused(tmp_path: Path, kept: int) -> None
         read_ply(tmp_path / "cut.ply")
 
 
+@pytest.mark.parametrize("head", ["element vertex 1\nproperty uint packed_position\n",
+                                  "property uint packed_position\n",
+                                  f"element chunk {'9' * 20}\nproperty float min_x\n"
+                                  "element vertex 1\nproperty uint packed_position\n"])
+def test_a_compressed_file_whose_header_makes_no_sense_is_refused(tmp_path: Path, head: str) -> None:
+    text = f"ply\nformat binary_little_endian 1.0\n{head}end_header\n"
+    (tmp_path / "odd.ply").write_bytes(text.encode() + bytes(99))
+    with pytest.raises(FlareFileError, match=r"odd\.ply is a damaged compressed PLY"):
+        read_ply(tmp_path / "odd.ply")
+
+
 def gsplat_parts() -> tuple[Any, Any]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # it tells that there is no CUDA here

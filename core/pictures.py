@@ -117,7 +117,9 @@ def read_picture(path: Path | str) -> Picture:
     if not path.is_file():
         raise FrameError(f"{path} is missing.")
     if path.suffix.lower() == ".exr":
-        return Picture(_framed(path, _rec709(path, _rgb_from_channels(path, read_exr(path)))), "linear")
+        header, channels = _read_exr(path)
+        pixels = _rec709(path, _rgb_from_channels(path, channels), header)
+        return Picture(framed(pixels, _window(path, header)), "linear")
     stored = stored_pixels(path)
     if stored.ndim == 2:
         stored = np.repeat(stored[..., None], 3, axis=2)
@@ -235,27 +237,18 @@ class Window:
 
 def window_of(path: Path | str) -> Window:
     """Where a picture's pixels lie on its frame: only EXRs have others than those of the frame. Raises FrameError."""
-    import OpenEXR
-
     path = Path(path)
     size = picture_size(path)
-    if path.suffix.lower() != ".exr":
-        return Window(size, (0, 0), size)
-    try:
-        with OpenEXR.File(str(path), header_only=True) as file:
-            header = file.parts[0].header
-            (low, high), (first, _) = header["dataWindow"], header["displayWindow"]
-            aspect = float(header.get("pixelAspectRatio", 1.0))
-    except Exception as problem:  # the library raises bare RuntimeError and worse for damaged files
-        raise FrameError(f"{path} is damaged or truncated ({problem}); export it again.") from problem
-    stored = _checked(path, (int(high[0]) - int(low[0]) + 1, int(high[1]) - int(low[1]) + 1))
-    return Window(stored, (int(low[0]) - int(first[0]), int(low[1]) - int(first[1])), size,
-                  aspect if 0.1 < aspect < 10 else 1.0)
+    return _window(path, exr_header(path)) if path.suffix.lower() == ".exr" else Window(size, (0, 0), size)
 
 
-def _framed(path: Path, pixels: Pixels) -> Pixels:
-    """The frame of an EXR's pixels (height, width, 3)."""
-    return framed(pixels, window_of(path))
+def _window(path: Path, header: Mapping[str, Any]) -> Window:
+    """Of an EXR, by its header."""
+    stored, frame = (_checked(path, (int(high[0]) - int(low[0]) + 1, int(high[1]) - int(low[1]) + 1))
+                     for low, high in (header["dataWindow"], header["displayWindow"]))
+    (x, y), (left, top) = header["dataWindow"][0], header["displayWindow"][0]
+    aspect = float(header.get("pixelAspectRatio", 1.0))
+    return Window(stored, (int(x) - int(left), int(y) - int(top)), frame, aspect if 0.1 < aspect < 10 else 1.0)
 
 
 def framed(pixels: Pixels, window: Window) -> Pixels:
@@ -300,16 +293,33 @@ def read_exr(path: Path | str) -> dict[str, Pixels]:
 
     Raises FrameError where the file is damaged or holds NaN or infinity.
     """
-    path = Path(path)
+    return _read_exr(Path(path))[1]
+
+
+def _read_exr(path: Path) -> tuple[dict[str, Any], dict[str, Pixels]]:
+    """The first part's header, and what `read_exr` gives."""
     picture_size(path)
+    parts = exr_parts(path)
     channels: dict[str, Pixels] = {}
-    for _header, of_part in exr_parts(path):
+    for _, of_part in parts:
         for name, pixels in of_part.items():
             channels.setdefault(name, np.asarray(pixels, np.float32))
     for name, values in channels.items():
         if not np.isfinite(values).all():
             raise FrameError(f"{path} holds values in channel {name} that are not finite; clean it first.")
-    return channels
+    return parts[0][0], channels
+
+
+def exr_header(path: Path | str) -> dict[str, Any]:
+    """The header of an EXR's first part, as the library has it, attributes that `core.exr` knows nothing of among them.
+    Raises FrameError where the file is damaged."""
+    import OpenEXR
+
+    try:
+        with OpenEXR.File(str(path), header_only=True) as file:
+            return dict(file.parts[0].header)
+    except Exception as problem:  # the library raises bare RuntimeError and worse for damaged files
+        raise FrameError(f"{path} is damaged or truncated ({problem}); export it again.") from problem
 
 
 def exr_parts(path: Path) -> list[tuple[dict[str, Any], dict[str, NDArray[Any]]]]:
@@ -336,15 +346,12 @@ def _rgb_from_channels(path: Path, channels: Mapping[str, Pixels]) -> Pixels:
     raise FrameError(f"{path} has no R, G, B channels at its root (it has {', '.join(sorted(channels))}).")
 
 
-def _rec709(path: Path, pixels: Pixels) -> Pixels:
+def _rec709(path: Path, pixels: Pixels, header: Mapping[str, Any]) -> Pixels:
     """Linear Rec. 709 of an EXR's pixels, by its chromaticities; as they are where it has none."""
-    import OpenEXR
-
     from .colour import space_of_chromaticities
     from .errors import SettingsError
 
-    with OpenEXR.File(str(path), header_only=True) as file:
-        told = file.parts[0].header.get("chromaticities")
+    told = header.get("chromaticities")
     if told is None:
         return pixels
     try:

@@ -15,7 +15,7 @@ from typing import Any
 
 from ..colour import REC_709, Chromaticities
 from ..errors import FrameError
-from ..pictures import read_exr, write_exr
+from ..pictures import exr_header, read_exr, write_exr
 from .layers import FrameLayers, Pixels, layer_names
 
 ATTRIBUTE = "fitFlare"
@@ -40,14 +40,11 @@ def write_layers(path: Path | str, layers: FrameLayers, *, half: bool = True,
 
 def read_description(path: Path | str) -> dict[str, Any]:
     """What `write_layers` noted in the header. Raises FrameError where the file is not one of ours."""
-    import OpenEXR
-
+    text = exr_header(path).get(ATTRIBUTE)
     try:
-        with OpenEXR.File(str(path), header_only=True) as file:
-            text = file.parts[0].header.get(ATTRIBUTE)
         description = json.loads(text) if text else None
-    except Exception as problem:  # the library raises bare RuntimeError and worse for damaged files
-        raise FrameError(f"{path} is damaged or no EXR file ({problem}); bake it again.") from problem
+    except (TypeError, ValueError, RecursionError) as problem:
+        raise FrameError(f"{path} has a damaged header ({problem}); bake it again.") from problem
     if not isinstance(description, dict) or not isinstance(description.get("lights"), dict):
         raise FrameError(f"{path} holds no layers of Fit Flare; choose a file that `bake` has written.")
     return description

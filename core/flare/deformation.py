@@ -14,9 +14,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from ..look.network import BANDS, CAMERA_BITS, CAMERA_GROWTH, LIGHT_BITS, LIGHT_GROWTH
 from .encoding import HashGrid, frequency_encoding
-
-BANDS = 3
 
 
 @dataclass(frozen=True)
@@ -63,8 +62,8 @@ class DeformationNetwork(nn.Module):
     def __init__(self, heads: Mapping[str, int], query_range: QueryRange, *, positions: int = 1, latent: int = 0,
                  width: int = 128, hidden: int = 3, levels: int = 16, base: int = 16) -> None:
         super().__init__()
-        self.light_grid = HashGrid(17, 1.8, levels, base=base)
-        self.camera_grid = HashGrid(15, 1.6, levels, base=base)
+        self.light_grid = HashGrid(LIGHT_BITS, LIGHT_GROWTH, levels, base=base)
+        self.camera_grid = HashGrid(CAMERA_BITS, CAMERA_GROWTH, levels, base=base)
         view = 2 * 2 * levels
         self.view_layer = nn.Linear(view, width)
         self.gaussian_layer = nn.Linear(2 * BANDS * positions + latent, width, bias=False)

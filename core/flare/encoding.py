@@ -12,8 +12,7 @@ import math
 import torch
 from torch import Tensor, nn
 
-# Instant-NGP's spatial hash (Müller et al. 2022, eq. 4).
-_PRIMES = (1, 2654435761, 805459861)
+from ..look.network import CORNERS, PRIMES
 
 
 class HashGrid(nn.Module):
@@ -46,9 +45,8 @@ class HashGrid(nn.Module):
         constant("_resolutions", resolutions)
         constant("_starts", starts)
         constant("_rows", rows)
-        constant("_primes", list(_PRIMES))
-        corners = [[(corner >> axis) & 1 for axis in range(3)] for corner in range(8)]
-        self.register_buffer("_corners", torch.tensor(corners, dtype=torch.int64), persistent=False)
+        constant("_primes", PRIMES.tolist())
+        self.register_buffer("_corners", torch.from_numpy(CORNERS.copy()), persistent=False)
 
     def forward(self, point: Tensor) -> Tensor:
         indices, weights = self._cell(point.detach())

@@ -18,25 +18,14 @@ from torch import Tensor
 
 from .. import tensors as on_disk
 from ..errors import FlareFileError
-from ..look.look import VERSION, checked
+from ..look.look import KEY, VERSION, TrainedCamera, checked
 from ..sampling import Sampling
 from .compositing import Blend
 from .deformation import QueryRange
 from .model import FlareForm, FlareModel, LightFlare
 
-_KEY = "fit_flare"
-
-
-@dataclass(frozen=True)
-class TrainingCamera:
-    """Intrinsics of the footage, pixels; the plane's coordinates are (pixel - centre) / focal length."""
-
-    width: int
-    height: int
-    fx: float
-    fy: float
-    cx: float
-    cy: float
+TrainingCamera = TrainedCamera
+"""One definition, for this file and for what reads it without torch."""
 
 
 @dataclass
@@ -70,7 +59,7 @@ def save(path: Path | str, flare: FlareFile) -> None:
                    "elements": flare.elements, "seen": flare.seen, "licence": flare.licence, "notes": flare.notes}
     if flare.sampling is not None:
         description["sampling"] = asdict(flare.sampling)
-    on_disk.write(path, _packed(flare.model), {_KEY: json.dumps(description)})
+    on_disk.write(path, _packed(flare.model), {KEY: json.dumps(description)})
 
 
 def load(path: Path | str) -> FlareFile:

@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from ..files import rounded
 from ..gaussians.spherical_harmonics import colours
 from ..look.look import Form
+from ..look.plane import PLANE_DEPTH
 from . import placement
 from .deformation import DeformationNetwork, QueryRange
 from .placement import PlaneGaussians
@@ -145,7 +146,7 @@ def _canonical(form: FlareForm, count: int, opacity: float, generator: torch.Gen
     share = torch.rand(count, 1, generator=generator)
     size = _log_between(*SIZES, share)
     if form.solid:
-        log_scales = (size + math.log(placement.PLANE_DEPTH)).repeat(1, 3)
+        log_scales = (size + math.log(PLANE_DEPTH)).repeat(1, 3)
         rotations = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1)
     else:
         log_scales, rotations = size.repeat(1, 2), torch.tensor([1.0, 0.0]).repeat(count, 1)

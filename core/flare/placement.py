@@ -15,12 +15,8 @@ from torch import Tensor
 from torch.nn import functional
 
 from ..gaussians.rendering import STRENGTH2_MIN
+from ..look.plane import ARC_SOFT, PLANE_DEPTH
 from ..sampling import Sampling, dilation
-
-PLANE_DEPTH = 0.21  # just past 3DGS's near plane of 0.2 (paper, appendix)
-
-ARC_SOFT = 0.1
-"""Strength of an arc at which its opacity begins to be that of the brightest place; see `opacity_gain`."""
 
 
 class PlaneGaussians(NamedTuple):

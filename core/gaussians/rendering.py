@@ -8,15 +8,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-ALPHA_MIN = 1 / 255
-"""Blended contributions fainter than this are skipped, as in 3DGS."""
-OPACITY_MAX = 0.99
-"""Opacity is clamped here before blending, so that no Gaussian hides all behind it (and 1 - alpha > 0)."""
+from ..splatting import ALPHA_MIN as ALPHA_MIN
+from ..splatting import OPACITY_MAX as OPACITY_MAX
+from ..splatting import PROFILE_MIN as PROFILE_MIN
+
 TRANSMITTANCE_MIN = 1e-4
 """A pixel is finished once its transmittance has fallen below this: later Gaussians do not count."""
-PROFILE_MIN = 1 / 4096
-"""Added contributions are skipped where the profile is below this share of its own peak. Relative to
-the peak, so that the extent of a Gaussian (4.08 sigma) depends on neither its opacity nor its colour."""
 STRENGTH2_MIN = 1e-16
 """Arcs whose squared strength is below this have no direction, nor a gradient by it."""
 NEAR = 0.2

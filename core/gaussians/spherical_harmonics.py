@@ -10,12 +10,9 @@ import torch
 from torch import Tensor
 
 from ..errors import SettingsError
+from ..splatting import C0, C1, C2, C3
 
 MAX_DEGREE = 3
-C0 = 0.28209479177387814  # 1 / (2 sqrt(pi))
-C1 = 0.4886025119029199  # sqrt(3) / (2 sqrt(pi))
-C2 = (1.0925484305920792, 0.31539156525252005, 0.5462742152960396)
-C3 = (0.5900435899266435, 2.890611442640554, 0.4570457994644658, 0.3731763325901154, 1.445305721320277)
 
 
 def degree_of(coefficients: int) -> int:

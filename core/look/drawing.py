@@ -13,11 +13,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..sampling import Sampling
+from ..splatting import ALPHA_MIN, PROFILE_MIN
+from ..splatting import OPACITY_MAX as OPACITY_MAX
 from .plane import Floats, PlaneGaussians, arc_level, joined, pixels, strengths, ways
-
-PROFILE_MIN = 1 / 4096  # added light below this share of its peak is left out (core/gaussians/rendering.py)
-ALPHA_MIN = 1 / 255
-OPACITY_MAX = 0.99
 
 
 def reach(gaussians: PlaneGaussians, blend: str = "add") -> Floats:

@@ -30,7 +30,8 @@ from .plane import (
 )
 
 VERSION = 1
-_KEY = "fit_flare"
+KEY = "fit_flare"
+"""Of the description in a .flare's metadata."""
 MOST_GAUSSIANS = 1_000_000
 """Of a light; a file that claims more is damaged or hostile."""
 FORM_BOUNDS = {"sh_degree": Bounds(0, 3), "latent": Bounds(0, 64), "levels": Bounds(1, 16), "base": Bounds(1, 256)}
@@ -82,7 +83,7 @@ class Form:
 
 @dataclass(frozen=True)
 class TrainedCamera:
-    """Intrinsics of the footage, pixels."""
+    """Intrinsics of the footage, pixels; the plane's coordinates are (pixel - centre) / focal length."""
 
     width: int
     height: int
@@ -279,21 +280,21 @@ def list_elements(path: Path | str) -> None:
     _, metadata = container.read_tensors(path)
     listed = [element.entry(light.name) for light in look.lights for element in light.elements]
     description = {**_described(Path(path), metadata), "elements": listed}
-    container.rewritten(path, path, {**metadata, _KEY: json.dumps(description)})
+    container.rewritten(path, path, {**metadata, KEY: json.dumps(description)})
 
 
 def annotated(source: Path | str, target: Path | str, *, notes: str, licence: str) -> None:
     """A copy of a .flare with other notes and licence. Raises FlareFileError where `source` is not a flare."""
     _, metadata = container.read_tensors(source)
     description = {**_described(Path(source), metadata), "notes": notes, "licence": licence}
-    container.rewritten(source, target, {**metadata, _KEY: json.dumps(description)})
+    container.rewritten(source, target, {**metadata, KEY: json.dumps(description)})
 
 
 def _described(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
-    if _KEY not in metadata:
+    if KEY not in metadata:
         raise FlareFileError(f"{path} is a safetensors file, but not a flare; choose another.")
     try:
-        description = json.loads(metadata[_KEY])
+        description = json.loads(metadata[KEY])
     except (ValueError, RecursionError) as problem:
         raise FlareFileError(f"{path} is damaged or not a flare ({problem}); save it again.") from problem
     version = description.get("version") if isinstance(description, dict) else None

@@ -17,9 +17,13 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float32]
 
 BANDS = 3
+"""Octaves of the frequency encoding of canonical positions."""
 LIGHT_BITS, LIGHT_GROWTH, CAMERA_BITS, CAMERA_GROWTH = 17, 1.8, 15, 1.6
-_PRIMES = np.array([1, 2654435761, 805459861], np.int64)  # Müller et al. 2022, eq. 4
-_CORNERS = np.array([[(corner >> axis) & 1 for axis in range(3)] for corner in range(8)], np.int64)
+"""Of the two hash grids: log2 of the rows of a level's table, and the growth of resolution from level to level."""
+PRIMES = np.array([1, 2654435761, 805459861], np.int64)
+"""Of the spatial hash (Müller et al. 2022, eq. 4)."""
+CORNERS = np.array([[(corner >> axis) & 1 for axis in range(3)] for corner in range(8)], np.int64)
+"""Of a cell, (8, 3)."""
 
 
 class HashGrid:
@@ -43,11 +47,11 @@ class HashGrid:
         scaled = (np.clip(point, 0, 1).astype(np.float32)[None] * resolutions.astype(np.float32))
         low = np.minimum(np.floor(scaled), resolutions.astype(np.float32) - 1)
         fraction = (scaled - low)[:, None]
-        corner = low.astype(np.int64)[:, None] + _CORNERS
-        weights = np.where(_CORNERS.astype(bool), fraction, 1 - fraction).prod(-1)
+        corner = low.astype(np.int64)[:, None] + CORNERS
+        weights = np.where(CORNERS.astype(bool), fraction, 1 - fraction).prod(-1)
         side = resolutions + 1
         dense = corner[..., 0] + side * (corner[..., 1] + side * corner[..., 2])
-        mixed = corner * _PRIMES
+        mixed = corner * PRIMES
         hashed = (mixed[..., 0] ^ mixed[..., 1] ^ mixed[..., 2]) % self._sizes[:, None]
         rows = np.where(side**3 <= self._sizes[:, None], dense, hashed) + self._starts[:, None]
         return np.asarray((self._row_values(rows) * weights[..., None]).sum(1).reshape(-1), np.float32)

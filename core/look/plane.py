@@ -16,16 +16,14 @@ from numpy.typing import ArrayLike, NDArray
 from ..exposures import brightness
 from ..pictures import LUMINANCE
 from ..sampling import Sampling, dilation
+from ..splatting import C0, C1, C2, C3
 
 Floats = NDArray[np.float32]
 
-PLANE_DEPTH = 0.21  # where solid Gaussians lie (core/flare/placement.py)
-ARC_SOFT = 0.1  # strength of an arc at which its opacity begins to be that of the brightest place
-
-C0 = 0.28209479177387814  # spherical harmonics with the signs and order of 3DGS
-C1 = 0.4886025119029199
-C2 = (1.0925484305920792, 0.31539156525252005, 0.5462742152960396)
-C3 = (0.5900435899266435, 2.890611442640554, 0.4570457994644658, 0.3731763325901154, 1.445305721320277)
+PLANE_DEPTH = 0.21
+"""Where solid Gaussians lie: just past 3DGS's near plane of 0.2 (paper, appendix)."""
+ARC_SOFT = 0.1
+"""Strength of an arc at which its opacity begins to be that of the brightest place; see `opacity_gain`."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,11 +19,11 @@ from ..gaussians.spherical_harmonics import dc_from_colour
 from ..look import Look, LookEdits, PlaneGaussians, ViewOfLight
 from ..look.plane import PLANE_DEPTH, joined
 from ..sampling import DILATION, Sampling, dilation
+from ..splatting import OPACITY_MAX
 
 PRESET_VERSION = 1
 _APART = 1e-5  # share of the depth between one Gaussian and the next, so that a sort by depth keeps their order
 _FLAT = 1e-4  # thickness along the axis, share of the depth: next to nothing in any view near the camera's
-_MOST_OPAQUE = 0.99
 
 
 def flare_scene(
@@ -53,8 +53,8 @@ def flare_scene(
     turned[:, 2, 2] = np.linalg.det(axes)  # a rotation, not a mirror image
     quaternions = np.array([quaternion_from_rotation(to_world @ one) for one in turned]).reshape(n, 4)
     # More opaque than 3DGS allows: the rest of the light goes into the colour.
-    gain = np.maximum(whole.opacities / _MOST_OPAQUE, 1)
-    opacities = np.clip(whole.opacities / gain, 1e-6, _MOST_OPAQUE)
+    gain = np.maximum(whole.opacities / OPACITY_MAX, 1)
+    opacities = np.clip(whole.opacities / gain, 1e-6, OPACITY_MAX)
     sh = torch.zeros(n, COEFFICIENTS, 3)
     sh[:, 0] = dc_from_colour(torch.from_numpy(np.asarray(whole.colours * gain[:, None], np.float32)))
 

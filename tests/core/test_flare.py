@@ -26,6 +26,7 @@ from core.flare.model import OURS, PAPER, FlareForm, FlareModel, LightFlare, Vie
 from core.gaussians import Splats, rasterization
 from core.gaussians.optimiser import Adam
 from core.gaussians.rendering import arc_strengths
+from core.look.plane import PLANE_DEPTH
 from core.sampling import Sampling
 from tests.core.flared import cameras
 
@@ -87,7 +88,7 @@ def test_solid_gaussians_project_as_the_rasterizer_projects_them() -> None:
     flat = placement.PlaneGaussians(means, placement.covariance_of_solid(means, log_scales, quaternions),
                                     opacities, colours)
     splats = splat_flare(flat, intrinsics, 40, 36, "over", kernels="torch")
-    solid = torch.cat([means, torch.ones(n, 1)], 1) * placement.PLANE_DEPTH
+    solid = torch.cat([means, torch.ones(n, 1)], 1) * PLANE_DEPTH
     sh = ((colours - 0.5) / 0.28209479177387814)[:, None]
     # All lie at one depth: nudged apart so that the order of the list is the order of depth.
     solid[:, 2] += torch.arange(n) * 1e-6

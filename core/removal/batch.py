@@ -13,7 +13,7 @@ from ..pictures import pictures_below, window_of
 from ..progress import Progress
 from .inference import Remover
 from .mattes import Mattes
-from .plates import write_flare, write_plate
+from .plates import write_results
 from .record import RECORD, Record, made_from
 from .steady import Sequences, shot_order
 
@@ -105,6 +105,4 @@ def _remove(path: Path, name: Path, results: Sequence[Path], remover: Remover, s
     """results: the clean plate's path, and the flare's where it is wanted."""
     plate, told = sequences.read(path)
     codes, flare = remover.remove(plate, mattes.read(name, window_of(path)) if mattes else None, told)
-    write_plate(results[0], plate, codes)
-    for result in results[1:]:
-        write_flare(result, plate, flare)
+    write_results(results, plate, codes, flare)

@@ -27,7 +27,7 @@ from ..metrics.evaluation import Renderer
 from ..pictures import linear_from_srgb, srgb_from_linear, window_of
 from ..progress import Progress
 from .inference import CLIPPED
-from .plates import Plate, finite, read_plate, write_flare, write_plate
+from .plates import Plate, finite, read_plate, write_results
 from .record import Record, made_from
 
 Pixels = NDArray[np.float32]
@@ -116,9 +116,7 @@ def _remove(fitted: Renderer, capture: Capture, view: View, results: Sequence[Pa
         clean = without(plate, flare, scene, lights)
     else:
         clean = without(plate, np.where(lights[..., None], 0, flare), scene)
-    write_plate(results[0], plate, clean)
-    for result in results[1:]:
-        write_flare(result, plate, flare)
+    write_results(results, plate, clean, flare)
     return parts
 
 
@@ -156,7 +154,8 @@ def _least_squares(product: Floats, goal: Floats, begin: Floats, low: Floats, hi
 
 
 def _light(plate: Plate) -> Pixels:
-    """Linear light of the codes."""
+    """Linear light of the codes by sRGB's curve, which is that of a fit's layers; the network's has its own
+    (`inference.GAMMA`)."""
     if plate.encoding == "srgb":
         return linear_from_srgb(_display(plate))
     return finite(plate.codes)
@@ -165,7 +164,7 @@ def _light(plate: Plate) -> Pixels:
 def _display(plate: Plate) -> Pixels:
     """Display values of the codes, 0..1."""
     if plate.encoding == "srgb":
-        return plate.codes.astype(np.float32) / np.float32(plate.top)
+        return plate.values
     return srgb_from_linear(np.clip(np.nan_to_num(plate.codes.astype(np.float32)), 0, 1))
 
 

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from ..errors import SettingsError
 from ..pictures import Encoding, linear_from_srgb
+from . import formation
 from .network import MULTIPLE, RemovalNetwork
 from .plates import Plate, finite
 from .weights import IN_THE_BOX, load
@@ -208,7 +209,7 @@ def _reduced(codes: NDArray[Any], encoding: Encoding, top: float, width: int, he
 
 
 def _light(codes: NDArray[Any], encoding: Encoding, top: float) -> Pixels:
-    """Linear light."""
+    """Linear light as `GAMMA` has it, which is that of the network's layers; a fit's are by sRGB's curve (`fitted`)."""
     if encoding == "srgb":
         if codes.dtype == np.uint8:
             return _TABLE[codes]
@@ -217,9 +218,9 @@ def _light(codes: NDArray[Any], encoding: Encoding, top: float) -> Pixels:
 
 
 def _display(light: Pixels) -> Pixels:
-    """What the network was trained on: light to the power of 1 / GAMMA, for files of either encoding, since the
-    sum of scene and flare is one of light as `GAMMA` has it."""
-    return np.power(np.clip(light, 0, 1), np.float32(1 / GAMMA)).astype(np.float32)
+    """What the network was trained on, for files of either encoding, since the sum of scene and flare is one of light
+    as `GAMMA` has it."""
+    return formation.display(light, GAMMA)
 
 
 _TABLE = np.power(np.arange(256, dtype=np.float32) / 255, np.float32(GAMMA)).astype(np.float32)

@@ -11,7 +11,7 @@ import io
 import shutil
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -65,6 +65,11 @@ class Plate:
     def top(self) -> float:
         """The code that means 1."""
         return float(np.iinfo(self.codes.dtype).max) if self.codes.dtype.kind == "u" else 1.0
+
+    @property
+    def values(self) -> NDArray[np.float32]:
+        """(height, width, 3) in its own space, codes as 0..1."""
+        return self.codes.astype(np.float32) / np.float32(self.top)
 
     def shown(self, light: NDArray[np.float32]) -> NDArray[np.float32]:
         """What of linear light (height, width, 3) such a plate shows: all of it, or its luminance where it is grey."""
@@ -192,6 +197,13 @@ def write_plate(path: Path | str, plate: Plate, codes: NDArray[Any]) -> None:
 def write_flare(path: Path | str, plate: Plate, flare: NDArray[Any]) -> None:
     """Write what was taken from a plate, light (height, width, 3) in its colours, as an EXR that lies where it does."""
     write_exr(path, {name: flare[..., k] for k, name in enumerate("RGB")}, header=plate.placing)
+
+
+def write_results(results: Sequence[Path], plate: Plate, codes: NDArray[Any], flare: NDArray[Any]) -> None:
+    """Write the clean plate, and the flare where the results have a path for it too."""
+    write_plate(results[0], plate, codes)
+    for result in results[1:]:
+        write_flare(result, plate, flare)
 
 
 def _tagged(encoded: bytes, suffix: str, plate: Plate) -> bytes:

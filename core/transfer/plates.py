@@ -44,7 +44,7 @@ class ColouredPlate:
     @property
     def values(self) -> Pixels:
         """(height, width, 3) in its own space, codes as 0..1."""
-        return self.plate.codes.astype(np.float32) / np.float32(self.plate.top)
+        return self.plate.values
 
     @property
     def linear(self) -> Pixels:

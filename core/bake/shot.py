@@ -19,7 +19,7 @@ from ..capture.camera import Camera
 from ..fit.rendering import render_scene, splat_look
 from ..fit.run import Run
 from ..flare.compositing import layers as linear_layers
-from ..flare.visibility import of_clear, visible_share
+from ..flare.visibility import share_seen
 from ..look import LookEdits, read
 from ..look.shot import PlacedLight, Shot, ShotFrame, evaluate
 from ..progress import Progress
@@ -68,17 +68,14 @@ class ShotRenderer:
                         depth.detach().numpy())
 
     def _behind_the_scene(self, light: PlacedLight, camera: Camera) -> PlacedLight:
-        """The light with what the fitted scene hides of it."""
-        import torch
-
+        """The light with what the fitted scene hides of it: the very share that the flare was fitted with. Over any
+        other scene a share near none or the whole says nothing (`core.transfer.transfer.SURE`); here the flare has
+        learned what a few hundredths of a light show."""
         settings = self.run.settings.flare.occluded_by_scene if self.run is not None else None
         if self.run is None or settings is None:
             return light
-        with torch.no_grad():
-            share = visible_share(self.run.scene, torch.from_numpy(camera.position), torch.from_numpy(light.xyz),
-                                  settings)
-        return PlacedLight(light.name, light.source, light.xyz,
-                           light.share * float(of_clear(share, self._clear.get(light.source, 1.0))))
+        seen = share_seen(self.run.scene, camera.position, light.xyz, settings, self._clear.get(light.source, 1.0))
+        return PlacedLight(light.name, light.source, light.xyz, light.share * seen)
 
 
 @dataclass(frozen=True)

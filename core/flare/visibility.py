@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from ..gaussians import rasterization
@@ -51,6 +52,14 @@ def visible_shares(scene: SceneGaussians, model: FlareModel, world_to_camera: Te
 def of_clear(share: Tensor, clear: Tensor | float) -> Tensor:
     """A visible share as part of what the scene leaves of the light where nothing hides it; see `FlareModel.clear`."""
     return (share / clear).clamp(max=1) if clear > 0 else torch.ones(())
+
+
+@torch.no_grad()
+def share_seen(scene: SceneGaussians, camera: NDArray[np.float64], light: NDArray[np.float64],
+               settings: VisibilitySettings, clear: float = 1.0) -> float:
+    """The visible share, 0..1, of a light at `light` (3,) from a camera at `camera` (3,), world units, as part of
+    `clear` (`FlareModel.clear`), which is 1 where the scene is not the one that the light was fitted with."""
+    return float(of_clear(visible_share(scene, torch.from_numpy(camera), torch.from_numpy(light), settings), clear))
 
 
 @torch.no_grad()

@@ -27,7 +27,7 @@ from ..files import check_apart, remove_partial_of
 from ..fit.rendering import render_scene, splat_look
 from ..flare.compositing import decode, encode
 from ..flare.compositing import layers as linear_layers
-from ..flare.visibility import VisibilitySettings, of_clear, visible_share
+from ..flare.visibility import VisibilitySettings, share_seen
 from ..gaussians import Splats
 from ..look import LookEdits, ViewOfLight, read
 from ..look.shot import PlacedLight
@@ -42,7 +42,8 @@ from .visibility import smoothed
 Pixels = NDArray[np.float32]
 
 SURE = 0.02
-"""Splats never hide all of a light, nor show all of it: a share so near to none or the whole is taken for that."""
+"""Splats never hide all of a light, nor show all of it: a share so near to none or the whole is taken for that. Not so
+in a bake (`core.bake.shot`), whose flare was fitted with the scene's shares as they are; here the scene is any."""
 
 FRAMES = "frames"
 """Folder of the plates with their flares, beside the layers."""
@@ -138,12 +139,10 @@ class Transfer:
             placed = next((one for one in shot.lights if one.name == light), None)
             share = placed.share if placed is not None else 0.0
             if placed is not None and share > 0 and self.target.scene is not None:
-                with torch.no_grad():
-                    seen = float(visible_share(self.target.scene, torch.from_numpy(shot.camera.position),
-                                               torch.from_numpy(placed.xyz), self.settings.visibility))
                 source = self.sources[placed.source]
-                if np.allclose(placed.xyz, source.xyz, rtol=1e-6, atol=1e-9):  # the splats it was learned in
-                    seen = float(of_clear(torch.tensor(seen), source.clear))
+                own = np.allclose(placed.xyz, source.xyz, rtol=1e-6, atol=1e-9)  # the splats it was learned in
+                seen = share_seen(self.target.scene, shot.camera.position, placed.xyz, self.settings.visibility,
+                                  source.clear if own else 1.0)
                 share *= min(max((seen - SURE) / (1 - 2 * SURE), 0.0), 1.0)
             self._shares[key] = share
         return self._shares[key]

@@ -29,15 +29,12 @@ class KnownScene(Trainer):
         targets = self.frames.targets(self._view())
         if targets.removed is None:
             raise CaptureError(f"{self.capture.folder} has no flare-free frames; the exact scene must be known.")
-        self._set_rates()
+        self.optimisers.set_rates(self.iteration)
         flare = render_flare(self.flare, settings.blend, targets.camera, settings.kernels)
         loss = l1_ssim(composite(targets.removed, flare, settings.blend), targets.frame, 1 - settings.ssim_share)
         if loss.requires_grad:
             loss.backward()
-        for optimiser in (self.flare_adam, self.grid_adam):
-            if optimiser is not None:
-                optimiser.step()
-                optimiser.zero_grad()
+        self.optimisers.step(scene=False)
         self._change_flare_density()
         return {"loss": float(loss.detach())}
 

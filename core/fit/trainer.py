@@ -24,11 +24,9 @@ from ..capture.discs import clipped_discs
 from ..errors import CaptureError, RunError
 from ..flare.compositing import clipped, composite
 from ..flare.density import clone_and_prune
-from ..flare.model import FlareModel
 from ..flare.visibility import clear_shares, uncovering
 from ..gaussians.densification import Classic, Mcmc, Strategy
 from ..gaussians.loss import l1_ssim
-from ..gaussians.optimiser import Adam
 from ..gaussians.ordering import morton_order
 from ..progress import Progress
 from . import metering
@@ -36,20 +34,17 @@ from .beginning import first_flare, first_scene, moved_lights
 from .checkpoint import State
 from .doubts import doubts
 from .frames import Frames, Targets, thinned
+from .optimisers import Optimisers
 from .rendering import render_flare, render_scene
 from .settings import FitSettings
 from .splitting import HeadStart, from_below, is_found, scene_beside_flare
 
-TABLE = "table.weight"
 CLEAR_EVERY = 50
 """Iterations between two looks at how much of the lights the scene leaves (`visibility.clear_shares`)."""
 UNTOLD = 0.01
 """Difference of display values between frame and flare-free frame below which nothing is told of a flare."""
 SAME_PLACE = 1e-5
 """Share of the extent within which a light that was given is where it was."""
-RATE_ABOVE_WHITE = 3.0
-"""Times the rate of a scene's colours where frames go on above white: theirs is a longer way. Lamps of 32 times white
-end a sixth off instead of three fifths (`desk`, preset draft)."""
 ASKED = 40
 """About as many views are asked there, and for whether a scene has been found (`splitting.is_found`)."""
 
@@ -88,10 +83,8 @@ class Trainer:
                      *(() if self.flare is None else moved_lights(capture, self.flare)))
         self.extent = capture.extent
         self._head_start = HeadStart(settings.split, len(self.views), settings.iterations)
-        self.scene_adam = Adam(dict(self.scene.named_parameters()), self._scene_rates())
+        self.optimisers = Optimisers(self.scene, self.flare, settings, self.extent, self.frames.display_white)
         self.strategy = self._strategy()
-        self.flare_adam, self.grid_adam = _flare_optimisers(self.flare, settings)
-        self._flare_rates = dict(self.flare_adam.rates) if self.flare_adam else {}
 
     # ---- one iteration ----------------------------------------------------------------------------
 
@@ -101,7 +94,7 @@ class Trainer:
         settings = self.settings
         view = self._view()
         targets = self.frames.targets(view)
-        self._set_rates()
+        self.optimisers.set_rates(self.iteration)
         scene = render_scene(self.scene, targets.camera, settings.kernels, sh_degree=self._sh_degree(), depth=False)
         shown = self._as_filmed(scene.colour)
         self._look_for_lights()
@@ -137,14 +130,11 @@ class Trainer:
         if covered is not None:
             loss = loss + covered
         if loss.requires_grad:  # a frozen scene without a light in front of the camera teaches nothing
-            with self.scene_adam.stepping() if self._rendered_once else nullcontext():
+            with self.optimisers.scene.stepping() if self._rendered_once else nullcontext():
                 loss.backward()
         if self.scene_is_fitted:
             self.strategy.observe(scene)
-        for optimiser in (self.scene_adam if self.scene_is_fitted else None, self.flare_adam, self.grid_adam):
-            if optimiser is not None:
-                optimiser.step()
-                optimiser.zero_grad()
+        self.optimisers.step(scene=self.scene_is_fitted)
         if self.scene_is_fitted:
             self.strategy.update(self.iteration)
             self._keep_neighbours_together()
@@ -272,53 +262,28 @@ class Trainer:
         mixed = (self.settings.seed * 1_000_003 + purpose) * 1_000_003 + number
         return torch.Generator().manual_seed(mixed % (1 << 62))
 
-    # ---- rates and density ------------------------------------------------------------------------
+    # ---- density ----------------------------------------------------------------------------------
 
     def _strategy(self) -> Strategy:
-        settings, generator = self.settings.scene, self._generator(0, 0)
+        settings, adam, generator = self.settings.scene, self.optimisers.scene, self._generator(0, 0)
         if settings.strategy == "mcmc":
-            return Mcmc(self.scene, self.scene_adam, generator, settings.mcmc)
-        return Classic(self.scene, self.scene_adam, self.extent, generator, settings.classic)
+            return Mcmc(self.scene, adam, generator, settings.mcmc)
+        return Classic(self.scene, adam, self.extent, generator, settings.classic)
 
     def _keep_neighbours_together(self) -> None:
         if self.iteration % self.settings.scene.reorder_every == 0:
             order = morton_order(self.scene.means.detach())
-            self.scene_adam.keep(order)
+            self.optimisers.scene.keep(order)
             self.strategy.reorder(order)
-
-    def _scene_rates(self) -> dict[str, float | Tensor]:
-        rates = self.settings.scene.rates
-        features = torch.full((16, 1), rates.features_rest)
-        features[0] = rates.features * (RATE_ABOVE_WHITE if self.frames.display_white > 1 else 1)
-        progress = self.iteration / self.settings.iterations
-        return {
-            "means": _decayed(rates.position, rates.position_final, progress) * self.extent,
-            "log_scales": rates.scale,
-            "quaternions": rates.rotation,
-            "opacity_logits": rates.opacity,
-            "sh": features.expand(16, 3).contiguous(),
-        }
-
-    def _set_rates(self) -> None:
-        self.scene_adam.rates["means"] = self._scene_rates()["means"]
-        if self.flare_adam is None or self.grid_adam is None:
-            return
-        rates, progress = self.settings.flare.rates, self.iteration / self.settings.iterations
-        settled = _decayed(1.0, rates.settled, 2 * progress - 1)
-        for name, rate in self._flare_rates.items():
-            position = name.endswith("gaussians.positions")
-            now = _decayed(rates.position, rates.position_final, progress) if position else rate * settled
-            self.flare_adam.rates[name] = now
-        for group in self.grid_adam.param_groups:
-            group["lr"] = rates.grids * settled
 
     def _change_flare_density(self) -> None:
         settings = self.settings.flare.density
-        if self.flare is None or self.flare_adam is None or not settings.due(self.iteration):
+        adam = self.optimisers.flare
+        if self.flare is None or adam is None or not settings.due(self.iteration):
             return
         for number, light in enumerate(self.flare.lights):
             names = {name: f"{number}.gaussians.{name}" for name in light.gaussians}
-            clone_and_prune(light, self.flare_adam, names, settings, self._generator(self.iteration, 2 + number))
+            clone_and_prune(light, adam, names, settings, self._generator(self.iteration, 2 + number))
 
     def check_finite(self) -> None:
         """Raise RunError where a parameter has become NaN or infinite: rasterizers skip those and hide them."""
@@ -335,13 +300,11 @@ class Trainer:
         """All that a resumed fit needs, as `checkpoint.save` takes it."""
         state: State = {"iteration": self.iteration, "alone_until": self._head_start.until,
                         "losses": [[name, loss] for name, loss in self.losses.items()],
-                        "scene": dict(self.scene.state_dict()),
-                        "scene_adam": self.scene_adam.state_dict(), "strategy": self.strategy.state_dict()}
-        if self.flare is not None and self.flare_adam is not None and self.grid_adam is not None:
+                        "scene": dict(self.scene.state_dict()), "strategy": self.strategy.state_dict(),
+                        **self.optimisers.state()}
+        if self.flare is not None:
             state["lights"] = self._given_lights()
             state["flare"] = dict(self.flare.state_dict())
-            state["flare_adam"] = self.flare_adam.state_dict()
-            state["grid_adam"] = {str(key): dict(value) for key, value in self.grid_adam.state_dict()["state"].items()}
         return state
 
     def load_state(self, state: State) -> None:
@@ -351,17 +314,13 @@ class Trainer:
             self.iteration, self._head_start.until = int(state["iteration"]), int(state["alone_until"])
             self.losses = {name: float(loss) for name, loss in state.get("losses", [])}
             _load_parameters(dict(self.scene.named_parameters()), state["scene"])
-            self.scene_adam.load_state_dict(state["scene_adam"])
-            self.strategy.load_state_dict(state["strategy"])
-            if self.flare is not None and self.flare_adam is not None and self.grid_adam is not None:
+            if self.flare is not None:
                 self._check_lights(state)
                 _load_parameters(dict(self.flare.named_parameters()), state["flare"])
                 self.flare.positions.copy_(state["flare"]["positions"])
                 self.flare.clear.copy_(state["flare"]["clear"])
-                self.flare_adam.load_state_dict(state["flare_adam"])
-                groups = self.grid_adam.state_dict()["param_groups"]
-                moments = {int(key): value for key, value in state.get("grid_adam", {}).items()}
-                self.grid_adam.load_state_dict({"state": moments, "param_groups": groups})
+            self.optimisers.load_state(state)
+            self.strategy.load_state_dict(state["strategy"])
         except (KeyError, RuntimeError, TypeError, ValueError) as problem:
             raise RunError(f"The checkpoint does not fit this fit ({problem}); start it anew.") from problem
 
@@ -394,33 +353,3 @@ def _difference(begun: list[Any], given: list[Any], apart: float) -> str:
     return next((f"{name!r} was at {old}, and is at {new} now"
                  for (name, old), (_, new) in zip(begun, given, strict=True)
                  if not np.allclose(old, new, rtol=1e-6, atol=apart)), "")
-
-
-def _decayed(first: float, last: float, progress: float) -> float:
-    """Exponential decay from `first` to `last` as progress goes from 0 to 1."""
-    return first * (last / first) ** min(max(progress, 0.0), 1.0)
-
-
-def _flare_optimisers(flare: FlareModel | None, settings: FitSettings) -> tuple[Adam | None, Any]:
-    """Adam for networks and Gaussians; for the grids one that updates only the rows that a view touched."""
-    if flare is None:
-        return None, None
-    rates = settings.flare.rates
-    of_gaussians = {
-        "positions": rates.position, "log_scales": rates.scale, "rotations": rates.rotation,
-        "opacity_logits": rates.opacity, "sh": rates.features, "offsets": rates.offset, "rings": rates.ring,
-        "arcs": rates.arc, "latent": rates.latent,
-    }
-    dense: dict[str, Parameter] = {}
-    tables: list[Parameter] = []
-    chosen: dict[str, float | Tensor] = {}
-    for name, parameter in flare.flares.named_parameters():
-        if name.endswith(TABLE):
-            tables.append(parameter)
-            continue
-        dense[name] = parameter
-        last = name.rsplit(".", 1)[1]
-        chosen[name] = of_gaussians[last] if ".gaussians." in name else rates.network
-    return Adam(dense, chosen), torch.optim.SparseAdam(tables, lr=rates.grids)
-
-

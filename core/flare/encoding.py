@@ -14,6 +14,9 @@ from torch import Tensor, nn
 
 from ..look.network import CORNERS, PRIMES
 
+TABLE = "table.weight"
+"""End of the name of a grid's table among a model's parameters."""
+
 
 class HashGrid(nn.Module):
     """Multiresolution hash grid over the unit cube (Müller et al. 2022, section 3).

@@ -22,6 +22,7 @@ from ..look.look import KEY, VERSION, TrainedCamera, checked
 from ..sampling import Sampling
 from .compositing import Blend
 from .deformation import QueryRange
+from .encoding import TABLE
 from .model import FlareForm, FlareModel, LightFlare
 
 TrainingCamera = TrainedCamera
@@ -88,7 +89,7 @@ def _packed(model: FlareModel) -> dict[str, Tensor]:
     packed: dict[str, Tensor] = {}
     for name, tensor in model.flares.state_dict().items():
         tensor = tensor.detach().contiguous().cpu()
-        if name.endswith("table.weight"):
+        if name.endswith(TABLE):
             rows = tensor.abs().amax(1).nonzero()[:, 0]
             packed[f"{name}.rows"], packed[f"{name}.values"] = rows.to(torch.int32), tensor[rows]
         else:
@@ -112,7 +113,7 @@ def _unpacked(description: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> 
     model.clear.copy_(torch.tensor(clear))
     state = model.flares.state_dict()
     for name in state:
-        if name.endswith("table.weight"):
+        if name.endswith(TABLE):
             rows = tensors[f"{name}.rows"].long()
             state[name] = torch.zeros_like(state[name]).index_copy(0, rows, tensors[f"{name}.values"])
         else:

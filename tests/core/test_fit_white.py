@@ -166,7 +166,7 @@ def test_behind_a_flare_what_is_above_white_is_the_clean_frame_s_to_the_end(brig
 
 
 def test_colours_of_bright_scenes_have_a_longer_way(bright: Capture) -> None:
-    rates = [trainer.scene_adam.rates["sh"] for trainer in
+    rates = [trainer.optimisers.scene.rates["sh"] for trainer in
              (Trainer(bright, replace(quick(), white=white)) for white in (None, 1.0, WHITEST))]
     assert all(isinstance(rate, torch.Tensor) for rate in rates)
     plain, clipped, far = (torch.as_tensor(rate) for rate in rates)

@@ -200,7 +200,8 @@ def set_up(scene: Any, layers: LayerFolder, *, keep_image: bool = False, plate: 
     if source is None:
         source = _named(_node(tree, "CompositorNodeImage", -4, 0), LAYERS)
     _point_at(source, layers)
-    sockets = {socket.name: socket for socket in source.outputs}
+    # The node keeps those that are linked of the files that it showed before.
+    sockets = {socket.name: socket for socket in source.outputs if not socket.is_unavailable}
     names = [name for name in sockets if name.startswith("flare_")] or [name for name in sockets if name == "flare"]
     if not names or "scene" not in sockets:
         _take_back(scene, tree, source, pointed, note)

@@ -13,7 +13,7 @@ from blenders import Blender
 
 from core.bake.exr import read_layers, write_layers
 from core.bake.layers import FrameLayers, matte
-from core.pictures import read_exr, read_picture, srgb_from_linear
+from core.pictures import read_exr, read_picture, srgb_from_linear, write_exr
 
 SCRIPTS = Path(__file__).parent / "scripts"
 NUMBERS = (0, 3, 4, 1000)  # a sequence may begin at 0 and have gaps
@@ -44,7 +44,10 @@ def made(blender: Blender, tmp_path_factory: pytest.TempPathFactory) -> Made:
     layers, out, user = base / "layers", base / "out", base / "user"
     for number in NUMBERS:
         write_layers(layers / f"layers.{number:04d}.exr", random_layers(number))
-    return Made(blender.run(SCRIPTS / "composite.py", layers, out, user=user), layers, out, user)
+    write_layers(base / "fewer" / "layers.0000.exr", random_layers(1, ("key light",)))
+    write_exr(base / "none" / "layers.0000.exr", {name: np.ones(SIZE, np.float32) for name in "RGB"})
+    facts = blender.run(SCRIPTS / "composite.py", layers, base / "fewer", base / "none", out, user=user)
+    return Made(facts, layers, out, user)
 
 
 def baked(made: Made, number: int) -> FrameLayers:
@@ -101,6 +104,16 @@ def test_the_flare_can_go_over_the_present_image(made: Made) -> None:
     assert made.facts["plate stays"]
     plate = np.array([0.25, 0.5, 0.75], np.float32)
     assert_half_equal(rgb(made.out / "over" / "0.exr"), plate + baked(made, 0).flare)
+
+
+def test_nothing_is_left_of_lights_that_other_layers_are_without(made: Made) -> None:
+    assert made.facts["fewer"] == ["Scene", "flare_key_light"]
+    layers = read_layers(made.layers.parent / "fewer" / "layers.0000.exr")
+    assert_half_equal(rgb(made.out / "fewer" / "0.exr"), layers.scene + layers.flare)
+
+
+def test_a_picture_without_layers_is_refused_where_there_were_layers(made: Made) -> None:
+    assert "holds no scene and flare layers" in made.facts.get("no layers", "")
 
 
 @pytest.mark.parametrize(("name", "factor"), [("over at 50", 0.5), ("over at 200", 2), ("plain at 50", 0.5)])

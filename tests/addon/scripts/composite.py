@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Inside Blender: build, rebuild, render. Words: the layers' folder, the folder to write."""
+"""Inside Blender: build, rebuild, render. Words: folders of layers, of layers of fewer lights, of a picture without
+layers, and the folder to write."""
 from __future__ import annotations
 
 import importlib.util
@@ -21,7 +22,7 @@ from fit_flare.flare_addon import compositor  # noqa: E402
 
 INTENSITY, TINT = 1.7, (1.0, 0.5, 0.25, 1.0)
 
-folder, out = map(Path, sys.argv[1:3])
+folder, fewer, none, out = map(Path, sys.argv[1:5])
 layers = LayerFolder.open(folder)
 
 
@@ -81,6 +82,17 @@ scene = empty()
 compositor.set_up(scene, layers)
 scene.render.resolution_percentage = 50
 render(scene, "plain at 50", sorted(layers.files)[:1])
+
+# Pointed at layers of fewer lights, and at a picture without layers, which is refused.
+scene = empty()
+compositor.set_up(scene, layers)
+node = compositor.set_up(scene, LayerFolder.open(fewer))
+try:
+    compositor.set_up(scene, LayerFolder.open(none))
+except compositor.FrameError as problem:
+    facts["no layers"] = str(problem)
+facts["fewer"] = [socket.name for socket in node.inputs if socket.is_linked]
+render(scene, "fewer", [layers.first])
 
 # Wide pixels stay; a region that is cut out is refused, and leaves nothing.
 scene = empty()

@@ -525,14 +525,23 @@ def _new_tree(scene: Any, keep_image: bool) -> Any:
 
 def _output(tree: Any, make: bool = True) -> Any:
     """The input socket that the final picture goes into; where there is none it is made, or None."""
-    found = sorted((node for node in tree.nodes if node.bl_idname == _END),  # 4.x does not tell which one counts
-                   key=lambda node: not getattr(node, "is_active_output", False))
+    found = sorted((node for node in tree.nodes if node.bl_idname == _END), key=lambda node: not _counts(tree, node))
     if not make:
         return found[0].inputs[0] if found and len(found[0].inputs) else None
     if _GROUPS_ARE_TREES and not any(getattr(item, "in_out", "") == "OUTPUT" for item in tree.interface.items_tree):
         tree.interface.new_socket("Image", in_out="OUTPUT", socket_type="NodeSocketColor")
     node = found[0] if found else _node(tree, _END, 1, 0)
     return node.inputs[0]
+
+
+def _counts(tree: Any, end: Any) -> bool:
+    """Whether an output is the one of several that Blender goes by. 4.x does not say so, but makes it the one that is
+    clicked on; once another node is, it is the one that shows our node, which was put there while it was known."""
+    if hasattr(end, "is_active_output"):
+        return bool(end.is_active_output)
+    if tree.nodes.active is not None and tree.nodes.active.bl_idname == _END:
+        return bool(end == tree.nodes.active)
+    return GROUP in tree.nodes and _is_behind(end, tree.nodes[GROUP])
 
 
 def _point_at(node: Any, layers: LayerFolder) -> None:

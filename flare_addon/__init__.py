@@ -7,6 +7,7 @@
     engine.py, jobs.py  the process with torch            fits.py          fits
     looks.py            .flare, flares, occlusion         overlay.py, points.py   what is drawn in the viewport
     shots.py            what is baked                     compositor.py    layers back together
+    flare_node.py       what puts layers together         wires.py         the panel's sliders on it
     library.py          flares for other shots            paths.py         files of a .blend that moves
     objects.py          where objects stand               curves.py        animation of what is moved
     operators/, panels.py   buttons and panels
@@ -15,7 +16,7 @@ from __future__ import annotations
 
 import bpy
 
-from . import compositor, fits, jobs, looks, operators, overlay, panels, paths, points, preferences, properties
+from . import fits, jobs, looks, operators, overlay, panels, paths, points, preferences, properties, wires
 
 _MODULES = (properties, preferences, operators, panels, points, overlay, paths)
 
@@ -28,7 +29,7 @@ def _loaded(_path: str) -> None:
     points.forget()
     overlay.problem = ""
     for scene in bpy.data.scenes:
-        compositor.go_by_numbers(scene)
+        wires.go_by_numbers(scene)
 
 
 def register() -> None:

@@ -1,19 +1,13 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Baked layers put together in Blender's compositor, by the reusable node group "Fit Flare".
+"""Baked layers put together in a scene's compositor, by the node "Fit Flare" (flare_node.py).
 
-    Flare = Intensity * Tint * (sum of the flare layers, each by its Gain),   Image = Scene + Flare
-
-in scene-linear light, so that the picture is the bake's composite at Intensity 1 and white Tint and Gains.
-What was there before is noted on the scene, so that it can all be taken away again.
-Written for the compositors of 4.2 to 5.2: up to 4.5 a scene owns a node tree that ends in a Composite
-node, from 5.0 it points at a node group that ends in a Group Output; the mix and math nodes changed
-family with it.
+What was there before is noted on the scene, so that it can all be taken away again. Written for the compositors of 4.2
+to 5.2: up to 4.5 the tree ends in a Composite node, from 5.0 in a Group Output.
 """
 from __future__ import annotations
 
 import contextlib
 import os
-import re
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -25,9 +19,9 @@ from ..core.colour.ocio import REC_709_LINEAR
 from ..core.errors import FrameError
 from ..core.files import atomic_path
 from ..core.pictures import exr_is_cut_off, exr_is_rec709
-from . import curves
+from . import curves, wires
+from .flare_node import GROUP, GROUPS_ARE_TREES, find_node, layer_of, new_node, node_group, of_render_size, tree_of
 
-GROUP = "Fit Flare"
 LAYERS = "Fit Flare Layers"
 PLATE = "Fit Flare Footage"
 VIEWER = "Fit Flare Viewer"
@@ -36,147 +30,9 @@ SIZE = "Fit Flare Size"
 _OURS = (GROUP, LAYERS, PLATE, SIZE, VIEWER, RENDER)
 NOTE = "fit_flare_compositor"  # a property of the scene: what was there before
 PLAIN_VIEWS = ("Standard", "Un-tone-mapped")  # of Blender's own colour configuration, and of ACES'
-_GAIN = " Gain"
-_OF_AN_INPUT = re.compile(rf'nodes\["{GROUP}"\]\.inputs\[(\d+)\]\.default_value')
-_LIVE = re.compile(r"fit_flare\.(master|lights\[\d+\])\.(intensity|tint|mute|solo)$")
-_OF_A_LIGHT = re.compile(r'fit_flare\.lights\[(?:(\d+)|"(.*)")\]\.intensity')
 _TO_THE_END = 1048574  # frames, the most that Blender has; those without a file are without flare
 _POINTING = ("image", "frame_start", "frame_offset", "frame_duration", "use_auto_refresh")
-
-_GROUPS_ARE_TREES = bpy.app.version >= (5, 0, 0)
-_END = "NodeGroupOutput" if _GROUPS_ARE_TREES else "CompositorNodeComposite"
-_MIX, _MATH = (("ShaderNodeMix", "ShaderNodeMath") if _GROUPS_ARE_TREES
-               else ("CompositorNodeMixRGB", "CompositorNodeMath"))
-
-
-# ---- the group ------------------------------------------------------------------------------------
-
-
-def node_group(layers: Sequence[str]) -> Any:
-    """The node group with one colour input for each flare layer; the one in the file where it fits.
-
-    layers: names of the inputs, such as "flare_lamp".
-    """
-    wanted = ["Scene", *layers, "Intensity", "Tint", *(gain_of(layer) for layer in layers)]
-    for group in bpy.data.node_groups:
-        if group.bl_idname == "CompositorNodeTree" and group.name.split(".")[0] == GROUP:
-            inputs = [item.name for item in group.interface.items_tree if getattr(item, "in_out", "") == "INPUT"]
-            if inputs == wanted:
-                return group
-    group = bpy.data.node_groups.new(GROUP, "CompositorNodeTree")
-    _declare(group, wanted)
-    _fill(group, layers)
-    return group
-
-
-def gain_of(layer: str) -> str:
-    """The input that holds a layer's factors on linear R, G, B."""
-    return f"{layer}{_GAIN}"
-
-
-def _declare(group: Any, inputs: Iterable[str]) -> None:
-    for name in ("Image", "Flare"):
-        group.interface.new_socket(name, in_out="OUTPUT", socket_type="NodeSocketColor")
-    for name in inputs:
-        kind = "NodeSocketFloat" if name == "Intensity" else "NodeSocketColor"
-        socket = group.interface.new_socket(name, in_out="INPUT", socket_type=kind)
-        if name == "Intensity":
-            socket.default_value, socket.min_value, socket.max_value = 1.0, 0.0, 1000.0
-        else:
-            grey = 1.0 if name == "Tint" or name.endswith(_GAIN) else 0.0
-            socket.default_value = (grey, grey, grey, 1.0)
-
-
-def _fill(group: Any, layers: Sequence[str]) -> None:
-    entry = _node(group, "NodeGroupInput", 0, 0)
-    sized = [_of_render_size(group, entry.outputs[name], 1, -row) for row, name in enumerate(layers, 1)]
-    gained = [_mix(group, "MULTIPLY", one.outputs[0], entry.outputs[gain_of(name)], 2, -row)
-              for row, (name, one) in enumerate(zip(layers, sized, strict=True), 1)]
-    total = gained[0]
-    for column, one in enumerate(gained[1:], 3):
-        total = _mix(group, "ADD", total, one, column, -1)
-    column = len(layers) + 2
-    tinted = _mix(group, "MULTIPLY", total, entry.outputs["Tint"], column, -1)
-    scaled = _mix(group, "MULTIPLY", tinted, entry.outputs["Intensity"], column + 1, -1)
-    image = _mix(group, "ADD", entry.outputs["Scene"], scaled, column + 2, 0)
-    leave = _node(group, "NodeGroupOutput", column + 6, 0)
-    group.links.new(image, leave.inputs["Image"])
-    group.links.new(_with_matte(group, scaled, column + 2), leave.inputs["Flare"])
-
-
-def _with_matte(group: Any, colour: Any, column: int) -> Any:
-    """Colour with alpha = max(R, G, B) in 0..1, the rule of the baked layers (core/bake/layers.py)."""
-    split = _node(group, "CompositorNodeSeparateColor", column, -2)
-    group.links.new(colour, split.inputs[0])
-    red, green, blue = split.outputs[:3]
-    alpha = _math(group, "MAXIMUM", _math(group, "MAXIMUM", red, green, column + 1), blue, column + 2, clamp=True)
-    join = _node(group, "CompositorNodeCombineColor", column + 3, -2)
-    for source, target in zip((red, green, blue, alpha), join.inputs, strict=True):
-        group.links.new(source, target)
-    return join.outputs[0]
-
-
-def _node(tree: Any, kind: str, column: float, row: float) -> Any:
-    node = tree.nodes.new(kind)
-    node.location = (220 * column, 220 * row)
-    return node
-
-
-def _of_render_size(tree: Any, socket: Any, column: float, row: float) -> Any:
-    """A node that brings a picture to the size that is rendered: at other percentages than it was baked for Blender
-    would lay it over the middle as it is."""
-    node = _node(tree, "CompositorNodeScale", column, row)
-    if hasattr(node, "space"):
-        node.space, node.frame_method = "RENDER_SIZE", "STRETCH"
-    else:
-        for name, value in (("Type", "Render Size"), ("Frame Type", "Stretch"), ("Extension X", "Extend"),
-                            ("Extension Y", "Extend")):
-            if name in node.inputs:
-                node.inputs[name].default_value = value
-    tree.links.new(socket, node.inputs["Image"])
-    return node
-
-
-def _mix(tree: Any, blend: str, a: Any, b: Any, column: float, row: float) -> Any:
-    """The output socket of a (blend) b, at full factor and unclamped."""
-    node = _node(tree, _MIX, column, row)
-    if _MIX == "ShaderNodeMix":
-        node.data_type, node.clamp_factor = "RGBA", False
-        sockets = {socket.identifier: socket for socket in node.inputs}
-        factor, first, second = (sockets[name] for name in ("Factor_Float", "A_Color", "B_Color"))
-        result = next(socket for socket in node.outputs if socket.identifier == "Result_Color")
-    else:
-        factor, first, second = node.inputs
-        result = node.outputs[0]
-    node.blend_type = blend
-    factor.default_value = 1.0
-    tree.links.new(a, first)
-    tree.links.new(b, second)
-    return result
-
-
-def _math(tree: Any, operation: str, a: Any, b: Any, column: float, *, clamp: bool = False) -> Any:
-    node = _node(tree, _MATH, column, -3)
-    node.operation, node.use_clamp = operation, clamp
-    tree.links.new(a, node.inputs[0])
-    tree.links.new(b, node.inputs[1])
-    return node.outputs[0]
-
-
-# ---- the graph ------------------------------------------------------------------------------------
-
-
-def tree_of(scene: Any) -> Any:
-    """The scene's compositor tree, None where it has none."""
-    if _GROUPS_ARE_TREES:
-        return scene.compositing_node_group
-    return scene.node_tree if scene.use_nodes else None
-
-
-def find_node(scene: Any) -> Any:
-    """The scene's "Fit Flare" node, whose inputs are the sliders; None where it is not set up."""
-    tree = tree_of(scene)
-    return tree.nodes.get(GROUP) if tree else None
+_END = "NodeGroupOutput" if GROUPS_ARE_TREES else "CompositorNodeComposite"
 
 
 def set_up(scene: Any, layers: LayerFolder, *, keep_image: bool = False, plate: Any = None) -> Any:
@@ -198,7 +54,7 @@ def set_up(scene: Any, layers: LayerFolder, *, keep_image: bool = False, plate: 
     source = tree.nodes.get(LAYERS)
     pointed = None if source is None else {name: getattr(source, name) for name in _POINTING}
     if source is None:
-        source = _named(_node(tree, "CompositorNodeImage", -4, 0), LAYERS)
+        source = _named(new_node(tree, "CompositorNodeImage", -4, 0), LAYERS)
     _point_at(source, layers)
     # The node keeps those that are linked of the files that it showed before.
     sockets = {socket.name: socket for socket in source.outputs if not socket.is_unavailable}
@@ -210,11 +66,11 @@ def set_up(scene: Any, layers: LayerFolder, *, keep_image: bool = False, plate: 
         scene[NOTE] = {**note, **_before(tree)}
     node = tree.nodes.get(GROUP)
     if node is None:
-        node = _named(_node(tree, "CompositorNodeGroup", -2, 0), GROUP)
-    _undriven(scene)
+        node = _named(new_node(tree, "CompositorNodeGroup", -2, 0), GROUP)
+    wires.cut(scene)
     numbered = [socket.name for socket in node.inputs]
     sliders = {name: (_value(node, name), _source(node.inputs[name])) for name in numbered
-               if name in ("Intensity", "Tint") or name.endswith(_GAIN)}
+               if name in ("Intensity", "Tint") or layer_of(name)}
     node.node_tree = node_group(names)
     numbers = {socket.name: number for number, socket in enumerate(node.inputs)}
     curves.renumber(tree, f'nodes["{GROUP}"].inputs',
@@ -243,12 +99,12 @@ def set_up(scene: Any, layers: LayerFolder, *, keep_image: bool = False, plate: 
     if (size := tree.nodes.get(SIZE)) is not None:
         tree.nodes.remove(size)
     if scene_socket is not None and scene_socket.node.name in (LAYERS, PLATE):
-        scene_socket = _named(_of_render_size(tree, scene_socket, -3, 1), SIZE).outputs[0]
+        scene_socket = _named(of_render_size(tree, scene_socket, -3, 1), SIZE).outputs[0]
     tree.links.new(scene_socket, node.inputs["Scene"])
     if not inside or end.links[0].from_node == node:
         tree.links.new(node.outputs["Image"], end)
     if not any(other.bl_idname == "CompositorNodeViewer" for other in tree.nodes):
-        viewer = _named(_node(tree, "CompositorNodeViewer", 1, -1), VIEWER)  # what the backdrop shows
+        viewer = _named(new_node(tree, "CompositorNodeViewer", 1, -1), VIEWER)  # what the backdrop shows
         tree.links.new(node.outputs["Image"], viewer.inputs["Image"])
     return node
 
@@ -294,7 +150,7 @@ def _take_back(scene: Any, tree: Any, source: Any, pointed: dict[str, Any] | Non
         tree.nodes.remove(source)
         if not note["tree"]:
             _discard_tree(scene, tree, bool(note["use_nodes"]))
-        elif not _GROUPS_ARE_TREES:
+        elif not GROUPS_ARE_TREES:
             scene.use_nodes = bool(note["use_nodes"])
     _drop([image], note)
 
@@ -302,11 +158,11 @@ def _take_back(scene: Any, tree: Any, source: Any, pointed: dict[str, Any] | Non
 def _render(tree: Any) -> Any:
     """A Render Layers node, the first there is."""
     found = next((node for node in tree.nodes if node.bl_idname == "CompositorNodeRLayers"), None)
-    return found or _named(_node(tree, "CompositorNodeRLayers", -4, 1), RENDER)
+    return found or _named(new_node(tree, "CompositorNodeRLayers", -4, 1), RENDER)
 
 
 def _footage(tree: Any, plate: tuple[Any, int, int, int]) -> Any:
-    node = tree.nodes.get(PLATE) or _named(_node(tree, "CompositorNodeImage", -4, 2.5), PLATE)
+    node = tree.nodes.get(PLATE) or _named(new_node(tree, "CompositorNodeImage", -4, 2.5), PLATE)
     image, start, offset, duration = plate
     node.image = image
     if image.source == "SEQUENCE":
@@ -315,112 +171,13 @@ def _footage(tree: Any, plate: tuple[Any, int, int, int]) -> Any:
     return node
 
 
-# ---- wired to the panel ---------------------------------------------------------------------------
-
-
-def wire(scene: Any, gains: dict[str, int]) -> None:
-    """Drive the node's sliders from the panel's: gains by layer, the number of the flare whose sliders they are.
-
-    Intensity, Tint, Mute and Solo of all lights and of each are live then; the layers must hold none of them. A layer
-    without a flare shows as it was baked.
-    """
-    node = find_node(scene)
-    _undriven(scene)
-    _drive(scene, node, "Intensity", -1, "i*(1-m)", {"i": "master.intensity", "m": "master.mute"})
-    for channel in range(3):
-        _drive(scene, node, "Tint", channel, "t", {"t": f"master.tint[{channel}]"})
-    solos = {f"s{number}": f"lights[{number}].solo" for number in sorted(set(gains.values()))}
-    for layer, number in gains.items():
-        path, own = f"lights[{number}]", f"s{number}"
-        most = f"max({','.join(solos)})" if len(solos) > 1 else own
-        for channel in range(3):
-            _drive(scene, node, gain_of(layer), channel, f"i*t*(1-m)*({own} if {most} else 1)",
-                   {"i": f"{path}.intensity", "t": f"{path}.tint[{channel}]", "m": f"{path}.mute", **solos})
-
-
-def wired(scene: Any) -> dict[str, int]:
-    """By layer, the number of the flare whose sliders drive its Gain."""
-    node, found = find_node(scene), {}
-    names = [item.name for item in scene.fit_flare.lights]
-    for curve in drivers(scene):
-        socket, variable = _driven(node, curve), curve.driver.variables.get("i")
-        target = variable.targets[0] if variable else None
-        match = _OF_A_LIGHT.fullmatch(target.data_path) if target and target.id == scene else None
-        if socket is None or match is None or not socket.name.endswith(_GAIN):
-            continue
-        name = bpy.utils.unescape_identifier(match[2] or "")
-        if match[1] or name in names:
-            found[socket.name.removesuffix(_GAIN)] = int(match[1]) if match[1] else names.index(name)
-    return found
-
-
-def go_by_numbers(scene: Any) -> None:
-    """Have drivers of an earlier version, which went by the names of the flares, go by their numbers: a flare that was
-    renamed lost its own."""
-    tree = tree_of(scene)
-    if tree is None or tree.library is not None or scene.library is not None:
-        return
-    if any(target.id == scene and 'lights["' in target.data_path for curve in drivers(scene)
-           for variable in curve.driver.variables for target in variable.targets):
-        for item in scene.fit_flare.lights:
-            item.identity = item.identity or item.name  # as the layers of that version have it
-        wire(scene, wired(scene))
-
-
-def is_animated(scene: Any) -> bool:
-    """Whether keys or drivers move sliders of the panel that drive the node's."""
-    own = scene.animation_data.drivers if scene.animation_data is not None else ()
-    return any(_LIVE.match(curve.data_path) for some in (*curves.of(scene), own) for curve in some)
-
-
-def drivers(scene: Any) -> list[Any]:
-    """The drivers of the node's sliders."""
-    tree = tree_of(scene)
-    if tree is None or tree.animation_data is None:
-        return []
-    return [curve for curve in tree.animation_data.drivers if curve.data_path.startswith(f'nodes["{GROUP}"]')]
-
-
-def _driven(node: Any, curve: Any) -> Any:
-    """The input that a driver drives, None where there is no such."""
-    match = _OF_AN_INPUT.fullmatch(curve.data_path)
-    return node.inputs[int(match[1])] if node and match and int(match[1]) < len(node.inputs) else None
-
-
-def _drive(scene: Any, node: Any, name: str, index: int, expression: str, variables: dict[str, str]) -> None:
-    if name not in node.inputs:  # someone has renamed it
-        return
-    curve = node.inputs[name].driver_add("default_value", index)
-    driver = curve.driver
-    driver.type = "SCRIPTED"
-    for short, path in variables.items():
-        variable = driver.variables.new()
-        variable.name, variable.type = short, "SINGLE_PROP"
-        target = variable.targets[0]
-        target.id_type, target.id, target.data_path = "SCENE", scene, f"fit_flare.{path}"
-    driver.expression = expression  # of the plain kind that needs no permission to run
-
-
-def _undriven(scene: Any) -> None:
-    """Take the drivers of the node's sliders out, and put back what they drove: a slider would keep what it was last
-    driven to, a flare that was muted or has lost its driver be gone for good."""
-    node = find_node(scene)
-    for curve in drivers(scene):
-        socket, channel = _driven(node, curve), curve.array_index
-        tree_of(scene).animation_data.drivers.remove(curve)
-        if socket is not None and isinstance(socket.default_value, float):
-            socket.default_value = 1.0
-        elif socket is not None:
-            socket.default_value[channel] = 1.0
-
-
 # ---- and away again -------------------------------------------------------------------------------
 
 
 def _note(scene: Any) -> dict[str, Any]:
     """What the scene and the file had before any of this."""
     viewer = any(image.type == "COMPOSITING" for image in bpy.data.images)  # Blender makes it for a Viewer node
-    if _GROUPS_ARE_TREES:
+    if GROUPS_ARE_TREES:
         return {"tree": scene.compositing_node_group is not None, "use_nodes": True, "viewer": viewer}
     return {"tree": scene.node_tree is not None, "use_nodes": bool(scene.use_nodes), "viewer": viewer}
 
@@ -451,7 +208,7 @@ def remove(scene: Any) -> None:
                 and (link.from_socket.name == "Image" or link.to_node.bl_idname == _END)]:
         if below is not None:
             tree.links.new(below, fed)
-    _undriven(scene)
+    wires.cut(scene)
     if not note.get("drivers", True) and tree.animation_data is not None and not tree.animation_data.drivers:
         tree.animation_data_clear()
     for name in _OURS:
@@ -467,7 +224,7 @@ def remove(scene: Any) -> None:
             for extra in [one for one in tree.nodes if one.name not in known and one.bl_idname == _END]:
                 if not any(socket.is_linked for socket in extra.inputs):
                     tree.nodes.remove(extra)
-        if not _GROUPS_ARE_TREES:
+        if not GROUPS_ARE_TREES:
             scene.use_nodes = bool(note["use_nodes"])
     if NOTE in scene:
         del scene[NOTE]
@@ -485,7 +242,7 @@ def _drop(images: Sequence[Any], note: dict[str, Any]) -> None:
 
 
 def _discard_tree(scene: Any, tree: Any, use_nodes: bool) -> None:
-    if _GROUPS_ARE_TREES:
+    if GROUPS_ARE_TREES:
         scene.compositing_node_group = None
         if not tree.users:
             bpy.data.node_groups.remove(tree)
@@ -509,8 +266,8 @@ def _new_tree(scene: Any, keep_image: bool) -> Any:
 
     A Render Layers node makes Blender render the 3D scene, used or not, so there is none without need.
     """
-    fresh = _GROUPS_ARE_TREES or scene.node_tree is None
-    if _GROUPS_ARE_TREES:
+    fresh = GROUPS_ARE_TREES or scene.node_tree is None
+    if GROUPS_ARE_TREES:
         tree = scene.compositing_node_group = bpy.data.node_groups.new("Compositor", "CompositorNodeTree")
     else:
         scene.use_nodes = True
@@ -518,7 +275,7 @@ def _new_tree(scene: Any, keep_image: bool) -> Any:
     if fresh:
         tree.nodes.clear()
         if keep_image:
-            render = _named(_node(tree, "CompositorNodeRLayers", -4, 1), RENDER)
+            render = _named(new_node(tree, "CompositorNodeRLayers", -4, 1), RENDER)
             tree.links.new(render.outputs["Image"], _output(tree))
     return tree
 
@@ -528,9 +285,9 @@ def _output(tree: Any, make: bool = True) -> Any:
     found = sorted((node for node in tree.nodes if node.bl_idname == _END), key=lambda node: not _counts(tree, node))
     if not make:
         return found[0].inputs[0] if found and len(found[0].inputs) else None
-    if _GROUPS_ARE_TREES and not any(getattr(item, "in_out", "") == "OUTPUT" for item in tree.interface.items_tree):
+    if GROUPS_ARE_TREES and not any(getattr(item, "in_out", "") == "OUTPUT" for item in tree.interface.items_tree):
         tree.interface.new_socket("Image", in_out="OUTPUT", socket_type="NodeSocketColor")
-    node = found[0] if found else _node(tree, _END, 1, 0)
+    node = found[0] if found else new_node(tree, _END, 1, 0)
     return node.inputs[0]
 
 

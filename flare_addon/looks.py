@@ -15,7 +15,7 @@ from ..core.errors import FlareFileError
 from ..core.look import Edit, Look, LookEdits, PlaneGaussians, read
 from ..core.look.look import Query
 from ..core.look.shot import PlacedLight, evaluate
-from . import cameras, compositor, curves
+from . import cameras, curves, wires
 from .lights import name_of, of_scene, place_of, stands
 from .objects import matrix_of
 from .paths import absolute
@@ -91,10 +91,10 @@ def use(scene: Any, path: Path | str) -> Look:
 def remove(scene: Any, number: int) -> None:
     """Take a flare out of the scene. Those after it keep their animation, and their wires to the compositor; its own
     layer is left there as it was baked."""
-    gains = compositor.wired(scene)
+    gains = wires.wired(scene)
     curves.take_out(scene.fit_flare.lights, "fit_flare.lights", number)
     if gains:
-        compositor.wire(scene, {layer: one - (one > number) for layer, one in gains.items() if one != number})
+        wires.wire(scene, {layer: one - (one > number) for layer, one in gains.items() if one != number})
 
 
 def _is_of(look: Look, root: Any, objects: dict[str, Any]) -> bool:

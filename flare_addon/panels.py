@@ -10,7 +10,7 @@ from typing import Any
 import bpy
 
 from ..core.errors import FitFlareError
-from . import compositor, engine, fits, jobs, library, lights, looks, overlay, shots
+from . import engine, fits, flare_node, jobs, library, lights, looks, overlay, shots, wires
 from .preferences import PACKAGE, draw_progress, lines
 
 
@@ -318,7 +318,7 @@ class FITFLARE_PT_bake(_Part, bpy.types.Panel):
         self._compositor(layout, scene)
 
     def _compositor(self, layout: Any, scene: Any) -> None:
-        state, node = scene.fit_flare, compositor.find_node(scene)
+        state, node = scene.fit_flare, flare_node.find_node(scene)
         box = layout.box().column()
         column = box.column()
         column.use_property_split = True
@@ -327,10 +327,10 @@ class FITFLARE_PT_bake(_Part, bpy.types.Panel):
         box.operator("fit_flare.set_up_baked", icon="NODE_COMPOSITING")
         if node is not None and node.node_tree is not None:
             sliders = [node.inputs[name] for name in ("Intensity", "Tint") if name in node.inputs]  # not renamed ones
-            wires = compositor.drivers(scene)
-            if not all(curve.driver.is_valid for curve in wires):
+            drivers = wires.drivers(scene)
+            if not all(curve.driver.is_valid for curve in drivers):
                 lines(box, "Some sliders of the panel Look act on it no longer: set it up again.", "ERROR")
-            elif wires or any(socket.is_linked for socket in sliders if socket.name == "Intensity"):
+            elif drivers or any(socket.is_linked for socket in sliders if socket.name == "Intensity"):
                 lines(box, "Set up: the sliders of the panel Look act on it.", "CHECKMARK")
             else:
                 column = box.column()

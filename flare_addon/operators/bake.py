@@ -13,7 +13,7 @@ from ...core.bake.folder import LayerFolder
 from ...core.bake.frames import Frame, absent
 from ...core.bake.layers import layer_names
 from ...core.errors import CaptureError, FrameError
-from .. import compositor, engine, jobs, looks, shots
+from .. import compositor, engine, flare_node, jobs, looks, shots, wires
 from ..paths import absolute
 from ..reports import NO_CAMERA, NO_FLARE, Action, reported
 
@@ -94,7 +94,7 @@ def _warnings(scene: Any, layers: LayerFolder, live: bool) -> Iterator[str]:
     if bare := absent(there, f"{max(scene.frame_start, 0)}-{max(scene.frame_end, scene.frame_start, 0)}"):
         yield (f"The scene has the frames {scene.frame_start}-{scene.frame_end}, and there are no layers of {bare}, "
                "which are without flare; bake them too.")
-    if live and compositor.is_animated(scene):
+    if live and wires.is_animated(scene):
         yield ("Sliders that act on it are animated: they stand still where this extension is not, on a farm say; bake "
                "without Keep Colours Live for that.")
     if misread := compositor.misread(scene):
@@ -163,7 +163,7 @@ def wire(scene: Any, layers: LayerFolder) -> bool:
     names, known = ({getattr(item, of): number for number, item in enumerate(scene.fit_flare.lights)}
                     for of in ("name", "identity"))
     found = {layer: known.get(identities[name], names.get(name)) for name, layer in baked.items()}
-    compositor.wire(scene, {layer: number for layer, number in found.items() if number is not None})
+    wires.wire(scene, {layer: number for layer, number in found.items() if number is not None})
     return True
 
 
@@ -176,7 +176,7 @@ class FITFLARE_OT_remove_compositor(Action, bpy.types.Operator):
 
     @classmethod
     def why_not(cls, context: bpy.types.Context) -> str:
-        if compositor.find_node(context.scene) is None:
+        if flare_node.find_node(context.scene) is None:
             return "The compositor is not set up"
         return ""
 

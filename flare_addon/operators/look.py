@@ -8,7 +8,7 @@ from typing import Any
 import bpy
 
 from ...core.errors import FitFlareError
-from .. import compositor, looks
+from .. import looks, wires
 from ..properties import EDIT_NAMES
 from ..reports import NO_FLARE, Action
 
@@ -93,7 +93,7 @@ class FITFLARE_OT_remove_flare(Action, bpy.types.Operator):
     def execute(self, context: bpy.types.Context) -> set[str]:
         state = context.scene.fit_flare
         name = state.lights[state.light].name
-        if state.light in compositor.wired(context.scene).values():
+        if state.light in wires.wired(context.scene).values():
             self.report({"WARNING"}, f"The layer of {name} stays in the compositor as it was baked; bake again to have "
                         "it go")
         looks.remove(context.scene, state.light)

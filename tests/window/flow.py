@@ -241,8 +241,8 @@ def compositor_and_render():
     x, y = yield from ui.find("fit_flare.over", panel(), path=True, across=0.65)
     yield from ui.choose_item(x, y, lambda: state.over == "plate")
     yield from ui.press_button("fit_flare.set_up_baked", panel(), below=y)
-    compositor = module("compositor")
-    assert compositor.find_node(scene) is not None
+    flare_node = module("flare_node")
+    assert flare_node.find_node(scene) is not None
     scene.render.engine = "BLENDER_WORKBENCH"  # the quickest; what it renders lies behind the plate
     figures = {}
     x, y = yield from ui.find("fit_flare.master.intensity", panel(), path=True, across=0.6)
@@ -264,7 +264,7 @@ def compositor_and_render():
     bpy.context.window.workspace = bpy.data.workspaces["Layout"]
     yield 1
     yield from ui.press_button("fit_flare.remove_compositor", panel())
-    assert compositor.find_node(scene) is None
+    assert flare_node.find_node(scene) is None
 
 
 def render(path: Path):

@@ -23,7 +23,7 @@ spec.loader.exec_module(run)
 run.load()
 
 from fit_flare.core.bake.folder import LayerFolder  # noqa: E402
-from fit_flare.flare_addon import compositor  # noqa: E402
+from fit_flare.flare_addon import compositor, flare_node  # noqa: E402
 from fit_flare.flare_addon.panels import FITFLARE_PT_bake  # noqa: E402
 
 GROUPS = bpy.app.version >= (5, 0, 0)
@@ -66,7 +66,7 @@ def grade(tree: bpy.types.NodeTree, name: str = "Grade") -> bpy.types.Node:
 
 def shown(scene: bpy.types.Scene) -> float | None:
     """The middle of the picture; None for a cycle, of which Blender may crash."""
-    tree = compositor.tree_of(scene)
+    tree = flare_node.tree_of(scene)
     if tree is None or not all(link.is_valid for link in tree.links):
         return None
     compositor.render_frames(scene, [layers.first], lambda _number, suffix: out / f"shown{suffix}")
@@ -77,18 +77,18 @@ def shown(scene: bpy.types.Scene) -> float | None:
 
 
 def names(scene: bpy.types.Scene) -> list[str]:
-    tree = compositor.tree_of(scene)
+    tree = flare_node.tree_of(scene)
     return [] if tree is None else sorted(node.name for node in tree.nodes if node.bl_idname != END)
 
 
 # ---- taken away from a composite that an artist has built round it ----------------------------------
 scene = empty()
 compositor.set_up(scene, layers)
-tree = compositor.tree_of(scene)
+tree = flare_node.tree_of(scene)
 fed = tree.nodes.new("CompositorNodeRGB")
 fed.name = "Sky"
 fed.outputs[0].default_value = (0.5, 0.5, 0.5, 1)
-tree.links.new(fed.outputs[0], compositor.find_node(scene).inputs["Scene"])
+tree.links.new(fed.outputs[0], flare_node.find_node(scene).inputs["Scene"])
 grade(tree)
 facts["with our own tree"] = shown(scene)
 compositor.remove(scene)
@@ -97,16 +97,16 @@ facts["our own tree, removed"] = [shown(scene), names(scene)]
 # A render that the artist's nodes go on from stays.
 scene = empty()
 compositor.set_up(scene, layers, keep_image=True)
-grade(compositor.tree_of(scene))
+grade(flare_node.tree_of(scene))
 compositor.remove(scene)
-tree = compositor.tree_of(scene)
+tree = flare_node.tree_of(scene)
 facts["render goes on"] = tree is not None and tree.nodes["Grade"].inputs[0].is_linked
 
 # Nodes of ours that were deleted by hand, and a composite made since.
 scene = empty()
 compositor.set_up(scene, layers, keep_image=True)
 if GROUPS:
-    bpy.data.node_groups.remove(compositor.tree_of(scene))
+    bpy.data.node_groups.remove(flare_node.tree_of(scene))
 plate(scene)
 compositor.set_up(scene, layers, keep_image=True)
 compositor.remove(scene)
@@ -116,7 +116,7 @@ facts["made since"] = [shown(scene), names(scene)]
 scene = empty()
 tree, _ = plate(scene)
 compositor.set_up(scene, layers)
-tree.nodes.remove(compositor.find_node(scene))
+tree.nodes.remove(flare_node.find_node(scene))
 compositor.set_up(scene, layers)
 compositor.remove(scene)
 facts["set up again"] = [shown(scene), names(scene)]

@@ -18,7 +18,7 @@ spec.loader.exec_module(run)
 run.load()
 
 from fit_flare.core.bake.folder import LayerFolder  # noqa: E402
-from fit_flare.flare_addon import compositor  # noqa: E402
+from fit_flare.flare_addon import compositor, flare_node  # noqa: E402
 
 INTENSITY, TINT = 1.7, (1.0, 0.5, 0.25, 1.0)
 
@@ -54,13 +54,13 @@ render(scene, "changed", sorted(layers.files))
 compositor.save_beside(out / "scene" / "compositor.blend")
 
 # Set up again: nothing doubles, the sliders stay.
-count = len(compositor.tree_of(scene).nodes), len(bpy.data.node_groups)
+count = len(flare_node.tree_of(scene).nodes), len(bpy.data.node_groups)
 again = compositor.set_up(scene, layers)
-facts["doubled"] = [count, (len(compositor.tree_of(scene).nodes), len(bpy.data.node_groups))]
+facts["doubled"] = [count, (len(flare_node.tree_of(scene).nodes), len(bpy.data.node_groups))]
 facts["sliders"] = [again.inputs["Intensity"].default_value, list(again.inputs["Tint"].default_value)]
 
 # The flare alone.
-compositor.tree_of(scene).links.new(again.outputs["Flare"], compositor._output(compositor.tree_of(scene)))
+flare_node.tree_of(scene).links.new(again.outputs["Flare"], compositor._output(flare_node.tree_of(scene)))
 render(scene, "flare", sorted(layers.files)[:1])
 
 # Over what is there: a plain colour in place of the baked scene, twice.
@@ -103,7 +103,7 @@ scene.render.use_border = scene.render.use_crop_to_border = True
 try:
     compositor.set_up(scene, layers)
 except compositor.FrameError as problem:
-    facts["cropped"] = [str(problem), compositor.find_node(scene) is None]
+    facts["cropped"] = [str(problem), flare_node.find_node(scene) is None]
 
 # A disk that fills up, which Blender does not tell of: files may not grow beyond a limit.
 if sys.platform == "linux":

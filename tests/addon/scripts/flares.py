@@ -17,8 +17,8 @@ package, flare, layers, more, out = sys.argv[1:6]
 install(package)
 sys.path.remove(str(Path(__file__).parent))
 ops = bpy.ops.fit_flare
-compositor, looks, shots, bake, panels, curves = (part(f"flare_addon.{name}") for name in (
-    "compositor", "looks", "shots", "operators.bake", "panels", "curves"))
+compositor, flare_node, wires, looks, shots, bake, panels, curves = (part(f"flare_addon.{name}") for name in (
+    "compositor", "flare_node", "wires", "looks", "shots", "operators.bake", "panels", "curves"))
 facts: dict[str, object] = {}
 
 
@@ -67,7 +67,7 @@ def told(scene):
 
 
 def work(scene):
-    return all(curve.driver.is_valid for curve in compositor.drivers(scene))
+    return all(curve.driver.is_valid for curve in wires.drivers(scene))
 
 
 # ---- renamed ----------------------------------------------------------------------------------------
@@ -88,7 +88,7 @@ facts["renamed, set up again"] = [shown(scene), work(scene), "act on it." in sai
 live.write_text(old)
 
 # A slider that an earlier version left at what it was last driven to, its flare having another name.
-node = compositor.find_node(scene)
+node = flare_node.find_node(scene)
 state.lights[0].mute = True
 muted = shown(scene)
 state.lights[0].name, state.lights[0].identity = "moon", ""
@@ -110,7 +110,7 @@ facts["removed"].append(shown(scene))
 scene = shot(["lamp", "key"])
 state = scene.fit_flare
 ops.set_up_baked()
-for curve in compositor.drivers(scene):
+for curve in wires.drivers(scene):
     for variable in curve.driver.variables:
         target = variable.targets[0]
         for number, name in enumerate(("lamp", "key")):
@@ -126,7 +126,7 @@ ops.set_up_baked()
 facts["of an earlier version"] += [shown(scene), work(scene)]
 
 # ---- dead drivers are told --------------------------------------------------------------------------
-for curve in compositor.drivers(scene):
+for curve in wires.drivers(scene):
     for variable in curve.driver.variables:
         variable.targets[0].data_path = "fit_flare.nothing"
     curve.driver.expression = curve.driver.expression  # compiled again
@@ -156,7 +156,7 @@ facts["keyed"].append([state.lights[2].intensity, state.lights[2].scale])
 live.rename(live.with_suffix(".away"))
 scene = shot(["lamp"])
 ops.set_up_baked()
-tree, node = compositor.tree_of(scene), compositor.find_node(scene)
+tree, node = flare_node.tree_of(scene), flare_node.find_node(scene)
 for frame, value in ((1, 1.0), (3, 4.0)):
     node.inputs["Intensity"].default_value = value
     node.inputs["Intensity"].keyframe_insert("default_value", frame=frame)
@@ -172,9 +172,9 @@ live.with_suffix(".away").rename(live)
 # ---- what is told of frames without layers and of animated sliders ----------------------------------
 scene = shot(["lamp"])
 compositor._new_tree(scene, keep_image=False)
-colour = compositor.tree_of(scene).nodes.new("CompositorNodeRGB")
+colour = flare_node.tree_of(scene).nodes.new("CompositorNodeRGB")
 colour.outputs[0].default_value = (0.5, 0.5, 0.5, 1)
-compositor.tree_of(scene).links.new(colour.outputs[0], compositor._output(compositor.tree_of(scene)))
+flare_node.tree_of(scene).links.new(colour.outputs[0], compositor._output(flare_node.tree_of(scene)))
 scene.frame_start, scene.frame_end = 1, 3
 facts["all frames"] = told(scene)
 scene.frame_start, scene.frame_end = 0, 6

@@ -14,7 +14,7 @@ package, flare, layers, out = sys.argv[1:5]
 install(package)
 sys.path.remove(str(Path(__file__).parent))
 ops = bpy.ops.fit_flare
-compositor = part("flare_addon.compositor")
+flare_node = part("flare_addon.flare_node")
 facts: dict[str, object] = {}
 GROUPS = bpy.app.version >= (5, 0, 0)
 
@@ -116,5 +116,5 @@ for curve_owner in (scene,):
 scene.frame_set(3)
 files["animated"] = rendered("animated")
 facts["files"] = files
-facts["valid"] = all(curve.driver.is_valid for curve in compositor.tree_of(scene).animation_data.drivers)
+facts["valid"] = all(curve.driver.is_valid for curve in flare_node.tree_of(scene).animation_data.drivers)
 leave(facts)

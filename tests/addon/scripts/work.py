@@ -379,9 +379,9 @@ image = bpy.data.images.new("plain", 8, 8, float_buffer=True)
 image.filepath_raw, image.file_format = str(Path(out) / "plain" / "a.0001.exr"), "OPEN_EXR"
 image.save()
 bpy.data.images.remove(image)
-compositor = part("flare_addon.compositor")
+flare_node = part("flare_addon.flare_node")
 facts["no layers"] = [refusal(lambda: ops.set_up_compositor(directory=str(Path(out) / "plain"))),
-                      compositor.tree_of(scene) is None, [image.name for image in bpy.data.images]]
+                      flare_node.tree_of(scene) is None, [image.name for image in bpy.data.images]]
 
 # ---- a .blend below a linked folder -----------------------------------------------------------------
 real, link, beside = (Path(out) / name for name in ("real/deep", "link", "beside"))

@@ -1,0 +1,151 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The reusable node group "Fit Flare", and the node of it in a scene, whose inputs are the sliders.
+
+    Flare = Intensity * Tint * (sum of the flare layers, each by its Gain),   Image = Scene + Flare
+
+in scene-linear light, so that the picture is the bake's composite at Intensity 1 and white Tint and Gains.
+Written for the compositors of 4.2 to 5.2: up to 4.5 a scene owns a node tree, from 5.0 it points at a node
+group; the mix and math nodes changed family with it.
+"""
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import bpy
+
+GROUP = "Fit Flare"
+GROUPS_ARE_TREES = bpy.app.version >= (5, 0, 0)
+_GAIN = " Gain"
+_MIX, _MATH = (("ShaderNodeMix", "ShaderNodeMath") if GROUPS_ARE_TREES
+               else ("CompositorNodeMixRGB", "CompositorNodeMath"))
+
+
+def tree_of(scene: Any) -> Any:
+    """The scene's compositor tree, None where it has none."""
+    if GROUPS_ARE_TREES:
+        return scene.compositing_node_group
+    return scene.node_tree if scene.use_nodes else None
+
+
+def find_node(scene: Any) -> Any:
+    """The scene's "Fit Flare" node, whose inputs are the sliders; None where it is not set up."""
+    tree = tree_of(scene)
+    return tree.nodes.get(GROUP) if tree else None
+
+
+def node_group(layers: Sequence[str]) -> Any:
+    """The node group with one colour input for each flare layer; the one in the file where it fits.
+
+    layers: names of the inputs, such as "flare_lamp".
+    """
+    wanted = ["Scene", *layers, "Intensity", "Tint", *(gain_of(layer) for layer in layers)]
+    for group in bpy.data.node_groups:
+        if group.bl_idname == "CompositorNodeTree" and group.name.split(".")[0] == GROUP:
+            inputs = [item.name for item in group.interface.items_tree if getattr(item, "in_out", "") == "INPUT"]
+            if inputs == wanted:
+                return group
+    group = bpy.data.node_groups.new(GROUP, "CompositorNodeTree")
+    _declare(group, wanted)
+    _fill(group, layers)
+    return group
+
+
+def gain_of(layer: str) -> str:
+    """The input that holds a layer's factors on linear R, G, B."""
+    return f"{layer}{_GAIN}"
+
+
+def layer_of(name: str) -> str:
+    """The layer whose factors an input of that name holds; "" for any other input."""
+    return name.removesuffix(_GAIN) if name.endswith(_GAIN) else ""
+
+
+def _declare(group: Any, inputs: Iterable[str]) -> None:
+    for name in ("Image", "Flare"):
+        group.interface.new_socket(name, in_out="OUTPUT", socket_type="NodeSocketColor")
+    for name in inputs:
+        kind = "NodeSocketFloat" if name == "Intensity" else "NodeSocketColor"
+        socket = group.interface.new_socket(name, in_out="INPUT", socket_type=kind)
+        if name == "Intensity":
+            socket.default_value, socket.min_value, socket.max_value = 1.0, 0.0, 1000.0
+        else:
+            grey = 1.0 if name == "Tint" or layer_of(name) else 0.0
+            socket.default_value = (grey, grey, grey, 1.0)
+
+
+def _fill(group: Any, layers: Sequence[str]) -> None:
+    entry = new_node(group, "NodeGroupInput", 0, 0)
+    sized = [of_render_size(group, entry.outputs[name], 1, -row) for row, name in enumerate(layers, 1)]
+    gained = [_mix(group, "MULTIPLY", one.outputs[0], entry.outputs[gain_of(name)], 2, -row)
+              for row, (name, one) in enumerate(zip(layers, sized, strict=True), 1)]
+    total = gained[0]
+    for column, one in enumerate(gained[1:], 3):
+        total = _mix(group, "ADD", total, one, column, -1)
+    column = len(layers) + 2
+    tinted = _mix(group, "MULTIPLY", total, entry.outputs["Tint"], column, -1)
+    scaled = _mix(group, "MULTIPLY", tinted, entry.outputs["Intensity"], column + 1, -1)
+    image = _mix(group, "ADD", entry.outputs["Scene"], scaled, column + 2, 0)
+    leave = new_node(group, "NodeGroupOutput", column + 6, 0)
+    group.links.new(image, leave.inputs["Image"])
+    group.links.new(_with_matte(group, scaled, column + 2), leave.inputs["Flare"])
+
+
+def _with_matte(group: Any, colour: Any, column: int) -> Any:
+    """Colour with alpha = max(R, G, B) in 0..1, the rule of the baked layers (core/bake/layers.py)."""
+    split = new_node(group, "CompositorNodeSeparateColor", column, -2)
+    group.links.new(colour, split.inputs[0])
+    red, green, blue = split.outputs[:3]
+    alpha = _math(group, "MAXIMUM", _math(group, "MAXIMUM", red, green, column + 1), blue, column + 2, clamp=True)
+    join = new_node(group, "CompositorNodeCombineColor", column + 3, -2)
+    for source, target in zip((red, green, blue, alpha), join.inputs, strict=True):
+        group.links.new(source, target)
+    return join.outputs[0]
+
+
+def new_node(tree: Any, kind: str, column: float, row: float) -> Any:
+    """A node of that type, placed on a grid."""
+    node = tree.nodes.new(kind)
+    node.location = (220 * column, 220 * row)
+    return node
+
+
+def of_render_size(tree: Any, socket: Any, column: float, row: float) -> Any:
+    """A node that brings a picture to the size that is rendered: at other percentages than it was baked for Blender
+    would lay it over the middle as it is."""
+    node = new_node(tree, "CompositorNodeScale", column, row)
+    if hasattr(node, "space"):
+        node.space, node.frame_method = "RENDER_SIZE", "STRETCH"
+    else:
+        for name, value in (("Type", "Render Size"), ("Frame Type", "Stretch"), ("Extension X", "Extend"),
+                            ("Extension Y", "Extend")):
+            if name in node.inputs:
+                node.inputs[name].default_value = value
+    tree.links.new(socket, node.inputs["Image"])
+    return node
+
+
+def _mix(tree: Any, blend: str, a: Any, b: Any, column: float, row: float) -> Any:
+    """The output socket of a (blend) b, at full factor and unclamped."""
+    node = new_node(tree, _MIX, column, row)
+    if _MIX == "ShaderNodeMix":
+        node.data_type, node.clamp_factor = "RGBA", False
+        sockets = {socket.identifier: socket for socket in node.inputs}
+        factor, first, second = (sockets[name] for name in ("Factor_Float", "A_Color", "B_Color"))
+        result = next(socket for socket in node.outputs if socket.identifier == "Result_Color")
+    else:
+        factor, first, second = node.inputs
+        result = node.outputs[0]
+    node.blend_type = blend
+    factor.default_value = 1.0
+    tree.links.new(a, first)
+    tree.links.new(b, second)
+    return result
+
+
+def _math(tree: Any, operation: str, a: Any, b: Any, column: float, *, clamp: bool = False) -> Any:
+    node = new_node(tree, _MATH, column, -3)
+    node.operation, node.use_clamp = operation, clamp
+    tree.links.new(a, node.inputs[0])
+    tree.links.new(b, node.inputs[1])
+    return node.outputs[0]

@@ -10,6 +10,7 @@
     flare_node.py       what puts layers together         wires.py         the panel's sliders on it
     library.py          flares for other shots            paths.py         files of a .blend that moves
     objects.py          where objects stand               curves.py        animation of what is moved
+    rendering.py        frames and .blends out            reports.py       what buttons tell
     operators/, panels.py   buttons and panels
 """
 from __future__ import annotations

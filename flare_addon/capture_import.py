@@ -23,8 +23,8 @@ from ..core.capture.camera import quaternion_from_rotation
 from ..core.errors import CaptureError
 from . import cameras, curves
 from .cameras import FLIP
-from .compositor import show_as_filmed
 from .paths import absolute, stored
+from .rendering import show_as_filmed
 
 SENSOR = 36.0  # mm
 UP = {"Z": (0.0, 0.0, 0.0), "-Y": (-math.pi / 2, 0.0, 0.0), "Y": (math.pi / 2, 0.0, 0.0)}

@@ -13,7 +13,7 @@ from ...core.bake.folder import LayerFolder
 from ...core.bake.frames import Frame, absent
 from ...core.bake.layers import layer_names
 from ...core.errors import CaptureError, FrameError
-from .. import compositor, engine, flare_node, jobs, looks, shots, wires
+from .. import compositor, engine, flare_node, jobs, looks, rendering, shots, wires
 from ..paths import absolute
 from ..reports import NO_CAMERA, NO_FLARE, Action, reported
 
@@ -81,7 +81,7 @@ def set_up(operator: Any, scene: Any, folder: str, *, keep_image: bool, plate: b
     layers = LayerFolder.open(shots.folder_of_camera(absolute(folder), scene.camera))
     compositor.set_up(scene, layers, keep_image=keep_image, plate=footage_of(scene) if plate else None)
     if match:
-        compositor.match_scene(scene, layers, layers.size())
+        rendering.match_scene(scene, layers, layers.size())
     live = "; Intensity and Tint of the panel act on it" if wire(scene, layers) else ""
     for told in _warnings(scene, layers, bool(live)):
         operator.report({"WARNING"}, told)

@@ -40,7 +40,7 @@ def frames_of(folder: Path, out: Path, progress: Progress, *, wanted: str | None
 
     from ...core.bake.folder import LayerFolder
     from ...core.bake.frames import Frame
-    from ...flare_addon import compositor
+    from ...flare_addon import compositor, rendering
 
     if out.resolve() == folder.resolve():
         raise SettingsError(f"{out} holds the layers; choose another folder for the frames.")
@@ -54,16 +54,16 @@ def frames_of(folder: Path, out: Path, progress: Progress, *, wanted: str | None
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
     scene = bpy.context.scene
     node = compositor.set_up(scene, layers)
-    compositor.match_scene(scene, layers, layers.size())
-    for note in (compositor.plain_view(scene), compositor.misread(scene)):
+    rendering.match_scene(scene, layers, layers.size())
+    for note in (rendering.plain_view(scene), compositor.misread(scene)):
         if note:
             progress.say(note)
     node.inputs["Intensity"].default_value = intensity
     node.inputs["Tint"].default_value = (*colour, 1.0)
     _keep(out.resolve() / BLEND, progress)
-    compositor.save_beside(out.resolve() / BLEND)
+    rendering.save_beside(out.resolve() / BLEND)
     progress.stage("compose", len(numbers))
-    compositor.render_frames(scene, numbers, lambda number, suffix: out.resolve() / f"frame.{number:04d}{suffix}",
+    rendering.render_frames(scene, numbers, lambda number, suffix: out.resolve() / f"frame.{number:04d}{suffix}",
                              lambda _number: progress.advance())
     return {"frames": str(out), "blend": str(out / BLEND), "blender": bpy.app.version_string}
 

@@ -23,7 +23,7 @@ spec.loader.exec_module(run)
 run.load()
 
 from fit_flare.core.bake.folder import LayerFolder  # noqa: E402
-from fit_flare.flare_addon import compositor, flare_node  # noqa: E402
+from fit_flare.flare_addon import compositor, flare_node, rendering  # noqa: E402
 from fit_flare.flare_addon.panels import FITFLARE_PT_bake  # noqa: E402
 
 GROUPS = bpy.app.version >= (5, 0, 0)
@@ -36,8 +36,8 @@ facts: dict[str, object] = {}
 def empty() -> bpy.types.Scene:
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
     scene = bpy.context.scene
-    compositor.match_scene(scene, layers, layers.size())
-    compositor.plain_view(scene)
+    rendering.match_scene(scene, layers, layers.size())
+    rendering.plain_view(scene)
     scene.camera = bpy.data.objects.new("Camera", bpy.data.cameras.new("Camera"))
     scene.collection.objects.link(scene.camera)
     return scene
@@ -69,7 +69,7 @@ def shown(scene: bpy.types.Scene) -> float | None:
     tree = flare_node.tree_of(scene)
     if tree is None or not all(link.is_valid for link in tree.links):
         return None
-    compositor.render_frames(scene, [layers.first], lambda _number, suffix: out / f"shown{suffix}")
+    rendering.render_frames(scene, [layers.first], lambda _number, suffix: out / f"shown{suffix}")
     image = bpy.data.images.load(str(out / "shown.exr"))
     value = float(image.pixels[0])
     bpy.data.images.remove(image)

@@ -18,7 +18,8 @@ spec.loader.exec_module(run)
 run.load()
 
 from fit_flare.core.bake.folder import LayerFolder  # noqa: E402
-from fit_flare.flare_addon import compositor, flare_node  # noqa: E402
+from fit_flare.core.errors import FrameError  # noqa: E402
+from fit_flare.flare_addon import compositor, flare_node, rendering  # noqa: E402
 
 INTENSITY, TINT = 1.7, (1.0, 0.5, 0.25, 1.0)
 
@@ -29,13 +30,13 @@ layers = LayerFolder.open(folder)
 def empty() -> bpy.types.Scene:
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
     scene = bpy.context.scene
-    compositor.match_scene(scene, layers, layers.size())
-    compositor.plain_view(scene)
+    rendering.match_scene(scene, layers, layers.size())
+    rendering.plain_view(scene)
     return scene
 
 
 def render(scene: bpy.types.Scene, name: str, frames: list[int]) -> None:
-    compositor.render_frames(scene, frames, lambda number, suffix: out / name / f"{number}{suffix}")
+    rendering.render_frames(scene, frames, lambda number, suffix: out / name / f"{number}{suffix}")
 
 
 facts: dict[str, object] = {"version": bpy.app.version_string}
@@ -51,7 +52,7 @@ render(scene, "plain", sorted(layers.files))
 node.inputs["Intensity"].default_value = INTENSITY
 node.inputs["Tint"].default_value = TINT
 render(scene, "changed", sorted(layers.files))
-compositor.save_beside(out / "scene" / "compositor.blend")
+rendering.save_beside(out / "scene" / "compositor.blend")
 
 # Set up again: nothing doubles, the sliders stay.
 count = len(flare_node.tree_of(scene).nodes), len(bpy.data.node_groups)
@@ -89,7 +90,7 @@ compositor.set_up(scene, layers)
 node = compositor.set_up(scene, LayerFolder.open(fewer))
 try:
     compositor.set_up(scene, LayerFolder.open(none))
-except compositor.FrameError as problem:
+except FrameError as problem:
     facts["no layers"] = str(problem)
 facts["fewer"] = [socket.name for socket in node.inputs if socket.is_linked]
 render(scene, "fewer", [layers.first])
@@ -97,12 +98,12 @@ render(scene, "fewer", [layers.first])
 # Wide pixels stay; a region that is cut out is refused, and leaves nothing.
 scene = empty()
 scene.render.pixel_aspect_x = 2
-compositor.match_scene(scene, layers, layers.size())
+rendering.match_scene(scene, layers, layers.size())
 facts["pixel aspect"] = scene.render.pixel_aspect_x
 scene.render.use_border = scene.render.use_crop_to_border = True
 try:
     compositor.set_up(scene, layers)
-except compositor.FrameError as problem:
+except FrameError as problem:
     facts["cropped"] = [str(problem), flare_node.find_node(scene) is None]
 
 # A disk that fills up, which Blender does not tell of: files may not grow beyond a limit.
@@ -116,11 +117,11 @@ if sys.platform == "linux":
     full, before = out / "full", resource.getrlimit(resource.RLIMIT_FSIZE)
     refused = []
     for write in (lambda: render(scene, "full", sorted(layers.files)[:1]),
-                  lambda: compositor.save_beside(full / "compositor.blend")):
+                  lambda: rendering.save_beside(full / "compositor.blend")):
         resource.setrlimit(resource.RLIMIT_FSIZE, (1000, before[1]))
         try:
             write()
-        except compositor.FrameError as problem:
+        except FrameError as problem:
             refused.append(str(problem))
         finally:
             resource.setrlimit(resource.RLIMIT_FSIZE, before)

@@ -17,8 +17,9 @@ package, flare, layers, more, out = sys.argv[1:6]
 install(package)
 sys.path.remove(str(Path(__file__).parent))
 ops = bpy.ops.fit_flare
-compositor, flare_node, wires, looks, shots, bake, panels, curves = (part(f"flare_addon.{name}") for name in (
-    "compositor", "flare_node", "wires", "looks", "shots", "operators.bake", "panels", "curves"))
+compositor, flare_node, wires, rendering, looks, shots, bake, panels, curves = (
+    part(f"flare_addon.{name}") for name in ("compositor", "flare_node", "wires", "rendering", "looks", "shots",
+                                             "operators.bake", "panels", "curves"))
 facts: dict[str, object] = {}
 
 
@@ -30,7 +31,7 @@ def shot(lamps, *, over="scene"):
     scene.render.resolution_x, scene.render.resolution_y = 16, 8
     if hasattr(scene.render, "compositor_device"):
         scene.render.compositor_device = "CPU"
-    compositor.plain_view(scene)
+    rendering.plain_view(scene)
     for name in lamps:
         lamp = bpy.data.objects.new(name, None)
         scene.collection.objects.link(lamp)
@@ -45,7 +46,7 @@ def shot(lamps, *, over="scene"):
 def shown(scene, frame=1):
     """The middle of the picture."""
     scene.frame_set(frame)
-    compositor.render_frames(scene, [frame], lambda _number, suffix: Path(out) / f"shown{suffix}")
+    rendering.render_frames(scene, [frame], lambda _number, suffix: Path(out) / f"shown{suffix}")
     image = bpy.data.images.load(str(Path(out) / "shown.exr"))
     value = float(image.pixels[0])
     bpy.data.images.remove(image)

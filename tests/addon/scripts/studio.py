@@ -14,7 +14,7 @@ package, capture, flare, layers, out = sys.argv[1:6]
 install(package)
 sys.path.remove(str(Path(__file__).parent))
 ops = bpy.ops.fit_flare
-compositor = part("flare_addon.compositor")
+compositor, rendering = part("flare_addon.compositor"), part("flare_addon.rendering")
 facts: dict[str, object] = {}
 
 scene = empty()
@@ -23,5 +23,5 @@ ops.open_flare(filepath=flare)
 scene.fit_flare.layers, scene.fit_flare.over = layers, "scene"
 ops.set_up_baked()
 facts["misread"] = compositor.misread(scene)
-compositor.render_frames(scene, [1], lambda _number, suffix: Path(out) / f"shown{suffix}")
+rendering.render_frames(scene, [1], lambda _number, suffix: Path(out) / f"shown{suffix}")
 leave(facts)

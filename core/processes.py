@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Other processes, known by their number, and by when they began: systems give the numbers of ended ones out again."""
+"""Other processes: what one is started with, and whether one that was written down still runs, known by its number and
+by when it began, since systems give the numbers of ended ones out again."""
 from __future__ import annotations
 
 import os
@@ -12,6 +13,19 @@ WINDOWS = os.name == "nt"
 PROC = Path("/proc")
 SLACK_S = 5.0
 """By which the clocks of the two may differ."""
+
+
+def python_at(place: Path) -> Path | None:
+    """The interpreter that `place` is, or that the virtual environment in it has."""
+    for path in (place, place / "Scripts" / "python.exe", place / "bin" / "python"):
+        if path.is_file():
+            return path.absolute()  # not resolved: a virtual environment's python is a link
+    return None
+
+
+def environment() -> dict[str, str]:
+    """This environment, less what would lead another Python to the modules of this one."""
+    return {name: value for name, value in os.environ.items() if name not in ("PYTHONHOME", "PYTHONPATH")}
 
 
 def is_same(pid: int, started: float) -> bool:

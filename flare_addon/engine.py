@@ -11,6 +11,7 @@ import bpy
 
 from ..core.errors import EngineError, FitFlareError
 from ..core.files import write_text
+from ..core.processes import environment, python_at
 from . import jobs
 from .jobs import Job
 
@@ -33,24 +34,18 @@ def user_folder(name: str, create: bool = False) -> Path:
         return folder
 
 
-def home(create: bool = False) -> Path:
+def home() -> Path:
     """Where a click sets the engine up. On Windows not in Blender's user folder: its path is so long that those of
     torch's files would have more than the 260 characters that are allowed."""
     local = os.environ.get("LOCALAPPDATA")
     if os.name != "nt" or not local:
-        return user_folder(FOLDER, create)
-    folder = Path(local, "fit_flare", "{}.{}".format(*bpy.app.version))
-    if create:
-        folder.mkdir(parents=True, exist_ok=True)
-    return folder
+        return user_folder(FOLDER)
+    return Path(local, "fit_flare", "{}.{}".format(*bpy.app.version))
 
 
-def python_at(place: Path) -> Path | None:
-    """The interpreter that `place` is, or that the virtual environment in it has."""
-    for path in (place, place / "Scripts" / "python.exe", place / "bin" / "python"):
-        if path.is_file():
-            return path.absolute()  # not resolved: a virtual environment's python is a link
-    return None
+def virtual_environment() -> Path:
+    """What a click sets up; it need not be there."""
+    return home() / "python"
 
 
 def named() -> tuple[str, str]:
@@ -64,13 +59,16 @@ def named() -> tuple[str, str]:
 
 
 def find() -> Path | None:
-    """The engine's Python: the one that is named, else the one that was set up by a click, or .venv beside the
-    extension's source, in the order of the commands. None where there is none; a look at the disk, cheap enough for a
-    panel."""
+    """The engine's Python: the one that is named, else the one that was set up by a click, or .venv in the extension's
+    source, in the order of the commands (headless/hand_off.py). None where there is none.
+
+    A look at the disk, cheap enough for a panel. The commands start what they find, to see whether it has torch, and so
+    may take a .venv in the folder above, too, which is anybody's.
+    """
     _, place = named()
     if place:
         return python_at(Path(place).expanduser())
-    for folder in (home() / "python", ROOT / ".venv"):
+    for folder in (virtual_environment(), ROOT / ".venv"):
         python = python_at(folder)
         if python is not None:
             return python
@@ -91,11 +89,6 @@ def command(*words: object) -> list[str]:
     if python is None:
         raise EngineError(f"{missing()}.")
     return [str(python), str(RUN), *map(str, words), "--progress", "json"]
-
-
-def environment() -> dict[str, str]:
-    """This environment, less what would lead another Python to Blender's modules."""
-    return {name: value for name, value in os.environ.items() if name not in ("PYTHONHOME", "PYTHONPATH")}
 
 
 def run(kind: str, folder: Path, words: Sequence[object]) -> Job:
@@ -131,13 +124,13 @@ def set_up() -> Job:
     if not bpy.app.online_access:
         raise EngineError("Blender's online access is off; allow it in Preferences > System > Network, then set up.")
     script = ROOT / "headless" / "set_up.py"
-    words = [sys.executable, *bpy.app.python_args, str(script), str(home(create=True) / "python")]
+    words = [sys.executable, *bpy.app.python_args, str(script), str(virtual_environment())]
     return jobs.start("set up", home(), words, environment())
 
 
 def was_set_up() -> bool:
     """Whether there is one that a click has set up."""
-    return (home() / "python").is_dir()
+    return virtual_environment().is_dir()
 
 
 def setting_up() -> Job | None:

@@ -22,6 +22,7 @@ from types import FrameType
 from typing import Any
 
 from ..core.errors import Cancelled, EngineError, FitFlareError, SettingsError
+from ..core.processes import environment, python_at
 from ..core.progress import Progress, is_hangup, stop_signals
 from .command import Side
 
@@ -51,13 +52,13 @@ def engine_command(named: str | None) -> list[str]:
     for where, place in (("--engine", named), ("FIT_FLARE_ENGINE", os.environ.get("FIT_FLARE_ENGINE")),
                          ("the add-on's preferences", _engine_in_preferences())):
         if place:
-            python = _python_at(Path(place).expanduser())
+            python = python_at(Path(place).expanduser())
             if python is None or not _has_torch(python):
                 raise EngineError(f"The engine that {where} names, {place}, is not a Python with torch; "
                                   "install the engine there or name another.")
             return [str(python), str(RUN)]
     for folder in (*_set_up_by_the_addon(), ROOT / ".venv", ROOT.parent / ".venv"):
-        python = _python_at(folder)
+        python = python_at(folder)
         if python is not None and _has_torch(python):
             return [str(python), str(RUN)]
     raise EngineError(f"This step needs a Python with torch, and none was found: run `make setup` in {ROOT}, or "
@@ -78,21 +79,13 @@ def _set_up_by_the_addon() -> list[Path]:
         return []
     from ..flare_addon import engine
 
-    return [engine.home() / "python"]
-
-
-def _python_at(place: Path) -> Path | None:
-    """The interpreter that `place` is, or that the virtual environment in it has."""
-    for path in (place, place / "Scripts" / "python.exe", place / "bin" / "python"):
-        if path.is_file():
-            return path.absolute()  # not resolved: a virtual environment's python is a link
-    return None
+    return [engine.virtual_environment()]
 
 
 def _has_torch(python: Path) -> bool:
     code = "import importlib.util, sys; sys.exit(importlib.util.find_spec('torch') is None)"
     try:
-        return subprocess.run([str(python), "-c", code], env=_environment(), capture_output=True,
+        return subprocess.run([str(python), "-c", code], env=environment(), capture_output=True,
                               timeout=60, check=False).returncode == 0
     except (OSError, subprocess.TimeoutExpired):
         return False
@@ -139,11 +132,6 @@ def _usual_places() -> Iterator[str]:
         yield from (str(path) for path in sorted(folder.glob("Blender */blender.exe"), reverse=True))
 
 
-def _environment() -> dict[str, str]:
-    """This environment, less what would lead another Python to the wrong modules."""
-    return {name: value for name, value in os.environ.items() if name not in ("PYTHONHOME", "PYTHONPATH")}
-
-
 # ---- how ------------------------------------------------------------------------------------------
 
 
@@ -169,7 +157,7 @@ def run_there(command: Sequence[str], words: Sequence[str], step: str, progress:
     with tempfile.TemporaryFile() as noise:
         try:
             child = subprocess.Popen(whole, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=noise,
-                                     env=_environment(), encoding="utf-8", errors="replace", **own_group())
+                                     env=environment(), encoding="utf-8", errors="replace", **own_group())
         except OSError as problem:
             raise EngineError(f"{whole[0]} cannot be started ({problem.strerror or problem}).") from problem
         try:

@@ -44,12 +44,13 @@ from benchmarks.bilateral import GradedScene
 from benchmarks.hidden_lights import hidden_flare
 from benchmarks.known_scene import KnownScene, score
 from core.capture import Camera, Capture, Light
+from core.choices import Preset
 from core.files import write_json
 from core.fit import fit
 from core.fit.frames import Frames
 from core.fit.rendering import render
 from core.fit.run import Run, ViewLayers
-from core.fit.settings import FitSettings, Preset, changed, preset
+from core.fit.settings import FitSettings, changed, preset
 from core.gaussians.scene import SceneGaussians
 from core.metrics.evaluation import evaluate
 from core.progress import Progress, TerminalProgress

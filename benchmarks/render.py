@@ -29,8 +29,9 @@ from benchmarks import report, workload
 from benchmarks.report import milliseconds, table
 from benchmarks.timing import medians
 from core.capture import Camera
+from core.choices import Blend
 from core.fit.run import Run
-from core.flare.compositing import Blend, composite, joined
+from core.flare.compositing import composite, joined
 from core.flare.deformation import QueryRange
 from core.flare.model import OURS, PAPER, FlareForm, FlareModel, LightFlare
 from core.flare.placement import PlaneGaussians, pixels, slopes

@@ -4,8 +4,8 @@ like in them. Blender reads them too, so numpy is all it takes."""
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
 
+from .choices import Blend
 from .errors import RunError
 from .files import read_json
 
@@ -29,6 +29,6 @@ def read(folder: Path) -> dict[str, float]:
     return {name: float(one) for name, one in exposures.items()}
 
 
-def brightness(exposure: float, blend: Literal["over", "add"]) -> float:
+def brightness(exposure: float, blend: Blend) -> float:
     """Times the colours of a flare's Gaussians: linear light where it adds, display values where it covers."""
     return exposure if blend == "add" else exposure ** (1 / DISPLAY_GAMMA)

@@ -6,6 +6,7 @@ keep two looks, and every number can be animated and driven (`fit_flare.lights[0
 """
 from __future__ import annotations
 
+import dataclasses
 import math
 from typing import Any
 
@@ -21,6 +22,7 @@ from bpy.props import (
     StringProperty,
 )
 
+from ..core.choices import ITERATIONS, Mode, Preset
 from ..core.exposures import LEAST
 from ..core.look import Edit
 
@@ -30,12 +32,12 @@ PATH = {"PATH_SUPPORTS_BLEND_RELATIVE"} if bpy.app.version >= (4, 5, 0) else set
 OVERRIDABLE = {"LIBRARY_OVERRIDABLE"}
 """For what a .blend may say of an object that is linked into it: without, it would be forgotten when it is saved."""
 
-PRESETS = (
-    ("draft", "Draft", "A first look in minutes: 1,500 iterations"),
-    ("standard", "Standard", "Good for most shots: 3,000 iterations"),
-    ("high", "High", "For final layers: 10,000 iterations"),
+PRESETS: tuple[tuple[Preset, str, str], ...] = (
+    ("draft", "Draft", f"A first look in minutes: {ITERATIONS['draft']:,} iterations"),
+    ("standard", "Standard", f"Good for most shots: {ITERATIONS['standard']:,} iterations"),
+    ("high", "High", f"For final layers: {ITERATIONS['high']:,} iterations"),
 )
-MODES = (
+MODES: tuple[tuple[Mode, str, str], ...] = (
     ("default", "Clean Frames", "The capture has the frames without flare in its folder removed/ (or truth/scene/)"),
     ("split", "No Clean Frames", "There are no frames without flare: scene and flare are told apart by parallax"),
 )
@@ -87,7 +89,7 @@ class Edits:
         name="Solo", description="Leave out all the others", default=False, update=redraw)
 
 
-EDIT_NAMES = ("intensity", "scale", "spread", "rotation", "tint", "saturation", "streak", "mute", "solo")
+EDIT_NAMES = tuple(entry.name for entry in dataclasses.fields(Edit))
 
 
 def edit_of(sliders: Any) -> Edit:

@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from ..capture import Camera
-from ..flare.compositing import Blend, Layers, decode, encode, exposed, joined, layers, splat_flare
+from ..choices import Blend
+from ..flare.compositing import Layers, decode, encode, exposed, joined, layers, splat_flare
 from ..flare.model import FlareModel
 from ..flare.placement import PlaneGaussians
 from ..flare.visibility import VisibilitySettings, visible_shares

@@ -17,6 +17,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from ..choices import ITERATIONS, Blend, Mode, Model, Preset
 from ..errors import RunError, SettingsError
 from ..files import WRITTEN_BY_HAND, write_text
 from ..flare.density import DensitySettings
@@ -26,9 +27,6 @@ from ..gaussians.densification import ClassicSettings, McmcSettings
 from ..look.look import FORM_BOUNDS, MOST_GAUSSIANS
 from ..pictures import srgb_from_linear
 from ..typed import MOST_SEED, WHOLE_DIGITS, Bounds, field_of, table_of
-
-Mode = Literal["default", "split", "unsup", "in-flare", "2d", "3dgs"]
-Preset = Literal["draft", "standard", "high", "paper"]
 
 
 @dataclass(frozen=True)
@@ -160,7 +158,7 @@ class FitSettings:
     """
 
     mode: Mode = "default"
-    blend: Literal["over", "add"] = "over"
+    blend: Blend = "over"
     iterations: int = 30000
     width: int = 0
     seed: int = 0
@@ -268,8 +266,8 @@ SETTLED = 0.05
 """Share of the flare's rates that is left at the end of a short schedule."""
 
 
-def preset(name: Preset, *, model: Literal["paper", "ours"] | None = None, mode: Mode = "default",
-           blend: Literal["over", "add"] | None = None, iterations: int | None = None) -> FitSettings:
+def preset(name: Preset, *, model: Model | None = None, mode: Mode = "default",
+           blend: Blend | None = None, iterations: int | None = None) -> FitSettings:
     """Settings by name, with every schedule stretched to the number of iterations.
 
     paper     the paper's form and figures, 30,000 iterations
@@ -278,10 +276,9 @@ def preset(name: Preset, *, model: Literal["paper", "ours"] | None = None, mode:
     `model` and `blend` choose another form: the paper's covers in display space, ours adds in linear light
     and is hidden by the scene.
     """
-    lengths = {"draft": 1500, "standard": 3000, "high": 10000, "paper": 30000}
-    if name not in lengths:
-        raise SettingsError(f"There is no preset {name!r}; choose {', '.join(lengths)}.")
-    length = lengths[name] if iterations is None else iterations
+    if name not in ITERATIONS:
+        raise SettingsError(f"There is no preset {name!r}; choose {', '.join(ITERATIONS)}.")
+    length = ITERATIONS[name] if iterations is None else iterations
     model = model or ("paper" if name == "paper" else "ours")
     form = replace(PAPER if model == "paper" else OURS, line=mode != "2d")
     if blend is None:

@@ -13,19 +13,18 @@ Layers are scene-linear whichever way was fitted, and scene + flare = composite 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
+from ..choices import Blend
 from ..exposures import brightness
 from ..gaussians import Splats, over, splat
 from ..gaussians.rasterizer import Kernels, Resolution
 from ..sampling import Sampling
 from . import placement
 from .placement import PlaneGaussians
-
-Blend = Literal["over", "add"]
 
 
 def splat_flare(gaussians: PlaneGaussians, intrinsics: Tensor, width: int, height: int, blend: Blend, *,

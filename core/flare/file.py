@@ -17,10 +17,10 @@ import torch
 from torch import Tensor
 
 from .. import tensors as on_disk
+from ..choices import Blend
 from ..errors import FlareFileError
 from ..look.look import KEY, VERSION, TrainedCamera, checked
 from ..sampling import Sampling
-from .compositing import Blend
 from .deformation import QueryRange
 from .encoding import TABLE
 from .model import FlareForm, FlareModel, LightFlare

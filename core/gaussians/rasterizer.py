@@ -6,6 +6,7 @@ from typing import Literal
 
 from torch import Tensor
 
+from ..choices import Blend
 from ..errors import SettingsError
 from ..sampling import DILATION
 from .kernels import choose
@@ -14,7 +15,6 @@ from .rendering import NEAR, Rendering, Splats, levelled
 from .spherical_harmonics import degree_of
 
 Kernels = Literal["auto", "torch", "tiles", "cpu", "cuda"]
-Blend = Literal["over", "add"]
 Resolution = Literal["full", "mixed"]
 
 

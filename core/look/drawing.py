@@ -7,11 +7,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..choices import Blend
 from ..sampling import Sampling
 from ..splatting import ALPHA_MIN, PROFILE_MIN
 from ..splatting import OPACITY_MAX as OPACITY_MAX
@@ -32,7 +33,7 @@ def reach(gaussians: PlaneGaussians, blend: str = "add") -> Floats:
 
 
 def draw(flares: Iterable[PlaneGaussians], intrinsics: ArrayLike, width: int, height: int,
-         blend: Literal["over", "add"] = "add", sampling: Sampling | None = None) -> Floats:
+         blend: Blend = "add", sampling: Sampling | None = None) -> Floats:
     """The flares as a picture (height, width, 3) under intrinsics (3, 3), pixel centres at + 0.5. sampling: the grid on
     which they were learned.
 

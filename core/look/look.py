@@ -13,6 +13,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..choices import Blend
 from ..errors import FlareFileError
 from ..sampling import Sampling
 from ..typed import Bounds, table_of
@@ -203,7 +204,7 @@ class LightLook:
 class Look:
     """All lights of a .flare; made by `read`."""
 
-    def __init__(self, path: Path, lights: tuple[LightLook, ...], blend: Literal["over", "add"], camera: TrainedCamera,
+    def __init__(self, path: Path, lights: tuple[LightLook, ...], blend: Blend, camera: TrainedCamera,
                  licence: str = "", notes: str = "", sampling: Sampling | None = None) -> None:
         self.path, self.lights, self.blend, self.camera = path, lights, blend, camera
         self.sampling = sampling

@@ -8,11 +8,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..choices import Blend
 from ..exposures import brightness
 from ..pictures import LUMINANCE
 from ..sampling import Sampling, dilation
@@ -45,7 +46,7 @@ class PlaneGaussians:
     def __len__(self) -> int:
         return len(self.means)
 
-    def exposed(self, exposure: float, blend: Literal["over", "add"]) -> PlaneGaussians:
+    def exposed(self, exposure: float, blend: Blend) -> PlaneGaussians:
         """As a frame shows them that was exposed to so many times the usual light."""
         return replace(self, colours=np.float32(brightness(exposure, blend)) * self.colours)
 

@@ -7,9 +7,10 @@ import shutil
 import time
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 from ...core.capture.capture import REMOVED
+from ...core.choices import Model
 from ...core.errors import CaptureError, RunError
 from ...core.files import atomic_folder
 from ...core.progress import Progress
@@ -41,7 +42,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     without.add_argument("--remove", action="store_true",
                          help="take the flares out of the frames as `remove` does, in place of the sample's exact "
                               "flare-free frames")
-    parser.add_argument("--model", choices=fit.MODELS, help="the flare's form, as of `fit`")
+    parser.add_argument("--model", choices=get_args(Model), help="the flare's form, as of `fit`")
     parser.add_argument("--iterations", type=int, metavar="N", help="length of the fit (default: the preset's)")
     parser.add_argument("--preset", choices=("draft", "standard", "high"), default="draft",
                         help="how long and how fine (default draft)")

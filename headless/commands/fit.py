@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
+from ...core.choices import Blend, Mode, Model, Preset
 from ...core.errors import SettingsError
 from ...core.files import WRITTEN_BY_HAND
 from ...core.progress import Progress
@@ -18,11 +19,6 @@ from .remove import with_removed
 if TYPE_CHECKING:
     from ...core.capture import Capture
 
-# Spelled out here, since the settings themselves can only be imported where torch is.
-PRESETS = ("draft", "standard", "high", "paper")
-MODES = ("default", "split", "unsup", "in-flare", "2d", "3dgs")
-MODELS = ("paper", "ours")
-BLENDS = ("over", "add")
 DECODED_BYTES = 1 << 26
 
 
@@ -39,15 +35,16 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--resume", action="store_true",
                         help="go on with the run in --out, with the settings it was begun with; begin it if there is "
                              "none")
-    parser.add_argument("--preset", choices=PRESETS, default="standard",
+    parser.add_argument("--preset", choices=get_args(Preset), default="standard",
                         help="how long and how fine (default standard)")
-    parser.add_argument("--model", choices=MODELS, help="the flare's form: the paper's, or ours with rings and offsets")
-    parser.add_argument("--mode", choices=MODES,
+    parser.add_argument("--model", choices=get_args(Model),
+                        help="the flare's form: the paper's, or ours with rings and offsets")
+    parser.add_argument("--mode", choices=get_args(Mode),
                         help="default: with flare-free frames, which `remove` makes where there are none; split: "
                              "without, by parallax; unsup: as the paper does without; in-flare: scene supervised by "
                              "frame less flare; 2d: flare free on the plane; 3dgs: scene alone (if not given: default "
                              "where the capture has flare-free frames, else split)")
-    parser.add_argument("--blend", choices=BLENDS,
+    parser.add_argument("--blend", choices=get_args(Blend),
                         help="over: the flare covers, in display space; add: it adds, in linear light")
     parser.add_argument("--holdout", metavar="FILE|N",
                         help="views kept for eval: a split.json, or every Nth, 0 for none (default: the capture's "

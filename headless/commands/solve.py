@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
+from ...core.choices import Matching
 from ...core.errors import CaptureError, SettingsError
 from ...core.progress import Progress
 from ..command import Command, Step, seed
-
-MATCHING = ("auto", "exhaustive", "sequential", "similar")
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -24,7 +23,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--frames", type=int, default=0, metavar="N",
                         help="choose N frames, evenly, the sharpest of each stretch (default: all of a folder, 150 of "
                              "a video)")
-    parser.add_argument("--matching", choices=MATCHING, default="auto",
+    parser.add_argument("--matching", choices=get_args(Matching), default="auto",
                         help="which frames to match: all with all, neighbours, or look-alikes (default: what fits)")
     parser.add_argument("--lens", default="RADIAL", metavar="MODEL",
                         help="COLMAP camera model to solve for (default RADIAL; OPENCV_FISHEYE for fisheyes)")

@@ -11,7 +11,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 
 # What Blender's own Python, which has numpy and nothing else of ours, must be able to import.
-LIGHT = ("core.errors", "core.files", "core.progress", "core.pictures", "core.capture",
+LIGHT = ("core.errors", "core.choices", "core.files", "core.progress", "core.pictures", "core.capture",
          "core.bake.bake", "core.metrics.evaluation", "core.look")
 
 # From the lowest; what is not named is the ground floor, below all.

@@ -9,13 +9,12 @@ import subprocess
 import sys
 import venv
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import pytest
 from fit_flare.core.capture import Capture
 from fit_flare.core.capture.colmap import PointCloud
 from fit_flare.core.errors import Cancelled, CaptureError, FitFlareError, SettingsError
-from fit_flare.core.fit import settings as fit_settings
 from fit_flare.core.progress import Progress
 from fit_flare.headless import cli
 from fit_flare.headless.command import Command, Step
@@ -264,11 +263,6 @@ def test_a_farm_is_told_names_of_any_script(tmp_path: Path) -> None:
 
 
 # ---- the pieces -----------------------------------------------------------------------------------
-
-
-def test_choices_are_those_of_the_settings() -> None:
-    assert get_args(fit_settings.Preset) == fit.PRESETS
-    assert get_args(fit_settings.Mode) == fit.MODES
 
 
 def test_settings_on_the_command_line() -> None:

@@ -19,12 +19,12 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from ...choices import Matching
 from ...errors import CaptureError
 from ...files import read_json, write_json
 from ...pictures import pictures_in
 from ...progress import Progress
 from ..lens import MODELS
-from .pairs import Matching
 
 REPORT, PICTURE, WORK, ASKED = "solve.json", "solve.png", ".solve", "request.json"
 

@@ -8,12 +8,13 @@ small vocabulary, summed), which closes loops without a vocabulary file from els
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-Matching = Literal["auto", "exhaustive", "sequential", "similar"]
+from ...choices import Matching
+
 SMALL = 60    # frames; all pairs of as many are matched in two minutes on two cores
 OVERLAP = 8   # neighbours of a video frame matched one by one; beyond them distances double
 WORDS = 64    # of the vocabulary of descriptors

@@ -1,0 +1,14 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What users choose from by name, for those who offer the choice where the engine itself cannot be imported."""
+from __future__ import annotations
+
+from typing import Literal
+
+Preset = Literal["draft", "standard", "high", "paper"]
+Mode = Literal["default", "split", "unsup", "in-flare", "2d", "3dgs"]
+Model = Literal["paper", "ours"]
+Blend = Literal["over", "add"]
+Matching = Literal["auto", "exhaustive", "sequential", "similar"]
+
+ITERATIONS: dict[Preset, int] = {"draft": 1500, "standard": 3000, "high": 10000, "paper": 30000}
+"""Length of a fit by its preset."""

@@ -6,7 +6,6 @@ to 5.2: up to 4.5 the tree ends in a Composite node, from 5.0 in a Group Output.
 """
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Sequence
 from typing import Any
 
@@ -18,6 +17,7 @@ from ..core.errors import FrameError
 from ..core.pictures import exr_is_rec709
 from . import curves, wires
 from .flare_node import GROUP, GROUPS_ARE_TREES, find_node, layer_of, new_node, node_group, of_render_size, tree_of
+from .paths import absolute, stored
 
 LAYERS = "Fit Flare Layers"
 PLATE = "Fit Flare Footage"
@@ -301,9 +301,7 @@ def _point_at(node: Any, layers: LayerFolder) -> None:
     """Make an Image node show the file of each frame's number, gaps and a frame 0 included."""
     image = bpy.data.images.load(str(layers.files[layers.first]), check_existing=True)
     image.source = "SEQUENCE"
-    if bpy.data.filepath:
-        with contextlib.suppress(ValueError):  # another drive than the .blend's: the path stays absolute
-            image.filepath = bpy.path.relpath(image.filepath)
+    image.filepath = stored(absolute(image.filepath))
     node.image = image
     if exr_is_rec709(layers.files[layers.first]):  # a studio's configuration may take EXRs for another space
         known = _spaces(image)
@@ -317,7 +315,7 @@ def _point_at(node: Any, layers: LayerFolder) -> None:
 def misread(scene: Any) -> str:
     """A sentence where the colour configuration has no space for the light of the layers, "" where it has."""
     image = tree_of(scene).nodes[LAYERS].image
-    if not exr_is_rec709(bpy.path.abspath(image.filepath)) or any(one in _spaces(image) for one in REC_709_LINEAR):
+    if not exr_is_rec709(absolute(image.filepath)) or any(one in _spaces(image) for one in REC_709_LINEAR):
         return ""
     return ("The colour configuration has no space of linear Rec. 709, which the layers are in; they are read as "
             f"{image.colorspace_settings.name}, and their colours are wrong.")

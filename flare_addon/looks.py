@@ -7,7 +7,6 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
-import bpy
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,7 +17,7 @@ from ..core.look.shot import PlacedLight, evaluate
 from . import cameras, curves, wires
 from .lights import name_of, of_scene, place_of, stands
 from .objects import matrix_of
-from .paths import absolute
+from .paths import absolute, stored
 from .properties import edit_of
 
 LIGHT_SHARE = 0.02  # of a light's distance: the disc's radius where none is given; as a fit's, two deviations wide
@@ -64,12 +63,7 @@ def use(scene: Any, path: Path | str) -> Look:
     look = read(path)
     state = scene.fit_flare
     before = state.flare
-    state.flare = str(path)
-    if bpy.data.filepath:
-        import contextlib
-
-        with contextlib.suppress(ValueError):
-            state.flare = bpy.path.relpath(str(path))
+    state.flare = stored(path)
     objects = {name_of(item): item for item in of_scene(scene)}
     if before != state.flare:
         for index in reversed(range(len(state.lights))):

@@ -14,6 +14,7 @@ from ..core.bake.folder import LayerFolder
 from ..core.errors import FrameError
 from ..core.files import atomic_path
 from ..core.pictures import exr_is_cut_off
+from .paths import absolute, stored
 
 PLAIN_VIEWS = ("Standard", "Un-tone-mapped")  # of Blender's own colour configuration, and of ACES'
 
@@ -112,8 +113,7 @@ def save_beside(path: Path) -> None:
                 bpy.ops.wm.save_as_mainfile(filepath=os.fspath(temporary))
                 for image in bpy.data.images:
                     if image.source == "SEQUENCE":
-                        with contextlib.suppress(ValueError):
-                            image.filepath = bpy.path.relpath(bpy.path.abspath(image.filepath))
+                        image.filepath = stored(absolute(image.filepath))
                 bpy.ops.wm.save_as_mainfile(filepath=os.fspath(temporary), compress=False)
             except RuntimeError as problem:
                 raise _unwritten(temporary) from problem

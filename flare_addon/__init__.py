@@ -11,6 +11,7 @@
     library.py          flares for other shots            paths.py         files of a .blend that moves
     objects.py          where objects stand               curves.py        animation of what is moved
     rendering.py        frames and .blends out            reports.py       what buttons tell
+    blend_shot.py       a .blend for the commands
     operators/, panels.py   buttons and panels
 """
 from __future__ import annotations
@@ -43,5 +44,6 @@ def unregister() -> None:
     bpy.app.handlers.load_post.remove(_loaded)
     jobs.unregister()
     fits.unregister()
+    looks.forget()
     for module in reversed(_MODULES):
         module.unregister()

@@ -105,6 +105,16 @@ def set_up(scene: Any, layers: LayerFolder, *, keep_image: bool = False, plate: 
     return node
 
 
+def plate_of(scene: Any) -> tuple[Any, int, int, int]:
+    """The footage behind the scene's camera, as `set_up` takes it. Raises FrameError where there is none."""
+    camera = scene.camera
+    for back in camera.data.background_images if camera is not None and camera.type == "CAMERA" else ():
+        if back.source == "IMAGE" and back.image is not None:
+            user = back.image_user
+            return back.image, user.frame_start, user.frame_offset, user.frame_duration
+    raise FrameError("The camera has no footage behind it; lay the flare over the present image instead.")
+
+
 def _source(socket: Any) -> Any:
     """The output socket that feeds an input, None where nothing does."""
     return socket.links[0].from_socket if socket is not None and socket.is_linked else None

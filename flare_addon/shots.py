@@ -2,6 +2,7 @@
 """The scene's cameras, lights and sliders, frame by frame, written down for the engine to bake."""
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -12,6 +13,7 @@ import bpy
 
 from ..core.bake import bake as bakes
 from ..core.bake.frames import layers_file
+from ..core.bake.layers import layer_names
 from ..core.errors import CaptureError, FrameError, RunError, SettingsError
 from ..core.files import digest_of, write_json
 from ..core.look import Edit, LookEdits
@@ -91,6 +93,22 @@ def live_of(state: Any, names: Sequence[str]) -> dict[str, list[str]]:
         item.identity = item.identity or uuid4().hex
         identities[item.name] = item.identity
     return {"lights": list(names), "identities": [identities[name] for name in names]}
+
+
+def live_layers(state: Any, folder: Path) -> dict[str, int] | None:
+    """Of layers whose colour was left to the compositor, the number of the flare in the scene that each is of; those of
+    flares that are gone are left out. None where the folder, or the one that has it, says nothing of the kind."""
+    folder = next((one for one in (folder, folder.parent) if (one / LIVE).is_file()), folder)
+    try:
+        live = json.loads((folder / LIVE).read_text(encoding="utf-8"))
+        baked = layer_names(live["lights"])
+        identities = dict(zip(live["lights"], live.get("identities", live["lights"]), strict=True))
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    names, known = ({getattr(item, of): number for number, item in enumerate(state.lights)}
+                    for of in ("name", "identity"))
+    found = {layer: known.get(identities[name], names.get(name)) for name, layer in baked.items()}
+    return {layer: number for layer, number in found.items() if number is not None}
 
 
 def layers_folder(scene: Any, create: bool = False) -> Path:

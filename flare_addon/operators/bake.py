@@ -2,7 +2,6 @@
 """Layers out, and back together in the compositor."""
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -11,9 +10,8 @@ import bpy
 
 from ...core.bake.folder import LayerFolder
 from ...core.bake.frames import Frame, absent
-from ...core.bake.layers import layer_names
-from ...core.errors import CaptureError, FrameError
-from .. import compositor, engine, flare_node, jobs, looks, rendering, shots, wires
+from ...core.errors import CaptureError
+from .. import compositor, engine, flare_node, jobs, rendering, shots, wires
 from ..paths import absolute
 from ..reports import NO_CAMERA, NO_FLARE, Action, reported
 
@@ -79,7 +77,7 @@ def set_up(operator: Any, scene: Any, folder: str, *, keep_image: bool, plate: b
     """Nodes for the layers in a folder, over the baked scene, what the compositor shows now (`keep_image`) or the
     footage behind the camera (`plate`); `match` gives the scene their frames and size. Raises FrameError."""
     layers = LayerFolder.open(shots.folder_of_camera(absolute(folder), scene.camera))
-    compositor.set_up(scene, layers, keep_image=keep_image, plate=footage_of(scene) if plate else None)
+    compositor.set_up(scene, layers, keep_image=keep_image, plate=compositor.plate_of(scene) if plate else None)
     if match:
         rendering.match_scene(scene, layers, layers.size())
     live = "; Intensity and Tint of the panel act on it" if wire(scene, layers) else ""
@@ -141,29 +139,12 @@ class FITFLARE_OT_set_up_compositor(Action, bpy.types.Operator):
                match=self.match_scene)
 
 
-def footage_of(scene: Any) -> tuple[Any, int, int, int]:
-    """The image behind the scene's camera and its place in time. Raises FrameError where there is none."""
-    camera = scene.camera
-    for back in camera.data.background_images if camera is not None and camera.type == "CAMERA" else ():
-        if back.source == "IMAGE" and back.image is not None:
-            user = back.image_user
-            return back.image, user.frame_start, user.frame_offset, user.frame_duration
-    raise FrameError("The camera has no footage behind it; lay the flare over the present image instead.")
-
-
 def wire(scene: Any, layers: LayerFolder) -> bool:
     """Connect the panel's sliders to layers that this scene has baked without them; whether it was done."""
-    folder = next((one for one in (layers.folder, layers.folder.parent) if (one / shots.LIVE).is_file()), layers.folder)
-    try:
-        live = json.loads((folder / shots.LIVE).read_text(encoding="utf-8"))
-        baked = layer_names(live["lights"])
-        identities = dict(zip(live["lights"], live.get("identities", live["lights"]), strict=True))
-    except (OSError, ValueError, KeyError, TypeError):
+    gains = shots.live_layers(scene.fit_flare, layers.folder)
+    if gains is None:
         return False
-    names, known = ({getattr(item, of): number for number, item in enumerate(scene.fit_flare.lights)}
-                    for of in ("name", "identity"))
-    found = {layer: known.get(identities[name], names.get(name)) for name, layer in baked.items()}
-    wires.wire(scene, {layer: number for layer, number in found.items() if number is not None})
+    wires.wire(scene, gains)
     return True
 
 
@@ -223,12 +204,4 @@ _CLASSES = (FITFLARE_OT_bake, FITFLARE_OT_set_up_compositor, FITFLARE_OT_set_up_
             FITFLARE_OT_open_folder)
 
 
-def register() -> None:
-    for cls in _CLASSES:
-        bpy.utils.register_class(cls)
-
-
-def unregister() -> None:
-    for cls in reversed(_CLASSES):
-        bpy.utils.unregister_class(cls)
-    looks.forget()
+register, unregister = bpy.utils.register_classes_factory(_CLASSES)

@@ -11,7 +11,7 @@
     library.py          flares for other shots            paths.py         files of a .blend that moves
     objects.py          where objects stand               curves.py        animation of what is moved
     rendering.py        frames and .blends out            reports.py       what buttons tell
-    blend_shot.py       a .blend for the commands
+    blend_shot.py       a .blend for the commands         layouts.py       what panels are laid out of
     operators/, panels.py   buttons and panels
 """
 from __future__ import annotations

@@ -17,7 +17,7 @@ from .jobs import Job
 
 ROOT = Path(__file__).resolve().parents[1]
 RUN = ROOT / "headless" / "run.py"
-PACKAGE = (__package__ or "").rpartition(".")[0]
+PACKAGE = (__package__ or "").rpartition(".")[0]  # "bl_ext.user_default.fit_flare", by which Blender knows it
 FOLDER = "engine"
 VARIABLE = "FIT_FLARE_ENGINE"
 TESTED = "python.txt"  # which Python the last test was of

@@ -11,7 +11,7 @@ import bpy
 
 from ..core.errors import FitFlareError
 from . import engine, fits, flare_node, jobs, library, lights, looks, overlay, shots, wires
-from .preferences import PACKAGE, draw_progress, lines
+from .layouts import draw_progress, lines
 
 
 class _Part:
@@ -195,7 +195,7 @@ def draw_engine(layout: Any) -> None:
     """That there is no engine, and the way to one."""
     box = layout.box()
     lines(box, f"{engine.missing()}.", "ERROR")
-    box.operator("preferences.addon_show", text="Open Preferences", icon="PREFERENCES").module = PACKAGE
+    box.operator("preferences.addon_show", text="Open Preferences", icon="PREFERENCES").module = engine.PACKAGE
 
 
 class FITFLARE_PT_look(_Part, bpy.types.Panel):

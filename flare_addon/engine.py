@@ -76,7 +76,9 @@ def find() -> Path | None:
 
 
 def missing() -> str:
-    """Why there is none, and what to do, without a full stop."""
+    """Why there is none, and what to do, without a full stop; "" where there is one."""
+    if find() is not None:
+        return ""
     who, place = named()
     if place:
         return f"The engine named by {who} is not there: {place}. Name a Python that has torch, or none"

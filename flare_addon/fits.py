@@ -15,6 +15,7 @@ from . import engine, jobs, lights, looks
 from .capture_import import expose
 from .jobs import Job
 from .paths import absolute, stored
+from .reports import NO_CAPTURE
 
 FLARE, SCENE, PREVIEW, CONFIG = "flare.flare", "scene.ply", "preview_small.png", "config.toml"
 
@@ -60,13 +61,13 @@ def why_not(scene: Any) -> str:
     """What keeps a fit from being started, and what to do; "" where nothing does. No full stop: for tooltips."""
     capture = capture_of(scene)
     if capture is None:
-        return "Import a capture first"
+        return NO_CAPTURE
     if not capture.is_dir():
         return f"The capture {capture} is not there any more; choose where it is now"
     if not lights.of_scene(scene):
         return "Add a light first, or find the lights in the frames"
-    if engine.find() is None:
-        return engine.missing()
+    if missing := engine.missing():
+        return missing
     if state_of(scene) == "running":
         return "A fit is running"
     return ""

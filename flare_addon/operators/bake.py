@@ -37,8 +37,8 @@ class FITFLARE_OT_bake(Action, bpy.types.Operator):
             return NO_FLARE
         if scene.camera is None:
             return NO_CAMERA
-        if engine.find() is None:
-            return engine.missing()
+        if missing := engine.missing():
+            return missing
         return "A bake is running" if _baking(scene) else ""
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:

@@ -35,8 +35,8 @@ class FITFLARE_OT_resume(Action, bpy.types.Operator):
 
     @classmethod
     def why_not(cls, context: bpy.types.Context) -> str:
-        if engine.find() is None:
-            return engine.missing()
+        if missing := engine.missing():
+            return missing
         if fits.state_of(context.scene) != "resumable":
             return "There is no broken-off fit to go on with"
         return ""
@@ -56,9 +56,7 @@ class FITFLARE_OT_clean_frames(Action, bpy.types.Operator):
         capture = fits.capture_of(context.scene)
         if capture is None or not (capture / "images").is_dir():
             return NO_CAPTURE
-        if engine.find() is None:
-            return engine.missing()
-        return ""
+        return engine.missing()
 
     def act(self, context: bpy.types.Context) -> None:
         fits.clean(context.scene)

@@ -80,9 +80,7 @@ class FITFLARE_OT_find_lights(Action, bpy.types.Operator):
         capture = fits.capture_of(context.scene)
         if capture is None or not capture.is_dir():
             return NO_CAPTURE
-        if engine.find() is None:
-            return engine.missing()
-        return ""
+        return engine.missing()
 
     def act(self, context: bpy.types.Context) -> None:
         fits.find_lights(context.scene)

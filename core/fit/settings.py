@@ -123,26 +123,26 @@ class SplitSettings:
     scene is fitted alone first, until every view was looked at `rounds` times (a third of the iterations at most), to
     what the frames agree on from below: where a frame is brighter than the scene, that counts for `excess` of what it
     counts where it is darker. Longer, and it takes up the glow about the lights; shorter, and the flare takes walls.
-    So it is asked then whether the scene has been found: flares only add, but errors go both ways. Where the square of
-    what the frames have more than the scene is less than `found` times that of what they have less, the scene goes on
-    alone to a third of the iterations, and `excess_unfound` counts instead of `excess`.
     From then on both are fitted to the frames, the scene besides from below with `weight`, in the end only where it is
     brighter than a frame; and its light costs `glow` near where a light is seen, half of that at `reach` of the width
     beside: what could be either's is the flare's. `sh_degree`: of the scene's colours for the share `plain` of the
     iterations, since they could follow a flare if they were free to change with the direction. `sky`: points far away
     to begin with.
+    When the flare is due it is asked whether the scene has been found: flares only add, but errors go both ways. Where
+    the square of what the frames have more than the scene is less than `found` times that of what they have less, the
+    flare's light costs `haze` away from the lights: what could be either's is the flare's near them alone.
     """
 
     rounds: int = 2
     excess: float = 0.25
-    found: float = 22.0
-    excess_unfound: float = 0.5
     weight: float = 0.05
     glow: float = 0.05
     reach: float = 0.05
     sh_degree: int = 1
     plain: float = 0.7
     sky: bool = True
+    found: float = 26.0
+    haze: float = 0.1
 
 
 @dataclass(frozen=True)
@@ -249,7 +249,7 @@ BOUNDS: dict[str, Bounds] = {
         "features", "features_rest", "opacity", "scale", "rotation")), _AMOUNT),
     **dict.fromkeys(("scene.rates.position", "scene.rates.position_final"), _POSITIVE),
 
-    "split.rounds": _FROM_0, "split.excess": _SHARE, "split.excess_unfound": _SHARE, "split.found": _AMOUNT,
+    "split.rounds": _FROM_0, "split.excess": _SHARE, "split.found": _AMOUNT, "split.haze": _AMOUNT,
     "split.weight": _AMOUNT, "split.glow": _AMOUNT, "split.reach": Bounds(1e-6, 1e6), "split.plain": _SHARE,
     "split.sh_degree": Bounds(0, 3),
 }
@@ -356,6 +356,8 @@ def read_config(path: Path) -> FitSettings:
         data = tomllib.loads(path.read_text(encoding=WRITTEN_BY_HAND))
         if "mode" not in data:  # what is cut off would pass for settings that are left as they come
             raise ValueError("it has no mode")
+        if isinstance(data.get("split"), dict):
+            data["split"].pop("excess_unfound", None)  # of versions whose scenes went on alone when not found
         return table_of(FitSettings, data).checked()
     except OSError as problem:
         raise RunError(f"{path} cannot be read ({problem.strerror}); is this the folder of a run?") from problem

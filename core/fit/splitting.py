@@ -3,7 +3,9 @@
 
 Frame = encode(scene + flare) leaves open who takes what both could make. Two things decide. A flare only adds light,
 so no frame is darker than the scene. And what both could make is the flare's: above all the glow about a light, which
-moves with the light as a part of the scene there would. The light's own disc is the scene's.
+moves with the light as a part of the scene there would. The light's own disc is the scene's. Where the scene is slow to
+find, as plain walls are, what it lacks would become the flare's too, a haze over the frame; so then what both could
+make is the flare's near the lights alone.
 """
 from __future__ import annotations
 
@@ -20,48 +22,34 @@ from .frames import Targets
 from .settings import SplitSettings
 
 
-class HeadStart:
-    """How long the scene of a mode `split` fit is fitted alone, and how much brighter frames count for it.
-
-    views: that are fitted. until: the last iteration of the scene alone, which `goes_on` puts off.
-    """
-
-    def __init__(self, settings: SplitSettings, views: int, iterations: int) -> None:
-        self._settings = settings
-        self._longest = iterations // 3
-        self._rounds_end = min(settings.rounds * views, self._longest)
-        self.until = self._rounds_end
-
-    def asks_before(self, iteration: int) -> bool:
-        """Whether this iteration, which would be the flare's first, waits for an answer of `is_found`."""
-        return iteration == self._rounds_end + 1 <= self._longest
-
-    def goes_on(self) -> None:
-        """The scene has not been found."""
-        self.until = self._longest
-
-    @property
-    def excess(self) -> float:
-        """See `from_below`."""
-        return self._settings.excess if self.until == self._rounds_end else self._settings.excess_unfound
+def head_start(settings: SplitSettings, views: int, iterations: int) -> int:
+    """Iterations, of so many, in which the scene of a fit to so many views is fitted alone."""
+    return min(settings.rounds * views, iterations // 3)
 
 
 def scene_beside_flare(scene: Tensor, targets: Targets, lights: ArrayLike, discs: Tensor | None,
-                       settings: SplitSettings, excess: float, progress: float) -> Tensor:
+                       settings: SplitSettings, progress: float) -> Tensor:
     """Loss of a scene (height, width, 3) of display values that is fitted with the flare, besides that of the two
     together. lights: (n, 3), world. discs: (height, width), the lights' own clipped pixels, if they are told.
-    excess: see `from_below`.
 
     progress: of the fit, 0..1. Until its middle the scene, which is still to be found, is less and less drawn up to
     brighter frames, and more and more held down near the lights.
     """
     settled = min(2 * progress, 1.0)
-    loss = settings.weight * from_below(scene, targets.frame, excess * (1 - settled))
+    loss = settings.weight * from_below(scene, targets.frame, settings.excess * (1 - settled))
     near = torch.from_numpy(nearness(targets.camera, lights, settings.reach))
     loss = loss + settings.glow * settled * (scene * near[..., None]).mean()
     if discs is not None:
         loss = loss + ((scene - targets.frame).abs() * discs[..., None]).mean()
     return loss
+
+
+def haze(added: Tensor, camera: Camera, lights: ArrayLike, settings: SplitSettings) -> Tensor:
+    """Loss of what a flare adds to the display values of a scene that was not found, (height, width, 3), away from
+    where lights (n, 3), world, are seen. What the frame shows costs a flare more to leave out than to make, so ghosts
+    that the scene cannot take over stay as they are."""
+    far = torch.from_numpy(1 - nearness(camera, lights, settings.reach))
+    return settings.haze * (added * far[..., None]).mean()
 
 
 def from_below(scene: Tensor, frame: Tensor, excess: float) -> Tensor:

@@ -25,6 +25,7 @@ from ..errors import CaptureError, RunError
 from ..flare.compositing import clipped, composite
 from ..flare.density import clone_and_prune
 from ..flare.visibility import clear_shares, uncovering
+from ..gaussians import Splats
 from ..gaussians.densification import Classic, Mcmc, Strategy
 from ..gaussians.loss import l1_ssim
 from ..gaussians.ordering import morton_order
@@ -37,7 +38,7 @@ from .frames import Frames, Targets, thinned
 from .optimisers import Optimisers
 from .rendering import render_flare, render_scene
 from .settings import FitSettings
-from .splitting import HeadStart, from_below, is_found, scene_beside_flare
+from .splitting import from_below, haze, head_start, is_found, scene_beside_flare
 
 CLEAR_EVERY = 50
 """Iterations between two looks at how much of the lights the scene leaves (`visibility.clear_shares`)."""
@@ -82,7 +83,8 @@ class Trainer:
                      *doubts(capture, settings, self.views, self.frames),
                      *(() if self.flare is None else moved_lights(capture, self.flare)))
         self.extent = capture.extent
-        self._head_start = HeadStart(settings.split, len(self.views), settings.iterations)
+        self._head_start = head_start(settings.split, len(self.views), settings.iterations)
+        self._scene_is_found = True
         self.optimisers = Optimisers(self.scene, self.flare, settings, self.extent, self.frames.display_white)
         self.strategy = self._strategy()
 
@@ -115,7 +117,7 @@ class Trainer:
             figures["scene_loss"] = float(scene_loss.detach())
             loss = loss + scene_loss
         elif settings.mode == "split" and self.scene_is_fitted:
-            scene_loss = self._split_loss(targets, shown, sources, alone)
+            scene_loss = self._split_loss(targets, shown, flare, sources)
             figures["scene_loss"] = float(scene_loss.detach())
             loss = loss + scene_loss
         self.losses[view.name] = sum(figures.values())
@@ -170,8 +172,8 @@ class Trainer:
 
     @torch.no_grad()
     def _look_for_scene(self) -> None:
-        """Mode `split` leaves a scene alone for longer that is not found yet when the flare is due."""
-        if self.settings.mode != "split" or not self._head_start.asks_before(self.iteration):
+        """Mode `split` asks whether the scene has been found when the flare is due."""
+        if self.settings.mode != "split" or self.iteration != self._head_start + 1 or not self._head_start:
             return
 
         def missing(targets: Targets) -> Tensor:
@@ -180,8 +182,8 @@ class Trainer:
             return targets.frame - self._as_filmed(scene.colour)
 
         asked = thinned(self.views, ASKED)
-        if not is_found((missing(self.frames.targets(view)) for view in asked), self.settings.split.found):
-            self._head_start.goes_on()
+        residuals = (missing(self.frames.targets(view)) for view in asked)
+        self._scene_is_found = is_found(residuals, self.settings.split.found)
 
     def _covered(self, targets: Targets) -> Tensor | None:
         """A loss where the scene hides a light from everywhere that the frame shows, until it lets some of it through.
@@ -197,7 +199,7 @@ class Trainer:
     def _scene_alone(self, targets: Targets) -> bool:
         """Whether the scene is fitted alone as yet, so that it hides lights by the time their flares are fitted."""
         if self.settings.mode == "split":
-            return self.iteration <= self._head_start.until
+            return self.iteration <= self._head_start
         begun = self.iteration > self.settings.flare.begin * self.settings.iterations
         return self.settings.supervised and self.scene_is_fitted and targets.removed is not None and not begun
 
@@ -242,13 +244,17 @@ class Trainer:
             return (targets.frame - (picture - scene).detach()).clamp(0, self.frames.display_white)
         return None
 
-    def _split_loss(self, targets: Targets, scene: Tensor, sources: Tensor | None, alone: bool) -> Tensor:
-        excess = self._head_start.excess
-        if alone or self.flare is None:
-            return from_below(scene, targets.frame, excess)
-        progress = self.iteration / self.settings.iterations
-        return scene_beside_flare(scene, targets, self.flare.positions.numpy(), sources, self.settings.split, excess,
-                                  progress)
+    def _split_loss(self, targets: Targets, scene: Tensor, flare: Splats | None, sources: Tensor | None) -> Tensor:
+        settings = self.settings
+        if self.flare is None or self._scene_alone(targets):
+            return from_below(scene, targets.frame, settings.split.excess)
+        lights, progress = self.flare.positions.numpy(), self.iteration / settings.iterations
+        loss = scene_beside_flare(scene, targets, lights, sources, settings.split, progress)
+        if flare is None or self._scene_is_found:
+            return loss
+        behind = scene.detach()
+        added = composite(behind, flare, settings.blend, self.frames.display_white) - behind
+        return loss + haze(added, targets.camera, lights, settings.split)
 
     def _sh_degree(self) -> int:
         if self.settings.scene.start:
@@ -298,7 +304,7 @@ class Trainer:
 
     def state(self) -> State:
         """All that a resumed fit needs, as `checkpoint.save` takes it."""
-        state: State = {"iteration": self.iteration, "alone_until": self._head_start.until,
+        state: State = {"iteration": self.iteration, "scene_is_found": self._scene_is_found,
                         "losses": [[name, loss] for name, loss in self.losses.items()],
                         "scene": dict(self.scene.state_dict()), "strategy": self.strategy.state_dict(),
                         **self.optimisers.state()}
@@ -311,7 +317,9 @@ class Trainer:
         """Go on from a state. Raises RunError where it does not fit the capture and settings, or the lights that the
         fit was given have changed."""
         try:
-            self.iteration, self._head_start.until = int(state["iteration"]), int(state["alone_until"])
+            self.iteration = int(state["iteration"])
+            found = state.get("scene_is_found", state.get("alone_until") == self._head_start)  # of earlier versions
+            self._scene_is_found = bool(found)
             self.losses = {name: float(loss) for name, loss in state.get("losses", [])}
             _load_parameters(dict(self.scene.named_parameters()), state["scene"])
             if self.flare is not None:

@@ -25,11 +25,13 @@ from core.errors import Cancelled, CaptureError, FlareFileError, RunError, Setti
 from core.fit import FitSettings, Run, checkpoint, fit, preset
 from core.fit.beginning import NEAREST_PART, nearest_depth
 from core.fit.frames import Frames
+from core.fit.rendering import render_flare
 from core.fit.run import FLARE, SCENE
 from core.fit.settings import SplitSettings, changed
 from core.fit.sky import COUNT, with_sky
-from core.fit.splitting import from_below, is_found, nearness, scene_beside_flare
+from core.fit.splitting import from_below, haze, is_found, nearness, scene_beside_flare
 from core.fit.trainer import Trainer
+from core.flare.compositing import composite
 from core.flare.model import OURS, PAPER
 from core.gaussians.rendering import NEAR
 from core.look import LookEdits, draw
@@ -248,25 +250,38 @@ def test_a_scene_is_found_once_what_frames_have_more_is_mostly_flare() -> None:
     assert is_found(iter(()), times=5), "nothing is missing where there is nothing"
 
 
-def test_a_scene_that_is_not_found_goes_on_alone(capture: Capture) -> None:
-    def alone(found: float) -> int:
-        """Iterations until the flare is first fitted, through a state that is taken up in the middle of it."""
-        settings = changed(quick(120), {"mode": "split", "split.rounds": 1, "split.found": found})
-        trainer, steps = Trainer(capture, settings), 0
-        assert trainer.flare is not None
-        before = {name: value.clone() for name, value in trainer.flare.named_parameters()}
-        while all(torch.equal(value, before[name]) for name, value in trainer.flare.named_parameters()):
+def test_light_costs_a_flare_away_from_the_lights_where_the_scene_is_not_found(capture: Capture) -> None:
+    def away(found: float) -> float:
+        """Light of the flare away from the lights, of a fit that was stopped and went on."""
+        settings = changed(quick(120), {"mode": "split", "split.rounds": 1, "split.found": found, "split.haze": 3.0})
+        trainer = Trainer(capture, settings)
+        for _ in range(len(trainer.views) + 5):
             trainer.step()
-            steps += 1
-            if steps == len(trainer.views) + 5:
-                state = copy.deepcopy(trainer.state())
-                trainer = Trainer(capture, settings)
-                trainer.load_state(state)
-                assert trainer.flare is not None
-        return steps - 1
+        state, trainer = copy.deepcopy(trainer.state()), Trainer(capture, settings)
+        trainer.load_state(state)
+        for _ in range(60):
+            trainer.step()
+        lights, light = np.array([light.xyz for light in capture.lights]), 0.0
+        for view in trainer.views:
+            camera = view.camera
+            black = torch.zeros(camera.height, camera.width, 3)
+            alone = composite(black, render_flare(trainer.flare, settings.blend, camera), settings.blend).detach()
+            light += float((alone.mean(-1) * (1 - nearness(camera, lights, settings.split.reach))).sum())
+        return light
 
-    assert alone(found=0.0) == len(Trainer(capture, quick(120)).views)
-    assert alone(found=1e9) == 40
+    assert away(found=1e9) < 0.5 * away(found=0.0)
+
+
+def test_a_haze_costs_by_its_light_and_by_how_far_it_is_from_the_lights(capture: Capture) -> None:
+    camera, lights = capture.views[0].camera, np.array([light.xyz for light in capture.lights])
+    added = torch.full((camera.height, camera.width, 3), 0.1, requires_grad=True)
+    settings = SplitSettings(haze=2.0, reach=0.05)
+    loss = haze(added, camera, lights, settings)
+    far = torch.from_numpy(1 - nearness(camera, lights, 0.05))
+    assert float(loss.detach()) == pytest.approx(2 * 0.1 * float(far.mean()), rel=1e-4)
+    loss.backward()
+    assert added.grad is not None
+    assert torch.allclose(added.grad * added.numel() / 2, far[..., None].expand_as(added), atol=1e-5)
 
 
 def test_what_could_be_either_is_the_flare_s_but_a_light_s_own_disc(capture: Capture) -> None:
@@ -282,7 +297,7 @@ def test_what_could_be_either_is_the_flare_s_but_a_light_s_own_disc(capture: Cap
 
     def slope(scene: torch.Tensor) -> torch.Tensor:
         scene = scene.clone().requires_grad_()
-        scene_beside_flare(scene, targets, lights, discs, SplitSettings(), excess=0.25, progress=1.0).backward()
+        scene_beside_flare(scene, targets, lights, discs, SplitSettings(), progress=1.0).backward()
         assert scene.grad is not None
         return scene.grad.sum(-1)
 
@@ -520,16 +535,16 @@ def test_a_run_is_known_by_its_scene_and_its_flare(tmp_path: Path) -> None:
 
 
 def test_a_checkpoint_brings_back_what_no_optimiser_holds(tmp_path: Path) -> None:
-    """How clear each view is, where the lights are, and how long the scene goes on alone."""
+    """How clear each view is, where the lights are, and whether the scene was found."""
     capture = Capture.open(flared_capture(tmp_path / "c", 5))
     first, second = (Trainer(capture, quick(mode="split")) for _ in range(2))
     assert first.flare is not None
     assert second.flare is not None
     first.flare.clear.fill_(0.3)
     first.flare.positions += 0.25
-    first._head_start.goes_on()
+    first._scene_is_found = False
     checkpoint.save(tmp_path / "state.safetensors", first.state())
     second.load_state(checkpoint.load(tmp_path / "state.safetensors"))
     assert torch.equal(second.flare.clear, first.flare.clear)
     assert torch.equal(second.flare.positions, first.flare.positions)
-    assert second._head_start.until == first._head_start.until
+    assert not second._scene_is_found

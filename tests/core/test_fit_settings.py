@@ -22,6 +22,14 @@ def test_config_round_trip(tmp_path: Path, name: Any, model: Any) -> None:
     assert read_config(tmp_path / "config.toml") == settings
 
 
+def test_a_run_of_a_version_with_a_setting_more_opens(tmp_path: Path) -> None:
+    path = tmp_path / "config.toml"
+    write_config(path, preset("draft", mode="split"))
+    path.write_text(path.read_text().replace("[split]\n", "[split]\nexcess_unfound = 0.5\n"))
+    assert "excess_unfound" in path.read_text()
+    assert read_config(path) == preset("draft", mode="split")
+
+
 @pytest.mark.parametrize("name", ["a\nb\r.ply", "a\tb\x00\x1b\x7f.ply", "Straße 写真 \U0001f526.ply"])
 def test_names_of_any_characters_come_back(tmp_path: Path, name: str) -> None:
     settings = changed(preset("draft"), {"scene.start": name})

@@ -534,6 +534,17 @@ def test_a_run_is_known_by_its_scene_and_its_flare(tmp_path: Path) -> None:
     assert len({fingerprint(b"a", b"x"), fingerprint(b"b", b"x"), fingerprint(b"a", b"y")}) == 3
 
 
+@pytest.mark.parametrize("found", [True, False])
+def test_a_checkpoint_of_a_version_whose_scene_went_on_alone_goes_on(capture: Capture, found: bool) -> None:
+    """It says until when the scene was alone: for longer where it had not been found."""
+    settings = changed(quick(120), {"mode": "split", "split.rounds": 1})
+    earlier, trainer = (Trainer(capture, settings) for _ in range(2))
+    state = earlier.state()
+    del state["scene_is_found"]
+    trainer.load_state({**state, "alone_until": len(earlier.views) if found else settings.iterations // 3})
+    assert trainer._scene_is_found == found
+
+
 def test_a_checkpoint_brings_back_what_no_optimiser_holds(tmp_path: Path) -> None:
     """How clear each view is, where the lights are, and whether the scene was found."""
     capture = Capture.open(flared_capture(tmp_path / "c", 5))

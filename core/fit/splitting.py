@@ -46,8 +46,8 @@ def scene_beside_flare(scene: Tensor, targets: Targets, lights: ArrayLike, discs
 
 def haze(added: Tensor, camera: Camera, lights: ArrayLike, settings: SplitSettings) -> Tensor:
     """Loss of what a flare adds to the display values of a scene that was not found, (height, width, 3), away from
-    where lights (n, 3), world, are seen. What the frame shows costs a flare more to leave out than to make, so ghosts
-    that the scene cannot take over stay as they are."""
+    where lights (n, 3), world, are seen. To leave out what the frame shows costs more than this, so ghosts, which the
+    scene cannot take over, stay; what the scene can make as well goes to it."""
     far = torch.from_numpy(1 - nearness(camera, lights, settings.reach))
     return settings.haze * (added * far[..., None]).mean()
 

@@ -84,6 +84,7 @@ class Trainer:
                      *(() if self.flare is None else moved_lights(capture, self.flare)))
         self.extent = capture.extent
         self._head_start = head_start(settings.split, len(self.views), settings.iterations)
+        """Iterations in which a scene of mode `split` is fitted alone; then it is asked whether it has been found."""
         self._scene_is_found = True
         self.optimisers = Optimisers(self.scene, self.flare, settings, self.extent, self.frames.display_white)
         self.strategy = self._strategy()
@@ -173,7 +174,7 @@ class Trainer:
     @torch.no_grad()
     def _look_for_scene(self) -> None:
         """Mode `split` asks whether the scene has been found when the flare is due."""
-        if self.settings.mode != "split" or self.iteration != self._head_start + 1 or not self._head_start:
+        if self.settings.mode != "split" or not 1 <= self._head_start == self.iteration - 1:
             return
 
         def missing(targets: Targets) -> Tensor:

@@ -4,32 +4,61 @@ by the sum of their gradients. On a processor this is a good deal faster than th
 from __future__ import annotations
 
 import multiprocessing
-import os
 import signal
-import sys
 import tempfile
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from datetime import timedelta
-from multiprocessing.synchronize import Event
+from multiprocessing.connection import wait
+from multiprocessing.synchronize import Barrier
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
-import torch.distributed as dist
 from torch import Tensor
 
 from ..errors import RunError
 from ..progress import stop_signals
 
-LOOPBACK = {"linux": "lo", "darwin": "lo0"}
-"""Name of the interface that reaches this machine alone."""
-PATIENCE = timedelta(minutes=10)
+PATIENCE_S = 600.0
 """How long one waits for the others: they may have flares to make."""
 
 ENDED = ("A process of the training ended before it was through; where memory is short, go on with --resume and fewer "
          "--processes.")
+
+
+class Table:
+    """Where the learners of a machine lay down what they have, for all to see: files that each of them maps.
+
+    No network: its buffers cost several times the processor's time of memory that is shared.
+    """
+
+    def __init__(self, folder: str, barrier: Barrier) -> None:
+        self._folder, self._barrier = folder, barrier
+        self._mapped: dict[tuple[int, int], Tensor] = {}
+
+    def rows(self, count: int, length: int) -> Tensor:
+        """(count, length) float32, the same memory for all who ask for as many."""
+        if (count, length) not in self._mapped:
+            path = Path(self._folder) / f"{count}x{length}"
+            with open(path, "ab") as file:
+                file.truncate(4 * count * length)  # by each of them: what is there stays
+            memory = np.memmap(path, np.float32, "r+", shape=(count, length))
+            self._mapped[count, length] = torch.from_numpy(memory)
+        return self._mapped[count, length]
+
+    def clear(self) -> None:
+        """Let go of the files, which Windows does not delete before."""
+        self._mapped.clear()
+
+    def meet(self) -> None:
+        """Go on when all are here. Raises RunError when one of them will not come."""
+        try:
+            self._barrier.wait(PATIENCE_S)
+        except threading.BrokenBarrierError as problem:
+            raise RunError(ENDED) from problem
 
 
 @dataclass(frozen=True)
@@ -38,59 +67,85 @@ class Learner:
 
     rank: int
     count: int
+    table: Table | None = None
+
+    def add_up(self, tensors: Sequence[Tensor]) -> None:
+        """Each becomes the sum of what the learners have, the same to the last bit for all of them. Raises
+        RunError."""
+        if self.table is None:
+            return
+        rows = self.table.rows(self.count, sum(tensor.numel() for tensor in tensors))
+        for tensor, mine in _parts(tensors, rows[self.rank]):
+            mine.copy_(tensor)
+        self.table.meet()
+        for tensor, part in _parts(tensors, rows[0]):
+            tensor.copy_(part)
+        for row in rows[1:]:
+            for tensor, part in _parts(tensors, row):
+                tensor.add_(part)
+        self.table.meet()  # before anyone lays down anew
+
+    def makes(self, number: int) -> bool:
+        """Whether a piece of work that is to be shared is this one's."""
+        return number % self.count == self.rank
+
+    def hand_round(self, tensors: Sequence[Tensor]) -> None:
+        """Everyone gets those that another `makes`. Raises RunError."""
+        if self.table is None:
+            return
+        row = self.table.rows(1, sum(tensor.numel() for tensor in tensors))[0]
+        for number, (tensor, part) in enumerate(_parts(tensors, row)):
+            if self.makes(number):
+                part.copy_(tensor)
+        self.table.meet()
+        for number, (tensor, part) in enumerate(_parts(tensors, row)):
+            if not self.makes(number):
+                tensor.copy_(part)
+        self.table.meet()
 
 
 ALONE = Learner(0, 1)
+
+
+def _parts(tensors: Sequence[Tensor], row: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
+    """Each tensor, as it lies in memory, and its part of a row."""
+    first = 0
+    for tensor in tensors:
+        lying = tensor.permute(sorted(range(tensor.ndim), key=tensor.stride, reverse=True))
+        yield lying, row[first:first + tensor.numel()].view(lying.shape)
+        first += tensor.numel()
 
 
 @contextmanager
 def shared(count: int, learn: Callable[..., None], *words: Any) -> Iterator[Learner]:
     """This process as the first of `count`; the others call `learn(learner, *words)` until this one is through.
 
-    Raises RunError where one of them ends before.
+    What learners do together raises RunError where one of them ends before.
     """
     if count == 1:
         yield ALONE
         return
     spawning = multiprocessing.get_context("spawn")
-    first, threads = Learner(0, count), torch.get_num_threads()
-    with tempfile.TemporaryDirectory() as folder:
-        store = str(Path(folder) / "store")
-        begun = [spawning.Event() for _ in range(1, count)]
-        others = [spawning.Process(target=_other, args=(Learner(rank, count), store, event, threads, learn, words),
+    threads = torch.get_num_threads()
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
+        barrier = spawning.Barrier(count)
+        table = Table(folder, barrier)
+        others = [spawning.Process(target=_other, args=(rank, count, folder, barrier, threads, learn, words),
                                    daemon=True)
-                  for rank, event in enumerate(begun, 1)]
+                  for rank in range(1, count)]
         try:
             for process in others:
                 process.start()
-            for process, event in zip(others, begun, strict=True):
-                while not event.wait(0.2):
-                    if not process.is_alive():
-                        raise RunError(ENDED)
-            _join(first, store, threads)
-            yield first
-        except RuntimeError as problem:  # the connection is lost, if it is that
-            for process in others:
-                process.join(1)
-            if all(process.is_alive() for process in others):
-                raise
-            raise RunError(ENDED) from problem
+            _watch([process.sentinel for process in others], barrier)
+            torch.set_num_threads(max(threads // count, 1))
+            yield Learner(0, count, table)
         finally:
+            table.clear()
             for process in others:
                 if process.pid is not None:  # it was started
                     process.kill()
                     process.join()
-            if dist.is_initialized():
-                dist.destroy_process_group()
             torch.set_num_threads(threads)
-
-
-def add_up(tensors: Sequence[Tensor]) -> None:
-    """Each becomes the sum of what the learners have, the same to the last bit for all of them."""
-    flat = torch.cat([tensor.reshape(-1) for tensor in tensors])
-    dist.all_reduce(flat)
-    for tensor, part in zip(tensors, flat.split([tensor.numel() for tensor in tensors]), strict=True):
-        tensor.copy_(part.view(tensor.shape))
 
 
 def begin_process(_number: int = 0) -> None:
@@ -102,17 +157,20 @@ def begin_process(_number: int = 0) -> None:
         signal.signal(number, signal.SIG_IGN)
 
 
-def _other(learner: Learner, store: str, begun: Event, threads: int, learn: Callable[..., None],
+def _other(rank: int, count: int, folder: str, barrier: Barrier, threads: int, learn: Callable[..., None],
            words: tuple[Any, ...]) -> None:
     begin_process()
-    begun.set()
-    _join(learner, store, threads)
-    learn(learner, *words)
+    first = multiprocessing.parent_process()
+    if first is not None:
+        _watch([first.sentinel], barrier)
+    torch.set_num_threads(max(threads // count, 1))
+    learn(Learner(rank, count, Table(folder, barrier)), *words)
 
 
-def _join(learner: Learner, store: str, threads: int) -> None:
-    torch.set_num_threads(max(threads // learner.count, 1))
-    if sys.platform in LOOPBACK:
-        os.environ.setdefault("GLOO_SOCKET_IFNAME", LOOPBACK[sys.platform])
-    dist.init_process_group("gloo", store=dist.FileStore(store, learner.count),  # type: ignore[attr-defined]
-                            rank=learner.rank, world_size=learner.count, timeout=PATIENCE)
+def _watch(sentinels: Sequence[int], barrier: Barrier) -> None:
+    """Let nobody wait for a process that has ended."""
+    def watch() -> None:
+        wait(sentinels)
+        barrier.abort()
+
+    threading.Thread(target=watch, daemon=True).start()

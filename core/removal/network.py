@@ -5,7 +5,7 @@ A U-Net of residual blocks. A flare is known by what it does over long ways: a v
 the whole frame, and ghosts lie on the line from a light through the principal point. So it is given, beside the
 frame, on every level the means, the darkest values and the over-exposure of what a place covers, the same turned
 by 180 degrees about the middle, where a light's mirrored ghosts fall, and where on the frame the place is; and on
-the two coarsest levels every place attends to every other.
+the two coarsest levels every place attends to every other, after every second block and in the end.
 
 It tells what the flare adds to the frame's display values, of which `gentle` is the part that is not the glow
 round the lights. The clean picture is the frame less that, and the flare the difference of the two in light:
@@ -13,8 +13,9 @@ what the network does not call flare, the source of light among it, is the frame
 """
 from __future__ import annotations
 
+import math
 from itertools import pairwise
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import torch
 import torch.nn.functional as F  # noqa: N812 - its name everywhere
@@ -91,14 +92,22 @@ class Block(nn.Module):
         return x + self.second(F.relu(self.first(self.norm(x))))
 
 
-class Attention(nn.Module):
-    """x + what each place takes from every other, by likeness and by where the two are."""
+WAVES = 4
+"""Octaves of the waves by which layers of attention between blocks tell places from each other."""
 
-    def __init__(self, width: int, heads: int) -> None:
+
+class Attention(nn.Module):
+    """x + what each place takes from every other, by likeness and by where the two are.
+
+    waves: octaves of sines and cosines of the place, without which only what changes slowly over the frame can be
+    asked of it: a ghost lies where it lies to within its width.
+    """
+
+    def __init__(self, width: int, heads: int, waves: int = 0) -> None:
         super().__init__()
-        self.heads = heads
+        self.heads, self.waves = heads, waves
         self.norm = Norm(width)
-        self.place = nn.Conv2d(5, width, 1)
+        self.place = nn.Conv2d(5 + 4 * waves, width, 1)
         self.asked = nn.Conv2d(width, 3 * width, 1)
         self.told = nn.Conv2d(width, width, 1)
         nn.init.zeros_(self.told.weight)
@@ -107,20 +116,37 @@ class Attention(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         n, width, rows, columns = x.shape
         place = _place(x, rows, columns)
-        place = torch.cat([place, place[:2] / (place[2:].sqrt() + 0.1)])[None]  # with the direction from the middle
+        told = [place, place[:2] / (place[2:].sqrt() + 0.1)]  # with the direction from the middle
+        for octave in range(self.waves):
+            phase = place[:2] * (math.pi * 2**octave)
+            told += [phase.sin(), phase.cos()]
+        place = torch.cat(told)[None]
         parts = self.asked(self.norm(x) + self.place(place)).flatten(2)
         query, key, value = parts.reshape(n, 3, self.heads, width // self.heads, rows * columns).mT.unbind(1)
-        found = F.scaled_dot_product_attention(query, key, value)
-        return x + self.told(found.mT.reshape(n, width, rows, columns))
+        return x + self.told(_attended(query, key, value).mT.reshape(n, width, rows, columns))
+
+
+WRITTEN_OUT = 1024
+"""Places up to which attention is written out on a processor, which then takes a third of the time of torch's own;
+beyond, the weights of all pairs would not fit memory."""
+
+
+def _attended(query: Tensor, key: Tensor, value: Tensor) -> Tensor:
+    """What each place takes from every other; all (n, heads, places, planes)."""
+    if query.device.type != "cpu" or query.shape[-2] > WRITTEN_OUT:
+        return F.scaled_dot_product_attention(query, key, value)
+    return torch.softmax(query * query.shape[-1] ** -0.5 @ key.mT, -1) @ value
 
 
 class RemovalNetwork(nn.Module):
     """widths: planes of each of the LEVELS levels, from the finest; the coarsest two are multiples of HEADS.
-    blocks: of each level on the way down; one each on the way up."""
+    blocks: of each level on the way down; one each on the way up.
+    attention: layers of it between the blocks of the coarsest two, one after every second block, beside the one after
+    all of them."""
 
     HEADS = 4
 
-    def __init__(self, widths: tuple[int, ...], blocks: tuple[int, ...]) -> None:
+    def __init__(self, widths: tuple[int, ...], blocks: tuple[int, ...], attention: tuple[int, ...]) -> None:
         super().__init__()
         planes = (3 * CELL**2 + SHOWN, *(SHOWN for _ in widths[1:]))
         self.see = nn.ModuleList(nn.Conv2d(a, b, 3, padding=1) for a, b in zip(planes, widths, strict=True))
@@ -129,6 +155,8 @@ class RemovalNetwork(nn.Module):
         self.enter = nn.ModuleList(nn.Sequential(*(Block(width) for _ in range(count)))
                                    for width, count in zip(widths, blocks, strict=True))
         self.leave = nn.ModuleList(Block(width) for width in widths)
+        self.between = nn.ModuleList(nn.ModuleList(Attention(width, self.HEADS, WAVES) for _ in range(count))
+                                     for width, count in zip(widths[-2:], attention, strict=True))
         self.attention = nn.ModuleList(Attention(width, self.HEADS) for width in widths[-2:])
         self.head = nn.Conv2d(widths[0], 6 * CELL**2, 1)
         nn.init.normal_(self.head.weight, std=1e-3)
@@ -139,16 +167,24 @@ class RemovalNetwork(nn.Module):
         MULTIPLE."""
         shown = [self.see[level](part) for level, part in enumerate(seen(display))]
         x, kept = shown[0], []
-        for level, enter in enumerate(self.enter):
+        for level in range(LEVELS):
             if level:
                 kept.append(x)
                 x = self.down[level - 1](x) + shown[level]
-            x = enter(x)
-            if level >= LEVELS - 2:
-                x = self.attention[level - LEVELS + 2](x)
+            x = self._entered(x, level)
         for level in reversed(range(LEVELS)):
             x = self.leave[level](x)
             if level:
                 x = F.interpolate(self.up[level - 1](x), scale_factor=2, mode="nearest") + kept.pop()
         out = F.pixel_shuffle(self.head(x), CELL).float()
         return Prediction(out[:, :3], out[:, :3] * torch.sigmoid(out[:, 3:] * 4))
+
+    def _entered(self, x: Tensor, level: int) -> Tensor:
+        """Through the blocks of a level on the way down, and what attention it has."""
+        coarse = level - (LEVELS - 2)
+        between = list(cast(nn.ModuleList, self.between[coarse])) if coarse >= 0 else []
+        for number, block in enumerate(cast(nn.Sequential, self.enter[level])):
+            x = block(x)
+            if number % 2 and number // 2 < len(between):
+                x = between[number // 2](x)
+        return cast(Tensor, self.attention[coarse](x)) if coarse >= 0 else x

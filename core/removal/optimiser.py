@@ -14,6 +14,8 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor, nn
 
+from .learners import ALONE, Learner
+
 NOT_HIDDEN = ("see.", "head.", ".place.")
 """In the names of weights that are shown the frame, or places, and of those that give the answer."""
 MOMENTUM, LENGTH = 0.95, 0.2
@@ -39,22 +41,27 @@ class Optimiser:
         self._adam = torch.optim.AdamW(others, weight_decay=decay, fused=True)
 
     @torch.no_grad()
-    def step(self, rate: float) -> None:
-        """One step by the gradients that the parameters have, which they have no more afterwards."""
+    def step(self, rate: float, learner: Learner = ALONE) -> None:
+        """One step by the gradients that the parameters have, which they have no more afterwards. Learners have the
+        same gradients, and share the work of Muon's steps, which is a third of an iteration's."""
+        stepping: list[Tensor] = []
+        directions: list[Tensor] = []
         for name, rows in self._matrices.items():
             gradient = self._parameters[name].grad
             if gradient is not None:
-                self._muon_step(rows, _rows(gradient), self._momenta[name], rate)
+                momentum = self._momenta[name].lerp_(_rows(gradient), 1 - MOMENTUM)
+                mine = learner.makes(len(stepping))
+                directions.append(orthogonalised(_rows(gradient).lerp(momentum, MOMENTUM)).contiguous() if mine
+                                  else torch.empty_like(rows))
+                stepping.append(rows)
+        learner.hand_round(directions)
+        for rows, direction in zip(stepping, directions, strict=True):
+            rows.mul_(1 - rate * self._decay).sub_(direction, alpha=rate * LENGTH * math.sqrt(max(rows.shape)))
         for group in self._adam.param_groups:
             group["lr"] = rate
         self._adam.step()
         for parameter in self._parameters.values():
             parameter.grad = None
-
-    def _muon_step(self, rows: Tensor, gradient: Tensor, momentum: Tensor, rate: float) -> None:
-        momentum.lerp_(gradient, 1 - MOMENTUM)
-        direction = orthogonalised(gradient.lerp(momentum, MOMENTUM))
-        rows.mul_(1 - rate * self._decay).sub_(direction, alpha=rate * LENGTH * math.sqrt(max(rows.shape)))
 
     def state(self) -> dict[str, Tensor]:
         """What a training needs to go on: `moment.`, which of a parameter's moments, `.` and its name."""

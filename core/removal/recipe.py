@@ -35,6 +35,8 @@ class Recipe:
     polish: float = 0.15           # of the iterations, the last of them, go for each picture's PSNR
     widths: tuple[int, ...] = (32, 48, 96, 128, 160)
     blocks: tuple[int, ...] = (0, 1, 4, 8, 6)
+    attention: tuple[int, ...] = (3, 2)
+    """Layers of it between the blocks of the two coarsest levels."""
     canvas: int = 384              # pixels a side of the flares' canvas
     bank: int = 400                # flares at hand at a time, 2.7 MB each
     renew_every: int = 6           # iterations for each new flare
@@ -53,6 +55,11 @@ class Recipe:
             raise SettingsError(f"A recipe needs a learning rate below 1, and widths and blocks of {LEVELS} levels.")
         if min(self.widths) < 1 or min(self.blocks) < 0:
             raise SettingsError("A recipe needs widths of one plane or more, and blocks of 0 or more.")
+        coarse = self.blocks[-len(self.attention):]
+        if len(self.attention) != 2 or any(not 0 <= 2 * layers <= blocks
+                                           for layers, blocks in zip(self.attention, coarse, strict=True)):
+            raise SettingsError("A recipe needs attention for two levels, a layer for every two of their blocks at "
+                                "most.")
         if not self.stages or any(len(stage) != 3 or not 2 * MULTIPLE <= stage[1] <= stage[2] for stage in self.stages):
             raise SettingsError("A recipe needs stages of (share of the iterations, least and most pixels of a long "
                                 f"side), of {2 * MULTIPLE} pixels or more.")

@@ -101,11 +101,12 @@ class Beginning(NamedTuple):
         if self.source is None:
             return Trainer(self.recipe, learner)
         state, about = weights.read(self.source)
-        widths, blocks = weights.form(self.source, about)
-        recipe = replace(self.recipe, widths=widths, blocks=tuple(map(max, self.recipe.blocks, blocks)))
+        form = weights.form(self.source, about)
+        recipe = replace(self.recipe, widths=form.widths, blocks=tuple(map(max, self.recipe.blocks, form.blocks)),
+                         attention=tuple(map(max, self.recipe.attention, form.attention)))
         iteration = 0
         if self.goes_on:
-            recipe = replace(recipe, blocks=blocks, seed=json.loads(about["recipe"])["seed"])
+            recipe = replace(recipe, **form._asdict(), seed=json.loads(about["recipe"])["seed"])
             iteration = int(about["iteration"])
         trainer = Trainer(recipe, learner)
         trainer.load_state(state, iteration)

@@ -37,13 +37,15 @@ class Form(NamedTuple):
 
     widths: tuple[int, ...]
     blocks: tuple[int, ...]
+    attention: tuple[int, ...]
 
 
 def form(path: Path | str, about: Mapping[str, str]) -> Form:
     """Of the recipe in the header of a file, the rest of which may be of an older program. Raises RunError."""
     try:
         recipe = json.loads(about["recipe"])
-        return Form(tuple(recipe["widths"]), tuple(recipe["blocks"]))
+        # Recipes of before had none between blocks.
+        return Form(tuple(recipe["widths"]), tuple(recipe["blocks"]), tuple(recipe.get("attention", (0, 0))))
     except (KeyError, ValueError, TypeError) as problem:
         raise _foreign(path) from problem
 

@@ -44,7 +44,7 @@ TINY = Recipe(widths=(8, 8, 8, 8, 8))
 def network_file(path: Path, seed: int = 0, bias: float = 0.0) -> Path:
     """A small network of random weights; `bias` makes it see flare everywhere (> 0) or nowhere (< 0)."""
     torch.manual_seed(seed)
-    network = RemovalNetwork(TINY.widths, TINY.blocks)
+    network = RemovalNetwork(TINY.widths, TINY.blocks, TINY.attention)
     with torch.no_grad():
         network.head.weight.mul_(0.1)
         network.head.bias[:3] = bias
@@ -102,14 +102,14 @@ def test_every_level_sees_the_frame_turned_about_its_middle_and_its_darkest_valu
 
 @pytest.mark.parametrize("size", [(32, 32), (64, 128)])
 def test_the_network_is_fully_convolutional(size: tuple[int, int]) -> None:
-    told = RemovalNetwork(TINY.widths, TINY.blocks)(torch.rand(2, 3, *size))
+    told = RemovalNetwork(TINY.widths, TINY.blocks, TINY.attention)(torch.rand(2, 3, *size))
     assert told.flare.shape == told.gentle.shape == (2, 3, *size)
 
 
 def test_what_is_far_away_counts() -> None:
     """A light in one corner may have its ghost in the other."""
     torch.manual_seed(3)
-    network = RemovalNetwork(TINY.widths, TINY.blocks)
+    network = RemovalNetwork(TINY.widths, TINY.blocks, TINY.attention)
     for parameter in network.parameters():
         torch.nn.init.normal_(parameter, std=0.3)
     frame = torch.full((1, 3, 96, 96), 0.2, requires_grad=True)

@@ -17,12 +17,12 @@ from core.errors import Cancelled, RunError, SettingsError
 from core.metrics.lpips import Lpips
 from core.pictures import Pixels, write_png
 from core.progress import Progress
-from core.removal import evaluation, optimiser, training, weights
+from core.removal import evaluation, network, optimiser, training, weights
 from core.removal.backgrounds import Backgrounds
 from core.removal.bank import OwnFlares
 from core.removal.batches import Batch, Batches, drawn_ahead
-from core.removal.learners import ALONE, Learner, add_up, shared
-from core.removal.network import RemovalNetwork
+from core.removal.learners import ALONE, Learner, shared
+from core.removal.network import Attention, RemovalNetwork
 from core.removal.optimiser import Optimiser
 from core.removal.recipe import Recipe, as_dict, from_dict
 from core.removal.synthesis.prescription import built_in
@@ -93,14 +93,46 @@ def test_learners_share_the_frames_of_one(tmp_path: Path) -> None:
     assert np.array_equal(whole.scene[1], parts[1].scene[0])
 
 
+def adds_up(learner: Learner) -> None:
+    """A learner that has numbers in several layouts, and makes every piece of work that is its own."""
+    sums, pieces = numbers(learner)
+    for _ in range(2):
+        learner.add_up(sums)
+        learner.hand_round(pieces)
+
+
+def numbers(learner: Learner) -> tuple[list[torch.Tensor], list[torch.Tensor]]:
+    plain = torch.arange(24.0).view(2, 3, 2, 2) + 100 * learner.rank
+    pieces = [torch.full((2, 3), float(k if learner.makes(k) else -1)) for k in range(5)]
+    return [plain.contiguous(memory_format=torch.channels_last), torch.tensor([1.0 + learner.rank])], pieces
+
+
+def test_learners_see_what_others_have() -> None:
+    with shared(3, adds_up) as learner:
+        sums, pieces = numbers(learner)
+        learner.add_up(sums)
+        learner.hand_round(pieces)
+        assert torch.equal(sums[0], 3 * torch.arange(24.0).view(2, 3, 2, 2) + 300)
+        assert sums[1].tolist() == [6]
+        assert [piece.unique().tolist() for piece in pieces] == [[0], [1], [2], [3], [4]]
+        once = sums[0].clone()
+        learner.add_up(sums)
+        assert torch.equal(sums[0], 3 * once), "the others have the sum too"
+        learner.hand_round(pieces)
+    alone, pieces = numbers(ALONE)
+    ALONE.add_up(alone)
+    ALONE.hand_round(pieces)
+    assert alone[1].tolist() == [1] and [float(piece[0, 0]) for piece in pieces] == [0, 1, 2, 3, 4]
+
+
 def ends(_learner: Learner) -> None:
     """A learner that ends at once."""
 
 
 def test_a_learner_that_is_no_more_is_told(tmp_path: Path) -> None:
-    with pytest.raises(RunError, match="ended before"), shared(2, ends):
+    with pytest.raises(RunError, match="ended before"), shared(2, ends) as learner:
         for _ in range(100):
-            add_up([torch.zeros(1000)])
+            learner.add_up([torch.zeros(1000)])
     assert not multiprocessing.active_children()
     with shared(1, ends) as learner:
         assert learner == ALONE
@@ -181,7 +213,7 @@ def test_muon_s_rounds_in_one_are_the_rounds_one_by_one(rows: int, columns: int,
 
 def test_weights_that_lie_otherwise_are_refused() -> None:
     with pytest.raises(ValueError, match="channels last"):
-        Optimiser(RemovalNetwork((16,) * 5, (0, 0, 1, 0, 0)), 0.0)
+        Optimiser(RemovalNetwork((16,) * 5, (0, 0, 1, 0, 0), (0, 0)), 0.0)
 
 
 def test_stages_of_a_training() -> None:
@@ -214,8 +246,21 @@ def test_going_on_from_weights(tmp_path: Path) -> None:
         training.train(RECIPE, tmp_path / "fourth", backgrounds(), built_in(), start=tmp_path / "foreign.safetensors")
 
 
+def test_attention_is_torch_s_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where it is written out and where it is not."""
+    attention = Attention(16, 4, waves=2)
+    torch.nn.init.normal_(attention.told.weight)
+    x = torch.randn(2, 16, 6, 9)
+    with torch.no_grad():
+        written_out = attention(x)
+        monkeypatch.setattr(network, "WRITTEN_OUT", 53)
+        torch.testing.assert_close(attention(x), written_out, rtol=1e-4, atol=1e-5)
+    assert (written_out - x).abs().max() > 0.1
+
+
 def test_a_network_grows_by_blocks_that_do_nothing_yet(tmp_path: Path) -> None:
-    small, large = replace(RECIPE, blocks=(0, 1, 1, 1, 1)), replace(RECIPE, blocks=(1, 0, 2, 1, 3))
+    small = replace(RECIPE, blocks=(0, 1, 1, 1, 1), attention=(0, 0))
+    large = replace(RECIPE, blocks=(1, 0, 2, 1, 3), attention=(0, 1))
     first = training.train(small, tmp_path / "first", backgrounds(), built_in(), processes=1)
     grown = training.Beginning(large, first, False, backgrounds(), built_in(), None).trainer(ALONE)
     assert [len(enter) for enter in grown.network.enter] == [1, 1, 2, 1, 3]  # type: ignore[arg-type]
@@ -225,10 +270,13 @@ def test_a_network_grows_by_blocks_that_do_nothing_yet(tmp_path: Path) -> None:
     assert before.flare.std() > 0
     torch.testing.assert_close(after.flare, before.flare, rtol=1e-3, atol=1e-6)  # a fused layout adds up otherwise
     grown_to = training.train(large, tmp_path / "second", backgrounds(), built_in(), start=first, processes=1)
-    assert weights.form(grown_to, weights.read(grown_to)[1]).blocks == (1, 1, 2, 1, 3)
-    longer = replace(large, iterations=5, blocks=(4, 4, 4, 4, 4))
+    form = weights.form(grown_to, weights.read(grown_to)[1])
+    assert form == (small.widths, (1, 1, 2, 1, 3), (0, 1))
+    longer = replace(large, iterations=5, blocks=(4, 4, 4, 4, 4), attention=(2, 2))
     training.train(longer, tmp_path / "second", backgrounds(), built_in(), resume=True, processes=1)
-    assert weights.form(grown_to, weights.read(grown_to)[1]).blocks == (1, 1, 2, 1, 3), "none grows on the way"
+    assert weights.form(grown_to, weights.read(grown_to)[1]) == form, "none grows on the way"
+    of_before = {name: value for name, value in as_dict(small).items() if name != "attention"}
+    assert weights.form(first, {"recipe": json.dumps(of_before)}).attention == (0, 0)
 
 
 def test_the_log_has_figures_and_checks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -298,6 +346,9 @@ def test_recipes(tmp_path: Path) -> None:
         Recipe(widths=())
     with pytest.raises(SettingsError, match="5 levels"):
         Recipe(blocks=(1, 1))
+    for attention in ((1,), (0, 4), (-1, 0)):
+        with pytest.raises(SettingsError, match="attention for two levels"):
+            Recipe(attention=attention)
     for stage in ((1.0, 32, 64), (1.0, 96, 64), (1.0, 96)):
         with pytest.raises(SettingsError, match="stages"):
             Recipe(stages=(stage,))  # type: ignore[arg-type]

@@ -161,6 +161,19 @@ def test_a_handful_of_pairs_is_learned() -> None:
     assert figures["error"] < 0.2 * figures["untouched"]
 
 
+def test_what_is_told_of_clean_pictures_counts_for_more_in_the_end() -> None:
+    recipe = replace(RECIPE, iterations=100, polish=1.0, clean=1.0)
+    trainer = Trainer(recipe)
+    batch = Batches(recipe, backgrounds(), built_in())[0]
+    assert np.array_equal(batch.frame, batch.scene)
+    torch.nn.init.constant_(trainer.network.head.bias, 0.03)
+    losses = {}
+    for trainer.iteration in (0, 40, 80, 99):
+        losses[trainer.iteration] = float(trainer.loss(batch)[0].detach())
+    assert 0 < losses[0] < losses[40] - 1 < losses[80] - 2
+    assert losses[80] == losses[99]
+
+
 def test_the_steps_of_hidden_weights_are_as_long_in_every_direction() -> None:
     """And as long as AdamW's usually are, a fifth of the rate; other weights take AdamW's, whose first is the rate."""
     recipe = Recipe(widths=(16, 16, 16, 16, 16), decay=0)

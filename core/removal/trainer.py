@@ -28,6 +28,9 @@ UNSEEN, SEEN_FROM = (3e-4, 3e-5), 0.8
 iteration on, pictures without any flare have the larger part of the gradients, and what is told of flares that are
 plain to see is held down with the rest."""
 
+LAST = (".second.", ".told.")
+"""In the names of the last convolutions of blocks and of layers of attention, which are zero before training."""
+
 
 def device() -> torch.device:
     """The graphics card where there is one."""
@@ -138,9 +141,10 @@ class Trainer:
         """Go on from `state`, or from weights alone (then with fresh moments), of a network that may have fewer
         blocks and layers of attention: the others do nothing yet."""
         self.iteration = iteration
+        grown: dict[str, Tensor] = {}
         if not any(name.startswith("network.") for name in state):
             grown = {name: value.clone() for name, value in self.network.state_dict().items()
-                     if name.startswith(("enter.", "between."))}
+                     if name.startswith(("enter.", "between.")) and name not in state}
             state = {f"{part}.{name}": value for name, value in {**grown, **state}.items()
                      for part in ("network", "averaged")}
         try:
@@ -155,7 +159,10 @@ class Trainer:
             self.begun_with = {name.removeprefix("begun."): value.float().to(self.device)
                                for name, value in state.items() if name.startswith("begun.")}
         else:
-            self.begun_with = {name: value.clone() for name, value in self.averaged.items()}
+            # What has grown began with nothing, which is what the last of its convolutions say, not with what the
+            # others were drawn as.
+            self.begun_with = {name: value.clone() for name, value in self.averaged.items()
+                               if name not in grown or any(part in name for part in LAST)}
         self.optimiser.load_state(state)
 
 

@@ -478,3 +478,17 @@ def test_a_share_of_the_weights_begun_with_is_kept(tmp_path: Path) -> None:
         assert torch.equal(kept[1.0][name], value)
         torch.testing.assert_close(kept[0.5][name].float(), (value.float() + kept[0.0][name].float()) / 2, atol=1e-3,
                                    rtol=1e-3)
+
+
+def test_what_has_grown_is_kept_by_the_same_share(tmp_path: Path) -> None:
+    """Of a network that grew, the weights begun with are those of the smaller one, which tells the same."""
+    small, large = replace(RECIPE, blocks=(0, 1, 1, 2, 2), attention=(0, 0)), replace(RECIPE, blocks=(0, 1, 2, 2, 2),
+                                                                                      attention=(1, 1), begun=1.0)
+    first = training.train(small, tmp_path / "first", backgrounds(), built_in(), processes=1)
+    grown = training.train(large, tmp_path / "grown", backgrounds(), built_in(), start=first, processes=1)
+    name = "between.0.0.asked.weight"
+    assert weights.read(grown)[0][name].any()
+    frame = torch.rand(1, 3, 64, 64)
+    with torch.no_grad():
+        before, after = weights.load(first)(frame).flare, weights.load(grown)(frame).flare
+    torch.testing.assert_close(after, before, rtol=1e-3, atol=1e-6)

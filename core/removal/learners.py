@@ -32,7 +32,7 @@ ENDED = ("A process of the training ended before it was through; where memory is
 class Table:
     """Where the learners of a machine lay down what they have, for all to see: files that each of them maps.
 
-    No network: its buffers cost several times the processor's time of memory that is shared.
+    Sockets would take more than twice the time of memory that is shared.
     """
 
     def __init__(self, folder: str, barrier: Barrier) -> None:
@@ -137,7 +137,7 @@ def shared(count: int, learn: Callable[..., None], *words: Any) -> Iterator[Lear
             for process in others:
                 process.start()
             _watch([process.sentinel for process in others], barrier)
-            torch.set_num_threads(max(threads // count, 1))
+            _take_share(threads, count)
             yield Learner(0, count, table)
         finally:
             table.clear()
@@ -163,8 +163,13 @@ def _other(rank: int, count: int, folder: str, barrier: Barrier, threads: int, l
     first = multiprocessing.parent_process()
     if first is not None:
         _watch([first.sentinel], barrier)
-    torch.set_num_threads(max(threads // count, 1))
+    _take_share(threads, count)
     learn(Learner(rank, count, Table(folder, barrier)), *words)
+
+
+def _take_share(threads: int, count: int) -> None:
+    """Of the processor's threads."""
+    torch.set_num_threads(max(threads // count, 1))
 
 
 def _watch(sentinels: Sequence[int], barrier: Barrier) -> None:

@@ -43,7 +43,7 @@ class Optimiser:
     @torch.no_grad()
     def step(self, rate: float, learner: Learner = ALONE) -> None:
         """One step by the gradients that the parameters have, which they have no more afterwards. Learners have the
-        same gradients, and share the work of Muon's steps, which is a third of an iteration's."""
+        same gradients, and share the work of Muon's steps, which is nearly a third of an iteration's."""
         stepping: list[Tensor] = []
         directions: list[Tensor] = []
         for name, rows in self._matrices.items():

@@ -35,8 +35,7 @@ class Recipe:
     polish: float = 0.15           # of the iterations, the last of them, go for each picture's PSNR
     widths: tuple[int, ...] = (32, 48, 96, 128, 160)
     blocks: tuple[int, ...] = (0, 1, 4, 8, 6)
-    attention: tuple[int, ...] = (3, 2)
-    """Layers of it between the blocks of the two coarsest levels."""
+    attention: tuple[int, ...] = (3, 2)  # layers of it between the blocks of the two coarsest levels
     canvas: int = 384              # pixels a side of the flares' canvas
     bank: int = 400                # flares at hand at a time, 2.7 MB each
     renew_every: int = 6           # iterations for each new flare

@@ -28,7 +28,7 @@ UNSEEN, SEEN_FROM = (3e-4, 3e-5), 0.8
 iteration on, pictures without any flare have the larger part of the gradients, and what is told of flares that are
 plain to see is held down with the rest."""
 
-LAST = (".second.", ".told.")
+NOTHING_AT_FIRST = (".second.", ".told.")
 """In the names of the last convolutions of blocks and of layers of attention, which are zero before training."""
 
 
@@ -162,7 +162,7 @@ class Trainer:
             # What has grown began with nothing, which is what the last of its convolutions say, not with what the
             # others were drawn as.
             self.begun_with = {name: value.clone() for name, value in self.averaged.items()
-                               if name not in grown or any(part in name for part in LAST)}
+                               if name not in grown or any(part in name for part in NOTHING_AT_FIRST)}
         self.optimiser.load_state(state)
 
 

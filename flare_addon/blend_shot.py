@@ -25,12 +25,15 @@ KINDS = ("POINT", "SPOT", "AREA", "SUN")
 
 def shot_of(scene: Any, flare: Path, names: Sequence[str], frames: Sequence[int], *, radius: float = 0.0,
             done: Callable[[], None] = lambda: None) -> Shot:
-    """The scene's active camera at these frames. names: of objects that are lights; none: the scene's lamps.
+    """The scene's active camera at these frames, which markers may change; one shot by its name, whoever films a part
+    of it. names: of objects that are lights; none: the scene's lamps.
 
     radius: of the lights' discs for the soft edge of shadows, world units; 0: a share of the distance. The shot's
     coordinates are Blender's world. Raises CaptureError for a scene without a camera, light, or named object.
     """
     things = _lights(scene, names)
+    if not things:
+        raise CaptureError(f"The scene {scene.name!r} has no lights; name objects with --lights.")
     made = []
     for frame in frames:
         scene.frame_set(frame)
@@ -41,12 +44,13 @@ def shot_of(scene: Any, flare: Path, names: Sequence[str], frames: Sequence[int]
         core = cameras.core_camera(camera.data, camera.matrix_world, scene.render)
         eye = camera.matrix_world.translation
         placed = tuple(_placed(scene, depsgraph, thing, eye, radius) for thing in things)
-        made.append(ShotFrame(frame, scene.camera.name, core, placed))
+        made.append(ShotFrame(frame, scene.name, core, placed))
         done()
     return Shot(flare, tuple(made))
 
 
 def _lights(scene: Any, names: Sequence[str]) -> list[Any]:
+    """The objects of these names; of none the lamps that are rendered. Raises CaptureError for a name without one."""
     if names:
         missing = [name for name in names if name not in scene.objects]
         if missing:
@@ -54,11 +58,8 @@ def _lights(scene: Any, names: Sequence[str]) -> list[Any]:
         return [scene.objects[name] for name in names]
     rendered = {thing.name for layer in scene.view_layers
                 for shown in collections_shown(layer.layer_collection, "hide_render") for thing in shown.objects}
-    found = [thing for thing in scene.objects if thing.type == "LIGHT" and thing.data.type in KINDS
-             and not thing.hide_render and thing.name in rendered]
-    if not found:
-        raise CaptureError(f"The scene {scene.name!r} has no lights; name objects with --lights.")
-    return found
+    return [thing for thing in scene.objects if thing.type == "LIGHT" and thing.data.type in KINDS
+            and not thing.hide_render and thing.name in rendered]
 
 
 def _placed(scene: Any, depsgraph: Any, thing: Any, eye: Any, radius: float) -> PlacedLight:
@@ -84,6 +85,7 @@ def capture_of(scene: Any, plates: Mapping[int, Path], folder: Path, names: Sequ
     """
     if scene.camera is None:
         raise CaptureError(f"The scene {scene.name!r} has no active camera; set one.")
+    things = _lights(scene, names)
     points = capture_export.points_of(scene, scene.camera)
     if not len(points):
         raise CaptureError("There are no points to begin a fit from; solve the camera with the motion tracker, or "
@@ -94,12 +96,10 @@ def capture_of(scene: Any, plates: Mapping[int, Path], folder: Path, names: Sequ
         entries.append(capture_export.entry_of(scene, scene.camera, frame, path, folder))
         done()
     capture_export.write_points(folder / "points.ply", points)
-    things = _lights(scene, names) if names or any(thing.type == "LIGHT" for thing in scene.objects) else []
     if things:
         eye, depsgraph = scene.camera.matrix_world.translation, bpy.context.evaluated_depsgraph_get()
         write_json(folder / "lights.json", {"lights": [
             {"name": thing.name, "xyz": list(map(float, lights.stands(thing, matrix_of(thing, depsgraph), eye)))}
             for thing in things]})
-    write_json(folder / "transforms.json",
-               {"camera_model": "PINHOLE", "ply_file_path": "points.ply", "frames": entries})
+    capture_export.write_cameras(folder, entries)
     return len(entries)

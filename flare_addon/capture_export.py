@@ -16,12 +16,16 @@ from typing import Any
 import bpy
 import numpy as np
 
+from ..core.capture.colmap import find_model
 from ..core.errors import CaptureError
-from ..core.files import atomic_path, write_json
+from ..core.files import atomic_path, read_json, write_json
 from . import cameras
 from .paths import stored
 
 MOST_POINTS = 100_000
+TRANSFORMS = "transforms.json"
+MAKER = "Fit Flare"
+"""What transforms.json that was made here says; that one may be written again."""
 _NUMBER = re.compile(r"(\d+)(?=\D*$)")
 
 
@@ -59,8 +63,10 @@ def footage_of(camera: Any) -> Footage | None:
 def export(scene: Any, folder: Path) -> int:
     """Write a capture of the scene's camera over the scene's frames, and make it the scene's; how many frames.
 
-    Raises CaptureError where a frame's picture is missing or there is nothing to start a fit from.
+    Raises CaptureError where a frame's picture is missing or there is nothing to start a fit from, and for a folder
+    with another capture.
     """
+    check_free(folder)
     camera = scene.camera
     footage = footage_of(camera) if camera is not None else None
     if footage is None:
@@ -82,12 +88,26 @@ def export(scene: Any, folder: Path) -> int:
     finally:
         scene.frame_set(before)
     write_points(folder / "points.ply", points)
-    write_json(folder / "transforms.json",
-               {"camera_model": "PINHOLE", "ply_file_path": "points.ply", "frames": entries})
+    write_cameras(folder, entries)
     state = scene.fit_flare
     state.capture, state.root, state.mode, state.footage = stored(folder), None, "split", "images"
     state.known_lights = ""  # those of an earlier capture are other lights, whatever their names
     return len(entries)
+
+
+def check_free(folder: Path) -> None:
+    """Raises CaptureError for a folder with a capture that was not made here: its frames would be lost, or its solve
+    be read in place of what is written."""
+    known = read_json(folder / TRANSFORMS, CaptureError) if (folder / TRANSFORMS).exists() else {"made_by": MAKER}
+    ours = isinstance(known, dict) and known.get("made_by") == MAKER
+    if find_model(folder) is not None or not ours:
+        raise CaptureError(f"{folder} holds another capture already; choose another folder.")
+
+
+def write_cameras(folder: Path, entries: list[dict[str, Any]]) -> None:
+    """transforms.json of frames as `entry_of` gives them, beside points.ply."""
+    write_json(folder / TRANSFORMS,
+               {"made_by": MAKER, "camera_model": "PINHOLE", "ply_file_path": "points.ply", "frames": entries})
 
 
 def entry_of(scene: Any, camera: Any, frame: int, path: Path, folder: Path) -> dict[str, Any]:

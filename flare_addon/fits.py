@@ -14,7 +14,7 @@ from ..core.look import Look, read
 from . import engine, jobs, lights, looks
 from .capture_import import expose
 from .jobs import Job
-from .paths import absolute, stored
+from .paths import absolute, read_again, stored
 from .reports import NO_CAPTURE
 
 FLARE, SCENE, PREVIEW, CONFIG = "flare.flare", "scene.ply", "preview_small.png", "config.toml"
@@ -112,11 +112,13 @@ def resume(scene: Any) -> Job:
     capture, folder = capture_of(scene), folder_of(scene)
     if folder is None or not (folder / CONFIG).is_file():
         raise RunError(f"There is no fit to go on with in {folder}; start a new one.")
-    capture = _begun_with(folder) or capture
-    if capture is None or not capture.is_dir():
-        raise CaptureError(f"The capture {capture} that this fit was begun with is not there; put it back, or start a "
-                           "new fit.")
-    return _run(scene, capture, folder)
+    begun = _begun_with(folder) or capture
+    if begun is None or not begun.is_dir():
+        if capture is None or not capture.is_dir() or not _may_be_of(folder, capture):
+            raise CaptureError(f"The capture {begun} that this fit was begun with is not there; put it back, or start "
+                               "a new fit.")
+        begun = capture  # where it has been moved to
+    return _run(scene, begun, folder)
 
 
 def _run(scene: Any, capture: Path, folder: Path) -> Job:
@@ -145,8 +147,7 @@ def expose_cameras(scene: Any, folder: Path | None) -> None:
     capture = capture_of(scene)
     if folder is None or capture is None or scene.fit_flare.root is None:
         return
-    begun = _begun_with(folder)
-    if begun is not None and begun.is_dir() and capture.is_dir() and begun.samefile(capture):
+    if _begun_with(folder) is not None and _may_be_of(folder, capture):
         expose(scene.fit_flare.root, exposures.read(folder))
 
 
@@ -235,7 +236,9 @@ def cleaning(scene: Any, capture: Path) -> list[object]:
     a matte where there is one."""
     folder = folder_of(scene)
     if folder is not None and state_of(scene) == "finished" and _may_be_of(folder, capture):
-        return ["remove", "--run", folder, "--out", capture / "removed"]
+        begun = _begun_with(folder)
+        moved = [] if begun is None or begun.is_dir() else ["--capture", capture]
+        return ["remove", "--run", folder, *moved, "--out", capture / "removed"]
     given = scene.fit_flare.matte
     matte = ["--matte", absolute(given, scene.library)] if given else []
     glow = ["--keep-glare"] if scene.fit_flare.keep_glow else []
@@ -243,7 +246,8 @@ def cleaning(scene: Any, capture: Path) -> list[object]:
 
 
 def cleaned(job: Job) -> None:
-    """Fits of the scenes with this capture go by the clean frames from now on."""
+    """Fits of the scenes with this capture go by the clean frames from now on; those that are shown are read again."""
+    read_again(job.folder.parent / "removed")
     if job.state != "done":
         return
     scenes = [scene for scene in bpy.data.scenes
@@ -261,7 +265,7 @@ def lights_found(job: Job) -> None:
               if (capture := capture_of(scene)) is not None and capture / "lights" == job.folder]
     for scene in scenes:
         try:
-            lights.reload(scene, job.folder.parent)
+            lights.bring_in(scene, job.folder.parent)
         except FitFlareError as problem:
             job.error = str(problem)
     _remember("Lights", scenes)

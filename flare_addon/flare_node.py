@@ -16,6 +16,8 @@ import bpy
 
 GROUP = "Fit Flare"
 GROUPS_ARE_TREES = bpy.app.version >= (5, 0, 0)
+MISSING_IS_MAGENTA = bpy.app.version < (4, 4, 0)
+"""Whether the compositor shows pictures that are missing in magenta, and not as nothing."""
 _GAIN = " Gain"
 _MIX, _MATH = (("ShaderNodeMix", "ShaderNodeMath") if GROUPS_ARE_TREES
                else ("CompositorNodeMixRGB", "CompositorNodeMath"))

@@ -52,11 +52,12 @@ _jobs: dict[str, Job] = {}
 
 
 class Job:
-    """One command of the engine. done, total: steps of `stage`; left_s: seconds left, None where unknown."""
+    """One command of the engine. done, total: steps of `stage`; left_s: seconds left, None where unknown. log_from:
+    bytes of the log that commands before it have written."""
 
     def __init__(self, kind: str, folder: Path, pid: int, process: subprocess.Popen[bytes] | None,
-                 words: Sequence[str] = (), host: str = HOST) -> None:
-        self.kind, self.folder, self.pid, self.host = kind, folder, pid, host
+                 words: Sequence[str] = (), host: str = HOST, log_from: int = 0) -> None:
+        self.kind, self.folder, self.pid, self.host, self.log_from = kind, folder, pid, host, log_from
         self.words = [word for word in words if word != "--overwrite"]
         self.state: State = "running"
         self.stage, self.done, self.total, self.left_s = "starting", 0, 0, None
@@ -180,7 +181,15 @@ class Job:
             self.error = f"The disk of {self.folder} is full; make room and start it again, what is finished is kept."
         else:
             self.state = "failed"
-            self.error = f"The engine ended without a result{_last_words(self.log)}; {LOG} in {self.folder} has it all."
+            self.error = f"The engine ended without a result{self._last_words()}; {LOG} in {self.folder} has it all."
+
+    def _last_words(self) -> str:
+        try:
+            text = self.log.read_bytes()[self.log_from:].decode("utf-8", errors="replace")
+        except OSError:
+            return ""
+        lines = [line.strip() for line in text.splitlines() if line.strip()]
+        return f' ("{lines[-1][:160]}")' if lines else ""
 
 
 def _is_full(folder: Path) -> bool:
@@ -188,15 +197,6 @@ def _is_full(folder: Path) -> bool:
         return shutil.disk_usage(folder).free < FULL
     except OSError:
         return False
-
-
-def _last_words(log: Path) -> str:
-    try:
-        text = log.read_text(encoding="utf-8", errors="replace")
-    except OSError:
-        return ""
-    lines = [line.strip() for line in text.splitlines() if line.strip()]
-    return f' ("{lines[-1][:160]}")' if lines else ""
 
 
 # ---- starting and finding -------------------------------------------------------------------------
@@ -220,13 +220,14 @@ def start(kind: str, folder: Path, command: Sequence[str], environment: Mapping[
         folder.mkdir(parents=True, exist_ok=True)
         (folder / STOP).unlink(missing_ok=True)
         with open(folder / EVENTS, "wb") as events, open(folder / LOG, "ab") as log:
+            log_from = log.tell()
             process = subprocess.Popen(list(command), stdin=subprocess.DEVNULL, stdout=events, stderr=log,
                                        env={**(os.environ if environment is None else environment),
                                             STOP_FILE: str((folder / STOP).absolute())}, **apart)
         _yield_to_the_window(process.pid)
         try:
             write_json(folder / RECORD, {"kind": kind, "host": HOST, "pid": process.pid, "started": time.time(),
-                                          "words": [str(word) for word in words]})
+                                          "words": [str(word) for word in words], "log_from": log_from})
         except OSError:
             process.kill()  # nobody would find it again
             raise
@@ -236,7 +237,7 @@ def start(kind: str, folder: Path, command: Sequence[str], environment: Mapping[
         if problem.errno in DISK_FULL:
             raise RunError(refusal(problem)) from problem
         raise RunError(f"{folder} cannot be used ({problem.strerror or problem}); choose another folder.") from problem
-    job = Job(kind, folder, process.pid, process, [str(word) for word in words])
+    job = Job(kind, folder, process.pid, process, [str(word) for word in words], log_from=log_from)
     _jobs[_key(folder)] = job
     if bpy.app.background:
         _wait(job)
@@ -264,7 +265,8 @@ def find(folder: Path | str | None) -> Job | None:
         record = json.loads((folder / RECORD).read_text(encoding="utf-8"))
         pid, host = int(record["pid"]), str(record.get("host", HOST))  # the version before wrote none
         here = host == HOST and processes.is_same(pid, float(record["started"]))
-        job = Job(str(record["kind"]), folder, pid if here else 0, None, list(map(str, record.get("words", ()))), host)
+        job = Job(str(record["kind"]), folder, pid if here else 0, None, list(map(str, record.get("words", ()))), host,
+                  int(record.get("log_from", 0)))
     except (OSError, ValueError, KeyError, TypeError):
         return None
     _jobs[_key(folder)] = job

@@ -16,7 +16,7 @@ from ..core.files import atomic_path, plain_name
 from ..core.look import Look, draw, read
 from ..core.look.look import ViewOfLight, annotated
 from ..core.pictures import linear_from_srgb, srgb_from_linear
-from . import engine, preferences
+from . import preferences
 
 SIDE = 192  # pixels of a thumbnail
 
@@ -26,9 +26,9 @@ _seen: tuple[tuple[str, float], ...] | None = None
 
 
 def folder(create: bool = False) -> Path:
-    """The library's folder: the preferences' own, or one of the extension's."""
-    named = preferences.library_path()
-    path = Path(named) if named else engine.user_folder("library", create=create)
+    """The library's folder: the preferences' own, or one in Blender's user folder; not one of the extension's, which
+    Blender deletes when the extension is uninstalled."""
+    path = Path(preferences.library_path() or bpy.utils.user_resource("DATAFILES", path="fit_flare/library"))
     if create:
         path.mkdir(parents=True, exist_ok=True)
     return path

@@ -163,20 +163,17 @@ def _names_in(path: Path) -> tuple[str, ...]:
         return ()
 
 
-def reload(scene: Any, folder: Path) -> int:
-    """Bring the lights of lights.json into the scene, those by name that are there moved; how many."""
-    there = {name_of(item): item for item in of_scene(scene)}
-    found = read_lights(folder / "lights.json")
+def bring_in(scene: Any, folder: Path) -> int:
+    """Bring lights of lights.json into the scene that it has never had; all of them into a scene that has none. How
+    many. Those that are there stay where they are, which may be elsewhere by now. Raises CaptureError."""
+    there = of_scene(scene)
+    wanted = set(unknown(scene, folder)) if there else None
+    found = [light for light in read_lights(folder / "lights.json") if wanted is None or light.name in wanted]
     root = scene.fit_flare.root
+    collection = root.users_collection[0] if root is not None and root.users_collection else scene.collection
+    size = max((item.empty_display_size for item in there if item.type == "EMPTY"), default=0.2)
     for light in found:
-        if light.name in there:
-            item = there[light.name]
-            if item.parent == root:
-                _put(item, light.xyz)
-        else:
-            collection = root.users_collection[0] if root is not None and root.users_collection else scene.collection
-            size = max((item.empty_display_size for item in there.values() if item.type == "EMPTY"), default=0.2)
-            there[light.name] = add_light(collection, root, light.name, light.xyz, size)
+        add_light(collection, root, light.name, light.xyz, size)
     remember(scene)
     return len(found)
 

@@ -25,7 +25,8 @@ class FITFLARE_AP_preferences(bpy.types.AddonPreferences):
     )
     library: bpy.props.StringProperty(  # type: ignore[valid-type]
         name="Flare Library",
-        description="Folder of .flare files to choose from. Empty: a folder of the extension's own",
+        description="Folder of .flare files to choose from. Empty: fit_flare/library among Blender's user files, which "
+        "stays when the extension is uninstalled",
         subtype="DIR_PATH",
     )
 

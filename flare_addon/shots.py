@@ -18,10 +18,10 @@ from ..core.errors import CaptureError, FrameError, RunError, SettingsError
 from ..core.files import digest_of, write_json
 from ..core.look import Edit, LookEdits
 from ..core.look.shot import Shot, ShotFrame
-from . import cameras, engine, fits, jobs, looks
+from . import cameras, engine, fits, jobs, library, looks
 from .jobs import Job
 from .objects import view_layer_of
-from .paths import absolute, stored
+from .paths import absolute, read_again, stored
 
 SHOT = "shot.json"
 LIVE = "live.json"  # lights whose colour was left to the compositor
@@ -72,7 +72,7 @@ def frame_of(scene: Any, depsgraph: Any, camera: Any, frame: int) -> ShotFrame:
     edits = looks.edits_of(scene.fit_flare)
     if scene.fit_flare.bake_live:
         edits = without_live(edits)
-    words = edits.words()
+    words = _of_lights(edits, {light.name for light in lights}).words()
     seen_by = replace(core, world_to_camera=pose, exposure=evaluated.fit_flare.exposure)
     return ShotFrame(frame, camera.name, seen_by, tuple(lights), tuple(words))
 
@@ -83,6 +83,12 @@ def without_live(edits: LookEdits) -> LookEdits:
         return replace(edit, intensity=1.0, tint=(1.0, 1.0, 1.0), mute=False, solo=False)
 
     return LookEdits(kept(edits.master), {name: kept(edit) for name, edit in edits.lights.items()}, edits.elements)
+
+
+def _of_lights(edits: LookEdits, names: set[str]) -> LookEdits:
+    """The edits of these lights: one that is not in the shot has nothing to be edited."""
+    return LookEdits(edits.master, {name: edit for name, edit in edits.lights.items() if name in names},
+                     {pair: edit for pair, edit in edits.elements.items() if pair[0] in names})
 
 
 def live_of(state: Any, names: Sequence[str]) -> dict[str, list[str]]:
@@ -116,9 +122,12 @@ def layers_folder(scene: Any, create: bool = False) -> Path:
     state = scene.fit_flare
     if not state.layers and create:
         path = looks.path_of(scene)
-        base = Path(bpy.data.filepath).parent if bpy.data.filepath else path.parent if path else None
-        if base is None:
+        if path is None:
             raise RunError("There is no flare to bake; fit one, or open a .flare.")
+        base = Path(bpy.data.filepath).parent if bpy.data.filepath else path.parent
+        if base.resolve() == library.folder().resolve():
+            raise RunError("Layers do not go into the library of flares; save the .blend first, or choose a folder for "
+                           "Layers.")
         folder, number = base / "layers", 1
         while folder.exists():
             number += 1
@@ -131,15 +140,26 @@ def folder_of_camera(layers: Path, camera: Any) -> Path:
     """Where a camera's layers are, in a folder into which the scene's own or chosen ones were baked. Raises FrameError
     where there are only others' layers."""
     try:
-        folders = Shot.read(layers / SHOT).folders
+        last = Shot.read(layers / SHOT).folders
     except SettingsError:
         return layers
+    folders = {**_kept(layers), **last}
     name = camera.name if camera is not None else ""
-    if name not in folders and "" not in folders.values() and not any(layers.glob("*.exr")):
+    if name not in folders and "" not in last.values() and not any(layers.glob("*.exr")):
         raise FrameError(f"{layers} has no layers of the camera {name!r}, only of {', '.join(map(repr, folders))}; "
                          "bake it too, or make one of those the scene's camera. One that was renamed needs its name "
                          "back.")
     return layers / folders.get(name, "")
+
+
+def _kept(layers: Path) -> dict[str, str]:
+    """Of the cameras whose layers a folder has, from bakes before the last too, the folder in it of each."""
+    try:
+        entries = bakes.read_record(layers)["frames"]
+    except RunError:
+        return {}
+    return {entry["view"].rpartition("/")[0]: entry["file"].rpartition("/")[0] for entry in entries
+            if "/" in entry["view"]}
 
 
 def replaced(scene: Any, chosen: Sequence[Any]) -> list[int]:
@@ -217,11 +237,8 @@ def bake(scene: Any, chosen: Sequence[Any], *, others_may_go: bool = False) -> J
 
 
 def baked(job: Job) -> None:
-    """Read the layers in a folder again, where Blender has them already: it would show those of before."""
-    folder = job.folder.resolve()
-    for image in bpy.data.images:
-        if image.source == "SEQUENCE" and absolute(image.filepath, image.library).resolve().is_relative_to(folder):
-            image.reload()
+    """Show the layers that were baked."""
+    read_again(job.folder)
 
 
 jobs.FINISHERS["bake"] = baked

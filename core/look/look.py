@@ -98,6 +98,12 @@ class TrainedCamera:
         """(3, 3)."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
+    def pixels_across(self, width: int, height: int) -> float:
+        """How many times as many pixels a picture of that size has across this camera's field of view: by the width;
+        where one of the two is upright and the other is not by the long sides, since that is how a camera is turned."""
+        turned = (width < height) != (self.width < self.height)
+        return max(width, height) / max(self.width, self.height) if turned else width / self.width
+
 
 @dataclass(frozen=True, eq=False)
 class ViewOfLight:

@@ -90,8 +90,9 @@ def _warnings(scene: Any, layers: LayerFolder, live: bool) -> Iterator[str]:
     """What of a composite that is set up will not be as somebody may expect."""
     there = [Frame("", number, "") for number in layers.files]
     if bare := absent(there, f"{max(scene.frame_start, 0)}-{max(scene.frame_end, scene.frame_start, 0)}"):
+        shown = "Blender shows in magenta before 4.4" if flare_node.MISSING_IS_MAGENTA else "are without flare"
         yield (f"The scene has the frames {scene.frame_start}-{scene.frame_end}, and there are no layers of {bare}, "
-               "which are without flare; bake them too.")
+               f"which {shown}; bake them too.")
     if live and wires.is_animated(scene):
         yield ("Sliders that act on it are animated: they stand still where this extension is not, on a farm say; bake "
                "without Keep Colours Live for that.")

@@ -190,7 +190,7 @@ class FITFLARE_OT_shot_from_picture(Action, bpy.types.Operator):
         data.lens = 36.0
         if scene.fit_flare.flare:  # the flare's own lens, which its shapes belong to
             filmed = looks.look_of(scene).camera
-            data.lens = 36.0 * filmed.fx / filmed.width
+            data.lens = 36.0 * filmed.fx * filmed.pixels_across(*image.size) / image.size[0]
         camera = bpy.data.objects.new(data.name, data)
         scene.collection.objects.link(camera)
         camera.rotation_euler = (1.5707963, 0, 0)

@@ -103,7 +103,7 @@ class FITFLARE_OT_use_lights(Action, bpy.types.Operator):
     def act(self, context: bpy.types.Context) -> None:
         capture = fits.capture_of(context.scene)
         assert capture is not None
-        lights.reload(context.scene, capture)
+        lights.bring_in(context.scene, capture)
 
 
 _CLASSES = (FITFLARE_OT_add_light, FITFLARE_OT_lights_from_selected, FITFLARE_OT_remove_light, FITFLARE_OT_find_lights,

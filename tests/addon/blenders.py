@@ -14,7 +14,8 @@ from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
-OLDER = ROOT / ".venv-bpy45" / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
+OLDER = Path(os.environ.get("FIT_FLARE_OLDER", "")
+             or ROOT / ".venv-bpy45" / ("Scripts/python.exe" if os.name == "nt" else "bin/python"))
 
 
 @dataclass(frozen=True)
@@ -62,5 +63,5 @@ def newer() -> Blender | None:
 
 
 def older() -> Blender | None:
-    """Blender 4.5 in a Python without an engine."""
+    """Blender 4.5 in a Python without an engine, or what FIT_FLARE_OLDER names."""
     return Blender(OLDER) if OLDER.is_file() else None

@@ -98,6 +98,8 @@ def test_an_engine_that_dies_is_told(said: Any) -> None:
     assert fits["refuses"] == "The frames are not there; put them back."
     assert is_sentence(fits["chatters"]) or fits["chatters"].endswith("has it all.")
     assert "without a result" in fits["ends"]
+    for how in ("dies without a word", "dies without a word, found again"):
+        assert said[how].startswith("The engine ended without a result; "), "an earlier one's words are not its own"
     assert {fits[f"{how}, state"] for how in ("dies", "refuses", "chatters", "ends")} == {"none"}
 
 

@@ -122,8 +122,11 @@ def test_layers_are_brought_to_the_size_that_is_rendered(made: Made, name: str, 
     assert image.shape[:2] == (SIZE[0] * factor, SIZE[1] * factor)
     expected = layers.flare if name.startswith("over") else layers.composite
     small, large = sorted((image, expected), key=len)
-    means = large.reshape(len(small), 2, small.shape[1], 2, 3).mean((1, 3))  # of pixels that know nothing of each other
-    assert np.corrcoef(means.ravel(), small.ravel())[0, 1] > 0.9
+    blocks = large.reshape(len(small), 2, small.shape[1], 2, 3)  # of pixels that know nothing of each other
+    smaller = [blocks.mean((1, 3))]
+    if made.facts["version"].startswith("4.2"):  # there one pixel of each block stands for it
+        smaller += [blocks[:, row, :, column] for row in range(2) for column in range(2)]
+    assert max(np.corrcoef(one.ravel(), small.ravel())[0, 1] for one in smaller) > 0.9
 
 
 def test_what_the_camera_goes_by_stays(made: Made) -> None:

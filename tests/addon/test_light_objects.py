@@ -37,7 +37,7 @@ def test_one_that_is_moved_by_itself_is_refused(facts: Any) -> None:
 
 
 def test_a_light_parented_where_it_stood_stays_there(facts: Any) -> None:
-    assert facts["parented, brought back"] == [True, True]
+    assert facts["parented, brought back"] == [True, True, True]
 
 
 @pytest.mark.parametrize("how", ["open", "closed"])
@@ -53,6 +53,18 @@ def test_found_lights_are_kept_until_they_are_used_or_taken_out(facts: Any) -> N
     names, left = facts["taken out"]
     assert "found" not in names and not left
     assert "found" not in facts["of the version before"]
+
+
+def test_what_was_moved_or_renamed_while_lights_were_looked_for_stays_so(facts: Any) -> None:
+    names, off, error = facts["found meanwhile"]
+    assert {"desk lamp", "more"} <= set(names)
+    assert "lamp" not in names
+    assert off < 1e-6
+    assert not error
+
+
+def test_a_scene_that_has_no_light_left_gets_all_that_are_found(facts: Any) -> None:
+    assert set(facts["found with none left"]) >= {"lamp", "more"}
 
 
 def test_only_an_empty_that_was_made_for_a_light_goes_with_it(facts: Any) -> None:

@@ -44,10 +44,16 @@ def test_baked_frames_do_not_go_unasked(facts: Any) -> None:
     assert "4 frames from 1 to 4" in facts["renamed"]
 
 
+def test_what_is_edited_of_a_flare_without_a_light_is_not_baked(facts: Any) -> None:
+    (light,), words = facts["edits"]
+    assert words == [f"{light}.intensity=2"]
+
+
 def test_each_chosen_camera_has_a_folder_even_alone(facts: Any) -> None:
     assert facts["one chosen"] == [facts["one chosen, read again"]] == ["Camera"]
     assert facts["the scene's own"] == [""]
     assert "has no layers of the camera 'Other', only of 'Camera'" in facts["renamed since"]
+    assert facts["of an earlier bake"] == "Other_2", "which is kept beside those of the last"
     assert facts["none chosen"] == "No camera is selected; select those to bake from."
 
 

@@ -42,6 +42,17 @@ def test_a_sun_is_a_direction_wherever_it_is_put(facts: Any) -> None:
     assert max(facts["sun"]) < 1e-5
 
 
+def test_a_solve_needs_no_lights(facts: Any) -> None:
+    """A tracked file has its first lamp, switched off; lights are found later, in the frames."""
+    assert facts["no lights"] == ["images", "points.ply", "transforms.json"]
+
+
+def test_a_shot_with_cuts_is_one_whatever_part_of_it_is_asked_for(facts: Any) -> None:
+    whole, part, same = facts["cut"]
+    assert whole == part == [""]
+    assert same, "so a farm's chunks are those of the whole"
+
+
 def test_what_renders_do_not_show_hides_nothing(facts: Any) -> None:
     assert facts["behind a wall"] == 0
     assert facts["that renders do not show"] == pytest.approx(1)

@@ -73,6 +73,18 @@ def test_frames_are_cleaned_by_a_matte_and_otherwise_again(made: tuple[Any, Path
     assert not first and not stopped
 
 
+def test_a_moved_project_goes_on_with_its_capture_where_it_is_now(made: tuple[Any, Path]) -> None:
+    facts, base = made
+    resumed, cleaned, moved = facts["moved"]
+    assert Path(resumed) == Path(moved).resolve()
+    assert cleaned[:5] == ["remove", "--run", str(base / "a run"), "--capture", moved]
+    assert "put it back" in facts["another's"]
+
+
+def test_clean_frames_that_were_made_again_are_shown(facts: Any) -> None:
+    assert facts["clean frames"] == [0, 1]
+
+
 def test_a_bake_follows_the_cuts_of_the_timeline(facts: Any) -> None:
     names, *off = facts["cut"]
     assert names == ["Camera"] and [far < 1e-4 for far in off] == [False, False, True], off
@@ -203,6 +215,9 @@ def test_the_library_keeps_flares(facts: Any) -> None:
     assert "already" in again
     assert facts["library"] == ["Desk lamp.flare"]
     assert facts["thumbnail"] > 200
+    assert facts["library's place"] == [True, False], "uninstalling the extension deletes what is its own"
+    said, chosen = facts["layers beside a flare of the library"]
+    assert "save the .blend first" in said and not chosen
     assert facts["items"] == [["Desk lamp", "1 lights, 60 Gaussians. 35 mm"]]
 
 
@@ -217,11 +232,22 @@ def test_a_light_is_picked_in_a_single_picture(facts: Any) -> None:
     np.testing.assert_allclose(facts["picked"], [0.25, 0.3], atol=1e-4)
 
 
+def test_an_upright_picture_is_by_a_turned_camera(facts: Any) -> None:
+    """As `transfer` takes it: across its long side lies what lay across the source's."""
+    found, expected, wide = facts["upright"]
+    assert wide
+    assert found == pytest.approx(expected, rel=1e-5)
+
+
 def test_blenders_own_camera_becomes_a_capture(facts: Any) -> None:
     assert facts["exported"] == ["FINISHED"]
     assert facts["export off"] < 1e-5
     assert facts["export lens off"] < 1e-3
     assert facts["export points"] == 150
+    assert facts["exported again"] == ["FINISHED"]
+    for whose in ("of nerfstudio", "of COLMAP"):
+        said, kept = facts[f"exported into one {whose}"]
+        assert "choose another folder" in said and kept
 
 
 def test_the_overlay_is_what_is_baked(made: tuple[Any, Path], tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 """Inside Blender: everything that can be broken. Words: the zip, a capture, a .flare of it, a folder, a sham engine."""
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
 import shutil
@@ -116,6 +117,15 @@ for how in ("dies", "refuses", "chatters", "ends"):
     fit_words[how] = refusal(lambda: ops.fit())
     fit_words[f"{how}, state"] = fits.state_of(scene)
 said["fits"] = fit_words
+behave("vanishes")
+long_ago = folder / "long ago"
+long_ago.mkdir()
+(long_ago / jobs.LOG).write_text("a warning of the last time\n")
+with contextlib.suppress(part("core.errors").FitFlareError):
+    jobs.start("fit", long_ago, [sham])
+said["dies without a word"] = jobs.find(long_ago).error
+jobs.forget(long_ago)
+said["dies without a word, found again"] = jobs.find(long_ago).error
 behave("finishes")
 said["a fit that ends well"] = [refusal(lambda: ops.fit()), fits.state_of(scene), scene.fit_flare.flare != ""]
 behave("answers")

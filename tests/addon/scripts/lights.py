@@ -80,9 +80,13 @@ lights.take([bulb], {"lamp"})
 bpy.context.view_layer.update()
 before = bulb.matrix_world.translation.copy()
 lights.write(scene, capture)
-lights.reload(scene, capture)
+written = {light.name: light.xyz for light in read_lights(capture / "lights.json")}
+lights.follow(scene, {lights.name_of(bulb): written[lights.name_of(bulb)] + 1}, capture)
+lights.follow(scene, written, capture)
+moved = (bulb.matrix_world.translation - before).length
+lights._put(bulb, written[lights.name_of(bulb)])
 bpy.context.view_layer.update()
-facts["parented, brought back"] = [(bulb.matrix_world.translation - before).length < 1e-4,
+facts["parented, brought back"] = [moved > 0.1, (bulb.matrix_world.translation - before).length < 1e-4,
                                    bool(np.allclose(before, (1, 2, 3), atol=1e-4))]
 
 # ---- an empty of one's own ---------------------------------------------------------------------------
@@ -203,6 +207,24 @@ facts["used"] = [[lights.name_of(item) for item in lights.of_scene(scene)], ligh
 ops.remove_light(object="found")
 lights.write(scene, capture)
 facts["taken out"] = [[light.name for light in read_lights(path)], lights.unknown(scene, capture)]
+lamp = scene.objects["lamp"]
+lights.write(scene, capture)
+lights.remember(scene)
+lamp.location.x += 0.5  # while they are looked for
+lamp.fit_flare.light = "desk lamp"
+bpy.context.view_layer.update()
+stood = lamp.matrix_world.translation.copy()
+path.write_text(json.dumps({"lights": [*json.loads(path.read_text())["lights"], {"name": "more", "xyz": [1, 2, 3]}]}))
+job = part("flare_addon.jobs").Job("lights", capture / "lights", 0, None)
+job.state = "done"
+fits.lights_found(job)
+bpy.context.view_layer.update()
+facts["found meanwhile"] = [[lights.name_of(item) for item in lights.of_scene(scene)],
+                            (lamp.matrix_world.translation - stood).length, job.error]
+for item in lights.of_scene(scene):
+    bpy.data.objects.remove(item)
+fits.lights_found(job)
+facts["found with none left"] = [lights.name_of(item) for item in lights.of_scene(scene)]
 scene.fit_flare.property_unset("known_lights")
 path.write_text(json.dumps({"lights": [*content["lights"], {"name": "found", "xyz": [1, 2, 3]}]}))
 lights.write(scene, capture)

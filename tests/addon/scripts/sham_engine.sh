@@ -12,6 +12,7 @@ echo '{"type": "stage", "name": "fit", "total": 100, "done": 0}'
 echo '{"type": "progress", "stage": "fit", "done": 40, "total": 100, "left_s": 6.0, "figures": {"loss": 0.1}}'
 case $(cat "$here/behaviour") in
   dies) echo "out of memory, says the system" >&2; kill -9 $$ ;;
+  vanishes) kill -9 $$ ;;
   refuses) echo '{"type": "error", "text": "The frames are not there; put them back."}'; exit 1 ;;
   chatters) echo 'no JSON'; echo '{"type": 7'; echo '[]'; echo '{"text": 1}'; exit 3 ;;
   ends) exit 0 ;;

@@ -114,6 +114,15 @@ facts["all anew"] = [refusal(ops.bake), len(begun)]
 state.bake_range = "current"
 facts["renamed"] = refusal(ops.bake)
 
+# ---- an edited flare without a light ----------------------------------------------------------------
+unplaced = state.lights.add()
+unplaced.name, unplaced.source, unplaced.mute = "sun", "sun", True
+state.lights[0].intensity, state.bake_live = 2.0, False
+(one,) = shots.of_scene(scene, [], [0], flare, None).frames
+facts["edits"] = [[light.name for light in one.lights], list(one.edits)]
+state.lights[0].intensity, state.bake_live = 1.0, True
+state.lights.remove(len(state.lights) - 1)
+
 # ---- chosen cameras ---------------------------------------------------------------------------------
 one = shots._shot(scene, [scene.camera], [0])
 facts["one chosen"] = list(one.folders.values())
@@ -124,6 +133,11 @@ try:
     shots.folder_of_camera(folder, scene.camera)
 except part("core.errors").FrameError as problem:
     facts["renamed since"] = str(problem)
+write_json(folder / "bake.json", {"version": 1, "made_from": {}, "layers": {}, "frames": [
+    {"file": f"Other_2/layers.{number:04d}.exr", "frame": number, "view": f"Other/{number}", "width": 8, "height": 8}
+    for number in range(2)]})
+facts["of an earlier bake"] = shots.folder_of_camera(folder, scene.camera).name
+(folder / "bake.json").unlink()
 facts["the scene's own"] = list(shots._shot(scene, [], [0]).folders.values())
 for item in scene.objects:
     item.select_set(False)

@@ -140,6 +140,23 @@ sun.fit_flare.is_light = True
 lights.write(scene, out)
 facts["sun"] = [off(json.loads((out / "lights.json").read_text())["lights"][0]["xyz"]),
                 off(blend_shot.shot_of(scene, out / "x.flare", [], [1]).frames[0].lights[0].xyz)]
+sun.hide_render = True
+bpy.ops.mesh.primitive_cube_add()
+cube = bpy.context.object
+plate = next((out / "clip").iterdir())
+blend_shot.capture_of(scene, {1: plate}, out / "no lights", [])
+facts["no lights"] = sorted(path.name for path in (out / "no lights").iterdir())
+bpy.data.objects.remove(cube)
+sun.hide_render = False
+second = bpy.data.objects.new("Second", bpy.data.cameras.new("Second"))
+scene.collection.objects.link(second)
+for frame, filming in ((1, camera), (4, second)):
+    scene.timeline_markers.new(f"F{frame}", frame=frame).camera = filming
+whole, part_of_it = (blend_shot.shot_of(scene, out / "lamp.flare", [], frames) for frames in ([1, 4], [4]))
+facts["cut"] = [list(whole.folders.values()), list(part_of_it.folders.values()),
+                whole.frames[1].described() == part_of_it.frames[0].described()]
+scene.timeline_markers.clear()
+scene.camera = camera
 item = scene.fit_flare.lights.add()
 item.name, item.source, item.target = "lamp", "lamp", sun
 facts["sun"].append(off(looks.placed(scene, depsgraph, camera)[1][0].xyz))

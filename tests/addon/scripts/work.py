@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shutil
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -114,6 +115,35 @@ run.mkdir()
 scene.fit_flare.run = str(run)
 facts["cleaned by the fit"] = [str(word) for word in fits.cleaning(scene, Path("capture"))]
 
+# ---- a project that was moved, its capture with it --------------------------------------------------
+moved, words = Path(out) / "moved" / "capture", []
+moved.mkdir(parents=True)
+(run / fits.CONFIG).write_text("")
+scene.fit_flare.capture, chosen = str(moved), scene.fit_flare.capture
+fits.engine.run = lambda _kind, _folder, these: words.append(list(map(str, these)))
+(run / "capture.txt").write_text(f"{Path(out) / 'gone' / 'capture'}\n")
+fits.resume(scene)
+facts["moved"] = [words[-1][1], list(map(str, fits.cleaning(scene, moved))), str(moved)]
+(run / "capture.txt").write_text(f"{Path(out) / 'gone' / 'another'}\n")
+try:
+    fits.resume(scene)
+except part("core.errors").CaptureError as problem:
+    facts["another's"] = str(problem)
+for name in ("capture.txt", fits.CONFIG):
+    (run / name).unlink()
+scene.fit_flare.capture, fits.engine.run = chosen, start
+
+# ---- clean frames that are made again ---------------------------------------------------------------
+seen = bpy.data.images.new("clean", 4, 4)
+seen.filepath_raw, seen.file_format = str(moved / "removed" / "0001.png"), "PNG"
+seen.save()
+shown = bpy.data.images.load(seen.filepath_raw)
+facts["clean frames"] = [shown.pixels[0]]
+seen.pixels.foreach_set(np.ones(64, np.float32))
+seen.save()
+fits.cleaned(SimpleNamespace(folder=moved / "removal", state="done"))
+facts["clean frames"].append(shown.pixels[0])
+
 # ---- one undo step ----------------------------------------------------------------------------------
 scene = empty()
 bpy.ops.ed.undo_push(message="before")
@@ -150,7 +180,7 @@ facts["followed"] = {name: bool(np.allclose(lights.place_of(item, scene.fit_flar
 lights.follow(scene, {light.name: light.xyz for light in written}, Path(capture))
 bpy.context.view_layer.update()
 facts["followed back"] = lights.place_of(scene.objects["lamp"], scene.fit_flare.root).tolist()
-lights.reload(scene, Path(capture))
+scene.objects["lamp"].location = next(light.xyz for light in written if light.name == "lamp").tolist()
 bpy.context.view_layer.update()
 ops.remove_light(object="key")
 lights.write(scene, Path(capture))
@@ -322,6 +352,9 @@ bpy.ops.preferences.addon_enable(module=NAME)
 facts["enabled again"] = [round(value, 3) for value in bpy.context.scene.fit_flare.lights[0].tint]
 
 # ---- library and transfer --------------------------------------------------------------------------
+extensions = Path(bpy.utils.user_resource("EXTENSIONS"))
+facts["library's place"] = [part("flare_addon.library").folder().is_absolute(),
+                            part("flare_addon.library").folder().is_relative_to(extensions)]
 part("flare_addon.preferences").own().library = str(Path(out) / "library")
 facts["saved"] = [list(ops.save_flare(name="Desk: lamp", notes="35 mm")),
                   refusal(lambda: ops.save_flare(name="Desk: lamp"))]
@@ -341,6 +374,10 @@ bpy.context.view_layer.update()
 lamp.select_set(True)
 facts["applied"] = list(ops.apply_flare(filepath=str(library.files()[0])))
 state = other.fit_flare
+try:
+    shots.layers_folder(other, create=True)  # the .blend is not saved, so they would go beside the flare
+except part("core.errors").RunError as problem:
+    facts["layers beside a flare of the library"] = [str(problem), other.fit_flare.layers]
 facts["applied to"] = [item.target.name if item.target else "" for item in state.lights]
 seen = looks.seen(other, bpy.context.evaluated_depsgraph_get(), camera)
 facts["transferred"] = [state.native, len(seen), float(drawing.draw(seen.values(), cameras.core_camera(
@@ -362,6 +399,14 @@ core = cameras.core_camera(single.camera.data, single.camera.matrix_world, singl
 where, _ = core.project([list(state.lights[0].target.matrix_world.translation)])
 facts["picked"] = (where[0] / core.size).tolist()
 
+upright = bpy.data.images.new("upright", 64, 96)
+upright.filepath_raw, upright.file_format = str(Path(out) / "upright.png"), "PNG"
+upright.save()
+ops.shot_from_picture(filepath=str(Path(out) / "upright.png"))
+core = cameras.core_camera(single.camera.data, single.camera.matrix_world, single.render)
+filmed = looks.look_of(single).camera
+facts["upright"] = [core.fx / 96, filmed.fx / filmed.width, filmed.width > filmed.height]
+
 # ---- a capture of Blender's own camera --------------------------------------------------------------
 scene = empty()
 ops.import_capture(directory=capture)
@@ -372,6 +417,20 @@ facts["export off"] = max(float(np.abs(one.camera.world_to_camera - two.camera.w
                           for one, two in zip(again.views, original.views, strict=True))
 facts["export lens off"] = float(np.abs(again.views[0].camera.intrinsics - original.views[0].camera.intrinsics).max())
 facts["export points"] = len(again.points)
+
+facts["exported again"] = list(ops.capture_from_camera(directory=str(exported)))
+core_files = part("core.files")
+theirs = core_files.read_json(exported / "transforms.json", RuntimeError)
+del theirs["made_by"]
+others = {"of nerfstudio": Path(out) / "nerfstudio", "of COLMAP": Path(out) / "colmap"}
+shutil.copytree(exported, others["of nerfstudio"])
+core_files.write_json(others["of nerfstudio"] / "transforms.json", theirs)
+shutil.copytree(Path(capture) / "sparse", others["of COLMAP"] / "sparse")
+for name, folder in others.items():
+    before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    said = refusal(lambda folder=folder: ops.capture_from_camera(directory=str(folder)))
+    facts[f"exported into one {name}"] = [said, before == {path: path.read_bytes() for path in folder.rglob("*")
+                                                           if path.is_file()}]
 
 # ---- a folder that holds no layers ------------------------------------------------------------------
 scene = empty()

@@ -103,11 +103,12 @@ def are_one_shape(size: tuple[int, int], other: tuple[int, int]) -> bool:
             and abs(large[1] - small[1] * scale) <= max(scale, 1.0) + 1e-9)
 
 
-def read_picture(path: Path | str) -> Picture:
+def read_picture(path: Path | str, *, own_primaries: bool = False) -> Picture:
     """Decode PNG, JPEG, TIFF (8 or 16 bit, grey or colour, alpha dropped) or EXR.
 
-    An EXR whose `chromaticities` say another space than Rec. 709 (ACEScg, say) is converted, and one that has more
-    pixels than the frame (overscan), or fewer, is cut to the frame, and black where it has none.
+    An EXR whose `chromaticities` say another space than Rec. 709 (ACEScg, say) is converted, unless it is to keep its
+    own primaries, and one that has more pixels than the frame (overscan), or fewer, is cut to the frame, and black
+    where it has none.
 
     Raises FrameError where the file is missing, damaged or of another kind, or holds NaN or infinity.
     """
@@ -118,7 +119,8 @@ def read_picture(path: Path | str) -> Picture:
         raise FrameError(f"{path} is missing.")
     if path.suffix.lower() == ".exr":
         header, channels = _read_exr(path)
-        pixels = _rec709(path, _rgb_from_channels(path, channels), header)
+        stored = _rgb_from_channels(path, channels)
+        pixels = stored if own_primaries else _rec709(path, stored, header)
         return Picture(framed(pixels, _window(path, header)), "linear")
     stored = stored_pixels(path)
     if stored.ndim == 2:
@@ -272,8 +274,8 @@ def _size_from_header(stream: BinaryIO) -> tuple[int, int] | None:
         header = jpeg.frame_header(stream)
         return header[:2] if header else None
     if head[:4] in (b"II*\0", b"MM\0*"):
-        sides = tiff.read_tags(stream, (tiff.WIDTH, tiff.HEIGHT))
-        return (int(sides[tiff.WIDTH].values[0]), int(sides[tiff.HEIGHT].values[0])) if len(sides) == 2 else None
+        sides = tiff.whole_numbers(tiff.read_tags(stream, (tiff.WIDTH, tiff.HEIGHT)))
+        return (sides[tiff.WIDTH], sides[tiff.HEIGHT]) if len(sides) == 2 else None
     if head[:4] == exr.MAGIC:
         return _exr_size(stream)
     return None

@@ -53,11 +53,19 @@ def read_tags(stream: BinaryIO, wanted: Container[int], at: int | None = None) -
         length = count * values.itemsize * (2 if kind in _RATIONALS else 1)
         raw = entry[8:8 + length]
         if length > 4:
-            stream.seek(struct.unpack(order + "I", entry[8:])[0])
+            start = struct.unpack(order + "I", entry[8:])[0]
+            if start + length > stream.seek(0, io.SEEK_END):  # reading asks for all the memory that is claimed
+                continue
+            stream.seek(start)
             raw = stream.read(length)
         if count and len(raw) == length:
             found[number] = Tag(kind, np.frombuffer(raw, values).astype(values.newbyteorder("=")))
     return found
+
+
+def whole_numbers(tags: Mapping[int, Tag]) -> dict[int, int]:
+    """The values of those tags that hold one number of 16 or 32 bits."""
+    return {name: int(tag.values[0]) for name, tag in tags.items() if tag.kind in (3, 4) and len(tag.values) == 1}
 
 
 def page_count(stream: BinaryIO) -> int:
@@ -100,14 +108,14 @@ def is_premultiplied(path: Path) -> bool:
     """Whether a file's colours are multiplied with its alpha already, as it says."""
     with open(path, "rb") as stream:
         told = read_tags(stream, (EXTRA_SAMPLES,))
-    return EXTRA_SAMPLES in told and int(told[EXTRA_SAMPLES].values[0]) == PREMULTIPLIED
+    return EXTRA_SAMPLES in told and bool(told[EXTRA_SAMPLES].values[0] == PREMULTIPLIED)
 
 
 def as_stored(data: bytes) -> bytes:
     """A TIFF whose pixels a reader leaves alone: it says that they are upright, and not to be multiplied with alpha."""
     told = read_tags(io.BytesIO(data), (ORIENTATION, EXTRA_SAMPLES))
     instead = {ORIENTATION: short(UPRIGHT)} if ORIENTATION in told else {}
-    if EXTRA_SAMPLES in told and int(told[EXTRA_SAMPLES].values[0]) == STRAIGHT:
+    if EXTRA_SAMPLES in told and told[EXTRA_SAMPLES].values[0] == STRAIGHT:
         instead[EXTRA_SAMPLES] = Tag(3, np.array([PREMULTIPLIED, *told[EXTRA_SAMPLES].values[1:]], np.uint16))
     return with_tags(data, instead)
 

@@ -129,8 +129,13 @@ def bake_frames(source: Sequenced, frames: Sequence[Frame], cameras: Mapping[str
     write such there; SettingsError for edits that make no sense; Cancelled when asked to stop.
     """
     settings, progress, out = settings or BakeSettings(), progress or Progress(), Path(out)
-    keyed = settings.keyed.and_always(settings.edits)
-    edits = {frame.number: keyed.at(frame.number, source.lights, source.elements) for frame in frames}
+    keyed, lights, elements = settings.keyed.and_always(settings.edits), source.lights, source.elements
+
+    def asked_of(frame: Frame) -> LookEdits:
+        asked, own = keyed.at(frame.number, lights, elements), of_frame(frame).words
+        return LookEdits.parse([*own, *asked.words()], lights, elements) if own else asked
+
+    edits = {frame.view: asked_of(frame) for frame in frames}  # before anything that is there makes way for it
     made_from = _made_from(source.fingerprint, settings, keyed)
     space = colour_space(settings.space, settings.config)
     if settings.space != "linear" or settings.config is not None:
@@ -138,7 +143,7 @@ def bake_frames(source: Sequenced, frames: Sequence[Frame], cameras: Mapping[str
     if keyed.frames:
         made_from["keyed"] = keyed.described()["frames"]
     made_from = json.loads(json.dumps(made_from))  # as it is read again
-    names = layer_names(source.lights)
+    names = layer_names(lights)
     _begin(out, made_from, names, overwrite)
 
     def notes(frame: Frame) -> dict[str, Any]:
@@ -153,10 +158,8 @@ def bake_frames(source: Sequenced, frames: Sequence[Frame], cameras: Mapping[str
     progress.stage("bake", len(frames), len(done))
 
     def made(frame: Frame) -> FrameLayers:
-        camera, one, asked = settings.scaled(cameras[frame.view]), of_frame(frame), edits[frame.number]
-        if one.words:
-            asked = LookEdits.parse([*one.words, *asked.words()], source.lights, source.elements)
-        return one.finished(_layers(one, camera, asked, source.lights).in_space(space), camera)
+        camera, one = settings.scaled(cameras[frame.view]), of_frame(frame)
+        return one.finished(_layers(one, camera, edits[frame.view], lights).in_space(space), camera)
 
     @contextlib.contextmanager
     def in_turn() -> Iterator[None]:

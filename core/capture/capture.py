@@ -68,6 +68,7 @@ class Capture:
         self.views = tuple(views)
         self.points = points
         self.lights = tuple(lights)
+        self.cache_bytes = cache_bytes
         self._frames = frames or {}
         self._pictures = _Pictures(cache_bytes)
         self._removed = _siblings(folder / REMOVED, self.views)
@@ -107,6 +108,10 @@ class Capture:
         if (folder / "split.json").exists():
             capture.split(None)
         return capture
+
+    def reopened(self) -> Capture:
+        """What its folder holds by now, with the same room for decoded pictures. Raises what `open` does."""
+        return Capture.open(self.folder, cache_bytes=self.cache_bytes)
 
     def exposed(self, exposures: Mapping[str, float]) -> Capture:
         """The same, views being exposed so many times as usual, by name."""
@@ -165,7 +170,12 @@ class Capture:
     @property
     def centre(self) -> Floats:
         """(3,) mean of the camera positions."""
-        return np.mean([view.camera.position for view in self.views], axis=0)
+        return self._positions.mean(axis=0)
+
+    @property
+    def _positions(self) -> Floats:
+        """(views, 3) of the cameras."""
+        return np.array([view.camera.position for view in self.views])
 
     @property
     def extent(self) -> float:
@@ -183,7 +193,8 @@ class Capture:
     @property
     def _reach(self) -> float:
         """Of the cameras from their middle."""
-        return max(float(np.linalg.norm(view.camera.position - self.centre)) for view in self.views)
+        places = self._positions
+        return float(np.linalg.norm(places - places.mean(axis=0), axis=1).max())
 
     @property
     def _away(self) -> float:

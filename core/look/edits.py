@@ -154,11 +154,11 @@ class LookEdits:
         """
         made: dict[tuple[str, str], Edit] = {}
         for text in edits:
-            name, equals, value = text.partition("=")
-            whom, dot, what = name.strip().rpartition(".")
-            if not (equals and dot and whom):
+            name, equals, value = text.rpartition("=")  # a light's name may hold one itself
+            whom, dot, what = name.rpartition(".")
+            if not (equals and dot and whom.strip()):
                 raise SettingsError(f"The edit {text!r} is not of the form light.intensity=2 or light.tint=1,0.5,0.2.")
-            change = _change(text, what, value.strip())
+            change = _change(text, what.rstrip(), value.strip())
             for target in _targets(text, whom, lights, elements):
                 before = made.get(target, NEUTRAL)
                 after = before.then(change)
@@ -193,6 +193,8 @@ class LookEdits:
 def _targets(text: str, whom: str, lights: Sequence[str],
              elements: Mapping[str, Sequence[str]] | None) -> list[tuple[str, str]]:
     """(light, element or "") that an edit is for."""
+    if not any(whom == light or whom.startswith(f"{light}/") for light in lights):
+        whom = whom.lstrip()  # only here, since a light's name may begin with a blank
     if whom in lights:
         return [(whom, "")]
     if whom == ALL:

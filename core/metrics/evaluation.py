@@ -28,6 +28,8 @@ Scores = dict[str, float | None]
 Reference = Literal["truth", "removed", "none"]
 
 LAYERS = ("composite", "scene", "flare", "flare_linear")
+_BESIDE_NONE = ("psnr", "empty_psnr", "relative_l2")
+"""Scores of a flare that are read beside those of an empty one."""
 _CLIPPED = 254.5 / 255
 
 
@@ -157,7 +159,11 @@ def _picture_scores(image: Array, target: Array, lpips: Perceptual | None) -> Sc
 
 def summary(reference: Reference, views: Sequence[tuple[str, dict[str, Scores]]],
             size: tuple[int, int]) -> dict[str, Any]:
-    """The content of eval.json: means over views, then each view. Not-finite numbers become null."""
+    """The content of eval.json: means over views, then each view. Not-finite numbers become null.
+
+    A flare's PSNR, that of an empty one and the relative error are means over the views whose reference holds a flare:
+    where it is black, an empty one would be exact, and no mean could hold that.
+    """
     mean = {layer: _mean([scores[layer] for _, scores in views if layer in scores]) for layer in LAYERS}
     return {
         "reference": reference,
@@ -171,10 +177,18 @@ def summary(reference: Reference, views: Sequence[tuple[str, dict[str, Scores]]]
 
 def _mean(parts: list[Scores]) -> Scores:
     means: Scores = {}
+    flared = [part for part in parts if not _is_without_flare(part)]
     for key in parts[0] if parts else ():
-        values = [value for part in parts if (value := part[key]) is not None and math.isfinite(value)]
+        values = [value for part in (flared if key in _BESIDE_NONE else parts)
+                  if (value := part[key]) is not None and math.isfinite(value)]
         means[key] = sum(values) / len(values) if values else None
     return means
+
+
+def _is_without_flare(scores: Scores) -> bool:
+    """Whether there is none in the reference of one view's flare, by scores as they are or as eval.json has them."""
+    empty = scores.get("empty_psnr", 0.0)
+    return empty is None or not math.isfinite(empty)
 
 
 def _finite(scores: Scores) -> Scores:
@@ -201,6 +215,11 @@ def table(scores: dict[str, Any]) -> str:
         where = f"{worst[layer]['psnr']:.2f} in {worst['name']}" if worst else "-"
         lines.append(f"{layer:13}{''.join(f'{cell:>8}' for cell in cells)}"
                      f"{_cell(part.get('relative_l2'), 3):>9}  {where}")
+    for layer in LAYERS:
+        without = sum(_is_without_flare(view[layer]) for view in scores["views"] if layer in view)
+        if without:
+            lines.append(f"{without} of {count} views show no flare to be scored against: PSNR, empty and rel. L2 of "
+                         f"{layer} are of the others.")
     return "\n".join(lines)
 
 

@@ -143,7 +143,7 @@ def _misread(path: Path) -> str:
             return _CMYK if header is not None and header[2] == 4 else ""
         if path.suffix.lower() not in _TIFFS:
             return ""
-        told = {name: int(tag.values[0]) for name, tag in
+        told = {name: tag.values[0] for name, tag in
                 tiff.read_tags(stream, (tiff.SAMPLES, tiff.PHOTOMETRIC)).items()}
         pages = tiff.page_count(stream)
     if pages > 1:

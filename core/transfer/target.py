@@ -9,13 +9,15 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..bake.frames import Frame, layers_file, numbered, plates_by_number
-from ..capture import Camera, Capture, Light, View, read_lights
+from ..capture import Camera, Capture, Lens, Light, View, read_lights
+from ..capture.lens import straightened
 from ..colour import ColourSpace
 from ..errors import CaptureError, SettingsError
 from ..files import content_of
@@ -35,13 +37,14 @@ Mapped = Mapping[str, str]
 class TargetFrame:
     """frame: its number and the file of its layers. shot: camera and lights. plate: its picture, if it has one.
 
-    undistorted: gives the plate's picture where the file itself is a distorted one.
+    undistorted: gives the plate's picture where the file itself is a distorted one, asked whether with the numbers of
+    the file, which are not converted by what it says of its space.
     """
 
     frame: Frame
     shot: ShotFrame
     plate: Path | None = None
-    undistorted: Callable[[], Picture] | None = None
+    undistorted: Callable[[bool], Picture] | None = None
 
     def flared(self, folder: Path) -> Path | None:
         """Where below `folder` the plate with its flare goes: beside those of the layers' folder, under its own name.
@@ -103,7 +106,7 @@ def of_pictures(paths: Sequence[Path], look: Look, lights: Mapping[str, tuple[fl
         path = by_name[frame.view]
         window = window_of(path)
         width, height = window.frame
-        larger = _larger(window.frame, (look.camera.width, look.camera.height))
+        larger = look.camera.pixels_across(width, height)
         fx = focal or look.camera.fx * larger
         fy = (focal or look.camera.fy * larger) * window.aspect
         cx, cy = centre or (width / 2, height / 2)
@@ -128,13 +131,6 @@ def of_pictures(paths: Sequence[Path], look: Look, lights: Mapping[str, tuple[fl
     if missing := set(wanted) - set(target.lights):
         raise SettingsError(f"The pictures have no light {min(missing)!r}; they have {', '.join(target.lights)}.")
     return target
-
-
-def _larger(size: tuple[int, int], source: tuple[int, int]) -> float:
-    """How many times as many pixels a picture has across the source's field of view: by the width; where one is upright
-    and the other is not by the long sides, since that is how a camera is turned."""
-    turned = (size[0] < size[1]) != (source[0] < source[1])
-    return max(size) / max(source) if turned else size[0] / source[0]
 
 
 def _detected(path: Path, detector: Detector | None) -> dict[str, tuple[float, float]]:
@@ -179,10 +175,10 @@ def of_capture(capture: Capture, look: Look, wanted: Mapped, *, lights: Path | N
     for frame in numbered(views):
         view = views[frame.view]
         path = None if shown else capture.frame_path(view)
-        straight = view.lens is None or path is None
-        camera = on_plate(view.camera, path) if straight and path is not None else view.camera
+        undistorted = None if view.lens is None or path is None else _undistorted(capture, view, view.lens)
+        camera = on_plate(view.camera, path) if undistorted is None and path is not None else view.camera
         shot = ShotFrame(frame.number, str(Path(frame.view).parent), camera, placed)
-        frames.append(TargetFrame(frame, shot, path, None if straight else _undistorted(capture, view)))
+        frames.append(TargetFrame(frame, shot, path, undistorted))
     return Target(tuple(frames), read_ply(scene) if scene else None, shown)
 
 
@@ -191,8 +187,20 @@ def _placed(lights: Sequence[Light], look: Look, wanted: Mapped) -> tuple[Placed
     return tuple(PlacedLight(light.name, sources[light.name], light.xyz) for light in lights)
 
 
-def _undistorted(capture: Capture, view: View) -> Callable[[], Picture]:
-    return lambda: capture.frame(view)
+def _undistorted(capture: Capture, view: View, lens: Lens) -> Callable[[bool], Picture]:
+    def plate(own_numbers: bool) -> Picture:
+        if not own_numbers:
+            return capture.frame(view)
+        stored = read_picture(capture.frame_path(view), own_primaries=True)
+        return straightened(stored, _maps(lens, stored.size))
+
+    return plate
+
+
+@lru_cache(maxsize=1)  # at 4K they take seconds, and the frames of a shot share their lens
+def _maps(lens: Lens, size: tuple[int, int]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """`Lens.maps` of its undistorted view at a size (width, height) in pixels."""
+    return lens.maps(Camera(lens.width, lens.height, *lens.pinhole, np.eye(4)).scaled(*size))
 
 
 def of_cameras(capture: Capture, look: Look, scene: Path | None = None) -> Target:
@@ -278,7 +286,7 @@ def background(one: TargetFrame, size: tuple[int, int], space: ColourSpace | Non
     that its numbers are in, where its file is not to say."""
     if one.undistorted is None:
         return None
-    picture = one.undistorted()
+    picture = one.undistorted(space is not None)
     if space is not None:
         picture = Picture(space.to_linear(picture.pixels), "linear")
     return np.asarray(picture.resized(*size).linear(), np.float32)

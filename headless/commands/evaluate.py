@@ -61,7 +61,7 @@ COMMAND = Command(
     """Writes RUN/eval.json and shows its means: PSNR, SSIM (11x11 window, sigma 1.5, inside the picture), FLIP
 where the flip-evaluator package is installed, LPIPS where --lpips names its weights. Scene and flare are
 scored against truth/ where the capture has it, else against removed/; "empty" is what no flare at all would
-score.
+score. Views that show no flare do not count in its PSNR, "empty" and relative error, and are told.
 
   run.py eval build/desk""",
     arguments, (Step("eval", "engine", run),))

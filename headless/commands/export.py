@@ -53,9 +53,16 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     if words.kind == "preset":
         if words.frames is not None and len(wanted) > 1:
             raise SettingsError(f"A preset is of one frame, and --frames {words.frames} are {len(wanted)}; name one.")
-        pose = cameras[wanted[0].view].world_to_camera
-        write_preset(words.out, look, {light.name: ViewOfLight.of(pose, light.xyz) for light in look.lights}, edits)
+        number, camera = wanted[0].number, cameras[wanted[0].view]
+        seen = {light.name: ViewOfLight.of(camera.world_to_camera, light.xyz) for light in look.lights}
+        behind = [name for name, view in seen.items() if view.depth <= 0]
+        if len(behind) == len(seen):
+            raise RunError(f"No light is in front of the camera in frame {number} of {folder}; name another with "
+                           "--frames.")
+        write_preset(words.out, look, seen, edits, camera.exposure)
         progress.say(f"The preset is {words.out}.")
+        if behind:
+            progress.say(f"Lights behind the camera in frame {number} are not in it: {', '.join(behind)}.")
         return {"preset": str(words.out)}
     progress.stage("export", len(wanted))
     for frame in wanted:

@@ -59,14 +59,13 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
 
 def with_lights(capture: Capture, progress: Progress) -> Capture:
     """The capture with its lights, which are found and written into its folder if no lights.json is there."""
-    from ...core.capture import Capture
     from ...core.lights import detector_for
 
     if capture.lights or (capture.folder / LIGHTS).exists():
         return capture
     progress.say(f"{capture.folder} has no {LIGHTS}: its lights are looked for.")
     _find(capture, detector_for("exposure"), progress)
-    return Capture.open(capture.folder)
+    return capture.reopened()
 
 
 def _find(capture: Capture, detector: Detector, progress: Progress, settings: GatherSettings | None = None, *,

@@ -110,7 +110,6 @@ def _remover(words: argparse.Namespace) -> Remover:
 
 def with_removed(capture: Capture, progress: Progress) -> Capture:
     """The capture with its flare-free frames, which are made and written into its folder if it has none."""
-    from ...core.capture import Capture
     from ...core.removal.captured import remove_from
     from ...core.removal.inference import Remover
 
@@ -119,7 +118,7 @@ def with_removed(capture: Capture, progress: Progress) -> Capture:
     progress.say(f"{capture.folder} has no removed/: the flares are taken out of its frames, and what comes of that is "
                  "kept there.")
     remove_from(capture, Remover(), progress)
-    return Capture.open(capture.folder)
+    return capture.reopened()
 
 
 COMMAND = Command(

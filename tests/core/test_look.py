@@ -413,6 +413,13 @@ def test_edits_go_to_words_and_back() -> None:
     assert both.elements == {("lamp", "ghost"): Edit(scale=6.0), ("lamp", "streak 2"): Edit(scale=3.0)}
 
 
+@pytest.mark.parametrize("name", ["key=1", " lamp", "a.b", " a.scale=2 /b = "])
+def test_edits_go_to_words_and_back_whatever_a_light_is_called(name: str) -> None:
+    edits = LookEdits(lights={name: Edit(intensity=2.5), "lamp": Edit(mute=True)},
+                      elements={(name, "ghost 2"): Edit(tint=(1.0, 0.5, 0.25), rotation=-30.0)})
+    assert LookEdits.parse(edits.words(), ["lamp", name], {name: ["ghost 2"]}) == edits
+
+
 @pytest.mark.parametrize("edit", ["lamp/iris.scale=2", "lamp.scale=-1", "lamp.mute=2", "lamp.rotation=a", "lamp.solo=",
                                   "sun/ghost.scale=1", "lamp.sizes=1", "lamp.scale=1e9", "lamp.rotation=inf"])
 def test_edits_that_make_no_sense_are_refused(edit: str) -> None:
@@ -556,6 +563,19 @@ def test_notes_can_be_changed_and_the_engine_reads_it(tmp_path: Path) -> None:
     view = cameras(3)[0].world_to_camera
     before, after_ = (read(tmp_path / name).evaluate(view) for name in ("a.flare", "b.flare"))
     np.testing.assert_array_equal(before["lamp 1"].means, after_["lamp 1"].means)
+
+
+def test_a_shot_with_an_edit_of_no_sense_leaves_what_was_baked_before(tmp_path: Path) -> None:
+    from core.bake.shot import bake_shot
+
+    bake_shot(a_shot(tmp_path), tmp_path / "layers", wanted={1, 2})
+    before = {path.name: path.read_bytes() for path in (tmp_path / "layers").iterdir()}
+    shot = a_shot(tmp_path, "second.intensity=2")
+    *good, last = shot.frames
+    bad = replace(shot, frames=(*good, replace(last, edits=("lamp 0.glow=2",))))
+    with pytest.raises(SettingsError, match="glow"):
+        bake_shot(bad, tmp_path / "layers", overwrite=True, half=False)
+    assert {path.name: path.read_bytes() for path in (tmp_path / "layers").iterdir()} == before
 
 
 @pytest.mark.parametrize("blend", ["add", "over"])

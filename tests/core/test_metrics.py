@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from core.errors import SettingsError
-from core.metrics.evaluation import clipped, out_of_range, score_view, summary, table
+from core.metrics.evaluation import clipped, out_of_range, score_view, summary, table, worse_than_none
 from core.metrics.pictures import flip, has_flip, psnr, relative_l2, ssim
 from core.pictures import Picture, srgb_from_linear
 
@@ -216,6 +216,25 @@ def test_infinite_scores_become_null() -> None:
     made = summary("removed", [("a", {**scores, "flare": scores["scene"]})], (4, 4))
     assert made["composite"] == {"psnr": None, "ssim": 1.0}
     assert "removed/" in table(made)
+
+
+def test_a_flare_is_averaged_over_the_views_that_show_one() -> None:
+    """Where there is none an empty flare is exact and has no mean: the fit's own score would stand alone there."""
+    scene, flare = layers()
+    flare[8:] = 0
+    reference, shown = (Picture(srgb_from_linear(light), "srgb") for light in (scene, scene + flare))
+    astray = scene + flare[::-1]
+    black = Picture(0 * flare, "linear")
+    views = [("lit.png", score_view(astray, scene, shown, reference, Picture(flare, "linear"))),
+             ("dark.png", score_view(scene + np.float32(1e-4), scene, reference, reference, black))]
+    alone, both = summary("truth", views[:1], (20, 16)), summary("truth", views, (20, 16))
+    for layer in ("flare", "flare_linear"):
+        of_one_set = [key for key in ("psnr", "empty_psnr", "relative_l2") if key in alone[layer]]
+        assert {key: both[layer][key] for key in of_one_set} == {key: alone[layer][key] for key in of_one_set}
+        assert f"1 of 2 views show no flare to be scored against: PSNR, empty and rel. L2 of {layer} " in table(both)
+    assert both["flare"]["ssim"] == pytest.approx(np.mean([scores["flare"]["ssim"] for _, scores in views]))
+    assert worse_than_none(both)
+    assert "show no flare" not in table(alone)
 
 
 def test_a_pixel_that_is_clipped_in_one_channel_is_clipped() -> None:

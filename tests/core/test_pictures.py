@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
+import struct
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -14,7 +15,7 @@ import numpy as np
 import OpenEXR
 import pytest
 
-from core import pictures
+from core import pictures, tiff
 from core.colour import colour_space
 from core.errors import FrameError
 from core.pictures import (
@@ -30,6 +31,7 @@ from core.pictures import (
     write_exr,
     write_png,
 )
+from core.removal.plates import read_plate
 
 RAMP = np.random.default_rng(0).uniform(0, 1, (7, 9, 3)).astype(np.float32)
 
@@ -111,6 +113,28 @@ def test_a_header_that_claims_too_much_is_refused_before_memory_is_taken(tmp_pat
     (tmp_path / "bomb.png").write_bytes(b"\x89PNG\r\n\x1a\n" + b"\0\0\0\rIHDR" + huge + huge + b"\x08\x02\0\0\0")
     with pytest.raises(FrameError, match="claims"):
         read_picture(tmp_path / "bomb.png")
+
+
+@pytest.mark.parametrize(("kind", "count", "width"), [
+    (11, 1, struct.pack("<f", np.nan)), (11, 1, struct.pack("<f", np.inf)), (12, 0xFFFFFFFF, struct.pack("<I", 8)),
+    (3, 2, struct.pack("<HH", 9, 9))], ids=["not a number", "infinite", "more than the file", "two numbers"])
+def test_a_tiff_of_no_sensible_width_is_refused(kind: int, count: int, width: bytes, tmp_path: Path) -> None:
+    entries = [(tiff.WIDTH, kind, count, width), (tiff.HEIGHT, 3, 1, struct.pack("<H", 7))]
+    (tmp_path / "a.tif").write_bytes(struct.pack("<2sHIH", b"II", 42, 8, len(entries)) + b"".join(
+        struct.pack("<HHI4s", *entry) for entry in entries) + bytes(4))
+    with pytest.raises(FrameError, match=r"a\.tif is not a picture, or its header is damaged"):
+        picture_size(tmp_path / "a.tif")
+
+
+@pytest.mark.parametrize("name", [tiff.EXTRA_SAMPLES, tiff.SAMPLES])
+def test_a_tiff_of_no_sensible_tag_is_read_or_refused(name: int, tmp_path: Path) -> None:
+    done, data = cv2.imencode(".tif", np.full((4, 5, 4), 51, np.uint8))
+    assert done
+    (tmp_path / "a.tif").write_bytes(tiff.with_tags(data.tobytes(), {
+        name: tiff.Tag(11, np.array([np.nan], np.float32))}))
+    for reads in (read_picture, read_plate):
+        with contextlib.suppress(FrameError):
+            reads(tmp_path / "a.tif")
 
 
 def test_nan_in_an_exr_is_refused(tmp_path: Path) -> None:

@@ -30,7 +30,7 @@ from core.removal.plates import Plate
 from core.transfer import query as queries
 from core.transfer.plates import ColouredPlate
 from core.transfer.sources import assigned, parsed
-from core.transfer.target import Target, _most_alike, of_capture, of_pictures, of_shot
+from core.transfer.target import Target, _most_alike, background, of_capture, of_pictures, of_shot
 from core.transfer.transfer import Transfer, TransferSettings
 from tests.core.captures import make_capture
 from tests.core.flared import cameras
@@ -538,6 +538,25 @@ def test_the_space_that_plates_are_said_to_be_in_counts(model: str, params: Any,
         scenes.append(transfer.of_frame(target.frames[1].frame).render(target.frames[1].shot.camera).scene)
     np.testing.assert_allclose(scenes[0], linear_from_srgb(scenes[1]), atol=0.01)
     assert np.abs(scenes[0] - scenes[1]).mean() > 0.1
+
+
+@pytest.mark.parametrize("space", ["auto", "acescg", "linear"])
+def test_a_distorted_exr_is_converted_once(space: str, look: Look, tmp_path: Path) -> None:
+    """One colour all over, which no lens bends: it comes out as that of the file itself."""
+    folder = make_capture(tmp_path / "capture", views=3, model="OPENCV", params=(57.6, 57.6, 32, 24, 0.02, 0, 0, 0))
+    (folder / "lights.json").write_text('{"lights": [{"name": "sun", "xyz": [0.2, -0.3, 0.5]}]}')
+    poses = folder / "sparse" / "0" / "images.txt"
+    poses.write_text(poses.read_text().replace(".png", ".exr"))
+    for path in (folder / "images").iterdir():
+        write_exr(path.with_suffix(".exr"), {channel: np.full((48, 64), value) for channel, value in
+                                             zip("RGB", (0.5, 0.1, 0.02), strict=True)},
+                  half=False, header={"chromaticities": colour_space("acescg").chromaticities})
+    one = of_capture(Capture.open(folder), look, {}).frames[1]
+    assert one.plate is not None
+    straight = background(one, one.shot.camera.size, None if space == "auto" else colour_space(space))
+    assert straight is not None
+    expected = ColouredPlate.read(one.plate, space).linear[0, 0]
+    np.testing.assert_allclose(straight, np.broadcast_to(expected, straight.shape), atol=1e-5)
 
 
 def test_edits_go_by_the_target_s_lights(flare: Path, look: Look, tmp_path: Path) -> None:

@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 import torch
 
+from core.exposures import brightness
 from core.flare.model import OURS, PAPER
 from core.gaussians import rasterization
 from core.gaussians.ply import read_ply
 from core.gaussians.projection import rotation_matrices
 from core.gaussians.rendering import ALPHA_MIN
-from core.look import PlaneGaussians, ViewOfLight, draw, read
+from core.look import LookEdits, PlaneGaussians, ViewOfLight, draw, read
 from core.sampling import Sampling
 from core.transfer.export import _part, flare_scene, preset, write_flare_ply, write_preset
 from tests.core.flared import cameras
@@ -119,6 +120,20 @@ def test_a_preset_says_where_and_how_bright(tmp_path: Path, monkeypatch: pytest.
     assert parts[2]["arc"] == pytest.approx({"towards": 90, "share": np.exp(-2 * 4 * 0.5)}, rel=1e-3)
     np.testing.assert_allclose(parts[0]["colour"], [1, 0.5, 0.25])
     assert parts[0]["intensity"] == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("blend", ["over", "add"])
+def test_a_preset_is_of_the_lights_that_are_shown_as_the_frame_is_exposed(blend: str, tmp_path: Path) -> None:
+    saved(tmp_path / "a.flare", OURS, 2, blend)
+    look, camera = read(tmp_path / "a.flare"), cameras(3)[1]
+    view = {light.name: ViewOfLight.of(camera.world_to_camera, light.xyz) for light in look.lights}
+    edits = LookEdits.parse(["lamp 0.mute=1"], look.names)
+    usual, exposed = preset(look, view, edits), preset(look, view, edits, 0.5)
+    assert [light["name"] for light in usual["lights"]] == [light["name"] for light in exposed["lights"]] == ["lamp 1"]
+    before, after = ([part["intensity"] for element in one["lights"][0]["elements"] for part in element["parts"]]
+                     for one in (usual, exposed))
+    assert max(before) > 0
+    np.testing.assert_allclose(after, np.multiply(before, brightness(0.5, blend)), rtol=1e-5)
 
 
 def test_a_preset_tells_to_which_side_a_part_lies_and_turns() -> None:

@@ -18,7 +18,9 @@ from fit_flare.core.errors import Cancelled, CaptureError, FitFlareError, Settin
 from fit_flare.core.progress import Progress
 from fit_flare.headless import cli
 from fit_flare.headless.command import Command, Step
-from fit_flare.headless.commands import COMMANDS, bake, compose, fit, lights
+from fit_flare.headless.commands import COMMANDS, bake, compose, fit, lights, remove
+
+from tests.core.captures import make_capture
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -55,6 +57,18 @@ def test_a_capture_that_may_not_be_written_to_is_told_before_lights_are_looked_f
     monkeypatch.setattr("fit_flare.core.lights.find_lights", lambda *_: pytest.fail("it looked"))
     with pytest.raises(CaptureError, match=r"cannot be written to, where lights\.json belongs"):
         lights.with_lights(Capture(tmp_path, (), PointCloud.empty()), Progress())
+
+
+def test_lights_and_clean_frames_that_are_made_leave_the_room_for_pictures_as_it_was(
+        tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A fit keeps few pictures decoded here, since it has its own."""
+    capture = Capture.open(make_capture(tmp_path / "c"), cache_bytes=100_000)
+    monkeypatch.setattr(lights, "_find", lambda *_: (tmp_path / "c" / "lights.json").write_text('{"lights": []}'))
+    monkeypatch.setattr("fit_flare.core.removal.inference.Remover", lambda: None)
+    monkeypatch.setattr("fit_flare.core.removal.captured.remove_from", lambda *_: None)
+    for made in (lights.with_lights(capture, Progress()), remove.with_removed(capture, Progress())):
+        assert made is not capture
+        assert (made.folder, made.cache_bytes) == (capture.folder, 100_000)
 
 
 def test_a_compositor_of_before_is_kept(tmp_path: Path) -> None:

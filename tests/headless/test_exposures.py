@@ -80,6 +80,18 @@ def test_export(runs: tuple[Path, Path], tmp_path: Path) -> None:
     assert torch.equal(told[1], plain[1])
 
 
+@pytest.mark.parametrize(("frame", "times"), [(1, TIMES), (2, 1.0)])
+def test_export_of_a_preset(runs: tuple[Path, Path], tmp_path: Path, frame: int, times: float) -> None:
+    intensities = []
+    for run in runs:
+        file = tmp_path / f"{run.name}.json"
+        assert cli.main(["export", str(run), "--as", "preset", "--out", str(file), "--frames", str(frame)]) == 0
+        (light,) = json.loads(file.read_text())["lights"]
+        intensities.append([part["intensity"] for element in light["elements"] for part in element["parts"]])
+    plain, told = intensities
+    np.testing.assert_allclose(np.multiply(told, times), plain, rtol=1e-5)
+
+
 def test_transfer_on_to_the_run(runs: tuple[Path, Path], tmp_path: Path) -> None:
     for run in runs:
         assert cli.main(["transfer", str(runs[0] / "flare.flare"), "--to", str(run), "--out", str(tmp_path / run.name),

@@ -19,10 +19,14 @@ from core.bake.exr import read_description, read_layers
 from core.capture import Capture
 from core.fit import fit, preset
 from core.fit.settings import changed
+from core.flare.file import FlareFile, TrainingCamera
+from core.flare.file import save as save_flare
 from core.gaussians.ply import read_ply
 from core.look import read
 from core.look.shot import Shot
 from core.pictures import read_picture, write_png
+from tests.core.captures import make_transforms
+from tests.core.test_flare import some_flare
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -122,6 +126,24 @@ def test_export(run: Run, made: Path, tmp_path: Path) -> None:
     parts = [part for element in preset_made["lights"][0]["elements"] for part in element["parts"]]
     assert len(parts) == read(made / "flare.flare").count
     assert {"offset", "size", "colour", "shape"} <= set(parts[0])
+
+
+def test_a_preset_needs_a_light_in_front_of_the_camera(run: Run, tmp_path: Path) -> None:
+    """Frame 0 has one of two lights before it and the other behind, frame 1 is past both."""
+    folder = make_transforms(tmp_path / "capture", views=2)
+    poses = json.loads((folder / "transforms.json").read_text())
+    poses["frames"][1]["transform_matrix"][2][3] = 100
+    (folder / "transforms.json").write_text(json.dumps(poses))
+    flare = some_flare(lights=2)
+    flare.positions[1] = torch.tensor([0.0, 0.0, -8.0])
+    save_flare(tmp_path / "a.flare", FlareFile(flare, "add", TrainingCamera(64, 40, 70.0, 70.0, 33.0, 19.5)))
+    words = ["export", tmp_path / "a.flare", "--capture", folder, "--as", "preset", "--out", tmp_path / "a.json"]
+    told = [event["text"] for event in run(*words) if event["type"] == "say"]
+    assert told[-1] == "Lights behind the camera in frame 0 are not in it: lamp 1."
+    made = (tmp_path / "a.json").read_text()
+    assert [light["name"] for light in json.loads(made)["lights"]] == ["lamp 0"]
+    assert "No light is in front of the camera in frame 1" in run(*words, "--frames", "1", status=1)[-1]["text"]
+    assert (tmp_path / "a.json").read_text() == made
 
 
 BLEND = """

@@ -36,6 +36,8 @@ class Video:
 
     length: int
     """Frames, as the file has it, which may be too many; 0 where it does not say."""
+    aspect: float
+    """A pixel's width by its height; 1 where the file does not say."""
 
     def __init__(self, path: Path) -> None:
         import cv2
@@ -46,6 +48,7 @@ class Video:
                                "it again, or convert it to MP4 (H.264).")
         self._reader.set(cv2.CAP_PROP_ORIENTATION_AUTO, 1)  # a telephone held upright
         self.length = max(int(self._reader.get(cv2.CAP_PROP_FRAME_COUNT)), 0)
+        self.aspect = self._aspect()
         transfer, matrix = _told(path)
         self._colours = None if self._is_as_read() else _from_601(MATRICES.get(matrix) or self._usual())
         self.says = () if transfer not in HIGH_RANGE else (
@@ -73,6 +76,16 @@ class Video:
         import cv2
 
         self._reader.set(cv2.CAP_PROP_POS_FRAMES, number)
+
+    def _aspect(self) -> float:
+        """Of frames turned upright: the file's own is that of frames as they were recorded."""
+        import cv2
+
+        wide, high, turned = (self._reader.get(name) for name in (
+            cv2.CAP_PROP_SAR_NUM, cv2.CAP_PROP_SAR_DEN, cv2.CAP_PROP_ORIENTATION_META))
+        if wide <= 0 or high <= 0:
+            return 1.0
+        return high / wide if turned % 180 else wide / high
 
     def _is_as_read(self) -> bool:
         """Whether OpenCV's colours are those of the file: it holds RGB, or Motion JPEG."""

@@ -194,7 +194,7 @@ class Capture:
     def _reach(self) -> float:
         """Of the cameras from their middle."""
         places = self._positions
-        return float(np.linalg.norm(places - places.mean(axis=0), axis=1).max())
+        return max(float(np.linalg.norm(away)) for away in places - places.mean(axis=0))
 
     @property
     def _away(self) -> float:

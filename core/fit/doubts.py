@@ -20,6 +20,10 @@ GREY, FAR_FROM_GREY = 0.18, 3.0
 """Scene-linear light in the middle of a usual frame, and stops from there at which a fit does badly: the sample's
 frames as EXR times 16, or a sixteenth, leave nine tenths of the flare unfound."""
 
+ASTRAY = 1e4
+"""Extents of the capture, at which the cameras' middle is too far from the world's origin: points are kept in 32 bits,
+a thousandth of the extent and more apart there."""
+
 UNLIKE, FEW_UNLIKE = 4.0, 0.1
 """Times the usual loss, at which a frame does not look like what the others make of it; in more than which part of the
 frames it is the fit that is bad."""
@@ -38,6 +42,11 @@ def doubts(capture: Capture, settings: FitSettings, views: Sequence[View], frame
     if settings.mode != "3dgs" and len(views) < FEW:
         found.append(f"{len(views)} frames are few to learn a flare from, which shows itself by how it changes with "
                      "the lights' places in the picture; it will be worse than it could be from twenty or more.")
+    off, extent = float(np.linalg.norm(capture.centre)), capture.extent
+    if off > ASTRAY * extent:
+        found.append(f"The world's origin is far away: the cameras' middle lies {off:.3g} units from it, in a capture "
+                     f"of {extent:.3g}, and what 32 bits hold of places there is too coarse. Move cameras, points and "
+                     "lights to the middle first, by COLMAP's model_transformer or model_aligner for instance.")
     if all(holds_floats(capture.frame_path(view)) for view in views):
         light = [linear_from_srgb(frames.frame(view).numpy()) @ LUMINANCE for view in thinned(views, ASKED)]
         middle = float(np.median([np.median(one) for one in light]))

@@ -47,6 +47,19 @@ def test_a_camera_that_only_turns_is_told_where_parallax_has_to_tell(capture: Ca
     assert told(tripod, "default") == []
 
 
+@pytest.mark.parametrize(("away", "doubted"), [(5.4e6, True), (1e3, False)])
+def test_a_world_far_from_its_origin_is_told(capture: Capture, away: float, doubted: bool) -> None:
+    views = []
+    for view in capture.views:
+        pose = view.camera.world_to_camera.copy()
+        pose[:3, 3] -= pose[:3, :3] @ (away, away, 0.0)
+        views.append(replace(view, camera=replace(view.camera, world_to_camera=pose)))
+    frames = {view.name: capture.frame_path(view) for view in capture.views}
+    points = replace(capture.points, xyz=capture.points.xyz + np.float32((away, away, 0)))
+    moved = Capture(capture.folder, views, points, capture.lights, frames=frames)
+    assert told(moved, "3dgs") == ["The world's origin is far away"] * doubted
+
+
 def test_few_frames_are_told(capture: Capture) -> None:
     assert [text.split(",")[0] for text in told(capture, count=11)] == ["11 frames are few to learn a flare from"]
     assert told(capture, "3dgs", count=11) == []

@@ -19,16 +19,18 @@ from core.capture import Camera, Capture
 from core.capture.camera import quaternion_from_rotation, rotation_from_quaternion
 from core.capture.colmap import Observed, PointCloud, read_model, write_model
 from core.capture.lens import Lens
-from core.capture.solve import SolveSettings, solve
+from core.capture.solve import SolveSettings, develop, solve
 from core.capture.solve.exif import read_exif, upright
+from core.capture.solve.mapping import Model, Solved, SolvedFrame
 from core.capture.solve.pairs import choose_matching, choose_pairs
-from core.capture.solve.shots import choose, gather, usable
+from core.capture.solve.shots import Shot, choose, gather, usable
 from core.capture.solve.world import up_direction
 from core.errors import Cancelled, CaptureError, FrameError
-from core.pictures import Picture
+from core.pictures import Picture, linear_from_srgb, picture_size, read_picture, stored_pixels, write_exr
 from core.progress import Progress
 from tests.core.captures import look_at, make_capture, orbit
 from tests.core.heard import Heard
+from tests.core.test_video import with_pixels
 
 SIZE = (320, 240)
 QUICK = SolveSettings(features=800)
@@ -275,6 +277,44 @@ def test_frames_of_different_sizes(tmp_path: Path) -> None:
     assert capture.views[0].camera.fx == pytest.approx(capture.views[9].camera.fx * 320 / 400, rel=0.05)
 
 
+def test_squeezed_frames(tmp_path: Path) -> None:
+    """EXRs whose pixels are twice as wide as high: the cameras are those of the frames as filmed."""
+    cameras = [camera.scaled(SIZE[0] // 2, SIZE[1]) for camera in orbit(8, size=SIZE, arc=0.9)]
+    frames = tmp_path / "frames"
+    frames.mkdir()
+    for number, camera in enumerate(cameras):
+        light = linear_from_srgb(render(camera)[..., ::-1] / 255)
+        write_exr(frames / f"{number:03d}.exr", dict(zip("RGB", np.moveaxis(light, 2, 0), strict=True)),
+                  header={"pixelAspectRatio": 2.0})
+    report = solve(frames, tmp_path / "out", QUICK)
+    found = Capture.open(tmp_path / "out").views[0].camera
+    assert report["registered"] == 8 and found.size == (SIZE[0] // 2, SIZE[1])
+    assert found.fx == pytest.approx(cameras[0].fx, rel=0.05) and found.fy == pytest.approx(cameras[0].fy, rel=0.05)
+
+
+@pytest.mark.parametrize(("name", "kind", "top", "suffix"), [
+    ("a.png", np.uint8, 1.0, ".png"), ("a.png", np.uint16, 1.0, ".png"), ("a.tif", np.uint8, 1.0, ".png"),
+    ("a.tif", np.uint16, 1.0, ".png"), ("a.tif", np.float32, 30.0, ".exr")])
+def test_straightened_frames_keep_what_their_files_hold(name: str, kind: type, top: float, suffix: str,
+                                                        tmp_path: Path) -> None:
+    full = 1 if kind is np.float32 else np.iinfo(kind).max
+    stored = np.zeros((48, 64, 3), kind)
+    stored[:, :] = kind(0.1 * full)
+    stored[16:32, 20:44] = kind(top * full)
+    cv2.imwrite(str(tmp_path / name), stored, [cv2.IMWRITE_TIFF_COMPRESSION, 1])
+    shot = Shot("000000.png", str(tmp_path / name), 64, 48, None, 1)
+    lens = Lens("SIMPLE_RADIAL", (58.0, 32.0, 24.0, -0.1), 64, 48)
+    frame = SolvedFrame(0, lens, np.eye(4), np.zeros((0, 2)), np.zeros(0, np.int64))
+    model = Model(np.zeros((1, 3)), np.zeros((1, 3), np.uint8), np.zeros(1), np.zeros(1, np.int64), [frame])
+    out = tmp_path / "out"
+    out.mkdir()
+    develop.write([shot], Solved(model, [1], "exhaustive", 0), out, tmp_path / "work", 0, Progress())
+    (written,) = (out / "images").iterdir()
+    assert written.name == "a" + suffix and read_picture(written).pixels.max() == pytest.approx(top, rel=1e-3)
+    if suffix == ".png":
+        assert stored_pixels(written).dtype == kind
+
+
 def write_video(path: Path, frames: list[NDArray[np.uint8]]) -> Path:
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), 25, SIZE)
     for frame in frames:
@@ -292,6 +332,15 @@ def test_a_video(tmp_path: Path) -> None:
     names = [view.name for view in Capture.open(tmp_path / "out").views]
     assert report["matching"] == "sequential" and report["registered"] == 10
     assert names == [f"{i:06d}.png" for i in range(1, 30, 3)]
+
+
+def test_the_small_frames_of_a_squeezed_video_are_not(tmp_path: Path) -> None:
+    frames = [render(camera) for camera in orbit(4, size=SIZE, arc=0.3)]
+    video = with_pixels(write_video(tmp_path / "shot.mp4", frames), 4, 3)
+    shots, _ = gather(video, tmp_path / "work", 0, 400, Progress())
+    assert [(shot.width, shot.height) for shot in shots] == [SIZE] * 4
+    assert picture_size(tmp_path / "work" / "small" / shots[0].name) == (400, 225)
+    assert picture_size(tmp_path / "work" / "masks" / f"{shots[0].name}.png") == (400, 225)
 
 
 def refusal(source: Path, out: Path, settings: SolveSettings = QUICK) -> str:
@@ -413,6 +462,14 @@ def test_masks_leave_out_clipped_pixels_and_ghost_lines() -> None:
     assert free[50, 260] and free[190, 60] and free.mean() > 0.85
     pixels[30:120, 150:300] = 1.0  # a bright wall clips but casts no line
     assert usable(Picture(pixels, "srgb"))[230, 60]
+
+
+def test_masks_of_linear_frames_do_not_depend_on_their_exposure() -> None:
+    light = np.full((240, 320, 3), 0.18, np.float32)
+    cv2.circle(light, (60, 50), 8, (30.0, 30.0, 30.0), -1)
+    masks = [usable(Picture(light * np.float32(gain), "linear")) for gain in (1 / 16, 1, 16)]
+    assert not masks[1][50, 60] and masks[1].mean() > 0.85
+    assert all((mask == masks[1]).all() for mask in masks)
 
 
 def test_up() -> None:

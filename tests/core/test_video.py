@@ -117,3 +117,27 @@ def test_a_clip_of_a_flare_trains_in_its_own_colours(tmp_path: Path) -> None:
     columns = ((np.arange(6) + 0.5) / 6 * shown.shape[1]).astype(int)
     truth = linear_from_srgb(PATCHES / 255)
     assert np.abs(shown[len(shown) // 2, columns] - truth).max() < 0.04
+
+
+def with_pixels(path: Path, wide: int, high: int) -> Path:
+    """A video of OpenCV's as one whose pixels are of that shape: the box `pasp`, in all boxes about it."""
+    data = bytearray(path.read_bytes())
+    entry = data.find(b"mp4v", data.find(b"stsd")) - 4
+    end = entry + int.from_bytes(data[entry:entry + 4], "big")
+    box = (16).to_bytes(4, "big") + b"pasp" + wide.to_bytes(4, "big") + high.to_bytes(4, "big")
+    at = data.find(b"moov")
+    for name in (b"moov", b"trak", b"mdia", b"minf", b"stbl", b"stsd", b"mp4v"):
+        at = data.find(name, at) - 4
+        data[at:at + 4] = (int.from_bytes(data[at:at + 4], "big") + len(box)).to_bytes(4, "big")
+        at += 4
+    data[end:end] = box
+    path.write_bytes(data)
+    return path
+
+
+def test_the_shape_of_pixels_is_told(tmp_path: Path) -> None:
+    path = patches(tmp_path / "a.mp4", 240, (0.299, 0.114))
+    with Video(path) as video:
+        assert video.aspect == 1
+    with Video(with_pixels(path, 4, 3)) as video:
+        assert video.aspect == pytest.approx(4 / 3) and len(list(video)) == 3

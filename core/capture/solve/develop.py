@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ...files import atomic_path, patiently
-from ...pictures import write_exr, write_png
+from ...pictures import holds_floats, stored_pixels, window_of, write_exr, write_png
 from ...progress import Progress
 from ..camera import Camera
 from ..colmap import Observed, PointCloud, write_model
@@ -54,11 +54,11 @@ def write(shots: Sequence[Shot], solved: Solved, out: Path, work: Path, size: in
 
 
 def _names(shots: Sequence[Shot]) -> list[str]:
-    """A name for each frame: its file's, with the suffix of a lossless format."""
+    """A name for each frame: its file's, with the suffix of a lossless format that holds the file's light."""
     names: list[str] = []
     for shot in shots:
         file = Path(shot.file)
-        suffix = ".exr" if file.suffix.lower() == ".exr" else ".png"
+        suffix = ".exr" if holds_floats(file) else ".png"
         name = file.stem + suffix
         names.append(file.name + suffix if name in names else name)
     return names
@@ -86,6 +86,7 @@ def _develop(shot: Shot, frame: SolvedFrame, camera: Camera, target: Path) -> No
         picture = straightened(picture, frame.lens.maps(camera.scaled(*picture.size)))
     picture = picture.resized(*camera.size)
     if target.suffix == ".exr":
-        write_exr(target, dict(zip("RGB", np.moveaxis(picture.pixels, 2, 0), strict=True)))
+        write_exr(target, dict(zip("RGB", np.moveaxis(picture.pixels, 2, 0), strict=True)),
+                  header={"pixelAspectRatio": window_of(source).aspect})
     else:
-        write_png(target, picture.display(), 16 if source.suffix.lower() in (".tif", ".tiff") else 8)
+        write_png(target, picture.display(), 16 if stored_pixels(source).dtype == np.uint16 else 8)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ...errors import CaptureError, FrameError
 from ...files import read_json, write_json
-from ...pictures import Picture, Pixels, picture_size, pictures_in, read_picture, write_png
+from ...pictures import Picture, Pixels, picture_size, pictures_in, read_picture, window_of, write_png
 from ...progress import Progress
 from ...video import VIDEOS, Video
 from .exif import read_exif, upright
@@ -141,13 +141,14 @@ def _from_folder(source: Path, work: Path, number: int, size: int,
             picture_size(file)
             orientation, focal = read_exif(file)
             picture = upright(read_picture(file), orientation)
+            aspect = window_of(file).aspect
         except FrameError as problem:
             left_out.append(str(problem))
             progress.say(f"Left out: {problem}")
         else:
             # Not its own name, which COLMAP would cut at a space, and which is another picture's without its suffix.
             shot = Shot(f"{len(shots):06d}.png", str(file.resolve()), *picture.size, focal, orientation)
-            _write_small(picture, work, shot.name, size)
+            _write_small(picture, aspect, work, shot.name, size)
             shots.append(shot)
             combed.append(is_combed(picture))
         progress.advance()
@@ -181,16 +182,18 @@ def _from_video(source: Path, work: Path, number: int, size: int,
                 file = work / "full" / f"{index:06d}.png"
                 write_png(file, picture.pixels)
                 shots.append(Shot(file.name, str(file.resolve()), *picture.size, None, 1))
-                _write_small(picture, work, file.name, size)
+                _write_small(picture, video.aspect, work, file.name, size)
                 combed.append(is_combed(picture))
                 progress.advance()
     _say_if_interlaced(combed, progress)
     return shots, []
 
 
-def _write_small(picture: Picture, work: Path, name: str, size: int) -> None:
-    scale = min(1.0, size / max(picture.size))
-    width, height = (max(1, round(side * scale)) for side in picture.size)
+def _write_small(picture: Picture, aspect: float, work: Path, name: str, size: int) -> None:
+    """With square pixels: a solve knows one focal length, and `develop` stretches its camera to the frame's own."""
+    wide = picture.size[0] * aspect
+    scale = min(1.0, size / max(wide, picture.size[1]))
+    width, height = (max(1, round(side * scale)) for side in (wide, picture.size[1]))
     small = picture.resized(width, height)
     write_png(work / "small" / name, _exposed(small))
     write_png(work / "masks" / f"{name}.png", usable(small).astype(np.float32))
@@ -208,10 +211,11 @@ def _exposed(picture: Picture) -> Pixels:
 def usable(picture: Picture) -> NDArray[np.bool_]:
     """Where features may be taken (h, w): not in clipped pixels nor in the bloom just round them, whose rim moves
     with exposure and glare; and not along the lines from compact clipped spots through the middle of the frame,
-    where the ghosts of a light have their centres, which move with the lens."""
+    where the ghosts of a light have their centres, which move with the lens. Of linear light what clips where features
+    are looked for."""
     import cv2
 
-    clipped = (picture.pixels.max(axis=2) >= CLIPPED).astype(np.uint8)
+    clipped = (_exposed(picture).max(axis=2) >= CLIPPED).astype(np.uint8)
     # Lone pixels are sparkle on a texture, and good features.
     clipped = cv2.morphologyEx(clipped, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     diagonal = float(np.hypot(*picture.size))

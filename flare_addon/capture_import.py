@@ -79,16 +79,16 @@ def import_capture(scene: Any, folder: Path | str, settings: ImportSettings | No
     folder = find_capture(folder)
     capture = Capture.open(folder, need_frames=settings.frames)
     notes: list[str] = []
+    extent = capture.extent
     collection = bpy.data.collections.new(folder.resolve().name)
     scene.collection.children.link(collection)
     root = _object(collection, f"{collection.name} Root", None, None)
-    root.empty_display_type, root.empty_display_size = "ARROWS", 0.2 * capture.extent
+    root.empty_display_type, root.empty_display_size = "ARROWS", 0.2 * extent
     root.rotation_euler, root.scale = UP[settings.up], (settings.scale,) * 3
-    made = _cameras(collection, root, capture, settings, scene, notes)
+    made = _cameras(collection, root, capture, extent, settings, scene, notes)
     if settings.points and len(capture.points):
         _points(collection, root, capture.points)
-    lights = tuple(add_light(collection, root, light.name, light.xyz, 0.02 * capture.extent)
-                   for light in capture.lights)
+    lights = tuple(add_light(collection, root, light.name, light.xyz, 0.02 * extent) for light in capture.lights)
     state = scene.fit_flare
     if state.root is not None:
         state.root.fit_flare.is_root = True  # the version before did not say so
@@ -119,7 +119,7 @@ def add_light(collection: Any, root: Any, name: str, xyz: Any, size: float) -> A
 # ---- cameras --------------------------------------------------------------------------------------
 
 
-def _cameras(collection: Any, root: Any, capture: Capture, settings: ImportSettings, scene: Any,
+def _cameras(collection: Any, root: Any, capture: Capture, extent: float, settings: ImportSettings, scene: Any,
              notes: list[str]) -> tuple[Any, ...]:
     frames = numbered(view.name for view in capture.views)
     number = {frame.view: frame.number for frame in frames}
@@ -141,7 +141,7 @@ def _cameras(collection: Any, root: Any, capture: Capture, settings: ImportSetti
     for folder, views in folders.items():
         label = "Camera" if folder == "." else f"Camera {folder}"
         if settings.cameras == "animated":
-            camera = _camera(collection, root, label, views[0], aspect, 0.15 * capture.extent)
+            camera = _camera(collection, root, label, views[0], aspect, 0.15 * extent)
             camera.fit_flare.view = folder
             _animate(camera, views, [number[view.name] for view in views], aspect)
             if settings.frames and not _footage(camera, capture, views, [number[view.name] for view in views]):
@@ -150,7 +150,7 @@ def _cameras(collection: Any, root: Any, capture: Capture, settings: ImportSetti
             made.append(camera)
         else:
             for view in views:
-                camera = _camera(collection, root, Path(view.name).stem, view, aspect, 0.08 * capture.extent)
+                camera = _camera(collection, root, Path(view.name).stem, view, aspect, 0.08 * extent)
                 camera.fit_flare.view = view.name
                 if settings.frames:
                     _backdrop(camera, bpy.data.images.load(str(capture.frame_path(view)), check_existing=True))

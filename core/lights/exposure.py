@@ -20,6 +20,8 @@ from .detection import Detection, measured
 
 THIN = 0.55    # of the thickest part's radius; thinner parts are cut off
 SMALLEST = 12  # pixels; below it noise and sparkle
+COSTLY = 1e10  # pixels times those of a disc: a quarter of a second
+LARGE = 0.025  # of the frame; a clipped region from there on is no lamp
 
 
 @dataclass(frozen=True)
@@ -43,7 +45,9 @@ class Exposure:
             if area < SMALLEST:
                 continue
             whole = labels[top:top + height, left:left + width] == label
-            mask = _core(whole)
+            mask = _core(whole, LARGE * clipped.size)
+            if mask is None:
+                continue
             around = float(crowd[top:top + height, left:left + width][mask].max()) / float(mask.sum()) - 1
             score = (_score(mask, (left, top), display) * _step(_attached(mask, whole), 0.4, 0.1)
                      * _step(around, 5.0, 1.5))
@@ -67,22 +71,38 @@ def _crowd(clipped: NDArray[np.uint8]) -> NDArray[np.int64]:
     return members[groups]
 
 
-def _core(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _core(mask: NDArray[np.bool_], largest: float) -> NDArray[np.bool_] | None:
     """The mask's main body: holes filled, and without what is thinner than half its thickest part, such as spikes of
-    a starburst or a bright bracket. Discs, ellipses and bars stay as they are."""
+    a starburst or a bright bracket. Discs, ellipses and bars stay as they are. None where a disc of more than `largest`
+    pixels fits in."""
     import cv2
 
     padded = np.pad(mask, 1).astype(np.uint8)
     outline, _ = cv2.findContours(padded, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     cv2.drawContours(padded, outline, -1, (1.0,), cv2.FILLED)
-    reach = int(THIN * float(cv2.distanceTransform(padded, cv2.DIST_L2, 5).max()))
+    thickest = float(cv2.distanceTransform(padded, cv2.DIST_L2, 5).max())
+    if math.pi * thickest ** 2 > largest:
+        return None
+    reach = int(THIN * thickest)
     if reach >= 1:
-        disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
-        opened = cv2.morphologyEx(np.pad(padded, reach), cv2.MORPH_OPEN, disc)[reach:-reach, reach:-reach]
-        number, labels, boxes, _ = cv2.connectedComponentsWithStats(opened, connectivity=4)
+        number, labels, boxes, _ = cv2.connectedComponentsWithStats(_opened(padded, reach), connectivity=4)
         if number > 1:
             padded = (labels == 1 + int(np.argmax(boxes[1:, cv2.CC_STAT_AREA]))).astype(np.uint8)
     return np.asarray(padded[1:-1, 1:-1] > 0)
+
+
+def _opened(mask: NDArray[np.uint8], reach: int) -> NDArray[np.uint8]:
+    """Without what a disc of that radius does not fit in. Where the region is large by distances, which take a few
+    steps a pixel and not as many as the disc has pixels, and round the disc's rim a little otherwise."""
+    import cv2
+
+    if (2 * reach + 1) ** 2 * mask.size <= COSTLY:
+        disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
+        opened = cv2.morphologyEx(np.pad(mask, reach), cv2.MORPH_OPEN, disc)[reach:-reach, reach:-reach]
+        return np.asarray(opened, np.uint8)
+    away: Any = cv2.distanceTransform(mask, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    away = cv2.distanceTransform((away <= reach).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    return (away <= reach).astype(np.uint8)
 
 
 def _attached(core: NDArray[np.bool_], whole: NDArray[np.bool_]) -> float:
@@ -116,7 +136,7 @@ def _score(mask: NDArray[np.bool_], corner: tuple[int, int], display: NDArray[np
     sides = np.sort(np.asarray(cv2.minAreaRect(hull)[1]) + 1.0)
     here = display[corner[1]:corner[1] + mask.shape[0], corner[0]:corner[0] + mask.shape[1]][mask]
     return (_step(solid, 0.84, 0.95) * _step(sides[1] / sides[0], 9.0, 5.0)
-            * _step(area / (width * height), 0.025, 0.005)
+            * _step(area / (width * height), LARGE, 0.005)
             * _step(float(here.min(axis=1).mean()), 0.78, 0.97)
             * _step(_surroundings(mask, corner, display), 0.97, 0.9))
 

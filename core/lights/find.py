@@ -146,7 +146,7 @@ def _follow_ghosts(capture: Capture, progress: Progress, seed: int) -> list[Foun
     for view in capture.views:
         blobs.append(find_blobs(capture.frame(view), capture.removed(view)))
         progress.advance()
-    return gather_ghosts([(view.name, view.camera) for view in capture.views], blobs, capture.extent, seed)
+    return gather_ghosts([(view.name, view.camera) for view in capture.views], blobs, capture.extent, seed, progress)
 
 
 def detector_for(method: str, threshold: float | None = None, boxes: str | Path | None = None,

@@ -26,6 +26,8 @@ from .detection import Detection
 FAR = 1000.0      # distance of a far light, in extents of the cameras' path
 STEPS = 20
 PAIRS = 60000     # of rays tested for meeting
+MANY = 20         # times PAIRS; of more pairs than these no list is made
+DRAWS = 8         # of twice PAIRS, after which those that came are enough
 PATIENCE = 6      # places of too few views in a row, after which there is nothing left
 
 
@@ -147,16 +149,9 @@ def _sightings(views: Sequence[tuple[str, Camera]], detections: Sequence[Sequenc
 def _best(seen: _Sightings, open_: NDArray[np.bool_], rng: np.random.Generator, tries: int) -> Floats | None:
     """The place (4,) that the most open detections, by worth, agree on; None where no two are of two views."""
     index = np.flatnonzero(open_)
-    first, second = np.triu_indices(len(index), 1)
-    first, second = index[first], index[second]
-    apart = seen.view[first] != seen.view[second]
-    first, second = first[apart], second[apart]
+    first, second = _pairs(seen, index, rng)
     if not len(first):
         return None
-    if len(first) > PAIRS:
-        worth = seen.worth[first] * seen.worth[second]
-        chosen = rng.choice(len(first), PAIRS, replace=False, p=worth / worth.sum())
-        first, second = first[chosen], second[chosen]
     places = np.concatenate([_crossing(seen, first, second), _direction(seen, first, second)])
     first, second = np.tile(first, 2), np.tile(second, 2)
     meet = np.flatnonzero(_on(seen, places, first) & _on(seen, places, second))
@@ -171,6 +166,39 @@ def _best(seen: _Sightings, open_: NDArray[np.bool_], rng: np.random.Generator, 
         if value_of[top] > value:
             best, value = some[top], float(value_of[top])
     return best
+
+
+def _pairs(seen: _Sightings, index: NDArray[np.int64],
+           rng: np.random.Generator) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """PAIRS at most of the detections `index`, each of two views, chosen by worth."""
+    if math.comb(len(index), 2) > MANY * PAIRS:
+        return _drawn_pairs(seen, index, rng)
+    first, second = np.triu_indices(len(index), 1)
+    first, second = index[first], index[second]
+    apart = seen.view[first] != seen.view[second]
+    first, second = first[apart], second[apart]
+    if len(first) > PAIRS:
+        worth = seen.worth[first] * seen.worth[second]
+        chosen = rng.choice(len(first), PAIRS, replace=False, p=worth / worth.sum())
+        first, second = first[chosen], second[chosen]
+    return first, second
+
+
+def _drawn_pairs(seen: _Sightings, index: NDArray[np.int64],
+                 rng: np.random.Generator) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """The same without a list of all pairs, which would fill the memory: drawn one detection beside the other, those
+    that are of one view or were drawn before left out. Fewer where nearly all are of one view."""
+    worth = seen.worth[index] / seen.worth[index].sum()
+    keys = np.zeros(0, np.int64)
+    for _ in range(DRAWS):
+        drawn = np.sort(index[rng.choice(len(index), (2 * PAIRS, 2), p=worth)], axis=1)
+        drawn = drawn[seen.view[drawn[:, 0]] != seen.view[drawn[:, 1]]]
+        keys = np.concatenate([keys, drawn[:, 0] * len(seen.view) + drawn[:, 1]])
+        keys = keys[np.sort(np.unique(keys, return_index=True)[1])]  # in the order in which they were drawn
+        if len(keys) >= PAIRS:
+            break
+    first, second = np.divmod(keys[:PAIRS], len(seen.view))
+    return first, second
 
 
 def _on(seen: _Sightings, places: Floats, index: NDArray[np.int64]) -> NDArray[np.bool_]:
@@ -335,9 +363,20 @@ def _accidents(seen: _Sightings, support: int, visible: int) -> float:
     area = seen.size.prod(axis=1)
     cover = np.pi * seen.tolerance ** 2 / area[seen.view]
     share = min(float(np.bincount(seen.view, cover, len(seen.cameras)).mean()), 0.5)
-    others, more = visible - 2, support - 2
-    chance = sum(math.comb(others, k) * share ** k * (1 - share) ** (others - k) for k in range(more, others + 1))
-    return math.comb(len(seen.view), 2) * chance
+    return math.comb(len(seen.view), 2) * _at_least(support - 2, visible - 2, share)
+
+
+def _at_least(least: int, tries: int, share: float) -> float:
+    """The chance that so many of the tries succeed or more, each with probability `share`. In logarithms: of some 1030
+    tries the binomial coefficients are larger than floats get."""
+    if least <= 0 or share >= 1:
+        return float(least <= tries)
+    if least > tries or share <= 0:
+        return 0.0
+    logs = [math.lgamma(tries + 1) - math.lgamma(k + 1) - math.lgamma(tries - k + 1)
+            + k * math.log(share) + (tries - k) * math.log1p(-share) for k in range(least, tries + 1)]
+    largest = max(logs)
+    return min(math.exp(largest) * math.fsum(math.exp(log - largest) for log in logs), 1.0)
 
 
 def merged(lights: Sequence[FoundLight], views: Sequence[tuple[str, Camera]], extent: float) -> list[FoundLight]:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from ..capture.camera import Camera
 from ..pictures import Picture
+from ..progress import Progress
 from .detection import Detection
 from .gather import FoundLight, GatherSettings, gather
 
@@ -70,11 +71,16 @@ def find_blobs(picture: Picture, clean: Picture | None = None) -> list[Blob]:
 
 
 def gather_ghosts(views: Sequence[tuple[str, Camera]], blobs: Sequence[Sequence[Blob]], extent: float,
-                  seed: int = 0) -> list[FoundLight]:
-    """At most one light that is out of frame, from the blobs of each view; none where too few views agree."""
+                  seed: int = 0, progress: Progress | None = None) -> list[FoundLight]:
+    """At most one light that is out of frame, from the blobs of each view; none where too few views agree.
+
+    Raises Cancelled when asked to stop.
+    """
+    progress = progress or Progress()
     best: FoundLight | None = None
     best_share = 0.0
     for share in SHARES:
+        progress.check()
         light = _with_share(views, blobs, extent, float(share), seed)
         if light is not None and (best is None or _rank(light, float(share)) > _rank(best, best_share)):
             best, best_share = light, float(share)
@@ -82,6 +88,7 @@ def gather_ghosts(views: Sequence[tuple[str, Camera]], blobs: Sequence[Sequence[
         return []
     for step in (0.06, 0.03, 0.015):  # the share itself, finer
         for share in (best_share * (1 - step), best_share * (1 + step)):
+            progress.check()
             light = _with_share(views, blobs, extent, share, seed)
             if light is not None and _rank(light, share) > _rank(best, best_share):
                 best, best_share = light, share

@@ -270,6 +270,14 @@ def test_extent(tmp_path: Path) -> None:
         np.median(np.linalg.norm(capture.points.xyz - orbit(1)[0].position, axis=1)), rel=1e-6)
 
 
+def test_the_extent_looks_at_each_camera_a_few_times_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    capture = Capture.open(make_capture(tmp_path / "c", views=12))
+    asked, position = [], Camera.position.fget
+    monkeypatch.setattr(Camera, "position", property(lambda camera: asked.append(camera) or position(camera)))
+    assert capture.extent > 0
+    assert len(asked) < 12 * 12 / 2
+
+
 @pytest.mark.parametrize("slip", [0.0, 1e-15, 1e-7, 1e-4])
 @pytest.mark.parametrize("offset", [0.0, 1e6])
 def test_the_extent_of_a_tripod_is_that_of_its_points(slip: float, offset: float, tmp_path: Path) -> None:

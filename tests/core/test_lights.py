@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -12,14 +13,16 @@ import pytest
 from numpy.typing import NDArray
 
 from core.capture import Camera, Capture
-from core.errors import CaptureError, EngineError, SettingsError
+from core.errors import Cancelled, CaptureError, EngineError, SettingsError
 from core.lights import Detection, Exposure, GatherSettings, detector_for, find_lights, gather, record, union
+from core.lights.exposure import COSTLY
 from core.lights.file import check_replaceable, write_lights
 from core.lights.find import _from_one_view
-from core.lights.gather import FoundLight, without_ghosts
+from core.lights.gather import MANY, PAIRS, FoundLight, _at_least, without_ghosts
 from core.lights.ghosts import find_blobs, gather_ghosts
 from core.lights.lifted import lift
 from core.pictures import Picture, srgb_from_linear
+from core.progress import Progress
 from tests.core.captures import make_capture, orbit, picture
 
 SIZE = (320, 240)
@@ -109,6 +112,33 @@ class TestExposure:
         elif what == "white":
             scene[:] = 1.0
         assert not union(Exposure().detect(stored(scene)), SIZE).any()
+
+    @pytest.mark.parametrize("what", ["half", "corner"])
+    def test_a_large_white_region_is_not_opened_by_a_large_disc(self, what: str,
+                                                                monkeypatch: pytest.MonkeyPatch) -> None:
+        """Which would take minutes, with nobody asked whether to go on."""
+        white = np.full((1080, 1920, 3), 0.2, np.float32)
+        if what == "half":
+            white[:540] = 1
+        else:
+            white[:160] = white[:, :160] = 1
+        white[700:740, 900:940] = 1
+        steps, morphology = [], cv2.morphologyEx
+        monkeypatch.setattr(cv2, "morphologyEx", lambda mask, how, disc: steps.append(mask.size * disc.size) or
+                            morphology(mask, how, disc))
+        (found,) = Exposure().detect(Picture(white, "srgb"))
+        assert np.linalg.norm(found.xy - (920, 720)) < 0.01
+        assert max(steps) < 2 * COSTLY
+
+    def test_a_large_lamp_is_opened_by_distances_as_by_a_disc(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        scene = with_disc(np.full((600, 800, 3), 0.02), (310, 280), 48, glare=0)
+        cv2.fillPoly(scene, [np.array([(310, 270), (310, 290), (420, 330)])], (20.0, 20.0, 20.0))
+        cv2.fillPoly(scene, [np.array([(300, 280), (320, 280), (290, 180)])], (20.0, 20.0, 20.0))
+        (by_disc,) = Exposure(0.1).detect(stored(scene))
+        monkeypatch.setattr("core.lights.exposure.COSTLY", 0)
+        (by_distances,) = Exposure(0.1).detect(stored(scene))
+        assert np.linalg.norm(by_disc.xy - by_distances.xy) < 0.1 and np.linalg.norm(by_disc.xy - (310, 280)) < 1
+        assert by_distances.score == pytest.approx(by_disc.score, abs=0.02)
 
     def test_linear_pictures(self) -> None:
         scene = with_disc(backdrop(), (150.2, 99.6), 8)
@@ -218,6 +248,37 @@ class TestGather:
         assert [light.xyz.tolist() for light in first] == [light.xyz.tolist() for light in second]
 
 
+    def test_a_light_in_every_fourth_of_many_views(self) -> None:
+        cameras = orbit(1100, size=SIZE)
+        detections = [some if i % 4 == 0 else [] for i, some in
+                      enumerate(scene([(0.4, -0.5, 0.3)], cameras, clutter=0))]
+        (found,) = gather(named(cameras), detections, EXTENT)
+        assert np.linalg.norm(found.xyz - (0.4, -0.5, 0.3)) < 0.02 and len(found.support) == 275
+
+    def test_of_very_many_detections_pairs_are_drawn(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """Without a list of all, and the same ones by the same seed."""
+        listed, triangle = [], np.triu_indices
+        monkeypatch.setattr(np, "triu_indices", lambda n, k: listed.append(math.comb(n, 2)) or triangle(n, k))
+        cameras = orbit(8, size=SIZE)
+        detections = scene([(0.4, -0.5, 0.3)], cameras, clutter=220)
+        assert math.comb(sum(map(len, detections)), 2) > MANY * PAIRS
+        first, second = (gather(named(cameras), detections, EXTENT, GatherSettings(most=1, tries=600, min_views=5,
+                                                                                  accidents=np.inf)) for _ in range(2))
+        assert [light.xyz.tolist() for light in first] == [light.xyz.tolist() for light in second] and first
+        assert len(first[0].support) >= 5
+        assert max(listed, default=0) <= MANY * PAIRS
+
+
+def test_the_chance_of_many_hits() -> None:
+    for share in (1e-6, 0.01, 0.3, 0.5):
+        for least in (0, 1, 15, 60):
+            direct = sum(math.comb(60, k) * share ** k * (1 - share) ** (60 - k) for k in range(least, 61))
+            assert _at_least(least, 60, share) == pytest.approx(direct, rel=1e-9)
+    many = [_at_least(least, 1500, 0.3) for least in (0, 1, 400, 450, 600, 1500, 1501)]
+    assert many == sorted(many, reverse=True) and many[0] == 1 and 0.5 < many[3] < 0.52 and many[-1] == 0
+    assert (_at_least(0, 60, 0), _at_least(1, 60, 0), _at_least(60, 60, 1), _at_least(61, 60, 1)) == (1, 0, 1, 0)
+
+
 def turning(number: int) -> list[Camera]:
     """Cameras that travel and turn, the light of `TestGhosts` above all their frames."""
     rng = np.random.default_rng(4)
@@ -261,6 +322,12 @@ class TestGhosts:
         a, b = found.xyz - middle, self.light - middle
         assert np.degrees(np.arccos(a @ b / np.linalg.norm(a) / np.linalg.norm(b))) < 2
         assert len(found.support) >= 12 and "ghost" in found.how
+
+    def test_the_search_can_be_stopped(self) -> None:
+        progress = Progress()
+        progress.request_stop()
+        with pytest.raises(Cancelled):
+            gather_ghosts(named(turning(8)), [[] for _ in range(8)], EXTENT, progress=progress)
 
     def test_without_ghosts_none_is_invented(self) -> None:
         cameras = turning(16)

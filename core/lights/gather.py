@@ -148,7 +148,7 @@ def _sightings(views: Sequence[tuple[str, Camera]], detections: Sequence[Sequenc
 
 def _best(seen: _Sightings, open_: NDArray[np.bool_], rng: np.random.Generator, tries: int) -> Floats | None:
     """The place (4,) that the most open detections, by worth, agree on; None where no two are of two views."""
-    index = np.flatnonzero(open_)
+    index = np.flatnonzero(open_ & (seen.worth > 0))
     first, second = _pairs(seen, index, rng)
     if not len(first):
         return None

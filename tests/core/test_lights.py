@@ -255,6 +255,15 @@ class TestGather:
         (found,) = gather(named(cameras), detections, EXTENT)
         assert np.linalg.norm(found.xyz - (0.4, -0.5, 0.3)) < 0.02 and len(found.support) == 275
 
+    def test_spots_without_a_score_propose_nothing(self) -> None:
+        """As a threshold of 0 lets them through, some of them more than there are pairs to be tried."""
+        cameras = orbit(16, size=SIZE)
+        nothing = [[spot((9.0 + 3 * number, 7.0), score=0.0) for number in range(24)] for _ in cameras]
+        assert not gather(named(cameras), nothing, EXTENT)
+        lit = [[*some, *none] for some, none in zip(scene([(0.4, -0.5, 0.3)], cameras, clutter=0), nothing, strict=True)]
+        (found,) = gather(named(cameras), lit, EXTENT)
+        assert np.linalg.norm(found.xyz - (0.4, -0.5, 0.3)) < 0.05
+
     def test_of_very_many_detections_pairs_are_drawn(self, monkeypatch: pytest.MonkeyPatch) -> None:
         """Without a list of all, and the same ones by the same seed."""
         listed, triangle = [], np.triu_indices

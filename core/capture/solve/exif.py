@@ -22,15 +22,10 @@ def read_exif(path: Path) -> tuple[int, float | None]:
     if head[:2] != b"\xff\xd8" or start < 6:
         return 1, None
     block = io.BytesIO(head[start:])
-    first = _numbers(tiff.read_tags(block, (tiff.ORIENTATION, EXIF)))
-    second = _numbers(tiff.read_tags(block, (FOCAL_35MM,), first[EXIF])) if EXIF in first else {}
+    first = tiff.whole_numbers(tiff.read_tags(block, (tiff.ORIENTATION, EXIF)))
+    second = tiff.whole_numbers(tiff.read_tags(block, (FOCAL_35MM,), first[EXIF])) if EXIF in first else {}
     orientation, focal = first.get(tiff.ORIENTATION, 1), second.get(FOCAL_35MM, 0)
     return orientation if 1 <= orientation <= 8 else 1, focal / WIDTH_35MM if 5 <= focal <= 2000 else None
-
-
-def _numbers(tags: dict[int, tiff.Tag]) -> dict[int, int]:
-    """Of those that hold one whole number."""
-    return {name: int(tag.values[0]) for name, tag in tags.items() if tag.kind in (3, 4) and len(tag.values) == 1}
 
 
 def upright(picture: Picture, orientation: int) -> Picture:

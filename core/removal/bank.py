@@ -140,6 +140,9 @@ def _frame_of(path: Path, random: Random) -> NDArray[np.float32]:
     with Video(path) as clip:
         clip.seek(int(random.integers(max(clip.length, 1))))
         frame = next(iter(clip), None)
+    if frame is None:  # past its end: files whose sound is longer claim more frames than they have
+        with Video(path) as clip:
+            frame = next(iter(clip), None)
     if frame is None:
         raise FrameError(f"{path} is no clip that can be read; convert it to pictures.")
     return np.asarray(linear_from_srgb(frame[..., ::-1].astype(np.float32) / 255), np.float32)

@@ -31,11 +31,12 @@ def plates_of(inputs: Iterable[Path], apart_from: Iterable[Path | None] = ()) ->
     others = [other.resolve() for other in apart_from if other is not None]
     for given in inputs:
         if given.is_dir():
-            inner = [other for other in others if given.resolve() in other.parents]
-            inner += [made for record in given.rglob(RECORD) if record.parent != given
-                      for made in Record(record.parent).results()]
+            inner = {other for other in others if given.resolve() in other.parents}
+            for record in given.rglob(RECORD):
+                if record.parent != given:
+                    inner.update(Record(record.parent).results())
             files = [(path, path.relative_to(given)) for path in pictures_below(given)
-                     if not any(path.resolve().is_relative_to(other) for other in inner)]
+                     if inner.isdisjoint(_itself_and_its_folders(path))]
             if not files:
                 raise SettingsError(f"{given} holds no pictures, or results alone; give a folder with PNG, JPEG, "
                                     "TIFF or EXR files.")
@@ -46,6 +47,11 @@ def plates_of(inputs: Iterable[Path], apart_from: Iterable[Path | None] = ()) ->
                 raise SettingsError(f"{found[name]} and {path} would be written to the same file; remove them apart.")
             found[name] = path
     return [(path, name) for name, path in found.items()]
+
+
+def _itself_and_its_folders(path: Path) -> list[Path]:
+    whole = path.resolve()
+    return [whole, *whole.parents]
 
 
 def remove_all(inputs: Sequence[Path], folder: Path, remover: Remover, progress: Progress, *,
@@ -63,7 +69,8 @@ def remove_all(inputs: Sequence[Path], folder: Path, remover: Remover, progress:
     plates = plates_of(inputs, [folder, flare_folder, mattes.given if mattes else None])
     results = {name: [folder / name, *([flare_folder / name.with_suffix(".exr")] if flare_folder else [])]
                for _, name in plates}
-    check_apart([path for path, _ in plates], itertools.chain.from_iterable(results.values()))
+    check_apart([*(path for path, _ in plates), *(mattes.files if mattes else ())],
+                itertools.chain.from_iterable(results.values()))
     record = Record(folder)
     sequences = Sequences(remover, [] if stills else [path for path, _ in plates])
     if wanted is not None:

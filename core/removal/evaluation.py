@@ -3,8 +3,9 @@
 
 Paired folders are read as the field keeps them: input/ and gt/ (also target/, clean/ or scene/ for the
 latter, flare/ or blend/ for the former), pictures matched by name, or by the number in it, as Flare7K++'s
-real and synthetic test sets have input_000001.png beside gt_000001.png; mask/ if there is one. A folder of
-such folders is a set of categories.
+real and synthetic test sets have input_000001.png beside gt_000001.png; mask/ if there is one. Of several the
+first of these counts: beside input/ a folder flare/ holds what was taken away. A folder of such folders is a set
+of categories.
 """
 from __future__ import annotations
 
@@ -48,8 +49,10 @@ def paired(folder: Path | str) -> list[Case]:
     cases: list[Case] = []
     for inputs in sorted(path for path in [folder, *folder.rglob("*")] if path.is_dir()):
         root = inputs.parent
-        truth = next((root / name for name in TRUTHS if (root / name).is_dir()), None)
-        if inputs.name.lower() not in INPUTS or truth is None:
+        if inputs.name.lower() not in INPUTS or inputs != _first_of(root, INPUTS):
+            continue
+        truth = _first_of(root, TRUTHS)
+        if truth is None:
             continue
         category = root.relative_to(folder).as_posix() if root != folder else root.name
         truths, masks = _by_key(truth), _by_key(root / "mask") if (root / "mask").is_dir() else {}
@@ -60,6 +63,12 @@ def paired(folder: Path | str) -> list[Case]:
     if not cases:
         raise SettingsError(f"{folder} holds no pairs; give a folder with input/ and gt/, or a folder of such folders.")
     return cases
+
+
+def _first_of(root: Path, names: Sequence[str]) -> Path | None:
+    """The folder in `root` that has the first of these names, in capitals or not."""
+    folders = {path.name.lower(): path for path in sorted(root.iterdir()) if path.is_dir()}
+    return next((folders[name] for name in names if name in folders), None)
 
 
 def _by_key(folder: Path) -> dict[str, Path]:

@@ -28,6 +28,11 @@ class Mattes:
         elif not given.is_file():
             raise SettingsError(f"{given} is missing; give a matte, or a folder with one for each plate.")
 
+    @property
+    def files(self) -> list[Path]:
+        """All that there are."""
+        return [self.given] if self._by_name is None else list(self._by_name.values())
+
     def path(self, name: Path) -> Path:
         """Of the plate of that name below its folder. Raises FrameError where it has none."""
         if self._by_name is None:

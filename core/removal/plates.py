@@ -234,6 +234,8 @@ def _write_exr(path: Path, plate: Plate, codes: NDArray[Any]) -> None:
     header = {name: value for name, value in plate.rest["header"].items() if name not in ("channels", "chunkCount")}
     header["type"] = OpenEXR.scanlineimage
     header.pop("tiles", None)
+    if header.get("lineOrder") == OpenEXR.RANDOM_Y:  # as renderers write tiles, in the order that they are done
+        header["lineOrder"] = OpenEXR.INCREASING_Y
     if header.get("compression") in (OpenEXR.DWAA_COMPRESSION, OpenEXR.DWAB_COMPRESSION):  # loses some at each writing
         header["compression"] = OpenEXR.ZIP_COMPRESSION
     save_exr(path, header, channels)

@@ -41,18 +41,20 @@ class Record:
 
     def begin(self, name: Path, how: str, results: Sequence[Path], overwrite: bool) -> None:
         """Before the files of a plate are written, itself and maybe its flare: what was made there in another way goes,
-        so that a kill leaves none under what is now written down. Raises FrameError for a plate that is not from here,
-        unless `overwrite`."""
+        so that a kill leaves none under what is now written down. Raises FrameError for a plate or flare that is not
+        from here, unless `overwrite`."""
         key = name.as_posix()
         with locked(self._folder / LOCK):
             plates, flares = self._read("plates"), self._read("flares")
             told = {"plates": {**plates, key: how}, "flares": {**flares}}
             if results[1:]:
                 told["flares"][key] = _from(self._folder, results[1])
-            if plates.get(key) != how:
-                if not overwrite and key not in plates and results[0].exists():
-                    raise FrameError(f"{results[0]} is there, and {RECORD} beside it does not tell of it: it may be "
+            from_here = (key in plates, key in flares and told["flares"][key] == flares[key])
+            for path, is_known in zip(results, from_here, strict=False):
+                if not overwrite and not is_known and path.exists():
+                    raise FrameError(f"{path} is there, and {self._folder / RECORD} does not tell of it: it may be "
                                      "someone's work; choose another folder, or have it written over (--overwrite).")
+            if plates.get(key) != how:
                 for path in results:
                     patiently(path.unlink, True)
             if told != {"plates": plates, "flares": flares}:

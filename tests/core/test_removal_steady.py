@@ -48,6 +48,26 @@ def test_a_cut_and_a_frame_of_another_shape_change_nothing() -> None:
     np.testing.assert_allclose(made, here.told.added, atol=1e-6)
 
 
+def test_photographs_of_other_things_change_nothing_however_dark_they_are() -> None:
+    """Their skies are alike, and so is what is flat in them; what is told of one says nothing of the others."""
+    def night(seed: int) -> Pixels:
+        lit = np.random.default_rng(seed).random((12, 16, 3)) ** 4
+        return np.asarray(cv2.resize(lit, (64, 48), interpolation=cv2.INTER_LINEAR), np.float32) * np.float32(0.15)
+
+    others = [night(seed) for seed in range(1, 9)]
+    for level in (0.05, 0.0):
+        made = steadied(calm(told(night(0), level)), [calm(told(other, 0.05 - level)) for other in others]).added
+        np.testing.assert_allclose(made, level, atol=1e-3)
+
+
+def test_frames_of_a_pan_and_of_a_sky_without_anything_are_of_one_shot() -> None:
+    wide = np.asarray(cv2.resize(np.random.default_rng(0).random((12, 40, 3)), (160, 48)), np.float32) * np.float32(0.1)
+    grain = np.random.default_rng(1).normal(0.1, 0.002, (2, 48, 64, 3)).astype(np.float32)
+    for here, after in ((wide[:, :64], wide[:, 1:65]), grain):
+        made = steadied(calm(told(here, 0.1)), [calm(told(after, 0.2))]).added
+        assert made.mean() > 0.14
+
+
 def test_a_flare_that_comes_out_is_not_drawn_into_the_frames_before() -> None:
     """Where it lies frames differ; beside it they are alike, and are told alike."""
     dark, lit = scene(3) * 0.3, scene(3) * 0.3

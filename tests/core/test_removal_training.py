@@ -426,6 +426,16 @@ def test_masks_count_alone(tmp_path: Path) -> None:
     assert result["masked_psnr"] > 45 > result["psnr"]
 
 
+def test_what_was_taken_away_is_no_input_where_there_is_one(tmp_path: Path) -> None:
+    """`remove PAIRS/input --out PAIRS/clean --flare PAIRS/flare` leaves such a folder."""
+    pair_folder(tmp_path)
+    for folder in ("flare", "clean"):
+        shutil.copytree(tmp_path / "gt", tmp_path / folder)
+    assert {case.name for case in evaluation.paired(tmp_path)} == {"input_0", "input_1"}
+    (tmp_path / "gt").rename(tmp_path / "GT")
+    assert all(np.allclose(case.read()[1], 0.5, atol=0.01) for case in evaluation.paired(tmp_path))
+
+
 def test_pairs_that_are_none(tmp_path: Path) -> None:
     with pytest.raises(SettingsError, match="no pairs"):
         evaluation.paired(tmp_path)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from core.errors import FrameError
 from core.pictures import linear_from_srgb
+from core.removal import bank
 from core.removal.bank import OwnFlares
 from core.video import Video
 
@@ -117,6 +118,20 @@ def test_a_clip_of_a_flare_trains_in_its_own_colours(tmp_path: Path) -> None:
     columns = ((np.arange(6) + 0.5) / 6 * shown.shape[1]).astype(int)
     truth = linear_from_srgb(PATCHES / 255)
     assert np.abs(shown[len(shown) // 2, columns] - truth).max() < 0.04
+
+
+def test_a_clip_that_claims_more_frames_than_it_has_trains(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As one does whose sound is longer."""
+    class Longer(Video):
+        def __init__(self, path: Path) -> None:
+            super().__init__(path)
+            self.length = 1000
+
+    path = tmp_path / "clips" / "flare.mp4"
+    path.parent.mkdir()
+    patches(path, 360, (0.299, 0.114))
+    monkeypatch.setattr(bank, "Video", Longer)
+    assert OwnFlares(path.parent, 256).draw(np.random.default_rng(0)).rest.max() > 0.1
 
 
 def with_pixels(path: Path, wide: int, high: int) -> Path:

@@ -44,6 +44,13 @@ class Cancelled(FitFlareError):
 DISK_FULL = (errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC))
 
 
+def is_out_of_memory(problem: BaseException) -> bool:
+    """Whether it says that memory is short: torch has a class for that of graphics cards, and for the processor's no
+    more than words in a RuntimeError."""
+    return (isinstance(problem, MemoryError) or type(problem).__name__ == "OutOfMemoryError"
+            or "DefaultCPUAllocator" in str(problem))
+
+
 def refusal(problem: OSError) -> str:
     """The sentence for what the system refused: a full disk, a folder that may not be written, …"""
     where = f" ({problem.filename})" if problem.filename else ""

@@ -44,6 +44,8 @@ def runs(pid: int) -> bool:
         return _began(pid) is not None
     try:
         os.kill(pid, 0)
+    except PermissionError:  # it is somebody else's
+        return True
     except OSError:
         return False
     return True

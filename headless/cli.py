@@ -14,7 +14,7 @@ import traceback
 from collections.abc import Iterator, Sequence
 from typing import Any, NoReturn, TextIO
 
-from ..core.errors import Cancelled, EngineError, FitFlareError, SettingsError, refusal
+from ..core.errors import Cancelled, EngineError, FitFlareError, SettingsError, is_out_of_memory, refusal
 from ..core.progress import JsonProgress, OpenJdProgress, Progress, TerminalProgress, flush_or_drop, stoppable
 from . import hand_off
 from .command import Command, Step
@@ -114,10 +114,10 @@ def _status(words: Sequence[str], progress: Progress) -> int:
     except OSError as problem:
         progress.error(refusal(problem))
         return FAILED
-    except MemoryError:
-        progress.error("It does not fit into the memory of this machine; use a smaller --size, or fewer --jobs.")
-        return FAILED
     except Exception as problem:
+        if is_out_of_memory(problem):
+            progress.error("It does not fit into the memory of this machine; use a smaller --size, or fewer --jobs.")
+            return FAILED
         traceback.print_exc()
         progress.error(f"A defect of Fit Flare, please report it: {type(problem).__name__}: {problem}.")
         return FAILED

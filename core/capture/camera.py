@@ -51,6 +51,11 @@ class Camera:
         return math.sqrt(self.fx * self.fy)
 
     @property
+    def reach(self) -> float:
+        """Of its frame from the principal point, normalised coordinates: to the farthest corner."""
+        return math.hypot(max(self.cx, self.width - self.cx) / self.fx, max(self.cy, self.height - self.cy) / self.fy)
+
+    @property
     def camera_to_world(self) -> Floats:
         """(4, 4), the inverse of the pose."""
         inverse = np.eye(4)

@@ -158,4 +158,4 @@ _BUILT_IN: dict[str, Callable[[], ColourSpace]] = {
 }
 _ALIASES = {**{name.replace("_", ""): name for name in _BUILT_IN}, "rec.709": "rec709", "bt709": "rec709",
             "linearrec.709": "linear", "linrec709": "linear", "linearrec709": "linear", "ap1": "acescg",
-            "ap0": "aces2065-1", "linearrec2020": "rec2020", "lin_rec2020": "rec2020"}
+            "ap0": "aces2065-1", "linearrec2020": "rec2020", "linrec2020": "rec2020"}

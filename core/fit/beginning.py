@@ -85,13 +85,15 @@ def first_flare(capture: Capture, views: tuple[View, ...], frames: Frames, setti
     elif settings.flare.snap and frames.reference:
         positions = torch.from_numpy(snapped(_sights(views, frames), positions.numpy()))
     poses = [torch.from_numpy(view.camera.world_to_camera) for view in views]
+    reach = max(view.camera.reach for view in views)
     flares = []
     for name, xyz in zip((light.name for light in capture.lights), positions, strict=True):
         seen = [one for one in (ViewOfLight.of(pose, xyz) for pose in poses) if one.depth > 0]
         if not seen:
             raise CaptureError(f"The light {name!r} is behind the camera in every view of {capture.folder}; "
                                "correct or remove it in lights.json.")
-        query = QueryRange.of(torch.stack([one.camera for one in seen]), torch.stack([one.light for one in seen]))
+        cameras, places = (torch.stack([getattr(one, name) for one in seen]) for name in ("camera", "light"))
+        query = QueryRange.of(cameras, places, reach)
         flares.append(LightFlare(settings.flare.form, query, settings.flare.count, generator, settings.flare.opacity))
     return FlareModel([light.name for light in capture.lights], positions, flares)
 

@@ -7,6 +7,7 @@ each parameter. The first layer is split: the view's share is computed once, the
 """
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -16,6 +17,10 @@ from torch.nn import functional
 
 from ..look.network import BANDS, CAMERA_BITS, CAMERA_GROWTH, LIGHT_BITS, LIGHT_GROWTH
 from .encoding import HashGrid, frequency_encoding
+
+BESIDE = 1.5
+"""Times as far out as the frame's corners, or as a light comes nearest, from where on its flare is taken to change no
+more: what is left of one there is little."""
 
 
 @dataclass(frozen=True)
@@ -31,12 +36,17 @@ class QueryRange:
     light_high: tuple[float, float, float]
 
     @classmethod
-    def of(cls, cameras: Tensor, lights: Tensor) -> QueryRange:
-        """The range of training views: camera positions (v, 3), normalised light positions (v, 2)."""
+    def of(cls, cameras: Tensor, lights: Tensor, reach: float = math.inf) -> QueryRange:
+        """The range of training views: camera positions (v, 3), normalised light positions (v, 2).
+
+        reach: of the frame from the principal point, normalised. A light that passes the camera's plane comes to lie
+        at a hundred of these; the grid over all of that would leave the frame itself a part of one cell.
+        """
         low, high = cameras.amin(0), cameras.amax(0)
         # A camera that hardly moves along an axis must not have its noise stretched over the whole grid.
         margin = (high - low).max().clamp_min(1e-3) * 0.05
-        light = light_input(lights).amax(0) * 1.05 + 1e-3
+        nearest = float(lights.norm(dim=-1).min())
+        light = light_input(lights).amax(0).clamp(max=BESIDE * max(reach, nearest)) * 1.05 + 1e-3
         return cls(*(tuple(values.tolist()) for values in (low - margin, high + margin, light)))
 
 

@@ -53,6 +53,11 @@ def test_a_space_is_known_by_its_chromaticities() -> None:
         space_of_chromaticities((0.3, 0.3) * 4)  # type: ignore[arg-type]
 
 
+def test_names_as_opencolorio_has_them_need_no_configuration(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("OCIO", raising=False)
+    assert [colour_space(name).name for name in ("lin_rec709", "lin_rec2020")] == ["linear", "rec2020"]
+
+
 def test_an_unknown_name_is_told_what_there_is(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("OCIO", raising=False)
     with pytest.raises(SettingsError, match=r"srgb, rec709, linear, acescg.*--ocio"):

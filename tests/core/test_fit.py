@@ -534,6 +534,18 @@ def test_a_run_is_known_by_its_scene_and_its_flare(tmp_path: Path) -> None:
     assert len({fingerprint(b"a", b"x"), fingerprint(b"b", b"x"), fingerprint(b"a", b"y")}) == 3
 
 
+def test_one_view_past_which_the_light_goes_leaves_the_flare_of_the_others_alone(capture: Capture) -> None:
+    """What the network tells of places in the frame is as fine as without that view."""
+    camera = capture.views[5].camera
+    beside = camera.position + camera.world_to_camera[:3].T[:3] @ np.array([3.0, 0.0, 0.03])
+    trainer = Trainer(capture.lit({"lamp": beside}), quick(1, **{"flare.snap": False}))
+    assert trainer.flare is not None
+    seen = [float(light.light.norm()) for view in trainer.views
+            for light in trainer.flare.views(torch.from_numpy(view.camera.world_to_camera)) if light.depth > 0]
+    assert max(seen) > 90
+    assert trainer.flare.lights[0].query_range.light_high[2] < 2 * max(camera.reach, min(seen))
+
+
 @pytest.mark.parametrize("found", [True, False])
 def test_a_checkpoint_of_a_version_whose_scene_went_on_alone_goes_on(capture: Capture, found: bool) -> None:
     """It says until when the scene was alone: for longer where it had not been found."""

@@ -67,6 +67,14 @@ def test_rings_at_first_are_of_all_sizes_and_thin() -> None:
     assert scales.max() <= 0.061
 
 
+def test_a_light_that_passes_the_cameras_plane_leaves_the_grid_to_the_frame() -> None:
+    """A turn of the camera takes it to a hundred frames aside; one that never is in the frame still has a range."""
+    eyes, aside = torch.zeros(3, 3), torch.tensor([[0.1, -0.2], [0.3, 0.1], [-90.0, 4.0]])
+    assert max(QueryRange.of(eyes, aside, reach=0.4).light_high) < 0.7
+    assert QueryRange.of(eyes[:2], aside[:2], reach=0.4) == QueryRange.of(eyes[:2], aside[:2])
+    assert max(QueryRange.of(eyes, aside + 2, reach=0.4).light_high) > 2.8
+
+
 # ---- placement ------------------------------------------------------------------------------------
 
 

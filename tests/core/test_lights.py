@@ -260,7 +260,8 @@ class TestGather:
         cameras = orbit(16, size=SIZE)
         nothing = [[spot((9.0 + 3 * number, 7.0), score=0.0) for number in range(24)] for _ in cameras]
         assert not gather(named(cameras), nothing, EXTENT)
-        lit = [[*some, *none] for some, none in zip(scene([(0.4, -0.5, 0.3)], cameras, clutter=0), nothing, strict=True)]
+        lamp = scene([(0.4, -0.5, 0.3)], cameras, clutter=0)
+        lit = [[*some, *none] for some, none in zip(lamp, nothing, strict=True)]
         (found,) = gather(named(cameras), lit, EXTENT)
         assert np.linalg.norm(found.xyz - (0.4, -0.5, 0.3)) < 0.05
 

@@ -55,3 +55,12 @@ def test_ages_as_ps_tells_them(monkeypatch: pytest.MonkeyPatch) -> None:
         assert processes._told_by_ps(1) == pytest.approx(time.time() - age, abs=1)
     monkeypatch.setattr(processes.subprocess, "run", lambda *_words, **_options: subprocess.CompletedProcess([], 1, ""))
     assert processes._told_by_ps(1) is None
+
+
+def test_a_process_of_somebody_else_runs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """What it writes is no leftover: on macOS, where a signal alone tells, one may not be sent to it."""
+    monkeypatch.setattr(processes, "PROC", tmp_path / "none")
+    monkeypatch.setattr(processes, "WINDOWS", False)
+    for refused, there in ((PermissionError, True), (ProcessLookupError, False)):
+        monkeypatch.setattr(processes.os, "kill", lambda *_, refused=refused: (_ for _ in ()).throw(refused))
+        assert processes.runs(1) == there

@@ -189,6 +189,9 @@ def ending_with(problem: BaseException | None, monkeypatch: pytest.MonkeyPatch) 
      "The disk is full (x.exr); make room and start it again, what is finished is kept."),
     (OSError(13, "Permission denied", "x.exr"), 1, "The system refused: Permission denied (x.exr)."),
     (MemoryError(), 1, "It does not fit into the memory of this machine; use a smaller --size, or fewer --jobs."),
+    (RuntimeError("[enforce fail at alloc_cpu.cpp:127] err == 0. DefaultCPUAllocator: can't allocate memory: you tried "
+                  "to allocate 972000000 bytes. Error code 12 (Cannot allocate memory)"), 1,
+     "It does not fit into the memory of this machine; use a smaller --size, or fewer --jobs."),
     (ZeroDivisionError("division by zero"), 1,
      "A defect of Fit Flare, please report it: ZeroDivisionError: division by zero."),
 ])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 from pathlib import Path
 
 import pytest
@@ -18,6 +19,8 @@ if word == "bad":
     sys.exit(1)
 if word == "killed":
     os._exit(9)
+if word == "threads":
+    sys.exit(f"{os.environ['OMP_NUM_THREADS']} and {os.environ['NUMBA_NUM_THREADS']}")
 if word == "loud":
     sys.exit("Bus error at 0x0")
 """
@@ -43,6 +46,18 @@ def test_shares(numbers: list[int], count: int, expected: list[str]) -> None:
     assert jobs.shares(numbers, count) == expected
     with pytest.raises(SettingsError, match="--jobs 0"):
         jobs.shares(numbers, 0)
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="the system gives no process a part of its cores")
+@pytest.mark.usefixtures("program")
+def test_processes_share_the_cores_that_are_theirs(monkeypatch: pytest.MonkeyPatch,
+                                                   capfd: pytest.CaptureFixture[str]) -> None:
+    """Of a large machine a farm's slot is a part, and threads for all of it would wait for each other."""
+    monkeypatch.setattr(os, "cpu_count", lambda: 64)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(4)))
+    with pytest.raises(EngineError):
+        run("threads", "fine")
+    assert "2 and 2" in capfd.readouterr().err
 
 
 @pytest.mark.usefixtures("program")

@@ -46,9 +46,9 @@ DISK_FULL = (errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC))
 
 def is_out_of_memory(problem: BaseException) -> bool:
     """Whether it says that memory is short: torch has a class for that of graphics cards, and for the processor's no
-    more than words in a RuntimeError."""
+    more than words in a RuntimeError, as OpenCV has."""
     return (isinstance(problem, MemoryError) or type(problem).__name__ == "OutOfMemoryError"
-            or "DefaultCPUAllocator" in str(problem))
+            or any(words in str(problem) for words in ("DefaultCPUAllocator", "Insufficient memory")))
 
 
 def refusal(problem: OSError) -> str:

@@ -7,7 +7,7 @@ from collections.abc import Container, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from ..errors import DISK_FULL, FrameError, SettingsError, refusal
+from ..errors import DISK_FULL, FrameError, SettingsError, is_out_of_memory, refusal
 from ..files import check_apart
 from ..pictures import pictures_below, window_of
 from ..progress import Progress
@@ -88,14 +88,16 @@ def remove_all(inputs: Sequence[Path], folder: Path, remover: Remover, progress:
                 record.begin(name, how, results[name], overwrite)
                 _remove(path, name, results[name], remover, sequences, mattes)
                 made += 1
-        except (FrameError, OSError, MemoryError) as problem:
+        except Exception as problem:
+            if not isinstance(problem, FrameError | OSError) and not is_out_of_memory(problem):
+                raise
             if isinstance(problem, OSError) and problem.errno in DISK_FULL:
                 raise  # none of the others would fit either
             if isinstance(problem, OSError) and record.is_refused(problem):
                 raise FrameError(f"{folder} cannot be written to ({problem.strerror}); choose another folder for the "
                                  "clean plates, or have the rights to this one.") from problem
-            failed.append(refusal(problem) if isinstance(problem, OSError) else
-                          str(problem) or f"{path} does not fit into memory.")
+            failed.append(refusal(problem) if isinstance(problem, OSError) else str(problem)
+                          if isinstance(problem, FrameError) else f"{path} does not fit into memory.")
             progress.say(f"Left out: {failed[-1]}")
         progress.advance()
     if kept:

@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import FrameError
+from ..errors import FrameError, is_out_of_memory
 from .inference import Remover, Told
 from .plates import Plate, read_plate
 
@@ -121,7 +121,9 @@ class Sequences:
             return self._kept[path]
         try:
             return self._keep(path, calm(self._remover.tell(read_plate(path))))
-        except (FrameError, OSError, MemoryError):
+        except Exception as problem:
+            if not isinstance(problem, FrameError | OSError) and not is_out_of_memory(problem):
+                raise
             self._kept[path] = None
             return None
 

@@ -807,6 +807,34 @@ def test_a_full_disk_ends_the_batch(tmp_path: Path, nowhere: Path, monkeypatch: 
         remove_all([tmp_path / "in"], tmp_path / "out", Remover(nowhere, working_size=64), Progress())
 
 
+@pytest.mark.parametrize("short", [
+    MemoryError("Unable to allocate 3.00 GiB for an array"),
+    cv2.error("OpenCV(5.0) alloc.cpp:73: error: (-4:Insufficient memory) Failed to allocate 9000000000 bytes"),
+    RuntimeError("[enforce fail at alloc_cpu.cpp:127] err == 0. DefaultCPUAllocator: can't allocate memory")])
+def test_a_plate_that_does_not_fit_into_memory_is_left_out(tmp_path: Path, nowhere: Path, short: Exception,
+                                                           monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("a", "b"):
+        write_codes(tmp_path / "in" / f"{name}.png", picture())
+    tell = Remover.tell
+
+    def told(remover: Remover, plate: Plate) -> Any:
+        if plate.path.name == "a.png":
+            raise short
+        return tell(remover, plate)
+
+    monkeypatch.setattr(Remover, "tell", told)
+    with pytest.raises(FrameError, match=r"1 of 2 plates could not be cleaned: \S*a\.png does not fit into memory"):
+        remove_all([tmp_path / "in"], tmp_path / "out", Remover(nowhere, working_size=64), Progress())
+    assert (tmp_path / "out" / "b.png").exists()
+
+
+def test_a_defect_is_not_taken_for_a_bad_plate(tmp_path: Path, nowhere: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_codes(tmp_path / "in" / "a.png", picture())
+    monkeypatch.setattr(Remover, "tell", lambda *_: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        remove_all([tmp_path / "in"], tmp_path / "out", Remover(nowhere, working_size=64), Progress())
+
+
 @pytest.mark.parametrize("number", [errno.EACCES, errno.EROFS])
 def test_a_folder_that_may_not_be_written_ends_the_batch(tmp_path: Path, nowhere: Path, number: int,
                                                          monkeypatch: pytest.MonkeyPatch) -> None:

@@ -35,6 +35,12 @@ Status at the end: 0 done; 1 it could not be done, the last line says why; 2 the
 
 
 class _Parser(argparse.ArgumentParser):
+    """Options by their whole names alone: a part of one may be two options' in the next version, and is none to those
+    who read words before this does."""
+
+    def __init__(self, *words: Any, **settings: Any) -> None:
+        super().__init__(*words, allow_abbrev=False, **settings)
+
     def error(self, message: str) -> NoReturn:
         raise SettingsError(f"{message[0].upper()}{message[1:]} (see {self.prog} --help).")
 

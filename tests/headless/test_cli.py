@@ -93,7 +93,8 @@ def test_the_list_of_commands(capsys: pytest.CaptureFixture[str], monkeypatch: p
 
 @pytest.mark.parametrize("words", [
     ["fly"], ["fit"], ["fit", "a"], ["bake", "a"], ["fit", "a", "--out", "b", "--preset", "x"],
-    ["fit", "a", "--out", "b", "--seed", "x"], ["eval", "a", "--views", "none"]])
+    ["fit", "a", "--out", "b", "--seed", "x"], ["fit", "a", "--out", "b", "--pres", "draft"],
+    ["eval", "a", "--views", "none"]])
 def test_misuse_is_status_2_and_one_sentence(words: list[str], capfd: pytest.CaptureFixture[str]) -> None:
     assert cli.main(words) == 2
     told = capfd.readouterr()

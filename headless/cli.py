@@ -38,8 +38,8 @@ class _Parser(argparse.ArgumentParser):
     """Options by their whole names alone: a part of one may be two options' in the next version, and is none to those
     who read words before this does."""
 
-    def __init__(self, *words: Any, **settings: Any) -> None:
-        super().__init__(*words, allow_abbrev=False, **settings)
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(**settings, allow_abbrev=False)
 
     def error(self, message: str) -> NoReturn:
         raise SettingsError(f"{message[0].upper()}{message[1:]} (see {self.prog} --help).")

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Other processes: what one is started with, and whether one that was written down still runs, known by its number and
-by when it began, since systems give the numbers of ended ones out again."""
+"""Processes: the cores that this one may use, what another is started with, and whether one that was written down still
+runs, known by its number and by when it began, since systems give the numbers of ended ones out again."""
 from __future__ import annotations
 
 import os
@@ -26,6 +26,11 @@ def python_at(place: Path) -> Path | None:
 def environment() -> dict[str, str]:
     """This environment, less what would lead another Python to the modules of this one."""
     return {name: value for name, value in os.environ.items() if name not in ("PYTHONHOME", "PYTHONPATH")}
+
+
+def cores() -> int:
+    """Those that this process may use: a farm or a container often gives it a few of many."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def is_same(pid: int, started: float) -> bool:

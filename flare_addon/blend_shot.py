@@ -25,8 +25,8 @@ KINDS = ("POINT", "SPOT", "AREA", "SUN")
 
 def shot_of(scene: Any, flare: Path, names: Sequence[str], frames: Sequence[int], *, radius: float = 0.0,
             done: Callable[[], None] = lambda: None) -> Shot:
-    """The scene's active camera at these frames, which markers may change; one shot by its name, whoever films a part
-    of it. names: of objects that are lights; none: the scene's lamps.
+    """The scene's active camera at these frames. names: of objects that are lights; none: the scene's lamps. Markers
+    may change the camera; it is one shot all the same, and bears the scene's name.
 
     radius: of the lights' discs for the soft edge of shadows, world units; 0: a share of the distance. The shot's
     coordinates are Blender's world. Raises CaptureError for a scene without a camera, light, or named object.

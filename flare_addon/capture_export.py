@@ -17,13 +17,13 @@ import bpy
 import numpy as np
 
 from ..core.capture.colmap import find_model
+from ..core.capture.transforms import FILE as TRANSFORMS
 from ..core.errors import CaptureError
 from ..core.files import atomic_path, read_json, write_json
 from . import cameras
 from .paths import stored
 
 MOST_POINTS = 100_000
-TRANSFORMS = "transforms.json"
 MAKER = "Fit Flare"
 """What transforms.json that was made here says; that one may be written again."""
 _NUMBER = re.compile(r"(\d+)(?=\D*$)")

@@ -112,12 +112,12 @@ def resume(scene: Any) -> Job:
     capture, folder = capture_of(scene), folder_of(scene)
     if folder is None or not (folder / CONFIG).is_file():
         raise RunError(f"There is no fit to go on with in {folder}; start a new one.")
-    begun = _begun_with(folder) or capture
+    begun = _begun_with(folder)
+    if begun is None or _has_moved(folder, capture):
+        begun = capture
     if begun is None or not begun.is_dir():
-        if capture is None or not capture.is_dir() or not _may_be_of(folder, capture):
-            raise CaptureError(f"The capture {begun} that this fit was begun with is not there; put it back, or start "
-                               "a new fit.")
-        begun = capture  # where it has been moved to
+        raise CaptureError(f"The capture {begun} that this fit was begun with is not there; put it back, or start a "
+                           "new fit.")
     return _run(scene, begun, folder)
 
 
@@ -165,6 +165,13 @@ def _may_be_of(folder: Path, capture: Path) -> bool:
     if begun is None:
         return True
     return begun.samefile(capture) if begun.is_dir() and capture.is_dir() else begun.name == capture.name
+
+
+def _has_moved(folder: Path, capture: Path | None) -> bool:
+    """Whether the capture of a run is gone from where it was, and may be the one that is given now."""
+    begun = _begun_with(folder)
+    return (begun is not None and not begun.is_dir() and capture is not None and capture.is_dir()
+            and _may_be_of(folder, capture))
 
 
 def _begun_with(folder: Path) -> Path | None:
@@ -236,8 +243,7 @@ def cleaning(scene: Any, capture: Path) -> list[object]:
     a matte where there is one."""
     folder = folder_of(scene)
     if folder is not None and state_of(scene) == "finished" and _may_be_of(folder, capture):
-        begun = _begun_with(folder)
-        moved = [] if begun is None or begun.is_dir() else ["--capture", capture]
+        moved = ["--capture", capture] if _has_moved(folder, capture) else []
         return ["remove", "--run", folder, *moved, "--out", capture / "removed"]
     given = scene.fit_flare.matte
     matte = ["--matte", absolute(given, scene.library)] if given else []

@@ -143,7 +143,7 @@ def folder_of_camera(layers: Path, camera: Any) -> Path:
         last = Shot.read(layers / SHOT).folders
     except SettingsError:
         return layers
-    folders = {**_kept(layers), **last}
+    folders = {**_folders_of_all_bakes(layers), **last}
     name = camera.name if camera is not None else ""
     if name not in folders and "" not in last.values() and not any(layers.glob("*.exr")):
         raise FrameError(f"{layers} has no layers of the camera {name!r}, only of {', '.join(map(repr, folders))}; "
@@ -152,8 +152,8 @@ def folder_of_camera(layers: Path, camera: Any) -> Path:
     return layers / folders.get(name, "")
 
 
-def _kept(layers: Path) -> dict[str, str]:
-    """Of the cameras whose layers a folder has, from bakes before the last too, the folder in it of each."""
+def _folders_of_all_bakes(layers: Path) -> dict[str, str]:
+    """Of each camera whose layers a folder has, those of bakes before the last too, the folder in it."""
     try:
         entries = bakes.read_record(layers)["frames"]
     except RunError:

@@ -21,6 +21,7 @@ from collections.abc import Sequence
 from typing import IO, Any
 
 from ..core.errors import EngineError, FitFlareError, SettingsError
+from ..core.processes import cores
 from ..core.progress import STOP_FILE, Progress
 from . import hand_off
 
@@ -77,7 +78,7 @@ def run_parts(words: argparse.Namespace, step: str, parts: Sequence[Sequence[str
     that failed, after the others have been stopped or, `past_failures`, have ended.
     """
     events: queue.Queue[tuple[int, dict[str, Any] | None]] = queue.Queue()
-    threads = str(max(_cores() // max(min(jobs, len(parts)), 1), 1))
+    threads = str(max(cores() // max(min(jobs, len(parts)), 1), 1))
     environment = {**os.environ, "OMP_NUM_THREADS": threads, "NUMBA_NUM_THREADS": threads}
     environment.pop(STOP_FILE, None)  # this process looks for it, and stops the others
     by_part = total == len(parts)
@@ -127,11 +128,6 @@ def run_parts(words: argparse.Namespace, step: str, parts: Sequence[Sequence[str
         raise EngineError(" ".join(told))
     if told:
         raise FitFlareError(" ".join(told))
-
-
-def _cores() -> int:
-    """Those that this process may use: a farm or a container often gives it a few of many."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _listen(number: int, child: subprocess.Popen[str], events: queue.Queue[tuple[int, dict[str, Any] | None]]) -> None:

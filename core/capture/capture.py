@@ -137,6 +137,13 @@ class Capture:
             raise FrameError(f"{self.folder} has no frame for {view.name}.")
         return self._picture(self._frames[view.name], view, size)
 
+    def frame_in_own_primaries(self, view: View) -> Picture:
+        """The view's frame, undistorted, at its file's size and with the file's own numbers, which are not converted by
+        what it says of its space. Raises FrameError."""
+        path = self.frame_path(view)
+        stored = read_picture(path, own_primaries=True)
+        return self._pictures.undistorted(stored, view, path) if view.lens else stored
+
     def frame_path(self, view: View) -> Path:
         """The file of the view's frame."""
         return self._frames[view.name]
@@ -295,7 +302,7 @@ class _Pictures:
                 return self._kept[key]
         picture = read_picture(path)
         if view.lens is not None:
-            picture = self._undistorted(picture, view, path)
+            picture = self.undistorted(picture, view, path)
         elif not are_one_shape(picture.size, view.camera.size):
             raise FrameError(f"{path} is {picture.size[0]} x {picture.size[1]} pixels, not "
                              f"{view.camera.width} x {view.camera.height}.")
@@ -314,7 +321,8 @@ class _Pictures:
                 _, old = self._kept.popitem(last=False)
                 self._used -= old.pixels.nbytes
 
-    def _undistorted(self, picture: Picture, view: View, path: Path) -> Picture:
+    def undistorted(self, picture: Picture, view: View, path: Path) -> Picture:
+        """What was read of a view's file, whose lens is distorted, without that. Raises FrameError."""
         assert view.lens is not None
         if not are_one_shape(picture.size, view.camera.size):
             raise FrameError(f"{path} is {picture.size[0]} x {picture.size[1]} pixels, not "

@@ -7,13 +7,13 @@ from collections.abc import Container, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from ..errors import DISK_FULL, FrameError, SettingsError, is_out_of_memory, refusal
+from ..errors import DISK_FULL, FrameError, SettingsError, refusal
 from ..files import check_apart
 from ..pictures import pictures_below, window_of
 from ..progress import Progress
 from .inference import Remover
 from .mattes import Mattes
-from .plates import write_results
+from .plates import is_of_the_plate, write_results
 from .record import RECORD, Record, made_from
 from .steady import Sequences, shot_order
 
@@ -89,7 +89,7 @@ def remove_all(inputs: Sequence[Path], folder: Path, remover: Remover, progress:
                 _remove(path, name, results[name], remover, sequences, mattes)
                 made += 1
         except Exception as problem:
-            if not isinstance(problem, FrameError | OSError) and not is_out_of_memory(problem):
+            if not is_of_the_plate(problem):
                 raise
             if isinstance(problem, OSError) and problem.errno in DISK_FULL:
                 raise  # none of the others would fit either

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from .. import jpeg, tiff
 from ..borders import Inside, inside_borders
 from ..colour import ColourSpace, colour_space, space_of_chromaticities
-from ..errors import FrameError
+from ..errors import FrameError, is_out_of_memory
 from ..files import atomic_path
 from ..pictures import (
     LUMINANCE,
@@ -98,6 +98,12 @@ class Plate:
         """What the header of another EXR has to say to lie where this one does, in its colours."""
         header = self.rest.get("header", {})
         return {name: header[name] for name in _PLACING if name in header}
+
+
+def is_of_the_plate(problem: Exception) -> bool:
+    """Whether a plate is what is wrong, so that others may do: it is damaged, the system refuses it, or it is too large
+    for the memory. All else is a defect."""
+    return isinstance(problem, FrameError | OSError) or is_out_of_memory(problem)
 
 
 def finite(codes: NDArray[Any]) -> NDArray[np.float32]:

@@ -21,9 +21,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import FrameError, is_out_of_memory
 from .inference import Remover, Told
-from .plates import Plate, read_plate
+from .plates import Plate, is_of_the_plate, read_plate
 
 Pixels = NDArray[np.float32]
 
@@ -122,7 +121,7 @@ class Sequences:
         try:
             return self._keep(path, calm(self._remover.tell(read_plate(path))))
         except Exception as problem:
-            if not isinstance(problem, FrameError | OSError) and not is_out_of_memory(problem):
+            if not is_of_the_plate(problem):
                 raise
             self._kept[path] = None
             return None

@@ -9,15 +9,13 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..bake.frames import Frame, layers_file, numbered, plates_by_number
-from ..capture import Camera, Capture, Lens, Light, View, read_lights
-from ..capture.lens import straightened
+from ..capture import Camera, Capture, Light, View, read_lights
 from ..colour import ColourSpace
 from ..errors import CaptureError, SettingsError
 from ..files import content_of
@@ -175,7 +173,7 @@ def of_capture(capture: Capture, look: Look, wanted: Mapped, *, lights: Path | N
     for frame in numbered(views):
         view = views[frame.view]
         path = None if shown else capture.frame_path(view)
-        undistorted = None if view.lens is None or path is None else _undistorted(capture, view, view.lens)
+        undistorted = None if view.lens is None or path is None else _undistorted(capture, view)
         camera = on_plate(view.camera, path) if undistorted is None and path is not None else view.camera
         shot = ShotFrame(frame.number, str(Path(frame.view).parent), camera, placed)
         frames.append(TargetFrame(frame, shot, path, undistorted))
@@ -187,20 +185,8 @@ def _placed(lights: Sequence[Light], look: Look, wanted: Mapped) -> tuple[Placed
     return tuple(PlacedLight(light.name, sources[light.name], light.xyz) for light in lights)
 
 
-def _undistorted(capture: Capture, view: View, lens: Lens) -> Callable[[bool], Picture]:
-    def plate(own_numbers: bool) -> Picture:
-        if not own_numbers:
-            return capture.frame(view)
-        stored = read_picture(capture.frame_path(view), own_primaries=True)
-        return straightened(stored, _maps(lens, stored.size))
-
-    return plate
-
-
-@lru_cache(maxsize=1)  # at 4K they take seconds, and the frames of a shot share their lens
-def _maps(lens: Lens, size: tuple[int, int]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """`Lens.maps` of its undistorted view at a size (width, height) in pixels."""
-    return lens.maps(Camera(lens.width, lens.height, *lens.pinhole, np.eye(4)).scaled(*size))
+def _undistorted(capture: Capture, view: View) -> Callable[[bool], Picture]:
+    return lambda own: capture.frame_in_own_primaries(view) if own else capture.frame(view)
 
 
 def of_cameras(capture: Capture, look: Look, scene: Path | None = None) -> Target:

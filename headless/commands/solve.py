@@ -63,12 +63,13 @@ def of_blend(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
 
     from ...core.bake.frames import plates_by_number
     from ...core.capture.colmap import find_model
+    from ...core.capture.transforms import FILE as TRANSFORMS
     from ...core.pictures import pictures_in
     from ...flare_addon.blend_shot import capture_of
 
     if words.plates is None or not words.plates.is_dir():
         raise SettingsError(f"{words.source} has cameras but no pictures; name the folder of its frames with --plates.")
-    if (words.out / "transforms.json").exists() or find_model(words.out) is not None:
+    if (words.out / TRANSFORMS).exists() or find_model(words.out) is not None:
         raise CaptureError(f"{words.out} holds a capture already; choose another folder.")
     try:
         bpy.ops.wm.open_mainfile(filepath=str(words.source.resolve()), load_ui=False, use_scripts=False)

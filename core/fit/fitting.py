@@ -11,7 +11,7 @@ import torch
 
 from ..capture import Capture
 from ..errors import Cancelled, RunError
-from ..files import atomic_path, remove_partial
+from ..files import atomic_path, held, remove_partial
 from ..flare import file as flare_file
 from ..flare.file import FlareFile, TrainingCamera
 from ..gaussians.ply import write_ply
@@ -42,25 +42,33 @@ def fit(capture: Capture, settings: FitSettings, folder: Path | str, progress: P
     it has begun).
     """
     progress, folder = progress or Progress(), Path(folder)
-    continued = resume and (folder / "config.toml").exists()
-    said: tuple[str, ...] = ()
-    if continued:
-        run = Run.open(folder)
-        _check_capture(run, capture)
-        if run.finished:
-            progress.say(f"The fit in {folder} is finished already.")
-            return run
-        trainer = Trainer(capture, run.settings, run.exposures)
-        remove_partial(folder)
-    else:
-        settings, said = with_white(settings.checked(), capture)
-        trainer = Trainer(capture, settings, progress=progress)  # before anything is written: it may refuse the capture
+    if resume and (folder / "config.toml").exists():
+        with held(folder):
+            run = Run.open(folder)
+            _check_capture(run, capture)
+            if run.finished:
+                progress.say(f"The fit in {folder} is finished already.")
+            else:
+                trainer = Trainer(capture, run.settings, run.exposures)
+                remove_partial(folder)
+                if (folder / CHECKPOINT).exists():
+                    trainer.load_state(checkpoint.load(folder / CHECKPOINT))
+                else:
+                    _say(trainer.says, run, progress)
+                _carry_through(trainer, run, progress)
+        return run
+    settings, said = with_white(settings.checked(), capture)
+    trainer = Trainer(capture, settings, progress=progress)  # before anything is written: it may refuse the capture
+    with held(folder):
         run = Run.create(folder, settings, capture.folder, trainer.exposures)
-    path = folder / CHECKPOINT
-    if continued and path.exists():
-        trainer.load_state(checkpoint.load(path))
-    else:
         _say((*said, *trainer.says), run, progress)
+        _carry_through(trainer, run, progress)
+    return run
+
+
+def _carry_through(trainer: Trainer, run: Run, progress: Progress) -> None:
+    """From where the trainer stands to the results."""
+    folder = run.folder
     _forget_after(folder / METRICS, trainer.iteration)
     _log(run, f"begun at iteration {trainer.iteration} of {run.settings.iterations}")
     progress.stage("fit", run.settings.iterations, trainer.iteration)
@@ -68,14 +76,13 @@ def fit(capture: Capture, settings: FitSettings, folder: Path | str, progress: P
         try:
             _train(trainer, run, progress)
         except Cancelled:
-            checkpoint.save(path, trainer.state())
+            checkpoint.save(folder / CHECKPOINT, trainer.state())
             _log(run, f"stopped at iteration {trainer.iteration}")
             raise
         _finish(trainer, run)
     if len(trainer.losses) == len(trainer.views):  # each has been looked at
         _say(unlike(trainer.losses), run, progress)
     _log(run, f"finished at iteration {trainer.iteration}")
-    return run
 
 
 def _say(texts: Iterable[str], run: Run, progress: Progress) -> None:

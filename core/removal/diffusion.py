@@ -24,6 +24,7 @@ import torch.nn.functional as F  # noqa: N812 - its name everywhere
 from torch import Tensor, nn
 
 from ..errors import EngineError, RunError, SettingsError
+from ..files import held
 from ..pictures import Pixels
 from ..progress import Progress
 from . import weights
@@ -220,22 +221,23 @@ def train_diffusion(model: DiffusionRemoval, folder: Path | str, draw: Callable[
     if iterations < 1:
         raise SettingsError("A training needs at least one iteration.")
     folder = Path(folder)
-    path, first = folder / "lora.safetensors", 0
-    if path.exists():
-        if not resume:
-            raise RunError(f"{folder} holds a training already; go on with --resume, or choose another folder.")
-        first = int(json.loads(model.load(path).get("iteration", "0")))
-    trainer = DiffusionTrainer(model, perceptual=perceptual)
-    progress.stage("train", iterations, min(first, iterations))
-    done = first
-    try:
-        for number in range(first, iterations):
-            figures = trainer.step(*draw(number))
-            done = number + 1
-            if done % SAVE_EVERY == 0:
+    with held(folder):
+        path, first = folder / "lora.safetensors", 0
+        if path.exists():
+            if not resume:
+                raise RunError(f"{folder} holds a training already; go on with --resume, or choose another folder.")
+            first = int(json.loads(model.load(path).get("iteration", "0")))
+        trainer = DiffusionTrainer(model, perceptual=perceptual)
+        progress.stage("train", iterations, min(first, iterations))
+        done = first
+        try:
+            for number in range(first, iterations):
+                figures = trainer.step(*draw(number))
+                done = number + 1
+                if done % SAVE_EVERY == 0:
+                    model.save(path, {"iteration": str(done)})
+                progress.advance(1, **figures)
+        finally:
+            if done > first:
                 model.save(path, {"iteration": str(done)})
-            progress.advance(1, **figures)
-    finally:
-        if done > first:
-            model.save(path, {"iteration": str(done)})
     return path

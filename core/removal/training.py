@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -14,6 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..errors import Cancelled, RunError, SettingsError
+from ..files import held
+from ..processes import cores
 from ..progress import Progress
 from . import weights
 from .backgrounds import Backgrounds
@@ -40,7 +41,7 @@ MOST_BESIDE_A_CARD = 8
 
 def processes_here() -> int:
     """How many processes a training is best shared among on this machine."""
-    return min(os.cpu_count() or 1, MOST_LEARNERS if device().type == "cpu" else MOST_BESIDE_A_CARD)
+    return min(cores(), MOST_LEARNERS if device().type == "cpu" else MOST_BESIDE_A_CARD)
 
 
 def checks(backgrounds: Backgrounds, lenses: Sequence[Prescription], count: int = CHECKS) -> dict[str, list[Pair]]:
@@ -71,18 +72,18 @@ def train(recipe: Recipe, folder: Path | str, backgrounds: Backgrounds, lenses: 
     processes = processes_here() if processes is None else processes
     if processes < 1:
         raise SettingsError(f"A training has at least one process, not {processes}.")
-    folder.mkdir(parents=True, exist_ok=True)
-    path = folder / CHECKPOINT
-    if path.exists() and not resume:
-        raise RunError(f"{folder} holds a training already; go on with --resume, or choose another folder.")
-    beginning = Beginning(recipe, path if path.exists() else start, path.exists(), backgrounds, lenses, own)
-    trainer = beginning.trainer(ALONE)  # before others are asked: it may refuse
-    learners, drawing = (processes, 0) if trainer.device.type == "cpu" else (1, processes - 1)
-    with shared(learners, _learn, beginning) as learner:
-        trainer.learner = learner
-        batches = drawn_ahead(beginning.batches(trainer), trainer.iteration, trainer.recipe.iterations, drawing)
-        held_out = checks(*tests) if tests else {}
-        _run(trainer, batches, folder, held_out, bool(held_out) and own is None, save_every_s, progress)
+    with held(folder):
+        path = folder / CHECKPOINT
+        if path.exists() and not resume:
+            raise RunError(f"{folder} holds a training already; go on with --resume, or choose another folder.")
+        beginning = Beginning(recipe, path if path.exists() else start, path.exists(), backgrounds, lenses, own)
+        trainer = beginning.trainer(ALONE)  # before others are asked: it may refuse
+        learners, drawing = (processes, 0) if trainer.device.type == "cpu" else (1, processes - 1)
+        with shared(learners, _learn, beginning) as learner:
+            trainer.learner = learner
+            batches = drawn_ahead(beginning.batches(trainer), trainer.iteration, trainer.recipe.iterations, drawing)
+            held_out = checks(*tests) if tests else {}
+            _run(trainer, batches, folder, held_out, bool(held_out) and own is None, save_every_s, progress)
     return folder / WEIGHTS
 
 

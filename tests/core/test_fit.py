@@ -22,6 +22,7 @@ import torch
 
 from core.capture import Capture, Light
 from core.errors import Cancelled, CaptureError, FlareFileError, RunError, SettingsError
+from core.files import held
 from core.fit import FitSettings, Run, checkpoint, fit, preset
 from core.fit.beginning import NEAREST_PART, nearest_depth
 from core.fit.frames import Frames
@@ -164,6 +165,16 @@ def test_stopped_and_resumed_is_bit_for_bit_the_unbroken_fit(tmp_path: Path, cap
     assert expected.keys() == got.keys()
     for name, tensor in expected.items():
         assert torch.equal(tensor, got[name]), name
+
+
+def test_two_fits_do_not_share_a_folder(tmp_path: Path, capture: Capture) -> None:
+    with pytest.raises(Cancelled):
+        fit(capture, quick(), tmp_path / "run", StopAt(2))
+    with held(tmp_path / "run"):
+        for folder_resumes in (True, False):
+            with pytest.raises(RunError, match="Another process"):
+                fit(capture, quick(), tmp_path / "run", resume=folder_resumes)
+    assert fit(capture, quick(), tmp_path / "run", resume=True).finished
 
 
 def test_killed_and_resumed_leaves_nothing_half_written(tmp_path: Path, capture: Capture) -> None:

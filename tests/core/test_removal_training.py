@@ -14,6 +14,7 @@ import pytest
 import torch
 
 from core.errors import Cancelled, RunError, SettingsError
+from core.files import held
 from core.metrics.lpips import Lpips
 from core.pictures import Pixels, write_png
 from core.progress import Progress
@@ -65,6 +66,8 @@ def test_a_training_that_was_stopped_goes_on_as_if_it_was_not(tmp_path: Path) ->
                        progress=StopAfter(2))
     with pytest.raises(RunError, match="--resume"):
         training.train(RECIPE, tmp_path / "parts", backgrounds(), built_in())
+    with held(tmp_path / "parts"), pytest.raises(RunError, match="Another process"):
+        training.train(RECIPE, tmp_path / "parts", backgrounds(), built_in(), resume=True)
     parts = training.train(RECIPE, tmp_path / "parts", backgrounds(), built_in(), resume=True, processes=2)
     a, b = weights.read(whole)[0], weights.read(parts)[0]
     assert a.keys() == b.keys()

@@ -57,7 +57,8 @@ class Batches(Dataset[Batch]):
         """A frame of an iteration, of that size."""
         self._made.renew_to(self._recipe.bank + iteration // self._recipe.renew_every)
         random = np.random.default_rng((self._recipe.seed, iteration, number + 1))  # to numpy, (1, 2) is (1, 2, 0)
-        return pair(random, self._bank, self._backgrounds, width, height, clean=self._recipe.clean)
+        return pair(random, self._bank, self._backgrounds, width, height, clean=self._recipe.clean,
+                    against_light=self._recipe.against_light)
 
 
 def drawn_ahead(batches: Batches, first: int, end: int, processes: int) -> Iterator[Batch]:

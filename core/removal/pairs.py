@@ -45,15 +45,22 @@ class Pair:
 
 
 def pair(random: Random, bank: Bank, backgrounds: Backgrounds, width: int, height: int, *,
-         clean: float = 0.08) -> Pair:
-    """One frame of that size; a share `clean` of all has no flare."""
+         clean: float = 0.08, against_light: float = 0.0) -> Pair:
+    """One frame of that size; a share `clean` of all has no flare. In a share `against_light` the lights are where
+    the scene is bright, as a sun is in its sky; in the others anywhere."""
     gamma = float(random.uniform(*GAMMAS))
     scene = _exposed(random, backgrounds.draw(random, width, height, gamma))
     rest, glare, light = (np.zeros_like(scene) for _ in range(3))
     bare = random.random() < clean
+    against = against_light > 0 and random.random() < against_light
     for number in range(1 if random.random() < 0.85 else 2):
         layers = bank.draw(random)
-        r, g, li = _placed(random, layers, width, height, 1.0 if number == 0 else random.uniform(0.1, 1))
+        matrix = _laid(random, layers, width, height)
+        if against and layers.lights:
+            matrix, bright = _against_light(random, layers, matrix, scene)
+            if number == 0 and random.random() < 0.5:
+                scene = scene * np.float32(np.clip(random.uniform(0.4, 2) / max(bright, 1e-3), 0.3, 3))
+        r, g, li = _placed(random, layers, matrix, width, height, 1.0 if number == 0 else random.uniform(0.1, 1))
         rest, glare, light = rest + r, glare + g, np.maximum(light, li)
     if bare:
         rest, glare, light = rest * 0, glare * 0, light * float(random.random() < 0.5)
@@ -77,12 +84,9 @@ def _exposed(random: Random, scene: Pixels) -> Pixels:
     return scene * (gain * balance).astype(np.float32)
 
 
-def _placed(random: Random, layers: Layers, width: int, height: int,
-            strength: float) -> tuple[Pixels, Pixels, Pixels]:
-    """The canvas turned, scaled, mirrored, sheared a little and cut to the frame, its middle at the frame's
-    middle in four of five; then coloured, and what the glow saturates near a light given to the light."""
-    import cv2
-
+def _laid(random: Random, layers: Layers, width: int, height: int) -> NDArray[Any]:
+    """(2, 3) from canvas to frame in pixels: turned, scaled, mirrored and sheared a little, the canvas's middle at the
+    frame's middle in four of five."""
     size = layers.rest.shape[0]
     half = math.hypot(width, height) / 2
     zoom = half / (size / 2) * random.uniform(0.85, 1.5)
@@ -93,7 +97,43 @@ def _placed(random: Random, layers: Layers, width: int, height: int,
     linear = zoom * (spin * np.array([flip, 1.0])) @ stretch
     shift = random.normal(0, 0.01 if random.random() < 0.8 else 0.25, 2) * half
     offset = np.array([width / 2, height / 2]) + shift - linear @ np.array([size / 2, size / 2])
-    matrix = np.concatenate([linear, offset[:, None]], 1)
+    return np.concatenate([linear, offset[:, None]], 1)
+
+
+TURNS = 12
+"""Ways of laying a flare, of which the one with its light in the brightest place is taken."""
+
+
+def _against_light(random: Random, layers: Layers, matrix: NDArray[Any],
+                   scene: Pixels) -> tuple[NDArray[Any], float]:
+    """Of `matrix` and others the one that has the first light where the scene is brightest, and how bright it is
+    there; for a light off the frame at the frame's edge."""
+    import cv2
+
+    height, width = scene.shape[:2]
+    columns, rows = max(width // 16, 1), max(height // 16, 1)
+    brightness = cv2.resize(scene, (columns, rows), interpolation=cv2.INTER_AREA).mean(-1)
+    best = -1.0
+    for other in [matrix, *(_laid(random, layers, width, height) for _ in range(TURNS - 1))]:
+        x, y = _on_frame(other, layers, layers.lights[0])
+        there = float(brightness[int(np.clip(y / height * rows, 0, rows - 1)),
+                                 int(np.clip(x / width * columns, 0, columns - 1))])
+        if there > best:
+            matrix, best = other, there
+    return matrix, best
+
+
+def _on_frame(matrix: NDArray[Any], layers: Layers, place: tuple[float, float]) -> NDArray[Any]:
+    """(x, y) in pixels of a place on the canvas."""
+    return matrix[:, :2] @ ((np.array(place) + 1) * layers.rest.shape[0] / 2) + matrix[:, 2]
+
+
+def _placed(random: Random, layers: Layers, matrix: NDArray[Any], width: int, height: int,
+            strength: float) -> tuple[Pixels, Pixels, Pixels]:
+    """The canvas cut to the frame; then coloured, and what the glow saturates near a light given to the light."""
+    import cv2
+
+    half = math.hypot(width, height) / 2
     rest, glare, light = (cv2.warpAffine(layer, matrix, (width, height),
                                          flags=cv2.INTER_LINEAR)
                           for layer in (layers.rest, layers.glare, layers.light))
@@ -109,7 +149,7 @@ def _placed(random: Random, layers: Layers, width: int, height: int,
     near = np.zeros((height, width), np.float32)
     x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
     for place in layers.lights:
-        at = linear @ ((np.array(place) + 1) * size / 2) + offset
+        at = _on_frame(matrix, layers, place)
         near = np.maximum(near, np.exp(-((x - at[0]) ** 2 + (y - at[1]) ** 2) / np.float32((0.35 * half) ** 2)))
     red, green, blue = np.moveaxis(rest + glare, -1, 0)
     least = np.minimum(np.minimum(red, green), blue)

@@ -153,6 +153,28 @@ def test_pairs_are_brighter_with_flare_and_keep_the_light() -> None:
     assert np.array_equal(again.frame, made[3].frame)
 
 
+def test_against_the_light_lights_are_where_the_scene_is_bright() -> None:
+    """In a picture that is bright in its upper right quarter, and dark in the rest."""
+    scene = np.full((64, 96, 3), 0.02, np.float32)
+    scene[:32, 48:] = 0.7
+    made = flare((2, 0), 128, lenses.built_in(), "glare")
+    layers = Single(made).draw(np.random.default_rng(0))
+    there: list[bool] = []
+    anywhere: list[bool] = []
+    for seed in range(60):
+        random = np.random.default_rng(seed)
+        first = pairs._laid(random, layers, 96, 64)
+        matrix, bright = pairs._against_light(random, layers, first, scene)
+        for places, laid in ((there, matrix), (anywhere, first)):
+            x, y = pairs._on_frame(laid, layers, layers.lights[0])
+            places.append(bool(x > 48 and y < 32))
+        assert bright == pytest.approx(0.7 if there[-1] else 0.02, abs=1e-3)
+    assert np.mean(there) > 0.9 > 0.6 > np.mean(anywhere)
+    dark, lit = (np.mean([pairs.pair(np.random.default_rng(seed), Single(made), backgrounds(), 96, 64, clean=0,
+                                     against_light=share).scene.mean() for seed in range(30)]) for share in (0, 1))
+    assert lit > dark, "half of them are exposed for that"
+
+
 def test_a_share_of_the_pairs_is_clean() -> None:
     bank = Single(flare((2, 0), 128, lenses.built_in(), "glare"))
     one = pairs.pair(np.random.default_rng(1), bank, backgrounds(), 96, 64, clean=1)

@@ -38,7 +38,7 @@ def shot_of(scene: Any, flare: Path, names: Sequence[str], frames: Sequence[int]
     for frame in frames:
         scene.frame_set(frame)
         depsgraph = bpy.context.evaluated_depsgraph_get()
-        if scene.camera is None:
+        if scene.camera is None or scene.camera.type != "CAMERA":
             raise CaptureError(f"The scene {scene.name!r} has no active camera; set one.")
         camera = scene.camera.evaluated_get(depsgraph)
         core = cameras.core_camera(camera.data, camera.matrix_world, scene.render)
@@ -83,8 +83,9 @@ def capture_of(scene: Any, plates: Mapping[int, Path], folder: Path, names: Sequ
     plates: the picture of each frame. Raises CaptureError where the scene lacks a camera, or anything to begin a fit
     from.
     """
-    if scene.camera is None:
+    if scene.camera is None or scene.camera.type != "CAMERA":
         raise CaptureError(f"The scene {scene.name!r} has no active camera; set one.")
+    capture_export.check_free(folder, plates)
     things = _lights(scene, names)
     points = capture_export.points_of(scene, scene.camera)
     if not len(points):

@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import re
 import shutil
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,7 @@ from ..core.capture.transforms import FILE as TRANSFORMS
 from ..core.errors import CaptureError
 from ..core.files import atomic_path, read_json, write_json
 from . import cameras
-from .paths import stored
+from .paths import absolute, stored
 
 MOST_POINTS = 100_000
 MAKER = "Fit Flare"
@@ -50,13 +51,14 @@ def footage_of(camera: Any) -> Footage | None:
     """The image sequence behind a camera: of its background images, or of the movie clip there."""
     for back in camera.data.background_images if camera.type == "CAMERA" else ():
         if back.source == "IMAGE" and back.image is not None and back.image.source == "SEQUENCE":
-            user, path = back.image_user, Path(bpy.path.abspath(back.image.filepath))
+            user, path = back.image_user, absolute(back.image.filepath, back.image.library)
             match = _NUMBER.search(path.stem)
             shown = user.frame_start - user.frame_offset - 1 + int(match[1]) if match else user.frame_start
             # The sequence shows file number `frame - frame_start + 1 + frame_offset`.
             return Footage(path, shown)
         if back.source == "MOVIE_CLIP" and back.clip is not None and back.clip.source == "SEQUENCE":
-            return Footage(Path(bpy.path.abspath(back.clip.filepath)), back.clip.frame_start - back.clip.frame_offset)
+            return Footage(absolute(back.clip.filepath, back.clip.library),
+                           back.clip.frame_start - back.clip.frame_offset)
     return None
 
 
@@ -64,9 +66,8 @@ def export(scene: Any, folder: Path) -> int:
     """Write a capture of the scene's camera over the scene's frames, and make it the scene's; how many frames.
 
     Raises CaptureError where a frame's picture is missing or there is nothing to start a fit from, and for a folder
-    with another capture.
+    with another capture, or pictures that would be lost.
     """
-    check_free(folder)
     camera = scene.camera
     footage = footage_of(camera) if camera is not None else None
     if footage is None:
@@ -76,6 +77,7 @@ def export(scene: Any, folder: Path) -> int:
     if len(pictures) < 3:
         raise CaptureError(f"Of the frames that the camera shows, {len(pictures)} are there as pictures beside "
                            f"{footage.first}; set the scene's frame range to the footage.")
+    check_free(folder, pictures)
     points = points_of(scene, camera)
     if not len(points):
         raise CaptureError("There are no points to begin a fit from; solve the camera with the motion tracker, or "
@@ -95,13 +97,21 @@ def export(scene: Any, folder: Path) -> int:
     return len(entries)
 
 
-def check_free(folder: Path) -> None:
+def check_free(folder: Path, plates: Mapping[int, Path]) -> None:
     """Raises CaptureError for a folder with a capture that was not made here: its frames would be lost, or its solve
-    be read in place of what is written."""
-    known = read_json(folder / TRANSFORMS, CaptureError) if (folder / TRANSFORMS).exists() else {"made_by": MAKER}
+    be read in place of what is written; and where pictures that are no capture's, or the plates themselves under
+    other numbers, would be replaced. plates: the picture of each frame."""
+    is_capture = (folder / TRANSFORMS).exists()
+    known = read_json(folder / TRANSFORMS, CaptureError) if is_capture else {"made_by": MAKER}
     ours = isinstance(known, dict) and known.get("made_by") == MAKER
     if find_model(folder) is not None or not ours:
         raise CaptureError(f"{folder} holds another capture already; choose another folder.")
+    for frame, plate in plates.items():
+        picture = folder / _picture(frame, plate)
+        if not picture.exists() or picture.samefile(plate):
+            continue
+        if not is_capture or plate.parent.resolve() == picture.parent.resolve():
+            raise CaptureError(f"{picture} is there already and would be replaced by {plate}; choose another folder.")
 
 
 def write_cameras(folder: Path, entries: list[dict[str, Any]]) -> None:
@@ -115,18 +125,23 @@ def entry_of(scene: Any, camera: Any, frame: int, path: Path, folder: Path) -> d
     depsgraph = bpy.context.evaluated_depsgraph_get()
     evaluated = camera.evaluated_get(depsgraph)
     core = cameras.core_camera(evaluated.data, evaluated.matrix_world, scene.render)
-    name = f"images/{frame:06d}{path.suffix.lower()}"
+    name = _picture(frame, path)
     target = folder / name
     target.parent.mkdir(parents=True, exist_ok=True)
     if not _is_copy(target, path):
         target.unlink(missing_ok=True)  # not written into: it may be linked to an earlier plate
         try:
-            os.link(path, target)
+            os.link(path.resolve(), target)  # of a symbolic link Linux would link that, to where it leads from here
         except OSError:  # another disk, or a file system without links
             shutil.copy2(path, target)
     pose = cameras.camera_to_world(evaluated.matrix_world) @ cameras.FLIP
     return {"file_path": name, "w": core.width, "h": core.height, "fl_x": core.fx, "fl_y": core.fy, "cx": core.cx,
             "cy": core.cy, **distortion_of(camera, path), "transform_matrix": pose.tolist()}
+
+
+def _picture(frame: int, plate: Path) -> str:
+    """A frame's picture in the capture."""
+    return f"images/{frame:06d}{plate.suffix.lower()}"
 
 
 def _is_copy(target: Path, path: Path) -> bool:
@@ -150,7 +165,7 @@ def distortion_of(camera: Any, path: Path) -> dict[str, float]:
     """
     for back in camera.data.background_images:
         clip = back.clip if back.source == "MOVIE_CLIP" else None
-        if clip is None or Path(bpy.path.abspath(clip.filepath)).parent.resolve() != path.parent.resolve():
+        if clip is None or absolute(clip.filepath, clip.library).parent.resolve() != path.parent.resolve():
             continue
         lens = clip.tracking.camera
         if lens.distortion_model == "POLYNOMIAL":

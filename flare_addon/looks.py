@@ -78,7 +78,7 @@ def use(scene: Any, path: Path | str) -> Look:
             item.target = objects[light.name]
         _elements(item, light)
     state.light = min(state.light, max(len(state.lights) - 1, 0))
-    state.native = _is_of(look, state.root, objects)
+    state.native = _is_of(look, state, objects)
     return look
 
 
@@ -91,10 +91,12 @@ def remove(scene: Any, number: int) -> None:
         wires.wire(scene, {layer: one - (one > number) for layer, one in gains.items() if one != number})
 
 
-def _is_of(look: Look, root: Any, objects: dict[str, Any]) -> bool:
-    """Whether the look was learned in the capture that `root` carries: its lights are where they were then."""
+def _is_of(look: Look, state: Any, objects: dict[str, Any]) -> bool:
+    """Whether the look was learned in the scene's capture: its lights are where they were then. The world of a capture
+    that was made of Blender's own camera, which has no root, is Blender's."""
+    root = state.root
     shared = [light for light in look.lights if light.name in objects]
-    if root is None or not shared:
+    if not (root is not None or state.capture) or not shared:
         return False
     extent = max(float(np.linalg.norm(light.query_range.camera_high - light.query_range.camera_low))
                  for light in shared)
@@ -149,7 +151,7 @@ def twice(state: Any) -> str:
 
 def query_of(state: Any) -> Query:
     """What appearance follows: the view itself in the capture's own scene, else the middle of what was trained."""
-    return "target" if state.root is not None and state.native else "source"
+    return "target" if state.native else "source"
 
 
 def placed(scene: Any, depsgraph: Any, camera: Any) -> tuple[NDArray[np.float64], list[PlacedLight]]:

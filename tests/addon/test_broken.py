@@ -103,6 +103,15 @@ def test_an_engine_that_dies_is_told(said: Any) -> None:
     assert {fits[f"{how}, state"] for how in ("dies", "refuses", "chatters", "ends")} == {"none"}
 
 
+def test_a_stop_before_the_engine_listens_is_a_stop(said: Any) -> None:
+    assert said["stopped before it listened"] == ["stopped", "Stopped as asked before it began."]
+
+
+def test_an_engine_that_cannot_be_executed_is_not_the_folders_fault(said: Any) -> None:
+    assert "python cannot be started (" in said["cannot be executed"]
+    assert said["cannot be executed"].endswith("; set up the engine in the preferences.")
+
+
 def test_a_fit_that_ends_well_shows_its_flare(said: Any) -> None:
     assert said["a fit that ends well"] == ["", "finished", True]
 

@@ -126,6 +126,19 @@ with contextlib.suppress(part("core.errors").FitFlareError):
 said["dies without a word"] = jobs.find(long_ago).error
 jobs.forget(long_ago)
 said["dies without a word, found again"] = jobs.find(long_ago).error
+
+# As one that is stopped while it loads its modules: with a status, and without a word to us.
+(long_ago / jobs.STOP).touch()
+jobs.forget(long_ago)
+found = jobs.find(long_ago)
+said["stopped before it listened"] = [found.state, found.error]
+(long_ago / jobs.STOP).unlink()
+not_executable = folder / "python"
+not_executable.touch(mode=0o644)
+try:
+    jobs.start("fit", folder / "cannot", [str(not_executable)])
+except part("core.errors").EngineError as problem:
+    said["cannot be executed"] = str(problem)
 behave("finishes")
 said["a fit that ends well"] = [refusal(lambda: ops.fit()), fits.state_of(scene), scene.fit_flare.flare != ""]
 behave("answers")

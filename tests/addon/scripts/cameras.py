@@ -58,7 +58,7 @@ facts["up"] = {name: list(np.array(Euler(axes[name]).to_matrix()) @ up)
 # Frames: of a custom range, and which file of a sequence a frame of the scene shows.
 custom = SimpleNamespace(bake_range="custom", bake_first=3, bake_last=5)
 facts["custom"] = list(shots.frames_of(SimpleNamespace(fit_flare=custom)))
-sequence = SimpleNamespace(source="SEQUENCE", filepath="/s/plate.1001.exr")
+sequence = SimpleNamespace(source="SEQUENCE", library=None, filepath="/s/plate.1001.exr")
 behind = SimpleNamespace(source="IMAGE", image=sequence,
                          image_user=SimpleNamespace(frame_start=1, frame_offset=1004))
 filmed = part("flare_addon.capture_export").footage_of(
@@ -80,5 +80,6 @@ facts["native"] = []
 for away in (0, 5):
     lamp.location = (away, 0, 0)
     bpy.context.view_layer.update()
-    facts["native"].append(bool(looks._is_of(learned, root, {"lamp": lamp})))
+    facts["native"].append([bool(looks._is_of(learned, SimpleNamespace(root=its, capture=capture), {"lamp": lamp}))
+                            for its, capture in ((root, "//capture"), (None, "//of this camera"), (None, ""))])
 leave(facts)

@@ -1,0 +1,158 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Inside Blender: what belongs to a project stays whole, and is found again where the project goes. Words: the zip, a
+capture, a .flare, a folder."""
+from __future__ import annotations
+
+import shutil
+import sys
+from pathlib import Path
+
+import bpy
+
+sys.path.insert(0, str(Path(__file__).parent))
+from start import empty, install, leave, part, refusal
+
+package, capture, flare, out = sys.argv[1], *map(Path, sys.argv[2:5])
+install(package)
+sys.path.remove(str(Path(__file__).parent))
+ops = bpy.ops.fit_flare
+paths = part("flare_addon.paths")
+export, loaded = part("flare_addon.capture_export"), part("core.capture").Capture
+facts: dict[str, object] = {}
+pictures = sorted((capture / "images").iterdir())[:6]
+
+
+def plates_in(folder: Path) -> Path:
+    """A numbered sequence, and its first picture."""
+    folder.mkdir(parents=True)
+    for number, picture in enumerate(pictures, 1):
+        shutil.copy(picture, folder / f"{number:06d}{picture.suffix}")
+    return folder / f"{1:06d}{pictures[0].suffix}"
+
+
+def filmed(first: Path | str, frame_start: int = 1) -> object:
+    """A scene with a mesh, and with the sequence as a clip behind its camera."""
+    scene = empty()
+    mesh = bpy.data.meshes.new("Set")
+    mesh.from_pydata([(0, 0, -5), (1, 0, -5), (0, 1, -5)], [], [(0, 1, 2)])
+    scene.collection.objects.link(bpy.data.objects.new("Set", mesh))
+    camera = scene.camera = bpy.data.objects.new("Camera", bpy.data.cameras.new("Camera"))
+    scene.collection.objects.link(camera)
+    clip = bpy.data.movieclips.load(str(first))
+    clip.frame_start = frame_start
+    back = camera.data.background_images.new()
+    back.source, back.clip = "MOVIE_CLIP", clip
+    scene.frame_start, scene.frame_end = frame_start, frame_start + len(pictures) - 1
+    scene.render.resolution_x, scene.render.resolution_y = 64, 40  # as the pictures are
+    return scene
+
+
+def contents(folder: Path) -> list[bytes]:
+    return [path.read_bytes() for path in sorted(folder.iterdir())]
+
+
+# ---- plates in the folder that a capture is to go to -------------------------------------------------
+first = plates_in(out / "beside" / "images")
+before = contents(first.parent)
+filmed(first, frame_start=3)
+facts["under other numbers"] = [refusal(lambda: ops.capture_from_camera(directory=str(out / "beside"))),
+                                contents(first.parent) == before]
+filmed(first)
+facts["under their own"] = [refusal(lambda: ops.capture_from_camera(directory=str(out / "beside"))),
+                            contents(first.parent) == before]
+other = plates_in(out / "others" / "images")
+other.write_bytes(b"an original")
+filmed(first)
+facts["over others"] = [refusal(lambda: ops.capture_from_camera(directory=str(out / "others"))), other.read_bytes() ==
+                        b"an original"]
+scene = filmed(first, frame_start=3)
+for _ in range(2):
+    ops.capture_from_camera(directory=str(out / "twice"))
+facts["made again"] = len(loaded.open(out / "twice").views)
+filmed(sorted((out / "twice" / "images").iterdir())[0], frame_start=5)
+facts["of its own pictures"] = refusal(lambda: ops.capture_from_camera(directory=str(out / "twice")))
+
+# ---- plates that are links ---------------------------------------------------------------------------
+links = out / "links"
+links.mkdir()
+try:
+    for path in sorted(first.parent.iterdir()):
+        (links / path.name).symlink_to(Path("..") / "beside" / "images" / path.name)
+    filmed(links / first.name)
+    ops.capture_from_camera(directory=str(out / "linked"))
+    facts["links"] = len(loaded.open(out / "linked").views)
+    shutil.rmtree(links)
+    facts["links"] = [facts["links"], len([path for path in (out / "linked" / "images").iterdir() if path.is_file()])]
+except OSError:
+    facts["links"] = [len(pictures), len(pictures)]  # a system that lets nobody make them
+
+# ---- a camera that is linked from another folder's .blend -------------------------------------------
+asset = plates_in(out / "assets" / "plates")
+filmed(asset)
+bpy.ops.wm.save_as_mainfile(filepath=str(out / "assets" / "camera.blend"))
+bpy.data.movieclips[0].filepath = "//plates/" + asset.name
+bpy.ops.wm.save_mainfile()
+scene = empty()
+(out / "shots").mkdir()
+bpy.ops.wm.save_as_mainfile(filepath=str(out / "shots" / "shot.blend"))
+with bpy.data.libraries.load(str(out / "assets" / "camera.blend"), link=True) as (_, into):
+    into.objects = ["Camera"]
+facts["linked camera"] = export.footage_of(into.objects[0]).path(2).is_file()
+
+# ---- a scene that is appended to another project ------------------------------------------------------
+scene = empty()
+scene.name = "Shot"
+(out / "p1").mkdir()
+(out / "p2").mkdir()
+bpy.ops.wm.save_as_mainfile(filepath=str(out / "p1" / "shot.blend"))
+scene.fit_flare.layers, scene.fit_flare.capture = "//layers", str(out / "twice")
+bpy.ops.wm.save_mainfile()
+empty()
+bpy.ops.wm.save_as_mainfile(filepath=str(out / "p2" / "other.blend"))
+bpy.ops.wm.append(directory=str(out / "p1" / "shot.blend" / "Scene") + "/", filename="Shot")
+state = bpy.data.scenes["Shot"].fit_flare
+wanted = [out / "p1" / "layers", out / "twice"]
+facts["tells of imports"] = hasattr(bpy.app.handlers, "blend_import_post")
+facts["appended"] = [paths.absolute(text) == path for text, path in zip((state.layers, state.capture), wanted,
+                                                                        strict=True)]
+
+# ---- a capture imported into a project that moves ------------------------------------------------------
+project = out / "project"
+shutil.copytree(capture, project / "desk")
+scene = empty()
+bpy.ops.wm.save_as_mainfile(filepath=str(project / "shot.blend"))
+ops.import_capture(directory=str(project / "desk"))
+ops.import_capture(directory=str(project / "desk"), cameras="each")
+ops.import_capture(directory=str(project / "desk"), cameras="animated")
+bpy.ops.wm.save_mainfile()
+project.rename(out / "moved")
+bpy.ops.wm.open_mainfile(filepath=str(out / "moved" / "shot.blend"))
+behind = [back.image for camera in bpy.data.cameras for back in camera.background_images]
+facts["footage after a move"] = all(paths.absolute(image.filepath).is_file() for image in behind)
+facts["stills and sequences"] = sorted({(image.source, len(camera.background_images))
+                                        for camera in bpy.data.cameras for back in camera.background_images
+                                        for image in [back.image]})
+
+# ---- a fit that ends while its scene is not the one in the window ---------------------------------------
+looks, lights = part("flare_addon.looks"), part("flare_addon.lights")
+scene = empty()
+ops.import_capture(directory=str(capture))
+scene.name = "Shot"
+bpy.context.window.scene = bpy.data.scenes.new("Other")
+bpy.ops.wm.save_as_mainfile(filepath=str(out / "two.blend"))
+bpy.ops.wm.open_mainfile(filepath=str(out / "two.blend"))
+scene = bpy.data.scenes["Shot"]
+place = {light.name: light.xyz + 0.1 for light in part("core.capture").read_lights(capture / "lights.json")}
+lights.follow(scene, place, capture)
+facts["moved unseen"] = max(abs(float(lights.place_of(item, scene.fit_flare.root)[0])
+                                - float(place[lights.name_of(item)][0])) for item in lights.of_scene(scene))
+
+# ---- another flare is saved into the library while one is chosen ----------------------------------------
+library, look = part("flare_addon.library"), part("core.look").read(flare)
+for name in ("mid", "zed"):
+    library.save(look, name, "", "")
+manager = bpy.context.window_manager
+manager.fit_flare_library = next(item[0] for item in library.items() if item[1] == "zed")
+library.save(look, "aaa", "", "")
+facts["chosen"] = Path(manager.fit_flare_library).stem
+leave(facts)

@@ -1,0 +1,64 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Nothing of a project is lost to another part of it, and all of it is found where it goes."""
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from blenders import Blender
+from test_work import a_flare
+
+from tests.core.flared import flared_capture
+
+SCRIPTS = Path(__file__).parent / "scripts"
+
+
+@pytest.fixture(scope="session")
+def facts(blender: Blender, package: Path, tmp_path_factory: pytest.TempPathFactory) -> Any:
+    base = tmp_path_factory.mktemp("projects")
+    capture, flare = flared_capture(base / "capture", 6), a_flare(base / "lamp.flare")
+    return blender.run(SCRIPTS / "projects.py", package, capture, flare, base / "out", user=base / "user")
+
+
+@pytest.mark.parametrize("how", ["under other numbers", "over others"])
+def test_plates_are_not_replaced_by_those_of_a_capture(facts: Any, how: str) -> None:
+    said, whole = facts[how]
+    assert "is there already and would be replaced by" in said and "choose another folder" in said
+    assert whole
+
+
+def test_plates_may_be_the_captures_own(facts: Any) -> None:
+    assert facts["under their own"] == ["", True]
+
+
+def test_a_capture_is_made_again_but_not_of_itself(facts: Any) -> None:
+    assert facts["made again"] == 6
+    assert "would be replaced by" in facts["of its own pictures"]
+
+
+def test_plates_that_are_links_are_the_captures_as_pictures(facts: Any) -> None:
+    assert facts["links"] == [6, 6]
+
+
+def test_plates_of_a_linked_camera_are_found_beside_its_file(facts: Any) -> None:
+    assert facts["linked camera"]
+
+
+def test_an_appended_scene_keeps_its_places(facts: Any) -> None:
+    if facts["appended"] == [False, True] and not facts["tells of imports"]:
+        pytest.skip("this Blender says nothing of what was appended")
+    assert facts["appended"] == [True, True]
+
+
+def test_footage_goes_with_its_project(facts: Any) -> None:
+    assert facts["footage after a move"]
+    assert facts["stills and sequences"] == [["FILE", 1], ["SEQUENCE", 1]]
+
+
+def test_lights_follow_a_fit_in_a_scene_that_no_window_shows(facts: Any) -> None:
+    assert facts["moved unseen"] < 1e-4
+
+
+def test_the_chosen_flare_of_the_library_stays_chosen(facts: Any) -> None:
+    assert facts["chosen"] == "zed"

@@ -153,7 +153,7 @@ def _cameras(collection: Any, root: Any, capture: Capture, extent: float, settin
                 camera = _camera(collection, root, Path(view.name).stem, view, aspect, 0.08 * extent)
                 camera.fit_flare.view = view.name
                 if settings.frames:
-                    _backdrop(camera, bpy.data.images.load(str(capture.frame_path(view)), check_existing=True))
+                    _backdrop(camera, _loaded(capture.frame_path(view)))
                 made.append(camera)
     return tuple(made)
 
@@ -225,20 +225,28 @@ def keys(block: Any, channels: dict[str, NDArray[Any]], frames: Sequence[int]) -
             curve.update()
 
 
+def _loaded(path: Path, source: str = "FILE") -> Any:
+    """The picture, or the sequence that begins with it: the image that is here for it, unless that one is the other of
+    the two. By a path that goes with a .blend into another place."""
+    image = bpy.data.images.load(str(path), check_existing=True)
+    if image.users and image.source != source:
+        image = bpy.data.images.load(str(path))
+    if not image.users:
+        image.source, image.filepath = source, stored(path)
+    return image
+
+
 def _footage(camera: Any, capture: Capture, views: Sequence[View], numbers: Sequence[int]) -> bool:
-    """The frames as one sequence behind the camera; False where their names are no sequence."""
+    """The frames as one sequence behind the camera; False, and the first alone, where their names are no sequence."""
     paths = [capture.frame_path(view) for view in views]
-    image = bpy.data.images.load(str(paths[0]), check_existing=True)
-    back = _backdrop(camera, image)
-    if len(paths) == 1:
-        return True
-    patterns = {(path.parent, _NUMBER.sub("#" * 1, path.name)) for path in paths}
+    patterns = {(path.parent, _NUMBER.sub("#", path.name)) for path in paths}
     found = [_NUMBER.search(path.stem) for path in paths]
-    if len(patterns) > 1 or any(match is None or int(match[1]) != number
-                                for match, number in zip(found, numbers, strict=True)):
-        return False
-    image.source = "SEQUENCE"
-    user = back.image_user
+    in_order = len(patterns) == 1 and all(match is not None and int(match[1]) == number
+                                          for match, number in zip(found, numbers, strict=True))
+    if len(paths) == 1 or not in_order:
+        _backdrop(camera, _loaded(paths[0]))
+        return len(paths) == 1
+    user = _backdrop(camera, _loaded(paths[0], "SEQUENCE")).image_user
     user.frame_start, user.frame_offset = numbers[0], numbers[0] - 1
     user.frame_duration = numbers[-1] - numbers[0] + 1
     user.use_auto_refresh = True
@@ -258,7 +266,7 @@ def show_footage(scene: Any, which: str) -> int:
         for back in camera.data.background_images:
             if back.image is None:
                 continue
-            path = Path(bpy.path.abspath(back.image.filepath)).resolve()
+            path = absolute(back.image.filepath, back.image.library).resolve()
             inner = next((path.relative_to((base / name).resolve()) for name in ("images", "removed")
                           if path.is_relative_to((base / name).resolve())), None)
             if inner is None:

@@ -101,7 +101,8 @@ def items(_self: Any = None, _context: Any = None) -> list[tuple[str, str, str, 
         _previews = previews.new()
     _previews.clear()
     found = []
-    for number, (name, _) in enumerate(stamps):
+    for name, _ in stamps:
+        number = zlib.crc32(name.encode("utf-8", "surrogateescape")) & 0x7FFFFFFF  # the same beside any others
         path = Path(name)
         try:
             look = read(path)

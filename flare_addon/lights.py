@@ -189,6 +189,7 @@ def follow(scene: Any, places: Mapping[str, ArrayLike], capture: Path | None) ->
     the fit was given them, as the capture's lights.json has it, and that nothing else moves."""
     path = None if capture is None else capture / "lights.json"
     given = {} if path is None or not path.is_file() else {light.name: light.xyz for light in read_lights(path)}
+    view_layer_of(scene).update()  # Blender has not looked at one that no window shows since the file was opened
     for item in of_scene(scene):
         name = name_of(item)
         if name in places and name in given and item.parent == scene.fit_flare.root and item.animation_data is None:

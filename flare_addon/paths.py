@@ -75,7 +75,22 @@ def _put_back(blend: str, *_: object) -> None:
     _before.clear()
 
 
-_HANDLERS = (("save_pre", _remap), ("save_post", _put_back), ("save_post_fail", _put_back))
+@bpy.app.handlers.persistent
+def _take_along(context: Any, *_: object) -> None:
+    """After scenes of another .blend were appended: their paths, which are told from there."""
+    for item in context.import_items:
+        if item.id_type != "SCENE" or item.id is None or item.id.library is not None or item.source_library is None:
+            continue
+        there = Path(bpy.path.abspath(item.source_library.filepath)).parent
+        for name in OURS:
+            text = getattr(item.id.fit_flare, name)
+            if text.startswith("//"):
+                setattr(item.id.fit_flare, name, stored(there / text[2:].replace("\\", "/")))
+
+
+_HANDLERS = [("save_pre", _remap), ("save_post", _put_back), ("save_post_fail", _put_back)]
+if hasattr(bpy.app.handlers, "blend_import_post"):  # from 4.3 on
+    _HANDLERS.append(("blend_import_post", _take_along))
 
 
 def register() -> None:

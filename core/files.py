@@ -33,6 +33,8 @@ _HELD = (5, 32, 33)  # Windows: access denied, sharing violation, lock violation
 _PATIENCE_S = 2.0
 _WRITER = re.compile(r"-(?P<process>\d+)@(?P<machine>[0-9a-f]{8})-")
 _ABANDONED_S = 3600.0
+_DRIVE = re.compile(r".*:" if os.name == "nt" else r"[A-Za-z]:")
+"""As the first part of a name begins; on Windows any colon, which would name a stream of a file as well."""
 _OF_DEVICES = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\.|$)", re.IGNORECASE)
 
 
@@ -310,7 +312,7 @@ def inside(folder: Path | str, name: str, error: type[FitFlareError]) -> Path:
     """
     folder = Path(folder)
     parts = Path(name.replace("\\", "/"))
-    if (not parts.parts or "\0" in name or parts.is_absolute() or ":" in parts.parts[0]
+    if (not parts.parts or "\0" in name or parts.is_absolute() or _DRIVE.match(parts.parts[0])
             or ".." in parts.parts or not all(map(_is_file_name, parts.parts))):
         raise error(f"{folder} names the file {name!r:.150}, which is not inside the folder; remove that entry.")
     path = folder / parts

@@ -179,6 +179,8 @@ class Job:
         elif _is_full(self.folder):  # then its last words found no room either
             self.state = "failed"
             self.error = f"The disk of {self.folder} is full; make room and start it again, what is finished is kept."
+        elif (self.folder / STOP).exists():  # before it listened
+            self.state, self.error = "stopped", "Stopped as asked before it began."
         else:
             self.state = "failed"
             self.error = f"The engine ended without a result{self._last_words()}; {LOG} in {self.folder} has it all."
@@ -221,9 +223,9 @@ def start(kind: str, folder: Path, command: Sequence[str], environment: Mapping[
         (folder / STOP).unlink(missing_ok=True)
         with open(folder / EVENTS, "wb") as events, open(folder / LOG, "ab") as log:
             log_from = log.tell()
-            process = subprocess.Popen(list(command), stdin=subprocess.DEVNULL, stdout=events, stderr=log,
-                                       env={**(os.environ if environment is None else environment),
-                                            STOP_FILE: str((folder / STOP).absolute())}, **apart)
+            process = _begun(command, stdin=subprocess.DEVNULL, stdout=events, stderr=log,
+                             env={**(os.environ if environment is None else environment),
+                                  STOP_FILE: str((folder / STOP).absolute())}, **apart)
         _yield_to_the_window(process.pid)
         try:
             write_json(folder / RECORD, {"kind": kind, "host": HOST, "pid": process.pid, "started": time.time(),
@@ -231,8 +233,6 @@ def start(kind: str, folder: Path, command: Sequence[str], environment: Mapping[
         except OSError:
             process.kill()  # nobody would find it again
             raise
-    except FileNotFoundError as problem:
-        raise EngineError(f"{command[0]} cannot be started; set up the engine in the preferences.") from problem
     except OSError as problem:
         if problem.errno in DISK_FULL:
             raise RunError(refusal(problem)) from problem
@@ -244,6 +244,15 @@ def start(kind: str, folder: Path, command: Sequence[str], environment: Mapping[
     else:
         _watch()
     return job
+
+
+def _begun(command: Sequence[str], **how: Any) -> subprocess.Popen[bytes]:
+    """Raises EngineError where the system does not start it."""
+    try:
+        return subprocess.Popen(list(command), **how)
+    except OSError as problem:
+        raise EngineError(f"{command[0]} cannot be started ({problem.strerror or problem}); set up the engine in the "
+                          "preferences.") from problem
 
 
 def _yield_to_the_window(pid: int) -> None:

@@ -23,7 +23,7 @@ from .beginning import with_white
 from .doubts import unlike
 from .preview import row, spread, write_preview, write_small
 from .rendering import render
-from .run import CHECKPOINT, FLARE, LOG, METRICS, PREVIEW, SCENE, SMALL_PREVIEW, Run
+from .run import CHECKPOINT, CONFIG, FLARE, LOG, METRICS, PREVIEW, SCENE, SMALL_PREVIEW, Run
 from .settings import FitSettings
 from .trainer import Trainer
 
@@ -42,7 +42,7 @@ def fit(capture: Capture, settings: FitSettings, folder: Path | str, progress: P
     it has begun).
     """
     progress, folder = progress or Progress(), Path(folder)
-    if resume and (folder / "config.toml").exists():
+    if resume and (folder / CONFIG).exists():
         with held(folder):
             run = Run.open(folder)
             _check_capture(run, capture)

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from ...core.errors import RunError, SettingsError
+from ...core.files import check_apart
 from ...core.progress import Progress
 from .. import frames
 from ..command import Command, Step
@@ -43,7 +44,9 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
         raise RunError(f"{words.flare} is missing; name a .flare, or the folder of a run.")
     if folder is None:
         raise SettingsError(f"{words.flare} says nothing of cameras; name a capture with --capture.")
-    look = read(words.flare / FLARE if words.flare.is_dir() else words.flare)
+    source = words.flare / FLARE if words.flare.is_dir() else words.flare
+    check_apart([source], [words.out])
+    look = read(source)
     edits = LookEdits.parse(words.edits, look.names, look.element_names)
     capture = Capture.open(folder, need_frames=False)
     if words.flare.is_dir():

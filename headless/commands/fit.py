@@ -18,6 +18,7 @@ from .remove import with_removed
 
 if TYPE_CHECKING:
     from ...core.capture import Capture
+    from ...core.fit import FitSettings
 
 DECODED_BYTES = 1 << 26
 
@@ -63,8 +64,8 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     from ...core.capture import Capture
-    from ...core.fit import fit
-    from ...core.fit.settings import changed, preset
+    from ...core.fit import Run, fit
+    from ...core.fit.run import CONFIG
 
     if words.listed is not None and words.capture is not None:
         raise SettingsError("fit takes a capture, or a list of them with --list: the one or the other.")
@@ -79,9 +80,24 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
         progress.say(f"{count} runs are in {words.out}.")
         return {"runs": str(words.out), "count": count}
     folder, out = place(words)
-    given = {"model": words.model} if words.model else {}
     # The fit keeps pictures itself, and smaller.
     capture = Capture.open(folder, cache_bytes=DECODED_BYTES)
+    goes_on = words.resume and (out / CONFIG).is_file()
+    settings = Run.open(out).settings if goes_on else chosen(words, capture, progress)
+    if settings.mode != "3dgs":
+        capture = with_lights(capture, progress)
+    if settings.supervised and not settings.scene.frozen and not capture.has_truth:
+        capture = with_removed(capture, progress)
+    done = fit(capture, settings, out, progress, resume=words.resume)
+    progress.say(f"The run is in {done.folder}: see preview.png there, then `eval` and `bake` it.")
+    return {"run": str(done.folder)}
+
+
+def chosen(words: argparse.Namespace, capture: Capture, progress: Progress) -> FitSettings:
+    """The settings that the words ask for. Raises SettingsError."""
+    from ...core.fit.settings import changed, preset
+
+    given = {"model": words.model} if words.model else {}
     mode = words.mode or mode_for(capture, words.freeze_scene, progress)
     settings = preset(words.preset, mode=mode, blend=words.blend, iterations=words.iterations, **given)
     changes = {"width": words.size, "seed": words.seed, "holdout": holdout(words.holdout)}
@@ -91,14 +107,7 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
         changes["scene.start"] = str(words.scene.resolve())
     changes["scene.frozen"] = words.freeze_scene or None
     changes = {name: value for name, value in changes.items() if value is not None}
-    settings = changed(settings, {**changes, **dict(map(change, words.changes))})
-    if settings.mode != "3dgs":
-        capture = with_lights(capture, progress)
-    if settings.supervised and not settings.scene.frozen and not capture.has_truth:
-        capture = with_removed(capture, progress)
-    done = fit(capture, settings, out, progress, resume=words.resume)
-    progress.say(f"The run is in {done.folder}: see preview.png there, then `eval` and `bake` it.")
-    return {"run": str(done.folder)}
+    return changed(settings, {**changes, **dict(map(change, words.changes))})
 
 
 def mode_for(capture: Capture, frozen: bool, progress: Progress) -> str:

@@ -13,7 +13,7 @@ from fit_flare.headless import cli
 
 from core.bake.exr import read_layers
 from core.capture import Capture
-from core.fit import fit, preset
+from core.fit import Run, fit, preset
 from core.fit.settings import changed
 from core.gaussians.ply import read_ply
 from core.pictures import linear_from_srgb, read_picture, srgb_from_linear, write_png
@@ -90,6 +90,28 @@ def test_export_of_a_preset(runs: tuple[Path, Path], tmp_path: Path, frame: int,
         intensities.append([part["intensity"] for element in light["elements"] for part in element["parts"]])
     plain, told = intensities
     np.testing.assert_allclose(np.multiply(told, times), plain, rtol=1e-5)
+
+
+def test_a_preset_does_not_replace_its_flare(runs: tuple[Path, Path], tmp_path: Path,
+                                              capsys: pytest.CaptureFixture[str]) -> None:
+    flare = tmp_path / "sun.flare"
+    shutil.copy(runs[0] / "flare.flare", flare)
+    before = flare.read_bytes()
+    assert cli.main(["export", str(flare), "--as", "preset", "--out", str(flare)]) == 2
+    assert "would be overwritten by a result" in capsys.readouterr().err
+    assert flare.read_bytes() == before
+
+
+def test_a_fit_goes_on_in_the_mode_it_was_begun_in(runs: tuple[Path, Path], tmp_path: Path) -> None:
+    """Whatever is asked for now: nobody waits for frames to be cleaned that the fit has no use for."""
+    folder = tmp_path / "capture"
+    shutil.copytree((runs[0] / "capture.txt").read_text().strip(), folder)
+    words = ["fit", str(folder), "--out", str(tmp_path / "run"), "--resume", "--set", "iterations=2"]
+    run = Run.create(tmp_path / "run", changed(Run.open(runs[0]).settings, {"iterations": 2}), folder)
+    assert not run.finished
+    assert cli.main([*words, "--mode", "default"]) == 0
+    assert Run.open(tmp_path / "run").settings.mode == "split"
+    assert not list(folder.glob("removed*"))
 
 
 def test_transfer_on_to_the_run(runs: tuple[Path, Path], tmp_path: Path) -> None:

@@ -154,6 +154,11 @@ def test_names_that_lead_out_are_refused(tmp_path: Path, name: str) -> None:
         inside(tmp_path, name, CaptureError)
 
 
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no such names")
+def test_a_time_of_day_is_no_drive(tmp_path: Path) -> None:
+    assert inside(tmp_path, "12:30.png", CaptureError) == tmp_path / "12:30.png"
+
+
 def test_a_name_need_not_be_utf_8_but_one_that_a_disk_takes(tmp_path: Path) -> None:
     assert inside(tmp_path, os.fsdecode(b"pl\xe9.png"), CaptureError).parent == tmp_path
     for name in (256 * "a", 128 * "\u00e9", "\ud800"):

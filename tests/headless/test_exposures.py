@@ -97,7 +97,8 @@ def test_a_preset_does_not_replace_its_flare(runs: tuple[Path, Path], tmp_path: 
     flare = tmp_path / "sun.flare"
     shutil.copy(runs[0] / "flare.flare", flare)
     before = flare.read_bytes()
-    assert cli.main(["export", str(flare), "--as", "preset", "--out", str(flare)]) == 2
+    assert cli.main(["export", str(flare), "--as", "preset", "--out", str(flare), "--capture",
+                     (runs[0] / "capture.txt").read_text().strip()]) == 2
     assert "would be overwritten by a result" in capsys.readouterr().err
     assert flare.read_bytes() == before
 

@@ -288,7 +288,9 @@ def preset(name: Preset, *, model: Model | None = None, mode: Mode = "default",
         flare = replace(flare, occlusion=True, begin=BEGIN, snap=True, steady=STEADY)
     settings = FitSettings(mode=mode, blend=blend, iterations=length, flare=flare,
                            apart=APART if model == "ours" else 0.0).checked()  # schedules are computed from its length
-    if name != "paper":
+    if name == "paper":
+        settings = _stretched(settings, length / ITERATIONS["paper"])
+    else:
         count, most = {"draft": (300, 40_000), "standard": (500, 60_000), "high": (700, 200_000)}[name]
         settings = _shortened(settings, count, most)
     if blend == "add":
@@ -296,6 +298,21 @@ def preset(name: Preset, *, model: Model | None = None, mode: Mode = "default",
         density = replace(settings.flare.density, clone_above=5e-4, prune_below=2e-4)
         settings = replace(settings, flare=replace(settings.flare, opacity=0.01, density=density))
     return settings.checked()
+
+
+def _stretched(settings: FitSettings, times: float) -> FitSettings:
+    """The same events at the same shares of a fit that is so many times as long."""
+    def at(iteration: int) -> int:
+        return max(round(iteration * times), 1)
+
+    density, scene = settings.flare.density, settings.scene
+    density = replace(density, start=at(density.start), stop=at(density.stop), every=at(density.every))
+    classic, mcmc = scene.classic, scene.mcmc
+    classic = replace(classic, start=at(classic.start), stop=at(classic.stop), every=at(classic.every),
+                      reset_every=at(classic.reset_every))
+    mcmc = replace(mcmc, start=at(mcmc.start), stop=at(mcmc.stop), every=at(mcmc.every))
+    return replace(settings, flare=replace(settings.flare, density=density),
+                   scene=replace(scene, classic=classic, mcmc=mcmc, sh_every=at(scene.sh_every)))
 
 
 def _shortened(settings: FitSettings, count: int, most: int) -> FitSettings:
@@ -312,7 +329,8 @@ def _shortened(settings: FitSettings, count: int, most: int) -> FitSettings:
                     features=1e-2, scale=0.02, rotation=5e-3, ring=2e-2, arc=2e-2, settled=SETTLED)
     classic = replace(settings.scene.classic, start=round(length * 0.05), stop=round(length * 0.6),
                       every=max(round(length / 50), 20), reset_every=10 * length, cap=most)
-    scene = replace(settings.scene, classic=classic, sh_every=max(round(length / 6), 1),
+    mcmc = replace(settings.scene.mcmc, start=classic.start, stop=round(length * 0.8), every=classic.every, cap=most)
+    scene = replace(settings.scene, classic=classic, mcmc=mcmc, sh_every=max(round(length / 6), 1),
                     rates=replace(settings.scene.rates, position=3.2e-4, position_final=3.2e-6))
     flare = replace(settings.flare, count=count, density=density, rates=rates)
     return replace(settings, preview_every=max(length // 8, 1), scene=scene, flare=flare)

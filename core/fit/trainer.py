@@ -139,7 +139,8 @@ class Trainer:
             self.strategy.observe(scene)
         self.optimisers.step(scene=self.scene_is_fitted)
         if self.scene_is_fitted:
-            self.strategy.update(self.iteration)
+            if self.iteration < settings.iterations:  # what the last would change nothing would learn
+                self.strategy.update(self.iteration)
             self._keep_neighbours_together()
         if not alone:  # Gaussians that nothing has taught are neither many nor faint
             self._change_flare_density()

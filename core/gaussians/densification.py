@@ -105,7 +105,7 @@ class Classic:
             self._refine(prune_large=iteration > s.reset_every)
             self._clear()
             changed = True
-        if iteration % s.reset_every == 0:
+        if iteration % s.reset_every == 0 and iteration < s.stop:  # what comes after finds them again
             self.scene.opacity_logits.clamp_(max=math.log(s.reset_to / (1 - s.reset_to)))
             self.optimiser.forget("opacity_logits")
         return changed

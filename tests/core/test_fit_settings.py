@@ -100,6 +100,24 @@ def test_the_paper_preset_is_the_paper() -> None:
     assert grown == pytest.approx(10965, rel=0.02)
 
 
+def test_the_paper_preset_of_another_length_is_the_paper_stretched() -> None:
+    settings = preset("paper", iterations=3000)
+    density, scene = settings.flare.density, settings.scene
+    assert (density.start, density.stop, density.every) == (100, 1200, 50)
+    assert (scene.classic.start, scene.classic.stop, scene.classic.every) == (50, 1500, 10)
+    assert (scene.classic.reset_every, scene.sh_every) == (300, 100)
+    assert preset("paper", iterations=30000) == preset("paper")
+
+
+@pytest.mark.parametrize("name", ["draft", "standard", "high", "paper"])
+def test_every_strategy_is_at_home_in_every_length(name: Any) -> None:
+    for length in (300, 1500, 30000):
+        scene = preset(name, iterations=length).scene
+        for strategy in (scene.classic, scene.mcmc):
+            assert strategy.start < strategy.stop < length
+    assert preset("draft").scene.mcmc.cap == preset("draft").scene.classic.cap
+
+
 @pytest.mark.parametrize(("name", "value"), [
     ("iterations", 0), ("iterations", 2.5), ("ssim_share", 2.0), ("ssim_share", float("nan")), ("mode", "fast"),
     ("width", -1), ("flare.rates.network", "quick"), ("flare.rates", 1.0), ("nothing", 1), ("seed.low", 1),

@@ -111,6 +111,20 @@ def test_what_is_not_a_number_is_not_drawn() -> None:
         assert torch.equal(rasterization(**{**arguments, name: spoiled}).colour, without)
 
 
+def test_splats_without_a_place_are_nowhere() -> None:
+    g = torch.Generator().manual_seed(2)
+    centres, covariances = torch.rand(60, 2, generator=g) * 70, torch.tensor([90.0, 20, 60]).repeat(60, 1)
+    opacities, colours = torch.rand(60, generator=g), torch.rand(60, 3, generator=g)
+    lost = torch.arange(60) % 3
+    without = splat(centres[lost == 2], covariances[lost == 2], opacities[lost == 2], colours[lost == 2], *SIZE,
+                    kernels="cpu").colour
+    centres[lost == 0, 0] = math.nan
+    centres[lost == 1] = math.nan
+    for kernels in ("cpu", "tiles"):
+        found = splat(centres, covariances, opacities, colours, *SIZE, kernels=kernels).colour
+        torch.testing.assert_close(found, without, atol=1e-6 if kernels == "cpu" else 1e-4, rtol=0)
+
+
 def test_splats_give_the_same_bits_on_all_thread_counts() -> None:
     def draw(count: int) -> list[Tensor]:
         torch.set_num_threads(count)

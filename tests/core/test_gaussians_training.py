@@ -326,6 +326,14 @@ def test_classic_resets_opacities() -> None:
     assert optimiser.moments["means"].first.any()
 
 
+def test_classic_resets_no_opacities_at_its_end() -> None:
+    scene, optimiser = some_scene()
+    strategy = Classic(scene, optimiser, 1.0, torch.Generator(), ClassicSettings(start=10, stop=10, reset_every=5))
+    before = scene.opacities.detach().clone()
+    strategy.update(10)
+    assert torch.equal(scene.opacities, before)
+
+
 def test_classic_waits_for_its_time() -> None:
     scene, optimiser = some_scene()
     strategy = Classic(scene, optimiser, 1.0, torch.Generator(), ClassicSettings(start=500, stop=700, every=100))

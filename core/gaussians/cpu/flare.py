@@ -177,7 +177,8 @@ def prepare(
         x, y, k = np.float64(centres[2 * i]), np.float64(centres[2 * i + 1]), -xy / yy
         major, minor = half * yy / determinant, half / yy
         half_x, half_y = reach * math.sqrt(xx), reach * math.sqrt(yy)
-        if x + half_x <= 0 or y + half_y <= 0 or x - half_x >= width or y - half_y >= height:
+        # Asked so that a centre that is no number is nowhere: it would be listed in tiles that are not there.
+        if not (x + half_x > 0 and y + half_y > 0 and x - half_x < width and y - half_y < height):
             continue
         gain = opacity if add else 1.0
         bend = major * k * k + minor

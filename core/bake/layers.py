@@ -107,9 +107,11 @@ def _add(channels: dict[str, Pixels], prefix: str, colour: Pixels, alpha: Pixels
 def _coloured(layer: Pixels, matrix: Any) -> Pixels:
     matrix = np.asarray(matrix, np.float32)
     factors = matrix.diagonal()
-    if np.array_equal(matrix, np.diag(factors)):  # what is negative, as differences of layers are, stays so
+    # What is negative, as differences of layers are where a flare covers what is brighter, stays so.
+    if np.array_equal(matrix, np.diag(factors)):
         return np.asarray(layer * factors, np.float32)
-    return np.asarray(np.maximum(layer @ matrix.T, 0), np.float32)
+    mixed = layer @ matrix.T
+    return np.asarray(np.where((layer < 0).any(-1, keepdims=True), mixed, np.maximum(mixed, 0)), np.float32)
 
 
 def matte(flare: Pixels) -> Pixels:

@@ -79,8 +79,9 @@ class Capture:
     def open(cls, folder: Path | str, *, need_frames: bool = True, cache_bytes: int = 1 << 30) -> Capture:
         """Read a capture and check all of it that can be checked without decoding a picture.
 
-        With `need_frames` every frame must be there, at the model's size or a uniform scale of it; without,
-        cameras, points and lights are enough. At most `cache_bytes` of decoded pictures are kept.
+        With `need_frames` every frame must be there, at the model's size or a uniform scale of it; without, cameras,
+        points and lights are enough, and views whose frames are missing have the model's size. At most `cache_bytes`
+        of decoded pictures are kept.
 
         Raises CaptureError (model, lights, split) or FrameError (pictures), naming the file.
         """
@@ -95,7 +96,7 @@ class Capture:
         views, frames = [], {}
         for frame in sorted(posed, key=lambda frame: frame.name):
             path = inside(root, frame.name, CaptureError)
-            size = _checked_size(path, frame.lens) if need_frames else (frame.lens.width, frame.lens.height)
+            size = _checked_size(path, frame.lens) if need_frames else _size_where_there(path, frame.lens)
             name = frame.name.removeprefix("images/") if root == folder else frame.name
             if name in frames:
                 raise CaptureError(f"{folder}: the frame {name} has two poses; remove one of them.")
@@ -124,6 +125,16 @@ class Capture:
         """The same, lights being at those places (3,), by name."""
         same = copy(self)
         same.lights = tuple(replace(light, xyz=places.get(light.name, light.xyz)) for light in self.lights)
+        return same
+
+    def sized(self, size: tuple[int, int]) -> Capture:
+        """The same, views whose frames are missing being of this size (width, height) where it is theirs, scaled: a
+        model may have been solved from larger or smaller frames than those that were fitted to."""
+        same = copy(self)
+        same.views = tuple(
+            replace(view, camera=view.camera.scaled(*size))
+            if not self.frame_path(view).is_file() and are_one_shape(view.camera.size, size) else view
+            for view in self.views)
         return same
 
     # What was filmed.
@@ -391,6 +402,14 @@ def _checked_size(path: Path, lens: Lens) -> tuple[int, int]:
     if path.suffix.lower() not in SUFFIXES:
         raise FrameError(f"{path} is not a picture this program reads; use PNG, JPEG, TIFF or EXR.")
     return size
+
+
+def _size_where_there(path: Path, lens: Lens) -> tuple[int, int]:
+    """The model's size where the picture is missing or none that could be used."""
+    try:
+        return _checked_size(path, lens)
+    except FrameError:
+        return lens.width, lens.height
 
 
 def _view(name: str, frame: Posed, size: tuple[int, int]) -> View:

@@ -109,11 +109,14 @@ class Run:
 
     def capture(self, given: Path | None = None, *, need_frames: bool = True) -> Capture:
         """What it was fitted to, from the folder given or where it was then; the exposures of its frames and the places
-        of its lights are those that the fit found. Raises RunError, CaptureError, FrameError."""
+        of its lights are those that the fit found, and views whose frames are not needed and not there are as large as
+        those that were fitted. Raises RunError, CaptureError, FrameError."""
         found = Capture.open(self.find_capture(given), need_frames=need_frames).exposed(self.exposures)
         if not (self.folder / FLARE).is_file() or self.flare is None:
             return found
-        model = self.flare.model
+        model, lens = self.flare.model, self.flare.camera
+        if not need_frames:
+            found = found.sized((lens.width, lens.height))
         return found.lit(dict(zip(model.names, model.positions.numpy().astype(np.float64), strict=True)))
 
     def find_capture(self, given: Path | None) -> Path:

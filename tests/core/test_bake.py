@@ -410,9 +410,11 @@ def test_colours_of_layers_are_light_and_plain_factors_exact() -> None:
     """A covering flare may take light away: a factor leaves that, so that scene + flare stays the composite."""
     layer = np.full((2, 2, 3), (1.0, 0.0, -0.25), np.float32)
     rendering = Rendered(np.zeros_like(layer), {"lamp": layer}, layer[..., 0])
-    vivid, double = (LookEdits.parse([f"lamp.{edit}=2"], ["lamp"]).matrices(["lamp"])
-                     for edit in ("saturation", "intensity"))
-    assert (layers_of(rendering, vivid).flares["lamp"] >= 0).all()
+    vivid, hardly, double = (LookEdits.parse([f"lamp.{edit}"], ["lamp"]).matrices(["lamp"])
+                             for edit in ("saturation=2", "saturation=0.999", "intensity=2"))
+    light = Rendered(np.zeros_like(layer), {"lamp": np.abs(layer)}, layer[..., 0])
+    assert (layers_of(light, vivid).flares["lamp"] >= 0).all()
+    np.testing.assert_allclose(layers_of(rendering, hardly).flares["lamp"], layer, atol=2e-3)
     np.testing.assert_array_equal(layers_of(rendering, double).flares["lamp"], 2 * layer)
 
 

@@ -15,7 +15,7 @@ import pytest
 
 from core.capture import Camera, Capture
 from core.errors import CaptureError, FrameError
-from core.pictures import write_exr
+from core.pictures import write_exr, write_png
 from tests.core.captures import SIZE, look_at, make_capture, make_transforms, orbit, picture
 
 
@@ -239,6 +239,22 @@ def test_without_frames(tmp_path: Path) -> None:
     assert len(capture.views) == 4
     with pytest.raises(FrameError, match=r"0000\.png is missing"):
         capture.frame(capture.views[0])
+
+
+def test_frames_that_are_not_needed_have_their_size_all_the_same(tmp_path: Path) -> None:
+    """Layers are baked to lie over the frames, which may be smaller than those that were solved."""
+    folder = make_capture(tmp_path / "c")
+    solved = Capture.open(folder).views[0].camera
+    size = solved.width // 2, solved.height // 2
+    for file in (folder / "images").iterdir():
+        write_png(file, np.zeros((size[1], size[0], 3)))
+    (folder / "images" / "0001.png").unlink()
+    (folder / "images" / "0002.png").write_bytes(b"none")
+    capture = Capture.open(folder, need_frames=False)
+    assert [view.camera.size for view in capture.views] == [size, solved.size, solved.size, size]
+    assert capture.views[0].camera.fx == solved.fx / 2
+    assert [view.camera.size for view in capture.sized(size).views] == [size, size, solved.size, size]
+    assert capture.sized((33, 7)).views[1].camera.size == solved.size, "of another shape"
 
 
 def test_how_a_pixel_moves_with_its_point() -> None:

@@ -77,7 +77,7 @@ def value_of(kind: Any, value: Any) -> Any:
         return value
     if typing.get_origin(kind) is tuple:
         if not isinstance(value, list | tuple):
-            raise ValueError(f"{value!r} is not {kind}")
+            raise ValueError(f"{value!r} is not {_in_words(kind)}")
         kinds = parts[:1] * len(value) if parts[-1] is Ellipsis else parts
         if len(kinds) != len(value):
             raise ValueError(f"{value!r} should have {len(kinds)} parts")
@@ -89,4 +89,15 @@ def value_of(kind: Any, value: Any) -> Any:
             return float(value)
         if type(value) is option or (option is type(None) and value is None):
             return value
-    raise ValueError(f"{value!r} is not {kind}")
+    raise ValueError(f"{value!r} is not {_in_words(kind)}")
+
+
+def _in_words(kind: Any) -> str:
+    """A type, for people."""
+    if typing.get_origin(kind) is tuple:
+        return "a list"
+    options = [part for part in typing.get_args(kind) if part is not type(None)] or [kind]
+    return " or ".join(_WORDS.get(option, str(option)) for option in options)
+
+
+_WORDS = {int: "a whole number", float: "a number", bool: "true or false", str: "text"}

@@ -23,6 +23,18 @@ from .objects import collections_shown, matrix_of
 KINDS = ("POINT", "SPOT", "AREA", "SUN")
 
 
+def opened(path: Path) -> Any:
+    """The active scene of a .blend, which is opened without its scripts. Raises CaptureError."""
+    if not path.is_file():
+        raise CaptureError(f"{path} is missing; name a .blend.")
+    try:
+        bpy.ops.wm.open_mainfile(filepath=str(path.resolve()), load_ui=False, use_scripts=False)
+    except RuntimeError as problem:
+        why = " ".join(str(problem).removeprefix("Error: ").split())
+        raise CaptureError(f"{path} cannot be opened by Blender {bpy.app.version_string} ({why}).") from problem
+    return bpy.context.scene
+
+
 def shot_of(scene: Any, flare: Path, names: Sequence[str], frames: Sequence[int], *, radius: float = 0.0,
             done: Callable[[], None] = lambda: None) -> Shot:
     """The scene's active camera at these frames. names: of objects that are lights; none: the scene's lamps. Markers

@@ -120,7 +120,8 @@ class FITFLARE_PT_fit(_Part, bpy.types.Panel):
 
 
 def _cleaning(layout: Any, state: Any, capture: Any, stage: str) -> None:
-    """The frames without flare: made, being made, or to be made; those of a network can be made again, otherwise."""
+    """The frames without flare: made, being made, or to be made; those of a network can be made again, otherwise or by
+    the fit that was made since."""
     job = fits.cleaning_of(capture)
     if job is not None and job.running:
         draw_progress(layout, job, "Clean frames")
@@ -140,7 +141,8 @@ def _cleaning(layout: Any, state: Any, capture: Any, stage: str) -> None:
         given.prop(state, "keep_glow")
     if there and state.mode == "split":  # they were made while the .blend was closed
         lines(layout, "There are clean frames: choose them as Supervision to learn from them.", "INFO")
-    if not there or by_network:
+    by_fit_since = stage == "finished" and job is not None and "--run" not in job.words
+    if not there or by_network or by_fit_since:
         layout.operator("fit_flare.clean_frames", text="Make Clean Frames Again" if there else "Make Clean Frames",
                         icon="BRUSH_DATA")
 
@@ -266,6 +268,7 @@ def _light(layout: Any, scene: Any, item: Any) -> None:
         lines(box, f"Choose the object that {item.name} comes from.", "ERROR")
     elif item.target.name not in scene.objects:
         lines(box, f"{item.target.name} is not in this scene: choose another object.", "ERROR")
+    lines(box, f"Look: {item.source}")
     _sliders(box, item)
     column = box.column()
     column.use_property_split = True

@@ -8,10 +8,11 @@ JSON-able) becomes part of the command's result.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from ..core.errors import SettingsError
 from ..core.progress import Progress
 from ..core.typed import MOST_SEED
 
@@ -24,6 +25,16 @@ def seed(text: str) -> int:
     if not text.isdecimal() or int(text) > MOST_SEED:
         raise argparse.ArgumentTypeError(f"a seed is a whole number from 0 to {MOST_SEED}, not {text!r}")
     return int(text)
+
+
+def refuse_useless(words: argparse.Namespace, defaults: Mapping[str, Any], goes_with: str) -> None:
+    """Raises SettingsError for an option that was given and does nothing: who gives it believes that it does.
+
+    defaults: of such options by their names in `words`, where they are as if not given. goes_with: what they are for.
+    """
+    for name, usual in defaults.items():
+        if getattr(words, name) != usual:
+            raise SettingsError(f"--{name.replace('_', '-')} goes with {goes_with}; leave it out.")
 
 
 @dataclass(frozen=True)

@@ -66,14 +66,21 @@ class Run:
         self.settings = settings
         self.capture_folder = capture_folder
 
+    @staticmethod
+    def check_free(folder: Path) -> None:
+        """Raises RunError where the folder holds a run already, or cannot be one."""
+        if (folder / CONFIG).exists():
+            raise RunError(f"{folder} holds a run already; go on with it by --resume, or choose another folder.")
+        if folder.exists() and not folder.is_dir():
+            raise RunError(f"{folder} is a file; name a folder for the run.")
+
     @classmethod
     def create(cls, folder: Path | str, settings: FitSettings, capture_folder: Path,
                exposed: Mapping[str, float] | None = None) -> Run:
         """A new run folder, with its settings written. exposed: its `exposures`. RunError where the folder holds a run
         already, or the capture's name cannot be written down."""
         folder = Path(folder)
-        if (folder / CONFIG).exists():
-            raise RunError(f"{folder} holds a run already; go on with it by --resume, or choose another folder.")
+        cls.check_free(folder)
         run = cls(folder, settings, capture_folder.resolve())
         if not is_utf8(str(run.capture_folder)):
             raise RunError(f"The name of the capture's folder, {str(run.capture_folder)!r}, is not UTF-8 and cannot be "

@@ -8,12 +8,16 @@ from typing import TYPE_CHECKING, Any
 
 from ...core.errors import SettingsError
 from ...core.progress import Progress
-from ..command import Command, Step, seed
+from ..command import Command, Step, refuse_useless, seed
 
 if TYPE_CHECKING:
     from ...core.removal.evaluation import Case
 
 SHEET, SCORES = "worst.png", "eval.json"
+
+
+SEED, SIZE = 7, (960, 640)
+"""Of --synthetic."""
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -27,9 +31,9 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--lenses", type=Path, metavar="DIR",
                         help="lens prescriptions for --synthetic, of which one in ten, by name, is kept from training")
     parser.add_argument("--all-backgrounds", action="store_true", help="use every clean picture, not one in ten")
-    parser.add_argument("--seed", type=seed, default=7, metavar="N", help="of --synthetic (default 7)")
-    parser.add_argument("--size", type=int, nargs=2, default=(960, 640), metavar=("W", "H"),
-                        help="of --synthetic's pictures (default 960 640)")
+    parser.add_argument("--seed", type=seed, default=SEED, metavar="N", help=f"of --synthetic (default {SEED})")
+    parser.add_argument("--size", type=int, nargs=2, default=SIZE, metavar=("W", "H"),
+                        help="of --synthetic's pictures (default {} {})".format(*SIZE))
     parser.add_argument("--keep-glare", action="store_true", help="leave the glow round the lights")
     parser.add_argument("--working-size", type=int, metavar="PIXELS", help="as of `remove`")
     parser.add_argument("--weights", type=Path, metavar="FILE", help="as of `remove`")
@@ -68,7 +72,11 @@ def _cases(words: argparse.Namespace) -> list[Case]:
     if (words.pairs is None) == (words.synthetic is None):
         raise SettingsError("Give either a folder of pairs, or --synthetic with --backgrounds.")
     if words.pairs is not None:
+        refuse_useless(words, {"backgrounds": [], "lenses": None, "all_backgrounds": False, "seed": SEED, "size": SIZE},
+                       "--synthetic")
         return evaluation.paired(words.pairs)
+    if not words.backgrounds:
+        raise SettingsError("--synthetic needs clean pictures; name folders of them with --backgrounds.")
     if words.synthetic < 1 or min(words.size) < 64:
         raise SettingsError("--synthetic wants one picture a class at least, of 64 pixels a side at least.")
     backgrounds = read_backgrounds(words.backgrounds, "all" if words.all_backgrounds else "test", max(words.size))
@@ -79,7 +87,7 @@ def _cases(words: argparse.Namespace) -> list[Case]:
 COMMAND = Command(
     "eval-removal", "Scores the removal of flares on pairs of pictures.",
     f"""Writes DIR/{SCORES} and DIR/{SHEET} (the ten pictures that gain least) and shows, by category, PSNR, SSIM,
-LPIPS and FLIP against the flare-free pictures, with those of the untouched input in brackets.
+LPIPS and FLIP against the flare-free pictures, with the first two of the untouched input in brackets; the file has all.
 
   run.py eval-removal Flare7Kpp/test_data/real --out build/eval
   run.py eval-removal --synthetic 25 --backgrounds photos hdri --lenses lenses --out build/eval""",

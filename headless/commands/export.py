@@ -75,7 +75,8 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
         write_flare_ply(words.out / frame.file.replace("layers.", "flare.").replace(".exr", ".ply"), flares, camera,
                         look.blend, look.sampling)
         progress.advance()
-    progress.say(f"{len(wanted)} frames of Gaussians are in {words.out}.")
+    made = "1 frame of Gaussians is" if len(wanted) == 1 else f"{len(wanted)} frames of Gaussians are"
+    progress.say(f"{made} in {words.out}.")
     return {"ply": str(words.out), "frames": len(wanted)}
 
 

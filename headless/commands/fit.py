@@ -71,8 +71,7 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
         raise SettingsError("fit takes a capture, or a list of them with --list: the one or the other.")
     if words.listed is None and (words.entry is not None or words.jobs != 1):
         raise SettingsError(f"--{'jobs' if words.entry is None else 'entry'} goes with --list; leave it out.")
-    if words.jobs < 1:
-        raise SettingsError(f"--jobs {words.jobs} makes no sense; give a number from 1.")
+    jobs.check(words.jobs)
     if words.listed is not None and words.entry is None:
         count = len(listed(words.listed))
         parts = [["--entry", str(entry), "--jobs", "1"] for entry in range(1, count + 1)]
@@ -80,9 +79,11 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
         progress.say(f"{count} runs are in {words.out}.")
         return {"runs": str(words.out), "count": count}
     folder, out = place(words)
+    goes_on = words.resume and (out / CONFIG).is_file()
+    if not goes_on:
+        Run.check_free(out)
     # The fit keeps pictures itself, and smaller.
     capture = Capture.open(folder, cache_bytes=DECODED_BYTES)
-    goes_on = words.resume and (out / CONFIG).is_file()
     settings = Run.open(out).settings if goes_on else chosen(words, capture, progress)
     if settings.mode != "3dgs":
         capture = with_lights(capture, progress)

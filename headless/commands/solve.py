@@ -9,7 +9,7 @@ from typing import Any, get_args
 from ...core.choices import Matching
 from ...core.errors import CaptureError, SettingsError
 from ...core.progress import Progress
-from ..command import Command, Step, seed
+from ..command import Command, Step, refuse_useless, seed
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -59,24 +59,19 @@ def is_blend(words: argparse.Namespace) -> bool:
 
 def of_blend(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     """Blender's part: the animated camera of a .blend as a capture."""
-    import bpy
-
     from ...core.bake.frames import plates_by_number
     from ...core.capture.colmap import find_model
     from ...core.capture.transforms import FILE as TRANSFORMS
     from ...core.pictures import pictures_in
-    from ...flare_addon.blend_shot import capture_of
+    from ...flare_addon.blend_shot import capture_of, opened
 
+    refuse_useless(words, {"frames": 0, "matching": "auto", "lens": "RADIAL", "work_size": 1000, "size": 0,
+                           "no_mask": False, "seed": 0}, "frames or a video that have to be solved")
     if words.plates is None or not words.plates.is_dir():
         raise SettingsError(f"{words.source} has cameras but no pictures; name the folder of its frames with --plates.")
     if (words.out / TRANSFORMS).exists() or find_model(words.out) is not None:
         raise CaptureError(f"{words.out} holds a capture already; choose another folder.")
-    try:
-        bpy.ops.wm.open_mainfile(filepath=str(words.source.resolve()), load_ui=False, use_scripts=False)
-    except RuntimeError as problem:
-        raise CaptureError(f"{words.source} cannot be opened by Blender {bpy.app.version_string} "
-                           f"({problem}).") from problem
-    scene = bpy.context.scene
+    scene = opened(words.source)
     plates = {number: path for number, path in plates_by_number(pictures_in(words.plates)).items()
               if scene.frame_start <= number <= scene.frame_end}
     if not plates:

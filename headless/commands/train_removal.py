@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from ...core.errors import SettingsError
 from ...core.progress import Progress
-from ..command import Command, Step
+from ..command import Command, Step, refuse_useless
 from .fit import change
 
 if TYPE_CHECKING:
@@ -62,6 +62,12 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     from ...core.removal.synthesis.prescription import built_in, read_lenses
     from ...core.removal.training import train
 
+    if words.model == "network":
+        refuse_useless(words, {"base": None, "keep_glare": False, "lpips": None}, "--model diffusion")
+    else:
+        refuse_useless(words, {"start": None, "processes": None}, "--model network")
+    if words.most_lenses < 1:
+        raise SettingsError(f"--most-lenses {words.most_lenses} makes no sense; give a number from 1.")
     if words.threads is not None and words.threads < 1:
         raise SettingsError(f"--threads {words.threads} makes no sense; give a number from 1.")
     if words.threads:

@@ -86,22 +86,22 @@ def is_blend(words: argparse.Namespace) -> bool:
 
 def look_at_blend(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     """Blender's part: the .blend's camera, lights and what hides them, written down for the engine."""
-    import bpy
-
     from ...core.bake.frames import Frame, chosen
-    from ...flare_addon.blend_shot import shot_of
+    from ...core.look import read
+    from ...flare_addon.blend_shot import opened, shot_of
     from ...flare_addon.fits import FLARE
 
     if len(words.to) > 1:
         raise SettingsError("One .blend at a time can be the target.")
-    path = words.to[0].resolve()
-    if not path.is_file():
-        raise CaptureError(f"{path} is missing.")
-    try:
-        bpy.ops.wm.open_mainfile(filepath=str(path), load_ui=False, use_scripts=False)
-    except RuntimeError as problem:
-        raise CaptureError(f"{path} cannot be opened by Blender {bpy.app.version_string} ({problem}).") from problem
-    scene = bpy.context.scene
+    _check_numbers(words)
+    _check_options(words, ".blend")
+    size(words.size)
+    jobs.check(words.jobs)
+    flare = words.flare.resolve()
+    if flare.is_dir():
+        flare /= FLARE
+    read(flare)
+    scene = opened(words.to[0])
     every = range(scene.frame_start, scene.frame_end + 1)
     # Neighbours too: the share of a light is smoothed over them, and a chunk must come out as the whole does.
     wanted = {frame.number for frame in chosen([Frame("", number, "") for number in every], words.frames)}
@@ -111,9 +111,6 @@ def look_at_blend(words: argparse.Namespace, progress: Progress) -> dict[str, An
         looked_at = list(every)  # whose middle chooses the training view
     names = [name.strip() for name in (words.lights or "").split(",") if name.strip()]
     progress.stage("look at the .blend", len(looked_at))
-    flare = words.flare.resolve()
-    if flare.is_dir():
-        flare /= FLARE
     shot = shot_of(scene, flare, names, looked_at, radius=words.radius, done=progress.advance)
     shot.write(shot_path(words))
     return {"shot": str(shot_path(words))}
@@ -198,7 +195,9 @@ def _made(words: argparse.Namespace, step: str, target: Target, flare: Path, tra
 
 
 def words_of_bake(words: argparse.Namespace) -> argparse.Namespace:
-    """What `bake FLARE` was asked, as transfer's own words."""
+    """What `bake FLARE` was asked, as transfer's own words. Raises SettingsError where two things name cameras."""
+    if words.blend is not None and words.capture is not None:
+        raise SettingsError("--capture and --blend each name cameras for the flare; give one of them.")
     given = vars(words) | {"flare": words.run, "to": [words.blend or words.capture]}
     plain = {"query": "blend", "smooth": 1, "radius": 0.0, "scale": 1.0, "use": [], "light": [], "plates": None,
              "scene": None, "cameras": None, "focal": None, "centre": None, "plate_space": "auto"}
@@ -260,6 +259,9 @@ def target_of(words: argparse.Namespace, flare: Path, training: list[Floats] | N
     look, to, wanted = read(flare), words.to, parsed(words.use)
     if len(to) > 1 and not all(path.suffix.lower() in PICTURES for path in to):
         raise SettingsError("Several targets at once have to be pictures.")
+    if missing := next((path for path in to if not path.exists()), None):
+        raise CaptureError(f"{missing} is missing; name what the flare goes on to: pictures, a capture, a run, a "
+                           ".blend, a PLY or a shot.")
     if len(to) == 1 and _kind(to[0]) == "capture" and _is_of_plates(to[0]):
         to = pictures_in(to[0])
     kind = _kind(to[0])

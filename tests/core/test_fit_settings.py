@@ -109,6 +109,14 @@ def test_the_paper_preset_of_another_length_is_the_paper_stretched() -> None:
     assert preset("paper", iterations=30000) == preset("paper")
 
 
+@pytest.mark.parametrize(("name", "value", "kind"), [
+    ("flare.count", "abc", "a whole number"), ("flare.rates.network", "quick", "a number"),
+    ("flare.snap", 1, "true or false"), ("scene.start", 3, "text")])
+def test_what_a_setting_should_be_is_said_in_words(name: str, value: Any, kind: str) -> None:
+    with pytest.raises(SettingsError, match=f"{value!r} is not {kind}"):
+        changed(preset("draft"), {name: value})
+
+
 @pytest.mark.parametrize("name", ["draft", "standard", "high", "paper"])
 def test_every_strategy_is_at_home_in_every_length(name: Any) -> None:
     for length in (300, 1500, 30000):

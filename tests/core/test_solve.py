@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
@@ -25,7 +28,7 @@ from core.capture.solve.mapping import Model, Solved, SolvedFrame
 from core.capture.solve.pairs import choose_matching, choose_pairs
 from core.capture.solve.shots import Shot, choose, gather, usable
 from core.capture.solve.world import up_direction
-from core.errors import Cancelled, CaptureError, FrameError
+from core.errors import Cancelled, CaptureError, FrameError, SettingsError
 from core.pictures import Picture, linear_from_srgb, picture_size, read_picture, stored_pixels, write_exr
 from core.progress import Progress
 from tests.core.captures import look_at, make_capture, orbit
@@ -426,7 +429,7 @@ def test_a_video_that_is_none(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("bad", [{"lens": "PERISCOPE"}, {"frames": -1}, {"matching": "none"}, {"size": 10}])
 def test_bad_settings(bad: dict[str, Any]) -> None:
-    with pytest.raises(CaptureError):
+    with pytest.raises(SettingsError):
         SolveSettings(**bad)
 
 
@@ -605,3 +608,22 @@ def test_upright(orientation: int) -> None:
     plain = cv2.imdecode(data, cv2.IMREAD_COLOR)
     ours = upright(Picture(plain.astype(np.float32), "srgb"), orientation)
     np.testing.assert_array_equal(ours.pixels, turned)
+
+
+LISTENS = """
+import signal, threading, time
+from core.capture.solve.mapping import load_pycolmap
+signal.signal(signal.SIGTERM, lambda *_: told.set())
+told = threading.Event()
+load_pycolmap()
+signal.raise_signal(signal.SIGTERM)
+print("stopped as asked" if told.wait(5) else "not told")
+"""
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no such signal")
+def test_who_asks_a_solve_to_end_is_heard() -> None:
+    """pycolmap's logging would end the process with a trace of its stack."""
+    done = subprocess.run([sys.executable, "-c", LISTENS], cwd=Path(__file__).resolve().parents[2], text=True,
+                          capture_output=True, check=False)
+    assert (done.returncode, done.stdout.strip()) == (0, "stopped as asked"), done.stderr[-500:]

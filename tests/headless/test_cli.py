@@ -148,6 +148,16 @@ def test_what_cannot_be_done_is_status_1_and_one_sentence(words: list[str], capt
     ["transfer", "no.flare", "--to", "a.png", "--out", "{tmp}/o", "--smooth", "99999999999"],
     ["compose", "{capture}", "--out", "{capture}"],
     ["train-removal", "--backgrounds", "{capture}", "--out", "{tmp}/o", "--threads", "-1"],
+    *(["train-removal", "--backgrounds", "{capture}", "--out", "{tmp}/o", *more] for more in (
+        ["--keep-glare"], ["--base", "sd-turbo"], ["--lpips", "no"], ["--most-lenses", "0"],
+        ["--model", "diffusion", "--start", "box"], ["--model", "diffusion", "--processes", "2"])),
+    *(["eval-removal", "{capture}", "--out", "{tmp}/o", *more] for more in (
+        ["--seed", "3"], ["--size", "64", "64"], ["--backgrounds", "{capture}"], ["--lenses", "no"],
+        ["--all-backgrounds"])),
+    ["eval-removal", "--synthetic", "2", "--out", "{tmp}/o"],
+    ["solve", "{capture}/images", "--out", "{tmp}/o", "--lens", "PERISCOPE"],
+    ["solve", "{capture}/images", "--out", "{tmp}/o", "--work-size", "-3"],
+    ["bake", "no.flare", "--out", "{tmp}/o", "--capture", "{capture}", "--blend", "no.blend"],
     *(["train-removal", "--backgrounds", "{capture}", "--out", "{tmp}/o", "--set", change] for change in (
         "learning_rate=abc", "stages=5", "polish=abc", "bank=1.5", "seed=-1", "pixels=NaN", "decay=-1", "canvas=abc",
         "clean=7", "average=9", "own_share=abc", "blocks=[1,2]")),

@@ -226,6 +226,27 @@ def test_a_bare_flare_is_baked_for_a_blend(run: Run, made: Path, blend: Path, tm
     assert "no object 'moon'" in problem["text"]
 
 
+def test_words_are_looked_at_before_a_blend(run: Run, made: Path, blend: Path, tmp_path: Path) -> None:
+    """Which may take minutes to look through; nothing is left behind either."""
+    for more, said in ((["--radius", "nan"], "--radius"), (["--light", "3,4"], "--light"), (["--jobs", "0"], "--jobs"),
+                       (["--size", "0"], "--size"), (["--smooth", "-1"], "--smooth")):
+        assert said in run("transfer", made, "--to", blend, "--out", tmp_path / "o", *more, status=2)[-1]["text"]
+    bad = tmp_path / "bad.blend"
+    bad.write_bytes(b"no blend")
+    text = run("transfer", made, "--to", bad, "--out", tmp_path / "o", status=1)[-1]["text"]
+    assert "\n" not in text and "bad.blend cannot be opened by Blender" in text
+    text = run("solve", blend, "--plates", tmp_path, "--out", tmp_path / "o", "--frames", "3", status=2)[-1]["text"]
+    assert text.startswith("--frames goes with frames or a video")
+    assert not (tmp_path / "o").exists()
+
+
+def test_a_target_that_is_missing_may_have_been_anything(run: Run, made: Path, tmp_path: Path) -> None:
+    for name in ("none", "none.png"):
+        text = run("transfer", made, "--to", tmp_path / name, "--out", tmp_path / "o", status=1)[-1]["text"]
+        assert text.endswith("is missing; name what the flare goes on to: pictures, a capture, a run, a .blend, a PLY "
+                             "or a shot.")
+
+
 def test_the_animated_camera_of_a_blend_is_a_capture(run: Run, blend: Path, tmp_path: Path) -> None:
     for frame in range(1, 5):
         write_png(tmp_path / "renders" / f"render.{frame:04d}.png", np.full((54, 96, 3), 0.1 * frame))

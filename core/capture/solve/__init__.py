@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from ...choices import Matching
-from ...errors import CaptureError
+from ...errors import CaptureError, SettingsError
 from ...files import read_json, write_json
 from ...pictures import pictures_in
 from ...progress import Progress
@@ -58,14 +58,18 @@ class SolveSettings:
 
     def __post_init__(self) -> None:
         if self.lens not in MODELS or self.lens == "EQUIRECTANGULAR":
-            raise CaptureError(f"{self.lens!r} is not a camera model to solve with; take one of "
+            raise SettingsError(f"{self.lens!r} is not a camera model to solve with; take one of "
                                f"{', '.join(name for name in MODELS if name != 'EQUIRECTANGULAR')}.")
         if self.matching not in ("auto", "exhaustive", "sequential", "similar"):
-            raise CaptureError(f"{self.matching!r} is not a way of matching; take auto, exhaustive, sequential "
+            raise SettingsError(f"{self.matching!r} is not a way of matching; take auto, exhaustive, sequential "
                                "or similar.")
-        if self.frames < 0 or self.output_size < 0 or not 100 <= self.size <= 20000 or self.features < 100:
-            raise CaptureError("Frames and output size cannot be negative, the working size lies within 100 and "
-                               "20000 pixels, and features are at least 100.")
+        if self.frames < 0 or self.output_size < 0:
+            raise SettingsError("Neither the number of frames nor their size can be negative; leave out what is to be "
+                                "as it is.")
+        if not 100 <= self.size <= 20000:
+            raise SettingsError(f"Features are looked for at 100 to 20000 pixels, not at {self.size}.")
+        if self.features < 100:
+            raise SettingsError(f"A solve needs 100 features a frame or more, not {self.features}.")
 
 
 def solve(source: Path | str, out: Path | str, settings: SolveSettings | None = None,

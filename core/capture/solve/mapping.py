@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import contextlib
 import shutil
+import signal
 import sqlite3
+import threading
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -127,6 +129,9 @@ def load_pycolmap() -> Any:
     except ImportError as problem:
         raise EngineError("solve needs pycolmap and OpenCV; install them with: pip install pycolmap "
                           "opencv-contrib-python-headless.") from problem
+    if threading.current_thread() is threading.main_thread():
+        # Its logging takes the signal that asks a process to end, and ends it with a trace of the stack.
+        signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM) or signal.SIG_DFL)
     return pycolmap
 
 

@@ -55,12 +55,13 @@ def pair(random: Random, bank: Bank, backgrounds: Backgrounds, width: int, heigh
     against = against_light > 0 and random.random() < against_light
     for number in range(1 if random.random() < 0.85 else 2):
         layers = bank.draw(random)
+        strength = 1.0 if number == 0 else random.uniform(0.1, 1)
         matrix = _laid(random, layers, width, height)
         if against and layers.lights:
             matrix, bright = _against_light(random, layers, matrix, scene)
             if number == 0 and random.random() < 0.5:
                 scene = scene * np.float32(np.clip(random.uniform(0.4, 2) / max(bright, 1e-3), 0.3, 3))
-        r, g, li = _placed(random, layers, matrix, width, height, 1.0 if number == 0 else random.uniform(0.1, 1))
+        r, g, li = _placed(random, layers, matrix, width, height, strength)
         rest, glare, light = rest + r, glare + g, np.maximum(light, li)
     if bare:
         rest, glare, light = rest * 0, glare * 0, light * float(random.random() < 0.5)

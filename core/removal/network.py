@@ -5,7 +5,7 @@ A U-Net of residual blocks. A flare is known by what it does over long ways: a v
 the whole frame, and ghosts lie on the line from a light through the principal point. So it is given, beside the
 frame, on every level the means, the darkest values and the over-exposure of what a place covers, the same turned
 by 180 degrees about the middle, where a light's mirrored ghosts fall, and where on the frame the place is; and on
-the two coarsest levels every place attends to every other, after every second block and in the end.
+the two coarsest levels every place attends to every other, after every second of the first blocks and in the end.
 
 It tells what the flare adds to the frame's display values, of which `gentle` is the part that is not the glow
 round the lights. The clean picture is the frame less that, and the flare the difference of the two in light:

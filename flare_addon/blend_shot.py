@@ -98,6 +98,7 @@ def capture_of(scene: Any, plates: Mapping[int, Path], folder: Path, names: Sequ
     if scene.camera is None or scene.camera.type != "CAMERA":
         raise CaptureError(f"The scene {scene.name!r} has no active camera; set one.")
     capture_export.check_free(folder, plates)
+    capture_export.check_shape(scene, plates)
     things = _lights(scene, names)
     points = capture_export.points_of(scene, scene.camera)
     if not len(points):

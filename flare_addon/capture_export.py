@@ -21,6 +21,7 @@ from ..core.capture.colmap import find_model
 from ..core.capture.transforms import FILE as TRANSFORMS
 from ..core.errors import CaptureError
 from ..core.files import atomic_path, read_json, write_json
+from ..core.pictures import are_one_shape, picture_size
 from . import cameras
 from .paths import absolute, stored
 
@@ -78,6 +79,7 @@ def export(scene: Any, folder: Path) -> int:
         raise CaptureError(f"Of the frames that the camera shows, {len(pictures)} are there as pictures beside "
                            f"{footage.first}; set the scene's frame range to the footage.")
     check_free(folder, pictures)
+    check_shape(scene, pictures)
     points = points_of(scene, camera)
     if not len(points):
         raise CaptureError("There are no points to begin a fit from; solve the camera with the motion tracker, or "
@@ -108,10 +110,22 @@ def check_free(folder: Path, plates: Mapping[int, Path]) -> None:
         raise CaptureError(f"{folder} holds another capture already; choose another folder.")
     for frame, plate in plates.items():
         picture = folder / _picture(frame, plate)
-        if not picture.exists() or picture.samefile(plate):
+        if not picture.exists() or _is_copy(picture, plate):
             continue
         if not is_capture or plate.parent.resolve() == picture.parent.resolve():
             raise CaptureError(f"{picture} is there already and would be replaced by {plate}; choose another folder.")
+
+
+def check_shape(scene: Any, plates: Mapping[int, Path]) -> None:
+    """Raises CaptureError for a plate of another shape than is rendered, which no fit would take, and FrameError for
+    one that is no picture."""
+    rendered = cameras.render_size(scene.render)
+    for plate in plates.values():
+        size = picture_size(plate)
+        if not are_one_shape(size, rendered):
+            raise CaptureError(f"{plate} is {size[0]} x {size[1]} pixels and the scene renders {rendered[0]} x "
+                               f"{rendered[1]}, which is another shape; set the scene's resolution to that of the "
+                               "pictures.")
 
 
 def write_cameras(folder: Path, entries: list[dict[str, Any]]) -> None:

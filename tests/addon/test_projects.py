@@ -37,6 +37,15 @@ def test_a_capture_is_made_again_but_not_of_itself(facts: Any) -> None:
     assert "would be replaced by" in facts["of its own pictures"]
 
 
+def test_a_capture_that_was_begun_is_finished(facts: Any) -> None:
+    assert facts["begun before"] == ""
+
+
+def test_pictures_of_another_shape_are_told_at_once(facts: Any) -> None:
+    assert facts["of another shape"].endswith("is 64 x 40 pixels and the scene renders 1920 x 40, which is another "
+                                              "shape; set the scene's resolution to that of the pictures.")
+
+
 def test_plates_that_are_links_are_the_captures_as_pictures(facts: Any) -> None:
     assert facts["links"] == [6, 6]
 

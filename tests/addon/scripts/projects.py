@@ -72,6 +72,13 @@ facts["made again"] = len(loaded.open(out / "twice").views)
 filmed(sorted((out / "twice" / "images").iterdir())[0], frame_start=5)
 facts["of its own pictures"] = refusal(lambda: ops.capture_from_camera(directory=str(out / "twice")))
 
+(out / "begun" / "images").mkdir(parents=True)
+shutil.copy2(first, out / "begun" / "images" / first.name)  # as a stop leaves it, on a disk without links
+filmed(first)
+facts["begun before"] = refusal(lambda: ops.capture_from_camera(directory=str(out / "begun")))
+filmed(first).render.resolution_x = 1920
+facts["of another shape"] = refusal(lambda: ops.capture_from_camera(directory=str(out / "shape")))
+
 # ---- plates that are links ---------------------------------------------------------------------------
 links = out / "links"
 links.mkdir()

@@ -12,7 +12,6 @@ import os
 import platform
 import re
 import shutil
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -20,20 +19,18 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from .errors import FitFlareError, RunError, SettingsError
-from .processes import runs
+from .errors import FitFlareError, SettingsError
+from .processes import WINDOWS, runs
 
 WRITTEN_BY_HAND = "utf-8-sig"
 """Encoding to read what people write: UTF-8, before which Windows' editors put a mark."""
 _PARTIAL = ".partial-"
 _REFUSALS = 100  # a hundredth of a second apart
-_HELD_BY = ".held"
-_TAKEN = (errno.EACCES, errno.EAGAIN, errno.EWOULDBLOCK, errno.EDEADLK)
 _HELD = (5, 32, 33)  # Windows: access denied, sharing violation, lock violation
 _PATIENCE_S = 2.0
 _WRITER = re.compile(r"-(?P<process>\d+)@(?P<machine>[0-9a-f]{8})-")
 _ABANDONED_S = 3600.0
-_DRIVE = re.compile(r".*:" if os.name == "nt" else r"[A-Za-z]:")
+_DRIVE = re.compile(r".*:" if WINDOWS else r"[A-Za-z]:")
 """As the first part of a name begins; on Windows any colon, which would name a stream of a file as well."""
 _OF_DEVICES = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\.|$)", re.IGNORECASE)
 
@@ -169,65 +166,6 @@ def locked(lock: Path | str, stale_s: float = 10.0) -> Iterator[None]:
         yield
     finally:
         patiently(lock.unlink, True)
-
-
-@contextlib.contextmanager
-def held(folder: Path | str) -> Iterator[None]:
-    """Have a folder, which is made where it is missing, to this process alone for as long as a long job runs in it. A
-    process that ends, however it ends, gives it back.
-
-    Raises RunError where another one has it. On a disk that knows no locks nobody is kept out.
-    """
-    folder = Path(folder)
-    made = not folder.exists()
-    folder.mkdir(parents=True, exist_ok=True)
-    descriptor = _locked_file(folder / _HELD_BY)
-    if descriptor is None:
-        raise RunError(f"Another process is at work in {folder}; wait for its end or stop it, or choose another "
-                       "folder.")
-    try:
-        yield
-    finally:
-        if sys.platform == "win32":  # which removes no open file
-            os.close(descriptor)
-        with contextlib.suppress(OSError):
-            (folder / _HELD_BY).unlink()
-        if sys.platform != "win32":  # or another one could have it, and a third one a new file
-            os.close(descriptor)
-        if made:
-            with contextlib.suppress(OSError):  # what is in it stays
-                folder.rmdir()
-
-
-def _locked_file(path: Path) -> int | None:
-    """The descriptor of the file, which is locked until that is closed; None where it is locked already."""
-    while True:
-        descriptor = os.open(path, os.O_CREAT | os.O_RDWR)
-        try:
-            _lock(descriptor)
-            if os.path.samestat(os.fstat(descriptor), path.stat()):
-                return descriptor
-        except FileNotFoundError:  # who had it removed it meanwhile
-            pass
-        except OSError as problem:
-            if problem.errno not in _TAKEN:
-                return descriptor
-            os.close(descriptor)
-            return None
-        os.close(descriptor)
-
-
-def _lock(descriptor: int) -> None:
-    """Until the file is closed, by whom that may be; OSError at once where it is locked."""
-    if sys.platform == "win32":
-        import msvcrt
-
-        os.lseek(descriptor, 0, os.SEEK_SET)
-        msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
-    else:
-        import fcntl
-
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
 @contextlib.contextmanager

@@ -50,15 +50,20 @@ def shot_of(scene: Any, flare: Path, names: Sequence[str], frames: Sequence[int]
     for frame in frames:
         scene.frame_set(frame)
         depsgraph = bpy.context.evaluated_depsgraph_get()
-        if scene.camera is None or scene.camera.type != "CAMERA":
-            raise CaptureError(f"The scene {scene.name!r} has no active camera; set one.")
-        camera = scene.camera.evaluated_get(depsgraph)
+        camera = _camera_of(scene).evaluated_get(depsgraph)
         core = cameras.core_camera(camera.data, camera.matrix_world, scene.render)
         eye = camera.matrix_world.translation
         placed = tuple(_placed(scene, depsgraph, thing, eye, radius) for thing in things)
         made.append(ShotFrame(frame, scene.name, core, placed))
         done()
     return Shot(flare, tuple(made))
+
+
+def _camera_of(scene: Any) -> Any:
+    """The active camera. Raises CaptureError where there is none, or an object that is none."""
+    if scene.camera is None or scene.camera.type != "CAMERA":
+        raise CaptureError(f"The scene {scene.name!r} has no active camera; set one.")
+    return scene.camera
 
 
 def _lights(scene: Any, names: Sequence[str]) -> list[Any]:
@@ -92,24 +97,11 @@ def capture_of(scene: Any, plates: Mapping[int, Path], folder: Path, names: Sequ
     """Write a capture of the scene's camera: transforms.json, images/, points.ply, and lights.json where there are
     lights (`names`, or the scene's lamps); how many frames it has.
 
-    plates: the picture of each frame. Raises CaptureError where the scene lacks a camera, or anything to begin a fit
-    from.
+    plates: the picture of each frame. Raises CaptureError where the scene lacks a camera, and what `write_frames` does.
     """
-    if scene.camera is None or scene.camera.type != "CAMERA":
-        raise CaptureError(f"The scene {scene.name!r} has no active camera; set one.")
-    capture_export.check_free(folder, plates)
-    capture_export.check_shape(scene, plates)
+    _camera_of(scene)
     things = _lights(scene, names)
-    points = capture_export.points_of(scene, scene.camera)
-    if not len(points):
-        raise CaptureError("There are no points to begin a fit from; solve the camera with the motion tracker, or "
-                           "model the rough scene as a mesh.")
-    entries = []
-    for frame, path in sorted(plates.items()):
-        scene.frame_set(frame)
-        entries.append(capture_export.entry_of(scene, scene.camera, frame, path, folder))
-        done()
-    capture_export.write_points(folder / "points.ply", points)
+    entries = capture_export.write_frames(scene, None, plates, folder, done)
     if things:
         eye, depsgraph = scene.camera.matrix_world.translation, bpy.context.evaluated_depsgraph_get()
         write_json(folder / "lights.json", {"lights": [

@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import re
 import shutil
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -78,20 +78,11 @@ def export(scene: Any, folder: Path) -> int:
     if len(pictures) < 3:
         raise CaptureError(f"Of the frames that the camera shows, {len(pictures)} are there as pictures beside "
                            f"{footage.first}; set the scene's frame range to the footage.")
-    check_free(folder, pictures)
-    check_shape(scene, pictures)
-    points = points_of(scene, camera)
-    if not len(points):
-        raise CaptureError("There are no points to begin a fit from; solve the camera with the motion tracker, or "
-                           "model the rough scene as a mesh.")
-    before, entries = scene.frame_current, []
+    before = scene.frame_current
     try:
-        for frame, path in pictures.items():
-            scene.frame_set(frame)
-            entries.append(entry_of(scene, camera, frame, path, folder))
+        entries = write_frames(scene, camera, pictures, folder)
     finally:
         scene.frame_set(before)
-    write_points(folder / "points.ply", points)
     write_cameras(folder, entries)
     state = scene.fit_flare
     state.capture, state.root, state.mode, state.footage = stored(folder), None, "split", "images"
@@ -99,7 +90,30 @@ def export(scene: Any, folder: Path) -> int:
     return len(entries)
 
 
-def check_free(folder: Path, plates: Mapping[int, Path]) -> None:
+def write_frames(scene: Any, camera: Any, plates: Mapping[int, Path], folder: Path,
+                 done: Callable[[], None] = lambda: None) -> list[dict[str, Any]]:
+    """A capture but for transforms.json, which says that it is whole: its pictures and points; what that is to have of
+    the frames. The scene is at the last of them then.
+
+    camera: None for the one that the scene has in each frame. plates: the picture of each. Raises CaptureError where
+    there is nothing to begin a fit from, or the plates cannot be a capture's in this folder, and FrameError.
+    """
+    _check_free(folder, plates)
+    _check_shape(scene, plates)
+    points = points_of(scene, camera or scene.camera)
+    if not len(points):
+        raise CaptureError("There are no points to begin a fit from; solve the camera with the motion tracker, or "
+                           "model the rough scene as a mesh.")
+    entries = []
+    for frame, path in sorted(plates.items()):
+        scene.frame_set(frame)
+        entries.append(entry_of(scene, camera or scene.camera, frame, path, folder))
+        done()
+    write_points(folder / "points.ply", points)
+    return entries
+
+
+def _check_free(folder: Path, plates: Mapping[int, Path]) -> None:
     """Raises CaptureError for a folder with a capture that was not made here: its frames would be lost, or its solve
     be read in place of what is written; and where pictures that are no capture's, or the plates themselves under
     other numbers, would be replaced. plates: the picture of each frame."""
@@ -116,7 +130,7 @@ def check_free(folder: Path, plates: Mapping[int, Path]) -> None:
             raise CaptureError(f"{picture} is there already and would be replaced by {plate}; choose another folder.")
 
 
-def check_shape(scene: Any, plates: Mapping[int, Path]) -> None:
+def _check_shape(scene: Any, plates: Mapping[int, Path]) -> None:
     """Raises CaptureError for a plate of another shape than is rendered, which no fit would take, and FrameError for
     one that is no picture."""
     rendered = cameras.render_size(scene.render)

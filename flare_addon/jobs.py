@@ -223,9 +223,9 @@ def start(kind: str, folder: Path, command: Sequence[str], environment: Mapping[
         (folder / STOP).unlink(missing_ok=True)
         with open(folder / EVENTS, "wb") as events, open(folder / LOG, "ab") as log:
             log_from = log.tell()
-            process = _begun(command, stdin=subprocess.DEVNULL, stdout=events, stderr=log,
-                             env={**(os.environ if environment is None else environment),
-                                  STOP_FILE: str((folder / STOP).absolute())}, **apart)
+            process = _launched(command, stdin=subprocess.DEVNULL, stdout=events, stderr=log,
+                                env={**(os.environ if environment is None else environment),
+                                     STOP_FILE: str((folder / STOP).absolute())}, **apart)
         _yield_to_the_window(process.pid)
         try:
             write_json(folder / RECORD, {"kind": kind, "host": HOST, "pid": process.pid, "started": time.time(),
@@ -246,7 +246,7 @@ def start(kind: str, folder: Path, command: Sequence[str], environment: Mapping[
     return job
 
 
-def _begun(command: Sequence[str], **how: Any) -> subprocess.Popen[bytes]:
+def _launched(command: Sequence[str], **how: Any) -> subprocess.Popen[bytes]:
     """Raises EngineError where the system does not start it."""
     try:
         return subprocess.Popen(list(command), **how)

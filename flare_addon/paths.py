@@ -81,11 +81,10 @@ def _take_along(context: Any, *_: object) -> None:
     for item in context.import_items:
         if item.id_type != "SCENE" or item.id is None or item.id.library is not None or item.source_library is None:
             continue
-        there = Path(bpy.path.abspath(item.source_library.filepath)).parent
         for name in OURS:
             text = getattr(item.id.fit_flare, name)
             if text.startswith("//"):
-                setattr(item.id.fit_flare, name, stored(there / text[2:].replace("\\", "/")))
+                setattr(item.id.fit_flare, name, stored(absolute(text, item.source_library)))
 
 
 _HANDLERS = [("save_pre", _remap), ("save_post", _put_back), ("save_post_fail", _put_back)]

@@ -27,6 +27,12 @@ def seed(text: str) -> int:
     return int(text)
 
 
+def from_1(option: str, value: int) -> None:
+    """Raises SettingsError for an option's number below 1."""
+    if value < 1:
+        raise SettingsError(f"{option} {value} makes no sense; give a number from 1.")
+
+
 def refuse_useless(words: argparse.Namespace, defaults: Mapping[str, Any], goes_with: str) -> None:
     """Raises SettingsError for an option that was given and does nothing: who gives it believes that it does.
 

@@ -20,10 +20,11 @@ import threading
 from collections.abc import Sequence
 from typing import IO, Any
 
-from ..core.errors import EngineError, FitFlareError, SettingsError
+from ..core.errors import EngineError, FitFlareError
 from ..core.processes import cores
 from ..core.progress import STOP_FILE, Progress
 from . import hand_off
+from .command import from_1
 
 POLL_S = 0.2
 
@@ -34,18 +35,12 @@ def add_option(parser: argparse.ArgumentParser,
     parser.add_argument("--jobs", type=int, default=1, metavar="N", help=f"{what} (default 1)")
 
 
-def check(jobs: int) -> None:
-    """Raises SettingsError for less than one job."""
-    if jobs < 1:
-        raise SettingsError(f"--jobs {jobs} makes no sense; give a number from 1.")
-
-
 def shares(numbers: Sequence[int], jobs: int) -> list[str]:
     """Frame numbers as `jobs` lists for --frames, contiguous and of about one length; fewer where there are few.
 
     Raises SettingsError for less than one job.
     """
-    check(jobs)
+    from_1("--jobs", jobs)
     ordered = sorted(set(numbers))
     count = min(jobs, len(ordered))
     cuts = [round(len(ordered) * part / count) for part in range(count + 1)] if count else [0]

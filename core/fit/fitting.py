@@ -11,10 +11,11 @@ import torch
 
 from ..capture import Capture
 from ..errors import Cancelled, RunError
-from ..files import atomic_path, held, remove_partial
+from ..files import atomic_path, remove_partial
 from ..flare import file as flare_file
 from ..flare.file import FlareFile, TrainingCamera
 from ..gaussians.ply import write_ply
+from ..holding import held
 from ..look import list_elements
 from ..progress import Progress
 from ..sampling import Sampling

@@ -24,7 +24,7 @@ import torch.nn.functional as F  # noqa: N812 - its name everywhere
 from torch import Tensor, nn
 
 from ..errors import EngineError, RunError, SettingsError
-from ..files import held
+from ..holding import held
 from ..pictures import Pixels
 from ..progress import Progress
 from . import weights

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..errors import Cancelled, RunError, SettingsError
-from ..files import held
+from ..holding import held
 from ..processes import cores
 from ..progress import Progress
 from . import weights

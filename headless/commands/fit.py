@@ -12,7 +12,7 @@ from ...core.files import WRITTEN_BY_HAND
 from ...core.progress import Progress
 from ...core.typed import WHOLE_DIGITS
 from .. import jobs
-from ..command import Command, Step, seed
+from ..command import Command, Step, from_1, refuse_useless, seed
 from .lights import with_lights
 from .remove import with_removed
 
@@ -69,9 +69,9 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
 
     if words.listed is not None and words.capture is not None:
         raise SettingsError("fit takes a capture, or a list of them with --list: the one or the other.")
-    if words.listed is None and (words.entry is not None or words.jobs != 1):
-        raise SettingsError(f"--{'jobs' if words.entry is None else 'entry'} goes with --list; leave it out.")
-    jobs.check(words.jobs)
+    if words.listed is None:
+        refuse_useless(words, {"entry": None, "jobs": 1}, "--list")
+    from_1("--jobs", words.jobs)
     if words.listed is not None and words.entry is None:
         count = len(listed(words.listed))
         parts = [["--entry", str(entry), "--jobs", "1"] for entry in range(1, count + 1)]

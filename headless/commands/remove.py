@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from ...core.errors import RunError, SettingsError
 from ...core.progress import Progress
 from .. import frames, jobs
-from ..command import Command, Step
+from ..command import Command, Step, refuse_useless
 
 if TYPE_CHECKING:
     from ...core.capture import Capture
@@ -55,8 +55,7 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
         raise SettingsError("remove needs plates, or a fitted run with --run: the one or the other.")
     if words.run is not None:
         return _by_run(words, progress)
-    if words.capture is not None:
-        raise SettingsError("--capture goes with --run; leave it out.")
+    refuse_useless(words, {"capture": None}, "--run")
     wanted = None
     if words.frames is not None or words.jobs != 1:
         names = [name.as_posix() for _, name in plates_of(words.plates, [words.out, words.flare, words.matte])]

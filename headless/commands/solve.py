@@ -11,6 +11,10 @@ from ...core.errors import CaptureError, SettingsError
 from ...core.progress import Progress
 from ..command import Command, Step, refuse_useless, seed
 
+OF_A_SOLVE = {"frames": 0, "matching": "auto", "lens": "RADIAL", "work_size": 1000, "size": 0, "no_mask": False,
+              "seed": 0}
+"""Options that are for frames without cameras, as they are where nobody gives them."""
+
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("source", type=Path, metavar="FRAMES_OR_VIDEO",
@@ -20,20 +24,21 @@ def arguments(parser: argparse.ArgumentParser) -> None:
                         help="of a .blend: the frames as filmed or rendered, whose names end with their numbers")
     parser.add_argument("--lights", metavar="NAMES", help="of a .blend: objects that are lights (default: its lamps)")
     parser.add_argument("--out", type=Path, required=True, metavar="CAPTURE", help="folder for the capture")
-    parser.add_argument("--frames", type=int, default=0, metavar="N",
+    parser.add_argument("--frames", type=int, metavar="N",
                         help="choose N frames, evenly, the sharpest of each stretch (default: all of a folder, 150 of "
                              "a video)")
-    parser.add_argument("--matching", choices=get_args(Matching), default="auto",
+    parser.add_argument("--matching", choices=get_args(Matching),
                         help="which frames to match: all with all, neighbours, or look-alikes (default: what fits)")
-    parser.add_argument("--lens", default="RADIAL", metavar="MODEL",
+    parser.add_argument("--lens", metavar="MODEL",
                         help="COLMAP camera model to solve for (default RADIAL; OPENCV_FISHEYE for fisheyes)")
-    parser.add_argument("--work-size", type=int, default=1000, metavar="PIXELS",
+    parser.add_argument("--work-size", type=int, metavar="PIXELS",
                         help="long side at which features are found (default 1000)")
-    parser.add_argument("--size", type=int, default=0, metavar="PIXELS",
+    parser.add_argument("--size", type=int, metavar="PIXELS",
                         help="long side of the frames written (default: as filmed)")
     parser.add_argument("--no-mask", action="store_true",
                         help="take features from clipped pixels and the lines of ghosts too")
-    parser.add_argument("--seed", type=seed, default=0, metavar="N", help="of all randomness (default 0)")
+    parser.add_argument("--seed", type=seed, metavar="N", help="of all randomness (default 0)")
+    parser.set_defaults(**OF_A_SOLVE)
 
 
 def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
@@ -65,8 +70,7 @@ def of_blend(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     from ...core.pictures import pictures_in
     from ...flare_addon.blend_shot import capture_of, opened
 
-    refuse_useless(words, {"frames": 0, "matching": "auto", "lens": "RADIAL", "work_size": 1000, "size": 0,
-                           "no_mask": False, "seed": 0}, "frames or a video that have to be solved")
+    refuse_useless(words, OF_A_SOLVE, "frames or a video that have to be solved")
     if words.plates is None or not words.plates.is_dir():
         raise SettingsError(f"{words.source} has cameras but no pictures; name the folder of its frames with --plates.")
     if (words.out / TRANSFORMS).exists() or find_model(words.out) is not None:

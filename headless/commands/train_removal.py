@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from ...core.errors import SettingsError
 from ...core.progress import Progress
-from ..command import Command, Step, refuse_useless
+from ..command import Command, Step, from_1, refuse_useless
 from .fit import change
 
 if TYPE_CHECKING:
@@ -66,11 +66,9 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
         refuse_useless(words, {"base": None, "keep_glare": False, "lpips": None}, "--model diffusion")
     else:
         refuse_useless(words, {"start": None, "processes": None}, "--model network")
-    if words.most_lenses < 1:
-        raise SettingsError(f"--most-lenses {words.most_lenses} makes no sense; give a number from 1.")
-    if words.threads is not None and words.threads < 1:
-        raise SettingsError(f"--threads {words.threads} makes no sense; give a number from 1.")
-    if words.threads:
+    from_1("--most-lenses", words.most_lenses)
+    if words.threads is not None:
+        from_1("--threads", words.threads)
         torch.set_num_threads(words.threads)
     changes = dict(map(change, words.changes))
     if words.iterations is not None:

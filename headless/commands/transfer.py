@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from ...core.errors import CaptureError, RunError, SettingsError
 from ...core.progress import Progress
 from .. import frames, jobs
-from ..command import Command, Step
+from ..command import Command, Step, from_1
 from .bake import size, space_options
 
 if TYPE_CHECKING:
@@ -96,7 +96,7 @@ def look_at_blend(words: argparse.Namespace, progress: Progress) -> dict[str, An
     _check_numbers(words)
     _check_options(words, ".blend")
     size(words.size)
-    jobs.check(words.jobs)
+    from_1("--jobs", words.jobs)
     flare = words.flare.resolve()
     if flare.is_dir():
         flare /= FLARE

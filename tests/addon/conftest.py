@@ -3,7 +3,9 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import blenders
 import pytest
@@ -29,3 +31,21 @@ def package(tmp_path_factory: pytest.TempPathFactory) -> Path:
                           text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     return next(out.glob("*.zip"))
+
+
+@pytest.fixture(scope="session")
+def told_by(blender: Blender, package: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, int], Any]:
+    """What a script of `scripts` tells, by its name, with the package, a capture of so many frames, a .flare of its
+    light, and a folder."""
+    from test_work import a_flare
+
+    from tests.core.flared import flared_capture
+
+    def run(name: str, frames: int) -> Any:
+        base = tmp_path_factory.mktemp(name)
+        capture, flare = flared_capture(base / "capture", frames), a_flare(base / "lamp.flare")
+        (base / "out").mkdir()
+        return blender.run(Path(__file__).parent / "scripts" / f"{name}.py", package, capture, flare, base / "out",
+                           user=base / "user")
+
+    return run

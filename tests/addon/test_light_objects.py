@@ -2,24 +2,15 @@
 """Lights are where they stand, whatever is switched off, and where a fit puts them; none is lost."""
 from __future__ import annotations
 
-from pathlib import Path
+from collections.abc import Callable
 from typing import Any
 
 import pytest
-from blenders import Blender
-from test_work import a_flare
-
-from tests.core.flared import flared_capture
-
-SCRIPTS = Path(__file__).parent / "scripts"
 
 
 @pytest.fixture(scope="session")
-def facts(blender: Blender, package: Path, tmp_path_factory: pytest.TempPathFactory) -> Any:
-    base = tmp_path_factory.mktemp("lights")
-    capture, flare = flared_capture(base / "capture", 5), a_flare(base / "lamp.flare")
-    (base / "out").mkdir()
-    return blender.run(SCRIPTS / "lights.py", package, capture, flare, base / "out", user=base / "user")
+def facts(told_by: Callable[[str, int], Any]) -> Any:
+    return told_by("lights", 5)
 
 
 @pytest.mark.parametrize("how", ["visible", "disabled", "excluded"])

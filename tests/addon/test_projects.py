@@ -2,23 +2,15 @@
 """Nothing of a project is lost to another part of it, and all of it is found where it goes."""
 from __future__ import annotations
 
-from pathlib import Path
+from collections.abc import Callable
 from typing import Any
 
 import pytest
-from blenders import Blender
-from test_work import a_flare
-
-from tests.core.flared import flared_capture
-
-SCRIPTS = Path(__file__).parent / "scripts"
 
 
 @pytest.fixture(scope="session")
-def facts(blender: Blender, package: Path, tmp_path_factory: pytest.TempPathFactory) -> Any:
-    base = tmp_path_factory.mktemp("projects")
-    capture, flare = flared_capture(base / "capture", 6), a_flare(base / "lamp.flare")
-    return blender.run(SCRIPTS / "projects.py", package, capture, flare, base / "out", user=base / "user")
+def facts(told_by: Callable[[str, int], Any]) -> Any:
+    return told_by("projects", 6)
 
 
 @pytest.mark.parametrize("how", ["under other numbers", "over others"])

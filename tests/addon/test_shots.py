@@ -2,23 +2,15 @@
 """What was made for one shot is not taken for another's, and does not go by the way."""
 from __future__ import annotations
 
-from pathlib import Path
+from collections.abc import Callable
 from typing import Any
 
 import pytest
-from blenders import Blender
-from test_work import a_flare
-
-from tests.core.flared import flared_capture
-
-SCRIPTS = Path(__file__).parent / "scripts"
 
 
 @pytest.fixture(scope="session")
-def facts(blender: Blender, package: Path, tmp_path_factory: pytest.TempPathFactory) -> Any:
-    base = tmp_path_factory.mktemp("shots")
-    capture, flare = flared_capture(base / "capture", 5), a_flare(base / "lamp.flare")
-    return blender.run(SCRIPTS / "shots.py", package, capture, flare, base / "out", user=base / "user")
+def facts(told_by: Callable[[str, int], Any]) -> Any:
+    return told_by("shots", 5)
 
 
 def test_another_capture_has_its_own_run_and_lights(facts: Any) -> None:

@@ -13,13 +13,12 @@ from pathlib import Path
 
 import pytest
 
-from core.errors import CaptureError, RunError, SettingsError, refusal
+from core.errors import CaptureError, SettingsError, refusal
 from core.files import (
     atomic_folder,
     atomic_path,
     check_apart,
     content_of,
-    held,
     inside,
     locked,
     named_by,
@@ -330,41 +329,3 @@ def test_what_is_written_can_be_read_by_those_whom_the_system_lets(tmp_path: Pat
     finally:
         os.umask(mask)
     assert (tmp_path / "a.json").stat().st_mode & 0o777 == 0o644
-
-
-HOLD = """
-import sys
-from core.files import held
-with held(sys.argv[1]):
-    print("held", flush=True)
-    sys.stdin.read()
-"""
-
-
-def test_a_folder_at_work_is_one_processs_and_free_when_that_is_killed(tmp_path: Path) -> None:
-    folder = tmp_path / "run"
-    other = subprocess.Popen([sys.executable, "-c", HOLD, str(folder)], cwd=ROOT, text=True,
-                             stdin=subprocess.PIPE, stdout=subprocess.PIPE)
-    try:
-        assert other.stdout is not None and other.stdout.readline() == "held\n"
-        with pytest.raises(RunError, match="Another process is at work in"), held(folder):
-            pass
-    finally:
-        other.kill()
-        other.communicate()
-    with held(folder):
-        (folder / "result").touch()
-    assert [path.name for path in folder.iterdir()] == ["result"]
-    with pytest.raises(ZeroDivisionError), held(tmp_path / "new"):
-        raise ZeroDivisionError
-    assert not (tmp_path / "new").exists()
-
-
-def test_a_disk_without_locks_keeps_nobody_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuses(descriptor: int) -> None:
-        del descriptor
-        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
-
-    monkeypatch.setattr("core.files._lock", refuses)
-    with held(tmp_path), held(tmp_path):
-        pass

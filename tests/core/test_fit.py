@@ -22,7 +22,6 @@ import torch
 
 from core.capture import Capture, Light
 from core.errors import Cancelled, CaptureError, FlareFileError, RunError, SettingsError
-from core.files import held
 from core.fit import FitSettings, Run, checkpoint, fit, preset
 from core.fit.beginning import NEAREST_PART, nearest_depth
 from core.fit.frames import Frames
@@ -35,6 +34,7 @@ from core.fit.trainer import Trainer
 from core.flare.compositing import composite
 from core.flare.model import OURS, PAPER
 from core.gaussians.rendering import NEAR
+from core.holding import held
 from core.look import LookEdits, draw
 from core.look.look import FORM_BOUNDS
 from core.pictures import read_picture, write_png
@@ -171,9 +171,9 @@ def test_two_fits_do_not_share_a_folder(tmp_path: Path, capture: Capture) -> Non
     with pytest.raises(Cancelled):
         fit(capture, quick(), tmp_path / "run", StopAt(2))
     with held(tmp_path / "run"):
-        for folder_resumes in (True, False):
+        for resume in (True, False):
             with pytest.raises(RunError, match="Another process"):
-                fit(capture, quick(), tmp_path / "run", resume=folder_resumes)
+                fit(capture, quick(), tmp_path / "run", resume=resume)
     assert fit(capture, quick(), tmp_path / "run", resume=True).finished
 
 

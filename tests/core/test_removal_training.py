@@ -14,7 +14,7 @@ import pytest
 import torch
 
 from core.errors import Cancelled, RunError, SettingsError
-from core.files import held
+from core.holding import held
 from core.metrics.lpips import Lpips
 from core.pictures import Pixels, write_png
 from core.progress import Progress

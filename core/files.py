@@ -148,6 +148,7 @@ def locked(lock: Path | str, stale_s: float = 10.0) -> Iterator[None]:
     while True:
         try:
             os.close(os.open(lock, os.O_CREAT | os.O_EXCL | os.O_WRONLY))
+            own = lock.stat().st_mtime_ns
             break
         except (FileExistsError, PermissionError) as problem:
             time.sleep(0.01)
@@ -156,7 +157,8 @@ def locked(lock: Path | str, stale_s: float = 10.0) -> Iterator[None]:
                 if state.st_mtime_ns != seen:
                     seen, since = state.st_mtime_ns, time.monotonic()
                 if max(time.time() - state.st_mtime, time.monotonic() - since) > stale_s:
-                    lock.unlink(missing_ok=True)
+                    with locked(lock.with_name(lock.name + ".taken_over"), stale_s):  # another may wait for the same
+                        _remove_lock(lock, state.st_mtime_ns)
             except FileNotFoundError:
                 # Windows refuses while another one is removing it; a folder that may not be written refuses for ever.
                 refused += isinstance(problem, PermissionError)
@@ -165,7 +167,14 @@ def locked(lock: Path | str, stale_s: float = 10.0) -> Iterator[None]:
     try:
         yield
     finally:
-        patiently(lock.unlink, True)
+        patiently(_remove_lock, lock, own)
+
+
+def _remove_lock(lock: Path, of: int) -> None:
+    """The one of that time in ns: who was slow enough to be taken for dead has lost it to another."""
+    with contextlib.suppress(FileNotFoundError):
+        if lock.stat().st_mtime_ns == of:
+            lock.unlink()
 
 
 @contextlib.contextmanager

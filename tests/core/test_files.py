@@ -7,6 +7,7 @@ import errno
 import os
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -259,6 +260,47 @@ def test_a_lock_is_held_by_one_and_outlives_no_one(tmp_path: Path) -> None:
         with locked(lock, stale_s=0.05):  # as if the holder had been killed
             assert time.monotonic() - started >= 0.04
     assert not lock.exists()
+
+
+def test_who_was_taken_for_dead_leaves_the_lock_to_the_next(tmp_path: Path) -> None:
+    lock = tmp_path / ".lock"
+    with contextlib.ExitStack() as next_one:
+        with locked(lock):
+            next_one.enter_context(locked(lock, stale_s=0.05))
+        assert lock.exists()
+    assert not lock.exists()
+
+
+def test_of_two_who_wait_for_a_dead_one_the_slower_leaves_the_other_its_lock(tmp_path: Path,
+                                                                             monkeypatch: pytest.MonkeyPatch) -> None:
+    """Both have seen that it is stale before either removes it."""
+    lock = tmp_path / ".lock"
+    lock.touch()
+    os.utime(lock, (1, 1))
+    dead, unlink = lock.stat().st_mtime_ns, Path.unlink
+    both_have_seen = threading.Barrier(2)
+    inside: list[str] = []
+
+    def unlink_late(path: Path, missing_ok: bool = False) -> None:
+        if path == lock and path.stat().st_mtime_ns == dead:
+            with contextlib.suppress(threading.BrokenBarrierError):
+                time.sleep(0.1 * both_have_seen.wait(0.5))
+        unlink(path, missing_ok)
+
+    def wait(name: str) -> None:
+        with locked(lock, stale_s=2.0):
+            inside.append(name)
+            time.sleep(0.3)
+            inside.append(name)
+
+    monkeypatch.setattr(Path, "unlink", unlink_late)
+    waiters = [threading.Thread(target=wait, args=(name,)) for name in ("one", "other")]
+    for waiter in waiters:
+        waiter.start()
+    for waiter in waiters:
+        waiter.join()
+    assert inside in (["one", "one", "other", "other"], ["other", "other", "one", "one"])
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_lock_out_of_the_future_outlives_no_one_either(tmp_path: Path) -> None:

@@ -23,19 +23,19 @@ _LOSSY = frozenset({".jpg", ".jpeg"})
 def remove_from(capture: Capture, remover: Remover, progress: Progress) -> Path:
     """Clean every frame into the capture's removed/, JPEG frames as PNG; what an earlier call has made is kept.
 
-    Raises CaptureError where there is a removed/ already or the folder cannot be written, FrameError for a
-    frame that cannot be read, and Cancelled when asked to stop.
+    Raises CaptureError where there is a removed/ already, where the folder cannot be written or two frames would have
+    one clean picture, FrameError for a frame that cannot be read, and Cancelled when asked to stop.
     """
     target, work = capture.folder / REMOVED, capture.folder / UNFINISHED
     if target.exists():
         raise CaptureError(f"{target} is there already; remove it, and the frames are cleaned again.")
+    names = _names(capture)
     progress.stage("remove", len(capture.views))
     sequences = Sequences(remover, [capture.frame_path(view) for view in capture.views])
     record, results = Record(work), []
     try:
         for view in sorted(capture.views, key=lambda one: shot_order(capture.frame_path(one))):
-            frame, name = capture.frame_path(view), Path(view.name)
-            name = name.with_suffix(".png") if name.suffix.lower() in _LOSSY else name
+            frame, name = capture.frame_path(view), names[view.name]
             result = inside(work, str(name), CaptureError)
             results.append(result)
             how = made_from(remover.described, [frame, *sequences.beside(frame)])
@@ -56,3 +56,16 @@ def remove_from(capture: Capture, remover: Remover, progress: Progress) -> Path:
         raise CaptureError(f"{work} cannot be written ({problem.strerror or problem}); copy the capture to where it "
                            "can, or make removed/ there with `remove`.") from problem
     return target
+
+
+def _names(capture: Capture) -> dict[str, Path]:
+    """Of every view's clean picture, below the folder. Raises CaptureError."""
+    views: dict[Path, str] = {}
+    for view in capture.views:
+        name = Path(view.name)
+        name = name.with_suffix(".png") if name.suffix.lower() in _LOSSY else name
+        if name in views:
+            raise CaptureError(f"The frames {views[name]} and {view.name} of {capture.folder} would both have "
+                               f"{REMOVED}/{name.as_posix()}; give one of them another name, in the model too.")
+        views[name] = view.name
+    return {view: name for name, view in views.items()}

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from core import tiff
 from core.capture import Capture
 from core.colour.spaces import AP1
-from core.errors import Cancelled, FrameError, RunError, SettingsError
+from core.errors import Cancelled, CaptureError, FrameError, RunError, SettingsError
 from core.pictures import Window, read_exr, read_picture, write_exr, write_png
 from core.progress import Progress
 from core.removal import batch, inference, weights
@@ -611,6 +611,18 @@ def test_frames_without_leading_noughts_are_told_once_each(tmp_path: Path, every
     monkeypatch.setattr(remover, "tell", lambda plate: told.append(plate.path.name) or tell(plate))
     remove_from(Capture.open(folder), remover, Progress())
     assert len(told) == len(set(told)) == 24
+
+
+def test_frames_that_differ_in_their_suffix_alone_are_told_before_any_is_cleaned(tmp_path: Path,
+                                                                                 everywhere: Path) -> None:
+    """Both would have one clean picture, and the second would be taken for what the first is without its flare."""
+    folder = make_capture(tmp_path / "capture", views=3)
+    model, frames = folder / "sparse" / "0" / "images.txt", folder / "images"
+    model.write_text(model.read_text().replace(" 0001.png", " 0000.jpg"))
+    cv2.imwrite(str(frames / "0000.jpg"), cv2.imread(str(frames / "0001.png")))
+    with pytest.raises(CaptureError, match=r"0000\.jpg and 0000\.png of .* both have removed/0000\.png; give one"):
+        remove_from(Capture.open(folder), Remover(everywhere, working_size=64), Progress())
+    assert not (folder / UNFINISHED).exists() and not (folder / "removed").exists()
 
 
 def test_a_fit_that_was_second_takes_what_the_first_has_cleaned(tmp_path: Path, everywhere: Path) -> None:

@@ -141,6 +141,7 @@ class LightLook:
         if form.latent:
             encoded = np.concatenate([encoded, rows["latent"]], -1)
         self._network = Network(tensors, _heads(form, rows), form.levels, form.base, query_range, encoded)
+        self._network.check(corrects=form.light_correction)
 
     @property
     def count(self) -> int:

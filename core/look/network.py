@@ -128,7 +128,7 @@ class Network:
     @cached_property
     def _gaussian_share(self) -> Floats:
         """The Gaussians' part of the first layer, which no view changes."""
-        return np.asarray(self._encoded @ self._t["network.gaussian_layer.weight"].T, np.float32)
+        return self._share_of(self._encoded)
 
     def view_features(self, camera: Floats, light: Floats) -> Floats:
         """Features of a camera position (3,), world units, and a light (2,), normalised coordinates."""
@@ -137,14 +137,30 @@ class Network:
         where = (camera.astype(np.float32) - self._range.camera_low) / extent
         return np.concatenate([self._light_grid(folded / self._range.light_high), self._camera_grid(where)])
 
+    def check(self, *, corrects: bool) -> None:
+        """Ask it for one Gaussian, and for delta_l where it `corrects`: ValueError or KeyError where its tensors do not
+        fit each other, before any view is asked for."""
+        nowhere = np.zeros(3, np.float32)
+        features = np.concatenate([self._light_grid(nowhere), self._camera_grid(nowhere)])
+        self._every(self._share_of(self._encoded[:1]), features)
+        if corrects and self.light_correction(features).shape != (2,):
+            raise ValueError("the correction of the light is no place")
+
     def offsets(self, features: Floats) -> dict[str, Floats]:
         """Offsets by name, (n, width) each."""
-        x = np.maximum(self._gaussian_share + self._linear("network.view_layer", features[None]), 0)
-        for name in self._hidden:
-            x = np.maximum(self._linear(name, x), 0)
-        every = self._linear("network.head", x)
+        every = self._every(self._gaussian_share, features)
         edges = np.cumsum([0, *self._heads.values()])
         return {name: every[:, a:b] for name, a, b in zip(self._heads, edges[:-1], edges[1:], strict=True)}
+
+    def _share_of(self, encoded: Floats) -> Floats:
+        return np.asarray(encoded @ self._t["network.gaussian_layer.weight"].T, np.float32)
+
+    def _every(self, gaussian_share: Floats, features: Floats) -> Floats:
+        """(n, all widths) what the heads say."""
+        x = np.maximum(gaussian_share + self._linear("network.view_layer", features[None]), 0)
+        for name in self._hidden:
+            x = np.maximum(self._linear(name, x), 0)
+        return self._linear("network.head", x)
 
     def light_correction(self, features: Floats) -> Floats:
         """delta_l (2,), normalised coordinates."""

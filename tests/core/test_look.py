@@ -329,6 +329,20 @@ def test_a_form_outside_of_its_bounds_is_refused_by_all_readers(name: str, tmp_p
                 reader(tmp_path / "b.flare")
 
 
+@pytest.mark.parametrize("changed", [{"latent": 0}, {"latent": 3}, {"levels": 5}])
+def test_a_network_that_does_not_fit_its_form_is_refused_when_it_is_read(changed: dict[str, int],
+                                                                         tmp_path: Path) -> None:
+    """Not when it is first asked for a view: by then it stands in a library or a scene."""
+    saved(tmp_path / "a.flare", OURS, 1)
+    _, metadata = read_tensors(tmp_path / "a.flare")
+    description = json.loads(metadata["fit_flare"])
+    description["lights"][0]["form"].update(changed)
+    rewritten(tmp_path / "a.flare", tmp_path / "b.flare", {"fit_flare": json.dumps(description)})
+    for reader in (read, flare_file.load):
+        with pytest.raises(FlareFileError, match="is damaged"):
+            reader(tmp_path / "b.flare")
+
+
 @pytest.mark.parametrize(("what", "said"), [
     ("two lights of one name", "two lights have one name"), ("clear 1.5", "clear share makes no sense"),
     ("clear -0.1", "clear share makes no sense"), ("clear NaN", "clear share makes no sense"),

@@ -175,6 +175,8 @@ def _frame(entry: Mapping[str, Any], data: Mapping[str, Any]) -> ShotFrame:
         raise ValueError(f"frame {entry['frame']} has no sensible camera")
     lights = tuple(PlacedLight(str(one["name"]), str(one["source"]), np.array([_number(x) for x in one["xyz"]]),
                                _number(one.get("share", 1.0))) for one in entry["lights"])
+    if len({light.name for light in lights}) < len(lights):
+        raise ValueError(f"frame {entry['frame']} has two lights of one name")
     if any(light.xyz.shape != (3,) for light in lights):
         raise ValueError("a light has no place")
     if not all(0 <= light.share <= 1 for light in lights):

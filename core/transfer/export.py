@@ -88,18 +88,19 @@ def write_flare_ply(path: Path | str, flares: Mapping[str, PlaneGaussians], came
 
 
 def preset(look: Look, view: Mapping[str, ViewOfLight], edits: LookEdits | None = None,
-           exposure: float = 1.0) -> dict[str, Any]:
+           camera: Camera | None = None) -> dict[str, Any]:
     """The look as a list of elements such as procedural flare tools have them, for one place of each light.
 
-    view: where each light stands, by name. exposure: of the frame, times the usual light. An element: `offset` along
-    the axis (0 at the light, 1 at the centre, 2 at the mirror image: 1 - mu), `aside` across it, `size` (standard
-    deviations along its long and short axis, as shares of the picture's width), `rotation` of the long axis (degrees
-    from the axis through the light, clockwise), `colour` (linear Rec. 709, brightest channel 1), `intensity` (linear
-    light at its brightest), `shape` (glow, disc, ring or streak), and for a ring its `radius` and `thickness` in the
-    same unit, and where one side is brighter `arc`: `towards` which (degrees, as `rotation`), and `share`, the other
-    side's light.
+    view: where each light stands, by name. camera: whose picture it is; the trained one's where not given. An element:
+    `offset` along the axis (0 at the light, 1 at the centre, 2 at the mirror image: 1 - mu), `aside` across it, `size`
+    (standard deviations along its long and short axis, as shares of the picture's width), `rotation` of the long axis
+    (degrees from the axis through the light, clockwise), `colour` (linear Rec. 709, brightest channel 1), `intensity`
+    (linear light at its brightest), `shape` (glow, disc, ring or streak), and for a ring its `radius` and `thickness`
+    in the same unit, and where one side is brighter `arc`: `towards` which (degrees, as `rotation`), and `share`, the
+    other side's light.
     """
-    width = look.camera.width / look.camera.fx  # of the picture, on the normalised plane
+    lens, exposure = (look.camera, 1.0) if camera is None else (camera, camera.exposure)
+    width = lens.width / lens.fx  # of the picture, on the normalised plane
     lights = []
     for light in look.lights:
         if light.name not in view or (edits is not None and not edits.shows(light.name, view)):
@@ -119,9 +120,9 @@ def preset(look: Look, view: Mapping[str, ViewOfLight], edits: LookEdits | None 
 
 
 def write_preset(path: Path | str, look: Look, view: Mapping[str, ViewOfLight], edits: LookEdits | None = None,
-                 exposure: float = 1.0) -> None:
+                 camera: Camera | None = None) -> None:
     """Write `preset` as JSON."""
-    write_json(path, preset(look, view, edits, exposure))
+    write_json(path, preset(look, view, edits, camera))
 
 
 def _part(seen: PlaneGaussians, row: int, light: NDArray[np.float64], width: float) -> dict[str, Any]:

@@ -62,7 +62,7 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
         if len(behind) == len(seen):
             raise RunError(f"No light is in front of the camera in frame {number} of {folder}; name another with "
                            "--frames.")
-        write_preset(words.out, look, seen, edits, camera.exposure)
+        write_preset(words.out, look, seen, edits, camera)
         progress.say(f"The preset is {words.out}.")
         if behind:
             progress.say(f"Lights behind the camera in frame {number} are not in it: {', '.join(behind)}.")

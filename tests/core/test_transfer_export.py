@@ -128,12 +128,27 @@ def test_a_preset_is_of_the_lights_that_are_shown_as_the_frame_is_exposed(blend:
     look, camera = read(tmp_path / "a.flare"), cameras(3)[1]
     view = {light.name: ViewOfLight.of(camera.world_to_camera, light.xyz) for light in look.lights}
     edits = LookEdits.parse(["lamp 0.mute=1"], look.names)
-    usual, exposed = preset(look, view, edits), preset(look, view, edits, 0.5)
+    usual, exposed = (preset(look, view, edits, replace(camera, exposure=times)) for times in (1.0, 0.5))
     assert [light["name"] for light in usual["lights"]] == [light["name"] for light in exposed["lights"]] == ["lamp 1"]
     before, after = ([part["intensity"] for element in one["lights"][0]["elements"] for part in element["parts"]]
                      for one in (usual, exposed))
     assert max(before) > 0
     np.testing.assert_allclose(after, np.multiply(before, brightness(0.5, blend)), rtol=1e-5)
+
+
+def test_a_preset_is_in_widths_of_the_picture_it_is_of(tmp_path: Path) -> None:
+    """Not of the footage the flare was trained on."""
+    saved(tmp_path / "a.flare", OURS, 1)
+    look, camera = read(tmp_path / "a.flare"), cameras(3)[1]
+    view = {light.name: ViewOfLight.of(camera.world_to_camera, light.xyz) for light in look.lights}
+    wide, tele = (preset(look, view, camera=replace(camera, fx=camera.fx * zoom, fy=camera.fy * zoom))["lights"][0]
+                  for zoom in (1, 2))
+    pixel = camera.project(look.lights[0].xyz[None])[0][0]
+    np.testing.assert_allclose(wide["at"], (pixel - [camera.cx, camera.cy]) / camera.width, rtol=1e-4)
+    np.testing.assert_allclose(tele["at"], 2 * np.array(wide["at"]), rtol=1e-6)
+    (part, *_), (closer, *_) = (one["elements"][0]["parts"] for one in (wide, tele))
+    np.testing.assert_allclose(closer["size"], 2 * np.array(part["size"]), rtol=1e-6)
+    assert closer["offset"] == part["offset"]
 
 
 def test_a_preset_tells_to_which_side_a_part_lies_and_turns() -> None:

@@ -85,8 +85,10 @@ def remove_all(inputs: Sequence[Path], folder: Path, remover: Remover, progress:
             if not overwrite and record.is_made(name, how, results[name]):
                 kept += 1
             else:
-                record.begin(name, how, results[name], overwrite)
-                _remove(path, name, results[name], remover, sequences, mattes)
+                plate, told = sequences.read(path)
+                marked = mattes.read(name, window_of(path)) if mattes else None
+                record.begin(name, how, results[name], overwrite)  # once it can be read: what is there goes
+                write_results(results[name], plate, *remover.remove(plate, marked, told))
                 made += 1
         except Exception as problem:
             if not is_of_the_plate(problem):
@@ -107,11 +109,3 @@ def remove_all(inputs: Sequence[Path], folder: Path, remover: Remover, progress:
         raise FrameError(f"{len(failed)} of {len(plates)} plates could not be cleaned: {' '.join(failed[:TOLD])}{more}")
     progress.say(f"{made + kept} clean plates are in {folder}.")
     return {"plates": str(folder), "made": made, "kept": kept}
-
-
-def _remove(path: Path, name: Path, results: Sequence[Path], remover: Remover, sequences: Sequences,
-            mattes: Mattes | None) -> None:
-    """results: the clean plate's path, and the flare's where it is wanted."""
-    plate, told = sequences.read(path)
-    codes, flare = remover.remove(plate, mattes.read(name, window_of(path)) if mattes else None, told)
-    write_results(results, plate, codes, flare)

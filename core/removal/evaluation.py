@@ -47,15 +47,19 @@ def paired(folder: Path | str) -> list[Case]:
     their counterpart."""
     folder = Path(folder)
     cases: list[Case] = []
-    for inputs in sorted(path for path in [folder, *folder.rglob("*")] if path.is_dir()):
+    if not folder.is_dir():
+        raise SettingsError(f"{folder} is {'no folder' if folder.exists() else 'missing'}; give a folder with input/ "
+                            "and gt/, or a folder of such folders.")
+    for inputs in sorted(path for path in folder.rglob("*") if path.is_dir()):
         root = inputs.parent
         if inputs.name.lower() not in INPUTS or inputs != _first_of(root, INPUTS):
             continue
         truth = _first_of(root, TRUTHS)
         if truth is None:
             continue
+        masks_in = _first_of(root, ("mask",))
         category = root.relative_to(folder).as_posix() if root != folder else root.name
-        truths, masks = _by_key(truth), _by_key(root / "mask") if (root / "mask").is_dir() else {}
+        truths, masks = _by_key(truth), _by_key(masks_in) if masks_in else {}
         for key, path in _by_key(inputs).items():
             if key not in truths:
                 raise SettingsError(f"{path} has no counterpart in {truth}; add it, or remove the picture.")

@@ -44,6 +44,8 @@ _PLACING = ("chromaticities", "dataWindow", "displayWindow", "pixelAspectRatio")
 _CMYK = "is CMYK, for print; convert it to RGB"
 _JPEG_QUALITY = 97
 _JPEGS, _TIFFS = (".jpg", ".jpeg"), (".tif", ".tiff")
+_DEPTHS: dict[str, tuple[type, ...]] = {".png": (np.uint8, np.uint16), **dict.fromkeys(_JPEGS, (np.uint8,))}
+"""Of pixels in files that cannot hold all that a plate may have; others OpenCV would bring to 8 bit without a word."""
 
 
 @dataclass
@@ -144,10 +146,12 @@ def _read_codes(path: Path) -> Plate:
 def _misread(path: Path) -> str:
     """What OpenCV would read without a word as something else, and what to do; "" where there is no such thing."""
     with open(path, "rb") as stream:
-        if path.suffix.lower() in _JPEGS:
+        begins = stream.read(4)
+        stream.seek(0)
+        if begins[:2] == b"\xff\xd8":  # whatever it is named
             header = jpeg.frame_header(stream)
             return _CMYK if header is not None and header[2] == 4 else ""
-        if path.suffix.lower() not in _TIFFS:
+        if begins not in (b"II*\0", b"MM\0*"):
             return ""
         told = {name: tag.values[0] for name, tag in
                 tiff.read_tags(stream, (tiff.SAMPLES, tiff.PHOTOMETRIC)).items()}
@@ -186,6 +190,10 @@ def write_plate(path: Path | str, plate: Plate, codes: NDArray[Any]) -> None:
     if "channels" in plate.rest:
         _write_exr(path, plate, codes)
         return
+    if codes.dtype not in _DEPTHS.get(suffix, (codes.dtype,)) or (suffix in _JPEGS and plate.alpha is not None):
+        raise FrameError(f"{plate.path} holds what no {suffix[1:].upper()} can hold ({codes.dtype} pixels"
+                         f"{', alpha' if plate.alpha is not None else ''}): it has the suffix of another kind of file; "
+                         "rename it to what it is.")
     import cv2
 
     stored: NDArray[Any] = codes[..., 0] if plate.grey else codes[..., ::-1]

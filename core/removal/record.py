@@ -14,6 +14,9 @@ from ..files import content_of, locked, patiently, read_json, remove_partial_of,
 
 RECORD = "remove.json"
 LOCK = ".remove.lock"
+_TABLES = ("plates", "flares", "flares_made")
+"""Of each plate how it was made, where from here its flare is, and how that was made: the plate may have been made in
+another way since, without one."""
 
 
 def made_from(maker: str, sources: Iterable[Path]) -> str:
@@ -37,7 +40,11 @@ class Record:
 
     def is_made(self, name: Path, how: str, results: Sequence[Path]) -> bool:
         """Whether all files of a plate are there, made in this way (`made_from`)."""
-        return self._read("plates").get(name.as_posix()) == how and all(path.is_file() for path in results)
+        key = name.as_posix()
+        wanted = {"plates": how, **({"flares": _from(self._folder, results[1]), "flares_made": how}
+                                    if results[1:] else {})}
+        return (all(self._read(what).get(key) == value for what, value in wanted.items())
+                and all(path.is_file() for path in results))
 
     def begin(self, name: Path, how: str, results: Sequence[Path], overwrite: bool) -> None:
         """Before the files of a plate are written, itself and maybe its flare: what was made there in another way goes,
@@ -45,19 +52,20 @@ class Record:
         from here, unless `overwrite`."""
         key = name.as_posix()
         with locked(self._folder / LOCK):
-            plates, flares = self._read("plates"), self._read("flares")
-            told = {"plates": {**plates, key: how}, "flares": {**flares}}
+            known = {what: self._read(what) for what in _TABLES}
+            told = {what: {**rows} for what, rows in known.items()}
+            told["plates"][key] = how
             if results[1:]:
-                told["flares"][key] = _from(self._folder, results[1])
-            from_here = (key in plates, key in flares and told["flares"][key] == flares[key])
+                told["flares"][key], told["flares_made"][key] = _from(self._folder, results[1]), how
+            from_here = (key in known["plates"], known["flares"].get(key) == told["flares"].get(key))
             for path, is_known in zip(results, from_here, strict=False):
                 if not overwrite and not is_known and path.exists():
                     raise FrameError(f"{path} is there, and {self._folder / RECORD} does not tell of it: it may be "
                                      "someone's work; choose another folder, or have it written over (--overwrite).")
-            if plates.get(key) != how:
-                for path in results:
+            for path, what in zip(results, ("plates", "flares_made"), strict=False):
+                if known[what].get(key) != how:
                     patiently(path.unlink, True)
-            if told != {"plates": plates, "flares": flares}:
+            if told != known:
                 write_json(self._folder / RECORD, {what: dict(sorted(rows.items())) for what, rows in told.items()})
         for path in results:
             remove_partial_of(path)
@@ -74,8 +82,7 @@ class Record:
         return problem.filename is not None and Path(problem.filename) in own
 
     def _read(self, what: str) -> dict[str, str]:
-        """Of each plate how it was made ("plates"), or where from here its flare is ("flares"); {} where it is not
-        written down."""
+        """Of each plate one of `_TABLES`; {} where it is not written down."""
         try:
             told = read_json(self._folder / RECORD, FrameError)[what]
             return {str(name): str(one) for name, one in told.items()}

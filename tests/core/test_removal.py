@@ -11,6 +11,7 @@ import shutil
 import struct
 import threading
 import zlib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -798,6 +799,56 @@ def test_bad_plates_do_not_stop_the_others(tmp_path: Path, everywhere: Path) -> 
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["good.png", RECORD]
 
 
+@pytest.mark.parametrize(("kind", "named", "depth", "channels"), [
+    (".png", "a.jpg", np.uint16, 3), (".png", "a.jpeg", np.uint8, 4), (".tiff", "a.png", np.float32, 3)])
+def test_a_plate_under_a_suffix_that_cannot_hold_it_is_left_out(tmp_path: Path, everywhere: Path, kind: str, named: str,
+                                                                depth: type, channels: int) -> None:
+    """OpenCV would bring its numbers to 8 bit, or leave its alpha out, without a word."""
+    codes = np.full((48, 64, channels), 0.7, np.float32) if depth is np.float32 else np.full(
+        (48, 64, channels), np.iinfo(depth).max * 2 // 3, depth)
+    (tmp_path / "in").mkdir()
+    (tmp_path / "in" / named).write_bytes(cv2.imencode(kind, codes)[1].tobytes())
+    with pytest.raises(FrameError, match=r"suffix of another kind of file; rename it"):
+        remove_all([tmp_path / "in"], tmp_path / "out", Remover(everywhere, working_size=64), Progress())
+    assert not (tmp_path / "out" / named).exists()
+
+
+def test_a_clean_plate_stays_when_its_plate_can_no_longer_be_read(tmp_path: Path, everywhere: Path) -> None:
+    write_codes(tmp_path / "in" / "a.png", picture())
+    remover = Remover(everywhere, working_size=64)
+    remove_all([tmp_path / "in"], tmp_path / "out", remover, Progress())
+    before = (tmp_path / "out" / "a.png").read_bytes()
+    plate = tmp_path / "in" / "a.png"
+    plate.write_bytes(plate.read_bytes()[:200])
+    with pytest.raises(FrameError, match="1 of 1 plates could not be cleaned"):
+        remove_all([tmp_path / "in"], tmp_path / "out", remover, Progress())
+    assert (tmp_path / "out" / "a.png").read_bytes() == before
+
+
+def test_a_flare_of_a_plate_that_was_made_otherwise_since_is_made_again(tmp_path: Path, everywhere: Path) -> None:
+    """It would not go with the clean plate."""
+    write_codes(tmp_path / "in" / "a.png", picture())
+    one, other = (Remover(everywhere, working_size=size) for size in (64, 96))
+    words = ([tmp_path / "in"], tmp_path / "out")
+    remove_all(*words, one, Progress(), flare_folder=tmp_path / "flares")
+    stale = (tmp_path / "flares" / "a.exr").read_bytes()
+    remove_all(*words, other, Progress())
+    assert remove_all(*words, other, Progress(), flare_folder=tmp_path / "flares")["made"] == 1
+    assert (tmp_path / "flares" / "a.exr").read_bytes() != stale
+    assert remove_all(*words, other, Progress(), flare_folder=tmp_path / "flares")["kept"] == 1
+
+
+def test_another_ones_flare_is_not_taken_for_a_plates(tmp_path: Path, everywhere: Path) -> None:
+    write_codes(tmp_path / "in" / "a.png", picture())
+    remover = Remover(everywhere, working_size=64)
+    remove_all([tmp_path / "in"], tmp_path / "out", remover, Progress())
+    (tmp_path / "flares").mkdir()
+    (tmp_path / "flares" / "a.exr").write_bytes(b"another's")
+    with pytest.raises(FrameError, match="someone's work"):
+        remove_all([tmp_path / "in"], tmp_path / "out", remover, Progress(), flare_folder=tmp_path / "flares")
+    assert (tmp_path / "flares" / "a.exr").read_bytes() == b"another's"
+
+
 def test_a_full_disk_ends_the_batch(tmp_path: Path, nowhere: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """None of the others would fit; what else the system refuses is told in its own sentence."""
     for name in ("a", "b", "c"):
@@ -805,16 +856,16 @@ def test_a_full_disk_ends_the_batch(tmp_path: Path, nowhere: Path, monkeypatch: 
     tried: list[str] = []
 
     def refused(number: int) -> Any:
-        def remove(path: Path, *_: object) -> None:
-            tried.append(path.name)
-            raise OSError(number, os.strerror(number), str(path))
-        return remove
+        def write(results: Sequence[Path], *_: object) -> None:
+            tried.append(results[0].name)
+            raise OSError(number, os.strerror(number), str(results[0]))
+        return write
 
-    monkeypatch.setattr(batch, "_remove", refused(errno.ENOSPC))
+    monkeypatch.setattr(batch, "write_results", refused(errno.ENOSPC))
     with pytest.raises(OSError) as full:
         remove_all([tmp_path / "in"], tmp_path / "out", Remover(nowhere, working_size=64), Progress())
     assert (full.value.errno, tried) == (errno.ENOSPC, ["a.png"])
-    monkeypatch.setattr(batch, "_remove", refused(errno.EACCES))
+    monkeypatch.setattr(batch, "write_results", refused(errno.EACCES))
     with pytest.raises(FrameError, match=r"3 of 3 plates could not be cleaned: The system refused: Permission denied"):
         remove_all([tmp_path / "in"], tmp_path / "out", Remover(nowhere, working_size=64), Progress())
 

@@ -29,6 +29,8 @@ PAIRS = 60000     # of rays tested for meeting
 MANY = 20         # times PAIRS; of more pairs than these no list is made
 DRAWS = 8         # of twice PAIRS, after which those that came are enough
 PATIENCE = 6      # places of too few views in a row, after which there is nothing left
+USES = 16         # refused places, after which others are proposed
+AT_ONCE = 512     # places whose worth is found together: memory is theirs times the detections
 
 
 @dataclass(frozen=True)
@@ -113,21 +115,27 @@ def gather(views: Sequence[tuple[str, Camera]], detections: Sequence[Sequence[De
     rng = np.random.default_rng(settings.seed)
     open_ = np.ones(len(seen.view), bool)
     found: list[FoundLight] = []
-    failures = 0
+    failures, proposed = 0, _Proposed(seen, open_, rng, settings.tries)
     while open_.sum() >= settings.min_views and failures < PATIENCE and len(found) < settings.most:
-        place = _best(seen, open_, rng, settings.tries)
+        place = proposed.best(open_)
         if place is None:
             break
         place, inliers, covariance = _settled(seen, place, open_, extent)
         if len(np.unique(seen.view[inliers])) < settings.min_views:
-            open_[_near(seen, place, open_)] = False  # spent, or the search would find it for ever
-            failures += 1
+            if not proposed.uses:
+                open_[_near(seen, place, open_)] = False  # spent, or the search would find it for ever
+                failures += 1
+            proposed = _Proposed(seen, open_, rng, settings.tries)
             continue
         light = _light(seen, place, inliers, covariance, extent, settings.anywhere)
         open_[inliers] = False
-        if light.accidents <= settings.accidents and len(light.support) >= settings.min_share * light.visible:
+        taken = light.accidents <= settings.accidents and len(light.support) >= settings.min_share * light.visible
+        if taken:
             found.append(light)
             failures = 0
+        proposed.uses += 1
+        if taken or proposed.uses == USES:
+            proposed = _Proposed(seen, open_, rng, settings.tries)
     return without_ghosts(merged(found, views, extent), views)
 
 
@@ -146,26 +154,42 @@ def _sightings(views: Sequence[tuple[str, Camera]], detections: Sequence[Sequenc
                       [detection for _, detection in flat])
 
 
-def _best(seen: _Sightings, open_: NDArray[np.bool_], rng: np.random.Generator, tries: int) -> Floats | None:
-    """The place (4,) that the most open detections, by worth, agree on; None where no two are of two views."""
-    index = np.flatnonzero(open_ & (seen.worth > 0))
-    first, second = _pairs(seen, index, rng)
-    if not len(first):
+class _Proposed:
+    """Places where the rays of open detections meet, to be looked at from the best on.
+
+    What is taken away from the open detections makes every place worth less or the same, so that a worth of before is
+    a bound, and few have to be found anew (lazy greedy choice: Minoux 1978, "Accelerated greedy algorithms").
+    """
+
+    def __init__(self, seen: _Sightings, open_: NDArray[np.bool_], rng: np.random.Generator, tries: int) -> None:
+        self.uses = 0
+        self._seen = seen
+        self._places = _meetings(seen, np.flatnonzero(open_ & (seen.worth > 0)), rng, tries)  # (n, 4)
+        self._bounds = np.full(len(self._places), np.inf)
+
+    def best(self, open_: NDArray[np.bool_]) -> Floats | None:
+        """The place (4,) that the most open detections, by worth, agree on; None where there is none. `open_`: fewer
+        from call to call."""
+        index = np.flatnonzero(open_ & (self._seen.worth > 0))
+        while len(self._places):
+            at_once = AT_ONCE if np.isinf(self._bounds).any() else AT_ONCE // 16
+            some = np.argsort(-self._bounds, kind="stable")[:at_once]
+            self._bounds[some] = _worth(self._seen, self._places[some], index)
+            top = int(np.argmax(self._bounds))
+            if top in some:
+                return self._places[top] if self._bounds[top] > 0 else None
         return None
+
+
+def _meetings(seen: _Sightings, index: NDArray[np.int64], rng: np.random.Generator, tries: int) -> Floats:
+    """(n, 4), n at most `tries`: where the rays of two of the detections `index`, of two views, meet."""
+    first, second = _pairs(seen, index, rng)
     places = np.concatenate([_crossing(seen, first, second), _direction(seen, first, second)])
     first, second = np.tile(first, 2), np.tile(second, 2)
     meet = np.flatnonzero(_on(seen, places, first) & _on(seen, places, second))
     if len(meet) > tries:
         meet = rng.choice(meet, tries, replace=False)
-    places = places[meet]
-    best, value = None, 0.0
-    for at in range(0, len(places), 512):
-        some = places[at:at + 512]
-        value_of = _worth(seen, some, index)
-        top = int(np.argmax(value_of))
-        if value_of[top] > value:
-            best, value = some[top], float(value_of[top])
-    return best
+    return places[meet]
 
 
 def _pairs(seen: _Sightings, index: NDArray[np.int64],
@@ -235,7 +259,9 @@ def _worth(seen: _Sightings, places: Floats, index: NDArray[np.int64]) -> Floats
     more the nearer it is."""
     pixels, front = seen.project(places)
     view = seen.view[index]
-    off = ((pixels[:, view] - seen.pixel[index]) ** 2).sum(axis=2) / seen.tolerance[index] ** 2
+    off = np.zeros((len(places), len(index)))
+    for axis in range(2):
+        off += ((pixels[:, view, axis] - seen.pixel[index, axis]) / seen.tolerance[index]) ** 2
     gain = np.where(front[:, view] & (off < 1), seen.worth[index] * (1 - off), 0.0)
     # Detections come in the order of their views.
     starts = np.flatnonzero(np.diff(view, prepend=-1))

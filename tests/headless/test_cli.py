@@ -9,9 +9,11 @@ import subprocess
 import sys
 import venv
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
+import torch
 from fit_flare.core.capture import Capture
 from fit_flare.core.capture.colmap import PointCloud
 from fit_flare.core.errors import Cancelled, CaptureError, FitFlareError, SettingsError
@@ -324,6 +326,17 @@ def test_a_blender_that_cannot_be_loaded_is_a_sentence(tmp_path: Path) -> None:
                           env={**os.environ, "PYTHONPATH": str(tmp_path)})
     assert done.returncode == 1 and "libXrender.so.1" in done.stderr and "--blender" in done.stderr, done.stderr
     assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("light", [0.5, float("nan")])
+def test_an_engine_that_splats_wrong_is_found_out(light: float, monkeypatch: pytest.MonkeyPatch,
+                                                  capsys: pytest.CaptureFixture[str]) -> None:
+    """It is what the preferences' button asks for."""
+    assert cli.main(["engine"]) == 0
+    wrong = SimpleNamespace(colour=torch.full((16, 16, 3), light))
+    monkeypatch.setattr("fit_flare.core.gaussians.splat", lambda *_, **__: wrong)
+    assert cli.main(["engine"]) == 1
+    assert "splats wrong" in capsys.readouterr().err
 
 
 def test_a_python_without_numpy_hands_over_to_the_engine(tmp_path: Path) -> None:

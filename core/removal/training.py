@@ -22,7 +22,7 @@ from .bank import OneFlare, OwnFlares
 from .batches import Batch, Batches, drawn_ahead
 from .learners import ALONE, Learner, shared
 from .pairs import Pair, pair
-from .recipe import Recipe, as_dict
+from .recipe import Recipe, as_dict, from_dict
 from .synthesis.layers import CLASSES
 from .synthesis.prescription import Prescription
 from .trainer import FIGURES, Trainer, device
@@ -53,6 +53,17 @@ def checks(backgrounds: Backgrounds, lenses: Sequence[Prescription], count: int 
                         clean=0)
                    for k in range(max(count // len(CLASSES), 1))]
             for index, kind in enumerate(CLASSES)}
+
+
+def recipe_in(folder: Path | str) -> Recipe | None:
+    """By which the training in a folder went when it was last kept; None where it holds none. Raises RunError where its
+    checkpoint is damaged, SettingsError where it is of a program that knew other recipes."""
+    path = Path(folder) / CHECKPOINT
+    if not path.exists():
+        return None
+    _, about = weights.read(path)
+    weights.form(path, about)  # or it is none of ours
+    return from_dict(json.loads(about["recipe"]))
 
 
 def train(recipe: Recipe, folder: Path | str, backgrounds: Backgrounds, lenses: Sequence[Prescription], *,

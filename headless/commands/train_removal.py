@@ -30,7 +30,8 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--flares", type=Path, metavar="DIR",
                         help="your own flares on black, mixed in: pictures, clips, or Flare7K++'s folders")
     parser.add_argument("--iterations", type=int, metavar="N", help="length (default: the recipe's)")
-    parser.add_argument("--resume", action="store_true", help="go on with the training in --out, to --iterations")
+    parser.add_argument("--resume", action="store_true", help="go on with the training in --out, by the recipe it has but for what --iterations and --set "
+                             "change")
     parser.add_argument("--start", type=Path, metavar="FILE",
                         help='weights to begin with; "box" for those that come with the program')
     parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", dest="changes",
@@ -60,7 +61,7 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     from ...core.removal.bank import OwnFlares
     from ...core.removal.evaluation import held_out
     from ...core.removal.synthesis.prescription import built_in, read_lenses
-    from ...core.removal.training import train
+    from ...core.removal.training import recipe_in, train
 
     if words.model == "network":
         refuse_useless(words, {"base": None, "keep_glare": False, "lpips": None}, "--model diffusion")
@@ -73,7 +74,10 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     changes = dict(map(change, words.changes))
     if words.iterations is not None:
         changes["iterations"] = words.iterations
-    recipe = recipes.from_dict({**recipes.as_dict(recipes.Recipe()), **changes})
+    before = recipe_in(words.out) if words.resume and words.model == "network" else None
+    if words.resume and words.model == "network" and before is None:
+        progress.say(f"{words.out} holds no training to go on with; one begins there.")
+    recipe = recipes.from_dict({**recipes.as_dict(before or recipes.Recipe()), **changes})
     lenses = read_lenses(words.lenses, words.most_lenses) if words.lenses else []
     train_on = [lens for lens in lenses if not kept_for_test(lens.name)] + built_in()
     test_on = held_out(lenses)

@@ -509,6 +509,7 @@ def test_a_shot_is_read_as_it_was_written(tmp_path: Path) -> None:
     text = (tmp_path / "shot.json").read_text()
     for old, new in (('"version": 1', '"version": 2'), ('"share": 1.0', '"share": "x"'), ('"frames"', '"frame"'),
                      ('"width": 64', '"width": -1'), ('"query": "target"', '"query": "moon"'),
+                     ('"name": "second"', '"name": "lamp 0"'),
                      ('"frame": 1', '"frame": 1e400'), ('"frame": 1', '"frame": 1.5'), ('"frame": 1', '"frame": -5'),
                      ('"frame": 1', '"frame": 1e30'), ('"width": 64', '"width": 1e400'),
                      ('"share": 1.0', '"share": 1' + 400 * "0"), ('"exposure": 1.0', '"exposure": 0'),

@@ -13,6 +13,7 @@ import pytest
 import torch
 from fit_flare.core.pictures import read_picture, write_png
 from fit_flare.core.removal.record import RECORD
+from fit_flare.core.removal.training import recipe_in
 from fit_flare.headless import cli
 
 RUN = Path(__file__).resolve().parents[2] / "headless" / "run.py"
@@ -38,6 +39,11 @@ def test_training_is_stopped_by_its_length_and_goes_on(backgrounds: Path, tmp_pa
     assert cli.main([*words, "--iterations", "3"]) == 1
     assert "--resume" in capsys.readouterr().err
     assert cli.main([*words, "--iterations", "3", "--resume"]) == 0
+    made = tmp_path / "made"
+    shorter = ["train-removal", "--backgrounds", str(backgrounds), "--out", str(made), "--resume", "--processes", "1"]
+    assert cli.main([*shorter, "--set", "clean=0.5"]) == 0
+    goes_by = recipe_in(made)  # with what it was begun by, not with the usual length and size
+    assert goes_by is not None and (goes_by.iterations, goes_by.bank, goes_by.clean) == (3, 2, 0.5)
     weights = str(tmp_path / "made" / "removal.safetensors")
     assert cli.main(["remove", str(backgrounds), "--out", str(tmp_path / "clean"), "--weights", weights]) == 0
     assert {path.name for path in (tmp_path / "clean").iterdir()} == {"a.png", "b.png", "remove.json"}

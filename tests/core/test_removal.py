@@ -813,6 +813,17 @@ def test_a_plate_under_a_suffix_that_cannot_hold_it_is_left_out(tmp_path: Path, 
     assert not (tmp_path / "out" / named).exists()
 
 
+@pytest.mark.skipif(os.name == "nt", reason="links want rights on Windows")
+def test_a_link_that_leads_nowhere_is_told_as_a_plate_that_is_missing(tmp_path: Path, everywhere: Path) -> None:
+    """A disk that is not mounted would leave a hole in the shot, and all would be said to be well."""
+    for name in ("a.1", "a.3"):
+        write_codes(tmp_path / "in" / f"{name}.png", picture())
+    (tmp_path / "in" / "a.2.png").symlink_to(tmp_path / "away" / "a.2.png")
+    with pytest.raises(FrameError, match=r"1 of 3 plates could not be cleaned: .*a\.2\.png is missing"):
+        remove_all([tmp_path / "in"], tmp_path / "out", Remover(everywhere, working_size=64), Progress())
+    assert (tmp_path / "out" / "a.3.png").exists()
+
+
 def test_a_clean_plate_stays_when_its_plate_can_no_longer_be_read(tmp_path: Path, everywhere: Path) -> None:
     write_codes(tmp_path / "in" / "a.png", picture())
     remover = Remover(everywhere, working_size=64)

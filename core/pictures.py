@@ -93,7 +93,7 @@ def pictures_below(folder: Path) -> list[Path]:
     """The pictures in a folder and its folders, but for hidden ones, sorted by name. Links that lead nowhere are among
     them, to be told by whoever reads them: the disk that they lead to may be away."""
     return [path for path in sorted(folder.rglob("*"))
-            if path.suffix.lower() in SUFFIXES and (path.is_file() or path.is_symlink() and not path.exists())
+            if path.suffix.lower() in SUFFIXES and (path.is_file() or (path.is_symlink() and not path.exists()))
             and not any(part.startswith(".") for part in path.relative_to(folder).parts)]
 
 

@@ -30,8 +30,9 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--flares", type=Path, metavar="DIR",
                         help="your own flares on black, mixed in: pictures, clips, or Flare7K++'s folders")
     parser.add_argument("--iterations", type=int, metavar="N", help="length (default: the recipe's)")
-    parser.add_argument("--resume", action="store_true", help="go on with the training in --out, by the recipe it has but for what --iterations and --set "
-                             "change")
+    parser.add_argument("--resume", action="store_true",
+                        help="go on with the training in --out, by the recipe it has but for what --iterations and "
+                             "--set change")
     parser.add_argument("--start", type=Path, metavar="FILE",
                         help='weights to begin with; "box" for those that come with the program')
     parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", dest="changes",

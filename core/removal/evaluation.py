@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -77,6 +78,9 @@ def _first_of(root: Path, names: Sequence[str]) -> Path | None:
 
 def _by_key(folder: Path) -> dict[str, Path]:
     paths = pictures_in(folder)
+    twice = [stem for stem, count in Counter(path.stem for path in paths).items() if count > 1]
+    if twice:
+        raise SettingsError(f"{folder} has {twice[0]} under two suffixes; remove one of them.")
     plain = {re.sub(r"^(input|gt|target|clean|scene|flare|blend|mask)_?", "", path.stem): path for path in paths}
     return plain if len(plain) == len(paths) else {path.stem: path for path in paths}
 
@@ -99,14 +103,22 @@ def evaluate(cases: Sequence[Case], clean: Callable[[Pixels], Pixels], progress:
 
     clean: display values (height, width, 3) to the same without flare. `gain_db` is the PSNR above the untouched
     input's (where two pictures are the same and have none, `ALIKE` counts), `made_worse` the share of pictures with a
-    gain below -0.5 dB; `masked_psnr` counts the pixels of the mask alone. lpips is null where no weights for it were
-    given, FLIP where its package is not installed.
+    gain below -0.5 dB; `failed` what is wrong with pairs that cannot be read, which are left out; `masked_psnr` counts
+    the pixels of the mask alone. lpips is null where no weights for it were given, FLIP where its package is not
+    installed. Raises FrameError where none can be read.
     """
     progress = progress or Progress()
     progress.stage("eval-removal", len(cases))
     rows: list[dict[str, Any]] = []
+    failed: list[str] = []
     for case in cases:
-        frame, truth, mask = case.read()
+        try:
+            frame, truth, mask = case.read()
+        except FrameError as problem:
+            failed.append(str(problem))
+            progress.say(f"Left out: {problem}")
+            progress.advance()
+            continue
         result = clean(frame)
         row: dict[str, Any] = {"name": case.name, "category": case.category,
                                "result": _scores(result, truth, mask, lpips),
@@ -115,9 +127,11 @@ def evaluate(cases: Sequence[Case], clean: Callable[[Pixels], Pixels], progress:
         row["gain_db"] = round((ALIKE if after is None else after) - (ALIKE if before is None else before), 4)
         rows.append(row)
         progress.advance()
+    if not rows:
+        raise FrameError(f"None of {len(cases)} pairs could be read: {failed[0]}")
     categories = sorted({row["category"] for row in rows})
-    return {"mean": _summary(rows), "categories": {name: _summary([row for row in rows if row["category"] == name])
-                                                   for name in categories}, "pictures": rows}
+    by_category = {name: _summary([row for row in rows if row["category"] == name]) for name in categories}
+    return {"failed": failed, "mean": _summary(rows), "categories": by_category, "pictures": rows}
 
 
 def _scores(picture: Pixels, truth: Pixels, mask: Pixels | None,
@@ -167,17 +181,19 @@ def worst_sheet(cases: Sequence[Case], clean: Callable[[Pixels], Pixels], scores
     """The pictures with the lowest gain, worst first: input | result | truth | flare taken, display values."""
     import cv2
 
-    ranked = sorted((row["gain_db"], k) for k, row in enumerate(scores["pictures"]))
+    by_name = {(case.category, case.name): case for case in cases}
+    ranked = sorted((row["gain_db"], k, by_name[row["category"], row["name"]])
+                    for k, row in enumerate(scores["pictures"]))
     strips = []
-    for gain, k in ranked[:WORST]:
-        frame, truth, _ = cases[k].read()
+    for gain, _, case in ranked[:WORST]:
+        frame, truth, _ = case.read()
         result = clean(frame)
         taken = np.clip((frame - result) * 2, 0, 1)
         height = round(width * frame.shape[0] / frame.shape[1])
         parts = [np.asarray(cv2.resize(part, (width, height), interpolation=cv2.INTER_AREA), np.float32)
                  for part in (frame, result, truth, taken)]
         head = np.zeros((20, 4 * width, 3), np.float32)
-        text = f"{cases[k].category} / {cases[k].name}: {gain:+.2f} dB   input | result | truth | taken away x2"
+        text = f"{case.category} / {case.name}: {gain:+.2f} dB   input | result | truth | taken away x2"
         cv2.putText(head, text, (4, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (0.9, 0.9, 0.9), 1, cv2.LINE_AA)
         strips += [head, np.concatenate(parts, 1)]
     return np.concatenate(strips, 0) if strips else np.zeros((20, 4 * width, 3), np.float32)

@@ -134,13 +134,20 @@ def _read_codes(path: Path) -> Plate:
     stored = stored_pixels(path)
     if stored.dtype not in (np.uint8, np.uint16, np.float32):
         raise FrameError(f"{path} holds {stored.dtype} pixels; save it as 8 or 16 bit or as 32 bit float.")
-    grey, alpha = stored.ndim == 2, None
-    if grey:
+    grey, alpha = stored.ndim == 2 or _is_grey_with_alpha(path), None
+    if stored.ndim == 2:
         codes = np.repeat(stored[..., None], 3, axis=2)
     else:
         alpha = stored[..., 3].copy() if stored.shape[2] == 4 else None
         codes = np.ascontiguousarray(stored[..., 2::-1])
     return Plate(path, codes, "linear" if stored.dtype == np.float32 else "srgb", grey, alpha)
+
+
+def _is_grey_with_alpha(path: Path) -> bool:
+    """A PNG of colour type 4 (PNG specification, 11.2.1), which OpenCV reads as colour."""
+    with open(path, "rb") as stream:
+        header = stream.read(26)
+    return header[:4] == b"\x89PNG" and header[25:] == b"\x04"
 
 
 def _misread(path: Path) -> str:
@@ -196,7 +203,7 @@ def write_plate(path: Path | str, plate: Plate, codes: NDArray[Any]) -> None:
                          "rename it to what it is.")
     import cv2
 
-    stored: NDArray[Any] = codes[..., 0] if plate.grey else codes[..., ::-1]
+    stored: NDArray[Any] = codes[..., 0] if plate.grey and plate.alpha is None else codes[..., ::-1]
     if plate.alpha is not None:
         stored = np.concatenate([stored, plate.alpha[..., None]], -1)
     options = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY, cv2.IMWRITE_JPEG_SAMPLING_FACTOR,

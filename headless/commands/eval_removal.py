@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ...core.errors import SettingsError
+from ...core.errors import FrameError, SettingsError
 from ...core.progress import Progress
 from ..command import Command, Step, refuse_useless, seed
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from ...core.removal.evaluation import Case
 
 SHEET, SCORES = "worst.png", "eval.json"
-
+TOLD = 20  # pairs that are spelled out in the last sentence
 
 SEED, SIZE = 7, (960, 640)
 """Of --synthetic."""
@@ -27,16 +27,18 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--synthetic", type=int, metavar="N",
                         help="in place of PAIRS: N synthesised pictures of every class of flare")
     parser.add_argument("--backgrounds", type=Path, nargs="+", default=[], metavar="DIR",
-                        help="clean pictures for --synthetic; one in ten, by name, is kept from training for this")
+                        help="clean pictures for --synthetic, of which one in ten, by name, is used: those that "
+                             "training leaves out")
     parser.add_argument("--lenses", type=Path, metavar="DIR",
-                        help="lens prescriptions for --synthetic, of which one in ten, by name, is kept from training")
+                        help="lens prescriptions (.lens) for --synthetic, of which one in ten, by name, is used: those "
+                             "that training leaves out (default: the six that come with the program)")
     parser.add_argument("--all-backgrounds", action="store_true", help="use every clean picture, not one in ten")
     parser.add_argument("--seed", type=seed, default=SEED, metavar="N", help=f"of --synthetic (default {SEED})")
     parser.add_argument("--size", type=int, nargs=2, default=SIZE, metavar=("W", "H"),
                         help="of --synthetic's pictures (default {} {})".format(*SIZE))
     parser.add_argument("--keep-glare", action="store_true", help="leave the glow round the lights")
-    parser.add_argument("--working-size", type=int, metavar="PIXELS", help="as of `remove`")
-    parser.add_argument("--weights", type=Path, metavar="FILE", help="as of `remove`")
+    parser.add_argument("--working-size", type=int, metavar="PIXELS", help="as for `remove`")
+    parser.add_argument("--weights", type=Path, metavar="FILE", help="as for `remove`")
     parser.add_argument("--lpips", type=Path, metavar="DIR", help="folder with the weights of LPIPS (AlexNet, v0.1)")
 
 
@@ -60,6 +62,9 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     write_json(words.out / SCORES, scores)
     write_png(words.out / SHEET, evaluation.worst_sheet(cases, remover.clean_display, scores))
     progress.say(evaluation.table(scores))
+    if scores["failed"]:
+        raise FrameError(f"{len(scores['failed'])} of {len(cases)} pairs could not be read, the scores of the others "
+                         f"are in {words.out / SCORES}: {' '.join(scores['failed'][:TOLD])}")
     return {"eval": str(words.out / SCORES), "sheet": str(words.out / SHEET), "mean": scores["mean"],
             "categories": scores["categories"]}
 

@@ -1071,6 +1071,23 @@ def test_pictures_that_would_come_out_as_something_else_are_refused_by_name(tmp_
         read_plate(tmp_path / "chroma.exr")
 
 
+def test_a_grey_png_with_alpha_stays_grey(tmp_path: Path, everywhere: Path) -> None:
+    """OpenCV reads it as colour, and writes no such file: three equal channels and the alpha come of it."""
+    grey = cv2.cvtColor(picture(), cv2.COLOR_BGR2GRAY)
+    with_alpha = np.stack([grey, 255 - grey], -1)
+    chunks = [(b"IHDR", struct.pack(">IIBBBBB", grey.shape[1], grey.shape[0], 8, 4, 0, 0, 0)),
+              (b"IDAT", zlib.compress(b"".join(b"\0" + row.tobytes() for row in with_alpha))), (b"IEND", b"")]
+    (tmp_path / "in").mkdir()
+    (tmp_path / "in" / "a.png").write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(
+        struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+        for name, data in chunks))
+    remove_all([tmp_path / "in"], tmp_path / "out", Remover(everywhere, working_size=64), Progress())
+    clean = cv2.imread(str(tmp_path / "out" / "a.png"), cv2.IMREAD_UNCHANGED)
+    np.testing.assert_array_equal(clean[..., 3], with_alpha[..., 1])
+    assert np.ptp(clean[..., :3], axis=-1).max() == 0
+    assert not np.array_equal(clean[..., 0], grey)
+
+
 def test_multipart_exr_is_told(tmp_path: Path) -> None:
     pixels = np.zeros((4, 4), np.float32)
     parts = [OpenEXR.Part({"name": name, "type": OpenEXR.scanlineimage}, dict.fromkeys("RGB", pixels)) for name in "ab"]

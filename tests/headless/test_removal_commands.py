@@ -102,6 +102,27 @@ def test_scores_of_pairs(tmp_path: Path, backgrounds: Path, capsys: pytest.Captu
     assert len(json.loads((tmp_path / "made" / "eval.json").read_text(encoding="utf-8"))["categories"]) == 8
 
 
+def test_pairs_that_cannot_be_read_do_not_cost_the_others_their_scores(tmp_path: Path, backgrounds: Path,
+                                                                       capsys: pytest.CaptureFixture[str]) -> None:
+    pairs = tmp_path / "pairs"
+    for kind in ("input", "gt"):
+        shutil.copytree(backgrounds, pairs / kind)
+    words = ["--out", str(tmp_path / "eval")]
+    (pairs / "gt" / "b.png").write_bytes((pairs / "gt" / "b.png").read_bytes()[:60])
+    assert cli.main(["eval-removal", str(pairs), *words]) == 1
+    assert "1 of 2 pairs could not be read, the scores of the others are in" in capsys.readouterr().err
+    scores = json.loads((tmp_path / "eval" / "eval.json").read_text(encoding="utf-8"))
+    assert [row["name"] for row in scores["pictures"]] == ["a"] and "b.png" in scores["failed"][0]
+    (pairs / "gt" / "a.png").write_bytes(b"none")
+    assert cli.main(["eval-removal", str(pairs), *words]) == 1
+    assert "None of 2 pairs could be read" in capsys.readouterr().err
+    (pairs / "input" / "a.jpg").touch()
+    for given, said in ((pairs, "a under two suffixes"), (pairs / "input", "holds no pairs"),
+                        (tmp_path / "nowhere", "is missing")):
+        assert cli.main(["eval-removal", str(given), *words]) == 2
+        assert said in capsys.readouterr().err
+
+
 def test_fit_does_without_flare_free_frames_where_there_are_none(capture: Path, tmp_path: Path,
                                                                   capsys: pytest.CaptureFixture[str]) -> None:
     bare, run = tmp_path / "bare", tmp_path / "run"

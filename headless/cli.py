@@ -29,7 +29,8 @@ Takes lens flares out of footage, learns them, and gives them back as layers.
   blender -b -P headless/run.py -- COMMAND …"""
 
 _EPILOGUE = """\
-A command that is stopped (Ctrl-C) can be given again and goes on, `fit` and `train-removal` with --resume.
+Stopped (Ctrl-C) and given again, solve, bake, transfer, remove and demo go on where they were; fit and
+train-removal do with --resume; the others start over.
 Status at the end: 0 done; 1 it could not be done, the last line says why; 2 the words made no sense; 130 stopped.
 `COMMAND --help` tells more."""
 

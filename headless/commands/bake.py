@@ -25,7 +25,8 @@ def arguments(parser: argparse.ArgumentParser) -> None:
                              "lights, lamp/ghost for one element; also saturation, spread, rotation (degrees), streak, "
                              "mute, solo; repeatable")
     parser.add_argument("--edits", type=Path, metavar="FILE", dest="keyed",
-                        help='edits by frame: {"frames": {"1": ["lamp.intensity=0"], "25": ["lamp.intensity=1"]}}')
+                        help='edits by frame (JSON or TOML): {"frames": {"1": ["lamp.intensity=0"], '
+                             '"25": ["lamp.intensity=1"]}}')
     parser.add_argument("--float", action="store_true", help="32 bit floats (default: 16 bit, depth always 32)")
     parser.add_argument("--overwrite", action="store_true",
                         help="replace layers of another bake in DIR (whole ones of the same settings are kept)")
@@ -119,7 +120,7 @@ def size(text: str | None) -> tuple[int | None, int | None]:
 
 
 COMMAND = Command(
-    "bake", "Renders a run's views to EXR layers.",
+    "bake", "Renders a run, a .flare or a shot to EXR layers.",
     """Writes one multilayer EXR a frame, scene-linear Rec. 709: composite at the root, scene, flare,
 flare_<light>, depth. scene + flare = composite, and the lights sum to the flare, so add them up in any
 compositor. Frames already made with the same settings are kept.

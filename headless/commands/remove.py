@@ -25,7 +25,8 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--capture", type=Path, metavar="CAPTURE", help="where the run's capture is, if it was moved")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR",
                         help="folder for the clean plates, under the names that the plates have")
-    frames.add_option(parser, "frame numbers, such as 1-20,31, of those in the plates' names; all where not given")
+    frames.add_option(parser, "frame numbers, such as 1-20,31 or 1-99:2, of those in the plates' names; all where not "
+                               "given")
     parser.add_argument("--flare", type=Path, metavar="DIR", help="write the flares too, as EXR in linear light")
     parser.add_argument("--matte", type=Path, metavar="PICTURE_OR_DIR",
                         help="where the flares are, white on black: one picture for all plates, or a folder with one "

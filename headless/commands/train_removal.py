@@ -26,7 +26,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, required=True, metavar="DIR",
                         help="folder for the weights, the checkpoint and the log")
     parser.add_argument("--lenses", type=Path, metavar="DIR",
-                        help="lens prescriptions (.lens) for the ghosts (default: a few that come with the program)")
+                        help="more lens prescriptions (.lens), besides the six that come with the program")
     parser.add_argument("--flares", type=Path, metavar="DIR",
                         help="your own flares on black, mixed in: pictures, clips, or Flare7K++'s folders")
     parser.add_argument("--iterations", type=int, metavar="N", help="length (default: the recipe's)")

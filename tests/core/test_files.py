@@ -368,6 +368,9 @@ def test_what_is_written_can_be_read_by_those_whom_the_system_lets(tmp_path: Pat
     mask = os.umask(0o022)
     try:
         write_json(tmp_path / "a.json", {})
+        with atomic_folder(tmp_path / "folder"):
+            pass
     finally:
         os.umask(mask)
     assert (tmp_path / "a.json").stat().st_mode & 0o777 == 0o644
+    assert (tmp_path / "folder").stat().st_mode & 0o777 == 0o755

@@ -148,7 +148,8 @@ def test_pairs_are_brighter_with_flare_and_keep_the_light() -> None:
         assert one.frame.shape == one.scene.shape == one.gentle.shape == (64, 96, 3)
         assert one.frame.min() >= 0 and one.frame.max() <= 1
         assert (one.gentle - one.scene).min() > -0.03, "the glow adds, but for what saturation takes"
-        assert (one.frame - one.scene).mean() > -0.01
+        assert (one.gentle - one.scene).mean() > 0.01
+        assert (one.frame - one.gentle).mean() > 2e-4, "the rest adds to that, some of it below what is stored"
     again = pairs.pair(np.random.default_rng(3), bank, backgrounds(), 96, 64, clean=0)
     assert np.array_equal(again.frame, made[3].frame)
 

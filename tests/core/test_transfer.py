@@ -518,9 +518,11 @@ def test_on_to_a_capture_and_in_chunks(flare: Path, look: Look, tmp_path: Path) 
     for part in (slice(2, 4), slice(0, 2)):
         again = Transfer(flare, of_capture(Capture.open(folder), look, {}))
         again.bake(tmp_path / "parts", [one.frame for one in target.frames[part]])
-    for path in sorted((tmp_path / "whole").rglob("*.*")):
-        if path.is_file():
-            assert (tmp_path / "parts" / path.relative_to(tmp_path / "whole")).read_bytes() == path.read_bytes()
+    written = {path.relative_to(tmp_path / "whole").as_posix() for path in (tmp_path / "whole").rglob("*.*")}
+    assert written == {"bake.json", *(f"layers.{k:04d}.exr" for k in range(4)),
+                       *(f"frames/{k:04d}.png" for k in range(4))}
+    for name in sorted(written):
+        assert (tmp_path / "parts" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
     with pytest.raises(RunError, match="other settings"):
         Transfer(flare, target, TransferSettings(query="source")).bake(tmp_path / "whole")
 

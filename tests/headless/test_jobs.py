@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 import os
 from pathlib import Path
 
@@ -23,6 +24,9 @@ if word == "threads":
     sys.exit(f"{os.environ['OMP_NUM_THREADS']} and {os.environ['NUMBA_NUM_THREADS']}")
 if word == "loud":
     sys.exit("Bus error at 0x0")
+if word == "told":
+    with open(__file__ + ".json", "w") as told:
+        json.dump(sys.argv[1:], told)
 """
 
 
@@ -63,7 +67,9 @@ def test_processes_share_the_cores_that_are_theirs(monkeypatch: pytest.MonkeyPat
 @pytest.mark.usefixtures("program")
 def test_names_behind_two_dashes_stay_names() -> None:
     words = argparse.Namespace(words=["remove", "--", "bad", "--frames"])
-    jobs.run_parts(words, "remove", [["--frames", "fine"]], 1, 1, Progress(), past_failures=True)
+    jobs.run_parts(words, "remove", [["--frames", "told"]], 1, 1, Progress(), past_failures=True)
+    told = json.loads(Path(f"{hand_off.RUN}.json").read_text(encoding="utf-8"))
+    assert told == ["remove", "--step", "remove", "--frames", "told", "--progress", "json", "--", "bad", "--frames"]
 
 
 @pytest.mark.usefixtures("program")

@@ -24,15 +24,17 @@ VERSION = 1
 
 def write_layers(path: Path | str, layers: FrameLayers, *, half: bool = True,
                  notes: Mapping[str, Any] | None = None, chromaticities: Chromaticities | None = REC_709,
-                 turn: AbstractContextManager[None] | None = None) -> None:
+                 pixel_aspect: float = 1.0, turn: AbstractContextManager[None] | None = None) -> None:
     """Write a frame's layers atomically, ZIP compressed; depth stays 32 bit when the rest is `half`. turn: see
     `atomic_path`.
 
-    notes: JSON-able entries for the header (view, frame, …). chromaticities: of the layers' linear space.
+    notes: JSON-able entries for the header (view, frame, …). chromaticities: of the layers' linear space. pixel_aspect:
+    how wide a pixel is shown in parts of its height.
     """
     lights = {layer: light for light, layer in layer_names(layers.flares).items()}
     description = json.dumps({"version": VERSION, "lights": lights, **(notes or {})})
-    header: dict[str, Any] = {"software": "Fit Flare", ATTRIBUTE: description}
+    header: dict[str, Any] = {"software": "Fit Flare", ATTRIBUTE: description,
+                              "pixelAspectRatio": float(pixel_aspect)}
     if chromaticities is not None:
         header["chromaticities"] = chromaticities
     write_exr(path, layers.channels(), half=half, header=header, turn=turn)

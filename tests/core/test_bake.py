@@ -20,7 +20,7 @@ from core.colour import REC_709, colour_space
 from core.errors import Cancelled, FrameError, RunError, SettingsError
 from core.files import write_json
 from core.look import KeyedEdits, LookEdits
-from core.pictures import exr_is_rec709, read_exr, write_exr
+from core.pictures import exr_header, exr_is_rec709, read_exr, write_exr
 from core.progress import Progress
 
 HALF = 2.0 ** -11  # the relative rounding error of 16 bit floats
@@ -205,6 +205,15 @@ def test_bake_writes_every_frame_at_the_size_asked_for(tmp_path: Path) -> None:
     rendering = FakeRenderer().render(camera(1).scaled(24, 16))
     np.testing.assert_allclose(again.flares["lamp"], 2 * rendering.flare_by_light["lamp"], rtol=HALF, atol=1e-6)
     np.testing.assert_allclose(again.flares["key light"], rendering.flare_by_light["key light"], rtol=HALF, atol=1e-6)
+
+
+def test_layers_of_squeezed_frames_say_so(tmp_path: Path) -> None:
+    """A compositor would show them half as wide as their plates; a solve's focal lengths that differ a little do not
+    make a pixel oblong."""
+    cameras = {name: replace(camera(60), fx=fx) for name, fx in zip(VIEWS, (30.0, 60.0, 60.3), strict=True)}
+    bake(FakeRenderer(), FRAMES, cameras, tmp_path)
+    told = [exr_header(tmp_path / frame.file)["pixelAspectRatio"] for frame in FRAMES]
+    assert told == [2.0, 1.0, 1.0]
 
 
 def test_edits_by_frame_reach_the_renderer_or_the_layers(tmp_path: Path) -> None:

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from ...core.removal.recipe import Recipe
     from ...core.removal.synthesis.prescription import Prescription
 
+MOST_LENSES = 180
+
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--backgrounds", type=Path, nargs="+", required=True, metavar="DIR",
@@ -37,8 +39,8 @@ def arguments(parser: argparse.ArgumentParser) -> None:
                         help='weights to begin with; "box" for those that come with the program')
     parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", dest="changes",
                         help="any other number of the recipe, e.g. learning_rate=3e-4; repeatable")
-    parser.add_argument("--most-lenses", type=int, default=180, metavar="N",
-                        help="so many of the lenses, evenly spread; each is traced once (default 180)")
+    parser.add_argument("--most-lenses", type=int, default=MOST_LENSES, metavar="N",
+                        help=f"so many of the lenses, evenly spread; each is traced once (default {MOST_LENSES})")
     parser.add_argument("--model", choices=("network", "diffusion"), default="network",
                         help="network: the one that comes with the program; diffusion: a LoRA for one-step diffusion, "
                              "if diffusers, transformers and peft are at hand")
@@ -68,6 +70,8 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
         refuse_useless(words, {"base": None, "keep_glare": False, "lpips": None}, "--model diffusion")
     else:
         refuse_useless(words, {"start": None, "processes": None}, "--model network")
+    if words.lenses is None:
+        refuse_useless(words, {"most_lenses": MOST_LENSES}, "--lenses")
     from_1("--most-lenses", words.most_lenses)
     if words.threads is not None:
         from_1("--threads", words.threads)

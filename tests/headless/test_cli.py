@@ -151,7 +151,7 @@ def test_what_cannot_be_done_is_status_1_and_one_sentence(words: list[str], capt
     ["compose", "{capture}", "--out", "{capture}"],
     ["train-removal", "--backgrounds", "{capture}", "--out", "{tmp}/o", "--threads", "-1"],
     *(["train-removal", "--backgrounds", "{capture}", "--out", "{tmp}/o", *more] for more in (
-        ["--keep-glare"], ["--base", "sd-turbo"], ["--lpips", "no"], ["--most-lenses", "0"],
+        ["--keep-glare"], ["--base", "sd-turbo"], ["--lpips", "no"], ["--most-lenses", "0"], ["--most-lenses", "7"],
         ["--model", "diffusion", "--start", "box"], ["--model", "diffusion", "--processes", "2"])),
     *(["eval-removal", "{capture}", "--out", "{tmp}/o", *more] for more in (
         ["--seed", "3"], ["--size", "64", "64"], ["--backgrounds", "{capture}"], ["--lenses", "no"],

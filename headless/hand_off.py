@@ -61,6 +61,9 @@ def engine_command(named: str | None) -> list[str]:
         python = python_at(folder)
         if python is not None and _has_torch(python):
             return [str(python), str(RUN)]
+    if not (ROOT / "Makefile").exists():  # the extension, as Blender installs it
+        raise EngineError("This step needs a Python with torch, and none was found: press Set Up Engine in the "
+                          "add-on's preferences, or name one with --engine or FIT_FLARE_ENGINE.")
     raise EngineError(f"This step needs a Python with torch, and none was found: run `make setup` in {ROOT}, or "
                       "`python -m pip install --group engine -c constraints.txt` there with a Python of yours, or name "
                       "one with --engine or FIT_FLARE_ENGINE.")

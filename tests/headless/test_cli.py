@@ -201,10 +201,11 @@ def ending_with(problem: BaseException | None, monkeypatch: pytest.MonkeyPatch) 
     (OSError(28, "No space left on device", "x.exr"), 1,
      "The disk is full (x.exr); make room and start it again, what is finished is kept."),
     (OSError(13, "Permission denied", "x.exr"), 1, "The system refused: Permission denied (x.exr)."),
-    (MemoryError(), 1, "It does not fit into the memory of this machine; use a smaller --size, or fewer --jobs."),
+    (MemoryError(), 1,
+     "It does not fit into the memory of this machine; end other programs, or take a larger machine."),
     (RuntimeError("[enforce fail at alloc_cpu.cpp:127] err == 0. DefaultCPUAllocator: can't allocate memory: you tried "
                   "to allocate 972000000 bytes. Error code 12 (Cannot allocate memory)"), 1,
-     "It does not fit into the memory of this machine; use a smaller --size, or fewer --jobs."),
+     "It does not fit into the memory of this machine; end other programs, or take a larger machine."),
     (ZeroDivisionError("division by zero"), 1,
      "A defect of Fit Flare, please report it: ZeroDivisionError: division by zero."),
 ])
@@ -231,6 +232,22 @@ def test_who_stops_a_command_is_told_how_it_goes_on(options: list[str], hint: st
     monkeypatch.setitem(COMMANDS, "try", Command("try", "Tries.", "", arguments, (Step("try", "engine", run),)))
     assert cli.main(["try"]) == 130
     assert f"Stopped as asked. {hint}" in capfd.readouterr().err
+
+
+@pytest.mark.parametrize(("options", "way"), [(["--size"], "use a smaller --size."),
+                                              (["--size", "--jobs"], "use a smaller --size, or fewer --jobs.")])
+def test_what_takes_less_memory_is_of_the_command_at_hand(options: list[str], way: str, monkeypatch: pytest.MonkeyPatch,
+                                                          capfd: pytest.CaptureFixture[str]) -> None:
+    def run(_words: argparse.Namespace, _progress: Progress) -> dict[str, Any]:
+        raise MemoryError
+
+    def arguments(parser: argparse.ArgumentParser) -> None:
+        for option in options:
+            parser.add_argument(option)
+
+    monkeypatch.setitem(COMMANDS, "try", Command("try", "Tries.", "", arguments, (Step("try", "engine", run),)))
+    assert cli.main(["try"]) == 1
+    assert f"It does not fit into the memory of this machine; {way}" in capfd.readouterr().err
 
 
 def test_events_have_standard_output_for_themselves(monkeypatch: pytest.MonkeyPatch,

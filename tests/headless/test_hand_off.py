@@ -64,6 +64,9 @@ def torchless(tmp_path: Path) -> Path:
 
 
 def test_the_engine_is_looked_for_in_order(bare: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(EngineError, match="press Set Up Engine"):  # the extension has no Makefile
+        hand_off.engine_command(None)
+    (bare / "Makefile").touch()
     with pytest.raises(EngineError, match="make setup"):
         hand_off.engine_command(None)
     environment = Path(sys.prefix)

@@ -66,6 +66,7 @@ def torchless(tmp_path: Path) -> Path:
 def test_the_engine_is_looked_for_in_order(bare: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(EngineError, match="press Set Up Engine"):  # the extension has no Makefile
         hand_off.engine_command(None)
+    bare.mkdir()
     (bare / "Makefile").touch()
     with pytest.raises(EngineError, match="make setup"):
         hand_off.engine_command(None)
@@ -73,7 +74,6 @@ def test_the_engine_is_looked_for_in_order(bare: Path, monkeypatch: pytest.Monke
     (bare.parent / ".venv").symlink_to(environment, target_is_directory=True)
     beside = hand_off.engine_command(None)
     assert beside[0].startswith(str(bare.parent / ".venv"))
-    bare.mkdir()
     (bare / ".venv").symlink_to(environment, target_is_directory=True)
     assert hand_off.engine_command(None)[0].startswith(str(bare / ".venv"))
     monkeypatch.setattr(hand_off, "_engine_in_preferences", lambda: sys.executable)

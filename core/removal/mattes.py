@@ -53,6 +53,11 @@ class Mattes:
         # Painted on nothing, which counts as black.
         if matte.alpha is not None and matte.encoding == "srgb" and not is_premultiplied(path):
             values = values * (matte.alpha.astype(np.float32) / np.float32(matte.top))
+        in_exr = matte.rest.get("channels", {}).get("A")
+        if in_exr is not None:
+            alpha = np.nan_to_num(np.asarray(in_exr, np.float32), nan=0.0, posinf=1.0)
+            # A roto may be in alpha alone. White beside it is as bright as it is there, whether multiplied or not.
+            values = np.minimum(values, alpha) if values.any() else np.where((alpha < 1).any(), alpha, values)
         if own.is_frame and own.size == plate.size:  # painted on the very pixels of the plate, overscan and all
             return np.clip(values, 0, 1)
         (columns, rows), (width, height) = own.frame, plate.frame

@@ -1071,6 +1071,19 @@ def test_pictures_that_would_come_out_as_something_else_are_refused_by_name(tmp_
         read_plate(tmp_path / "chroma.exr")
 
 
+@pytest.mark.parametrize(("colour", "alpha", "marked"), [
+    ("black", "left", "left"), ("white", "left", "left"), ("left", "left", "left"), ("left", "full", "left"),
+    ("black", "full", "none"), ("black", "none", "none")])
+def test_the_alpha_of_an_exr_matte_counts(colour: str, alpha: str, marked: str, tmp_path: Path) -> None:
+    """Rotos come with the shape in alpha alone, with it in all channels, or white beside it."""
+    left = np.zeros((48, 64), np.float32)
+    left[:, :32] = 1
+    shapes = {"left": left, "black": 0 * left, "none": 0 * left, "white": 0 * left + 1, "full": 0 * left + 1}
+    write_exr(tmp_path / "roto.exr", {**dict.fromkeys("RGB", shapes[colour]), "A": shapes[alpha]})
+    found = Mattes(tmp_path / "roto.exr").read(Path("plate.png"), whole(64, 48))
+    np.testing.assert_array_equal(found, shapes[marked])
+
+
 def test_a_grey_png_with_alpha_stays_grey(tmp_path: Path, everywhere: Path) -> None:
     """OpenCV reads it as colour, and writes no such file: three equal channels and the alpha come of it."""
     grey = cv2.cvtColor(picture(), cv2.COLOR_BGR2GRAY)

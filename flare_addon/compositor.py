@@ -42,7 +42,7 @@ def set_up(scene: Any, layers: LayerFolder, *, keep_image: bool = False, plate: 
     if scene.render.use_border and scene.render.use_crop_to_border:
         raise FrameError(f"The scene {scene.name!r} renders a region cut out of the frame, where layers of whole "
                          "frames do not fit; switch Crop to Render Region off in its output properties.")
-    there = tree_of(scene)
+    there = _own_tree(scene)
     if NOTE in scene and (there is None or not any(name in there.nodes for name in _OURS)):
         del scene[NOTE]  # our nodes were deleted by hand: what was noted is of another compositor
     note = _note(scene)
@@ -103,6 +103,16 @@ def set_up(scene: Any, layers: LayerFolder, *, keep_image: bool = False, plate: 
         viewer = _named(new_node(tree, "CompositorNodeViewer", 1, -1), VIEWER)  # what the backdrop shows
         tree.links.new(node.outputs["Image"], viewer.inputs["Image"])
     return node
+
+
+def _own_tree(scene: Any) -> Any:
+    """The scene's compositor tree, None where it has none. One that another scene has as well is copied first: what is
+    done to it would be done to the other scene's."""
+    tree = tree_of(scene)
+    if GROUPS_ARE_TREES and tree is not None and any(other != scene and tree_of(other) == tree
+                                                     for other in bpy.data.scenes):
+        tree = scene.compositing_node_group = tree.copy()
+    return tree
 
 
 def plate_of(scene: Any) -> tuple[Any, int, int, int]:
@@ -202,9 +212,10 @@ def remove(scene: Any) -> None:
 
     Raises FrameError where it is not set up.
     """
-    tree, node = tree_of(scene), find_node(scene)
-    if node is None:
+    if find_node(scene) is None:
         raise FrameError(f"The scene {scene.name!r} has no compositor of Fit Flare to remove.")
+    tree = _own_tree(scene)
+    node = tree.nodes[GROUP]
     note = dict(scene[NOTE]) if NOTE in scene else {**_note(scene), **_before(tree), "nodes": None}
     group, images = node.node_tree, [tree.nodes[name].image for name in (LAYERS, PLATE) if tree.nodes.get(name)]
     below = _under(tree, node, note)

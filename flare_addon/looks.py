@@ -54,6 +54,11 @@ def look_of(scene: Any) -> Look:
     return known[1]
 
 
+def is_placed(item: Any, scene: Any) -> bool:
+    """Whether a flare has a light in the scene; an object that was deleted there is still the flare's."""
+    return item.target is not None and item.target.name in scene.objects
+
+
 def use(scene: Any, path: Path | str) -> Look:
     """Show a .flare in the scene: one flare for each of its lights, at the light object of that name.
 
@@ -163,7 +168,7 @@ def placed(scene: Any, depsgraph: Any, camera: Any) -> tuple[NDArray[np.float64]
     into = cameras.to_capture(root)
     lights = []
     for item in state.lights:
-        if item.target is None or item.target.name not in scene.objects:
+        if not is_placed(item, scene):
             continue
         where = stands(item.target, matrix_of(item.target, depsgraph), matrix.translation)
         share = visible_share(scene, depsgraph, matrix.translation, item) if state.occlusion else 1.0

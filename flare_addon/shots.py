@@ -221,7 +221,7 @@ def bake(scene: Any, chosen: Sequence[Any], *, others_may_go: bool = False) -> J
         raise CaptureError("The scene has no camera to bake from; add one, or import a capture.")
     engine.command()
     state = scene.fit_flare
-    if not any(item.target is not None for item in state.lights):
+    if not any(looks.is_placed(item, scene) for item in state.lights):
         raise RunError("No flare has a light to come from; choose an object for each in the panel Look.")
     if looks.twice(state):
         raise RunError(f"Two flares have the name {looks.twice(state)!r}; rename one in the panel Look.")

@@ -112,6 +112,13 @@ def test_nothing_is_left_of_lights_that_other_layers_are_without(made: Made) -> 
     assert_half_equal(rgb(made.out / "fewer" / "0.exr"), layers.scene + layers.flare)
 
 
+def test_scenes_that_share_a_tree_do_not_change_each_other(made: Made) -> None:
+    if "two scenes of one tree" not in made.facts:
+        pytest.skip("before 5.0 every scene has a tree of its own")
+    assert made.facts["two scenes of one tree"] == [True, True, True]
+    assert_half_equal(rgb(made.out / "of one tree" / "0.exr"), baked(made, 0).composite)
+
+
 def test_a_picture_without_layers_is_refused_where_there_were_layers(made: Made) -> None:
     assert "holds no scene and flare layers" in made.facts.get("no layers", "")
 

@@ -258,6 +258,11 @@ bpy.data.objects.remove(scene.camera)
 said["camera deleted"] = [polls("bake"), scene.camera is None]
 said["panel without a camera"] = shown("look")
 target = scene.fit_flare.lights[0].target
+scene.camera = bpy.data.objects.new("Camera", bpy.data.cameras.new("Camera"))
+scene.collection.objects.link(scene.camera)
+for collection in target.users_collection:  # as X in the viewport does: the flare still knows the object
+    collection.objects.unlink(target)
+said["light taken out of the scene"] = [scene.fit_flare.lights[0].target is not None, refusal(lambda: ops.bake())]
 bpy.data.objects.remove(target)
 said["light deleted"] = scene.fit_flare.lights[0].target is None
 second = bpy.data.scenes.new("Second")

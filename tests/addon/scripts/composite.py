@@ -95,6 +95,22 @@ except FrameError as problem:
 facts["fewer"] = [socket.name for socket in node.inputs if socket.is_linked]
 render(scene, "fewer", [layers.first])
 
+# Two scenes of one tree: what is set up and removed in the second leaves the first as it is.
+if flare_node.GROUPS_ARE_TREES:
+    scene = empty()
+    compositor.set_up(scene, layers)
+    second = bpy.data.scenes.new("Second")
+    second.compositing_node_group = scene.compositing_node_group
+    compositor.set_up(second, LayerFolder.open(fewer))
+    shown = flare_node.tree_of(scene).nodes[compositor.LAYERS].image.filepath
+    compositor.remove(second)
+    third = bpy.data.scenes.new("Third")
+    third.compositing_node_group = scene.compositing_node_group
+    compositor.remove(third)
+    facts["two scenes of one tree"] = [str(folder) in bpy.path.abspath(shown),
+                                       flare_node.find_node(second) is None, flare_node.find_node(third) is None]
+    render(scene, "of one tree", sorted(layers.files)[:1])
+
 # Wide pixels stay; a region that is cut out is refused, and leaves nothing.
 scene = empty()
 scene.render.pixel_aspect_x = 2

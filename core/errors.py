@@ -7,6 +7,7 @@ The commands and the add-on show it as it stands; anything else that escapes is 
 from __future__ import annotations
 
 import errno
+from collections.abc import Sequence
 
 
 class FitFlareError(Exception):
@@ -39,6 +40,16 @@ class EngineError(FitFlareError):
 
 class Cancelled(FitFlareError):
     """The user, or the system, asked a long job to stop; what is on disk is whole."""
+
+
+_MOST = 20
+"""Failures that are spelled out in the last sentence of many."""
+
+
+def spelled_out(failures: Sequence[str]) -> str:
+    """The sentences of what failed, one after the other; of many the first, and how many more there are."""
+    more = f" And {len(failures) - _MOST} more." if len(failures) > _MOST else ""
+    return " ".join(failures[:_MOST]) + more
 
 
 DISK_FULL = (errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC))

@@ -170,10 +170,10 @@ def locked(lock: Path | str, stale_s: float = 10.0) -> Iterator[None]:
         patiently(_remove_lock, lock, own)
 
 
-def _remove_lock(lock: Path, of: int) -> None:
-    """The one of that time in ns: who was slow enough to be taken for dead has lost it to another."""
+def _remove_lock(lock: Path, made_ns: int) -> None:
+    """The one that was made at that time: who was slow enough to be taken for dead has lost it to another."""
     with contextlib.suppress(FileNotFoundError):
-        if lock.stat().st_mtime_ns == of:
+        if lock.stat().st_mtime_ns == made_ns:
             lock.unlink()
 
 

@@ -266,7 +266,7 @@ def _light(layout: Any, scene: Any, item: Any) -> None:
     column.prop(item, "target")
     if item.target is None:
         lines(box, f"Choose the object that {item.name} comes from.", "ERROR")
-    elif item.target.name not in scene.objects:
+    elif not looks.is_placed(item, scene):
         lines(box, f"{item.target.name} is not in this scene: choose another object.", "ERROR")
     lines(box, f"Look: {item.source}")
     _sliders(box, item)

@@ -123,15 +123,14 @@ def _status(words: Sequence[str], progress: Progress) -> int:
         return FAILED
     except Exception as problem:
         if is_out_of_memory(problem):
-            progress.error("It does not fit into the memory of this machine; "
-                           f"{_less(arguments)}.")
+            progress.error(f"It does not fit into the memory of this machine; {_memory_spared(arguments)}.")
             return FAILED
         traceback.print_exc()
         progress.error(f"A defect of Fit Flare, please report it: {type(problem).__name__}: {problem}.")
         return FAILED
 
 
-def _less(arguments: argparse.Namespace) -> str:
+def _memory_spared(arguments: argparse.Namespace) -> str:
     """What takes less memory, of what this command has."""
     ways = [way for option, way in (("size", "a smaller --size"), ("jobs", "fewer --jobs"),
                                     ("processes", "fewer --processes")) if hasattr(arguments, option)]

@@ -29,8 +29,6 @@ from .layers import FrameLayers, Rendering, layer_names, layers_of
 RECORD = "bake.json"
 LOCK = ".bake.lock"
 VERSION = 1
-SQUARE = 0.02
-"""So far from 1 a pixel still counts as square."""
 
 
 class OfCamera(Protocol):
@@ -178,17 +176,10 @@ def bake_frames(source: Sequenced, frames: Sequence[Frame], cameras: Mapping[str
         remove_partial_of(path)
         # Not kept in a name: at 4K the layers of one frame are half a gigabyte.
         write_layers(path, made(frame), half=settings.half, chromaticities=space.chromaticities, notes=notes(frame),
-                     pixel_aspect=pixel_aspect(cameras[frame.view]), turn=in_turn())
+                     pixel_aspect=cameras[frame.view].pixel_aspect, turn=in_turn())
         record = _add_to_record(out, made_from, names, [_entry(out, frame, of_frame(frame).rest)])
         progress.advance()
     return record
-
-
-def pixel_aspect(camera: Camera) -> float:
-    """How wide a camera's pixels are in parts of their height: 2 for squeezed plates. Focal lengths that a solve found
-    a little apart are of square ones."""
-    aspect = camera.fy / camera.fx
-    return round(aspect, 3) if abs(aspect - 1) > SQUARE else 1.0
 
 
 def _layers(renderer: OfCamera, camera: Camera, edits: LookEdits, lights: Sequence[str]) -> FrameLayers:

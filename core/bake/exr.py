@@ -29,12 +29,12 @@ def write_layers(path: Path | str, layers: FrameLayers, *, half: bool = True,
     `atomic_path`.
 
     notes: JSON-able entries for the header (view, frame, …). chromaticities: of the layers' linear space. pixel_aspect:
-    how wide a pixel is shown in parts of its height.
+    as `Camera.pixel_aspect`.
     """
     lights = {layer: light for light, layer in layer_names(layers.flares).items()}
     description = json.dumps({"version": VERSION, "lights": lights, **(notes or {})})
     header: dict[str, Any] = {"software": "Fit Flare", ATTRIBUTE: description,
-                              "pixelAspectRatio": float(pixel_aspect)}
+                              "pixelAspectRatio": pixel_aspect}
     if chromaticities is not None:
         header["chromaticities"] = chromaticities
     write_exr(path, layers.channels(), half=half, header=header, turn=turn)

@@ -13,6 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Floats = NDArray[np.float64]
+SQUARE = 0.02
+"""So far from 1 the aspect of a pixel still counts as 1."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +51,12 @@ class Camera:
     def focal_length(self) -> float:
         """In pixels, the (geometric) mean of both directions."""
         return math.sqrt(self.fx * self.fy)
+
+    @property
+    def pixel_aspect(self) -> float:
+        """A pixel's width by its height, 2 for squeezed plates; 1 where a solve found focal lengths a little apart."""
+        aspect = self.fy / self.fx
+        return round(aspect, 3) if abs(aspect - 1) > SQUARE else 1.0
 
     @property
     def reach(self) -> float:

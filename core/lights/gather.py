@@ -31,6 +31,7 @@ DRAWS = 8         # of twice PAIRS, after which those that came are enough
 PATIENCE = 6      # places of too few views in a row, after which there is nothing left
 USES = 16         # refused places, after which others are proposed
 AT_ONCE = 512     # places whose worth is found together: memory is theirs times the detections
+FEW = 32          # of them once each has a bound
 
 
 @dataclass(frozen=True)
@@ -172,7 +173,7 @@ class _Proposed:
         from call to call."""
         index = np.flatnonzero(open_ & (self._seen.worth > 0))
         while len(self._places):
-            at_once = AT_ONCE if np.isinf(self._bounds).any() else AT_ONCE // 16
+            at_once = AT_ONCE if np.isinf(self._bounds).any() else FEW
             some = np.argsort(-self._bounds, kind="stable")[:at_once]
             self._bounds[some] = _worth(self._seen, self._places[some], index)
             top = int(np.argmax(self._bounds))

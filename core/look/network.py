@@ -142,21 +142,21 @@ class Network:
         fit each other, before any view is asked for."""
         nowhere = np.zeros(3, np.float32)
         features = np.concatenate([self._light_grid(nowhere), self._camera_grid(nowhere)])
-        self._every(self._share_of(self._encoded[:1]), features)
+        self._all_offsets(self._share_of(self._encoded[:1]), features)
         if corrects and self.light_correction(features).shape != (2,):
             raise ValueError("the correction of the light is no place")
 
     def offsets(self, features: Floats) -> dict[str, Floats]:
         """Offsets by name, (n, width) each."""
-        every = self._every(self._gaussian_share, features)
+        every = self._all_offsets(self._gaussian_share, features)
         edges = np.cumsum([0, *self._heads.values()])
         return {name: every[:, a:b] for name, a, b in zip(self._heads, edges[:-1], edges[1:], strict=True)}
 
     def _share_of(self, encoded: Floats) -> Floats:
         return np.asarray(encoded @ self._t["network.gaussian_layer.weight"].T, np.float32)
 
-    def _every(self, gaussian_share: Floats, features: Floats) -> Floats:
-        """(n, all widths) what the heads say."""
+    def _all_offsets(self, gaussian_share: Floats, features: Floats) -> Floats:
+        """(n, sum of the heads' widths)."""
         x = np.maximum(gaussian_share + self._linear("network.view_layer", features[None]), 0)
         for name in self._hidden:
             x = np.maximum(self._linear(name, x), 0)

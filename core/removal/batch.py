@@ -7,7 +7,7 @@ from collections.abc import Container, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from ..errors import DISK_FULL, FrameError, SettingsError, refusal
+from ..errors import DISK_FULL, FrameError, SettingsError, refusal, spelled_out
 from ..files import check_apart
 from ..pictures import pictures_below, window_of
 from ..progress import Progress
@@ -16,8 +16,6 @@ from .mattes import Mattes
 from .plates import is_of_the_plate, write_results
 from .record import RECORD, Record, made_from
 from .steady import Sequences, shot_order
-
-TOLD = 20  # failures that are spelled out in the last sentence
 
 
 def plates_of(inputs: Iterable[Path], apart_from: Iterable[Path | None] = ()) -> list[tuple[Path, Path]]:
@@ -105,7 +103,6 @@ def remove_all(inputs: Sequence[Path], folder: Path, remover: Remover, progress:
     if kept:
         progress.say(f"{kept} plates were in {folder} already; --overwrite makes them again.")
     if failed:
-        more = f" And {len(failed) - TOLD} more." if len(failed) > TOLD else ""
-        raise FrameError(f"{len(failed)} of {len(plates)} plates could not be cleaned: {' '.join(failed[:TOLD])}{more}")
+        raise FrameError(f"{len(failed)} of {len(plates)} plates could not be cleaned: {spelled_out(failed)}")
     progress.say(f"{made + kept} clean plates are in {folder}.")
     return {"plates": str(folder), "made": made, "kept": kept}

@@ -58,9 +58,9 @@ def paired(folder: Path | str) -> list[Case]:
         truth = _first_of(root, TRUTHS)
         if truth is None:
             continue
-        masks_in = _first_of(root, ("mask",))
+        marked = _first_of(root, ("mask",))
         category = root.relative_to(folder).as_posix() if root != folder else root.name
-        truths, masks = _by_key(truth), _by_key(masks_in) if masks_in else {}
+        truths, masks = _by_key(truth), _by_key(marked) if marked else {}
         for key, path in _by_key(inputs).items():
             if key not in truths:
                 raise SettingsError(f"{path} has no counterpart in {truth}; add it, or remove the picture.")
@@ -182,10 +182,9 @@ def worst_sheet(cases: Sequence[Case], clean: Callable[[Pixels], Pixels], scores
     import cv2
 
     by_name = {(case.category, case.name): case for case in cases}
-    ranked = sorted((row["gain_db"], k, by_name[row["category"], row["name"]])
-                    for k, row in enumerate(scores["pictures"]))
     strips = []
-    for gain, _, case in ranked[:WORST]:
+    for row in sorted(scores["pictures"], key=lambda row: row["gain_db"])[:WORST]:
+        case, gain = by_name[row["category"], row["name"]], row["gain_db"]
         frame, truth, _ = case.read()
         result = clean(frame)
         taken = np.clip((frame - result) * 2, 0, 1)

@@ -48,16 +48,7 @@ class Mattes:
         import cv2
 
         path = self.path(name)
-        matte, own = read_plate(path), window_of(path)
-        values = np.nan_to_num(matte.codes.max(-1).astype(np.float32) / np.float32(matte.top), nan=0.0, posinf=1.0)
-        # Painted on nothing, which counts as black.
-        if matte.alpha is not None and matte.encoding == "srgb" and not is_premultiplied(path):
-            values = values * (matte.alpha.astype(np.float32) / np.float32(matte.top))
-        in_exr = matte.rest.get("channels", {}).get("A")
-        if in_exr is not None:
-            alpha = np.nan_to_num(np.asarray(in_exr, np.float32), nan=0.0, posinf=1.0)
-            # A roto may be in alpha alone. White beside it is as bright as it is there, whether multiplied or not.
-            values = np.minimum(values, alpha) if values.any() else np.where((alpha < 1).any(), alpha, values)
+        own, values = window_of(path), _painted(path)
         if own.is_frame and own.size == plate.size:  # painted on the very pixels of the plate, overscan and all
             return np.clip(values, 0, 1)
         (columns, rows), (width, height) = own.frame, plate.frame
@@ -70,6 +61,21 @@ class Mattes:
         x, y = plate.origin
         values = framed(values, Window(plate.frame, (-x, -y), plate.size))
         return np.clip(values, 0, 1)
+
+
+def _painted(path: Path) -> NDArray[np.float32]:
+    """(height, width): a matte's brightest channel by its alpha; what is painted on nothing counts as black."""
+    matte = read_plate(path)
+    values = np.nan_to_num(matte.codes.max(-1).astype(np.float32) / np.float32(matte.top), nan=0.0, posinf=1.0)
+    if matte.alpha is not None and matte.encoding == "srgb" and not is_premultiplied(path):
+        return values * (matte.alpha.astype(np.float32) / np.float32(matte.top))
+    in_exr = matte.rest.get("channels", {}).get("A")
+    if in_exr is None:
+        return values
+    alpha = np.nan_to_num(np.asarray(in_exr, np.float32), nan=0.0, posinf=1.0)
+    if values.any():  # multiplied by alpha, as an EXR should be, or white beside it
+        return np.minimum(values, alpha)
+    return alpha if (alpha < 1).any() else values  # a roto may be in alpha alone
 
 
 def _by_name(folder: Path) -> dict[Path, Path]:

@@ -40,11 +40,8 @@ class Record:
 
     def is_made(self, name: Path, how: str, results: Sequence[Path]) -> bool:
         """Whether all files of a plate are there, made in this way (`made_from`)."""
-        key = name.as_posix()
-        wanted = {"plates": how, **({"flares": _from(self._folder, results[1]), "flares_made": how}
-                                    if results[1:] else {})}
-        return (all(self._read(what).get(key) == value for what, value in wanted.items())
-                and all(path.is_file() for path in results))
+        written = all(self._read(what).get(name.as_posix()) == value for what, value in self._row(how, results).items())
+        return written and all(path.is_file() for path in results)
 
     def begin(self, name: Path, how: str, results: Sequence[Path], overwrite: bool) -> None:
         """Before the files of a plate are written, itself and maybe its flare: what was made there in another way goes,
@@ -54,9 +51,8 @@ class Record:
         with locked(self._folder / LOCK):
             known = {what: self._read(what) for what in _TABLES}
             told = {what: {**rows} for what, rows in known.items()}
-            told["plates"][key] = how
-            if results[1:]:
-                told["flares"][key], told["flares_made"][key] = _from(self._folder, results[1]), how
+            for what, value in self._row(how, results).items():
+                told[what][key] = value
             from_here = (key in known["plates"], known["flares"].get(key) == told["flares"].get(key))
             for path, is_known in zip(results, from_here, strict=False):
                 if not overwrite and not is_known and path.exists():
@@ -69,6 +65,11 @@ class Record:
                 write_json(self._folder / RECORD, {what: dict(sorted(rows.items())) for what, rows in told.items()})
         for path in results:
             remove_partial_of(path)
+
+    def _row(self, how: str, results: Sequence[Path]) -> dict[str, str]:
+        """What is written down of a plate, by table."""
+        of_flare = {"flares": _from(self._folder, results[1]), "flares_made": how} if results[1:] else {}
+        return {"plates": how, **of_flare}
 
     def results(self) -> list[Path]:
         """The paths of the plates and flares that it lists, there or not."""

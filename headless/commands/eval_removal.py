@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ...core.errors import FrameError, SettingsError
+from ...core.errors import FrameError, SettingsError, spelled_out
 from ...core.progress import Progress
 from ..command import Command, Step, refuse_useless, seed
 
@@ -14,7 +14,6 @@ if TYPE_CHECKING:
     from ...core.removal.evaluation import Case
 
 SHEET, SCORES = "worst.png", "eval.json"
-TOLD = 20  # pairs that are spelled out in the last sentence
 
 SEED, SIZE = 7, (960, 640)
 """Of --synthetic."""
@@ -64,7 +63,7 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     progress.say(evaluation.table(scores))
     if scores["failed"]:
         raise FrameError(f"{len(scores['failed'])} of {len(cases)} pairs could not be read, the scores of the others "
-                         f"are in {words.out / SCORES}: {' '.join(scores['failed'][:TOLD])}")
+                         f"are in {words.out / SCORES}: {spelled_out(scores['failed'])}")
     return {"eval": str(words.out / SCORES), "sheet": str(words.out / SHEET), "mean": scores["mean"],
             "categories": scores["categories"]}
 

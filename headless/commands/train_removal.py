@@ -79,9 +79,11 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     changes = dict(map(change, words.changes))
     if words.iterations is not None:
         changes["iterations"] = words.iterations
-    before = recipe_in(words.out) if words.resume and words.model == "network" else None
-    if words.resume and words.model == "network" and before is None:
-        progress.say(f"{words.out} holds no training to go on with; one begins there.")
+    before = None
+    if words.resume and words.model == "network":
+        before = recipe_in(words.out)
+        if before is None:
+            progress.say(f"{words.out} holds no training to go on with; one begins there.")
     recipe = recipes.from_dict({**recipes.as_dict(before or recipes.Recipe()), **changes})
     lenses = read_lenses(words.lenses, words.most_lenses) if words.lenses else []
     train_on = [lens for lens in lenses if not kept_for_test(lens.name)] + built_in()

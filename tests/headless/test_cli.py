@@ -8,6 +8,7 @@ import os
 import subprocess
 import sys
 import venv
+from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -182,7 +183,8 @@ def _is_refused(words: list[str], status: int, capture: Path, tmp_path: Path,
 # ---- how a command ends ---------------------------------------------------------------------------
 
 
-def ending_with(problem: BaseException | None, monkeypatch: pytest.MonkeyPatch) -> None:
+def ending_with(problem: BaseException | None, monkeypatch: pytest.MonkeyPatch, options: Sequence[str] = ()) -> None:
+    """A command "try" of these options."""
     def run(_words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
         print("a library prints")
         progress.say("working")
@@ -190,8 +192,11 @@ def ending_with(problem: BaseException | None, monkeypatch: pytest.MonkeyPatch) 
             raise problem
         return {"made": 1}
 
-    command = Command("try", "Tries.", "", lambda _parser: None, (Step("try", "engine", run),))
-    monkeypatch.setitem(COMMANDS, "try", command)
+    def arguments(parser: argparse.ArgumentParser) -> None:
+        for option in options:
+            parser.add_argument(option, nargs="?")
+
+    monkeypatch.setitem(COMMANDS, "try", Command("try", "Tries.", "", arguments, (Step("try", "engine", run),)))
 
 
 @pytest.mark.parametrize(("problem", "status", "sentence"), [
@@ -222,14 +227,7 @@ def test_status_and_sentence(problem: BaseException, status: int, sentence: str,
                                                (["--resume"], "Give the command again with --resume to go on.")])
 def test_who_stops_a_command_is_told_how_it_goes_on(options: list[str], hint: str, monkeypatch: pytest.MonkeyPatch,
                                                     capfd: pytest.CaptureFixture[str]) -> None:
-    def run(_words: argparse.Namespace, _progress: Progress) -> dict[str, Any]:
-        raise Cancelled("Stopped as asked.")
-
-    def arguments(parser: argparse.ArgumentParser) -> None:
-        for option in options:
-            parser.add_argument(option, action="store_true")
-
-    monkeypatch.setitem(COMMANDS, "try", Command("try", "Tries.", "", arguments, (Step("try", "engine", run),)))
+    ending_with(Cancelled("Stopped as asked."), monkeypatch, options)
     assert cli.main(["try"]) == 130
     assert f"Stopped as asked. {hint}" in capfd.readouterr().err
 
@@ -238,14 +236,7 @@ def test_who_stops_a_command_is_told_how_it_goes_on(options: list[str], hint: st
                                               (["--size", "--jobs"], "use a smaller --size, or fewer --jobs.")])
 def test_what_takes_less_memory_is_of_the_command_at_hand(options: list[str], way: str, monkeypatch: pytest.MonkeyPatch,
                                                           capfd: pytest.CaptureFixture[str]) -> None:
-    def run(_words: argparse.Namespace, _progress: Progress) -> dict[str, Any]:
-        raise MemoryError
-
-    def arguments(parser: argparse.ArgumentParser) -> None:
-        for option in options:
-            parser.add_argument(option)
-
-    monkeypatch.setitem(COMMANDS, "try", Command("try", "Tries.", "", arguments, (Step("try", "engine", run),)))
+    ending_with(MemoryError(), monkeypatch, options)
     assert cli.main(["try"]) == 1
     assert f"It does not fit into the memory of this machine; {way}" in capfd.readouterr().err
 

@@ -42,6 +42,7 @@ def set_up(scene: Any, layers: LayerFolder, *, keep_image: bool = False, plate: 
     if scene.render.use_border and scene.render.use_crop_to_border:
         raise FrameError(f"The scene {scene.name!r} renders a region cut out of the frame, where layers of whole "
                          "frames do not fit; switch Crop to Render Region off in its output properties.")
+    had = tree_of(scene)
     there = _own_tree(scene)
     if NOTE in scene and (there is None or not any(name in there.nodes for name in _OURS)):
         del scene[NOTE]  # our nodes were deleted by hand: what was noted is of another compositor
@@ -57,6 +58,9 @@ def set_up(scene: Any, layers: LayerFolder, *, keep_image: bool = False, plate: 
     names = [name for name in sockets if name.startswith("flare_")] or [name for name in sockets if name == "flare"]
     if not names or "scene" not in sockets:
         _take_back(scene, tree, source, pointed, note)
+        if had is not None and tree != had:  # it was copied for this
+            scene.compositing_node_group = had
+            bpy.data.node_groups.remove(tree)
         raise FrameError(f"{layers.files[layers.first]} holds no scene and flare layers; choose a folder of a bake.")
     if NOTE not in scene:
         scene[NOTE] = {**note, **_before(tree)}

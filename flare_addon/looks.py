@@ -56,7 +56,7 @@ def look_of(scene: Any) -> Look:
 
 def is_placed(item: Any, scene: Any) -> bool:
     """Whether a flare has a light in the scene; an object that was deleted there is still the flare's."""
-    return item.target is not None and item.target.name in scene.objects
+    return item.target is not None and scene.objects.get(item.target.name) == item.target
 
 
 def use(scene: Any, path: Path | str) -> Look:

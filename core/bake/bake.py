@@ -176,7 +176,7 @@ def bake_frames(source: Sequenced, frames: Sequence[Frame], cameras: Mapping[str
         remove_partial_of(path)
         # Not kept in a name: at 4K the layers of one frame are half a gigabyte.
         write_layers(path, made(frame), half=settings.half, chromaticities=space.chromaticities, notes=notes(frame),
-                     pixel_aspect=cameras[frame.view].pixel_aspect, turn=in_turn())
+                     pixel_aspect=settings.scaled(cameras[frame.view]).pixel_aspect, turn=in_turn())
         record = _add_to_record(out, made_from, names, [_entry(out, frame, of_frame(frame).rest)])
         progress.advance()
     return record

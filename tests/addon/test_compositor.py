@@ -116,6 +116,7 @@ def test_scenes_that_share_a_tree_do_not_change_each_other(made: Made) -> None:
     if "two scenes of one tree" not in made.facts:
         pytest.skip("before 5.0 every scene has a tree of its own")
     assert made.facts["two scenes of one tree"] == [True, True, True]
+    assert made.facts["refused of one tree"] == [True, 0], "layers that are none leave no copy"
     assert_half_equal(rgb(made.out / "of one tree" / "0.exr"), baked(made, 0).composite)
 
 

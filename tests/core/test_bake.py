@@ -214,6 +214,8 @@ def test_layers_of_squeezed_frames_say_so(tmp_path: Path) -> None:
     bake(FakeRenderer(), FRAMES, cameras, tmp_path)
     told = [exr_header(tmp_path / frame.file)["pixelAspectRatio"] for frame in FRAMES]
     assert told == [2.0, 1.0, 1.0]
+    bake(FakeRenderer(), FRAMES[:1], cameras, tmp_path / "square", BakeSettings(24, 8))
+    assert exr_header(tmp_path / "square" / FRAMES[0].file)["pixelAspectRatio"] == 1.0, "as they are rendered"
 
 
 def test_edits_by_frame_reach_the_renderer_or_the_layers(tmp_path: Path) -> None:

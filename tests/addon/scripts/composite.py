@@ -107,6 +107,14 @@ if flare_node.GROUPS_ARE_TREES:
     third = bpy.data.scenes.new("Third")
     third.compositing_node_group = scene.compositing_node_group
     compositor.remove(third)
+    fourth = bpy.data.scenes.new("Fourth")
+    fourth.compositing_node_group = scene.compositing_node_group
+    trees = len(bpy.data.node_groups)
+    try:
+        compositor.set_up(fourth, LayerFolder.open(none))
+    except FrameError:
+        facts["refused of one tree"] = [fourth.compositing_node_group == scene.compositing_node_group,
+                                        len(bpy.data.node_groups) - trees]
     facts["two scenes of one tree"] = [str(folder) in bpy.path.abspath(shown),
                                        flare_node.find_node(second) is None, flare_node.find_node(third) is None]
     render(scene, "of one tree", sorted(layers.files)[:1])

@@ -132,10 +132,11 @@ class FITFLARE_FH_flare(bpy.types.FileHandler):
 class FITFLARE_UL_lights(bpy.types.UIList):
     """The flares of a scene, with mute and solo."""
 
-    def draw_item(self, _context: Any, layout: Any, _data: Any, item: Any, _icon: Any, _active: Any, _property: Any,
+    def draw_item(self, context: Any, layout: Any, _data: Any, item: Any, _icon: Any, _active: Any, _property: Any,
                   _index: int = 0) -> None:
         row = layout.row(align=True)
-        row.prop(item, "name", text="", emboss=False, icon="LIGHT_SUN" if item.target else "ERROR")
+        icon = "LIGHT_SUN" if looks.is_placed(item, context.scene) else "ERROR"
+        row.prop(item, "name", text="", emboss=False, icon=icon)
         row.prop(item, "intensity", text="", emboss=False)
         row.prop(item, "solo", text="", icon="SOLO_ON" if item.solo else "SOLO_OFF", emboss=False)
         row.prop(item, "mute", text="", icon="HIDE_ON" if item.mute else "HIDE_OFF", emboss=False)

@@ -148,6 +148,7 @@ def test_cameras_lights_and_scenes(said: Any) -> None:
     assert said["camera deleted"] == [False, True]
     known, told = said["light taken out of the scene"]
     assert known and "No flare has a light to come from" in told
+    assert said["icon of its flare"] == "ERROR"
     assert said["light deleted"]
     assert said["second scene is empty"] == ["", False, 0]
     assert said["two scenes"] == [3.0, 1.0]

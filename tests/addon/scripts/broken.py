@@ -262,6 +262,12 @@ scene.camera = bpy.data.objects.new("Camera", bpy.data.cameras.new("Camera"))
 scene.collection.objects.link(scene.camera)
 for collection in target.users_collection:  # as X in the viewport does: the flare still knows the object
     collection.objects.unlink(target)
+icons = {}
+row = types.SimpleNamespace(prop=lambda _item, name, icon="", **_how: icons.update({name: icon}))
+part("flare_addon.operators.look").FITFLARE_UL_lights.draw_item(
+    None, types.SimpleNamespace(scene=scene), types.SimpleNamespace(row=lambda **_how: row), None,
+    scene.fit_flare.lights[0], 0, None, "")
+said["icon of its flare"] = icons["name"]
 said["light taken out of the scene"] = [scene.fit_flare.lights[0].target is not None, refusal(lambda: ops.bake())]
 bpy.data.objects.remove(target)
 said["light deleted"] = scene.fit_flare.lights[0].target is None

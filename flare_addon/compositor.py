@@ -337,6 +337,13 @@ def _point_at(node: Any, layers: LayerFolder) -> None:
     node.use_auto_refresh = True
 
 
+def over_render(scene: Any) -> bool:
+    """Whether the flare lies over what the scene renders."""
+    node = find_node(scene)
+    return node is not None and any(_is_behind(node, one) for one in tree_of(scene).nodes
+                                    if one.bl_idname == "CompositorNodeRLayers")
+
+
 def misread(scene: Any) -> str:
     """A sentence where the colour configuration has no space for the light of the layers, "" where it has."""
     image = tree_of(scene).nodes[LAYERS].image

@@ -2,16 +2,14 @@
 """Layers out, and back together in the compositor."""
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import bpy
 
 from ...core.bake.folder import LayerFolder
-from ...core.bake.frames import Frame, absent
 from ...core.errors import CaptureError
-from .. import compositor, engine, flare_node, jobs, rendering, shots, wires
+from .. import compositor, compositor_warnings, engine, flare_node, jobs, rendering, shots, wires
 from ..paths import absolute
 from ..reports import NO_CAMERA, NO_FLARE, Action, reported
 
@@ -81,23 +79,9 @@ def set_up(operator: Any, scene: Any, folder: str, *, keep_image: bool, plate: b
     if match:
         rendering.match_scene(scene, layers, layers.size())
     live = "; Intensity and Tint of the panel act on it" if wire(scene, layers) else ""
-    for told in _warnings(scene, layers, bool(live)):
+    for told in compositor_warnings.warnings(scene, layers, bool(live)):
         operator.report({"WARNING"}, told)
     operator.report({"INFO"}, f"{len(layers.files)} frames of layers set up{live}")
-
-
-def _warnings(scene: Any, layers: LayerFolder, live: bool) -> Iterator[str]:
-    """What of a composite that is set up will not be as somebody may expect."""
-    there = [Frame("", number, "") for number in layers.files]
-    if bare := absent(there, f"{max(scene.frame_start, 0)}-{max(scene.frame_end, scene.frame_start, 0)}"):
-        shown = "Blender shows in magenta before 4.4" if flare_node.MISSING_IS_MAGENTA else "are without flare"
-        yield (f"The scene has the frames {scene.frame_start}-{scene.frame_end}, and there are no layers of {bare}, "
-               f"which {shown}; bake them too.")
-    if live and wires.is_animated(scene):
-        yield ("Sliders that act on it are animated: they stand still where this extension is not, on a farm say; bake "
-               "without Keep Colours Live for that.")
-    if misread := compositor.misread(scene):
-        yield misread
 
 
 class FITFLARE_OT_set_up_compositor(Action, bpy.types.Operator):

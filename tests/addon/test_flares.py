@@ -83,6 +83,22 @@ def test_frames_without_layers_are_told_and_without_flare(facts: Any) -> None:
         assert after == [PLATE, PLATE]
 
 
+@pytest.mark.parametrize(("case", "sentence"), [
+    ("switched off", "Compositing is switched off for this scene"),
+    ("sequenced", "the video sequencer, which has 'title', in place of the compositor"),
+    ("square", "The layers have 16 x 8 pixels and the scene renders 8 x 8, another shape"),
+    ("transparent", "The film is transparent, and PNG files have no light"),
+])
+def test_renders_that_would_not_show_the_composite_are_told(facts: Any, case: str, sentence: str) -> None:
+    (told,) = facts[case]
+    assert sentence in told
+
+
+@pytest.mark.parametrize("case", ["muted", "no alpha"])
+def test_of_renders_that_show_it_nothing_is_told(facts: Any, case: str) -> None:
+    assert facts[case] == []
+
+
 def test_animated_sliders_that_a_farm_would_not_have_are_told(facts: Any) -> None:
     assert facts["scale keyed"] == []
     (told,) = facts["intensity keyed"]

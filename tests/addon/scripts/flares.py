@@ -188,6 +188,28 @@ facts["scale keyed"] = told(scene)
 scene.fit_flare.lights[0].keyframe_insert("intensity", frame=1)
 facts["intensity keyed"] = told(scene)
 
+# ---- what is told of renders that would not show the composite as it is ------------------------------
+scene = shot(["lamp"])
+scene.frame_start, scene.frame_end = 1, 3
+scene.render.use_compositing = False
+facts["switched off"] = told(scene)
+scene.render.use_compositing = True
+editor = scene.sequence_editor_create()
+strips = editor.strips if hasattr(editor, "strips") else editor.sequences
+ends = "length" if "length" in strips.bl_rna.functions["new_effect"].parameters else "frame_end"
+strip = strips.new_effect(name="title", type="COLOR", channel=1, frame_start=1, **{ends: 4})
+facts["sequenced"] = told(scene)
+strip.mute = True
+facts["muted"] = told(scene)
+scene.render.resolution_x = scene.render.resolution_y
+facts["square"] = told(scene)
+scene.render.resolution_x, scene.render.resolution_y = 32, 16
+scene.render.film_transparent = True
+scene.render.image_settings.color_mode = "RGBA"
+facts["transparent"] = told(scene)
+scene.render.image_settings.color_mode = "RGB"
+facts["no alpha"] = told(scene)
+
 # ---- a frame that is shown is baked again -----------------------------------------------------------
 scene = shot(["lamp"])
 ops.set_up_baked()

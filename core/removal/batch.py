@@ -2,6 +2,7 @@
 """Removal of many plates: one after the other, past those that cannot be read, resumable."""
 from __future__ import annotations
 
+import contextlib
 import itertools
 from collections.abc import Container, Iterable, Sequence
 from pathlib import Path
@@ -9,7 +10,7 @@ from typing import Any
 
 from ..errors import DISK_FULL, FrameError, SettingsError, refusal, spelled_out
 from ..files import check_apart
-from ..pictures import pictures_below, window_of
+from ..pictures import pictures_below, pictures_in, window_of
 from ..progress import Progress
 from .inference import Remover
 from .mattes import Mattes
@@ -47,6 +48,18 @@ def plates_of(inputs: Iterable[Path], apart_from: Iterable[Path | None] = ()) ->
     return [(path, name) for name, path in found.items()]
 
 
+def shots_of(inputs: Sequence[Path], apart_from: Iterable[Path | None] = ()) -> list[Path]:
+    """The plates of `plates_of`, and what lies beside those that were given by themselves: one frame of a shot comes
+    out as it does with all of them."""
+    apart = {other.resolve() for other in apart_from if other is not None}
+    found = dict.fromkeys(path for path, _ in plates_of(inputs, apart))
+    for folder in dict.fromkeys(given.parent for given in inputs if not given.is_dir()):
+        with contextlib.suppress(OSError):  # a plate may be read out of a folder that may not be
+            found.update(dict.fromkeys(path for path in pictures_in(folder)
+                                       if apart.isdisjoint(_itself_and_its_folders(path))))
+    return list(found)
+
+
 def _itself_and_its_folders(path: Path) -> list[Path]:
     whole = path.resolve()
     return [whole, *whole.parents]
@@ -64,13 +77,14 @@ def remove_all(inputs: Sequence[Path], folder: Path, remover: Remover, progress:
     Raises SettingsError before anything is written, FrameError at once where the folder may not be written to, and
     FrameError after everything was tried, with a list of the plates that failed.
     """
-    plates = plates_of(inputs, [folder, flare_folder, mattes.given if mattes else None])
+    apart = [folder, flare_folder, mattes.given if mattes else None]
+    plates = plates_of(inputs, apart)
     results = {name: [folder / name, *([flare_folder / name.with_suffix(".exr")] if flare_folder else [])]
                for _, name in plates}
     check_apart([*(path for path, _ in plates), *(mattes.files if mattes else ())],
                 itertools.chain.from_iterable(results.values()))
     record = Record(folder)
-    sequences = Sequences(remover, [] if stills else [path for path, _ in plates])
+    sequences = Sequences(remover, [] if stills else shots_of(inputs, apart))
     if wanted is not None:
         plates = [(path, name) for path, name in plates if name in wanted]
     progress.stage("remove", len(plates))

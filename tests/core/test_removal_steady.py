@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from core.errors import FrameError
 from core.progress import Progress
-from core.removal.batch import remove_all
+from core.removal.batch import remove_all, shots_of
 from core.removal.inference import Remover, Told
 from core.removal.plates import Plate
 from core.removal.record import RECORD
@@ -137,9 +137,19 @@ def test_a_frame_is_the_same_whichever_others_are_cleaned(shot: Path, tmp_path: 
     remove_all([shot], tmp_path / "all", Wavering(), Progress())
     for number in (1, 8):
         remove_all([shot], tmp_path / "one", Wavering(), Progress(), wanted={Path(f"f{number}.png")})
+    remove_all([shot / "f3.png"], tmp_path / "one", Wavering(), Progress())
     for path in (tmp_path / "one").glob("*.png"):
         assert path.read_bytes() == (tmp_path / "all" / path.name).read_bytes()
-    assert sorted(path.name for path in (tmp_path / "one").iterdir()) == ["f1.png", "f8.png", RECORD]
+    assert sorted(path.name for path in (tmp_path / "one").iterdir()) == ["f1.png", "f3.png", "f8.png",
+                                                                          RECORD]
+
+
+def test_mattes_and_results_beside_a_frame_are_not_its_neighbours(shot: Path) -> None:
+    (shot / "matte.png").write_bytes((shot / "f1.png").read_bytes())
+    (shot / "clean").mkdir()
+    (shot / "clean" / "f1.png").write_bytes((shot / "f1.png").read_bytes())
+    found = shots_of([shot / "f1.png"], [shot / "clean", shot / "matte.png"])
+    assert sorted(found) == sorted(shot.glob("f*.png"))
 
 
 def test_neighbours_are_those_of_the_folder(shot: Path) -> None:

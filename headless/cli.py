@@ -10,6 +10,7 @@ import contextlib
 import io
 import os
 import sys
+import textwrap
 import traceback
 from collections.abc import Iterator, Sequence
 from typing import Any, NoReturn, TextIO
@@ -17,10 +18,16 @@ from typing import Any, NoReturn, TextIO
 from ..core.errors import Cancelled, EngineError, FitFlareError, SettingsError, is_out_of_memory, refusal
 from ..core.progress import JsonProgress, OpenJdProgress, Progress, TerminalProgress, flush_or_drop, stoppable
 from . import hand_off
-from .command import Command, Step
+from .command import Command, Step, Stopped
 from .commands import COMMANDS
 
 DONE, FAILED, MISUSED, STOPPED = 0, 1, hand_off.MISUSED, hand_off.STOPPED
+
+_HINTS: dict[Stopped, str] = {
+    "goes on": "Give the command again to go on.",
+    "goes on with --resume": "Give the command again with --resume to go on.",
+    "starts over": "Given again, it starts over.",
+}
 
 _DESCRIPTION = """\
 Takes lens flares out of footage, learns them, and gives them back as layers.
@@ -29,8 +36,6 @@ Takes lens flares out of footage, learns them, and gives them back as layers.
   blender -b -P headless/run.py -- COMMAND …"""
 
 _EPILOGUE = """\
-Stopped (Ctrl-C) and given again, solve, bake, transfer, remove and demo go on where they were; fit and
-train-removal do with --resume; the others start over.
 Status at the end: 0 done; 1 it could not be done, the last line says why; 2 the words made no sense; 130 stopped.
 `COMMAND --help` tells more."""
 
@@ -61,7 +66,7 @@ def parser() -> argparse.ArgumentParser:
                          help="the Blender for the steps that need one (else FIT_FLARE_BLENDER, the bpy package of "
                               "this Python, `blender` on the PATH, the system's usual places)")
     options.add_argument("--step", help=argparse.SUPPRESS)
-    whole = _Parser(prog="run.py", description=_DESCRIPTION, epilog=_EPILOGUE,
+    whole = _Parser(prog="run.py", description=_DESCRIPTION, epilog=f"{_after_a_stop()}\n{_EPILOGUE}",
                     formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = whole.add_subparsers(dest="command", metavar="COMMAND", required=True)
     for command in COMMANDS.values():
@@ -70,6 +75,14 @@ def parser() -> argparse.ArgumentParser:
                                   formatter_class=argparse.RawDescriptionHelpFormatter)
         command.arguments(one)
     return whole
+
+
+def _after_a_stop() -> str:
+    """What commands do that are given again after Ctrl-C."""
+    ways = {way: [name for name, command in COMMANDS.items() if command.stopped == way] for way in _HINTS}
+    text = "; ".join(f"{', '.join(names)} {way.replace('goes', 'go')}" for way, names in ways.items()
+                     if names and way != "starts over")
+    return textwrap.fill(f"Stopped (Ctrl-C) and given again, {text}; the others start over.", 110)
 
 
 def main(words: Sequence[str]) -> int:
@@ -109,8 +122,8 @@ def _status(words: Sequence[str], progress: Progress) -> int:
         progress.error(str(problem))
         return MISUSED
     except (Cancelled, KeyboardInterrupt) as stop:
-        how = " with --resume" if hasattr(arguments, "resume") else ""
-        hint = f" Give the command again{how} to go on." if isinstance(progress, TerminalProgress) else ""
+        command = COMMANDS.get(getattr(arguments, "command", ""))
+        hint = f" {_HINTS[command.stopped]}" if command and isinstance(progress, TerminalProgress) else ""
         progress.error(f"{str(stop) or 'Stopped.'}{hint}")
         return STOPPED
     except FitFlareError as problem:

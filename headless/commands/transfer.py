@@ -343,4 +343,5 @@ camera, its lights, and what hides them.
   run.py transfer lamp.flare --to plate.exr --light 1210,340 --out build/plate
   run.py transfer lamp.flare --to shots/sh010 --scene sh010.ply --out build/sh010 --use sun=lamp
   run.py transfer lamp.flare --to shot.blend --plates renders --out build/shot --jobs 2""",
-    arguments, (Step("look", "blender", look_at_blend, wanted=is_blend), Step("transfer", "engine", run)))
+    arguments, (Step("look", "blender", look_at_blend, wanted=is_blend), Step("transfer", "engine", run)),
+    stopped="goes on")

@@ -23,6 +23,7 @@ from ..core.capture.camera import quaternion_from_rotation
 from ..core.errors import CaptureError
 from . import cameras, curves
 from .cameras import FLIP
+from .images import loaded
 from .paths import absolute, stored
 from .rendering import show_as_filmed
 
@@ -153,7 +154,7 @@ def _cameras(collection: Any, root: Any, capture: Capture, extent: float, settin
                 camera = _camera(collection, root, Path(view.name).stem, view, aspect, 0.08 * extent)
                 camera.fit_flare.view = view.name
                 if settings.frames:
-                    _backdrop(camera, _loaded(capture.frame_path(view)))
+                    _backdrop(camera, loaded(capture.frame_path(view)))
                 made.append(camera)
     return tuple(made)
 
@@ -225,17 +226,6 @@ def keys(block: Any, channels: dict[str, NDArray[Any]], frames: Sequence[int]) -
             curve.update()
 
 
-def _loaded(path: Path, source: str = "FILE") -> Any:
-    """The picture, or the sequence that begins with it: the image that is here for it, unless that one is the other of
-    the two. By a path that goes with a .blend into another place."""
-    image = bpy.data.images.load(str(path), check_existing=True)
-    if image.users and image.source != source:
-        image = bpy.data.images.load(str(path))
-    if not image.users:
-        image.source, image.filepath = source, stored(path)
-    return image
-
-
 def _footage(camera: Any, capture: Capture, views: Sequence[View], numbers: Sequence[int]) -> bool:
     """The frames as one sequence behind the camera; False, and the first alone, where their names are no sequence."""
     paths = [capture.frame_path(view) for view in views]
@@ -244,9 +234,9 @@ def _footage(camera: Any, capture: Capture, views: Sequence[View], numbers: Sequ
     in_order = len(patterns) == 1 and all(match is not None and int(match[1]) == number
                                           for match, number in zip(found, numbers, strict=True))
     if len(paths) == 1 or not in_order:
-        _backdrop(camera, _loaded(paths[0]))
+        _backdrop(camera, loaded(paths[0]))
         return len(paths) == 1
-    user = _backdrop(camera, _loaded(paths[0], "SEQUENCE")).image_user
+    user = _backdrop(camera, loaded(paths[0], "SEQUENCE")).image_user
     user.frame_start, user.frame_offset = numbers[0], numbers[0] - 1
     user.frame_duration = numbers[-1] - numbers[0] + 1
     user.use_auto_refresh = True

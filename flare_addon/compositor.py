@@ -17,7 +17,8 @@ from ..core.errors import FrameError
 from ..core.pictures import exr_is_rec709
 from . import curves, wires
 from .flare_node import GROUP, GROUPS_ARE_TREES, find_node, layer_of, new_node, node_group, of_render_size, tree_of
-from .paths import absolute, stored
+from .images import loaded
+from .paths import absolute
 
 LAYERS = "Fit Flare Layers"
 PLATE = "Fit Flare Footage"
@@ -324,9 +325,7 @@ def _counts(tree: Any, end: Any) -> bool:
 
 def _point_at(node: Any, layers: LayerFolder) -> None:
     """Make an Image node show the file of each frame's number, gaps and a frame 0 included."""
-    image = bpy.data.images.load(str(layers.files[layers.first]), check_existing=True)
-    image.source = "SEQUENCE"
-    image.filepath = stored(absolute(image.filepath))
+    image = loaded(layers.files[layers.first], "SEQUENCE")
     node.image = image
     if exr_is_rec709(layers.files[layers.first]):  # a studio's configuration may take EXRs for another space
         known = _spaces(image)

@@ -13,8 +13,9 @@ from ..core.errors import CaptureError, FitFlareError, RunError
 from ..core.look import Look, read
 from . import engine, jobs, lights, looks
 from .capture_import import expose
+from .images import read_again
 from .jobs import Job
-from .paths import absolute, read_again, stored
+from .paths import absolute, stored
 from .reports import NO_CAPTURE
 
 FLARE, SCENE, PREVIEW, CONFIG = "flare.flare", "scene.ply", "preview_small.png", "config.toml"

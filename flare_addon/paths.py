@@ -28,15 +28,6 @@ def absolute(text: str, library: Any = None) -> Path:
     return Path(os.path.normpath(bpy.path.abspath(text, library=library)))
 
 
-def read_again(folder: Path) -> None:
-    """Read pictures below a folder from disk again, where Blender has them: it would show those of before."""
-    folder = folder.resolve()
-    for image in bpy.data.images:
-        if image.source in ("FILE", "SEQUENCE") and image.filepath and \
-                absolute(image.filepath, image.library).resolve().is_relative_to(folder):
-            image.reload()
-
-
 def _relative(path: Path, blend: str) -> str:
     if not blend:
         return os.fspath(path)

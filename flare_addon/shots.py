@@ -19,9 +19,10 @@ from ..core.files import digest_of, write_json
 from ..core.look import Edit, LookEdits
 from ..core.look.shot import Shot, ShotFrame
 from . import cameras, engine, fits, jobs, library, looks
+from .images import read_again
 from .jobs import Job
 from .objects import view_layer_of
-from .paths import absolute, read_again, stored
+from .paths import absolute, stored
 
 SHOT = "shot.json"
 LIVE = "live.json"  # lights whose colour was left to the compositor

@@ -66,6 +66,10 @@ def test_keys_and_links_stay_with_their_slider_of_the_node(facts: Any) -> None:
     assert facts["keyed node"] == [SCENE + 4 * flare, SCENE + 4 * more, SCENE + more]
 
 
+def test_an_artists_still_of_a_layer_stays_one(facts: Any) -> None:
+    assert facts["still"] == ["FILE", "SEQUENCE"]
+
+
 def test_a_frame_that_was_baked_again_is_shown(facts: Any) -> None:
     assert facts["baked again"] == [SCENE + LAMP + KEY, SCENE + RIM + KEY]
 

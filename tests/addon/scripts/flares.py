@@ -210,6 +210,13 @@ facts["transparent"] = told(scene)
 scene.render.image_settings.color_mode = "RGB"
 facts["no alpha"] = told(scene)
 
+# ---- a layer that an artist looks at as a still -----------------------------------------------------
+scene = shot(["lamp"])
+still = bpy.data.images.load(str(Path(layers) / "layers.0001.exr"))
+still.use_fake_user = True
+ops.set_up_baked()
+facts["still"] = [still.source, flare_node.tree_of(scene).nodes[compositor.LAYERS].image.source]
+
 # ---- a frame that is shown is baked again -----------------------------------------------------------
 scene = shot(["lamp"])
 ops.set_up_baked()

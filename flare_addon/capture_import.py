@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from ..core.bake.frames import numbered
 from ..core.capture import Capture, PointCloud, Twins, View
-from ..core.capture.camera import quaternion_from_rotation
+from ..core.capture.camera import Camera, quaternion_from_rotation
 from ..core.errors import CaptureError
 from . import cameras, curves
 from .cameras import FLIP
@@ -33,6 +33,9 @@ UP = {"Z": (0.0, 0.0, 0.0), "-Y": (-math.pi / 2, 0.0, 0.0), "Y": (math.pi / 2, 0
 
 EXPOSURE = "fit_flare.exposure"
 """RNA path on a camera object."""
+
+SAME_PIXELS = 2e-3
+"""Of the ratio of focal lengths, what cameras may differ by that are solved apart: a pixel at the edge of 1000."""
 
 Placement = Literal["animated", "each"]
 _NUMBER = re.compile(r"(\d+)(?=\D*$)")
@@ -136,8 +139,7 @@ def _cameras(collection: Any, root: Any, capture: Capture, extent: float, settin
         render.pixel_aspect_x, render.pixel_aspect_y = aspect
         scene.frame_start, scene.frame_end = min(number.values()), max(number.values())
         scene.frame_set(scene.frame_start)
-    if len({view.camera.size for view in capture.views}) > 1:
-        notes.append("The frames differ in size, and a scene has one: it is that of the first frame.")
+    notes += unlike_the_first([view.camera for view in capture.views])
     made: list[Any] = []
     for folder, views in folders.items():
         label = "Camera" if folder == "." else f"Camera {folder}"
@@ -157,6 +159,17 @@ def _cameras(collection: Any, root: Any, capture: Capture, extent: float, settin
                     _backdrop(camera, loaded(capture.frame_path(view)))
                 made.append(camera)
     return tuple(made)
+
+
+def unlike_the_first(those: Sequence[Camera]) -> Iterator[str]:
+    """Sentences on what a scene has one of, where the cameras of a capture differ in it."""
+    if len({camera.size for camera in those}) > 1:
+        yield "The frames differ in size, and a scene has one: it is that of the first frame."
+    shape = those[0].fx / those[0].fy
+    off = max(abs(camera.fx / camera.fy / shape - 1) for camera in those)
+    if off > SAME_PIXELS:
+        yield ("The pixels of the frames differ in shape, and a scene has one: it is that of the first frame, and "
+               f"others are up to {off:.1%} too wide or too high behind their cameras.")
 
 
 def _camera(collection: Any, root: Any, name: str, view: View, aspect: tuple[float, float], size: float) -> Any:

@@ -23,6 +23,13 @@ def test_intrinsics_are_blender_s_own_for_every_fit_and_pixel(facts: Any) -> Non
         np.testing.assert_allclose(ours, blenders, atol=2e-4, err_msg=name)
 
 
+def test_cameras_that_differ_in_what_a_scene_has_one_of_are_told(facts: Any) -> None:
+    alike, of_another_size, of_other_pixels = facts["unlike"]
+    assert alike == []
+    assert of_another_size == ["The frames differ in size, and a scene has one: it is that of the first frame."]
+    assert ["others are up to 2.0% too wide" in note for note in of_other_pixels] == [True]
+
+
 def test_other_pixels_than_square_come_back(facts: Any) -> None:
     for given, back in facts["back"]:
         np.testing.assert_allclose(back, given, atol=1e-3)

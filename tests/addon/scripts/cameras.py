@@ -50,6 +50,12 @@ for fx, fy in ((70.0, 50.0), (50.0, 70.0)):
     data.lens, data.shift_x, data.shift_y = cameras.lens_of(one, 36.0, aspect)
     facts["back"].append([[fx, fy, 33.0, 19.5], list(map(float, cameras.intrinsics_of(data, render)))])
 
+# What a scene has one of.
+Camera = part("core.capture").Camera
+facts["unlike"] = [list(part("flare_addon.capture_import").unlike_the_first(
+    [Camera(64, 40, 70.0, 70.0, 32, 20, np.eye(4)), Camera(64, height, 70.0, fy, 32, 20, np.eye(4))]))
+    for height, fy in ((40, 70.1), (44, 70.0), (40, 71.4))]
+
 # What was up in the capture is up in Blender.
 axes = part("flare_addon.capture_import").UP
 facts["up"] = {name: list(np.array(Euler(axes[name]).to_matrix()) @ up)

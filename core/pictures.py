@@ -10,11 +10,11 @@ from __future__ import annotations
 
 import errno
 import os
-from collections.abc import Mapping
+from collections.abc import Container, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO, Literal
+from typing import Any, BinaryIO, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -120,7 +120,8 @@ def read_picture(path: Path | str, *, own_primaries: bool = False) -> Picture:
     if not path.is_file():
         raise FrameError(f"{path} is missing.")
     if path.suffix.lower() == ".exr":
-        header, channels = _read_exr(path)
+        picture_size(path)
+        header, channels = _of_the_picture([(part, part[1]) for part in exr_parts(path)])
         stored = _rgb_from_channels(path, channels)
         pixels = stored if own_primaries else _rec709(path, stored, header)
         return Picture(framed(pixels, _window(path, header)), "linear")
@@ -132,6 +133,8 @@ def read_picture(path: Path | str, *, own_primaries: bool = False) -> Picture:
         return Picture(colour.astype(np.float32) / np.float32(255), "srgb")
     if stored.dtype == np.uint16:
         return Picture(colour.astype(np.float32) / np.float32(65535), "srgb")
+    if stored.dtype.kind != "f":
+        raise FrameError(f"{path} holds {stored.dtype} pixels; save it as 8 or 16 bit or as 32 bit float.")
     pixels = np.ascontiguousarray(colour, np.float32)
     if not np.isfinite(pixels).all():
         raise FrameError(f"{path} holds pixels that are not finite numbers; clean it before it is used.")
@@ -147,14 +150,44 @@ def holds_floats(path: Path) -> bool:
 
 def stored_pixels(path: Path) -> NDArray[Any]:
     """What a PNG, JPEG or TIFF holds, turned and multiplied with nothing: (height, width) or with the channels B G R
-    and alpha behind. Raises FrameError where it is missing or damaged."""
+    and alpha behind. Raises FrameError where it is missing or damaged, or would be read as something else."""
     import cv2
 
     width, height = picture_size(path)
+    if misread := _misread(path):
+        raise FrameError(f"{path} {misread}.")
     stored = decoded(path, cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
     if stored is None or stored.shape[:2] != (height, width):
         raise FrameError(f"{path} is damaged or truncated; export it again.")
     return stored
+
+
+_CMYK = "is CMYK, for print; convert it to RGB"
+
+
+def _misread(path: Path) -> str:
+    """What OpenCV would read without a word as something else, and what to do; "" where there is no such thing."""
+    with open(path, "rb") as stream:
+        begins = stream.read(4)
+        stream.seek(0)
+        if begins[:2] == b"\xff\xd8":  # whatever it is named
+            header = jpeg.frame_header(stream)
+            return _CMYK if header is not None and header[2] == 4 else ""
+        if begins not in (b"II*\0", b"MM\0*"):
+            return ""
+        wanted = (tiff.BITS, tiff.PHOTOMETRIC, tiff.SAMPLES, tiff.PLANES)
+        told = {name: tag.values[0] for name, tag in tiff.read_tags(stream, wanted).items()}
+    if told.get(tiff.SAMPLES) == 2:
+        return "is grey with alpha; save it as RGB with alpha, or as PNG"
+    if told.get(tiff.PHOTOMETRIC) == tiff.SEPARATED:
+        return _CMYK
+    if told.get(tiff.BITS, 1) <= 8:
+        return ""
+    if told.get(tiff.PLANES) == tiff.IN_PLANES and told.get(tiff.SAMPLES, 1) > 1:
+        return "has its colours apart (per channel, planar); save it interleaved"
+    if told.get(tiff.PHOTOMETRIC) == tiff.WHITE_IS_0:
+        return "has 0 for white; save it with 0 for black"
+    return ""
 
 
 def decoded(path: Path, flags: int) -> NDArray[Any] | None:
@@ -243,7 +276,10 @@ def window_of(path: Path | str) -> Window:
     """Where a picture's pixels lie on its frame: only EXRs have others than those of the frame. Raises FrameError."""
     path = Path(path)
     size = picture_size(path)
-    return _window(path, exr_header(path)) if path.suffix.lower() == ".exr" else Window(size, (0, 0), size)
+    if path.suffix.lower() != ".exr":
+        return Window(size, (0, 0), size)
+    headers = _exr_headers(path)
+    return _window(path, _of_the_picture([(header, [one.name for one in header["channels"]]) for header in headers]))
 
 
 def _window(path: Path, header: Mapping[str, Any]) -> Window:
@@ -297,33 +333,52 @@ def read_exr(path: Path | str) -> dict[str, Pixels]:
 
     Raises FrameError where the file is damaged or holds NaN or infinity.
     """
-    return _read_exr(Path(path))[1]
-
-
-def _read_exr(path: Path) -> tuple[dict[str, Any], dict[str, Pixels]]:
-    """The first part's header, and what `read_exr` gives."""
+    path = Path(path)
     picture_size(path)
-    parts = exr_parts(path)
-    channels: dict[str, Pixels] = {}
-    for _, of_part in parts:
+    channels: dict[str, NDArray[Any]] = {}
+    for _, of_part in exr_parts(path):
         for name, pixels in of_part.items():
-            channels.setdefault(name, np.asarray(pixels, np.float32))
-    for name, values in channels.items():
-        if not np.isfinite(values).all():
-            raise FrameError(f"{path} holds values in channel {name} that are not finite; clean it first.")
-    return parts[0][0], channels
+            channels.setdefault(name, pixels)
+    return {name: _finite(path, name, pixels) for name, pixels in channels.items()}
+
+
+def _finite(path: Path, name: str, channel: NDArray[Any]) -> Pixels:
+    values = np.asarray(channel, np.float32)
+    if not np.isfinite(values).all():
+        raise FrameError(f"{path} holds values in channel {name} that are not finite; clean it first.")
+    return values
+
+
+_Part = TypeVar("_Part")
+
+
+def _of_the_picture(parts: Sequence[tuple[_Part, Container[str]]]) -> _Part:
+    """Of the parts of an EXR, each with the names of its channels, the first that holds a picture: others have the
+    depth, or a pass, with windows of their own. The first of all where none does."""
+    for wanted in ("RGB", "Y"):
+        for part, names in parts:
+            if all(name in names for name in wanted):
+                return part
+    return parts[0][0]
 
 
 def exr_header(path: Path | str) -> dict[str, Any]:
     """The header of an EXR's first part, as the library has it, attributes that `core.exr` knows nothing of among them.
     Raises FrameError where the file is damaged."""
+    return _exr_headers(path)[0]
+
+
+def _exr_headers(path: Path | str) -> list[dict[str, Any]]:
     import OpenEXR
 
     try:
         with OpenEXR.File(str(path), header_only=True) as file:
-            return dict(file.parts[0].header)
+            headers = [dict(part.header) for part in file.parts]
     except Exception as problem:  # the library raises bare RuntimeError and worse for damaged files
         raise FrameError(f"{path} is damaged or truncated ({problem}); export it again.") from problem
+    if not headers:
+        raise FrameError(f"{path} is damaged or truncated; export it again.")
+    return headers
 
 
 def exr_parts(path: Path) -> list[tuple[dict[str, Any], dict[str, NDArray[Any]]]]:
@@ -339,15 +394,16 @@ def exr_parts(path: Path) -> list[tuple[dict[str, Any], dict[str, NDArray[Any]]]
         raise FrameError(f"{path} is damaged or truncated ({problem}); export it again.") from problem
     if not parts:
         raise FrameError(f"{path} is damaged or truncated; export it again.")
+    if any(pixels.dtype == object for _, channels in parts for pixels in channels.values()):
+        raise FrameError(f"{path} is a deep EXR, with several values to a pixel; flatten it.")
     return parts
 
 
-def _rgb_from_channels(path: Path, channels: Mapping[str, Pixels]) -> Pixels:
-    if all(name in channels for name in "RGB"):
-        return np.stack([channels[name] for name in "RGB"], axis=-1)
-    if "Y" in channels:
-        return np.repeat(channels["Y"][..., None], 3, axis=2)
-    raise FrameError(f"{path} has no R, G, B channels at its root (it has {', '.join(sorted(channels))}).")
+def _rgb_from_channels(path: Path, channels: Mapping[str, NDArray[Any]]) -> Pixels:
+    names = "RGB" if all(name in channels for name in "RGB") else "YYY" if "Y" in channels else ""
+    if not names:
+        raise FrameError(f"{path} has no R, G, B channels at its root (it has {', '.join(sorted(channels))}).")
+    return np.stack([_finite(path, name, channels[name]) for name in names], axis=-1)
 
 
 def _rec709(path: Path, pixels: Pixels, header: Mapping[str, Any]) -> Pixels:
@@ -396,6 +452,8 @@ def save_exr(path: Path | str, header: Mapping[str, Any], channels: Mapping[str,
         except RuntimeError as problem:  # how the library hands on what the system refused, by its words alone
             full = os.strerror(errno.ENOSPC) in str(problem)
             raise OSError(errno.ENOSPC if full else errno.EIO, str(problem), str(path)) from problem
+        if not temporary.stat().st_size or exr_is_cut_off(temporary):  # what is refused at its closing, it keeps quiet
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
 
 
 def write_png(path: Path | str, display: NDArray[Any], bits: Literal[8, 16] = 8) -> None:

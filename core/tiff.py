@@ -11,13 +11,16 @@ from typing import BinaryIO, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-SUBFILE, WIDTH, HEIGHT, PHOTOMETRIC, ORIENTATION, SAMPLES, EXTRA_SAMPLES = 254, 256, 257, 262, 274, 277, 338
+SUBFILE, WIDTH, HEIGHT, BITS, PHOTOMETRIC, ORIENTATION, SAMPLES = 254, 256, 257, 258, 262, 274, 277
+PLANES, EXTRA_SAMPLES = 284, 338
 X_RESOLUTION, Y_RESOLUTION, RESOLUTION_UNIT, XMP, COLOUR_PROFILE = 282, 283, 296, 700, 34675
 
 UPRIGHT = 1
 """Orientation: rows from the top, columns from the left."""
-SEPARATED = 5
-"""Photometric interpretation: inks, CMYK."""
+WHITE_IS_0, SEPARATED = 0, 5
+"""Photometric interpretation: ink on paper; inks, CMYK."""
+IN_PLANES = 2
+"""Planar configuration: all of one colour, then all of the next."""
 PREMULTIPLIED, STRAIGHT = 1, 2
 """What the extra sample of a pixel is: alpha that the colours were multiplied with, or not."""
 

@@ -41,7 +41,6 @@ _KEPT_CHUNKS = (b"iCCP", b"gAMA", b"cHRM", b"sRGB", b"pHYs", b"eXIf", b"cICP")
 _KEPT_TAGS = (tiff.ORIENTATION, tiff.EXTRA_SAMPLES, tiff.X_RESOLUTION, tiff.Y_RESOLUTION, tiff.RESOLUTION_UNIT,
               tiff.XMP, tiff.COLOUR_PROFILE)
 _PLACING = ("chromaticities", "dataWindow", "displayWindow", "pixelAspectRatio")
-_CMYK = "is CMYK, for print; convert it to RGB"
 _JPEG_QUALITY = 97
 _JPEGS, _TIFFS = (".jpg", ".jpeg"), (".tif", ".tiff")
 _DEPTHS: dict[str, tuple[type, ...]] = {".png": (np.uint8, np.uint16), **dict.fromkeys(_JPEGS, (np.uint8,))}
@@ -128,9 +127,10 @@ def read_plate(path: Path | str) -> Plate:
 
 
 def _read_codes(path: Path) -> Plate:
-    misread = _misread(path)
-    if misread:
-        raise FrameError(f"{path} {misread}.")
+    with open(path, "rb") as stream:
+        pages = tiff.page_count(stream)
+    if pages > 1:
+        raise FrameError(f"{path} has {pages} pages; export the plate as a file of its own.")
     stored = stored_pixels(path)
     if stored.dtype not in (np.uint8, np.uint16, np.float32):
         raise FrameError(f"{path} holds {stored.dtype} pixels; save it as 8 or 16 bit or as 32 bit float.")
@@ -148,26 +148,6 @@ def _is_grey_with_alpha(path: Path) -> bool:
     with open(path, "rb") as stream:
         header = stream.read(26)
     return header[:4] == b"\x89PNG" and header[25:] == b"\x04"
-
-
-def _misread(path: Path) -> str:
-    """What OpenCV would read without a word as something else, and what to do; "" where there is no such thing."""
-    with open(path, "rb") as stream:
-        begins = stream.read(4)
-        stream.seek(0)
-        if begins[:2] == b"\xff\xd8":  # whatever it is named
-            header = jpeg.frame_header(stream)
-            return _CMYK if header is not None and header[2] == 4 else ""
-        if begins not in (b"II*\0", b"MM\0*"):
-            return ""
-        told = {name: tag.values[0] for name, tag in
-                tiff.read_tags(stream, (tiff.SAMPLES, tiff.PHOTOMETRIC)).items()}
-        pages = tiff.page_count(stream)
-    if pages > 1:
-        return f"has {pages} pages; export the plate as a file of its own"
-    if told.get(tiff.SAMPLES) == 2:
-        return "is grey with alpha; save it as RGB with alpha, or as PNG"
-    return _CMYK if told.get(tiff.PHOTOMETRIC) == tiff.SEPARATED else ""
 
 
 def _read_exr(path: Path) -> Plate:

@@ -28,6 +28,7 @@ from core.pictures import (
     read_picture,
     save_exr,
     srgb_from_linear,
+    window_of,
     write_exr,
     write_png,
 )
@@ -166,7 +167,6 @@ def test_a_picture_shrinks_in_light() -> None:
     np.testing.assert_allclose(small.linear(), 0.5, atol=1e-6)
 
 
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs the device that is always full, which Linux has")
 @pytest.mark.skipif(sys.platform != "linux", reason="elsewhere all names are Unicode")
 def test_a_folder_that_is_not_utf8_is_refused_by_name(tmp_path: Path) -> None:
     folder = tmp_path / os.fsdecode(b"caf\xe9")
@@ -175,19 +175,60 @@ def test_a_folder_that_is_not_utf8_is_refused_by_name(tmp_path: Path) -> None:
     assert not folder.exists()
 
 
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs the device that is always full, which Linux has")
 def test_a_full_disk_is_told_as_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     @contextlib.contextmanager
     def full(_target: Path, _turn: object = None) -> Iterator[Path]:
         yield Path("/dev/full")
 
     monkeypatch.setattr(pictures, "atomic_path", full)
-    with pytest.raises(OSError) as told:
-        write_exr(tmp_path / "a.exr", {"R": np.random.default_rng(0).random((200, 300)).astype(np.float32)})
-    assert told.value.errno == errno.ENOSPC
-    assert told.value.filename == str(tmp_path / "a.exr")
+    for sides in ((200, 300), (2, 2)):  # the smaller is refused no sooner than at its closing
+        with pytest.raises(OSError) as told:
+            write_exr(tmp_path / "a.exr", {"R": np.random.default_rng(0).random(sides).astype(np.float32)})
+        assert told.value.errno == errno.ENOSPC
+        assert told.value.filename == str(tmp_path / "a.exr")
     with pytest.raises(OSError) as told:
         write_png(tmp_path / "a.png", RAMP)
     assert told.value.errno == errno.ENOSPC
+
+
+@pytest.mark.parametrize(("tag", "value", "told"), [(tiff.PLANES, tiff.IN_PLANES, "colours apart"),
+                                                    (tiff.PHOTOMETRIC, tiff.WHITE_IS_0, "0 for white")])
+def test_a_tiff_that_would_be_read_as_something_else_is_refused(tag: int, value: int, told: str,
+                                                                tmp_path: Path) -> None:
+    codes = (RAMP * 65535).astype(np.uint16)
+    data = cv2.imencode(".tif", codes if tag == tiff.PLANES else codes[..., 0])[1].tobytes()
+    (tmp_path / "a.tif").write_bytes(tiff.with_tags(data, {tag: tiff.short(value)}))
+    for read in (read_picture, read_plate):
+        with pytest.raises(FrameError, match=rf"a\.tif has .*{told}"):
+            read(tmp_path / "a.tif")
+
+
+def test_of_an_exr_only_the_picture_counts(tmp_path: Path) -> None:
+    """Depth in a part before it, cropped to what is there and infinite behind that."""
+    depth = np.full((3, 2), np.inf, np.float32)
+    parts = [OpenEXR.Part({"name": "depth", "type": OpenEXR.scanlineimage,
+                           "dataWindow": ((4, 2), (5, 4)), "displayWindow": ((0, 0), (8, 6))}, {"Z": depth}),
+             OpenEXR.Part({"name": "rgba", "type": OpenEXR.scanlineimage, "dataWindow": ((0, 0), (8, 6)),
+                           "displayWindow": ((0, 0), (8, 6))},
+                          {name: np.ascontiguousarray(RAMP[..., index]) for index, name in enumerate("RGB")})]
+    with OpenEXR.File(parts) as file:
+        file.write(str(tmp_path / "a.exr"))
+    np.testing.assert_array_equal(read_picture(tmp_path / "a.exr").pixels, RAMP)
+    assert window_of(tmp_path / "a.exr").is_frame
+    with pytest.raises(FrameError, match="channel Z that are not finite"):
+        read_exr(tmp_path / "a.exr")
+
+
+def test_a_deep_exr_is_refused(tmp_path: Path) -> None:
+    samples = np.empty((2, 2), object)
+    for place in np.ndindex(2, 2):
+        samples[place] = np.arange(3, dtype=np.float32)
+    with OpenEXR.File({"type": OpenEXR.deepscanline, "compression": OpenEXR.ZIPS_COMPRESSION},
+                      dict.fromkeys("RGB", samples)) as file:
+        file.write(str(tmp_path / "deep.exr"))
+    with pytest.raises(FrameError, match=r"deep\.exr is a deep EXR"):
+        read_picture(tmp_path / "deep.exr")
 
 
 def test_of_parts_with_channels_of_one_name_the_first_counts(tmp_path: Path) -> None:

@@ -12,9 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from contextlib import nullcontext
-from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import Parameter
@@ -35,6 +33,7 @@ from .beginning import first_flare, first_scene, moved_lights
 from .checkpoint import State
 from .doubts import doubts
 from .frames import Frames, Targets, thinned
+from .given import Given
 from .optimisers import Optimisers
 from .rendering import render_flare, render_scene
 from .settings import FitSettings
@@ -83,6 +82,8 @@ class Trainer:
                      *doubts(capture, settings, self.views, self.frames),
                      *(() if self.flare is None else moved_lights(capture, self.flare)))
         self.extent = capture.extent
+        self._given = Given(capture, removed=self.frames.reference == "removed", lights=self.flare is not None,
+                            apart=SAME_PLACE * self.extent)
         self._head_start = head_start(settings.split, len(self.views), settings.iterations)
         """Iterations in which a scene of mode `split` is fitted alone; then it is asked whether it has been found."""
         self._scene_is_found = True
@@ -309,23 +310,22 @@ class Trainer:
         state: State = {"iteration": self.iteration, "scene_is_found": self._scene_is_found,
                         "losses": [[name, loss] for name, loss in self.losses.items()],
                         "scene": dict(self.scene.state_dict()), "strategy": self.strategy.state_dict(),
-                        **self.optimisers.state()}
+                        **self.optimisers.state(), **self._given.note()}
         if self.flare is not None:
-            state["lights"] = self._given_lights()
             state["flare"] = dict(self.flare.state_dict())
         return state
 
     def load_state(self, state: State) -> None:
-        """Go on from a state. Raises RunError where it does not fit the capture and settings, or the lights that the
-        fit was given have changed."""
+        """Go on from a state. Raises RunError where it does not fit the capture and settings, or what the fit was given
+        has changed."""
         try:
+            self._given.check(state)
             self.iteration = int(state["iteration"])
             found = state.get("scene_is_found", state.get("alone_until") == self._head_start)  # of earlier versions
             self._scene_is_found = bool(found)
             self.losses = {name: float(loss) for name, loss in state.get("losses", [])}
             _load_parameters(dict(self.scene.named_parameters()), state["scene"])
             if self.flare is not None:
-                self._check_lights(state)
                 _load_parameters(dict(self.flare.named_parameters()), state["flare"])
                 self.flare.positions.copy_(state["flare"]["positions"])
                 self.flare.clear.copy_(state["flare"]["clear"])
@@ -334,32 +334,8 @@ class Trainer:
         except (KeyError, RuntimeError, TypeError, ValueError) as problem:
             raise RunError(f"The checkpoint does not fit this fit ({problem}); start it anew.") from problem
 
-    def _given_lights(self) -> list[Any]:
-        """[name, [x, y, z]] of each light as the capture has it, wherever the fit has put it since."""
-        return [[light.name, light.xyz.tolist()] for light in self.capture.lights]
-
-    def _check_lights(self, state: State) -> None:
-        """Raises RunError where the state was made with other lights: flares belong to lights by their order. States of
-        earlier versions do not say with which."""
-        begun, given = state.get("lights"), self._given_lights()
-        changed = "" if begun is None else _difference(begun, given, SAME_PLACE * self.extent)
-        if changed:
-            raise RunError(f"{self.capture.folder / 'lights.json'} has changed since the fit began ({changed}); put "
-                           "the old one back, or begin the fit anew in another folder.")
-
 
 def _load_parameters(parameters: dict[str, Parameter], state: State) -> None:
     """Values of any number of rows: Gaussians come and go during a fit."""
     for name, parameter in parameters.items():
         parameter.data = state[name].clone().to(parameter.dtype)
-
-
-def _difference(begun: list[Any], given: list[Any], apart: float) -> str:
-    """What has changed in a list of [name, [x, y, z]], or "": the names, or else the first place, by more than `apart`
-    or what Blender's own numbers round to."""
-    before, after = ([name for name, _ in lights] for lights in (begun, given))
-    if before != after:
-        return f"its lights were {', '.join(map(repr, before))}, and are {', '.join(map(repr, after))} now"
-    return next((f"{name!r} was at {old}, and is at {new} now"
-                 for (name, old), (_, new) in zip(begun, given, strict=True)
-                 if not np.allclose(old, new, rtol=1e-6, atol=apart)), "")

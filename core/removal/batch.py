@@ -99,7 +99,7 @@ def remove_all(inputs: Sequence[Path], folder: Path, remover: Remover, progress:
             else:
                 plate, told = sequences.read(path)
                 marked = mattes.read(name, window_of(path)) if mattes else None
-                record.begin(name, how, results[name], overwrite)  # once it can be read: what is there goes
+                record.begin(name, path, how, results[name], overwrite)  # once it can be read: what is there goes
                 write_results(results[name], plate, *remover.remove(plate, marked, told))
                 made += 1
         except Exception as problem:

@@ -40,7 +40,7 @@ def remove_from(capture: Capture, remover: Remover, progress: Progress) -> Path:
             results.append(result)
             how = made_from(remover.described, [frame, *sequences.beside(frame)])
             if not record.is_made(name, how, [result]):
-                record.begin(name, how, [result], overwrite=True)
+                record.begin(name, frame, how, [result], overwrite=True)
                 plate, told = sequences.read(frame)
                 write_plate(result, plate, remover.remove(plate, told=told)[0])
             progress.advance()
@@ -56,6 +56,19 @@ def remove_from(capture: Capture, remover: Remover, progress: Progress) -> Path:
         raise CaptureError(f"{work} cannot be written ({problem.strerror or problem}); copy the capture to where it "
                            "can, or make removed/ there with `remove`.") from problem
     return target
+
+
+def check_removed(capture: Capture) -> None:
+    """Raises CaptureError where the capture has clean frames that were made here from others than it has now. Those of
+    which nothing is written down are someone's own."""
+    folder = capture.folder / REMOVED
+    frames = {capture.removed_path(view).resolve(): view for view in capture.views}
+    sources = {path.relative_to(folder.resolve()): capture.frame_path(view) for path, view in frames.items()
+               if path.is_relative_to(folder.resolve())}
+    if others := Record(folder).made_from_others(sources):
+        raise CaptureError(f"{len(others)} of the {len(sources)} flare-free frames in {folder} were made from other "
+                           f"frames than the capture has now ({others[0].as_posix()} first); remove that folder, and "
+                           "they are made again.")
 
 
 def _names(capture: Capture) -> dict[str, Path]:

@@ -69,7 +69,7 @@ def remove_fitted(fitted: Renderer, capture: Capture, views: Sequence[View], fol
         name = Path(view.name)
         how = made_from(repr((made_by, view.camera.numbers, lights)), [capture.frame_path(view)])
         if overwrite or not record.is_made(name, how, targets):
-            record.begin(name, how, targets, overwrite)
+            record.begin(name, capture.frame_path(view), how, targets, overwrite)
             parts = _remove(fitted, capture, view, targets, above_white)
             dim.update(light for light, part in parts.items() if part < HALF)
             made += 1

@@ -6,7 +6,7 @@ from __future__ import annotations
 import errno
 import hashlib
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from ..errors import FrameError
@@ -14,9 +14,9 @@ from ..files import content_of, locked, patiently, read_json, remove_partial_of,
 
 RECORD = "remove.json"
 LOCK = ".remove.lock"
-_TABLES = ("plates", "flares", "flares_made")
+_TABLES = ("plates", "flares", "flares_made", "sources")
 """Of each plate how it was made, where from here its flare is, and how that was made: the plate may have been made in
-another way since, without one."""
+another way since, without one. And the content of what it was made from."""
 
 
 def made_from(maker: str, sources: Iterable[Path]) -> str:
@@ -41,9 +41,9 @@ class Record:
     def is_made(self, name: Path, how: str, results: Sequence[Path]) -> bool:
         """Whether all files of a plate are there, made in this way (`made_from`)."""
         written = all(self._read(what).get(name.as_posix()) == value for what, value in self._row(how, results).items())
-        return written and all(path.is_file() for path in results)
+        return written and all(path.is_file() and path.stat().st_size for path in results)
 
-    def begin(self, name: Path, how: str, results: Sequence[Path], overwrite: bool) -> None:
+    def begin(self, name: Path, source: Path, how: str, results: Sequence[Path], overwrite: bool) -> None:
         """Before the files of a plate are written, itself and maybe its flare: what was made there in another way goes,
         so that a kill leaves none under what is now written down. Raises FrameError for a plate or flare that is not
         from here, unless `overwrite`."""
@@ -51,7 +51,7 @@ class Record:
         with locked(self._folder / LOCK):
             known = {what: self._read(what) for what in _TABLES}
             told = {what: {**rows} for what, rows in known.items()}
-            for what, value in self._row(how, results).items():
+            for what, value in {**self._row(how, results), "sources": content_of(source)}.items():
                 told[what][key] = value
             from_here = (key in known["plates"], known["flares"].get(key) == told["flares"].get(key))
             for path, is_known in zip(results, from_here, strict=False):
@@ -70,6 +70,12 @@ class Record:
         """What is written down of a plate, by table."""
         of_flare = {"flares": _from(self._folder, results[1]), "flares_made": how} if results[1:] else {}
         return {"plates": how, **of_flare}
+
+    def made_from_others(self, sources: Mapping[Path, Path]) -> list[Path]:
+        """Of plates by their names here, and what each is to be made from, those that were made from something else."""
+        told = self._read("sources")
+        return [name for name, source in sources.items()
+                if name.as_posix() in told and told[name.as_posix()] != content_of(source)]
 
     def results(self) -> list[Path]:
         """The paths of the plates and flares that it lists, there or not."""

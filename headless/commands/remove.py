@@ -109,11 +109,13 @@ def _remover(words: argparse.Namespace) -> Remover:
 
 
 def with_removed(capture: Capture, progress: Progress) -> Capture:
-    """The capture with its flare-free frames, which are made and written into its folder if it has none."""
-    from ...core.removal.captured import remove_from
+    """The capture with its flare-free frames, which are made and written into its folder if it has none. Raises
+    CaptureError where it has some that were made of other frames."""
+    from ...core.removal.captured import check_removed, remove_from
     from ...core.removal.inference import Remover
 
     if capture.has_removed:
+        check_removed(capture)
         return capture
     progress.say(f"{capture.folder} has no removed/: the flares are taken out of its frames, and what comes of that is "
                  "kept there.")

@@ -477,6 +477,22 @@ def test_a_fit_goes_on_with_the_lights_it_began_with(tmp_path: Path, capture: Ca
         fit(with_lights(*as_blender_has_it), quick(), tmp_path / "run", StopAt(1), resume=True)
 
 
+@pytest.mark.parametrize("what", ["images", "removed", "the camera"])
+def test_a_fit_goes_on_with_the_views_it_began_with(what: str, tmp_path: Path, capture: Capture) -> None:
+    own = Capture.open(shutil.copytree(capture.folder, tmp_path / "own"))
+    with pytest.raises(Cancelled):
+        fit(own, quick(), tmp_path / "run", StopAt(1))
+    view = own.views[1]
+    if what == "the camera":
+        turned = replace(view, camera=replace(view.camera, fx=view.camera.fx * 1.01))
+        own.views = tuple(turned if one == view else one for one in own.views)
+    else:
+        path = own.frame_path(view) if what == "images" else own.removed_path(view)
+        write_png(path, 1 - read_picture(path).pixels)
+    with pytest.raises(RunError, match=rf"1 of {len(own.views)} views have another frame.*, {view.name} first"):
+        fit(own, quick(), tmp_path / "run", resume=True)
+
+
 def test_a_light_that_the_fit_has_moved_is_still_the_one_it_was_given(capture: Capture) -> None:
     first, second = (Trainer(capture, quick()) for _ in range(2))
     assert first.flare is not None
@@ -486,11 +502,11 @@ def test_a_light_that_the_fit_has_moved_is_still_the_one_it_was_given(capture: C
 
 
 def test_a_checkpoint_of_an_earlier_version_goes_on(capture: Capture) -> None:
-    """It does not say which lights the fit was given."""
+    """It does not say which lights and frames the fit was given."""
     earlier = Trainer(capture, quick())
     earlier.step()
     state = earlier.state()
-    del state["lights"]
+    del state["lights"], state["views"]
     moved = copy.copy(capture)
     moved.lights = (Light("sun", capture.lights[0].xyz + 0.1),)
     trainer = Trainer(moved, quick())

@@ -30,7 +30,7 @@ from core.pictures import Window, read_exr, read_picture, write_exr, write_png
 from core.progress import Progress
 from core.removal import batch, inference, weights
 from core.removal.batch import plates_of, remove_all
-from core.removal.captured import UNFINISHED, remove_from
+from core.removal.captured import UNFINISHED, check_removed, remove_from
 from core.removal.inference import FlareMap, Remover, Told, carried_up, flare_light
 from core.removal.mattes import Mattes
 from core.removal.network import LEVELS, SHOWN, RemovalNetwork, seen
@@ -536,16 +536,36 @@ def test_a_plate_that_another_process_has_made_meanwhile_stays(tmp_path: Path) -
     nor taken for someone's work."""
     plate = write_codes(tmp_path / "out" / "b.png", picture())
     plate.unlink()
+    source = write_codes(tmp_path / "in" / "b.png", picture())
     second = Record(tmp_path / "out")
     first = Record(tmp_path / "out")
-    first.begin(Path("b.png"), "one way", [plate], overwrite=False)
+    first.begin(Path("b.png"), source, "one way", [plate], overwrite=False)
     write_codes(plate, picture())
     assert second.is_made(Path("b.png"), "one way", [plate])
     for overwrite in (False, True):
-        second.begin(Path("b.png"), "one way", [plate], overwrite)
+        second.begin(Path("b.png"), source, "one way", [plate], overwrite)
         assert plate.exists()
-    second.begin(Path("b.png"), "another way", [plate], overwrite=False)
+    second.begin(Path("b.png"), source, "another way", [plate], overwrite=False)
     assert not plate.exists() and not first.is_made(Path("b.png"), "one way", [plate])
+
+
+@pytest.mark.parametrize("by_the_fit", [True, False])
+def test_clean_frames_of_other_frames_are_told(by_the_fit: bool, tmp_path: Path, everywhere: Path) -> None:
+    """A regraded capture under its old names: what was removed/ then is no truth now."""
+    capture, remover = Capture.open(make_capture(tmp_path / "capture", views=4)), Remover(everywhere, working_size=64)
+    removed = capture.folder / "removed"
+    shutil.rmtree(removed, ignore_errors=True)
+    if by_the_fit:
+        remove_from(Capture.open(capture.folder), remover, Progress())
+    else:
+        remove_all([capture.folder / "images"], removed, remover, Progress())
+    check_removed(Capture.open(capture.folder))
+    frame = capture.frame_path(capture.views[2])
+    cv2.imwrite(str(frame), 255 - cv2.imread(str(frame)))
+    with pytest.raises(CaptureError, match=rf"1 of the 4 flare-free frames .*\({frame.stem}"):
+        check_removed(Capture.open(capture.folder))
+    (removed / "remove.json").unlink()  # someone's own
+    check_removed(Capture.open(capture.folder))
 
 
 def test_two_fits_that_clean_one_capture_at_once(tmp_path: Path, everywhere: Path) -> None:
@@ -648,7 +668,7 @@ def test_a_plate_that_was_begun_is_made(tmp_path: Path, everywhere: Path) -> Non
     remove_all([source], tmp_path / "out", remover, Progress())
     other = Remover(everywhere, working_size=96)
     how = made_from(other.described, [source])
-    Record(tmp_path / "out").begin(Path("a.png"), how, [tmp_path / "out" / "a.png"], overwrite=False)
+    Record(tmp_path / "out").begin(Path("a.png"), source, how, [tmp_path / "out" / "a.png"], overwrite=False)
     assert not (tmp_path / "out" / "a.png").exists()
     assert remove_all([source], tmp_path / "out", other, Progress())["made"] == 1
 

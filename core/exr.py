@@ -43,6 +43,13 @@ def chromaticities(stream: BinaryIO) -> tuple[float, ...] | None:
     return tuple(np.frombuffer(value, "<f4").tolist()) if len(value) == 32 else None
 
 
+def pixel_aspect(stream: BinaryIO) -> float:
+    """Width of a pixel by its height; 1 where that is not told, or makes no sense."""
+    value = _attributes(stream, {b"pixelAspectRatio": b"float"}).get(b"pixelAspectRatio", b"")
+    told = float(np.frombuffer(value, "<f4")[0]) if len(value) == 4 else 1.0
+    return told if 0.1 < told < 10 else 1.0
+
+
 def is_cut_off(stream: BinaryIO) -> bool:
     """Whether the chunks of a picture of one part in lines are not all in the file. Of other kinds it is not known, and
     none of those is."""

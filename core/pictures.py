@@ -231,14 +231,28 @@ def channel_names(path: Path | str) -> list[str]:
     return names
 
 
-def exr_is_rec709(path: Path | str) -> bool:
-    """Whether an EXR's light is linear Rec. 709, as the format has it where no chromaticities are told. Raises OSError
-    where there is no such file."""
-    from .colour import REC_709
+def exr_space(path: Path | str) -> str:
+    """The name of the linear space that an EXR's light is in, by its chromaticities: "linear", Rec. 709, as the format
+    has it, where it tells none; "" for one that has no name here. Raises OSError where there is no such file."""
+    from .colour import space_of_chromaticities
+    from .colour.spaces import names
+    from .errors import SettingsError
 
     with open(path, "rb") as stream:
         told = exr.chromaticities(stream)
-    return told is None or bool(np.allclose(told, REC_709, atol=1e-4))
+    if told is None:
+        return "linear"
+    try:
+        found = space_of_chromaticities(told).name
+    except SettingsError:
+        return ""
+    return found if found in names() else ""
+
+
+def exr_pixel_aspect(path: Path | str) -> float:
+    """Width of an EXR's pixels by their height. Raises OSError where there is no such file."""
+    with open(path, "rb") as stream:
+        return exr.pixel_aspect(stream)
 
 
 def exr_is_cut_off(path: Path | str) -> bool:

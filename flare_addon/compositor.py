@@ -12,9 +12,9 @@ from typing import Any
 import bpy
 
 from ..core.bake.folder import LayerFolder
-from ..core.colour.ocio import REC_709_LINEAR
+from ..core.colour.ocio import NAMES
 from ..core.errors import FrameError
-from ..core.pictures import exr_is_rec709
+from ..core.pictures import exr_space
 from . import curves, wires
 from .flare_node import GROUP, GROUPS_ARE_TREES, find_node, layer_of, new_node, node_group, of_render_size, tree_of
 from .images import loaded
@@ -327,10 +327,8 @@ def _point_at(node: Any, layers: LayerFolder) -> None:
     """Make an Image node show the file of each frame's number, gaps and a frame 0 included."""
     image = loaded(layers.files[layers.first], "SEQUENCE")
     node.image = image
-    if exr_is_rec709(layers.files[layers.first]):  # a studio's configuration may take EXRs for another space
-        known = _spaces(image)
-        if space := next((one for one in REC_709_LINEAR if one in known), ""):
-            image.colorspace_settings.name = space
+    if space := _space_of(image):  # a configuration may take EXRs for another
+        image.colorspace_settings.name = space
     node.frame_start, node.frame_offset = layers.first, layers.first - 1
     node.frame_duration = _TO_THE_END  # of the layers' own range the last one would be shown ever after
     node.use_auto_refresh = True
@@ -346,11 +344,14 @@ def over_render(scene: Any) -> bool:
 def misread(scene: Any) -> str:
     """A sentence where the colour configuration has no space for the light of the layers, "" where it has."""
     image = tree_of(scene).nodes[LAYERS].image
-    if not exr_is_rec709(absolute(image.filepath)) or any(one in _spaces(image) for one in REC_709_LINEAR):
+    if _space_of(image):
         return ""
-    return ("The colour configuration has no space of linear Rec. 709, which the layers are in; they are read as "
-            f"{image.colorspace_settings.name}, and their colours are wrong.")
+    space = exr_space(absolute(image.filepath)).replace("linear", "linear Rec. 709")
+    return (f"The colour configuration has no space of {space or 'these chromaticities'}, which the layers are in; "
+            f"they are read as {image.colorspace_settings.name}, and their colours are wrong.")
 
 
-def _spaces(image: Any) -> set[str]:
-    return {item.identifier for item in image.colorspace_settings.bl_rna.properties["name"].enum_items}
+def _space_of(image: Any) -> str:
+    """What the colour configuration calls the space that an EXR's light is in; "" where it has none."""
+    known = {item.identifier for item in image.colorspace_settings.bl_rna.properties["name"].enum_items}
+    return next((one for one in NAMES.get(exr_space(absolute(image.filepath)), ()) if one in known), "")

@@ -139,7 +139,7 @@ def bake_frames(source: Sequenced, frames: Sequence[Frame], cameras: Mapping[str
     made_from = _made_from(source.fingerprint, settings, keyed)
     space = colour_space(settings.space, settings.config)
     if settings.space != "linear" or settings.config is not None:
-        made_from["space"] = [settings.space, settings.config]
+        made_from["space"] = [settings.space, settings.config, space.meaning]
     if keyed.frames:
         made_from["keyed"] = keyed.described()["frames"]
     made_from = json.loads(json.dumps(made_from))  # as it is read again

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..errors import FrameError
-from ..pictures import channel_names, exr_is_cut_off, picture_size
+from ..pictures import channel_names, exr_is_cut_off, exr_pixel_aspect, picture_size
 
 _NUMBERED = re.compile(r"(.*?)(\d+)\.exr", re.IGNORECASE)
 
@@ -58,6 +58,10 @@ class LayerFolder:
     def size(self) -> tuple[int, int]:
         """(width, height) of the first frame, from its header."""
         return picture_size(self.files[self.first])
+
+    def pixel_aspect(self) -> float:
+        """Width of the first frame's pixels by their height."""
+        return exr_pixel_aspect(self.files[self.first])
 
 
 def _layers_of(path: Path) -> set[str]:

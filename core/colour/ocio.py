@@ -17,9 +17,15 @@ from ..errors import EngineError, SettingsError
 from .spaces import REC_709, ColourSpace, colour_space, linear_space
 from .spaces import names as built_in_names
 
-REC_709_LINEAR = ("lin_rec709_scene", "lin_rec709", "Linear Rec.709 (sRGB)", "Linear Rec.709",
-                  "Utility - Linear - sRGB", "Utility - Linear - Rec.709", "Linear")
-"""What configurations call scene-linear Rec. 709."""
+NAMES = {
+    "linear": ("lin_rec709_scene", "lin_rec709", "Linear Rec.709 (sRGB)", "Linear Rec.709", "Utility - Linear - sRGB",
+               "Utility - Linear - Rec.709", "Linear"),
+    "acescg": ("ACEScg", "lin_ap1_scene", "lin_ap1", "ACES - ACEScg"),
+    "aces2065-1": ("ACES2065-1", "lin_ap0_scene", "lin_ap0", "ACES - ACES2065-1"),
+    "rec2020": ("lin_rec2020_scene", "lin_rec2020", "Linear Rec.2020", "Utility - Linear - Rec.2020"),
+    "p3-d65": ("lin_p3d65_scene", "lin_p3d65", "Linear P3-D65", "Linear DCI-P3 D65", "Utility - Linear - P3-D65"),
+}
+"""What configurations call the scene-linear spaces of ours."""
 _BUILT_IN = "ocio://default"
 
 
@@ -74,7 +80,7 @@ def _library() -> ModuleType:
 
 def _processor(library: ModuleType, config: Any, name: str, *, forward: bool) -> Any:
     """From the space to linear Rec. 709, or back."""
-    own = next((one for one in REC_709_LINEAR if config.getColorSpace(one) is not None), None)
+    own = next((one for one in NAMES["linear"] if config.getColorSpace(one) is not None), None)
     try:
         if own is not None:
             made = config.getProcessor(name, own) if forward else config.getProcessor(own, name)

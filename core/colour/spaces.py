@@ -6,6 +6,7 @@ White points are adapted by Bradford's matrix, as ACES and ICC do. Curves go on 
 """
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -50,6 +51,16 @@ class ColourSpace:
     def is_linear(self) -> bool:
         """Whether light adds in it."""
         return self.matrix is not None
+
+    @property
+    def meaning(self) -> str:
+        """A short text that changes with what it does to colours: configurations may have other spaces under one name,
+        and a file may be another tomorrow."""
+        levels = np.array([0.02, 0.18, 0.9], np.float32)
+        colours = np.stack(np.meshgrid(levels, levels, levels), -1).reshape(-1, 3)
+        told = np.concatenate([self.to_linear(colours), self.from_linear(colours)]).ravel()
+        digits = " ".join(f"{value:.3g}" for value in told)  # what machines differ in is not among them
+        return hashlib.blake2b(digits.encode(), digest_size=8).hexdigest()
 
 
 def matrix_to_xyz(chromaticities: Chromaticities) -> NDArray[np.float64]:

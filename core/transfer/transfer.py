@@ -85,7 +85,9 @@ class Transfer:
         """Changes whenever all pictures would; what is a frame's alone, its renderer's fingerprint tells."""
         digest = hashlib.sha256(self.flare.read_bytes())
         digest.update(self.target.fingerprint().encode())
-        digest.update(repr((self.settings, self.config, sorted(self.seen))).encode())
+        plates = self.settings.plate_space
+        meaning = "" if plates == AUTO else colour_space(plates, self.config).meaning
+        digest.update(repr((self.settings, self.config, meaning, sorted(self.seen))).encode())
         return digest.hexdigest()[:16]
 
     def fingerprint_of(self, index: int) -> str:

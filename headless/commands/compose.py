@@ -40,7 +40,7 @@ def frames_of(folder: Path, out: Path, progress: Progress, *, wanted: str | None
 
     from ...core.bake.folder import LayerFolder
     from ...core.bake.frames import Frame
-    from ...flare_addon import compositor, rendering
+    from ...flare_addon import cameras, compositor, rendering
 
     if out.resolve() == folder.resolve():
         raise SettingsError(f"{out} holds the layers; choose another folder for the frames.")
@@ -55,6 +55,8 @@ def frames_of(folder: Path, out: Path, progress: Progress, *, wanted: str | None
     scene = bpy.context.scene
     node = compositor.set_up(scene, layers)
     rendering.match_scene(scene, layers, layers.size())
+    render = scene.render
+    render.pixel_aspect_x, render.pixel_aspect_y = cameras.pixel_aspect(1, layers.pixel_aspect())
     for note in (rendering.plain_view(scene), compositor.misread(scene)):
         if note:
             progress.say(note)

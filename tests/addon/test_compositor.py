@@ -13,6 +13,7 @@ from blenders import Blender
 
 from core.bake.exr import read_layers, write_layers
 from core.bake.layers import FrameLayers, matte
+from core.colour import colour_space
 from core.pictures import read_exr, read_picture, srgb_from_linear, write_exr
 
 SCRIPTS = Path(__file__).parent / "scripts"
@@ -46,7 +47,10 @@ def made(blender: Blender, tmp_path_factory: pytest.TempPathFactory) -> Made:
         write_layers(layers / f"layers.{number:04d}.exr", random_layers(number))
     write_layers(base / "fewer" / "layers.0000.exr", random_layers(1, ("key light",)))
     write_exr(base / "none" / "layers.0000.exr", {name: np.ones(SIZE, np.float32) for name in "RGB"})
-    facts = blender.run(SCRIPTS / "composite.py", layers, base / "fewer", base / "none", out, user=user)
+    aces = colour_space("acescg")
+    write_layers(base / "aces" / "layers.0000.exr", random_layers(0).in_space(aces), half=False, pixel_aspect=2.0,
+                 chromaticities=aces.chromaticities)
+    facts = blender.run(SCRIPTS / "composite.py", layers, base / "fewer", base / "none", base / "aces", out, user=user)
     return Made(facts, layers, out, user)
 
 
@@ -135,6 +139,13 @@ def test_layers_are_brought_to_the_size_that_is_rendered(made: Made, name: str, 
     if made.facts["version"].startswith("4.2"):  # there one pixel of each block stands for it
         smaller += [blocks[:, row, :, column] for row in range(2) for column in range(2)]
     assert max(np.corrcoef(one.ravel(), small.ravel())[0, 1] for one in smaller) > 0.9
+
+
+def test_layers_in_another_space_and_of_wide_pixels_are_composed_as_they_are(made: Made) -> None:
+    assert made.facts["aces"] == ["", 2.0, 1.0]
+    exact = random_layers(0)
+    np.testing.assert_allclose(rgb(made.out / "aces" / "frame.0000.exr"),
+                               exact.scene + exact.flares["lamp"] + exact.flares["key light"], rtol=2e-3, atol=2e-3)
 
 
 def test_what_the_camera_goes_by_stays(made: Made) -> None:

@@ -20,7 +20,7 @@ from core.colour import REC_709, colour_space
 from core.errors import Cancelled, FrameError, RunError, SettingsError
 from core.files import write_json
 from core.look import KeyedEdits, LookEdits
-from core.pictures import exr_header, exr_is_rec709, read_exr, write_exr
+from core.pictures import exr_header, exr_space, read_exr, write_exr
 from core.progress import Progress
 
 HALF = 2.0 ** -11  # the relative rounding error of 16 bit floats
@@ -429,9 +429,10 @@ def test_colours_of_layers_are_light_and_plain_factors_exact() -> None:
     np.testing.assert_array_equal(layers_of(rendering, double).flares["lamp"], 2 * layer)
 
 
-def test_a_file_tells_whether_its_light_is_rec_709(tmp_path: Path) -> None:
+def test_a_file_tells_what_its_light_is_in(tmp_path: Path) -> None:
     layers = FrameLayers(np.ones((2, 3, 3), np.float32), {}, np.ones((2, 3), np.float32))
-    spaces = {"rec709": REC_709, "untold": None, "acescg": colour_space("acescg").chromaticities}
+    red_is_cyan = (0.2, 0.3, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329)
+    spaces = {"rec709": REC_709, "untold": None, "acescg": colour_space("acescg").chromaticities, "own": red_is_cyan}
     for name, chromaticities in spaces.items():
         write_layers(tmp_path / f"{name}.exr", layers, chromaticities=chromaticities)
-    assert [exr_is_rec709(tmp_path / f"{name}.exr") for name in spaces] == [True, True, False]
+    assert [exr_space(tmp_path / f"{name}.exr") for name in spaces] == ["linear", "linear", "acescg", ""]

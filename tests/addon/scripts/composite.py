@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Inside Blender: build, rebuild, render. Words: folders of layers, of layers of fewer lights, of a picture without
-layers, and the folder to write."""
+layers, of wide pixels in ACEScg, and the folder to write."""
 from __future__ import annotations
 
 import importlib.util
@@ -19,11 +19,13 @@ run.load()
 
 from fit_flare.core.bake.folder import LayerFolder  # noqa: E402
 from fit_flare.core.errors import FrameError  # noqa: E402
+from fit_flare.core.progress import Progress  # noqa: E402
 from fit_flare.flare_addon import compositor, flare_node, rendering  # noqa: E402
+from fit_flare.headless.commands import compose  # noqa: E402
 
 INTENSITY, TINT = 1.7, (1.0, 0.5, 0.25, 1.0)
 
-folder, fewer, none, out = map(Path, sys.argv[1:5])
+folder, fewer, none, aces, out = map(Path, sys.argv[1:6])
 layers = LayerFolder.open(folder)
 
 
@@ -129,6 +131,11 @@ try:
     compositor.set_up(scene, layers)
 except FrameError as problem:
     facts["cropped"] = [str(problem), flare_node.find_node(scene) is None]
+
+# The command, of layers of wide pixels in ACEScg.
+compose.frames_of(aces, out / "aces", Progress())
+scene = bpy.context.scene
+facts["aces"] = [compositor.misread(scene), scene.render.pixel_aspect_x, scene.render.pixel_aspect_y]
 
 # A disk that fills up, which Blender does not tell of: files may not grow beyond a limit.
 if sys.platform == "linux":

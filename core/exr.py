@@ -27,14 +27,19 @@ def windows(stream: BinaryIO) -> dict[str, tuple[int, int]]:
     return {name.decode(): (x1 - x0 + 1, y1 - y0 + 1) for name, (x0, y0, x1, y1) in corners.items()}
 
 
-def channel_names(stream: BinaryIO) -> list[str]:
-    """The channels, such as "flare_sun.R", in the file's order; none where the header is damaged."""
+HALF, FLOAT = 1, 2
+"""Kinds of a channel's numbers: 16 and 32 bit floats."""
+
+
+def channel_kinds(stream: BinaryIO) -> dict[str, int]:
+    """Of the channels, such as "flare_sun.R", in the file's order, the kind of their numbers; none where the header is
+    damaged."""
     value = _attributes(stream, {b"channels": b"chlist"}).get(b"channels", b"")
-    names, at = [], 0
+    kinds, at = {}, 0
     while (end := value.find(b"\0", at)) > at:
-        names.append(value[at:end].decode(errors="replace"))
-        at = end + 17  # past the zero, the pixel type, whether it is linear, and the sampling
-    return names if value[at:] == b"\0" else []
+        kinds[value[at:end].decode(errors="replace")] = int.from_bytes(value[end + 1:end + 5], "little")
+        at = end + 17  # past the zero, the kind, whether it is linear, and the sampling
+    return kinds if value[at:] == b"\0" else {}
 
 
 def chromaticities(stream: BinaryIO) -> tuple[float, ...] | None:

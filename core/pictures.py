@@ -148,6 +148,15 @@ def holds_floats(path: Path) -> bool:
     return suffix == ".exr" or (suffix in {".tif", ".tiff"} and stored_pixels(path).dtype.kind == "f")
 
 
+def holds_halves(path: Path) -> bool:
+    """Whether a picture's light is stored in 16 bit floats, as only EXRs have it. Raises FrameError."""
+    if path.suffix.lower() != ".exr":
+        return False
+    with open(path, "rb") as stream:
+        kinds = exr.channel_kinds(stream)
+    return all(kinds.get(name, exr.HALF) == exr.HALF for name in "RGBY")
+
+
 def stored_pixels(path: Path) -> NDArray[Any]:
     """What a PNG, JPEG or TIFF holds, turned and multiplied with nothing: (height, width) or with the channels B G R
     and alpha behind. Raises FrameError where it is missing or damaged, or would be read as something else."""
@@ -223,7 +232,7 @@ def channel_names(path: Path | str) -> list[str]:
     path = Path(path)
     try:
         with open(path, "rb") as stream:
-            names = exr.channel_names(stream) if stream.read(4) == exr.MAGIC else []
+            names = list(exr.channel_kinds(stream)) if stream.read(4) == exr.MAGIC else []
     except OSError as problem:
         raise FrameError(f"{path} cannot be read: {problem.strerror or problem}.") from problem
     if not names:

@@ -3,7 +3,8 @@
 
 A view's frame number is the number its name ends with ("DSC_0123.JPG" is frame 123), so that layers line
 up with the footage; views without one come after the last that has one. Where no name of a folder has one, or two
-would share one, the views of that folder are counted from 1 in their order.
+would share one, the views of that folder are counted from 1 in their order. Ten digits and more are a time, and no
+number.
 """
 from __future__ import annotations
 
@@ -11,11 +12,12 @@ import itertools
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import Path, PurePath, PurePosixPath
 
 from ..errors import SettingsError
 
-_LAST_NUMBER = re.compile(r"(\d{1,6})$")
+_LAST_NUMBER = re.compile(r"(?<!\d)(\d{1,9})$")
+_BELOW_0 = re.compile(r"[._]-\d+$")
 
 
 @dataclass(frozen=True)
@@ -33,14 +35,15 @@ def layers_file(folder: PurePosixPath | str, number: int) -> str:
 
 
 def numbered(views: Iterable[str]) -> list[Frame]:
-    """Frames for views, by folder and number. A view in a folder keeps the folder: `left/layers.0001.exr`."""
+    """Frames for views, by folder and number. A view in a folder keeps the folder: `left/layers.0001.exr`. Raises
+    SettingsError for a number below 0."""
     folders: dict[PurePosixPath, list[str]] = {}
     for view in views:
         folders.setdefault(PurePosixPath(view).parent, []).append(view)
     frames: list[Frame] = []
     for folder, names in sorted(folders.items()):
-        found = {name: _LAST_NUMBER.search(PurePosixPath(name).stem) for name in sorted(names)}
-        numbers = {name: int(match[1]) for name, match in found.items() if match}
+        found = {name: _number(PurePosixPath(name)) for name in sorted(names)}
+        numbers = {name: number for name, number in found.items() if number is not None}
         if len(set(numbers.values())) < len(numbers):
             numbers = {}
         after = max(numbers.values(), default=0) + 1
@@ -50,17 +53,27 @@ def numbered(views: Iterable[str]) -> list[Frame]:
     return frames
 
 
+def _number(name: PurePath) -> int | None:
+    """The number that a name ends with, None where it has none. Raises SettingsError where it is below 0."""
+    if _BELOW_0.search(name.stem):
+        raise SettingsError(f"{name} has a frame number below 0, which no layers can have; number the frames anew, "
+                            "from 0 or more.")
+    match = _LAST_NUMBER.search(name.stem)
+    return int(match[1]) if match else None
+
+
 def plates_by_number(pictures: Sequence[Path]) -> dict[int, Path]:
     """Plates by the number that each name ends with; those without one are no plates of the sequence, unless none has
-    one: then they are counted from 1 in their order. Raises SettingsError where two have one number."""
+    one: then they are counted from 1 in their order. Raises SettingsError where two have one number, or one has one
+    below 0."""
     found: dict[int, Path] = {}
     for path in pictures:
-        match = _LAST_NUMBER.search(path.stem)
-        if match is None:
+        number = _number(path)
+        if number is None:
             continue
-        if int(match[1]) in found:
-            raise SettingsError(f"{found[int(match[1])]} and {path} have one number; keep one sequence in a folder.")
-        found[int(match[1])] = path
+        if number in found:
+            raise SettingsError(f"{found[number]} and {path} have one number; keep one sequence in a folder.")
+        found[number] = path
     return found or dict(enumerate(sorted(pictures), 1))
 
 

@@ -177,6 +177,16 @@ def test_frame_numbers_come_from_names_or_else_from_the_order() -> None:
         ("sh.1001.png", 1001), ("sh.1002.png", 1002), ("chart.png", 1003), ("slate.png", 1004)]
 
 
+def test_long_numbers_are_whole_and_those_below_0_refused(tmp_path: Path) -> None:
+    assert [frame.number for frame in numbered(["sh.999999.exr", "sh.1000000.exr"])] == [999999, 1000000]
+    assert [frame.number for frame in numbered(["1700000002.png", "1700000001.png"])] == [1, 2]  # times, not numbers
+    assert plates_by_number([tmp_path / "sh.1000000.png"]) == {1000000: tmp_path / "sh.1000000.png"}
+    assert [frame.number for frame in numbered(["take-0010.png"])] == [10]
+    for read in (lambda: numbered(["sh.0001.png", "sh.-0001.png"]), lambda: plates_by_number([Path("sh_-0001.png")])):
+        with pytest.raises(SettingsError, match=r"-0001\.png has a frame number below 0"):
+            read()
+
+
 def test_frames_are_chosen_by_ranges() -> None:
     assert [frame.number for frame in chosen(FRAMES, None)] == [3, 4, 10]
     assert [frame.number for frame in chosen(FRAMES, "1-3, 10")] == [3, 10]

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ...files import atomic_path, patiently
-from ...pictures import holds_floats, stored_pixels, window_of, write_exr, write_png
+from ...pictures import holds_floats, holds_halves, stored_pixels, window_of, write_exr, write_png
 from ...progress import Progress
 from ..camera import Camera
 from ..colmap import Observed, PointCloud, write_model
@@ -86,7 +86,7 @@ def _develop(shot: Shot, frame: SolvedFrame, camera: Camera, target: Path) -> No
         picture = straightened(picture, frame.lens.maps(camera.scaled(*picture.size)))
     picture = picture.resized(*camera.size)
     if target.suffix == ".exr":
-        write_exr(target, dict(zip("RGB", np.moveaxis(picture.pixels, 2, 0), strict=True)),
+        write_exr(target, dict(zip("RGB", np.moveaxis(picture.pixels, 2, 0), strict=True)), half=holds_halves(source),
                   header={"pixelAspectRatio": window_of(source).aspect})
     else:
         write_png(target, picture.display(), 16 if stored_pixels(source).dtype == np.uint16 else 8)

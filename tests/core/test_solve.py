@@ -7,6 +7,7 @@ import os
 import shutil
 import subprocess
 import sys
+import zlib
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
@@ -18,6 +19,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from core import tiff
 from core.capture import Camera, Capture
 from core.capture.camera import quaternion_from_rotation, rotation_from_quaternion
 from core.capture.colmap import Observed, PointCloud, read_model, write_model
@@ -595,6 +597,21 @@ def test_exif(tmp_path: Path, order: str) -> None:
     assert read_exif(tmp_path / "b.jpg") == (1, None)
     (tmp_path / "c.jpg").write_bytes(raw[:2] + exif(order, 6, 27)[:40])
     assert read_exif(tmp_path / "c.jpg") == (1, None)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".tif"])
+def test_orientation_of_pngs_and_tiffs(suffix: str, tmp_path: Path) -> None:
+    raw = cv2.imencode(suffix, np.zeros((8, 8, 3), np.uint8))[1].tobytes()
+    (tmp_path / f"plain{suffix}").write_bytes(raw)
+    assert read_exif(tmp_path / f"plain{suffix}") == (1, None)
+    block = b"eXIf" + exif("MM", 6, 27)[10:]
+    chunk = (len(block) - 4).to_bytes(4, "big") + block + zlib.crc32(block).to_bytes(4, "big")
+    turned = (raw[:-12] + chunk + raw[-12:] if suffix == ".png" else
+              tiff.with_tags(raw, {tiff.ORIENTATION: tiff.short(6)}))
+    (tmp_path / f"turned{suffix}").write_bytes(turned)
+    assert read_exif(tmp_path / f"turned{suffix}") == (6, 0.75 if suffix == ".png" else None)
+    (tmp_path / f"cut{suffix}").write_bytes(turned[:60])
+    assert read_exif(tmp_path / f"cut{suffix}")[1] is None
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))

@@ -9,6 +9,7 @@ from typing import Any
 import bpy
 
 from ..core import exposures
+from ..core.capture.capture import REMOVED
 from ..core.errors import CaptureError, FitFlareError, RunError
 from ..core.look import Look, read
 from . import engine, jobs, lights, looks
@@ -29,6 +30,12 @@ def folder_of(scene: Any) -> Path | None:
 def capture_of(scene: Any) -> Path | None:
     """The capture's folder; None where none is chosen."""
     return absolute(scene.fit_flare.capture, scene.library) if scene.fit_flare.capture else None
+
+
+def has_clean_frames(scene: Any) -> bool:
+    """Whether the imported capture has frames without flare, to be shown behind its cameras."""
+    folder = capture_of(scene)
+    return scene.fit_flare.root is not None and folder is not None and (folder / REMOVED).is_dir()
 
 
 def job_of(scene: Any) -> Job | None:
@@ -245,16 +252,16 @@ def cleaning(scene: Any, capture: Path) -> list[object]:
     folder = folder_of(scene)
     if folder is not None and state_of(scene) == "finished" and _may_be_of(folder, capture):
         moved = ["--capture", capture] if _has_moved(folder, capture) else []
-        return ["remove", "--run", folder, *moved, "--out", capture / "removed"]
+        return ["remove", "--run", folder, *moved, "--out", capture / REMOVED]
     given = scene.fit_flare.matte
     matte = ["--matte", absolute(given, scene.library)] if given else []
     glow = ["--keep-glare"] if scene.fit_flare.keep_glow else []
-    return ["remove", capture / "images", "--out", capture / "removed", *matte, *glow]
+    return ["remove", capture / "images", "--out", capture / REMOVED, *matte, *glow]
 
 
 def cleaned(job: Job) -> None:
     """Fits of the scenes with this capture go by the clean frames from now on; those that are shown are read again."""
-    read_again(job.folder.parent / "removed")
+    read_again(job.folder.parent / REMOVED)
     if job.state != "done":
         return
     scenes = [scene for scene in bpy.data.scenes

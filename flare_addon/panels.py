@@ -37,7 +37,7 @@ class FITFLARE_PT_capture(_Part, bpy.types.Panel):
         row.operator("fit_flare.import_capture", icon="IMPORT")
         if folder is not None:
             layout.prop(state, "capture", text="")
-            if state.root is not None and (folder / "removed").is_dir():
+            if fits.has_clean_frames(context.scene):
                 layout.row().prop(state, "footage", expand=True)
         column = layout.column()
         column.operator("fit_flare.capture_from_camera", icon="CAMERA_DATA")
@@ -226,6 +226,9 @@ class FITFLARE_PT_look(_Part, bpy.types.Panel):
             lines(layout, "The scene has no camera to see the flare from.", "ERROR")
         elif not _through_camera(context):
             layout.operator("view3d.view_camera", text="Look through the Camera", icon="VIEW_CAMERA")
+        elif state.show and state.native and state.footage == "images" and fits.has_clean_frames(scene):
+            lines(layout, "The frames behind the camera have their own flare, and this one is over it: choose Without "
+                          "Flare under Capture to see one alone.", "INFO")
         if looks.twice(state):
             lines(layout, f"Two flares have the name {looks.twice(state)}: rename one.", "ERROR")
         _sliders(layout, state.master)

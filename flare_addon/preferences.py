@@ -103,6 +103,7 @@ class FITFLARE_OT_test_engine(Action, bpy.types.Operator):
 
     bl_idname = "fit_flare.test_engine"
     bl_label = "Test"
+    changes_scene = False
 
     @classmethod
     def why_not(cls, _context: bpy.types.Context) -> str:
@@ -119,6 +120,7 @@ class FITFLARE_OT_set_up_engine(Action, bpy.types.Operator):
 
     bl_idname = "fit_flare.set_up_engine"
     bl_label = "Set Up Engine"
+    changes_scene = False
 
     @classmethod
     def why_not(cls, _context: bpy.types.Context) -> str:
@@ -145,6 +147,7 @@ class FITFLARE_OT_remove_engine(Action, bpy.types.Operator):
 
     bl_idname = "fit_flare.remove_engine"
     bl_label = "Remove"
+    changes_scene = False
 
     @classmethod
     def why_not(cls, _context: bpy.types.Context) -> str:

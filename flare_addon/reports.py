@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 from ..core.errors import FitFlareError, refusal
 
@@ -34,6 +34,9 @@ def reported(operator: Any) -> Iterator[Outcome]:
 class Action:
     """For an operator to inherit beside bpy.types.Operator: `why_not` greys its button out, `act` does the work."""
 
+    changes_scene: ClassVar[bool] = True
+    """Whether it needs a scene that can be changed, which a linked one cannot."""
+
     @classmethod
     def why_not(cls, _context: Any) -> str:
         """Why it cannot run now, as its tooltip says it; "" where it can."""
@@ -42,7 +45,7 @@ class Action:
     @classmethod
     def poll(cls, context: Any) -> bool:
         """Blender's question whether the button can be pressed."""
-        why = cls.why_not(context)
+        why = LINKED if cls.changes_scene and context.scene.library is not None else cls.why_not(context)
         if why:
             cls.poll_message_set(why)  # type: ignore[attr-defined]  # Operator's
         return not why
@@ -57,6 +60,7 @@ class Action:
         return outcome.status
 
 
+LINKED = "The scene is linked from another file, and nothing in it can be changed here: append it, or open that file"
 NO_FLARE = "Fit or open a flare first"
 NO_CAMERA = "The scene has no camera"
 NO_CAPTURE = "Import a capture first"

@@ -136,6 +136,7 @@ class FITFLARE_OT_show_preview(Action, bpy.types.Operator):
 
     bl_idname = "fit_flare.show_preview"
     bl_label = "Show Preview"
+    changes_scene = False
 
     @classmethod
     def why_not(cls, context: bpy.types.Context) -> str:

@@ -53,3 +53,9 @@ def test_a_project_finds_its_files_wherever_it_goes(facts: Any) -> None:
     assert facts["saved as a copy"], "the file that is open has no place yet"
     assert facts["saved first and moved"]
     assert facts["linked"]
+
+
+def test_a_linked_scene_is_not_changed(facts: Any) -> None:
+    why, engine = facts["changed when linked"]
+    assert "The scene is linked from another file" in why
+    assert not engine

@@ -154,6 +154,12 @@ def test_a_flare_finds_its_light(facts: Any) -> None:
     assert facts["native"]
 
 
+def test_a_flare_over_frames_that_have_their_own_is_told(facts: Any) -> None:
+    as_filmed, without = facts["look says"]
+    assert "The frames behind the camera have their own flare" in as_filmed
+    assert "their own flare" not in without
+
+
 def test_sliders_can_be_animated_driven_and_reset(facts: Any) -> None:
     assert facts["animated"] == pytest.approx(1.5)
     assert facts["driven"] == pytest.approx(2.0)

@@ -159,5 +159,9 @@ empty()
 bpy.ops.wm.save_as_mainfile(filepath=str(out / "edit.blend"))
 with bpy.data.libraries.load(str(out / "moved" / "shot.blend"), link=True) as (_, wanted):
     wanted.scenes = ["Shot"]
-facts["linked"] = looks.path_of(wanted.scenes[0]) == out / "moved" / "my.flare"
+linked = wanted.scenes[0]
+facts["linked"] = looks.path_of(linked) == out / "moved" / "my.flare"
+with bpy.context.temp_override(scene=linked):
+    facts["changed when linked"] = [refusal(lambda: bpy.ops.fit_flare.open_flare(filepath=str(project / "my.flare"))),
+                                    part("flare_addon.preferences").FITFLARE_OT_test_engine.changes_scene]
 leave(facts)

@@ -8,6 +8,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import MagicMock
 
 import bpy
 import numpy as np
@@ -190,6 +191,13 @@ facts["open"] = list(ops.open_flare(filepath=flare))
 state = scene.fit_flare
 facts["flares"] = [[item.name, item.source, item.target.name, len(item.elements) > 0] for item in state.lights]
 facts["native"] = state.native
+panels, facts["look says"] = part("flare_addon.panels"), []
+(Path(capture) / "removed").mkdir(exist_ok=True)
+for state.footage in ("images", "removed"):
+    layout = MagicMock()
+    panels.FITFLARE_PT_look.draw(SimpleNamespace(layout=layout), bpy.context)
+    facts["look says"].append(" ".join(call.kwargs["text"] for call in layout.mock_calls if call[0].endswith(".label")))
+state.footage = "images"
 item = state.lights[0]
 item.intensity = 0.5
 item.keyframe_insert("intensity", frame=1)

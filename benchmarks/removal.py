@@ -7,6 +7,8 @@
                                         [--sheet FILE]       # and a picture: frame, cleaned, exact scene
     python benchmarks/removal.py clean PHOTOS...             # pictures without flare, against themselves
     python benchmarks/removal.py matte PHOTOS... [--lenses LENSES]  # what it is worth to mark where flares are
+    python benchmarks/removal.py scenes PHOTOS...            # held-out scenes without flare, as training has them
+    python benchmarks/removal.py against PHOTOS... [--lenses LENSES]  # flares whose lights are in a bright sky
     python benchmarks/removal.py coverage [--sheet FILE]     # what the synthesis spans, and a sheet of it
 
 Speed: each case in a process of its own, on the threads that torch takes; reading and writing included; the
@@ -16,6 +18,8 @@ frame to the next, |(result - truth) of a frame - the same of the frame before|,
 frames. Clean: PSNR of the result against its input, not of a number where they are equal to the last bit.
 Matte: `count` synthesised pictures of every class, of held-out photographs and lenses and of another seed than
 eval-removal's; the matte is as an artist would rough it in, wide about all that the flare changes, with a soft rim.
+Scenes: as `clean`, of the exposures, colours and grain that training has, some with a light. Against: the same flares
+with their lights where the scene is bright, and anywhere.
 """
 from __future__ import annotations
 
@@ -157,6 +161,50 @@ def clean_pictures(folders: list[Path], weights: Path | None) -> None:
           "dB or more")
 
 
+def scenes(folders: list[Path], weights: Path | None, count: int) -> None:
+    """What happens to held-out scenes without flare."""
+    from core.removal.backgrounds import read_backgrounds
+    from core.removal.bank import OneFlare
+    from core.removal.pairs import pair
+    from core.removal.synthesis.prescription import built_in
+
+    remover, backgrounds = Remover(weights), read_backgrounds(folders, "test", 480)
+    values = []
+    for number in range(count):
+        random, source = np.random.default_rng((1002, number)), OneFlare((1002, number), 160, built_in(), "glare")
+        frame = pair(random, source, backgrounds, 480, 320, clean=1.0).frame
+        values.append(min(psnr(remover.clean_display(frame), frame), 100.0))
+    low = sorted(value for value in values if value < 60)
+    print(f"{len(values) - len(low)} of {len(values)} scenes at 60 dB or more, {np.mean(np.array(values) >= 45):.0%} "
+          f"at 45; the others {', '.join(f'{value:.1f}' for value in low) or 'none'} dB")
+
+
+AGAINST = ("scatter", "ghosts", "streak", "glare", "mixed")
+"""Classes of flares that have a light in the frame."""
+
+
+def against(folders: list[Path], lenses: Path | None, weights: Path | None, count: int) -> None:
+    """What removal gains where lights stand in a bright part of the scene, and where they stand anywhere."""
+    from core.removal.backgrounds import read_backgrounds
+    from core.removal.bank import OneFlare
+    from core.removal.evaluation import held_out
+    from core.removal.pairs import pair
+    from core.removal.synthesis.prescription import read_lenses
+
+    remover, backgrounds = Remover(weights), read_backgrounds(folders, "test", 480)
+    unseen = held_out(read_lenses(lenses) if lenses else [])
+    for name, share in (("against the light", 1.0), ("anywhere", 0.0)):
+        gains = []
+        for kind in AGAINST:
+            for number in range(count):
+                seed = (1003, AGAINST.index(kind), number)
+                one = pair(np.random.default_rng(seed), OneFlare(seed, 640, unseen, kind), backgrounds, 480, 320,
+                           clean=0, against_light=share)
+                gains.append(psnr(remover.clean_display(one.frame), one.scene) - psnr(one.frame, one.scene))
+        print(f"{name:17} gain {np.mean(gains):+.2f} dB, made worse by 0.5 dB {np.mean(np.array(gains) < -0.5):.1%} of "
+              f"{len(gains)}")
+
+
 def matte(folders: list[Path], lenses: Path | None, weights: Path | None, count: int) -> None:
     """What removal gains with a rough matte of the flare, and without."""
     from core.removal.backgrounds import read_backgrounds
@@ -213,7 +261,8 @@ def coverage(sheet: Path | None, count: int) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("speed", "sample", "clean", "matte", "coverage", "one"))
+    parser.add_argument("what", choices=("speed", "sample", "clean", "scenes", "against", "matte", "coverage",
+                                         "one"))
     parser.add_argument("paths", type=Path, nargs="*")
     parser.add_argument("--capture", type=Path, default=ROOT / "sample_scenes" / "desk")
     parser.add_argument("--cleaned", type=Path)
@@ -221,7 +270,8 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=WORKING_SIZE)
     parser.add_argument("--lenses", type=Path)
     parser.add_argument("--sheet", type=Path)
-    parser.add_argument("--count", type=int, help="pictures: of each class for matte (default 20), of coverage (400)")
+    parser.add_argument("--count", type=int, help="pictures: of each class for matte and against (default 20), of "
+                                                  "scenes (64), of coverage (400)")
     words = parser.parse_args()
     if words.what == "one":
         one(words.paths[0], words.size, words.weights)
@@ -231,6 +281,10 @@ def main() -> None:
         sample(words.capture, words.weights, words.cleaned, words.sheet)
     elif words.what == "clean":
         clean_pictures(words.paths, words.weights)
+    elif words.what == "scenes":
+        scenes(words.paths, words.weights, words.count or 64)
+    elif words.what == "against":
+        against(words.paths, words.lenses, words.weights, words.count or 20)
     elif words.what == "matte":
         matte(words.paths, words.lenses, words.weights, words.count or 20)
     else:

@@ -60,7 +60,8 @@ def atomic_path(target: Path | str, turn: contextlib.AbstractContextManager[None
         raise
     finally:
         if temporary != target:
-            temporary.unlink(missing_ok=True)
+            with contextlib.suppress(OSError):  # what failed before is what is to be told
+                remove_file(temporary)
 
 
 def named_by(target: Path) -> Path:
@@ -91,6 +92,11 @@ def patiently(change: Callable[..., object], *words: Any) -> None:
             if getattr(problem, "winerror", None) not in _HELD or time.monotonic() > end:
                 raise
             time.sleep(0.02)
+
+
+def remove_file(path: Path) -> None:
+    """Remove a file that need not be there, as patiently as Windows wants it. Raises OSError."""
+    patiently(path.unlink, True)
 
 
 def _share(temporary: Path, mode: int) -> None:
@@ -127,12 +133,13 @@ def _is_being_written(partial: Path) -> bool:
 
 
 def remove_partial_of(target: Path | str) -> None:
-    """Remove what a killed process left of `target` half written. What another one is writing stays: on a farm a task
-    may be given again while its first worker still lives."""
+    """Remove what a killed process left of `target` half written, where the system lets it. What another one is writing
+    stays: on a farm a task may be given again while its first worker still lives."""
     target = Path(target)
     for path in target.parent.glob(f"{glob.escape(_partial_of(target))}*"):
         if not _is_being_written(path):
-            path.unlink(missing_ok=True)
+            with contextlib.suppress(OSError):
+                remove_file(path)
 
 
 @contextlib.contextmanager
@@ -198,7 +205,8 @@ def remove_partial(folder: Path | str) -> None:
         if path.is_dir():
             shutil.rmtree(path, ignore_errors=True)
         elif not _is_being_written(path):
-            path.unlink(missing_ok=True)
+            with contextlib.suppress(OSError):
+                remove_file(path)
 
 
 def _umask() -> int:

@@ -29,7 +29,7 @@ import bpy
 
 from ..core import processes
 from ..core.errors import DISK_FULL, EngineError, FitFlareError, RunError, refusal
-from ..core.files import write_json
+from ..core.files import remove_file, write_json
 from ..core.progress import STOP_FILE
 
 State = Literal["running", "done", "failed", "stopped"]
@@ -220,7 +220,7 @@ def start(kind: str, folder: Path, command: Sequence[str], environment: Mapping[
                  | getattr(subprocess, "BELOW_NORMAL_PRIORITY_CLASS", 0)}
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / STOP).unlink(missing_ok=True)
+        remove_file(folder / STOP)
         with open(folder / EVENTS, "wb") as events, open(folder / LOG, "ab") as log:
             log_from = log.tell()
             process = _launched(command, stdin=subprocess.DEVNULL, stdout=events, stderr=log,

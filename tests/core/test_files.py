@@ -26,6 +26,7 @@ from core.files import (
     patiently,
     plain_name,
     read_json,
+    remove_file,
     remove_partial,
     remove_partial_of,
     rounded,
@@ -100,6 +101,33 @@ def test_a_file_that_windows_holds_for_a_moment_is_waited_for(tmp_path: Path, mo
     with pytest.raises(PermissionError):
         write_text(tmp_path / "a.txt", "newer")
     assert [path.name for path in tmp_path.iterdir()] == ["a.txt"]
+
+
+def test_what_windows_holds_for_a_moment_is_removed_after_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    refusals, unlink = [refused_by_windows() for _ in range(3)], Path.unlink
+
+    def held(path: Path, missing_ok: bool = False) -> None:
+        if refusals:
+            raise refusals.pop()
+        unlink(path, missing_ok)
+
+    monkeypatch.setattr(Path, "unlink", held)
+    (tmp_path / "a.txt").touch()
+    remove_file(tmp_path / "a.txt")
+    remove_file(tmp_path / "a.txt")  # it need not be there
+    assert (list(tmp_path.iterdir()), refusals) == ([], [])
+
+
+def test_what_cannot_be_tidied_up_hides_no_failure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
+        raise PermissionError(errno.EACCES, "Permission denied")
+
+    monkeypatch.setattr(Path, "unlink", refuse)
+    with pytest.raises(ZeroDivisionError), atomic_path(tmp_path / "a.txt"):
+        raise ZeroDivisionError
+    (tmp_path / ".partial-b.txt-").touch()
+    remove_partial_of(tmp_path / "b.txt")
+    remove_partial(tmp_path)
 
 
 def test_a_disk_without_permissions_is_written_to(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

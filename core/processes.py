@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Processes: the cores that this one may use, what another is started with, and whether one that was written down still
-runs, known by its number and by when it began, since systems give the numbers of ended ones out again."""
+"""Processes: the cores that this one may use, what another is started with, by what status ours end, and whether one
+that was written down still runs, known by its number and by when it began, since systems give the numbers of ended ones
+out again."""
 from __future__ import annotations
 
 import os
@@ -8,8 +9,11 @@ import re
 import subprocess
 import time
 from pathlib import Path
+from typing import Any
 
 WINDOWS = os.name == "nt"
+DONE, FAILED, MISUSED, STOPPED = 0, 1, 2, 130
+"""Statuses of our commands: done; it could not be; the words made no sense; it was asked to stop, and did."""
 PROC = Path("/proc")
 SLACK_S = 5.0
 """By which the clocks of the two may differ."""
@@ -26,6 +30,13 @@ def python_at(place: Path) -> Path | None:
 def environment() -> dict[str, str]:
     """This environment, less what would lead another Python to the modules of this one."""
     return {name: value for name, value in os.environ.items() if name not in ("PYTHONHOME", "PYTHONPATH")}
+
+
+def own_group() -> dict[str, Any]:
+    """Options of Popen that keep a terminal's Ctrl-C from a child, so that it is stopped by its parent alone."""
+    if WINDOWS:
+        return {"creationflags": getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0)}
+    return {"start_new_session": True}
 
 
 def cores() -> int:

@@ -30,14 +30,13 @@ import bpy
 from ..core import processes
 from ..core.errors import DISK_FULL, EngineError, FitFlareError, RunError, refusal
 from ..core.files import remove_file, write_json
+from ..core.processes import STOPPED, WINDOWS, own_group
 from ..core.progress import STOP_FILE
 
 State = Literal["running", "done", "failed", "stopped"]
 
 RECORD, EVENTS, LOG, STOP = "job.json", "events.jsonl", "engine.log", "stop"
-WINDOWS = os.name == "nt"
 HOST = platform.node()
-STOPPED = 130  # the status of a command that was stopped (headless/cli.py)
 EVERY_S = 0.2
 NICENESS = 5
 TAB = "Fit Flare"  # of the sidebar
@@ -214,10 +213,9 @@ def start(kind: str, folder: Path, command: Sequence[str], environment: Mapping[
     before = find(folder)
     if before is not None and before.running:
         raise RunError(f"The engine works in {folder} already; wait for it or cancel it first.")
-    apart: dict[str, Any] = {"start_new_session": True}
+    apart = own_group()
     if WINDOWS:
-        apart = {"creationflags": getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0)
-                 | getattr(subprocess, "BELOW_NORMAL_PRIORITY_CLASS", 0)}
+        apart["creationflags"] |= getattr(subprocess, "BELOW_NORMAL_PRIORITY_CLASS", 0)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         remove_file(folder / STOP)

@@ -16,12 +16,11 @@ from collections.abc import Iterator, Sequence
 from typing import Any, NoReturn, TextIO
 
 from ..core.errors import Cancelled, EngineError, FitFlareError, SettingsError, is_out_of_memory, refusal
+from ..core.processes import DONE, FAILED, MISUSED, STOPPED
 from ..core.progress import JsonProgress, OpenJdProgress, Progress, TerminalProgress, flush_or_drop, stoppable
 from . import hand_off
 from .command import Command, Step, Stopped
 from .commands import COMMANDS
-
-DONE, FAILED, MISUSED, STOPPED = 0, 1, hand_off.MISUSED, hand_off.STOPPED
 
 _HINTS: dict[Stopped, str] = {
     "goes on": "Give the command again to go on.",

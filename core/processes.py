@@ -20,11 +20,23 @@ SLACK_S = 5.0
 
 
 def python_at(place: Path) -> Path | None:
-    """The interpreter that `place` is, or that the virtual environment in it has."""
-    for path in (place, place / "Scripts" / "python.exe", place / "bin" / "python"):
-        if path.is_file():
+    """The interpreter that `place` is, or that the virtual environment in it has; on Windows conda has it at the top of
+    the environment. None, too, where the Python that the environment was made from is gone."""
+    for path in (place, place / "Scripts" / "python.exe", place / "bin" / "python", place / "python.exe"):
+        if path.is_file() and not (WINDOWS and _lacks_its_base(path)):
             return path.absolute()  # not resolved: a virtual environment's python is a link
     return None
+
+
+def _lacks_its_base(python: Path) -> bool:
+    """Whether a virtual environment's python.exe, on Windows no link but a program that starts another, has lost that:
+    the Blender that it was made by, say, has been replaced by a newer one."""
+    try:
+        told = (python.parent.parent / "pyvenv.cfg").read_text(encoding="utf-8", errors="replace")
+    except OSError:  # it is its own base
+        return False
+    home = re.search(r"^home\s*=\s*(.+?)\s*$", told, re.MULTILINE)
+    return home is not None and not Path(home[1], "python.exe").is_file()
 
 
 def environment() -> dict[str, str]:

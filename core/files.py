@@ -32,7 +32,7 @@ _WRITER = re.compile(r"-(?P<process>\d+)@(?P<machine>[0-9a-f]{8})-")
 _ABANDONED_S = 3600.0
 _DRIVE = re.compile(r".*:" if WINDOWS else r"[A-Za-z]:")
 """As the first part of a name begins; on Windows any colon, which would name a stream of a file as well."""
-_OF_DEVICES = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\.|$)", re.IGNORECASE)
+_OF_DEVICES = re.compile(r"^(con|prn|aux|nul|conin\$|conout\$|(com|lpt)[\d¹²³])\s*(\.|$)", re.IGNORECASE)
 
 
 @contextlib.contextmanager
@@ -247,8 +247,9 @@ def _without_doubles(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def plain_name(name: str) -> str:
-    """`name`, or with "_" after it where Windows takes it for a device: con, aux, nul, com1 and their like."""
-    return f"{name}_" if _OF_DEVICES.match(name) else name
+    """`name`, with "_" after the part that Windows takes for a device, whatever suffix follows: con, aux, nul, com1 and
+    their like."""
+    return _OF_DEVICES.sub(r"\1_\3", name, count=1)
 
 
 def _is_file_name(part: str) -> bool:
@@ -262,14 +263,16 @@ def _is_file_name(part: str) -> bool:
 def inside(folder: Path | str, name: str, error: type[FitFlareError]) -> Path:
     """`folder / name`, refused with `error` where the name would lead out of the folder.
 
-    Absolute names, drive letters, `..` and symbolic links that point outside are refused; what a file
-    from elsewhere names must not reach the rest of the disk.
+    Absolute names, drive letters, `..` and symbolic links that point outside are refused, on Windows those of devices
+    too; what a file from elsewhere names must not reach the rest of the disk.
     """
     folder = Path(folder)
     parts = Path(name.replace("\\", "/"))
     if (not parts.parts or "\0" in name or parts.is_absolute() or _DRIVE.match(parts.parts[0])
             or ".." in parts.parts or not all(map(_is_file_name, parts.parts))):
         raise error(f"{folder} names the file {name!r:.150}, which is not inside the folder; remove that entry.")
+    if WINDOWS and any(map(_OF_DEVICES.match, parts.parts)):
+        raise error(f"{folder} names the file {name!r:.150}, which Windows takes for a device; give it another name.")
     path = folder / parts
     if not path.resolve().is_relative_to(folder.resolve()):
         raise error(f"{path} is a link that leads out of {folder}; put the file itself there.")

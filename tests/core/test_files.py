@@ -147,10 +147,21 @@ def test_what_windows_editors_write_is_read(tmp_path: Path) -> None:
     assert read_json(tmp_path / "lights.json", CaptureError) == {"a": 1}
 
 
-@pytest.mark.parametrize(("name", "expected"), [("Aux", "Aux_"), ("con.flare", "con.flare_"), ("COM1", "COM1_"),
-                                                ("Camera", "Camera"), ("console", "console"), ("com", "com")])
+@pytest.mark.parametrize(("name", "expected"), [
+    ("Aux", "Aux_"), ("con.flare", "con_.flare"), ("COM1", "COM1_"), ("nul .png", "nul_.png"), ("lpt²", "lpt²_"),
+    ("conin$", "conin$_"), ("Camera", "Camera"), ("console", "console"), ("com", "com"), ("a.con", "a.con"),
+    ("conin", "conin")])
 def test_names_of_devices(name: str, expected: str) -> None:
     assert plain_name(name) == expected
+
+
+def test_what_windows_takes_for_a_device_is_no_file_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for windows in (False, True):
+        monkeypatch.setattr("core.files.WINDOWS", windows)
+        for name in ("images/nul.png", "con/0001.png"):
+            with pytest.raises(CaptureError, match="device") if windows else contextlib.nullcontext():
+                assert inside(tmp_path, name, CaptureError) == tmp_path / name
+        assert inside(tmp_path, "console/0001.png", CaptureError) == tmp_path / "console" / "0001.png"
 
 
 def test_a_file_has_several_names(tmp_path: Path) -> None:

@@ -294,6 +294,17 @@ def test_a_full_disk_under_the_log_is_no_failure(options: str, full: str) -> Non
     assert subprocess.run(f"{run} fly {options} {full}>/dev/full", shell=True, check=False).returncode == 2
 
 
+def test_a_torch_that_does_not_load_is_no_refusal_of_a_disk(tmp_path: Path) -> None:
+    """As Windows says that a library of its own is missing."""
+    (tmp_path / "torch").mkdir()
+    (tmp_path / "torch" / "__init__.py").write_text("raise OSError(126, 'The specified module could not be found')")
+    done = subprocess.run([sys.executable, str(cli.hand_off.RUN), "engine"], capture_output=True, check=False,
+                          text=True, env={**os.environ, "PYTHONPATH": str(tmp_path)})
+    assert done.returncode == 1
+    assert done.stderr.startswith("error: torch of ")
+    assert "cannot be loaded (The specified module could not be found)" in done.stderr
+
+
 def test_help_is_shown_on_a_terminal_of_ascii() -> None:
     environment = {**os.environ, "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0", "LC_ALL": "C"}
     done = subprocess.run([sys.executable, str(cli.hand_off.RUN), "--help"], capture_output=True, env=environment,

@@ -24,7 +24,7 @@ from .processes import WINDOWS, runs
 
 WRITTEN_BY_HAND = "utf-8-sig"
 """Encoding to read what people write: UTF-8, before which Windows' editors put a mark."""
-_PARTIAL = ".partial-"
+_PARTIAL, _OLD = ".partial-", ".old-"
 _REFUSALS = 100  # a hundredth of a second apart
 _HELD = (5, 32, 33)  # Windows: access denied, sharing violation, lock violation
 _PATIENCE_S = 2.0
@@ -97,6 +97,21 @@ def patiently(change: Callable[..., object], *words: Any) -> None:
 def remove_file(path: Path) -> None:
     """Remove a file that need not be there, as patiently as Windows wants it. Raises OSError."""
     patiently(path.unlink, True)
+
+
+def remove_folder(folder: Path) -> None:
+    """Remove a folder that need not be there, and all that is in it: by its name it is gone as a whole, or OSError is
+    raised and it is as it was, since Windows has something in it in use. What cannot be removed of it after that goes
+    with the next."""
+    for old in folder.parent.glob(f"{glob.escape(folder.name)}{_OLD}*"):
+        shutil.rmtree(old, ignore_errors=True)
+    if not folder.exists():
+        return
+    old = Path(tempfile.mkdtemp(prefix=f"{folder.name}{_OLD}", dir=folder.parent))
+    try:
+        patiently(folder.rename, old / folder.name)
+    finally:
+        shutil.rmtree(old, ignore_errors=True)
 
 
 def _share(temporary: Path, mode: int) -> None:

@@ -15,6 +15,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
 import tomllib
 from collections.abc import Iterator
@@ -125,6 +126,21 @@ def base() -> str | None:
     return None
 
 
+def cleared(folder: Path) -> bool:
+    """Whether the folder is gone: as a whole, since nothing of an old engine may be left in a new one. It stays where
+    Windows has a file of it in use."""
+    if not folder.exists():
+        return True
+    old = Path(tempfile.mkdtemp(prefix=f"{folder.name}.old-", dir=folder.parent))
+    try:
+        folder.rename(old / folder.name)
+    except OSError:
+        return False
+    finally:
+        shutil.rmtree(old, ignore_errors=True)
+    return True
+
+
 def placing(maker: str, folder: Path) -> Step:
     """A virtual environment, made by the Python `maker`."""
     return Step("Making a place for the engine", [maker, "-m", "venv", str(folder)],
@@ -171,16 +187,19 @@ def main(words: list[str]) -> int:
     if not words[1:]:
         steps.append(testing(folder))
     say(type="stage", name="set up", total=len(steps), done=0)
-    shutil.rmtree(folder, ignore_errors=True)
+    if not cleared(folder):
+        say(type="error", text=f"The engine in {folder} is in use; close other Blenders and programs that work with "
+                               "it, and set up again.")
+        return 1
     for number, step in enumerate(steps):
         say(type="say", text=step.begins)
         try:
             why = run(step.command)
         except KeyboardInterrupt:  # a half of an engine would count as one
-            shutil.rmtree(folder, ignore_errors=True)
+            cleared(folder)
             raise
         if why:
-            shutil.rmtree(folder, ignore_errors=True)
+            cleared(folder)
             say(type="error", text=step.fails.replace("{why}", why))
             return 1
         say(type="progress", stage="set up", done=number + 1, total=len(steps), left_s=None, figures={})

@@ -159,3 +159,18 @@ def test_an_engine_that_does_not_load_is_none(windows: bool, cure: str, tmp_path
 
 def test_what_the_engine_is_tested_by_loads_here() -> None:
     assert module().run([sys.executable, "-c", module().TEST]) == ""
+
+
+def test_an_engine_in_use_is_left_as_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+                                           capsys: pytest.CaptureFixture[str]) -> None:
+    """Half of it would stay on Windows, and be taken for a folder of somebody's."""
+    (tmp_path / "engine").mkdir()
+    (tmp_path / "engine" / "pyvenv.cfg").touch()
+
+    def refuse(*_: object) -> None:
+        raise PermissionError("Access is denied")
+
+    monkeypatch.setattr(Path, "rename", refuse)
+    assert module().main([str(tmp_path / "engine"), "nothing"]) == 1
+    assert "is in use; close other Blenders" in json.loads(capsys.readouterr().out.splitlines()[-1])["text"]
+    assert list(tmp_path.rglob("*")) == [tmp_path / "engine", tmp_path / "engine" / "pyvenv.cfg"]

@@ -27,6 +27,7 @@ from core.files import (
     plain_name,
     read_json,
     remove_file,
+    remove_folder,
     remove_partial,
     remove_partial_of,
     rounded,
@@ -128,6 +129,24 @@ def test_what_cannot_be_tidied_up_hides_no_failure(tmp_path: Path, monkeypatch: 
     (tmp_path / ".partial-b.txt-").touch()
     remove_partial_of(tmp_path / "b.txt")
     remove_partial(tmp_path)
+
+
+def test_a_folder_is_removed_whole_or_not_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder, rename = tmp_path / "engine", Path.rename
+    (folder / "python").mkdir(parents=True)
+    (tmp_path / "engine.old-1" / "engine").mkdir(parents=True)  # what was in use when it was removed
+
+    def refuse(*_: object) -> None:
+        raise PermissionError(errno.EACCES, "Access is denied")
+
+    monkeypatch.setattr(Path, "rename", refuse)
+    with pytest.raises(PermissionError):
+        remove_folder(folder)
+    assert list(tmp_path.rglob("*")) == [folder, folder / "python"]
+    monkeypatch.setattr(Path, "rename", rename)
+    remove_folder(folder)
+    remove_folder(folder)  # it need not be there
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_disk_without_permissions_is_written_to(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -54,6 +54,13 @@ def test_runs_of_a_list_lie_below_the_folder_for_them(tmp_path: Path, monkeypatc
         assert named == [Path("runs/shoot"), Path("runs/lists"), Path("runs/b")]
 
 
+def test_runs_whose_names_differ_by_case_alone_are_two_on_every_disk(tmp_path: Path) -> None:
+    (tmp_path / "list.txt").write_text("a/Lamp\nb/lamp\nc/desk\n")
+    named = [fit.place(argparse.Namespace(listed=tmp_path / "list.txt", entry=entry, out=Path("runs")))[1]
+             for entry in (1, 2, 3)]
+    assert named == [Path("runs/001_Lamp"), Path("runs/002_lamp"), Path("runs/desk")]
+
+
 def test_a_capture_that_may_not_be_written_to_is_told_before_lights_are_looked_for(
         tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "access", lambda path, mode: (Path(path), mode) != (tmp_path, os.W_OK))

@@ -9,7 +9,6 @@ import hashlib
 import json
 import math
 import os
-import platform
 import re
 import shutil
 import tempfile
@@ -20,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from .errors import FitFlareError, SettingsError
-from .processes import WINDOWS, runs
+from .processes import WINDOWS, machine, runs
 
 WRITTEN_BY_HAND = "utf-8-sig"
 """Encoding to read what people write: UTF-8, before which Windows' editors put a mark."""
@@ -132,7 +131,7 @@ def _writer() -> str:
 
 @lru_cache(maxsize=1)
 def _machine() -> str:
-    return hashlib.sha256(platform.node().encode()).hexdigest()[:8]
+    return hashlib.sha256(machine().encode()).hexdigest()[:8]
 
 
 def _is_being_written(partial: Path) -> bool:

@@ -1,13 +1,18 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Processes: the cores that this one may use, what another is started with, by what status ours end, and whether one
-that was written down still runs, known by its number and by when it began, since systems give the numbers of ended ones
-out again."""
+"""Processes: the cores that this one may use, what another is started with, by what status ours end, on which machine
+they run, and whether one that was written down still runs, known by its number and by when it began, since systems give
+the numbers of ended ones out again."""
 from __future__ import annotations
 
+import contextlib
 import os
+import platform
 import re
 import subprocess
+import sys
 import time
+import uuid
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +54,31 @@ def own_group() -> dict[str, Any]:
     if WINDOWS:
         return {"creationflags": getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0)}
     return {"start_new_session": True}
+
+
+@lru_cache(maxsize=1)
+def machine() -> str:
+    """What tells this machine from others that see the same folders, today and later: its name. A Mac's changes with
+    the network, so there it is a name that was made up once and is kept for the user; elsewhere a user's folder may be
+    the same on many machines."""
+    if sys.platform == "darwin":
+        with contextlib.suppress(OSError, RuntimeError, ValueError):  # of a user without a home, too
+            return _made_up(Path.home() / "Library" / "Application Support" / "fit_flare" / "machine")
+    return platform.node()
+
+
+def _made_up(file: Path) -> str:
+    """The name that the file holds; one is made up where there is none."""
+    if not file.exists():
+        file.parent.mkdir(parents=True, exist_ok=True)
+        fresh = file.with_name(f"{file.name}.{uuid.uuid4()}")
+        try:
+            fresh.write_text(str(uuid.uuid4()), encoding="utf-8")
+            with contextlib.suppress(FileExistsError):  # another process was first
+                os.link(fresh, file)
+        finally:
+            fresh.unlink(missing_ok=True)
+    return file.read_text(encoding="utf-8")
 
 
 def cores() -> int:

@@ -86,3 +86,18 @@ def test_an_environment_whose_base_is_gone_has_no_python(tmp_path: Path, monkeyp
     assert processes.python_at(tmp_path / "engine") == processes.python_at(python) == python
     base.unlink()
     assert processes.python_at(tmp_path / "engine") is processes.python_at(python) is None
+
+
+def test_a_mac_is_itself_in_every_network(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    names = iter(("studio.local", "guest-17.wifi", "studio.local"))
+    monkeypatch.setattr(processes.platform, "node", lambda: next(names))
+    monkeypatch.setattr(processes.Path, "home", lambda: tmp_path)
+    machine = processes.machine.__wrapped__
+    assert machine() != machine(), "its name, elsewhere"
+    monkeypatch.setattr(processes.sys, "platform", "darwin")
+    told = machine()
+    assert told == machine()
+    assert len(told) == 36
+    assert [path.name for path in tmp_path.rglob("*") if path.is_file()] == ["machine"]
+    monkeypatch.setattr(processes.Path, "home", lambda: tmp_path.joinpath(*tmp_path.rglob("machine")))  # a file
+    assert machine() == "studio.local"

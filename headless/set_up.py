@@ -8,6 +8,7 @@ object a line (core/progress.py). A folder that a stopped set-up left is made an
 from __future__ import annotations
 
 import contextlib
+import glob
 import json
 import os
 import platform
@@ -15,8 +16,8 @@ import shutil
 import signal
 import subprocess
 import sys
-import tempfile
 import threading
+import time
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
@@ -25,6 +26,7 @@ from typing import NamedTuple
 ROOT = Path(__file__).resolve().parents[1]
 WINDOWS = os.name == "nt"
 OLDEST_MACOS = 14  # that the wheels of torch and pycolmap in constraints.txt are made for
+ATTEMPTS = 20  # a tenth of a second apart
 TEST = "import cv2, numpy, torch, numba, OpenEXR, pycolmap"  # OpenCV before COLMAP, as in core/capture/solve
 
 
@@ -128,17 +130,25 @@ def base() -> str | None:
 
 def cleared(folder: Path) -> bool:
     """Whether the folder is gone: as a whole, since nothing of an old engine may be left in a new one. It stays where
-    Windows has a file of it in use."""
-    if not folder.exists():
-        return True
-    old = Path(tempfile.mkdtemp(prefix=f"{folder.name}.old-", dir=folder.parent))
-    try:
-        folder.rename(old / folder.name)
-    except OSError:
-        return False
-    finally:
-        shutil.rmtree(old, ignore_errors=True)
-    return True
+    Windows has a file of it in use for long."""
+    for left in folder.parent.glob(f"{glob.escape(folder.name)}.old-*"):  # what was in use when it was removed
+        shutil.rmtree(left, ignore_errors=True)
+    old = folder.with_name(f"{folder.name}.old-{os.getpid()}")
+    for _ in range(ATTEMPTS):
+        if not folder.exists():
+            break
+        try:
+            folder.rename(old)
+        except OSError:  # a process of it that has just ended is held for a moment
+            time.sleep(0.1)
+    shutil.rmtree(old, ignore_errors=True)
+    return not folder.exists()
+
+
+def discard(folder: Path) -> None:
+    """As far as that goes: a half of an engine would count as one."""
+    if not cleared(folder):
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def placing(maker: str, folder: Path) -> Step:
@@ -195,11 +205,11 @@ def main(words: list[str]) -> int:
         say(type="say", text=step.begins)
         try:
             why = run(step.command)
-        except KeyboardInterrupt:  # a half of an engine would count as one
-            cleared(folder)
+        except KeyboardInterrupt:
+            discard(folder)
             raise
         if why:
-            cleared(folder)
+            discard(folder)
             say(type="error", text=step.fails.replace("{why}", why))
             return 1
         say(type="progress", stage="set up", done=number + 1, total=len(steps), left_s=None, figures={})

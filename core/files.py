@@ -9,7 +9,6 @@ import hashlib
 import json
 import math
 import os
-import platform
 import re
 import shutil
 import tempfile
@@ -20,11 +19,11 @@ from pathlib import Path
 from typing import Any
 
 from .errors import FitFlareError, SettingsError
-from .processes import WINDOWS, runs
+from .processes import WINDOWS, machine, runs
 
 WRITTEN_BY_HAND = "utf-8-sig"
 """Encoding to read what people write: UTF-8, before which Windows' editors put a mark."""
-_PARTIAL = ".partial-"
+_PARTIAL, _OLD = ".partial-", ".old-"
 _REFUSALS = 100  # a hundredth of a second apart
 _HELD = (5, 32, 33)  # Windows: access denied, sharing violation, lock violation
 _PATIENCE_S = 2.0
@@ -32,7 +31,7 @@ _WRITER = re.compile(r"-(?P<process>\d+)@(?P<machine>[0-9a-f]{8})-")
 _ABANDONED_S = 3600.0
 _DRIVE = re.compile(r".*:" if WINDOWS else r"[A-Za-z]:")
 """As the first part of a name begins; on Windows any colon, which would name a stream of a file as well."""
-_OF_DEVICES = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\.|$)", re.IGNORECASE)
+_OF_DEVICES = re.compile(r"^(con|prn|aux|nul|conin\$|conout\$|(com|lpt)[\d¹²³])\s*(\.|$)", re.IGNORECASE)
 
 
 @contextlib.contextmanager
@@ -60,7 +59,8 @@ def atomic_path(target: Path | str, turn: contextlib.AbstractContextManager[None
         raise
     finally:
         if temporary != target:
-            temporary.unlink(missing_ok=True)
+            with contextlib.suppress(OSError):  # what failed before is what is to be told
+                remove_file(temporary)
 
 
 def named_by(target: Path) -> Path:
@@ -93,6 +93,26 @@ def patiently(change: Callable[..., object], *words: Any) -> None:
             time.sleep(0.02)
 
 
+def remove_file(path: Path) -> None:
+    """Remove a file that need not be there, as patiently as Windows wants it. Raises OSError."""
+    patiently(path.unlink, True)
+
+
+def remove_folder(folder: Path) -> None:
+    """Remove a folder that need not be there, and all that is in it: by its name it is gone as a whole, or OSError is
+    raised and it is as it was, since Windows has something in it in use. What cannot be removed of it after that goes
+    with the next."""
+    for old in folder.parent.glob(f"{glob.escape(folder.name)}{_OLD}*"):
+        shutil.rmtree(old, ignore_errors=True)
+    if not folder.exists():
+        return
+    old = Path(tempfile.mkdtemp(prefix=f"{folder.name}{_OLD}", dir=folder.parent))
+    try:
+        patiently(folder.rename, old / folder.name)
+    finally:
+        shutil.rmtree(old, ignore_errors=True)
+
+
 def _share(temporary: Path, mode: int) -> None:
     """mkstemp makes private files; the result gets the permissions that any new one here would have, where the disk
     has permissions at all and lets them be changed (Windows' disks in WSL and some network shares do not)."""
@@ -111,7 +131,7 @@ def _writer() -> str:
 
 @lru_cache(maxsize=1)
 def _machine() -> str:
-    return hashlib.sha256(platform.node().encode()).hexdigest()[:8]
+    return hashlib.sha256(machine().encode()).hexdigest()[:8]
 
 
 def _is_being_written(partial: Path) -> bool:
@@ -127,12 +147,13 @@ def _is_being_written(partial: Path) -> bool:
 
 
 def remove_partial_of(target: Path | str) -> None:
-    """Remove what a killed process left of `target` half written. What another one is writing stays: on a farm a task
-    may be given again while its first worker still lives."""
+    """Remove what a killed process left of `target` half written, where the system lets it. What another one is writing
+    stays: on a farm a task may be given again while its first worker still lives."""
     target = Path(target)
     for path in target.parent.glob(f"{glob.escape(_partial_of(target))}*"):
         if not _is_being_written(path):
-            path.unlink(missing_ok=True)
+            with contextlib.suppress(OSError):
+                remove_file(path)
 
 
 @contextlib.contextmanager
@@ -198,7 +219,8 @@ def remove_partial(folder: Path | str) -> None:
         if path.is_dir():
             shutil.rmtree(path, ignore_errors=True)
         elif not _is_being_written(path):
-            path.unlink(missing_ok=True)
+            with contextlib.suppress(OSError):
+                remove_file(path)
 
 
 def _umask() -> int:
@@ -239,8 +261,9 @@ def _without_doubles(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def plain_name(name: str) -> str:
-    """`name`, or with "_" after it where Windows takes it for a device: con, aux, nul, com1 and their like."""
-    return f"{name}_" if _OF_DEVICES.match(name) else name
+    """`name`, with "_" after the part that Windows takes for a device, whatever suffix follows: con, aux, nul, com1 and
+    their like."""
+    return _OF_DEVICES.sub(r"\1_\3", name, count=1)
 
 
 def _is_file_name(part: str) -> bool:
@@ -254,14 +277,16 @@ def _is_file_name(part: str) -> bool:
 def inside(folder: Path | str, name: str, error: type[FitFlareError]) -> Path:
     """`folder / name`, refused with `error` where the name would lead out of the folder.
 
-    Absolute names, drive letters, `..` and symbolic links that point outside are refused; what a file
-    from elsewhere names must not reach the rest of the disk.
+    Absolute names, drive letters, `..` and symbolic links that point outside are refused, on Windows those of devices
+    too; what a file from elsewhere names must not reach the rest of the disk.
     """
     folder = Path(folder)
     parts = Path(name.replace("\\", "/"))
     if (not parts.parts or "\0" in name or parts.is_absolute() or _DRIVE.match(parts.parts[0])
             or ".." in parts.parts or not all(map(_is_file_name, parts.parts))):
         raise error(f"{folder} names the file {name!r:.150}, which is not inside the folder; remove that entry.")
+    if WINDOWS and any(map(_OF_DEVICES.match, parts.parts)):
+        raise error(f"{folder} names the file {name!r:.150}, which Windows takes for a device; give it another name.")
     path = folder / parts
     if not path.resolve().is_relative_to(folder.resolve()):
         raise error(f"{path} is a link that leads out of {folder}; put the file itself there.")

@@ -14,7 +14,7 @@ from collections.abc import Container, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, BinaryIO, Literal, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,9 @@ from . import exr, jpeg, tiff
 from .errors import FrameError
 from .files import atomic_path
 from .typed import is_utf8
+
+if TYPE_CHECKING:
+    from .colour import Chromaticities
 
 Encoding = Literal["srgb", "linear"]
 Pixels = NDArray[np.float32]
@@ -252,7 +255,7 @@ def exr_space(path: Path | str) -> str:
     if told is None:
         return "linear"
     try:
-        found = space_of_chromaticities(told).name
+        found = space_of_chromaticities(cast("Chromaticities", told)).name
     except SettingsError:
         return ""
     return found if found in names() else ""

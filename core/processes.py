@@ -1,31 +1,84 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Processes: the cores that this one may use, what another is started with, and whether one that was written down still
-runs, known by its number and by when it began, since systems give the numbers of ended ones out again."""
+"""Processes: the cores that this one may use, what another is started with, by what status ours end, on which machine
+they run, and whether one that was written down still runs, known by its number and by when it began, since systems give
+the numbers of ended ones out again."""
 from __future__ import annotations
 
+import contextlib
 import os
+import platform
 import re
 import subprocess
+import sys
 import time
+import uuid
+from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 WINDOWS = os.name == "nt"
+DONE, FAILED, MISUSED, STOPPED = 0, 1, 2, 130
+"""Statuses of our commands: done; it could not be; the words made no sense; it was asked to stop, and did."""
 PROC = Path("/proc")
 SLACK_S = 5.0
 """By which the clocks of the two may differ."""
 
 
 def python_at(place: Path) -> Path | None:
-    """The interpreter that `place` is, or that the virtual environment in it has."""
-    for path in (place, place / "Scripts" / "python.exe", place / "bin" / "python"):
-        if path.is_file():
+    """The interpreter that `place` is, or that the virtual environment in it has; on Windows conda has it at the top of
+    the environment. None, too, where the Python that the environment was made from is gone."""
+    for path in (place, place / "Scripts" / "python.exe", place / "bin" / "python", place / "python.exe"):
+        if path.is_file() and not (WINDOWS and _lacks_its_base(path)):
             return path.absolute()  # not resolved: a virtual environment's python is a link
     return None
+
+
+def _lacks_its_base(python: Path) -> bool:
+    """Whether a virtual environment's python.exe, on Windows no link but a program that starts another, has lost that:
+    the Blender that it was made by, say, has been replaced by a newer one."""
+    try:
+        told = (python.parent.parent / "pyvenv.cfg").read_text(encoding="utf-8", errors="replace")
+    except OSError:  # it is its own base
+        return False
+    home = re.search(r"^home\s*=\s*(.+?)\s*$", told, re.MULTILINE)
+    return home is not None and not Path(home[1], "python.exe").is_file()
 
 
 def environment() -> dict[str, str]:
     """This environment, less what would lead another Python to the modules of this one."""
     return {name: value for name, value in os.environ.items() if name not in ("PYTHONHOME", "PYTHONPATH")}
+
+
+def own_group() -> dict[str, Any]:
+    """Options of Popen that keep a terminal's Ctrl-C from a child, so that it is stopped by its parent alone."""
+    if WINDOWS:
+        return {"creationflags": getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0)}
+    return {"start_new_session": True}
+
+
+@lru_cache(maxsize=1)
+def machine() -> str:
+    """What tells this machine from others that see the same folders, today and later: its name. A Mac's changes with
+    the network, so there it is a name that was made up once and is kept for the user; elsewhere a user's folder may be
+    the same on many machines."""
+    if sys.platform == "darwin":
+        with contextlib.suppress(OSError, RuntimeError, ValueError):  # of a user without a home, too
+            return _made_up(Path.home() / "Library" / "Application Support" / "fit_flare" / "machine")
+    return platform.node()
+
+
+def _made_up(file: Path) -> str:
+    """The name that the file holds; one is made up where there is none."""
+    if not file.exists():
+        file.parent.mkdir(parents=True, exist_ok=True)
+        fresh = file.with_name(f"{file.name}.{uuid.uuid4()}")
+        try:
+            fresh.write_text(str(uuid.uuid4()), encoding="utf-8")
+            with contextlib.suppress(FileExistsError):  # another process was first
+                os.link(fresh, file)
+        finally:
+            fresh.unlink(missing_ok=True)
+    return file.read_text(encoding="utf-8")
 
 
 def cores() -> int:

@@ -20,7 +20,7 @@ import numpy as np
 from ..core.capture.colmap import find_model
 from ..core.capture.transforms import FILE as TRANSFORMS
 from ..core.errors import CaptureError
-from ..core.files import atomic_path, read_json, write_json
+from ..core.files import atomic_path, read_json, remove_file, write_json
 from ..core.pictures import are_one_shape, picture_size
 from . import cameras
 from .paths import absolute, stored
@@ -157,7 +157,7 @@ def entry_of(scene: Any, camera: Any, frame: int, path: Path, folder: Path) -> d
     target = folder / name
     target.parent.mkdir(parents=True, exist_ok=True)
     if not _is_copy(target, path):
-        target.unlink(missing_ok=True)  # not written into: it may be linked to an earlier plate
+        remove_file(target)  # not written into: it may be linked to an earlier plate
         try:
             os.link(path.resolve(), target)  # of a symbolic link Linux would link that, to where it leads from here
         except OSError:  # another disk, or a file system without links

@@ -10,7 +10,7 @@ from pathlib import Path
 import bpy
 
 from ..core.errors import EngineError, FitFlareError
-from ..core.files import write_text
+from ..core.files import remove_folder, write_text
 from ..core.processes import environment, python_at
 from . import jobs
 from .jobs import Job
@@ -121,10 +121,12 @@ def tested() -> Job | None:
 def set_up() -> Job:
     """Make a virtual environment in the extension's own folder and install the engine into it.
 
-    Raises EngineError where Blender's online access is not granted.
+    Raises EngineError where Blender's online access is not granted, or what is left of an engine cannot be removed.
     """
     if not bpy.app.online_access:
         raise EngineError("Blender's online access is off; allow it in Preferences > System > Network, then set up.")
+    if was_set_up() and not (virtual_environment() / "pyvenv.cfg").is_file():  # half of it was removed
+        _clear(virtual_environment())
     script = ROOT / "headless" / "set_up.py"
     words = [sys.executable, *bpy.app.python_args, str(script), str(virtual_environment())]
     return jobs.start("set up", home(), words, environment())
@@ -141,11 +143,18 @@ def setting_up() -> Job | None:
 
 
 def remove() -> None:
-    """Remove the engine that a click set up. Raises FitFlareError while it works."""
-    import shutil
-
+    """Remove the engine that a click set up. Raises FitFlareError while it works, EngineError where a file of it is in
+    use otherwise."""
     if any(job.running for job in jobs.running()):
         raise FitFlareError("The engine is at work; wait for it or cancel it before removing it.")
     folder = home()
+    _clear(folder)
     jobs.forget(folder)
-    shutil.rmtree(folder, ignore_errors=True)
+
+
+def _clear(folder: Path) -> None:
+    try:
+        remove_folder(folder)
+    except OSError as problem:
+        raise EngineError(f"The engine in {folder} is in use or cannot be removed ({problem.strerror or problem}); "
+                          "close other Blenders and programs that work with it, and try again.") from problem

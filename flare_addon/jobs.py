@@ -29,15 +29,14 @@ import bpy
 
 from ..core import processes
 from ..core.errors import DISK_FULL, EngineError, FitFlareError, RunError, refusal
-from ..core.files import write_json
+from ..core.files import remove_file, write_json
+from ..core.processes import STOPPED, WINDOWS, own_group
 from ..core.progress import STOP_FILE
 
 State = Literal["running", "done", "failed", "stopped"]
 
 RECORD, EVENTS, LOG, STOP = "job.json", "events.jsonl", "engine.log", "stop"
-WINDOWS = os.name == "nt"
-HOST = platform.node()
-STOPPED = 130  # the status of a command that was stopped (headless/cli.py)
+HOST = processes.machine()
 EVERY_S = 0.2
 NICENESS = 5
 TAB = "Fit Flare"  # of the sidebar
@@ -53,11 +52,12 @@ _jobs: dict[str, Job] = {}
 
 class Job:
     """One command of the engine. done, total: steps of `stage`; left_s: seconds left, None where unknown. log_from:
-    bytes of the log that commands before it have written."""
+    bytes of the log that commands before it have written. host: its machine, which people call `host_name`."""
 
     def __init__(self, kind: str, folder: Path, pid: int, process: subprocess.Popen[bytes] | None,
-                 words: Sequence[str] = (), host: str = HOST, log_from: int = 0) -> None:
+                 words: Sequence[str] = (), host: str = HOST, log_from: int = 0, host_name: str = "") -> None:
         self.kind, self.folder, self.pid, self.host, self.log_from = kind, folder, pid, host, log_from
+        self.host_name = host_name or host
         self.words = [word for word in words if word != "--overwrite"]
         self.state: State = "running"
         self.stage, self.done, self.total, self.left_s = "starting", 0, 0, None
@@ -172,7 +172,7 @@ class Job:
             self.state = "failed"
         elif self.host != HOST and self.folder.is_dir():
             self.state = "failed"
-            self.error = (f"The engine on {self.host} has told nothing for an hour; see there whether it works in "
+            self.error = (f"The engine on {self.host_name} has told nothing for an hour; see there whether it works in "
                           f"{self.folder}.")
         elif not self.folder.is_dir():
             self.state, self.error = "failed", f"The folder {self.folder} was removed while the engine worked in it."
@@ -214,13 +214,12 @@ def start(kind: str, folder: Path, command: Sequence[str], environment: Mapping[
     before = find(folder)
     if before is not None and before.running:
         raise RunError(f"The engine works in {folder} already; wait for it or cancel it first.")
-    apart: dict[str, Any] = {"start_new_session": True}
+    apart = own_group()
     if WINDOWS:
-        apart = {"creationflags": getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0)
-                 | getattr(subprocess, "BELOW_NORMAL_PRIORITY_CLASS", 0)}
+        apart["creationflags"] |= getattr(subprocess, "BELOW_NORMAL_PRIORITY_CLASS", 0)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / STOP).unlink(missing_ok=True)
+        remove_file(folder / STOP)
         with open(folder / EVENTS, "wb") as events, open(folder / LOG, "ab") as log:
             log_from = log.tell()
             process = _launched(command, stdin=subprocess.DEVNULL, stdout=events, stderr=log,
@@ -228,8 +227,9 @@ def start(kind: str, folder: Path, command: Sequence[str], environment: Mapping[
                                      STOP_FILE: str((folder / STOP).absolute())}, **apart)
         _yield_to_the_window(process.pid)
         try:
-            write_json(folder / RECORD, {"kind": kind, "host": HOST, "pid": process.pid, "started": time.time(),
-                                          "words": [str(word) for word in words], "log_from": log_from})
+            write_json(folder / RECORD, {"kind": kind, "host": HOST, "host_name": platform.node(), "pid": process.pid,
+                                          "started": time.time(), "words": [str(word) for word in words],
+                                          "log_from": log_from})
         except OSError:
             process.kill()  # nobody would find it again
             raise
@@ -272,10 +272,11 @@ def find(folder: Path | str | None) -> Job | None:
         return known
     try:
         record = json.loads((folder / RECORD).read_text(encoding="utf-8"))
-        pid, host = int(record["pid"]), str(record.get("host", HOST))  # the version before wrote none
+        pid, host = int(record["pid"]), str(record.get("host", HOST))  # an early version wrote none,
+        host = HOST if host == platform.node() else host  # and the next a Mac's name
         here = host == HOST and processes.is_same(pid, float(record["started"]))
         job = Job(str(record["kind"]), folder, pid if here else 0, None, list(map(str, record.get("words", ()))), host,
-                  int(record.get("log_from", 0)))
+                  int(record.get("log_from", 0)), str(record.get("host_name", "")))
     except (OSError, ValueError, KeyError, TypeError):
         return None
     _jobs[_key(folder)] = job

@@ -15,7 +15,7 @@ from ..core.bake import bake as bakes
 from ..core.bake.frames import layers_file
 from ..core.bake.layers import layer_names
 from ..core.errors import CaptureError, FrameError, RunError, SettingsError
-from ..core.files import digest_of, write_json
+from ..core.files import digest_of, remove_file, write_json
 from ..core.look import Edit, LookEdits
 from ..core.look.shot import Shot, ShotFrame
 from . import cameras, engine, fits, jobs, library, looks
@@ -233,7 +233,7 @@ def bake(scene: Any, chosen: Sequence[Any], *, others_may_go: bool = False) -> J
     if state.bake_live:
         write_json(folder / LIVE, live_of(state, shot.lights))
     else:
-        (folder / LIVE).unlink(missing_ok=True)
+        remove_file(folder / LIVE)
     return engine.run("bake", folder, ["bake", folder / SHOT, "--out", folder, "--overwrite"])
 
 

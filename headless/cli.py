@@ -16,12 +16,11 @@ from collections.abc import Iterator, Sequence
 from typing import Any, NoReturn, TextIO
 
 from ..core.errors import Cancelled, EngineError, FitFlareError, SettingsError, is_out_of_memory, refusal
+from ..core.processes import DONE, FAILED, MISUSED, STOPPED, WINDOWS
 from ..core.progress import JsonProgress, OpenJdProgress, Progress, TerminalProgress, flush_or_drop, stoppable
 from . import hand_off
 from .command import Command, Step, Stopped
 from .commands import COMMANDS
-
-DONE, FAILED, MISUSED, STOPPED = 0, 1, hand_off.MISUSED, hand_off.STOPPED
 
 _HINTS: dict[Stopped, str] = {
     "goes on": "Give the command again to go on.",
@@ -196,6 +195,20 @@ def _quiet() -> Iterator[None]:
         os.close(nowhere)
 
 
+@contextlib.contextmanager
+def _torch_loaded() -> Iterator[None]:
+    """Raises EngineError where torch is there and does not load: on Windows that is an OSError, as of a disk."""
+    try:
+        yield
+    except OSError as problem:
+        if not any(frame.f_code.co_name == "<module>" and frame.f_globals.get("__name__") == "torch"
+                   for frame, _ in traceback.walk_tb(problem.__traceback__)):
+            raise
+        cure = "install the Microsoft Visual C++ Redistributable (vc_redist.x64) or " if WINDOWS else ""
+        raise EngineError(f"torch of {sys.executable} cannot be loaded ({problem.strerror or problem}); {cure}"
+                          "set the engine up anew.") from problem
+
+
 def _run(command: Command, arguments: argparse.Namespace, words: Sequence[str], progress: Progress) -> dict[str, Any]:
     result: dict[str, Any] = {}
     for step in command.steps:
@@ -214,7 +227,7 @@ def _run_step(step: Step, arguments: argparse.Namespace, words: Sequence[str], p
                               "--blender.") from problem
     elsewhere = step.side == "engine" and arguments.engine is not None and not arguments.step
     if hand_off.here() == step.side and not elsewhere:
-        with _quiet() if step.side == "blender" else contextlib.nullcontext():
+        with _quiet() if step.side == "blender" else _torch_loaded():
             return step.run(arguments, progress)
     if arguments.step:
         raise EngineError(f"The step {step.name} was handed to {sys.executable}, which has no {step.side} either.")

@@ -8,29 +8,25 @@ from __future__ import annotations
 
 import contextlib
 import importlib.util
-import json
 import os
 import shlex
 import shutil
 import signal
 import subprocess
 import sys
-import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from ..core.errors import Cancelled, EngineError, FitFlareError, SettingsError
-from ..core.processes import environment, python_at
+from ..core.errors import Cancelled, EngineError
+from ..core.processes import DONE, WINDOWS, environment, python_at
 from ..core.progress import Progress, is_hangup, stop_signals
+from .child import Child, failure
 from .command import Side
 
 ROOT = Path(__file__).resolve().parents[1]
 RUN = ROOT / "headless" / "run.py"
-WINDOWS = os.name == "nt"
-MISUSED, STOPPED = 2, 130  # statuses: the words made no sense; it was asked to stop, and did
-PATIENCE_S = 60.0  # for a stopped process to write what it must
 
 
 def here() -> Side | None:
@@ -138,13 +134,6 @@ def _usual_places() -> Iterator[str]:
 # ---- how ------------------------------------------------------------------------------------------
 
 
-def own_group() -> dict[str, Any]:
-    """Options of Popen that keep a terminal's Ctrl-C from a child, so that it is stopped by its parent alone."""
-    if WINDOWS:
-        return {"creationflags": getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0)}
-    return {"start_new_session": True}
-
-
 def with_options(words: Sequence[str], *added: str) -> list[str]:
     """The command's words with options more, before the "--" after which there are none."""
     end = words.index("--") if "--" in words else len(words)
@@ -154,39 +143,29 @@ def with_options(words: Sequence[str], *added: str) -> list[str]:
 def run_there(command: Sequence[str], words: Sequence[str], step: str, progress: Progress) -> dict[str, Any]:
     """Run one step of the command `words` in another process and return its result.
 
-    Raises Cancelled when that process was stopped, and FitFlareError with its own sentence when it failed.
+    Raises Cancelled when that process was stopped, SettingsError and FitFlareError with its own sentence when it
+    failed, and EngineError where it cannot be started or ends without a reason.
     """
-    whole = [*command, *with_options(words, "--step", step, "--progress", "json")]
-    with tempfile.TemporaryFile() as noise:
-        try:
-            child = subprocess.Popen(whole, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=noise,
-                                     env=environment(), encoding="utf-8", errors="replace", **own_group())
-        except OSError as problem:
-            raise EngineError(f"{whole[0]} cannot be started ({problem.strerror or problem}).") from problem
-        try:
-            with _stops_passed_on(child):
-                result, error = _relayed(child, progress)
-        finally:
-            _end(child)
-        progress.check()
-        if child.returncode == 0:
-            return result
-        if error is None:
-            noise.seek(0)
-            sys.stderr.write("".join(noise.read().decode("utf-8", "replace").splitlines(keepends=True)[-40:]))
-            raise EngineError(f"{Path(whole[0]).name} ended with status {child.returncode} during {step}; "
-                              "its last words stand above.")
-        raise {STOPPED: Cancelled, MISUSED: SettingsError}.get(child.returncode, FitFlareError)(error)
+    child = Child([*command, *with_options(words, "--step", step, "--progress", "json")], environment())
+    try:
+        with _stops_passed_on(child):
+            result = _relayed(child, progress)
+    except BaseException:  # this process is leaving early
+        child.interrupt()
+        raise
+    finally:
+        child.end()
+    progress.check()
+    if child.status != DONE:
+        raise failure([child], 1, step)
+    return result
 
 
-def _relayed(child: subprocess.Popen[str], progress: Progress) -> tuple[dict[str, Any], str | None]:
-    """The child's result and error, with its other events made this process's own."""
+def _relayed(child: Child, progress: Progress) -> dict[str, Any]:
+    """The child's result, with its other events made this process's own."""
     result: dict[str, Any] = {}
-    error = None
     done = 0
-    assert child.stdout is not None
-    for line in child.stdout:
-        event = _event(line)
+    for event in child.events():
         kind = event.get("type")
         with contextlib.suppress(Cancelled):  # the child has been told too, and is heard to its end
             if kind == "stage":
@@ -199,24 +178,11 @@ def _relayed(child: subprocess.Popen[str], progress: Progress) -> tuple[dict[str
                 progress.say(event["text"])
             elif kind == "result":
                 result.update(event["data"])
-            elif kind == "error":
-                error = event["text"]
-    return result, error
-
-
-def _event(line: str) -> dict[str, Any]:
-    """The event that a line holds; {} for the other things that programs print."""
-    if not line.startswith("{"):
-        return {}
-    try:
-        event = json.loads(line)
-    except ValueError:
-        return {}
-    return event if isinstance(event, dict) else {}
+    return result
 
 
 @contextlib.contextmanager
-def _stops_passed_on(child: subprocess.Popen[str]) -> Iterator[None]:
+def _stops_passed_on(child: Child) -> Iterator[None]:
     """Signals that ask this process to stop reach the child too; it has a process group of its own."""
     before = {number: signal.getsignal(number) for number in stop_signals()}
     told: list[int] = []
@@ -224,7 +190,7 @@ def _stops_passed_on(child: subprocess.Popen[str]) -> Iterator[None]:
     def pass_on(number: int, frame: FrameType | None) -> None:
         # A second stop ends the child at once, and a lost terminal's signal often comes with another.
         if not told or not is_hangup(number):
-            _interrupt(child)
+            child.interrupt()
         told.append(number)
         handler = before[number]
         if callable(handler):
@@ -241,19 +207,3 @@ def _stops_passed_on(child: subprocess.Popen[str]) -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, signal.SIG_DFL if handler is None else handler)
-
-
-def _interrupt(child: subprocess.Popen[str]) -> None:
-    with contextlib.suppress(OSError):
-        child.send_signal(getattr(signal, "CTRL_BREAK_EVENT", signal.SIGINT))
-
-
-def _end(child: subprocess.Popen[str]) -> None:
-    """Wait for the child; where this process is leaving early, stop it first."""
-    if sys.exc_info()[0] is not None and child.poll() is None:
-        _interrupt(child)
-    try:
-        child.communicate(timeout=PATIENCE_S)
-    except subprocess.TimeoutExpired:
-        child.kill()
-        child.communicate()

@@ -7,26 +7,17 @@ theirs alone, so nothing is shared but the folder they write to.
 from __future__ import annotations
 
 import argparse
-import contextlib
 import itertools
-import json
-import os
 import queue
-import signal
-import subprocess
 import sys
-import tempfile
-import threading
+from collections import deque
 from collections.abc import Sequence
-from typing import IO, Any
 
-from ..core.errors import EngineError, FitFlareError
-from ..core.processes import cores
+from ..core.processes import DONE, cores, environment
 from ..core.progress import STOP_FILE, Progress
 from . import hand_off
+from .child import Child, Event, Inbox, failure, next_event
 from .command import from_1
-
-POLL_S = 0.2
 
 
 def add_option(parser: argparse.ArgumentParser,
@@ -74,87 +65,68 @@ def run_parts(words: argparse.Namespace, step: str, parts: Sequence[Sequence[str
 
     total: steps of all together, as the processes count them; where it is the number of parts, parts are counted.
     past_failures: one that fails does not stop the others, since they go past what they cannot do themselves.
-    Raises Cancelled when asked to stop, after the processes have stopped; FitFlareError with the sentences of those
-    that failed, after the others have been stopped or, `past_failures`, have ended.
+    Raises Cancelled when asked to stop, after the processes have stopped; what `child.failure` makes of those that
+    failed, after the others have been stopped or, `past_failures`, have ended; EngineError where one cannot be started.
     """
-    events: queue.Queue[tuple[int, dict[str, Any] | None]] = queue.Queue()
-    threads = str(max(cores() // max(min(jobs, len(parts)), 1), 1))
-    environment = {**os.environ, "OMP_NUM_THREADS": threads, "NUMBA_NUM_THREADS": threads}
-    environment.pop(STOP_FILE, None)  # this process looks for it, and stops the others
-    by_part = total == len(parts)
-    children: list[subprocess.Popen[str]] = []
-    noises: list[IO[bytes]] = []
-    counted, errors, ended = [0] * len(parts), dict[int, str](), 0
+    commands = [[sys.executable, str(hand_off.RUN),
+                 *hand_off.with_options(words.words, "--step", step, *part, "--progress", "json")] for part in parts]
     progress.stage(step, total)
+    failed = _run_all(commands, jobs, _Counter(progress, total == len(parts)), past_failures)
+    if failed:
+        raise failure(failed, len(parts), step)
+
+
+class _Counter:
+    """The steps of all processes together, for one progress: of a process that is through one, `by_part`, or those that
+    it counts itself."""
+
+    def __init__(self, progress: Progress, by_part: bool) -> None:
+        self.progress, self._by_part = progress, by_part
+        self._counted: dict[Child, int] = {}
+
+    def take(self, child: Child, event: Event | None) -> None:
+        """An event of a process, or its end. Raises Cancelled."""
+        if self._by_part:
+            if event is None and child.status == DONE:
+                self.progress.advance()
+        elif event is not None and event.get("type") in ("stage", "progress"):
+            made = event["done"] - self._counted.get(child, 0)
+            self._counted[child] = event["done"]
+            if made:
+                self.progress.advance(made)
+
+
+def _run_all(commands: Sequence[Sequence[str]], jobs: int, counter: _Counter, past_failures: bool) -> list[Child]:
+    """The processes that failed; where it ends before all are through, the others have been stopped."""
+    inbox: Inbox = queue.Queue()
+    shared = _environment(min(jobs, len(commands)))
+    waiting, running, failed = deque(commands), list[Child](), list[Child]()
     try:
-        while ended < len(parts) and (past_failures or not errors):
-            while len(children) < len(parts) and len(children) - ended < jobs:
-                noises.append(tempfile.TemporaryFile())  # noqa: SIM115 - closed below, when its process has ended
-                own = hand_off.with_options(words.words, "--step", step, *parts[len(children)], "--progress", "json")
-                whole = [sys.executable, str(hand_off.RUN), *own]
-                children.append(subprocess.Popen(whole, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
-                                                 stderr=noises[-1], encoding="utf-8", errors="replace",
-                                                 env=environment, **hand_off.own_group()))
-                threading.Thread(target=_listen, args=(len(children) - 1, children[-1], events), daemon=True).start()
-            progress.check()
-            try:
-                number, event = events.get(timeout=POLL_S)
-            except queue.Empty:
+        while (waiting or running) and (past_failures or not failed):
+            while waiting and len(running) < jobs:
+                running.append(Child(waiting.popleft(), shared, inbox))
+            counter.progress.check()
+            heard = next_event(inbox)
+            if heard is None:
                 continue
+            child, event = heard
             if event is None:
-                ended += 1
-                if children[number].wait() != 0:
-                    errors.setdefault(number, "")
-                elif by_part:
-                    progress.advance()
-            elif event.get("type") in ("stage", "progress") and not by_part:
-                made, counted[number] = event["done"] - counted[number], event["done"]
-                if made:
-                    progress.advance(made)
-            elif event.get("type") == "error":
-                errors[number] = event["text"]
+                child.end()
+                running.remove(child)
+                if child.status != DONE:
+                    failed.append(child)
+            counter.take(child, event)
     finally:
-        _end(children)
-        silent = [number for number, text in errors.items() if not text]
-        said = _last_words(noises[silent[0]]) if silent else ""
-        for noise in noises:
-            noise.close()
-    told = list(dict.fromkeys(text for text in errors.values() if text))
-    if silent:
-        sys.stderr.write(said)
-        statuses = ", ".join(str(children[number].returncode) for number in silent)
-        told.append(f"{len(silent)} of {len(parts)} processes of {step} ended without a reason, status {statuses}; "
-                    f"{'what one wrote last stands above' if said else 'memory may have been short'}.")
-        raise EngineError(" ".join(told))
-    if told:
-        raise FitFlareError(" ".join(told))
+        for child in running:
+            child.interrupt()
+        for child in running:
+            child.end()
+    return failed
 
 
-def _listen(number: int, child: subprocess.Popen[str], events: queue.Queue[tuple[int, dict[str, Any] | None]]) -> None:
-    assert child.stdout is not None
-    for line in child.stdout:
-        with contextlib.suppress(ValueError):
-            event = json.loads(line)
-            if isinstance(event, dict):
-                events.put((number, event))
-    events.put((number, None))
-
-
-def _end(children: Sequence[subprocess.Popen[str]]) -> None:
-    """Ask those that run to stop, and wait for them."""
-    running = [child for child in children if child.poll() is None]
-    for child in running:
-        with contextlib.suppress(OSError):
-            child.send_signal(getattr(signal, "CTRL_BREAK_EVENT", signal.SIGINT))
-    for child in running:
-        try:
-            child.wait(timeout=hand_off.PATIENCE_S)
-        except subprocess.TimeoutExpired:
-            child.kill()
-            child.wait()
-
-
-def _last_words(noise: IO[bytes]) -> str:
-    noise.seek(0)
-    return "".join(noise.read().decode("utf-8", "replace").splitlines(keepends=True)[-40:])
-
+def _environment(processes: int) -> dict[str, str]:
+    """Of each of so many at once, which share the cores."""
+    threads = str(max(cores() // max(processes, 1), 1))
+    shared = {**environment(), "OMP_NUM_THREADS": threads, "NUMBA_NUM_THREADS": threads}
+    shared.pop(STOP_FILE, None)  # this process looks for it, and stops the others
+    return shared

@@ -8,6 +8,7 @@ object a line (core/progress.py). A folder that a stopped set-up left is made an
 from __future__ import annotations
 
 import contextlib
+import glob
 import json
 import os
 import platform
@@ -16,12 +17,25 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 ROOT = Path(__file__).resolve().parents[1]
+WINDOWS = os.name == "nt"
 OLDEST_MACOS = 14  # that the wheels of torch and pycolmap in constraints.txt are made for
+ATTEMPTS = 20  # a tenth of a second apart
+TEST = "import cv2, numpy, torch, numba, OpenEXR, pycolmap"  # OpenCV before COLMAP, as in core/capture/solve
+
+
+class Step(NamedTuple):
+    """begins: what is told of it. fails: what is told where it does not end well, with why."""
+
+    begins: str
+    command: list[str]
+    fails: str
 
 
 def say(**event: object) -> None:
@@ -35,7 +49,7 @@ def packages() -> list[str]:
 
 
 def python_in(folder: Path) -> Path:
-    return folder / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
+    return folder / ("Scripts/python.exe" if WINDOWS else "bin/python")
 
 
 def run(command: list[str]) -> str:
@@ -114,13 +128,60 @@ def base() -> str | None:
     return None
 
 
+def cleared(folder: Path) -> bool:
+    """Whether the folder is gone: as a whole, since nothing of an old engine may be left in a new one. It stays where
+    Windows has a file of it in use for long."""
+    for left in folder.parent.glob(f"{glob.escape(folder.name)}.old-*"):  # what was in use when it was removed
+        shutil.rmtree(left, ignore_errors=True)
+    old = folder.with_name(f"{folder.name}.old-{os.getpid()}")
+    for _ in range(ATTEMPTS):
+        if not folder.exists():
+            break
+        try:
+            folder.rename(old)
+        except OSError:  # a process of it that has just ended is held for a moment
+            time.sleep(0.1)
+    shutil.rmtree(old, ignore_errors=True)
+    return not folder.exists()
+
+
+def discard(folder: Path) -> None:
+    """As far as that goes: a half of an engine would count as one."""
+    if not cleared(folder):
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def placing(maker: str, folder: Path) -> Step:
+    """A virtual environment, made by the Python `maker`."""
+    return Step("Making a place for the engine", [maker, "-m", "venv", str(folder)],
+                "The virtual environment for the engine could not be made ({why}); look at the log, check the free "
+                "disk space, and set up again.")
+
+
+def installing(folder: Path, package: str) -> Step:
+    """Of a package by its name, or by its wheel's file."""
+    pip = [str(python_in(folder)), "-m", "pip", "install", "--disable-pip-version-check", "--no-input",
+           "--only-binary", ":all:"]  # building one takes a compiler, which an artist has not
+    constraints = ROOT / "constraints.txt"
+    if constraints.is_file():
+        pip += ["-c", str(constraints)]
+    return Step(f"Installing {package}", [*pip, package],
+                f"{package} could not be installed ({{why}}); look at the log, check the network and the free disk "
+                "space, and set up again.")
+
+
+def testing(folder: Path) -> Step:
+    """Everything is there: does it load?"""
+    cure = "install the Microsoft Visual C++ Redistributable (vc_redist.x64)" if WINDOWS else "look at the log"
+    return Step("Testing the engine", [str(python_in(folder)), "-c", TEST],
+                f"The engine was installed, and cannot be loaded ({{why}}); {cure}, and set up again.")
+
+
 def main(words: list[str]) -> int:
     if not words:
         print(__doc__, file=sys.stderr)
         return 2
     folder, wanted = Path(words[0]), words[1:] or packages()
-    steps = ["a place of its own", *wanted, "a test"]
-    say(type="stage", name="set up", total=len(steps), done=0)
     if not words[1:] and unsuitable():
         say(type="error", text=unsuitable())
         return 1
@@ -132,31 +193,27 @@ def main(words: list[str]) -> int:
     if folder.exists() and not (folder / "pyvenv.cfg").is_file() and (not folder.is_dir() or any(folder.iterdir())):
         say(type="error", text=f"{folder} is there and is no virtual environment; name another folder, or remove it.")
         return 1
-    shutil.rmtree(folder, ignore_errors=True)
-    python = python_in(folder)
-    constraints = ROOT / "constraints.txt"
-    pip = [str(python), "-m", "pip", "install", "--disable-pip-version-check", "--no-input",
-           "--only-binary", ":all:"]  # building one takes a compiler, which an artist has not
-    if constraints.is_file():
-        pip += ["-c", str(constraints)]
-    test = "import importlib.util, sys; sys.exit(importlib.util.find_spec('torch') is None)"
-    commands = [[maker, "-m", "venv", str(folder)], *([*pip, name] for name in wanted)]
+    steps = [placing(maker, folder), *(installing(folder, name) for name in wanted)]
     if not words[1:]:
-        commands.append([str(python), "-c", test])
-    for number, (what, command) in enumerate(zip(steps, commands, strict=False)):
-        say(type="say", text=f"Installing {what}")
+        steps.append(testing(folder))
+    say(type="stage", name="set up", total=len(steps), done=0)
+    if not cleared(folder):
+        say(type="error", text=f"The engine in {folder} is in use; close other Blenders and programs that work with "
+                               "it, and set up again.")
+        return 1
+    for number, step in enumerate(steps):
+        say(type="say", text=step.begins)
         try:
-            refused = run(command)
-        except KeyboardInterrupt:  # a half of an engine would count as one
-            shutil.rmtree(folder, ignore_errors=True)
+            why = run(step.command)
+        except KeyboardInterrupt:
+            discard(folder)
             raise
-        if refused:
-            shutil.rmtree(folder, ignore_errors=True)
-            say(type="error", text=f"{what[0].upper()}{what[1:]} could not be installed ({refused}); look at the log, "
-                                   "check the network and the free disk space, and set up again.")
+        if why:
+            discard(folder)
+            say(type="error", text=step.fails.replace("{why}", why))
             return 1
         say(type="progress", stage="set up", done=number + 1, total=len(steps), left_s=None, figures={})
-    say(type="result", data={"engine": str(python)})
+    say(type="result", data={"engine": str(python_in(folder))})
     return 0
 
 

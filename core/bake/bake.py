@@ -17,7 +17,7 @@ from typing import Any, Protocol
 from ..capture.camera import Camera
 from ..colour import colour_space
 from ..errors import FrameError, RunError
-from ..files import inside, locked, read_json, remove_partial_of, write_json
+from ..files import inside, locked, read_json, remove_file, remove_partial_of, write_json
 from ..look import KeyedEdits, LookEdits
 from ..pictures import exr_is_cut_off, picture_size
 from ..progress import Progress
@@ -225,7 +225,7 @@ def _begin(out: Path, made_from: dict[str, Any], names: dict[str, str], overwrit
                            "choose another folder, or overwrite them (--overwrite).")
         for entry in record["frames"] if record is not None else ():  # a mixture would pass for one sequence
             for file in (entry["file"], *entry.get("rest", ())):
-                (out / file).unlink(missing_ok=True)
+                remove_file(out / file)
         write_json(out / RECORD, {"version": VERSION, "made_from": made_from, "layers": names, "frames": []})
 
 

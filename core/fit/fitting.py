@@ -2,6 +2,7 @@
 """A fit from beginning to end, in a run folder that any stop leaves whole."""
 from __future__ import annotations
 
+import contextlib
 import json
 import time
 from collections.abc import Iterable
@@ -11,7 +12,7 @@ import torch
 
 from ..capture import Capture
 from ..errors import Cancelled, RunError
-from ..files import atomic_path, remove_partial
+from ..files import atomic_path, remove_file, remove_partial
 from ..flare import file as flare_file
 from ..flare.file import FlareFile, TrainingCamera
 from ..gaussians.ply import write_ply
@@ -141,7 +142,8 @@ def _finish(trainer: Trainer, run: Run) -> None:
             flare_file.save(unnamed, FlareFile(trainer.flare, run.settings.blend, lens, seen=seen,
                                                 sampling=sampling))
             list_elements(unnamed)
-    (run.folder / CHECKPOINT).unlink(missing_ok=True)
+    with contextlib.suppress(OSError):  # the fit is whole without that
+        remove_file(run.folder / CHECKPOINT)
 
 
 @torch.no_grad()

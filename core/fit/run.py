@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from .. import exposures
 from ..capture import Camera, Capture
 from ..errors import RunError
-from ..files import digest_of, write_json, write_text
+from ..files import digest_of, remove_file, write_json, write_text
 from ..flare import file as flare_file
 from ..flare.file import FlareFile
 from ..gaussians.ply import read_ply
@@ -86,7 +86,7 @@ class Run:
             raise RunError(f"The name of the capture's folder, {str(run.capture_folder)!r}, is not UTF-8 and cannot be "
                            "written down; rename it.")
         write_text(folder / CAPTURE, f"{run.capture_folder}\n")
-        (folder / exposures.FILE).unlink(missing_ok=True)  # of a fit that was killed as it began
+        remove_file(folder / exposures.FILE)  # of a fit that was killed as it began
         if exposed:
             write_json(folder / exposures.FILE, dict(exposed))
         write_config(folder / CONFIG, settings)

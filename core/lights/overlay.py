@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..capture import Capture
+from ..files import remove_file
 from ..pictures import write_png
 from .detection import Detection
 from .gather import FoundLight
@@ -26,7 +27,7 @@ def write_sheets(folder: Path, capture: Capture, detections: Sequence[Sequence[D
     arrow at the edge points to a light out of frame.
     """
     for old in folder.glob("sheet*.png"):
-        old.unlink()
+        remove_file(old)
     each = COLUMNS * ROWS
     paths = []
     for start in range(0, len(capture.views), each):

@@ -24,9 +24,9 @@ def plates_of(inputs: Iterable[Path], apart_from: Iterable[Path | None] = ()) ->
 
     apart_from: files and folders in these folders that hold no plates: the results of this run, mattes. Clean plates
     and flares of an earlier one, which its record tells, are none either, unless their own folder is given. Raises
-    SettingsError where there are none, or where two would be written to one name.
+    SettingsError where there are none, or where two would be written to one name; on Windows and macOS a.png is A.png.
     """
-    found: dict[Path, Path] = {}
+    found: dict[str, tuple[Path, Path]] = {}
     others = [other.resolve() for other in apart_from if other is not None]
     for given in inputs:
         if given.is_dir():
@@ -42,10 +42,12 @@ def plates_of(inputs: Iterable[Path], apart_from: Iterable[Path | None] = ()) ->
         else:
             files = [(given, Path(given.name))]
         for path, name in files:
-            if name in found:
-                raise SettingsError(f"{found[name]} and {path} would be written to the same file; remove them apart.")
-            found[name] = path
-    return [(path, name) for name, path in found.items()]
+            key = name.as_posix().casefold()
+            if key in found:
+                raise SettingsError(f"{found[key][0]} and {path} would be written to the same file, on Windows and macOS "
+                                    "at least; remove them apart.")
+            found[key] = path, name
+    return list(found.values())
 
 
 def shots_of(inputs: Sequence[Path], apart_from: Iterable[Path | None] = ()) -> list[Path]:

@@ -72,13 +72,16 @@ def check_removed(capture: Capture) -> None:
 
 
 def _names(capture: Capture) -> dict[str, Path]:
-    """Of every view's clean picture, below the folder. Raises CaptureError."""
-    views: dict[Path, str] = {}
+    """Of every view's clean picture, below the folder. Raises CaptureError where two would be one, on any file system.
+    """
+    names: dict[str, Path] = {}
+    views: dict[str, str] = {}
     for view in capture.views:
         name = Path(view.name)
         name = name.with_suffix(".png") if name.suffix.lower() in _LOSSY else name
-        if name in views:
-            raise CaptureError(f"The frames {views[name]} and {view.name} of {capture.folder} would both have "
+        key = name.as_posix().casefold()
+        if key in views:
+            raise CaptureError(f"The frames {views[key]} and {view.name} of {capture.folder} would both have "
                                f"{REMOVED}/{name.as_posix()}; give one of them another name, in the model too.")
-        views[name] = view.name
-    return {view: name for name, view in views.items()}
+        names[view.name], views[key] = name, view.name
+    return names

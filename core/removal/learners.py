@@ -4,6 +4,7 @@ by the sum of their gradients. On a processor this is a good deal faster than th
 from __future__ import annotations
 
 import multiprocessing
+import os
 import signal
 import tempfile
 import threading
@@ -43,8 +44,12 @@ class Table:
         """(count, length) float32, the same memory for all who ask for as many."""
         if (count, length) not in self._mapped:
             path = Path(self._folder) / f"{count}x{length}"
-            with open(path, "ab") as file:
-                file.truncate(4 * count * length)  # by each of them: what is there stays
+            path.touch()
+            with open(path, "r+b") as file:
+                # By each of them: what is there stays, and what another has mapped is not made shorter, which Windows
+                # refuses.
+                if os.fstat(file.fileno()).st_size < 4 * count * length:
+                    file.truncate(4 * count * length)
             memory = np.memmap(path, np.float32, "r+", shape=(count, length))
             self._mapped[count, length] = torch.from_numpy(memory)
         return self._mapped[count, length]

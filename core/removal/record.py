@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from ..errors import FrameError
-from ..files import content_of, locked, patiently, read_json, remove_partial_of, write_json
+from ..files import content_of, locked, read_json, remove_file, remove_partial_of, write_json
 
 RECORD = "remove.json"
 LOCK = ".remove.lock"
@@ -60,7 +60,7 @@ class Record:
                                      "someone's work; choose another folder, or have it written over (--overwrite).")
             for path, what in zip(results, ("plates", "flares_made"), strict=False):
                 if known[what].get(key) != how:
-                    patiently(path.unlink, True)
+                    remove_file(path)
             if told != known:
                 write_json(self._folder / RECORD, {what: dict(sorted(rows.items())) for what, rows in told.items()})
         for path in results:

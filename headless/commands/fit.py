@@ -130,8 +130,9 @@ def place(words: argparse.Namespace) -> tuple[Path, Path]:
     if not 1 <= words.entry <= len(folders):
         raise SettingsError(f"{words.listed} lists {len(folders)} captures; --entry {words.entry} is none of them.")
     names = [folder.resolve().name if folder.name in ("", "..") else folder.name for folder in folders]
-    name = names[words.entry - 1]
-    return folders[words.entry - 1], words.out / (name if names.count(name) == 1 else f"{words.entry:03d}_{name}")
+    name, same = names[words.entry - 1], [other.casefold() for other in names]  # on Windows and macOS a is A
+    alone = same.count(name.casefold()) == 1
+    return folders[words.entry - 1], words.out / (name if alone else f"{words.entry:03d}_{name}")
 
 
 def listed(path: Path) -> list[Path]:

@@ -132,3 +132,45 @@ def test_a_network_that_is_down_is_told_as_one() -> None:
     assert module().run([sys.executable, "-c", said]) == "the network could not be reached"
     assert module().run([sys.executable, "-c", "print('ERROR: No room left.'); exit(1)"]) == "No room left"
     assert module().run([sys.executable, "-c", "print('fine')"]) == ""
+
+
+@pytest.mark.parametrize(("windows", "cure"), [(True, "vc_redist.x64"), (False, "look at the log")])
+def test_an_engine_that_does_not_load_is_none(windows: bool, cure: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+                                              capsys: pytest.CaptureFixture[str]) -> None:
+    """Everything can be installed where Windows lacks what torch's libraries want."""
+    script, ran = module(), []
+
+    def run(command: list[str]) -> str:
+        ran.append(command)
+        return "OSError: [WinError 126] c10.dll" if "import cv2" in command[-1] else ""
+
+    monkeypatch.setattr(script, "run", run)
+    monkeypatch.setattr(script, "WINDOWS", windows)
+    monkeypatch.setattr(script, "unsuitable", lambda: "")
+    assert script.main([str(tmp_path / "engine")]) == 1
+    told = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert told[0] == {"type": "stage", "name": "set up", "total": len(ran), "done": 0}
+    assert told[-1]["text"].startswith(
+        "The engine was installed, and cannot be loaded (OSError: [WinError 126] c10.dll); ")
+    assert cure in told[-1]["text"]
+    assert [event["text"] for event in told if event["type"] == "say"][:2] == ["Making a place for the engine",
+                                                                               "Installing numpy"]
+
+
+def test_what_the_engine_is_tested_by_loads_here() -> None:
+    assert module().run([sys.executable, "-c", module().TEST]) == ""
+
+
+def test_an_engine_in_use_is_left_as_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+                                           capsys: pytest.CaptureFixture[str]) -> None:
+    """Half of it would stay on Windows, and be taken for a folder of somebody's."""
+    (tmp_path / "engine").mkdir()
+    (tmp_path / "engine" / "pyvenv.cfg").touch()
+
+    def refuse(*_: object) -> None:
+        raise PermissionError("Access is denied")
+
+    monkeypatch.setattr(Path, "rename", refuse)
+    assert module().main([str(tmp_path / "engine"), "nothing"]) == 1
+    assert "is in use; close other Blenders" in json.loads(capsys.readouterr().out.splitlines()[-1])["text"]
+    assert list(tmp_path.rglob("*")) == [tmp_path / "engine", tmp_path / "engine" / "pyvenv.cfg"]

@@ -26,6 +26,8 @@ from core.files import (
     patiently,
     plain_name,
     read_json,
+    remove_file,
+    remove_folder,
     remove_partial,
     remove_partial_of,
     rounded,
@@ -102,6 +104,51 @@ def test_a_file_that_windows_holds_for_a_moment_is_waited_for(tmp_path: Path, mo
     assert [path.name for path in tmp_path.iterdir()] == ["a.txt"]
 
 
+def test_what_windows_holds_for_a_moment_is_removed_after_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    refusals, unlink = [refused_by_windows() for _ in range(3)], Path.unlink
+
+    def held(path: Path, missing_ok: bool = False) -> None:
+        if refusals:
+            raise refusals.pop()
+        unlink(path, missing_ok)
+
+    monkeypatch.setattr(Path, "unlink", held)
+    (tmp_path / "a.txt").touch()
+    remove_file(tmp_path / "a.txt")
+    remove_file(tmp_path / "a.txt")  # it need not be there
+    assert (list(tmp_path.iterdir()), refusals) == ([], [])
+
+
+def test_what_cannot_be_tidied_up_hides_no_failure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
+        raise PermissionError(errno.EACCES, "Permission denied")
+
+    monkeypatch.setattr(Path, "unlink", refuse)
+    with pytest.raises(ZeroDivisionError), atomic_path(tmp_path / "a.txt"):
+        raise ZeroDivisionError
+    (tmp_path / ".partial-b.txt-").touch()
+    remove_partial_of(tmp_path / "b.txt")
+    remove_partial(tmp_path)
+
+
+def test_a_folder_is_removed_whole_or_not_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder, rename = tmp_path / "engine", Path.rename
+    (folder / "python").mkdir(parents=True)
+    (tmp_path / "engine.old-1" / "engine").mkdir(parents=True)  # what was in use when it was removed
+
+    def refuse(*_: object) -> None:
+        raise PermissionError(errno.EACCES, "Access is denied")
+
+    monkeypatch.setattr(Path, "rename", refuse)
+    with pytest.raises(PermissionError):
+        remove_folder(folder)
+    assert list(tmp_path.rglob("*")) == [folder, folder / "python"]
+    monkeypatch.setattr(Path, "rename", rename)
+    remove_folder(folder)
+    remove_folder(folder)  # it need not be there
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_disk_without_permissions_is_written_to(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(_path: Path, _mode: int) -> None:
         raise PermissionError(errno.EPERM, "Operation not permitted")
@@ -119,10 +166,21 @@ def test_what_windows_editors_write_is_read(tmp_path: Path) -> None:
     assert read_json(tmp_path / "lights.json", CaptureError) == {"a": 1}
 
 
-@pytest.mark.parametrize(("name", "expected"), [("Aux", "Aux_"), ("con.flare", "con.flare_"), ("COM1", "COM1_"),
-                                                ("Camera", "Camera"), ("console", "console"), ("com", "com")])
+@pytest.mark.parametrize(("name", "expected"), [
+    ("Aux", "Aux_"), ("con.flare", "con_.flare"), ("COM1", "COM1_"), ("nul .png", "nul_.png"), ("lpt²", "lpt²_"),
+    ("conin$", "conin$_"), ("Camera", "Camera"), ("console", "console"), ("com", "com"), ("a.con", "a.con"),
+    ("conin", "conin")])
 def test_names_of_devices(name: str, expected: str) -> None:
     assert plain_name(name) == expected
+
+
+def test_what_windows_takes_for_a_device_is_no_file_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for windows in (False, True):
+        monkeypatch.setattr("core.files.WINDOWS", windows)
+        for name in ("images/nul.png", "con/0001.png"):
+            with pytest.raises(CaptureError, match="device") if windows else contextlib.nullcontext():
+                assert inside(tmp_path, name, CaptureError) == tmp_path / name
+        assert inside(tmp_path, "console/0001.png", CaptureError) == tmp_path / "console" / "0001.png"
 
 
 def test_a_file_has_several_names(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import errno
 import json
 import os
 import random
@@ -26,7 +27,7 @@ from core.fit import FitSettings, Run, checkpoint, fit, preset
 from core.fit.beginning import NEAREST_PART, nearest_depth
 from core.fit.frames import Frames
 from core.fit.rendering import render_flare
-from core.fit.run import FLARE, SCENE
+from core.fit.run import CHECKPOINT, FLARE, SCENE
 from core.fit.settings import SplitSettings, changed
 from core.fit.sky import COUNT, with_sky
 from core.fit.splitting import from_below, haze, is_found, nearness, scene_beside_flare
@@ -432,6 +433,19 @@ def test_a_capture_whose_name_cannot_be_written_down_is_refused(tmp_path: Path, 
     with pytest.raises(RunError, match="not UTF-8"):
         fit(Capture.open(folder), quick(2), tmp_path / "run")
     assert not (tmp_path / "run").exists()
+
+
+def test_a_fit_whose_checkpoint_is_held_by_another_program_is_done(tmp_path: Path, capture: Capture,
+                                                                    monkeypatch: pytest.MonkeyPatch) -> None:
+    unlink = Path.unlink
+
+    def held(path: Path, missing_ok: bool = False) -> None:
+        if path == tmp_path / "run" / CHECKPOINT:
+            raise PermissionError(errno.EACCES, "The process cannot access the file", str(path))
+        unlink(path, missing_ok)
+
+    monkeypatch.setattr(Path, "unlink", held)
+    assert fit(capture, quick(2), tmp_path / "run").finished
 
 
 def test_a_run_folder_is_not_overwritten(tmp_path: Path, capture: Capture) -> None:

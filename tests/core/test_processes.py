@@ -64,3 +64,40 @@ def test_a_process_of_somebody_else_runs(monkeypatch: pytest.MonkeyPatch, tmp_pa
     for refused, there in ((PermissionError, True), (ProcessLookupError, False)):
         monkeypatch.setattr(processes.os, "kill", lambda *_, refused=refused: (_ for _ in ()).throw(refused))
         assert processes.runs(1) == there
+
+
+@pytest.mark.parametrize("inner", ["python.exe", "Scripts/python.exe", "bin/python"])
+def test_a_python_is_found_in_an_environment_of_every_kind(inner: str, tmp_path: Path) -> None:
+    assert processes.python_at(tmp_path) is None
+    python = tmp_path / inner
+    python.parent.mkdir(exist_ok=True)
+    python.touch()
+    assert processes.python_at(tmp_path) == processes.python_at(python) == python
+
+
+def test_an_environment_whose_base_is_gone_has_no_python(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """On Windows, where its python.exe outlives that."""
+    monkeypatch.setattr(processes, "WINDOWS", True)
+    python, base = tmp_path / "engine" / "Scripts" / "python.exe", tmp_path / "Blender 5.0" / "python.exe"
+    for file in (python, base):
+        file.parent.mkdir(parents=True)
+        file.touch()
+    (tmp_path / "engine" / "pyvenv.cfg").write_text(f"include-system-site-packages = false\nhome = {base.parent} \n")
+    assert processes.python_at(tmp_path / "engine") == processes.python_at(python) == python
+    base.unlink()
+    assert processes.python_at(tmp_path / "engine") is processes.python_at(python) is None
+
+
+def test_a_mac_is_itself_in_every_network(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    names = iter(("studio.local", "guest-17.wifi", "studio.local"))
+    monkeypatch.setattr(processes.platform, "node", lambda: next(names))
+    monkeypatch.setattr(processes.Path, "home", lambda: tmp_path)
+    machine = processes.machine.__wrapped__
+    assert machine() != machine(), "its name, elsewhere"
+    monkeypatch.setattr(processes.sys, "platform", "darwin")
+    told = machine()
+    assert told == machine()
+    assert len(told) == 36
+    assert [path.name for path in tmp_path.rglob("*") if path.is_file()] == ["machine"]
+    monkeypatch.setattr(processes.Path, "home", lambda: tmp_path.joinpath(*tmp_path.rglob("machine")))  # a file
+    assert machine() == "studio.local"

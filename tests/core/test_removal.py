@@ -12,6 +12,7 @@ import struct
 import threading
 import zlib
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +31,7 @@ from core.pictures import Window, read_exr, read_picture, write_exr, write_png
 from core.progress import Progress
 from core.removal import batch, inference, weights
 from core.removal.batch import plates_of, remove_all
-from core.removal.captured import UNFINISHED, check_removed, remove_from
+from core.removal.captured import UNFINISHED, _names, check_removed, remove_from
 from core.removal.inference import FlareMap, Remover, Told, carried_up, flare_light
 from core.removal.mattes import Mattes
 from core.removal.network import LEVELS, SHOWN, RemovalNetwork, seen
@@ -959,6 +960,13 @@ def test_what_is_there_is_kept(tmp_path: Path, everywhere: Path) -> None:
     assert remove_all([source], tmp_path / "out", remover, Progress())["made"] == 1
 
 
+def test_frames_whose_clean_pictures_would_be_one_on_windows_are_told(tmp_path: Path) -> None:
+    capture = Capture.open(make_capture(tmp_path / "capture", 2))
+    capture.views = (replace(capture.views[0], name="a.jpg"), replace(capture.views[1], name="A.png"))
+    with pytest.raises(CaptureError, match=r"The frames a\.jpg and A\.png of .* would both have removed/A\.png"):
+        _names(capture)
+
+
 def test_inputs_that_make_no_sense(tmp_path: Path, everywhere: Path) -> None:
     source = write_codes(tmp_path / "plate.png", picture())
     remover = Remover(everywhere, working_size=64)
@@ -970,6 +978,8 @@ def test_inputs_that_make_no_sense(tmp_path: Path, everywhere: Path) -> None:
     twin = write_codes(tmp_path / "other" / "plate.png", picture())
     with pytest.raises(SettingsError, match="same file"):
         plates_of([source, twin])
+    with pytest.raises(SettingsError, match="same file"):  # on Windows and macOS
+        plates_of([source, twin.rename(twin.with_name("Plate.PNG"))])
 
 
 def test_nothing_that_is_read_is_written_over_and_nothing_twice(tmp_path: Path, nowhere: Path) -> None:

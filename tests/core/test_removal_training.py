@@ -22,7 +22,7 @@ from core.removal import evaluation, network, optimiser, training, weights
 from core.removal.backgrounds import Backgrounds
 from core.removal.bank import OwnFlares
 from core.removal.batches import Batch, Batches, drawn_ahead
-from core.removal.learners import ALONE, Learner, shared
+from core.removal.learners import ALONE, Learner, Table, shared
 from core.removal.network import Attention, RemovalNetwork
 from core.removal.optimiser import Optimiser
 from core.removal.recipe import Recipe, as_dict, from_dict
@@ -126,6 +126,14 @@ def test_learners_see_what_others_have() -> None:
     ALONE.add_up(alone)
     ALONE.hand_round(pieces)
     assert alone[1].tolist() == [1] and [float(piece[0, 0]) for piece in pieces] == [0, 1, 2, 3, 4]
+
+
+def test_what_learners_share_is_never_made_shorter(tmp_path: Path) -> None:
+    """Windows refuses that where another has it mapped."""
+    (tmp_path / "2x3").write_bytes(b"\1" * 64)
+    rows = Table(str(tmp_path), multiprocessing.get_context("spawn").Barrier(1)).rows(2, 3)
+    assert (tmp_path / "2x3").stat().st_size == 64 and rows.shape == (2, 3)
+    assert (rows != 0).all(), "what is there stays"
 
 
 def ends(_learner: Learner) -> None:

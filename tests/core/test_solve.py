@@ -644,3 +644,8 @@ def test_who_asks_a_solve_to_end_is_heard() -> None:
     done = subprocess.run([sys.executable, "-c", LISTENS], cwd=Path(__file__).resolve().parents[2], text=True,
                           capture_output=True, check=False)
     assert (done.returncode, done.stdout.strip()) == (0, "stopped as asked"), done.stderr[-500:]
+
+
+def test_frames_whose_names_differ_by_case_or_suffix_alone_are_two_on_every_disk() -> None:
+    shots = [Shot(name, f"/shoot/{name}", 8, 8, None, 1) for name in ("a.jpg", "A.jpeg", "b.jpg")]
+    assert develop._names(shots) == ["a.png", "A.jpeg.png", "b.png"]

@@ -54,6 +54,13 @@ def test_runs_of_a_list_lie_below_the_folder_for_them(tmp_path: Path, monkeypatc
         assert named == [Path("runs/shoot"), Path("runs/lists"), Path("runs/b")]
 
 
+def test_runs_whose_names_differ_by_case_alone_are_two_on_every_disk(tmp_path: Path) -> None:
+    (tmp_path / "list.txt").write_text("a/Lamp\nb/lamp\nc/desk\n")
+    named = [fit.place(argparse.Namespace(listed=tmp_path / "list.txt", entry=entry, out=Path("runs")))[1]
+             for entry in (1, 2, 3)]
+    assert named == [Path("runs/001_Lamp"), Path("runs/002_lamp"), Path("runs/desk")]
+
+
 def test_a_capture_that_may_not_be_written_to_is_told_before_lights_are_looked_for(
         tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "access", lambda path, mode: (Path(path), mode) != (tmp_path, os.W_OK))
@@ -292,6 +299,17 @@ def test_a_full_disk_under_the_log_is_no_failure(options: str, full: str) -> Non
     done = subprocess.run(f"{run} engine {options} {full}>/dev/full", shell=True, capture_output=True, check=False)
     assert (done.returncode, done.stderr) == (0, b"")
     assert subprocess.run(f"{run} fly {options} {full}>/dev/full", shell=True, check=False).returncode == 2
+
+
+def test_a_torch_that_does_not_load_is_no_refusal_of_a_disk(tmp_path: Path) -> None:
+    """As Windows says that a library of its own is missing."""
+    (tmp_path / "torch").mkdir()
+    (tmp_path / "torch" / "__init__.py").write_text("raise OSError(126, 'The specified module could not be found')")
+    done = subprocess.run([sys.executable, str(cli.hand_off.RUN), "engine"], capture_output=True, check=False,
+                          text=True, env={**os.environ, "PYTHONPATH": str(tmp_path)})
+    assert done.returncode == 1
+    assert done.stderr.startswith("error: torch of ")
+    assert "cannot be loaded (The specified module could not be found)" in done.stderr
 
 
 def test_help_is_shown_on_a_terminal_of_ascii() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import queue
 import shutil
 import signal
 import subprocess
@@ -13,8 +14,10 @@ from typing import Any
 
 import pytest
 from fit_flare.core.errors import Cancelled, EngineError, FitFlareError, SettingsError
+from fit_flare.core.processes import environment
 from fit_flare.core.progress import Progress, stoppable
 from fit_flare.headless import hand_off
+from fit_flare.headless.child import Child, Inbox, next_event
 
 HERE = [sys.executable, str(hand_off.RUN)]
 
@@ -176,6 +179,17 @@ def test_its_crash_is_told_with_its_last_words(tmp_path: Path, capsys: pytest.Ca
 def test_a_program_that_cannot_start_is_a_sentence(tmp_path: Path) -> None:
     with pytest.raises(EngineError, match="cannot be started"):
         hand_off.run_there([str(tmp_path / "nothing")], [], "x", Heard())
+
+
+def test_who_waits_for_an_event_hears_a_stop_meanwhile(tmp_path: Path) -> None:
+    """On Windows no signal gets through to who reads from a pipe."""
+    inbox: Inbox = queue.Queue()
+    silent = Child(child(tmp_path, "time.sleep(60)"), environment(), inbox)
+    assert next_event(inbox) is None
+    silent.interrupt()
+    silent.end()
+    assert next_event(inbox) == (silent, None)
+    assert silent.status != 0
 
 
 @pytest.mark.skipif(os.name == "nt", reason="signals to oneself end the process on Windows")

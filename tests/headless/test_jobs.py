@@ -5,10 +5,11 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import time
 from pathlib import Path
 
 import pytest
-from fit_flare.core.errors import EngineError, FitFlareError, SettingsError
+from fit_flare.core.errors import Cancelled, EngineError, FitFlareError, SettingsError
 from fit_flare.core.progress import Progress
 from fit_flare.headless import hand_off, jobs
 
@@ -18,8 +19,17 @@ word = sys.argv[sys.argv.index("--frames") + 1]
 if word == "bad":
     print(json.dumps({"type": "error", "text": "Frame 7 is damaged."}))
     sys.exit(1)
+if word.startswith("status"):
+    print(json.dumps({"type": "error", "text": "The words are no good."}))
+    sys.exit(int(word[len("status "):]))
+if word == "home":
+    sys.exit(os.environ.get("PYTHONPATH", "nowhere"))
 if word == "killed":
     os._exit(9)
+if word == "sleep":
+    import time
+    time.sleep(60)
+    open(os.path.join(os.path.dirname(__file__), "slept"), "w").close()
 if word == "threads":
     sys.exit(f"{os.environ['OMP_NUM_THREADS']} and {os.environ['NUMBA_NUM_THREADS']}")
 if word == "loud":
@@ -85,3 +95,40 @@ def test_every_failed_process_is_told_those_without_a_reason_too(capfd: pytest.C
     with pytest.raises(EngineError, match="status 1; what one wrote last stands above"):
         run("loud", "fine")
     assert "Bus error at 0x0" in capfd.readouterr().err
+
+
+@pytest.mark.parametrize(("frames", "error"), [
+    (["status 2", "fine"], SettingsError), (["status 130", "status 130"], Cancelled), (["status 1"], FitFlareError),
+    (["status 2", "status 1"], FitFlareError),
+])
+@pytest.mark.usefixtures("program")
+def test_what_several_processes_could_not_do_is_the_error_that_one_would_end_with(
+        frames: list[str], error: type[FitFlareError]) -> None:
+    with pytest.raises(FitFlareError, match=r"^The words are no good\.$") as problem:
+        run(*frames)
+    assert type(problem.value) is error
+
+
+@pytest.mark.usefixtures("program")
+def test_processes_are_led_to_no_modules_of_this_one(monkeypatch: pytest.MonkeyPatch,
+                                                     capfd: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setenv("PYTHONPATH", "/of/blender")
+    with pytest.raises(EngineError):
+        run("home")
+    assert capfd.readouterr().err.strip() == "nowhere"
+
+
+@pytest.mark.usefixtures("program")
+def test_a_python_that_cannot_be_started_is_a_sentence(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(jobs.sys, "executable", str(tmp_path / "python"))
+    with pytest.raises(EngineError, match="cannot be started"):
+        run("fine", "fine")
+
+
+@pytest.mark.usefixtures("program")
+def test_one_that_fails_stops_the_others(tmp_path: Path) -> None:
+    words, began = argparse.Namespace(words=["bake"]), time.monotonic()
+    with pytest.raises(FitFlareError, match=r"^Frame 7 is damaged\.$"):
+        jobs.run_parts(words, "bake", [["--frames", "sleep"], ["--frames", "bad"]], 2, 2, Progress())
+    assert time.monotonic() - began < 30
+    assert not (tmp_path / "slept").exists()

@@ -21,7 +21,7 @@ from typing import Any
 
 from ...choices import Matching
 from ...errors import CaptureError, SettingsError
-from ...files import read_json, write_json
+from ...files import read_json, remove_file, write_json
 from ...pictures import pictures_in
 from ...progress import Progress
 from ..lens import MODELS
@@ -102,7 +102,7 @@ def solve(source: Path | str, out: Path | str, settings: SolveSettings | None = 
     if missing:
         names = ", ".join(Path(chosen[i].file).name for i in missing[:12]) + (", …" if len(missing) > 12 else "")
         progress.say(f"{len(missing)} of {len(chosen)} frames found no place in the model and are left out: {names}.")
-    (out / REPORT).unlink(missing_ok=True)  # it tells of what is about to be replaced
+    remove_file(out / REPORT)  # it tells of what is about to be replaced
     develop.write(chosen, solved, out, work, settings.output_size, progress)
     data = report.figures(chosen, solved, left_out, request, time.monotonic() - began)
     report.picture(solved, out / PICTURE)

@@ -54,13 +54,16 @@ def write(shots: Sequence[Shot], solved: Solved, out: Path, work: Path, size: in
 
 
 def _names(shots: Sequence[Shot]) -> list[str]:
-    """A name for each frame: its file's, with the suffix of a lossless format that holds the file's light."""
+    """A name for each frame: its file's, with the suffix of a lossless format that holds the file's light. No two are
+    one, on any file system."""
     names: list[str] = []
+    taken: set[str] = set()
     for shot in shots:
         file = Path(shot.file)
         suffix = ".exr" if holds_floats(file) else ".png"
         name = file.stem + suffix
-        names.append(file.name + suffix if name in names else name)
+        names.append(file.name + suffix if name.casefold() in taken else name)
+        taken.add(names[-1].casefold())
     return names
 
 

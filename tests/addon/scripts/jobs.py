@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import platform
 import signal
 import subprocess
 import sys
@@ -49,10 +50,14 @@ far.poll()
 facts["stopped elsewhere"] = [far.poll(), far.state, ended]
 silent = begun("silent", GOES_ON, host="another")
 os.utime(silent / jobs.EVENTS, (0, time.time() - 2 * jobs.SILENT_S))
+named = begun("named", GOES_ON, host="6f1c", host_name="studio-mac")
+os.utime(named / jobs.EVENTS, (0, time.time() - 2 * jobs.SILENT_S))
+facts["silent on a Mac"] = jobs.find(named).error
 facts["silent elsewhere"] = [jobs.find(silent).state, jobs.find(silent).error]
 
 # ---- this machine -----------------------------------------------------------------------------------
-facts["written by the version before"] = jobs.find(begun("old", GOES_ON)).state
+facts["written by the version before"] = [jobs.find(begun("old", GOES_ON)).state,
+                                          jobs.find(begun("by name", GOES_ON, host=platform.node())).host == jobs.HOST]
 later = jobs.find(begun("later", GOES_ON, started=time.time() + 3600))  # as when this machine was started anew since
 facts["its number is an older process's"] = later.state
 facts["the stranger lives"] = sleeper.poll() is None
@@ -66,7 +71,8 @@ scene.fit_flare.run = str(own)
 for folder in (own, other, bake):
     jobs.find(folder)
 facts["of the scene"] = [job.folder.name for job in shots.jobs_of(scene)]
-facts["of none"] = [job.folder.name for job in shots.unnamed() if job.folder != out / "old"]
+facts["of none"] = [job.folder.name for job in shots.unnamed()
+                    if job.folder not in (out / "old", out / "by name")]
 cancel = part("flare_addon.operators.fit").FITFLARE_OT_cancel_by_key
 over = SimpleNamespace(region=SimpleNamespace(type="UI", active_panel_category="Fit Flare"), scene=scene,
                        screen=SimpleNamespace(is_animation_playing=True))

@@ -44,8 +44,8 @@ def plates_of(inputs: Iterable[Path], apart_from: Iterable[Path | None] = ()) ->
         for path, name in files:
             key = name.as_posix().casefold()
             if key in found:
-                raise SettingsError(f"{found[key][0]} and {path} would be written to the same file, on Windows and macOS "
-                                    "at least; remove them apart.")
+                raise SettingsError(f"{found[key][0]} and {path} would be written to the same file, on Windows and "
+                                    "macOS at least; remove them apart.")
             found[key] = path, name
     return list(found.values())
 

@@ -11,7 +11,7 @@ from torch.nn import Parameter
 from ..flare.encoding import TABLE
 from ..flare.model import FlareModel
 from ..gaussians.optimiser import Adam
-from ..gaussians.scene import SceneGaussians
+from ..gaussians.scene import COEFFICIENTS, SceneGaussians
 from .checkpoint import State
 from .settings import FitSettings
 
@@ -28,11 +28,11 @@ class Optimisers:
         """extent: of the capture, world units. display_white: display value that frames go up to."""
         self._settings, self._extent = settings, extent
         rates = settings.scene.rates
-        features = torch.full((16, 1), rates.features_rest)
+        features = torch.full((COEFFICIENTS, 1), rates.features_rest)
         features[0] = rates.features * (RATE_ABOVE_WHITE if display_white > 1 else 1)
         chosen: dict[str, float | Tensor] = {
             "means": self._means_rate(0.0), "log_scales": rates.scale, "quaternions": rates.rotation,
-            "opacity_logits": rates.opacity, "sh": features.expand(16, 3).contiguous(),
+            "opacity_logits": rates.opacity, "sh": features.expand(COEFFICIENTS, 3).contiguous(),
         }
         self.scene = Adam(dict(scene.named_parameters()), chosen)
         self.flare, self.grids = _of_flare(flare, settings)

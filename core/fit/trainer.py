@@ -27,6 +27,7 @@ from ..gaussians import Splats
 from ..gaussians.densification import Classic, Mcmc, Strategy
 from ..gaussians.loss import l1_ssim
 from ..gaussians.ordering import morton_order
+from ..gaussians.spherical_harmonics import MAX_DEGREE
 from ..progress import Progress
 from . import metering
 from .beginning import first_flare, first_scene, moved_lights
@@ -261,9 +262,9 @@ class Trainer:
 
     def _sh_degree(self) -> int:
         if self.settings.scene.start:
-            return 3  # it was trained before
+            return MAX_DEGREE  # it was trained before
         plain = self.settings.mode == "split" and self.iteration <= self.settings.split.plain * self.settings.iterations
-        most = self.settings.split.sh_degree if plain else 3
+        most = self.settings.split.sh_degree if plain else MAX_DEGREE
         return min(most, self.iteration // self.settings.scene.sh_every)
 
     def _generator(self, number: int, purpose: int) -> torch.Generator:

@@ -24,6 +24,9 @@ from .kernels import fused
 
 Rate = float | Tensor
 
+BETA1, BETA2 = 0.9, 0.999
+"""How much of the running means stays with each step, of the gradient and of its square."""
+
 
 class Moments(NamedTuple):
     """Running means of the gradient and of its square, shaped as the parameter."""
@@ -43,8 +46,7 @@ class Adam:
 
     def __init__(
         self, parameters: Mapping[str, Parameter], rates: Rate | Mapping[str, Rate],
-        *, betas: tuple[float, float] = (0.9, 0.999), epsilon: float = 1e-15,
-        kernels: Literal["auto", "torch"] = "auto",
+        *, epsilon: float = 1e-15, kernels: Literal["auto", "torch"] = "auto",
     ) -> None:  # fmt: skip
         self.parameters = dict(parameters)
         self.rates: dict[str, Rate] = (
@@ -52,7 +54,6 @@ class Adam:
         )
         if unknown := self.rates.keys() - self.parameters.keys():
             raise SettingsError(f"There is no parameter {min(unknown)!r} to give a learning rate to.")
-        self.betas = betas
         self.epsilon = epsilon
         self.kernels = kernels
         self.moments = {name: _zeros(p) for name, p in self.parameters.items()}
@@ -60,7 +61,7 @@ class Adam:
 
     @property
     def _options(self) -> dict[str, Any]:
-        return {"beta1": self.betas[0], "beta2": self.betas[1], "epsilon": self.epsilon}
+        return {"beta1": BETA1, "beta2": BETA2, "epsilon": self.epsilon}
 
     @contextmanager
     def stepping(self) -> Iterator[None]:

@@ -95,7 +95,7 @@ class DeformationNetwork(nn.Module):
         self.register_buffer("light_high", torch.tensor(query_range.light_high), persistent=False)
 
     def view_features(self, camera: Tensor, light: Tensor) -> Tensor:
-        """Features (64,) of a camera position (3,), world units, and a light (2,), normalised coordinates."""
+        """Features (4 levels,) of a camera position (3,), world units, and a light (2,), normalised coordinates."""
         # A wide extent along one axis and none along another still maps by one scale for each axis.
         where = (camera - self.camera_low) / self.camera_extent
         return torch.cat([self.light_grid(light_input(light) / self.light_high), self.camera_grid(where)])

@@ -10,7 +10,8 @@ from torch import Tensor
 
 from ..capture import Camera
 from ..choices import Blend
-from ..flare.compositing import Layers, decode, encode, exposed, joined, layers, splat_flare
+from ..display import decode, encode, exposed
+from ..flare.compositing import Layers, joined, layers, splat_flare
 from ..flare.model import FlareModel
 from ..flare.placement import PlaneGaussians
 from ..flare.visibility import VisibilitySettings, visible_shares

@@ -19,8 +19,9 @@ from torch.nn import Parameter
 
 from ..capture import Capture, View
 from ..capture.discs import clipped_discs
+from ..display import clipped
 from ..errors import CaptureError, RunError
-from ..flare.compositing import clipped, composite
+from ..flare.compositing import composite
 from ..flare.density import clone_and_prune
 from ..flare.visibility import clear_shares, uncovering
 from ..gaussians import Splats

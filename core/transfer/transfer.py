@@ -22,10 +22,10 @@ from ..bake.frames import Frame
 from ..bake.layers import FrameLayers, Rendered
 from ..capture import Camera
 from ..colour import ColourSpace, colour_space
+from ..display import decode, encode
 from ..errors import SettingsError
 from ..files import check_apart, remove_partial_of
 from ..fit.rendering import render_scene, splat_look
-from ..flare.compositing import decode, encode
 from ..flare.compositing import layers as linear_layers
 from ..flare.visibility import VisibilitySettings, share_seen
 from ..gaussians import Splats

@@ -14,10 +14,11 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from core.capture import Camera
+from core.display import decode, encode
 from core.errors import FlareFileError
 from core.flare import file as flare_file
 from core.flare import placement
-from core.flare.compositing import composite, decode, encode, joined, layers, splat_flare
+from core.flare.compositing import composite, joined, layers, splat_flare
 from core.flare.deformation import QueryRange
 from core.flare.density import DensitySettings, clone_and_prune
 from core.flare.encoding import HashGrid, frequency_encoding

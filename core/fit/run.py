@@ -16,7 +16,6 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .. import exposures
 from ..capture import Camera, Capture
@@ -28,6 +27,7 @@ from ..gaussians.ply import read_ply
 from ..gaussians.scene import SceneGaussians
 from ..look import Look, LookEdits
 from ..look import read as read_look
+from ..pictures import Pixels
 from ..typed import is_utf8
 from .rendering import RenderedView, render
 from .settings import FitSettings, read_config, write_config
@@ -43,7 +43,6 @@ SMALL_PREVIEW = "preview_small.png"
 EVALUATION = "eval.json"
 LOG = "log.txt"
 
-Pixels = NDArray[np.float32]
 
 
 @dataclass(frozen=True)

@@ -21,10 +21,10 @@ from ..choices import ITERATIONS, Blend, Mode, Model, Preset
 from ..errors import RunError, SettingsError
 from ..files import WRITTEN_BY_HAND, write_text
 from ..flare.density import DensitySettings
-from ..flare.model import OURS, PAPER, FlareForm
+from ..flare.model import OURS, PAPER
 from ..flare.visibility import VisibilitySettings
 from ..gaussians.densification import ClassicSettings, McmcSettings
-from ..look.look import FORM_BOUNDS, MOST_GAUSSIANS
+from ..look.look import FORM_BOUNDS, MOST_GAUSSIANS, FlareForm
 from ..pictures import srgb_from_linear
 from ..typed import MOST_SEED, WHOLE_DIGITS, Bounds, field_of, table_of
 

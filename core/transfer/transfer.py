@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from ..bake.bake import BakeSettings, bake_frames
 from ..bake.frames import Frame
@@ -31,15 +30,13 @@ from ..flare.visibility import VisibilitySettings, share_seen
 from ..gaussians import Splats
 from ..look import LookEdits, ViewOfLight, read
 from ..look.shot import PlacedLight
-from ..pictures import Picture
+from ..pictures import Picture, Pixels
 from ..progress import Progress
 from . import query as queries
 from .plates import AUTO, ColouredPlate
 from .query import Query
 from .target import Target, TargetFrame, background
 from .visibility import smoothed
-
-Pixels = NDArray[np.float32]
 
 SURE = 0.02
 """Splats never hide all of a light, nor show all of it: a share so near to none or the whole is taken for that. Not so

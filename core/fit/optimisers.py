@@ -2,8 +2,6 @@
 """What steps scene and flare, and how its rates fall along a fit."""
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from torch import Tensor
 from torch.nn import Parameter
@@ -87,7 +85,7 @@ def _decayed(first: float, last: float, progress: float) -> float:
     return first * (last / first) ** min(max(progress, 0.0), 1.0)
 
 
-def _of_flare(flare: FlareModel | None, settings: FitSettings) -> tuple[Adam | None, Any]:
+def _of_flare(flare: FlareModel | None, settings: FitSettings) -> tuple[Adam | None, torch.optim.SparseAdam | None]:
     """Adam for networks and Gaussians; for the grids one that updates only the rows that a view touched."""
     if flare is None:
         return None, None

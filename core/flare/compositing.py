@@ -18,11 +18,11 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ..choices import Blend
+from ..choices import Blend, Kernels
 from ..display import decode, decoded_with_slope, encoded_with_slope
 from ..exposures import brightness
 from ..gaussians import Splats, over, splat
-from ..gaussians.rasterizer import Kernels, Resolution
+from ..gaussians.rasterizer import Resolution
 from ..sampling import Sampling
 from . import placement
 from .placement import PlaneGaussians

@@ -18,8 +18,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ..choices import Kernels
 from ..gaussians import rasterization
-from ..gaussians.rasterizer import Kernels
 from ..gaussians.scene import SceneGaussians
 from .model import FlareModel
 

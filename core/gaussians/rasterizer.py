@@ -6,7 +6,7 @@ from typing import Literal
 
 from torch import Tensor
 
-from ..choices import Blend
+from ..choices import Blend, Kernels
 from ..errors import SettingsError
 from ..sampling import DILATION
 from .kernels import choose
@@ -14,7 +14,6 @@ from .mixed import splat_mixed
 from .rendering import NEAR, Rendering, Splats, levelled
 from .spherical_harmonics import degree_of
 
-Kernels = Literal["auto", "torch", "tiles", "cpu", "cuda"]
 Resolution = Literal["full", "mixed"]
 
 

@@ -7,11 +7,12 @@ import torch
 from torch import Tensor, nn
 
 from ..capture import Camera, PointCloud
+from ..choices import Kernels
 from ..errors import SettingsError
 from ..sampling import Sampling, dilation
 from . import spherical_harmonics
 from .ordering import nearest_distances
-from .rasterizer import Kernels, rasterization
+from .rasterizer import rasterization
 from .rendering import NEAR, Rendering
 
 COEFFICIENTS = (spherical_harmonics.MAX_DEGREE + 1) ** 2

@@ -129,7 +129,7 @@ class LightLook:
     """The flare of one light; made by `read`."""
 
     def __init__(self, name: str, xyz: NDArray[np.float64], form: FlareForm, query_range: QueryRange,
-                 rows: Mapping[str, Floats], tensors: Mapping[str, NDArray[Any]], blend: str,
+                 rows: Mapping[str, Floats], tensors: Mapping[str, NDArray[Any]], blend: Blend,
                  listed: list[Element], clear: float = 1.0) -> None:
         """rows: canonical Gaussians by name; tensors: the network's; listed: elements the file has, [] for none.
         clear: what the scene it was learned in leaves of the light where nothing hides it, 0..1
@@ -369,7 +369,7 @@ def read(path: Path | str) -> Look:
                 Sampling.read(description.get("sampling")))
 
 
-def _light(number: int, entry: Mapping[str, Any], tensors: Mapping[str, NDArray[Any]], blend: str,
+def _light(number: int, entry: Mapping[str, Any], tensors: Mapping[str, NDArray[Any]], blend: Blend,
            listed: Any) -> LightLook:
     form, name, count = FlareForm(**entry["form"]), str(entry["name"]), int(entry["count"])
     xyz = np.array([float(value) for value in entry["xyz"]], np.float64)

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import ArrayLike
 
 from ..bake.bake import BakeSettings, bake_frames
 from ..bake.frames import Frame
@@ -66,7 +67,7 @@ class Transfer:
     """
 
     def __init__(self, flare: Path, target: Target, settings: TransferSettings | None = None,
-                 training: Sequence[Any] | None = None, config: str | None = None) -> None:
+                 training: Sequence[ArrayLike] | None = None, config: str | None = None) -> None:
         self.flare, self.target, self.settings, self.config = flare, target, settings or TransferSettings(), config
         self.look = read(flare)
         self.sources = {light.name: light for light in self.look.lights}

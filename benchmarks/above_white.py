@@ -24,7 +24,7 @@ from core.capture import Capture, View
 from core.choices import OUR_PRESETS
 from core.errors import CaptureError
 from core.fit import Run, fit, preset
-from core.fit.beginning import WHITEST
+from core.fit.metering import WHITEST
 from core.metrics.pictures import relative_l2
 from core.pictures import Picture
 

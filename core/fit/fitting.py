@@ -20,8 +20,8 @@ from ..look import TrainedCamera, list_elements
 from ..progress import Progress
 from ..sampling import Sampling
 from . import checkpoint
-from .beginning import with_white
 from .doubts import unlike
+from .metering import with_white
 from .preview import row, spread, write_preview, write_small
 from .rendering import render
 from .run import CHECKPOINT, CONFIG, FLARE, LOG, METRICS, PREVIEW, SCENE, SMALL_PREVIEW, Run

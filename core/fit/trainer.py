@@ -31,9 +31,9 @@ from ..gaussians.ordering import morton_order
 from ..gaussians.spherical_harmonics import MAX_DEGREE
 from ..progress import Progress
 from . import metering
-from .beginning import first_flare, first_scene, moved_lights
+from .beginning import first_flare, first_scene
 from .checkpoint import State
-from .doubts import doubts
+from .doubts import doubts, moved_lights
 from .frames import Frames, Targets, thinned
 from .given import Given
 from .optimisers import Optimisers

@@ -16,8 +16,8 @@ from core.capture import Capture, View
 from core.display import decode, encode
 from core.errors import SettingsError
 from core.fit import FitSettings, Run, fit, preset
-from core.fit.beginning import WHITEST, with_white
 from core.fit.frames import Frames, Targets
+from core.fit.metering import WHITEST, with_white
 from core.fit.run import FLARE
 from core.fit.settings import changed
 from core.fit.sky import with_sky

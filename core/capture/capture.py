@@ -269,7 +269,7 @@ class Capture:
         if unknown:
             raise CaptureError(f"{path} names {min(unknown)!r}, which is not a frame of the capture.")
         if len(set(names)) < len(names):
-            raise CaptureError(f"{path} names a frame twice.")
+            raise CaptureError(f"{path} names a frame twice; name each once.")
         return set(names)
 
     def _check_layers(self) -> None:

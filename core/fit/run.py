@@ -96,7 +96,7 @@ class Run:
         """A run folder as it is. RunError where it is none."""
         folder = Path(folder)
         if not (folder / CONFIG).is_file():
-            raise RunError(f"{folder} is not the folder of a run (it has no {CONFIG}).")
+            raise RunError(f"{folder} is not the folder of a run (it has no {CONFIG}); name one that fit has written.")
         settings = read_config(folder / CONFIG)
         try:
             capture = Path((folder / CAPTURE).read_text(encoding="utf-8").removesuffix("\n"))

@@ -107,7 +107,9 @@ def choose(name: str, like: Tensor) -> KernelSet:
     if name == "auto":
         name = _fastest(like)
     if name not in MODULES:
-        raise SettingsError(f"kernels are {', '.join(MODULES)} or auto, not {name!r}.")
+        raise SettingsError(
+            f"Gaussians are rasterized by the kernels {', '.join(MODULES)} or auto, not {name!r}; choose one of those."
+        )
     kernels = _load(name)
     if isinstance(kernels, ImportError):
         raise EngineError(

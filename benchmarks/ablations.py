@@ -44,7 +44,7 @@ from benchmarks.bilateral import GradedScene
 from benchmarks.hidden_lights import hidden_flare
 from benchmarks.known_scene import KnownScene, score
 from core.capture import Camera, Capture, Light
-from core.choices import Preset
+from core.choices import OUR_PRESETS, Preset
 from core.files import write_json
 from core.fit import fit
 from core.fit.frames import Frames
@@ -379,7 +379,7 @@ def main() -> None:
     parser.add_argument("--captures", nargs="+", type=Path, default=[SAMPLE])
     parser.add_argument("--only", nargs="+", choices=STUDIES)
     parser.add_argument("--variants", nargs="+", metavar="NAME", help="of the studies' rows; all by default")
-    parser.add_argument("--preset", choices=("draft", "standard", "high"), default="draft")
+    parser.add_argument("--preset", choices=OUR_PRESETS, default="draft")
     parser.add_argument("--iterations", type=int, help="of each fit, with every schedule stretched to it")
     parser.add_argument("--seed", type=int, default=0, help="of every fit (default 0)")
     parser.add_argument("--width", type=int, default=240, help="of the frames; 0: as filmed (default 240)")

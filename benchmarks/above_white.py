@@ -21,9 +21,10 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks import report
 from core.capture import Capture, View
+from core.choices import OUR_PRESETS
 from core.errors import CaptureError
 from core.fit import Run, fit, preset
-from core.fit.beginning import WHITEST
+from core.fit.metering import WHITEST
 from core.metrics.pictures import relative_l2
 from core.pictures import Picture
 
@@ -66,7 +67,7 @@ def main() -> None:
     """Print a row for each capture and mode, with the light above white and without."""
     parser = argparse.ArgumentParser(description="Fits of float frames, with and without light above white.")
     parser.add_argument("captures", type=Path, nargs="+")
-    parser.add_argument("--preset", choices=("draft", "standard", "high"), default="draft")
+    parser.add_argument("--preset", choices=OUR_PRESETS, default="draft")
     parser.add_argument("--modes", choices=("default", "split"), nargs="+", default=["default", "split"])
     words = parser.parse_args()
     rows = []

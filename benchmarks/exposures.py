@@ -24,6 +24,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks import report
 from core.capture import Capture, View
+from core.choices import OUR_PRESETS
 from core.fit import Run, fit, preset
 from core.metrics.evaluation import LAYERS, evaluate
 from core.pictures import Picture, srgb_from_linear
@@ -101,7 +102,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Frames whose exposure changes.")
     parser.add_argument("captures", type=Path, nargs="+")
     parser.add_argument("--stops", type=float, default=0.7, help="to either side")
-    parser.add_argument("--preset", choices=("draft", "standard", "high"), default="draft")
+    parser.add_argument("--preset", choices=OUR_PRESETS, default="draft")
     parser.add_argument("--size", type=int, default=240, help="width at which it is fitted")
     words = parser.parse_args()
     for folder in words.captures:

@@ -9,10 +9,11 @@ import numpy as np
 import torch
 
 from core.capture import View
+from core.display import decode
 from core.errors import CaptureError
 from core.fit.rendering import render_flare
 from core.fit.trainer import Trainer
-from core.flare.compositing import composite, decode
+from core.flare.compositing import composite
 from core.gaussians.loss import l1_ssim
 from core.metrics.evaluation import out_of_range
 from core.metrics.pictures import psnr, relative_l2

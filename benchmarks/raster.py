@@ -43,8 +43,9 @@ from benchmarks import opensplat, report, workload
 from benchmarks.report import milliseconds, table
 from benchmarks.resident import held, held_at_most
 from benchmarks.timing import medians, on_threads, once, threads
+from core.fit.optimisers import Optimisers
+from core.fit.settings import FitSettings
 from core.gaussians import Adam, SceneGaussians, kernels, l1_ssim, over, rasterization, splat
-from core.gaussians.scene import learning_rates
 from core.gaussians.spherical_harmonics import colours
 
 Engine = Callable[..., Tensor]
@@ -145,7 +146,7 @@ class Iteration:
         self.camera = (torch.eye(4), workload.intrinsics(job.width, job.height))
         self.target = torch.rand(job.height, job.width, 3, generator=torch.Generator().manual_seed(0))
         parameters = dict(self.scene.named_parameters())
-        rates = dict(learning_rates(1.0))
+        rates = Optimisers(self.scene, None, FitSettings(), extent=1.0, display_white=1.0).scene.rates
         if job.flares:
             parameters |= {f"flare{i}": p for i, p in enumerate(self.flares)}
             rates |= {f"flare{i}": 1e-6 for i in range(len(self.flares))}

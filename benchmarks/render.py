@@ -33,9 +33,10 @@ from core.choices import Blend
 from core.fit.run import Run
 from core.flare.compositing import composite, joined
 from core.flare.deformation import QueryRange
-from core.flare.model import OURS, PAPER, FlareForm, FlareModel, LightFlare
+from core.flare.model import OURS, PAPER, FlareModel, LightFlare
 from core.flare.placement import PlaneGaussians, pixels, slopes
 from core.gaussians import SceneGaussians, kernels, splat
+from core.look.look import FlareForm
 
 SIZES = ((1920, 1080), (3840, 2160))
 SCENE, FLARE = 162_283, 10_965

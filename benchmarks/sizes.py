@@ -21,6 +21,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks import report
 from core.capture import Capture, View
+from core.choices import OUR_PRESETS
 from core.errors import CaptureError
 from core.fit import Run, fit, preset
 from core.metrics.pictures import psnr
@@ -70,7 +71,7 @@ def main() -> None:
     """Print a table for each capture."""
     parser = argparse.ArgumentParser(description="A fit at other sizes than its own.")
     parser.add_argument("captures", type=Path, nargs="+")
-    parser.add_argument("--preset", choices=("draft", "standard", "high"), default="draft")
+    parser.add_argument("--preset", choices=OUR_PRESETS, default="draft")
     parser.add_argument("--size", type=int, default=240, help="width at which it is fitted")
     words = parser.parse_args()
     for folder in words.captures:

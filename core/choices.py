@@ -8,7 +8,10 @@ Preset = Literal["draft", "standard", "high", "paper"]
 Mode = Literal["default", "split", "unsup", "in-flare", "2d", "3dgs"]
 Model = Literal["paper", "ours"]
 Blend = Literal["over", "add"]
+Kernels = Literal["auto", "torch", "tiles", "cpu", "cuda"]
 Matching = Literal["auto", "exhaustive", "sequential", "similar"]
 
+OUR_PRESETS: tuple[Preset, ...] = ("draft", "standard", "high")
+"""Those of our form, the shortest first."""
 ITERATIONS: dict[Preset, int] = {"draft": 1500, "standard": 3000, "high": 10000, "paper": 30000}
 """Length of a fit by its preset."""

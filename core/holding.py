@@ -18,7 +18,7 @@ _TAKEN = (errno.EACCES, errno.EAGAIN, errno.EWOULDBLOCK, errno.EDEADLK)
 
 @contextlib.contextmanager
 def held(folder: Path | str) -> Iterator[None]:
-    """Have a folder, which is made where it is missing, and nothing is left of one that nothing was put into.
+    """Have a folder. It is made where it is missing, and removed again at the end if nothing was put into it.
 
     Raises RunError where another process has it. On a disk that knows no locks nobody is kept out.
     """

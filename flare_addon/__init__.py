@@ -5,7 +5,8 @@
     capture_import.py   captures in                       capture_export.py   Blender's cameras as captures
     cameras.py          Blender's cameras and the core's  lights.py        light objects
     engine.py, jobs.py  the process with torch            fits.py          fits
-    looks.py            .flare, flares, occlusion         overlay.py, points.py   what is drawn in the viewport
+    looks.py            .flare, flares                    occlusion.py     what of a light is seen
+    overlay.py, points.py   what is drawn in the viewport
     shots.py            what is baked                     compositor.py    layers back together
     flare_node.py       what puts layers together         wires.py         the panel's sliders on it
     library.py          flares for other shots            paths.py         files of a .blend that moves

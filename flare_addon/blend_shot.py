@@ -17,7 +17,7 @@ import numpy as np
 from ..core.errors import CaptureError
 from ..core.files import write_json
 from ..core.look.shot import PlacedLight, Shot, ShotFrame
-from . import cameras, capture_export, lights, looks
+from . import cameras, capture_export, lights, occlusion
 from .objects import collections_shown, matrix_of
 
 KINDS = ("POINT", "SPOT", "AREA", "SUN")
@@ -81,7 +81,7 @@ def _lights(scene: Any, names: Sequence[str]) -> list[Any]:
 
 def _placed(scene: Any, depsgraph: Any, thing: Any, eye: Any, radius: float) -> PlacedLight:
     item = SimpleNamespace(target=thing, radius=radius or _radius(thing))
-    share = looks.visible_share(scene, depsgraph, eye, item)
+    share = occlusion.visible_share(scene, depsgraph, eye, item)
     where = np.array(lights.stands(thing, matrix_of(thing, depsgraph), eye), np.float64)
     return PlacedLight(thing.name, thing.name, where, float(share))
 

@@ -1,9 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The look of a scene: its .flare, which object each flare comes from, what it shows in a camera, occlusion."""
+"""The look of a scene: its .flare, which object each flare comes from, what it shows in a camera."""
 from __future__ import annotations
 
-import math
-from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -14,15 +12,11 @@ from ..core.errors import FlareFileError
 from ..core.look import Edit, Look, LookEdits, PlaneGaussians, read
 from ..core.look.look import Query
 from ..core.look.shot import PlacedLight, evaluate
-from . import cameras, curves, wires
+from . import cameras, curves, occlusion, wires
 from .lights import name_of, of_scene, place_of, stands
 from .objects import matrix_of
 from .paths import absolute, stored
 from .properties import edit_of
-
-LIGHT_SHARE = 0.02  # of a light's distance: the disc's radius where none is given; as a fit's, two deviations wide
-MARGIN = 0.06  # what stands nearer to the light than this share of its distance is the lamp itself
-RAYS = 25
 
 _cache: dict[str, tuple[tuple[float, int], Look | str]] = {}
 
@@ -171,7 +165,7 @@ def placed(scene: Any, depsgraph: Any, camera: Any) -> tuple[NDArray[np.float64]
         if not is_placed(item, scene):
             continue
         where = stands(item.target, matrix_of(item.target, depsgraph), matrix.translation)
-        share = visible_share(scene, depsgraph, matrix.translation, item) if state.occlusion else 1.0
+        share = occlusion.visible_share(scene, depsgraph, matrix.translation, item) if state.occlusion else 1.0
         xyz = (into @ np.array([*where, 1.0]))[:3]
         lights.append(PlacedLight(item.name, item.source, xyz, share))
     return cameras.pose_in_capture(matrix, root), lights
@@ -184,81 +178,6 @@ def seen(scene: Any, depsgraph: Any, camera: Any) -> dict[str, PlaneGaussians]:
     found = evaluate(look, pose, lights, edits_of(scene.fit_flare), query_of(scene.fit_flare))
     exposure = camera.evaluated_get(depsgraph).fit_flare.exposure
     return {name: one.exposed(exposure, look.blend) for name, one in found.items()}
-
-
-# ---- occlusion ------------------------------------------------------------------------------------
-
-
-def _disk() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Points of a sunflower on the unit disk (n, 2), and weights that fall off to the rim."""
-    index = np.arange(RAYS) + 0.5
-    radius, angle = np.sqrt(index / RAYS), index * math.pi * (3 - math.sqrt(5))
-    weights = np.exp(-2.0 * radius**2)
-    return np.stack([radius * np.cos(angle), radius * np.sin(angle)], -1), weights / weights.sum()
-
-
-_POINTS, _WEIGHTS = _disk()
-
-
-def visible_share(scene: Any, depsgraph: Any, eye: Any, item: Any) -> float:
-    """How much of a light's disk the eye sees past the scene's objects, 0..1, by rays to points of the disk.
-
-    What stands right at the light (within 6% of the distance) is the lamp itself and hides nothing, and so do its
-    children and what it or they are instances of.
-    """
-    where = stands(item.target, matrix_of(item.target, depsgraph), eye)
-    lamp = (item.target, *item.target.children_recursive)
-    own = {thing.name for thing in lamp}
-    instances = _instances_of(depsgraph, own) if any(thing.is_instancer for thing in lamp) else set()
-    return share_seen(scene, depsgraph, eye, where, own, item.radius, instances)
-
-
-def _instances_of(depsgraph: Any, parents: set[str]) -> set[tuple[str, Any]]:
-    """The instances that objects of these names show, each by its object's name and where it is."""
-    return {(one.object.original.name, one.matrix_world.copy().freeze()) for one in depsgraph.object_instances
-            if one.is_instance and one.parent.original.name in parents}
-
-
-def share_seen(scene: Any, depsgraph: Any, eye: Any, light: Any, own: set[str], disk: float = 0.0,
-               instances: Collection[tuple[str, Any]] = ()) -> float:
-    """How much of a disk about the point `light` the eye sees past all objects but `own` and these instances (name and
-    matrix_world), 0..1; its radius in world units, 0 for a share of the distance."""
-    from mathutils import Vector
-
-    away = light - eye
-    distance = away.length
-    if distance < 1e-6:
-        return 1.0
-    radius = disk or LIGHT_SHARE * distance
-    forward = away / distance
-    right = forward.orthogonal().normalized()
-    up = forward.cross(right)
-    share = 0.0
-    reach = (1 - MARGIN) * distance
-    for (x, y), weight in zip(_POINTS.tolist(), _WEIGHTS.tolist(), strict=True):
-        target = light + radius * (x * right + y * up)
-        direction = (target - eye).normalized()
-        start, left, clear = Vector(eye), reach, True
-        for _ in range(4):  # past the lamp's own meshes
-            hit, where, _normal, _index, thing, matrix = scene.ray_cast(depsgraph, start, direction, distance=left)
-            if not hit:
-                break
-            if thing is None or not (thing.original.name in own or _is_unseen(thing)
-                                     or any(thing.original.name == name and matrix == place
-                                            for name, place in instances)):
-                clear = False
-                break
-            step = (where - start).length + 1e-4 * distance
-            start, left = start + direction * step, left - step
-            if left <= 0:
-                break
-        share += weight * clear
-    return min(share, 1.0)  # of rounding
-
-
-def _is_unseen(thing: Any) -> bool:
-    """Whether pictures of the camera do not show an object that the viewport has."""
-    return bool(thing.original.hide_render) or not thing.original.visible_camera
 
 
 def forget() -> None:

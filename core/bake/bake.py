@@ -75,7 +75,7 @@ class _OfView:
     renderer: Renderer
     camera: Camera
     words: tuple[str, ...] = ()
-    rest: tuple[Path, ...] = ()
+    rest = ()
 
     @property
     def fingerprint(self) -> str:

@@ -84,7 +84,7 @@ class _OfFrame:
 
     renderer: ShotRenderer
     one: ShotFrame
-    rest: tuple[Path, ...] = ()
+    rest = ()
 
     @property
     def fingerprint(self) -> str:

@@ -252,14 +252,6 @@ class Capture:
             raise CaptureError(f"{holdout} holds out every view, so that none is left to train on.")
         return train, tuple(view for view in self.views if view.name in names)
 
-    def summary(self) -> dict[str, Any]:
-        """What the capture holds, JSON-able."""
-        sizes = sorted({view.camera.size for view in self.views})
-        return {"folder": str(self.folder), "views": len(self.views), "sizes": [list(size) for size in sizes],
-                "points": len(self.points), "lights": [light.name for light in self.lights],
-                "distorted": any(view.lens for view in self.views), "removed": self.has_removed,
-                "truth": self.has_truth, "extent": self.extent}
-
     # How the pictures are had.
 
     def _picture(self, path: Path, view: View, size: tuple[int, int] | None) -> Picture:
@@ -277,7 +269,7 @@ class Capture:
         if unknown:
             raise CaptureError(f"{path} names {min(unknown)!r}, which is not a frame of the capture.")
         if len(set(names)) < len(names):
-            raise CaptureError(f"{path} names a frame twice.")
+            raise CaptureError(f"{path} names a frame twice; name each once.")
         return set(names)
 
     def _check_layers(self) -> None:

@@ -75,7 +75,7 @@ def read_model(folder: Path) -> tuple[list[Posed], PointCloud]:
     for name, camera, quaternion, translation, seen in images:
         if camera not in lenses:
             raise CaptureError(f"{_path(folder, 'images')} gives {name} the camera {camera}, which "
-                               f"{_path(folder, 'cameras')} does not have.")
+                               f"{_path(folder, 'cameras')} does not have; export the whole model again.")
         where = f"{_path(folder, 'images')}, {name}:"
         pose = np.eye(4)
         length = math.sqrt(sum(q * q for q in quaternion))
@@ -138,11 +138,12 @@ def write_model(folder: Path, frames: Sequence[Observed], cloud: PointCloud) -> 
 def check_lens(lens: Lens, where: str) -> Lens:
     """`lens`, or CaptureError where its numbers cannot be a camera's."""
     if lens.width <= 0 or lens.height <= 0 or lens.width * lens.height > LARGEST:
-        raise CaptureError(f"{where} a size of {lens.width} x {lens.height} pixels makes no sense.")
+        raise CaptureError(f"{where} a size of {lens.width} x {lens.height} pixels makes no sense; solve the cameras "
+                           "again.")
     if not all(map(math.isfinite, lens.params)):
-        raise CaptureError(f"{where} the camera parameters are not finite numbers.")
+        raise CaptureError(f"{where} the camera parameters are not finite numbers; solve the cameras again.")
     if min(lens.focal) <= 0:
-        raise CaptureError(f"{where} the focal length {min(lens.focal):g} is not positive.")
+        raise CaptureError(f"{where} the focal length {min(lens.focal):g} is not positive; solve the cameras again.")
     return lens
 
 
@@ -213,7 +214,8 @@ def _cameras_bin(file: _Bytes) -> dict[int, Lens]:
     for _ in range(file.count(24)):
         camera, number, width, height = file.take("iiQQ")
         if number not in NAMES:
-            raise CaptureError(f"{file.path} has a camera of model {number}, which this program does not know.")
+            raise CaptureError(f"{file.path} has a camera of model {number}, which this program does not know; solve "
+                               "the cameras again with another model (OPENCV, for instance).")
         model = NAMES[number]
         params = file.take("d" * len(MODELS[model][1]))
         _add_lens(lenses, file.path, camera, Lens(model, params, width, height))
@@ -226,18 +228,19 @@ def _cameras_txt(path: Path, lines: list[str]) -> dict[int, Lens]:
         words = line.split()
         model = words[1] if len(words) > 1 else ""
         if model not in MODELS:
-            raise CaptureError(f"{path}, line {number}: {model!r} is no camera model this program knows.")
+            raise CaptureError(f"{path}, line {number}: {model!r} is no camera model this program knows; solve the "
+                               "cameras again with another (OPENCV, for instance).")
         camera, width, height, *params = _numbers(path, number, [words[0], *words[2:]], "iii")
         if len(params) != len(MODELS[model][1]):
             raise CaptureError(f"{path}, line {number}: {model} takes {len(MODELS[model][1])} parameters "
-                               f"({' '.join(MODELS[model][1])}), not {len(params)}.")
+                               f"({' '.join(MODELS[model][1])}), not {len(params)}; export the model again.")
         _add_lens(lenses, path, camera, Lens(model, tuple(params), width, height))
     return lenses
 
 
 def _add_lens(lenses: dict[int, Lens], path: Path, camera: int, lens: Lens) -> None:
     if camera in lenses:
-        raise CaptureError(f"{path} has two cameras with the number {camera}.")
+        raise CaptureError(f"{path} has two cameras with the number {camera}; export the model again.")
     lenses[camera] = check_lens(lens, f"{path}, camera {camera}:")
 
 
@@ -268,11 +271,12 @@ def _images_txt(path: Path, lines: list[str]) -> list[Image]:
         words = line.split(maxsplit=9)
         if len(words) < 10:
             raise CaptureError(f"{path}, line {number}: an image takes ten values (number, quaternion, "
-                               f"translation, camera, name), not {len(words)}.")
+                               f"translation, camera, name), not {len(words)}; export the model again.")
         _, *pose, camera = _numbers(path, number, words[:9], "iqqqqtttc")
         second = next(rest, None)
         if second is None:
-            raise CaptureError(f"{path} is truncated: the line of 2D points after {words[9].strip()} is missing.")
+            raise CaptureError(f"{path} is truncated: the line of 2D points after {words[9].strip()} is missing; "
+                               "export the model again.")
         images.append((words[9].strip(), camera, tuple(pose[:4]), tuple(pose[4:]), _found(second[1])))
     return images
 
@@ -314,10 +318,12 @@ def _points_txt(path: Path, lines: list[str]) -> Points:
     for number, line in _rows(lines):
         words = line.split(maxsplit=8)
         if len(words) < 8:
-            raise CaptureError(f"{path}, line {number}: a point takes at least eight values, not {len(words)}.")
+            raise CaptureError(f"{path}, line {number}: a point takes at least eight values, not {len(words)}; export "
+                               "the model again.")
         own, x, y, z, *colour, error = _numbers(path, number, words[:8], "ixyziiie")
         if not all(0 <= c <= 255 for c in colour):
-            raise CaptureError(f"{path}, line {number}: the colour {colour} is not within 0 to 255.")
+            raise CaptureError(f"{path}, line {number}: the colour {colour} is not within 0 to 255; export the model "
+                               "again.")
         values.append((x, y, z, error))
         rgb.append(colour)
         numbers.append(own if abs(own) < 2**63 else 0)

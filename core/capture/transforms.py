@@ -33,13 +33,13 @@ def read_transforms(folder: Path) -> tuple[list[Posed], PointCloud]:
     meta = read_json(path, CaptureError)
     frames = meta.get("frames") if isinstance(meta, dict) else None
     if not isinstance(frames, list) or not frames:
-        raise CaptureError(f"{path} holds no frames.")
+        raise CaptureError(f"{path} holds no frames; export it again.")
     posed: list[Posed] = []
     lenses: dict[tuple[object, ...], Lens] = {}  # one object for frames of one lens: its maps are shared
     for number, frame in enumerate(frames):
         name = frame.get("file_path") if isinstance(frame, dict) else None
         if not isinstance(name, str):
-            raise CaptureError(f"{path}, frame {number}: file_path is missing.")
+            raise CaptureError(f"{path}, frame {number}: file_path is missing; export it again.")
         where = f"{path}, {name}:"
         name = _with_suffix(folder, name)
         lens = _lens({**meta, **frame}, folder, name, where)
@@ -62,7 +62,8 @@ def _with_suffix(folder: Path, name: str) -> str:
 def _number(meta: dict[str, Any], key: str, where: str, default: float | None = None) -> float:
     value = meta.get(key, default)
     if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e12:
-        raise CaptureError(f"{where} {key} should be a finite number, not {value!r:.40}.")
+        raise CaptureError(f"{where} {key} should be a finite number, not {value!r:.40}; correct it or export the file "
+                           "again.")
     return float(value)
 
 
@@ -100,7 +101,7 @@ def _lens(meta: dict[str, Any], folder: Path, name: str, where: str) -> Lens:
 
 def _focal(angle: float, size: int, where: str) -> float:
     if not 0 < angle < math.pi:
-        raise CaptureError(f"{where} a field of view of {angle:g} radians makes no sense.")
+        raise CaptureError(f"{where} a field of view of {angle:g} radians makes no sense; it lies between 0 and pi.")
     return 0.5 * size / math.tan(0.5 * angle)
 
 
@@ -111,7 +112,7 @@ def _matrix(value: Any, where: str, what: str) -> Floats:
     except (TypeError, ValueError):
         matrix = np.zeros(0)
     if matrix.shape not in ((3, 4), (4, 4)) or not np.isfinite(matrix).all():
-        raise CaptureError(f"{where} {what} should be 4 rows of 4 finite numbers.")
+        raise CaptureError(f"{where} {what} should be 4 rows of 4 finite numbers; export the file again.")
     full = np.eye(4)
     full[:len(matrix)] = matrix
     return full
@@ -122,7 +123,7 @@ def _pose(frame: dict[str, Any], where: str) -> Floats:
     pose = _matrix(frame.get("transform_matrix"), where, "transform_matrix")
     rotation = pose[:3, :3]
     if not np.allclose(rotation.T @ rotation, np.eye(3), atol=2e-3) or np.linalg.det(rotation) < 0:
-        raise CaptureError(f"{where} transform_matrix is not a rotation and a translation.")
+        raise CaptureError(f"{where} transform_matrix is not a rotation and a translation; export the file again.")
     left, _, right = np.linalg.svd(rotation)  # the nearest rotation: files round their numbers
     rotation = left @ right @ np.diag([1.0, -1.0, -1.0])
     inverse = np.eye(4)

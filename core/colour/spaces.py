@@ -16,11 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import SettingsError
-from ..pictures import linear_from_srgb, srgb_from_linear
+from ..pictures import Pixels, linear_from_srgb, srgb_from_linear
 
 Chromaticities = tuple[float, float, float, float, float, float, float, float]
 """x and y of red, green, blue and white, as OpenEXR's attribute has them."""
-Pixels = NDArray[np.float32]
 Curve = Callable[[NDArray[Any]], Pixels]
 
 REC_709: Chromaticities = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)

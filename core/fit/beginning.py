@@ -1,10 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What a fit begins with: the white of its frames, a scene, and a flare for each light, which is put in its place
-first."""
+"""What a fit begins with: a scene, and a flare for each light, which is put in its place first."""
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import torch
@@ -16,7 +14,7 @@ from ..flare.model import FlareModel, LightFlare, ViewOfLight
 from ..gaussians.ply import read_ply
 from ..gaussians.scene import SceneGaussians
 from ..lights.snap import Sight, sight, snapped
-from ..pictures import Picture, holds_floats
+from ..pictures import Picture
 from .frames import Frames, thinned
 from .settings import FitSettings
 from .sky import with_sky
@@ -27,9 +25,6 @@ that is less than usual: worlds of small units, metres about a watch, are fitted
 NEAREST_POINTS = 10_000  # that are looked at
 SNAP_WIDTH, SNAP_VIEWS = 160, 40
 """Pixels of the pictures that lights are placed by, and about how many of them."""
-WHITEST = 64.0
-"""Scene-linear light at which frames that hold light above white are clipped: six stops above it, as far as cameras
-reach; a fit that is shown a rendered sun is not drawn to it alone."""
 
 
 def first_scene(capture: Capture, settings: FitSettings, views: tuple[View, ...], frames: Frames) -> SceneGaussians:
@@ -52,8 +47,7 @@ def nearest_depth(capture: Capture) -> float:
     return float(np.quantile(every, NEAREST)) if len(every) else math.inf
 
 
-def _scene(capture: Capture, settings: FitSettings, views: tuple[View, ...],
-                    frames: Frames) -> SceneGaussians:
+def _scene(capture: Capture, settings: FitSettings, views: tuple[View, ...], frames: Frames) -> SceneGaussians:
     if settings.scene.start:
         scene = read_ply(settings.scene.start)
         if not len(scene):
@@ -87,10 +81,10 @@ def first_flare(capture: Capture, views: tuple[View, ...], frames: Frames, setti
     poses = [torch.from_numpy(view.camera.world_to_camera) for view in views]
     reach = max(view.camera.reach for view in views)
     flares = []
-    for name, xyz in zip((light.name for light in capture.lights), positions, strict=True):
+    for light, xyz in zip(capture.lights, positions, strict=True):
         seen = [one for one in (ViewOfLight.of(pose, xyz) for pose in poses) if one.depth > 0]
         if not seen:
-            raise CaptureError(f"The light {name!r} is behind the camera in every view of {capture.folder}; "
+            raise CaptureError(f"The light {light.name!r} is behind the camera in every view of {capture.folder}; "
                                "correct or remove it in lights.json.")
         cameras, places = (torch.stack([getattr(one, name) for one in seen]) for name in ("camera", "light"))
         query = QueryRange.of(cameras, places, reach)
@@ -109,37 +103,3 @@ def _sights(views: tuple[View, ...], frames: Frames) -> list[Sight]:
             shrunk = (Picture(part.numpy(), "srgb").resized(*small.size).display() for part in (frame, removed))
             found.append(sight(small, *shrunk))
     return found
-
-
-def with_white(settings: FitSettings, capture: Capture) -> tuple[FitSettings, tuple[str, ...]]:
-    """The settings with the light at which frames are clipped, where that was left open, and what is to be said of it.
-
-    It is 1, the white of most formats, or more where all are float files and some frame holds more.
-    """
-    if settings.white is not None:
-        return settings, ()
-    views, _ = capture.split(settings.holdout)
-    if not any(_is_above_white(capture, view) for view in views):
-        return replace(settings, white=1.0), ()
-    files = [capture.frame_path(view) for view in views]
-    if capture.has_removed and settings.supervised:
-        files += [capture.removed_path(view) for view in views]
-    clipped = next((path for path in files if not holds_floats(path)), None)
-    if clipped is not None:
-        return replace(settings, white=1.0), (
-            f"The frames hold light above white (1.0), and {clipped} cannot: it is fitted as white, and flares that "
-            "are brighter come out wrong; EXR files for all would keep it.",)
-    return replace(settings, white=WHITEST), (
-        f"The frames hold light above white (1.0); it is fitted up to {WHITEST:g}.",)
-
-
-def _is_above_white(capture: Capture, view: View) -> bool:
-    return holds_floats(capture.frame_path(view)) and bool(capture.frame(view).pixels.max() > 1)
-
-
-def moved_lights(capture: Capture, flare: FlareModel) -> tuple[str, ...]:
-    """A sentence for each light that is not where the capture has it."""
-    away = [float(np.linalg.norm(xyz - light.xyz)) for light, xyz in
-            zip(capture.lights, flare.positions.numpy(), strict=True)]
-    return tuple(f"The light {light.name!r} was put where its flare is, {distance:.3g} from where it was given."
-                 for light, distance in zip(capture.lights, away, strict=True) if distance > 0)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The state of an unfinished fit on disk: one safetensors file, whole or absent.
 
-A state is a nested dictionary of tensors, numbers, strings, and lists of the last two. Big tables of which
-training has touched a few rows are stored as those rows. Nothing is pickled.
+A state is a nested dictionary of tensors and of what JSON holds: numbers, strings, and lists, nested ones too.
+Big tables of which training has touched a few rows are stored as those rows. Nothing is pickled.
 """
 from __future__ import annotations
 

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What is told of footage that a flare can hardly be learned from, before a fit begins and as it ends."""
+"""What is told of footage that a flare can hardly be learned from, before a fit begins and as it ends, and of lights
+that it put elsewhere."""
 from __future__ import annotations
 
 import math
@@ -8,6 +9,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from ..capture import Capture, View
+from ..flare.model import FlareModel
 from ..pictures import LUMINANCE, holds_floats, linear_from_srgb
 from .frames import Frames, thinned
 from .settings import FitSettings
@@ -65,3 +67,11 @@ def unlike(losses: Mapping[str, float]) -> tuple[str, ...]:
     more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
     return (f"{', '.join(names[:NAMED])}{more}: what the fit makes of the shot does not look like it; it may be of "
             "another scene, or its camera be wrong. Take it out of the capture, and fit again.",)
+
+
+def moved_lights(capture: Capture, flare: FlareModel) -> tuple[str, ...]:
+    """A sentence for each light that is not where the capture has it."""
+    away = [float(np.linalg.norm(xyz - light.xyz)) for light, xyz in
+            zip(capture.lights, flare.positions.numpy(), strict=True)]
+    return tuple(f"The light {light.name!r} was put where its flare is, {distance:.3g} from where it was given."
+                 for light, distance in zip(capture.lights, away, strict=True) if distance > 0)

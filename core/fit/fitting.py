@@ -14,15 +14,15 @@ from ..capture import Capture
 from ..errors import Cancelled, RunError
 from ..files import atomic_path, remove_file, remove_partial
 from ..flare import file as flare_file
-from ..flare.file import FlareFile, TrainingCamera
+from ..flare.file import FlareFile
 from ..gaussians.ply import write_ply
 from ..holding import held
-from ..look import list_elements
+from ..look import TrainedCamera, list_elements
 from ..progress import Progress
 from ..sampling import Sampling
 from . import checkpoint
-from .beginning import with_white
 from .doubts import unlike
+from .metering import with_white
 from .preview import row, spread, write_preview, write_small
 from .rendering import render
 from .run import CHECKPOINT, CONFIG, FLARE, LOG, METRICS, PREVIEW, SCENE, SMALL_PREVIEW, Run
@@ -136,7 +136,7 @@ def _finish(trainer: Trainer, run: Run) -> None:
     write_ply(run.folder / SCENE, trainer.scene)
     if trainer.flare is not None:
         camera = trainer.views[0].camera
-        lens = TrainingCamera(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
+        lens = TrainedCamera(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
         seen = trainer.flare.seen_from([torch.from_numpy(view.camera.world_to_camera) for view in trainer.views])
         with atomic_path(run.folder / FLARE) as unnamed:
             flare_file.save(unnamed, FlareFile(trainer.flare, run.settings.blend, lens, seen=seen,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""How each frame of a capture is exposed, by how bright it shows the capture's points.
+"""How each frame of a capture is exposed, by how bright it shows the capture's points; and at which light all clip.
 
 A camera left to itself darkens the picture as a lamp comes into it, which is where its flare begins; to a fit that
 takes the exposure to be fixed the difference is flare. What a frame shows of points is a straight line over what is
@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,9 +17,10 @@ from numpy.typing import NDArray
 
 from ..capture import Capture, View
 from ..exposures import LEAST
-from ..pictures import LUMINANCE, linear_from_srgb
+from ..pictures import LUMINANCE, holds_floats, linear_from_srgb
 from ..progress import Progress
 from .frames import Frames, colours_at, thinned
+from .settings import FitSettings
 
 UNLIKE = 0.25
 """Stops, the spread over the frames, from which on they are taken to be exposed otherwise."""
@@ -37,6 +38,9 @@ RARE = 0.1
 ROUNDS, REFINED, SETTLED = 20, 3, 1e-3
 SOFT = 0.05
 """Linear light that is added to what errors are parts of: those of dark points are rounding."""
+WHITEST = 64.0
+"""Scene-linear light at which frames that hold light above white are clipped: six stops above it, as far as cameras
+reach; a fit that is shown a rendered sun is not drawn to it alone."""
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -180,3 +184,29 @@ def _line(known: Floats, shown: Floats) -> tuple[Floats, float]:
         line = np.linalg.solve(product, columns.T @ (weights * shown))
     scatter = weights @ (shown - columns @ line) ** 2 / max(trust.sum() - 2, 1)
     return line, float(np.sqrt(scatter * np.linalg.inv(product)[0, 0]))
+
+
+def with_white(settings: FitSettings, capture: Capture) -> tuple[FitSettings, tuple[str, ...]]:
+    """The settings with the light at which frames are clipped, where that was left open, and what is to be said of it.
+
+    It is 1, the white of most formats, or more where all are float files and some frame holds more.
+    """
+    if settings.white is not None:
+        return settings, ()
+    views, _ = capture.split(settings.holdout)
+    if not any(_is_above_white(capture, view) for view in views):
+        return replace(settings, white=1.0), ()
+    files = [capture.frame_path(view) for view in views]
+    if capture.has_removed and settings.supervised:
+        files += [capture.removed_path(view) for view in views]
+    clipped = next((path for path in files if not holds_floats(path)), None)
+    if clipped is not None:
+        return replace(settings, white=1.0), (
+            f"The frames hold light above white (1.0), and {clipped} cannot: it is fitted as white, and flares that "
+            "are brighter come out wrong; EXR files for all would keep it.",)
+    return replace(settings, white=WHITEST), (
+        f"The frames hold light above white (1.0); it is fitted up to {WHITEST:g}.",)
+
+
+def _is_above_white(capture: Capture, view: View) -> bool:
+    return holds_floats(capture.frame_path(view)) and bool(capture.frame(view).pixels.max() > 1)

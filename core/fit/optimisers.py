@@ -2,8 +2,6 @@
 """What steps scene and flare, and how its rates fall along a fit."""
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from torch import Tensor
 from torch.nn import Parameter
@@ -11,7 +9,7 @@ from torch.nn import Parameter
 from ..flare.encoding import TABLE
 from ..flare.model import FlareModel
 from ..gaussians.optimiser import Adam
-from ..gaussians.scene import SceneGaussians
+from ..gaussians.scene import COEFFICIENTS, SceneGaussians
 from .checkpoint import State
 from .settings import FitSettings
 
@@ -28,11 +26,11 @@ class Optimisers:
         """extent: of the capture, world units. display_white: display value that frames go up to."""
         self._settings, self._extent = settings, extent
         rates = settings.scene.rates
-        features = torch.full((16, 1), rates.features_rest)
+        features = torch.full((COEFFICIENTS, 1), rates.features_rest)
         features[0] = rates.features * (RATE_ABOVE_WHITE if display_white > 1 else 1)
         chosen: dict[str, float | Tensor] = {
             "means": self._means_rate(0.0), "log_scales": rates.scale, "quaternions": rates.rotation,
-            "opacity_logits": rates.opacity, "sh": features.expand(16, 3).contiguous(),
+            "opacity_logits": rates.opacity, "sh": features.expand(COEFFICIENTS, 3).contiguous(),
         }
         self.scene = Adam(dict(scene.named_parameters()), chosen)
         self.flare, self.grids = _of_flare(flare, settings)
@@ -87,7 +85,7 @@ def _decayed(first: float, last: float, progress: float) -> float:
     return first * (last / first) ** min(max(progress, 0.0), 1.0)
 
 
-def _of_flare(flare: FlareModel | None, settings: FitSettings) -> tuple[Adam | None, Any]:
+def _of_flare(flare: FlareModel | None, settings: FitSettings) -> tuple[Adam | None, torch.optim.SparseAdam | None]:
     """Adam for networks and Gaussians; for the grids one that updates only the rows that a view touched."""
     if flare is None:
         return None, None

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ..flare.compositing import encode
+from ..display import encode
 from ..pictures import Picture, write_png
 from .rendering import RenderedView
 

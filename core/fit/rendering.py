@@ -9,13 +9,13 @@ import torch
 from torch import Tensor
 
 from ..capture import Camera
-from ..choices import Blend
-from ..flare.compositing import Layers, decode, encode, exposed, joined, layers, splat_flare
+from ..choices import Blend, Kernels
+from ..display import decode, encode, exposed
+from ..flare.compositing import Layers, joined, layers, splat_flare
 from ..flare.model import FlareModel
 from ..flare.placement import PlaneGaussians
 from ..flare.visibility import VisibilitySettings, visible_shares
 from ..gaussians import Rendering, Splats
-from ..gaussians.rasterizer import Kernels
 from ..gaussians.scene import SceneGaussians
 from ..look import Look, LookEdits
 from ..look import PlaneGaussians as LookGaussians

@@ -16,7 +16,6 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .. import exposures
 from ..capture import Camera, Capture
@@ -28,6 +27,7 @@ from ..gaussians.ply import read_ply
 from ..gaussians.scene import SceneGaussians
 from ..look import Look, LookEdits
 from ..look import read as read_look
+from ..pictures import Pixels
 from ..typed import is_utf8
 from .rendering import RenderedView, render
 from .settings import FitSettings, read_config, write_config
@@ -43,7 +43,6 @@ SMALL_PREVIEW = "preview_small.png"
 EVALUATION = "eval.json"
 LOG = "log.txt"
 
-Pixels = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -97,7 +96,7 @@ class Run:
         """A run folder as it is. RunError where it is none."""
         folder = Path(folder)
         if not (folder / CONFIG).is_file():
-            raise RunError(f"{folder} is not the folder of a run (it has no {CONFIG}).")
+            raise RunError(f"{folder} is not the folder of a run (it has no {CONFIG}); name one that fit has written.")
         settings = read_config(folder / CONFIG)
         try:
             capture = Path((folder / CAPTURE).read_text(encoding="utf-8").removesuffix("\n"))

@@ -17,14 +17,14 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ..choices import ITERATIONS, Blend, Mode, Model, Preset
+from ..choices import ITERATIONS, Blend, Kernels, Mode, Model, Preset
 from ..errors import RunError, SettingsError
 from ..files import WRITTEN_BY_HAND, write_text
 from ..flare.density import DensitySettings
-from ..flare.model import OURS, PAPER, FlareForm
+from ..flare.model import OURS, PAPER
 from ..flare.visibility import VisibilitySettings
 from ..gaussians.densification import ClassicSettings, McmcSettings
-from ..look.look import FORM_BOUNDS, MOST_GAUSSIANS
+from ..look.look import FORM_BOUNDS, MOST_GAUSSIANS, FlareForm
 from ..pictures import srgb_from_linear
 from ..typed import MOST_SEED, WHOLE_DIGITS, Bounds, field_of, table_of
 
@@ -167,7 +167,7 @@ class FitSettings:
     holdout: str | int | None = None
     white: float | None = None
     exposure: Literal["found", "fixed"] = "found"
-    kernels: Literal["auto", "torch", "tiles", "cpu", "cuda"] = "auto"
+    kernels: Kernels = "auto"
     checkpoint_every_s: float = 60.0
     preview_every: int = 1000
     flare: FlareSettings = field(default_factory=FlareSettings)

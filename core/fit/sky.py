@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..capture import Capture, View
 from ..capture.colmap import PointCloud
-from ..flare.compositing import exposed
+from ..display import exposed
 from .frames import Frames, colours_at, thinned
 
 COUNT = 2000

@@ -19,19 +19,21 @@ from torch.nn import Parameter
 
 from ..capture import Capture, View
 from ..capture.discs import clipped_discs
+from ..display import clipped
 from ..errors import CaptureError, RunError
-from ..flare.compositing import clipped, composite
+from ..flare.compositing import composite
 from ..flare.density import clone_and_prune
 from ..flare.visibility import clear_shares, uncovering
 from ..gaussians import Splats
 from ..gaussians.densification import Classic, Mcmc, Strategy
 from ..gaussians.loss import l1_ssim
 from ..gaussians.ordering import morton_order
+from ..gaussians.spherical_harmonics import MAX_DEGREE
 from ..progress import Progress
 from . import metering
-from .beginning import first_flare, first_scene, moved_lights
+from .beginning import first_flare, first_scene
 from .checkpoint import State
-from .doubts import doubts
+from .doubts import doubts, moved_lights
 from .frames import Frames, Targets, thinned
 from .given import Given
 from .optimisers import Optimisers
@@ -261,9 +263,9 @@ class Trainer:
 
     def _sh_degree(self) -> int:
         if self.settings.scene.start:
-            return 3  # it was trained before
+            return MAX_DEGREE  # it was trained before
         plain = self.settings.mode == "split" and self.iteration <= self.settings.split.plain * self.settings.iterations
-        most = self.settings.split.sh_degree if plain else 3
+        most = self.settings.split.sh_degree if plain else MAX_DEGREE
         return min(most, self.iteration // self.settings.scene.sh_every)
 
     def _generator(self, number: int, purpose: int) -> torch.Generator:

@@ -18,10 +18,11 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ..choices import Blend
+from ..choices import Blend, Kernels
+from ..display import decode, decoded_with_slope, encoded_with_slope
 from ..exposures import brightness
 from ..gaussians import Splats, over, splat
-from ..gaussians.rasterizer import Kernels, Resolution
+from ..gaussians.rasterizer import Resolution
 from ..sampling import Sampling
 from . import placement
 from .placement import PlaneGaussians
@@ -71,43 +72,6 @@ def composite(scene: Tensor, flare: Splats | None, blend: Blend, white: float = 
     return added
 
 
-def decode(display: Tensor) -> Tensor:
-    """sRGB display values, not negative, to linear light (IEC 61966-2-1)."""
-    return torch.where(display <= 0.04045, display / 12.92, ((display.clamp_min(0.04045) + 0.055) / 1.055) ** 2.4)
-
-
-def encode(linear: Tensor) -> Tensor:
-    """Linear light, not negative, to sRGB display values; above 1 the curve goes on."""
-    return torch.where(linear <= 0.0031308, linear * 12.92,
-                       1.055 * linear.clamp_min(0.0031308) ** (1 / 2.4) - 0.055)
-
-
-def exposed(display: Tensor, exposure: float) -> Tensor:
-    """Display values, not negative, of `exposure` times the light; above 1 the curve goes on."""
-    shown: Tensor = display if exposure == 1 else _Exposed.apply(display, exposure)
-    return shown
-
-
-def clipped(display: Tensor, white: float) -> Tensor:
-    """As a camera clips it, with the gradient passed on as it is: see `composite`."""
-    return display - (display - white).clamp_min(0).detach()
-
-
-class _Exposed(torch.autograd.Function):
-    """encode(exposure * decode(display)), by the powers of which the slopes are made too."""
-
-    @staticmethod
-    def forward(ctx: Any, display: Tensor, exposure: float) -> Tensor:
-        linear, within = _decoded(display)
-        shown, slope = _encoded(linear.mul_(exposure))
-        ctx.save_for_backward(within.mul_(exposure).mul_(slope))
-        return shown
-
-    @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
-        return gradient * ctx.saved_tensors[0], None
-
-
 class _LightAdded(torch.autograd.Function):
     """encode(decode(scene) + light), clipped to 0..white on the way in and out, with the gradient passed on as it is.
 
@@ -116,8 +80,8 @@ class _LightAdded(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, scene: Tensor, light: Tensor, white: float) -> Tensor:
-        linear, within = _decoded(scene.clamp(0, white))
-        shown, slope = _encoded(linear.add_(light))
+        linear, within = decoded_with_slope(scene.clamp(0, white))
+        shown, slope = encoded_with_slope(linear.add_(light))
         ctx.save_for_backward(within if ctx.needs_input_grad[0] else None, slope)
         return shown.clamp_(0, white)
 
@@ -126,21 +90,6 @@ class _LightAdded(torch.autograd.Function):
         within, slope = ctx.saved_tensors
         of_light = gradient * slope
         return None if within is None else of_light * within, of_light, None
-
-
-def _decoded(display: Tensor) -> tuple[Tensor, Tensor]:
-    """`decode` and its slope, which the same power gives: autograd would take another."""
-    base = (display + 0.055) / 1.055
-    power, low = base**1.4, display <= 0.04045
-    return torch.where(low, display / 12.92, base * power), power.mul_(2.4 / 1.055).masked_fill_(low, 1 / 12.92)
-
-
-def _encoded(linear: Tensor) -> tuple[Tensor, Tensor]:
-    """`encode` and its slope, likewise."""
-    bright, low = linear.clamp_min(0.0031308), linear <= 0.0031308
-    power = bright ** (1 / 2.4)
-    shown = torch.where(low, linear * 12.92, power * 1.055 - 0.055)
-    return shown, power.mul_(1.055 / 2.4).div_(bright).masked_fill_(low, 12.92)
 
 
 class Layers(NamedTuple):

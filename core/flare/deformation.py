@@ -18,6 +18,8 @@ from torch.nn import functional
 from ..look.network import BANDS, CAMERA_BITS, CAMERA_GROWTH, LIGHT_BITS, LIGHT_GROWTH
 from .encoding import HashGrid, frequency_encoding
 
+WIDTH, HIDDEN = 128, 3
+"""Of the backbone: width of its layers, and how many there are."""
 BESIDE = 1.5
 """Times as far out as the frame's corners, or as a light comes nearest, from where on its flare is taken to change no
 more: what is left of one there is little."""
@@ -70,19 +72,19 @@ class DeformationNetwork(nn.Module):
     light_high: Tensor
 
     def __init__(self, heads: Mapping[str, int], query_range: QueryRange, *, positions: int = 1, latent: int = 0,
-                 width: int = 128, hidden: int = 3, levels: int = 16, base: int = 16) -> None:
+                 levels: int = 16, base: int = 16) -> None:
         super().__init__()
         self.light_grid = HashGrid(LIGHT_BITS, LIGHT_GROWTH, levels, base=base)
         self.camera_grid = HashGrid(CAMERA_BITS, CAMERA_GROWTH, levels, base=base)
         view = 2 * 2 * levels
-        self.view_layer = nn.Linear(view, width)
-        self.gaussian_layer = nn.Linear(2 * BANDS * positions + latent, width, bias=False)
-        self.layers = nn.ModuleList(nn.Linear(width, width) for _ in range(hidden - 1))
+        self.view_layer = nn.Linear(view, WIDTH)
+        self.gaussian_layer = nn.Linear(2 * BANDS * positions + latent, WIDTH, bias=False)
+        self.layers = nn.ModuleList(nn.Linear(WIDTH, WIDTH) for _ in range(HIDDEN - 1))
         self.names, self.widths = list(heads), list(heads.values())
         # One matrix holds every head: the same function, one product instead of many.
-        self.head = nn.Linear(width, sum(self.widths))
-        shift = nn.Linear(width, 2)
-        self.correction = nn.Sequential(nn.Linear(view, width), nn.ReLU(), shift)
+        self.head = nn.Linear(WIDTH, sum(self.widths))
+        shift = nn.Linear(WIDTH, 2)
+        self.correction = nn.Sequential(nn.Linear(view, WIDTH), nn.ReLU(), shift)
         # All offsets start at nothing: the first picture is the canonical flare.
         for layer in (self.head, shift):
             nn.init.zeros_(layer.weight)
@@ -93,7 +95,7 @@ class DeformationNetwork(nn.Module):
         self.register_buffer("light_high", torch.tensor(query_range.light_high), persistent=False)
 
     def view_features(self, camera: Tensor, light: Tensor) -> Tensor:
-        """Features (64,) of a camera position (3,), world units, and a light (2,), normalised coordinates."""
+        """Features (4 levels,) of a camera position (3,), world units, and a light (2,), normalised coordinates."""
         # A wide extent along one axis and none along another still maps by one scale for each axis.
         where = (camera - self.camera_low) / self.camera_extent
         return torch.cat([self.light_grid(light_input(light) / self.light_high), self.camera_grid(where)])

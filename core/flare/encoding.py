@@ -2,8 +2,8 @@
 """Input encodings of the deformation network (paper, appendix "Flare representation").
 
 The light and the camera are the same for all Gaussians of a view, so each hash grid is asked for one
-point a view: 8 corners on each of 16 levels. Gradients therefore touch 128 rows of millions; the tables
-give sparse gradients and are meant for an optimiser that updates those rows alone.
+point a view: 8 corners on each level. Gradients therefore touch 8 rows a level (of the paper's 16 levels
+128, of millions); the tables give sparse gradients and are meant for an optimiser that updates those rows alone.
 """
 from __future__ import annotations
 

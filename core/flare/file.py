@@ -19,14 +19,11 @@ from torch import Tensor
 from .. import tensors as on_disk
 from ..choices import Blend
 from ..errors import FlareFileError
-from ..look.look import KEY, VERSION, TrainedCamera, checked
+from ..look.look import KEY, VERSION, FlareForm, TrainedCamera, checked
 from ..sampling import Sampling
 from .deformation import QueryRange
 from .encoding import TABLE
-from .model import FlareForm, FlareModel, LightFlare
-
-TrainingCamera = TrainedCamera
-"""One definition, for this file and for what reads it without torch."""
+from .model import FlareModel, LightFlare
 
 
 @dataclass
@@ -39,7 +36,7 @@ class FlareFile:
 
     model: FlareModel
     blend: Blend
-    camera: TrainingCamera
+    camera: TrainedCamera
     licence: str = ""
     notes: str = ""
     elements: list[dict[str, Any]] = field(default_factory=list)
@@ -119,7 +116,7 @@ def _unpacked(description: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> 
         else:
             state[name] = tensors[name]
     model.flares.load_state_dict(state)
-    return FlareFile(model, description["blend"], TrainingCamera(**description["camera"]),
+    return FlareFile(model, description["blend"], TrainedCamera(**description["camera"]),
                      str(description.get("licence", "")), str(description.get("notes", "")),
                      list(description.get("elements", [])), dict(description.get("seen", {})),
                      Sampling.read(description.get("sampling")))

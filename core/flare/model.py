@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from ..files import rounded
 from ..gaussians.spherical_harmonics import colours
-from ..look.look import Form
+from ..look.look import FlareForm
 from ..look.plane import PLANE_DEPTH
 from . import placement
 from .deformation import DeformationNetwork, QueryRange
@@ -36,8 +36,6 @@ RING_WIDTH = 0.5
 """w of rings at first, in standard deviations."""
 
 
-FlareForm = Form
-"""What the model is made of: one definition, for this model and for the one without torch."""
 PAPER = FlareForm()
 OURS = replace(PAPER, solid=False, sh_degree=0, static_offset=True, rings=True, latent=4, levels=3, base=4)
 

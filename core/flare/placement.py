@@ -2,8 +2,8 @@
 """Where flare Gaussians lie in the picture (paper, section "Flare Representation").
 
 Everything is in normalised image coordinates (x/z, y/z, origin at the principal point p, y down), so a
-flare does not depend on resolution and a change of focal length moves it as a lens would. `pixels` is
-the only place where a camera's intrinsics enter.
+flare does not depend on resolution and a change of focal length moves it as a lens would. A camera's
+intrinsics enter in `pixels` and `slopes` alone.
 """
 from __future__ import annotations
 
@@ -22,9 +22,10 @@ from ..sampling import Sampling, dilation
 class PlaneGaussians(NamedTuple):
     """Gaussians on the normalised plane, ready to be splatted.
 
-    means (n, 2), covariances (n, 3) as xx, xy, yy, opacities (n,) in 0..1, colours (n, 3), and rings
-    (n, 2) as r0 and w in Mahalanobis radii (ours) or None. arcs (n, 2) or None: the way covariance b from
-    the mean towards the side that exp(b·d) makes brighter; a vector of the plane, which is scaled and turned as it is.
+    means (n, 2), covariances (n, 3) as xx, xy, yy, opacities (n,) in 0..1 (with arcs above 1, too: see
+    `opacity_gain`), colours (n, 3), and rings (n, 2) as r0 and w in Mahalanobis radii (ours) or None. arcs (n, 2) or
+    None: the way covariance b from the mean towards the side that exp(b·d) makes brighter; a vector of the plane, which
+    is scaled and turned as it is.
     """
 
     means: Tensor

@@ -18,9 +18,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ..choices import Kernels
 from ..gaussians import rasterization
-from ..gaussians.rasterizer import Kernels
 from ..gaussians.scene import SceneGaussians
+from ..look.shot import LIGHT_MARGIN, LIGHT_RADIUS
 from .model import FlareModel
 
 LEAST_CLEAR = 0.01
@@ -35,8 +36,8 @@ class VisibilitySettings:
     """radius: of the light's disk, as a share of its distance. margin: Gaussians nearer to the light than this
     share of its distance do not hide it, since they show the lamp itself. pixels: the small picture's side."""
 
-    radius: float = 0.01
-    margin: float = 0.06
+    radius: float = LIGHT_RADIUS
+    margin: float = LIGHT_MARGIN
     pixels: int = 9
 
 

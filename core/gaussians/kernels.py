@@ -13,12 +13,15 @@ from __future__ import annotations
 
 import importlib
 import logging
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
 from functools import cache
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol, cast, runtime_checkable
 
 import torch
 from torch import Tensor
 
+from ..choices import Blend
 from ..errors import EngineError, SettingsError
 from .rendering import Rendering, Splats
 
@@ -40,7 +43,7 @@ class KernelSet(Protocol):
 
     def splat(
         self, centres: Tensor, covariances: Tensor, opacities: Tensor, colours: Tensor,
-        width: int, height: int, *, rings: Tensor | None, arcs: Tensor | None, blend: str,
+        width: int, height: int, *, rings: Tensor | None, arcs: Tensor | None, blend: Blend,
     ) -> Splats: ...  # fmt: skip
 
 
@@ -63,13 +66,37 @@ def _say_once(sentence: str) -> None:
     log.warning(sentence)
 
 
-def fused(like: Tensor) -> Any:
+class Offers(Protocol):
+    """Steps that a backward pass may take, and the names of the parameters whose steps it took."""
+
+    taken: set[str]
+
+
+class FusedKernels(Protocol):
+    """What the CPU kernels have beside those of a kernel set; a step is `Step` for all but themselves."""
+
+    def l1_ssim(self, image: Tensor, target: Tensor, lam: float) -> Tensor: ...
+    def over(self, colour: Tensor, t: Tensor, behind: Tensor) -> Tensor | None: ...
+    def enlarged(
+        self, colour: Tensor, t: Tensor, factor: int, width: int, height: int
+    ) -> tuple[Tensor, Tensor] | None: ...
+    def Step(
+        self, parameter: Tensor, gradient: Tensor | None, first: Tensor, second: Tensor, step: int,
+        rate: float | Tensor,
+    ) -> Any: ...  # fmt: skip
+    def adam_steps(self, steps: Sequence[Any], *, beta1: float, beta2: float, epsilon: float) -> None: ...
+    def offered(
+        self, steps: Mapping[str, Any], *, beta1: float, beta2: float, epsilon: float
+    ) -> AbstractContextManager[Offers]: ...
+
+
+def fused(like: Tensor) -> FusedKernels | None:
     """The CPU kernels if they can take tensors such as `like`, else None: for the loss and the optimiser,
     which have a plain torch form of their own."""
     if not like.is_cpu or like.dtype != torch.float32:
         return None
     kernels = _load("cpu")
-    return None if isinstance(kernels, ImportError) else kernels
+    return None if isinstance(kernels, ImportError) else cast(FusedKernels, kernels)
 
 
 def choose(name: str, like: Tensor) -> KernelSet:
@@ -80,7 +107,9 @@ def choose(name: str, like: Tensor) -> KernelSet:
     if name == "auto":
         name = _fastest(like)
     if name not in MODULES:
-        raise SettingsError(f"kernels are {', '.join(MODULES)} or auto, not {name!r}.")
+        raise SettingsError(
+            f"Gaussians are rasterized by the kernels {', '.join(MODULES)} or auto, not {name!r}; choose one of those."
+        )
     kernels = _load(name)
     if isinstance(kernels, ImportError):
         raise EngineError(

@@ -22,6 +22,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from ..choices import Blend
 from .kernels import KernelSet
 from .layers import enlarged, over
 from .rendering import Splats, arc_strengths
@@ -59,7 +60,7 @@ def reductions(covariances: Tensor, rings: Tensor | None, arcs: Tensor | None) -
 
 def splat_mixed(
     kernels: KernelSet, centres: Tensor, covariances: Tensor, opacities: Tensor, colours: Tensor,
-    width: int, height: int, *, rings: Tensor | None, arcs: Tensor | None, blend: str,
+    width: int, height: int, *, rings: Tensor | None, arcs: Tensor | None, blend: Blend,
 ) -> Splats:  # fmt: skip
     """`splat` with resolution "mixed"."""
     factors = reductions(covariances, rings, arcs)
@@ -91,7 +92,7 @@ def _rows(tensor: Tensor, index: Tensor) -> Tensor:
     return tensor if len(index) == len(tensor) else tensor[index]
 
 
-def _behind(front: Splats, back: Splats, blend: str) -> Splats:
+def _behind(front: Splats, back: Splats, blend: Blend) -> Splats:
     """Two layers as one."""
     if blend == "add":
         return Splats(front.colour + back.colour, front.transmittance)

@@ -20,9 +20,12 @@ from torch import Tensor
 from torch.nn import Parameter
 
 from ..errors import RunError, SettingsError
-from .kernels import fused
+from .kernels import FusedKernels, fused
 
 Rate = float | Tensor
+
+BETA1, BETA2 = 0.9, 0.999
+"""How much of the running means stays with each step, of the gradient and of its square."""
 
 
 class Moments(NamedTuple):
@@ -43,8 +46,7 @@ class Adam:
 
     def __init__(
         self, parameters: Mapping[str, Parameter], rates: Rate | Mapping[str, Rate],
-        *, betas: tuple[float, float] = (0.9, 0.999), epsilon: float = 1e-15,
-        kernels: Literal["auto", "torch"] = "auto",
+        *, epsilon: float = 1e-15, kernels: Literal["auto", "torch"] = "auto",
     ) -> None:  # fmt: skip
         self.parameters = dict(parameters)
         self.rates: dict[str, Rate] = (
@@ -52,7 +54,6 @@ class Adam:
         )
         if unknown := self.rates.keys() - self.parameters.keys():
             raise SettingsError(f"There is no parameter {min(unknown)!r} to give a learning rate to.")
-        self.betas = betas
         self.epsilon = epsilon
         self.kernels = kernels
         self.moments = {name: _zeros(p) for name, p in self.parameters.items()}
@@ -60,7 +61,7 @@ class Adam:
 
     @property
     def _options(self) -> dict[str, Any]:
-        return {"beta1": self.betas[0], "beta2": self.betas[1], "epsilon": self.epsilon}
+        return {"beta1": BETA1, "beta2": BETA2, "epsilon": self.epsilon}
 
     @contextmanager
     def stepping(self) -> Iterator[None]:
@@ -70,12 +71,13 @@ class Adam:
         The steps are the same; those gradients stay None, and `step` is for what is left. Only for a scene that gets
         its whole gradient from one `rasterization`: raises RunError if more comes after the steps.
         """
-        cpu, steps = None, {}
+        cpu: FusedKernels | None = None
+        steps: dict[str, Any] = {}
         for name, rate in self.rates.items():
             parameter = self.parameters[name]
             if found := self._kernels_for(parameter):
                 cpu = found
-                steps[name] = cpu.Step(parameter, None, *self.moments[name], self.steps[name] + 1, rate)
+                steps[name] = found.Step(parameter, None, *self.moments[name], self.steps[name] + 1, rate)
         if cpu is None:
             yield
             return
@@ -86,7 +88,7 @@ class Adam:
             if self.parameters[name].grad is not None:
                 raise RunError(f"{name} got a gradient after its step: the scene was rendered twice.")
 
-    def _kernels_for(self, parameter: Tensor) -> Any:
+    def _kernels_for(self, parameter: Tensor) -> FusedKernels | None:
         """The fused kernels if they can step this parameter, else None."""
         return fused(parameter) if self.kernels == "auto" and parameter.is_contiguous() else None
 
@@ -94,7 +96,8 @@ class Adam:
     def step(self) -> None:
         """Moves every parameter that has a gradient and a rate."""
         options = self._options
-        cpu, together = None, []
+        cpu: FusedKernels | None = None
+        together: list[Any] = []
         for name, rate in self.rates.items():
             parameter = self.parameters[name]
             if parameter.grad is None or parameter.numel() == 0:
@@ -107,7 +110,7 @@ class Adam:
                 adam_step(*values, **options)
             else:
                 cpu = found
-                together.append(cpu.Step(*values))
+                together.append(found.Step(*values))
         if cpu is not None:
             cpu.adam_steps(together, **options)
 

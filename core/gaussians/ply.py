@@ -138,7 +138,7 @@ class _Header(NamedTuple):
 def _header(path: Path, head: bytes) -> _Header:
     told = ply.read_header(head)
     if told is None:
-        raise FlareFileError(f"{path} is not a PLY file.")
+        raise FlareFileError(f"{path} is not a PLY file; name one of a scene of Gaussians.")
     if told.form and told.form not in ORDERS:
         raise FlareFileError(f"{path} is a PLY file in the format {told.form}; export it as binary.")
     vertices = told.elements[0] if told.elements else ply.Element("vertex", 0, [])
@@ -147,9 +147,10 @@ def _header(path: Path, head: bytes) -> _Header:
     try:
         names = [name for name, _ in vertices.layout()]
     except ValueError as problem:
-        raise FlareFileError(f"{path} has the property {problem}, not a plain number.") from problem
+        raise FlareFileError(f"{path} has the property {problem}, not a plain number; export it without "
+                             "that.") from problem
     if not told.form or not names or len(set(names)) < len(names):
-        raise FlareFileError(f"{path} is not a PLY file of Gaussians.")
+        raise FlareFileError(f"{path} is not a PLY file of Gaussians; export the scene as one.")
     near, display_white, sampling = NEAR, 1.0, None
     for words in told.comments:
         with contextlib.suppress(ValueError):

@@ -6,7 +6,7 @@ from typing import Literal
 
 from torch import Tensor
 
-from ..choices import Blend
+from ..choices import Blend, Kernels
 from ..errors import SettingsError
 from ..sampling import DILATION
 from .kernels import choose
@@ -14,7 +14,6 @@ from .mixed import splat_mixed
 from .rendering import NEAR, Rendering, Splats, levelled
 from .spherical_harmonics import degree_of
 
-Kernels = Literal["auto", "torch", "tiles", "cpu", "cuda"]
 Resolution = Literal["full", "mixed"]
 
 
@@ -99,9 +98,9 @@ def splat(
         _expect(arcs, (n, 2), "arcs")
     _check_size(width, height)
     if blend not in ("over", "add"):
-        raise SettingsError(f"blend is over or add, not {blend!r}.")
+        raise SettingsError(f"Flares are not laid on a picture by the blend {blend!r}; choose over or add.")
     if resolution not in ("full", "mixed"):
-        raise SettingsError(f"resolution is full or mixed, not {resolution!r}.")
+        raise SettingsError(f"Flares are not laid on a picture at the resolution {resolution!r}; choose full or mixed.")
     if arcs is not None:
         arcs = levelled(arcs, covariances, rings)
     chosen = choose(kernels, centres)

@@ -24,6 +24,7 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
+from ..choices import Blend
 from .projection import camera_position, determinants, project, visible_radii
 from .rendering import (
     ALPHA_MIN,
@@ -138,7 +139,7 @@ def rasterize_scene(
 
 def splat(
     centres: Tensor, covariances: Tensor, opacities: Tensor, colours: Tensor, width: int, height: int,
-    *, rings: Tensor | None, arcs: Tensor | None, blend: str,
+    *, rings: Tensor | None, arcs: Tensor | None, blend: Blend,
 ) -> Splats:  # fmt: skip
     """See `splat` of the package; full resolution."""
     index = torch.nonzero(determinants(covariances) > 0)[:, 0]  # a degenerate ellipse covers nothing

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from ..choices import Blend
 from ..splatting import ALPHA_MIN as ALPHA_MIN
 from ..splatting import OPACITY_MAX as OPACITY_MAX
 from ..splatting import PROFILE_MIN as PROFILE_MIN
@@ -84,7 +85,7 @@ def levelled(arcs: Tensor, covariances: Tensor, rings: Tensor | None) -> Tensor:
 
 
 def extent(
-    peaks: Tensor, blend: str = "over", rings: Tensor | None = None, strengths: Tensor | None = None
+    peaks: Tensor, blend: Blend = "over", rings: Tensor | None = None, strengths: Tensor | None = None
 ) -> Tensor:
     """(n,) Mahalanobis radius beyond which a Gaussian, or a ring (n, 2), or an arc of this strength (n,) of either, is
     skipped; 0 if all of it is.

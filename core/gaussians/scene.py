@@ -7,12 +7,12 @@ import torch
 from torch import Tensor, nn
 
 from ..capture import Camera, PointCloud
+from ..choices import Kernels
 from ..errors import SettingsError
 from ..sampling import Sampling, dilation
 from . import spherical_harmonics
-from .optimiser import Rate
 from .ordering import nearest_distances
-from .rasterizer import Kernels, rasterization
+from .rasterizer import rasterization
 from .rendering import NEAR, Rendering
 
 COEFFICIENTS = (spherical_harmonics.MAX_DEGREE + 1) ** 2
@@ -106,28 +106,3 @@ class SceneGaussians(nn.Module):
             camera.width, camera.height, background=background, sh_degree=sh_degree, kernels=kernels,
             near=self.near, dilation=dilation(self.sampling, camera.focal_length), depth=depth, raw=True,
         )  # fmt: skip
-
-
-def sh_degree_at(iteration: int, interval: int = 1000) -> int:
-    """The degree in use at an iteration: one more every `interval`, so that the colour seen from everywhere
-    settles first (Kerbl et al. 2023, section 7.1)."""
-    return min(iteration // interval, spherical_harmonics.MAX_DEGREE)
-
-
-def learning_rates(extent: float) -> dict[str, Rate]:
-    """Rates of 3DGS by parameter, for `Adam`; extent: of the scene, world units (see `Capture.extent`)."""
-    sh = torch.full((COEFFICIENTS, 3), 2.5e-3 / 20)
-    sh[0] = 2.5e-3
-    return {
-        "means": 1.6e-4 * extent,
-        "log_scales": 5e-3,
-        "quaternions": 1e-3,
-        "opacity_logits": 5e-2,
-        "sh": sh,
-    }
-
-
-def means_rate(extent: float, iteration: int, iterations: int) -> float:
-    """Rate of the means at an iteration: falls exponentially from 1.6e-4 to 1.6e-6 of the extent."""
-    share = min(max(iteration / max(iterations, 1), 0.0), 1.0)
-    return float(1.6e-4 * extent * 0.01**share)

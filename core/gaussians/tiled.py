@@ -19,6 +19,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from ..choices import Blend
 from .projection import camera_position, determinants, half_sizes, project, visible_radii
 from .rendering import (
     ALPHA_MIN,
@@ -60,7 +61,7 @@ class Gaussians(NamedTuple):
     arcs: Tensor | None
 
 
-Draw = Callable[[Lists, str, bool, Gaussians], tuple[Tensor, Tensor]]
+Draw = Callable[[Lists, Blend, bool, Gaussians], tuple[Tensor, Tensor]]
 """draw(lists, blend, median, gaussians): the pictures of the tiles, (tiles, size², c), sums of the values by their
 weights; and the row of the Gaussian at which transmittance falls below 1/2, or -1, (tiles, size²), if `median`.
 Differentiable by the Gaussians."""
@@ -133,7 +134,7 @@ def _nearest(centres: Tensor, whitening: Tensor, corners: Tensor, size: int) -> 
 
 def draw_tiles(
     draw: Draw, size: int, drawn: Gaussians, radii: Tensor, half: Tensor, width: int, height: int,
-    *, blend: str, median: bool = False,
+    *, blend: Blend, median: bool = False,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
     """(height, width, c) sums of the values, by their weights, and (height, width) rows, see `Draw`.
 
@@ -217,7 +218,7 @@ def rasterize_scene(
 def splat(
     draw: Draw, size: int,
     centres: Tensor, covariances: Tensor, opacities: Tensor, colours: Tensor, width: int, height: int,
-    *, rings: Tensor | None, arcs: Tensor | None, blend: str,
+    *, rings: Tensor | None, arcs: Tensor | None, blend: Blend,
 ) -> Splats:  # fmt: skip
     """See `splat` of the package; at full resolution, with this drawing, in tiles of this size."""
     centres, covariances = _geometry(centres), _geometry(covariances)

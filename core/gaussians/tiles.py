@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import threshold
 
+from ..choices import Blend
 from . import tiled
 from .reference import RADIUS_MIN
 from .rendering import ALPHA_MIN, OPACITY_MAX, PROFILE_MIN, TRANSMITTANCE_MIN
@@ -118,7 +119,7 @@ class _Draw(torch.autograd.Function):
     """See `tiled.Draw`."""
 
     @staticmethod
-    def forward(ctx: Any, lists: Lists, blend: str, median: bool, *parts: Tensor | None) -> Any:
+    def forward(ctx: Any, lists: Lists, blend: Blend, median: bool, *parts: Tensor | None) -> Any:
         ctx.lists, ctx.blend = lists, blend
         drawn = _with_nothing(Gaussians(*parts))  # type: ignore[arg-type]
         n, channels = len(drawn.values) - 1, drawn.values.shape[1] - 1
@@ -179,7 +180,7 @@ class _Draw(torch.autograd.Function):
         )  # fmt: skip
 
 
-def _weigh(chunk: _Chunk, blend: str, before: Tensor) -> tuple[Tensor, Tensor]:
+def _weigh(chunk: _Chunk, blend: Blend, before: Tensor) -> tuple[Tensor, Tensor]:
     """Weights (b, pixels, k) of the entries, and the transmittances after them, from those before the chunk
     (b, pixels, 1)."""
     if blend == "add":
@@ -198,7 +199,7 @@ def _half_lost(before: Tensor, after: Tensor, index: Tensor) -> Tensor:
     return torch.where(crosses, index.gather(1, place.clamp(max=index.shape[1] - 1)), -1)
 
 
-def draw(lists: Lists, blend: str, median: bool, drawn: Gaussians) -> tuple[Tensor, Tensor]:
+def draw(lists: Lists, blend: Blend, median: bool, drawn: Gaussians) -> tuple[Tensor, Tensor]:
     """See `tiled.Draw`."""
     return _Draw.apply(lists, blend, median, *drawn)
 

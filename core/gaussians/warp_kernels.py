@@ -17,6 +17,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
+from ..choices import Blend
 from . import rendering
 from .reference import RADIUS_MIN
 from .tiled import Gaussians, Lists
@@ -169,7 +170,7 @@ class _Draw(torch.autograd.Function):
     """See `tiled.Draw`."""
 
     @staticmethod
-    def forward(ctx: Any, lists: Lists, blend: str, *parts: Tensor | None) -> Any:
+    def forward(ctx: Any, lists: Lists, blend: Blend, *parts: Tensor | None) -> Any:
         ctx.lists, ctx.blend = lists, blend
         _, values, _, _ = parts
         assert values is not None
@@ -206,7 +207,7 @@ def _rows(tensor: Tensor) -> Any:
     return wp.from_torch(tensor.detach(), dtype=kind, requires_grad=False)
 
 
-def _launch(kernel: Any, lists: Lists, blend: str, parts: Any, more: list[Any]) -> None:
+def _launch(kernel: Any, lists: Lists, blend: Blend, parts: Any, more: list[Any]) -> None:
     places, values, rings, arcs = parts
     shapes = values.new_zeros(len(values), SHAPES)
     if rings is not None:
@@ -225,6 +226,6 @@ def _launch(kernel: Any, lists: Lists, blend: str, parts: Any, more: list[Any]) 
     )
 
 
-def draw(lists: Lists, blend: str, median: bool, drawn: Gaussians) -> tuple[Tensor, Tensor]:  # noqa: ARG001
+def draw(lists: Lists, blend: Blend, median: bool, drawn: Gaussians) -> tuple[Tensor, Tensor]:  # noqa: ARG001
     """See `tiled.Draw`."""
     return _Draw.apply(lists, blend, *drawn)

@@ -33,7 +33,8 @@ def read_tensors(path: Path | str) -> tuple[Arrays, dict[str, str]]:
         data = path.read_bytes()
         return _parsed(data)
     except OSError as problem:
-        raise FlareFileError(f"{path} cannot be read ({problem.strerror or problem}).") from problem
+        raise FlareFileError(f"{path} cannot be read ({problem.strerror or problem}); copy it again, or choose "
+                             "another.") from problem
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as problem:
         raise FlareFileError(f"{path} is damaged or not a flare ({problem}); save it again.") from problem
 

@@ -19,7 +19,7 @@ from ..splatting import OPACITY_MAX as OPACITY_MAX
 from .plane import Floats, PlaneGaussians, arc_level, joined, pixels, strengths, ways
 
 
-def reach(gaussians: PlaneGaussians, blend: str = "add") -> Floats:
+def reach(gaussians: PlaneGaussians, blend: Blend = "add") -> Floats:
     """(n,) Mahalanobis radius beyond which nothing of a Gaussian is drawn."""
     if blend == "add":
         radius = np.full(len(gaussians), math.sqrt(-2 * math.log(PROFILE_MIN)), np.float32)

@@ -28,6 +28,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..choices import Blend
 from ..errors import SettingsError
 from ..pictures import LUMINANCE, linear_from_srgb, srgb_from_linear
 from .elements import Element
@@ -254,7 +255,7 @@ def _words(edit: Edit) -> list[str]:
 
 
 def edited(gaussians: PlaneGaussians, light: str, place: NDArray[Any], elements: Sequence[Element], edits: LookEdits,
-           blend: str) -> PlaneGaussians:
+           blend: Blend) -> PlaneGaussians:
     """One light's Gaussians with the edits applied; order kept, hidden ones gone.
 
     place: (2,) the light on the normalised plane, delta_l included. elements: groups of the rows.
@@ -283,7 +284,7 @@ def edited(gaussians: PlaneGaussians, light: str, place: NDArray[Any], elements:
     return every.kept(np.argsort(np.concatenate(rows), kind="stable"))
 
 
-def _coloured(part: PlaneGaussians, edit: Edit, blend: str) -> PlaneGaussians:
+def _coloured(part: PlaneGaussians, edit: Edit, blend: Blend) -> PlaneGaussians:
     if not edit.coloured:
         return part
     if blend == "add":

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The Gaussians of a light as elements that an artist knows: the glare at the source, ghosts, streaks, rings.
 
-A fit groups its Gaussians at its end and writes the groups into the .flare (`entries`); where a file has none,
+A fit groups its Gaussians at its end and writes the groups into the .flare (`Element.entry`); where a file has none,
 `group` finds them from the canonical Gaussians alone: by kind (ring, streak, compact), and along the line where
 their energy has valleys. Element names are unique within a light.
 """

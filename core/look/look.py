@@ -42,7 +42,7 @@ Query = Literal["target", "source", "trained"]
 
 
 @dataclass(frozen=True)
-class Form:
+class FlareForm:
     """What the model is made of; each field a choice that can be measured alone.
 
     line              Gaussians live on the line through principal point and light; else free (mode `2d`)
@@ -128,8 +128,8 @@ class ViewOfLight:
 class LightLook:
     """The flare of one light; made by `read`."""
 
-    def __init__(self, name: str, xyz: NDArray[np.float64], form: Form, query_range: QueryRange,
-                 rows: Mapping[str, Floats], tensors: Mapping[str, NDArray[Any]], blend: str,
+    def __init__(self, name: str, xyz: NDArray[np.float64], form: FlareForm, query_range: QueryRange,
+                 rows: Mapping[str, Floats], tensors: Mapping[str, NDArray[Any]], blend: Blend,
                  listed: list[Element], clear: float = 1.0) -> None:
         """rows: canonical Gaussians by name; tensors: the network's; listed: elements the file has, [] for none.
         clear: what the scene it was learned in leaves of the light where nothing hides it, 0..1
@@ -334,14 +334,14 @@ def checked(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
 
 def _check_light(path: Path, entry: Mapping[str, Any], listed: Any) -> str:
     """Its name."""
-    strange = set(entry["form"]) - {one.name for one in fields(Form)}
+    strange = set(entry["form"]) - {one.name for one in fields(FlareForm)}
     if strange:
         raise FlareFileError(f"{path} was written by a newer Fit Flare (its form has {', '.join(sorted(strange))}); "
                              "update to open it.")
     name, count, xyz = str(entry["name"]), int(entry["count"]), [float(value) for value in entry["xyz"]]
     if not 0 <= count <= MOST_GAUSSIANS or len(xyz) != 3 or not all(map(math.isfinite, xyz)):
         raise ValueError("a light's description makes no sense")
-    if not Form(**entry["form"]).makes_sense:
+    if not FlareForm(**entry["form"]).makes_sense:
         raise ValueError("a light's form makes no sense")
     if not 0 <= float(entry.get("clear", 1.0)) <= 1:
         raise ValueError("a light's clear share makes no sense")
@@ -369,9 +369,9 @@ def read(path: Path | str) -> Look:
                 Sampling.read(description.get("sampling")))
 
 
-def _light(number: int, entry: Mapping[str, Any], tensors: Mapping[str, NDArray[Any]], blend: str,
+def _light(number: int, entry: Mapping[str, Any], tensors: Mapping[str, NDArray[Any]], blend: Blend,
            listed: Any) -> LightLook:
-    form, name, count = Form(**entry["form"]), str(entry["name"]), int(entry["count"])
+    form, name, count = FlareForm(**entry["form"]), str(entry["name"]), int(entry["count"])
     xyz = np.array([float(value) for value in entry["xyz"]], np.float64)
     own = {key[len(f"{number}."):]: value for key, value in tensors.items() if key.startswith(f"{number}.")}
     rows = {key[len("gaussians."):]: np.asarray(value, np.float32) for key, value in own.items()
@@ -383,7 +383,7 @@ def _light(number: int, entry: Mapping[str, Any], tensors: Mapping[str, NDArray[
                      elements.read(listed, name, count), float(entry.get("clear", 1.0)))
 
 
-def _widths(form: Form) -> dict[str, int]:
+def _widths(form: FlareForm) -> dict[str, int]:
     """Columns of the canonical Gaussians by name (core.flare.model.LightFlare)."""
     widths = {"positions": 1 if form.line else 2, "log_scales": 3 if form.solid else 2,
               "rotations": 4 if form.solid else 2, "opacity_logits": 1, "sh": 3 * (form.sh_degree + 1) ** 2}
@@ -392,7 +392,7 @@ def _widths(form: Form) -> dict[str, int]:
     return {**widths, **{name: width for name, (there, width) in extra.items() if there}}
 
 
-def _heads(form: Form, rows: Mapping[str, Floats]) -> dict[str, int]:
+def _heads(form: FlareForm, rows: Mapping[str, Floats]) -> dict[str, int]:
     """Offsets by name, in the order of the network's one head matrix (core.flare.model.LightFlare)."""
     known = sorted(name for name in _widths(form) if name not in ("offsets", "latent"))  # as torch sorts parameters
     heads = {name: rows[name].shape[1] for name in known}

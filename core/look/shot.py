@@ -34,6 +34,10 @@ from .plane import PlaneGaussians
 VERSION = 1
 _LARGEST = 1 << 15  # pixels of a side
 _MOST_FRAMES = 10**9
+LIGHT_RADIUS = 0.01
+"""Of a light's distance, unless another is told: the deviation of the soft disc of which a share is visible."""
+LIGHT_MARGIN = 0.06
+"""Of a light's distance: what stands nearer to the light is the lamp itself and hides nothing."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,9 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import SettingsError
-from ..pictures import decoded
+from ..pictures import Pixels, decoded
 from . import variety
-from .formation import Pixels
 from .synthesis.canvas import uniform_log
 
 Part = Literal["train", "test", "all"]

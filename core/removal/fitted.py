@@ -24,13 +24,12 @@ from ..capture.discs import clipped_discs
 from ..errors import CaptureError
 from ..files import check_apart, inside
 from ..metrics.evaluation import Renderer
-from ..pictures import linear_from_srgb, srgb_from_linear, window_of
+from ..pictures import Pixels, linear_from_srgb, srgb_from_linear, window_of
 from ..progress import Progress
 from .inference import CLIPPED
 from .plates import Plate, finite, read_plate, write_results
 from .record import Record, made_from
 
-Pixels = NDArray[np.float32]
 Floats = NDArray[np.float64]
 
 ASKED = 100_000

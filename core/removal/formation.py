@@ -9,9 +9,8 @@ become light and where light becomes display.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-Pixels = NDArray[np.float32]
+from ..pictures import Pixels
 
 GAMMAS = (1.8, 2.2)
 

@@ -21,13 +21,11 @@ import torch
 from numpy.typing import NDArray
 
 from ..errors import SettingsError
-from ..pictures import Encoding, linear_from_srgb
+from ..pictures import Encoding, Pixels, linear_from_srgb
 from . import formation
 from .network import MULTIPLE, RemovalNetwork
 from .plates import Plate, finite
 from .weights import IN_THE_BOX, load
-
-Pixels = NDArray[np.float32]
 
 GAMMA = 2
 """Of the light that flares are taken from display values in: the middle of what pictures are formed with, and cheap."""

@@ -13,8 +13,9 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from ..pictures import Pixels
 from .backgrounds import Backgrounds
-from .formation import GAMMAS, Pixels, display
+from .formation import GAMMAS, display
 
 Random = np.random.Generator
 

@@ -19,12 +19,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..pictures import Pixels
 from .inference import Remover, Told
 from .plates import Plate, is_of_the_plate, read_plate
-
-Pixels = NDArray[np.float32]
 
 REACH = 4
 """Frames to either side that count."""

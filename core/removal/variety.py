@@ -14,7 +14,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from .formation import Pixels
+from ..pictures import Pixels
 from .synthesis.canvas import uniform_log
 
 Random = np.random.Generator

@@ -12,6 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from ..capture.camera import Camera, quaternion_from_rotation
+from ..choices import Blend
 from ..files import write_json
 from ..gaussians.ply import write_ply
 from ..gaussians.scene import COEFFICIENTS, SceneGaussians
@@ -75,7 +76,7 @@ def _nothing() -> PlaneGaussians:
     return PlaneGaussians(*(np.zeros(shape, np.float32) for shape in ((0, 2), (0, 3), (0,), (0, 3))))
 
 
-def write_flare_ply(path: Path | str, flares: Mapping[str, PlaneGaussians], camera: Camera, blend: str,
+def write_flare_ply(path: Path | str, flares: Mapping[str, PlaneGaussians], camera: Camera, blend: Blend,
                     sampling: Sampling | None = None) -> None:
     """One frame's flare as a 3DGS PLY; what `flare_scene` has besides, and what it means in the header."""
     scene, more = flare_scene(flares, camera, sampling)

@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..colour import ColourSpace, colour_space
+from ..pictures import Pixels
 from ..removal.plates import Plate, read_plate, write_plate
 
 AUTO = "auto"
 
-Pixels = NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False)

@@ -203,7 +203,7 @@ def of_cameras(capture: Capture, look: Look, scene: Path | None = None) -> Targe
 
 
 def of_shot(shot: Shot, look: Look, wanted: Mapped, *, plates: Path | None = None, scene: Path | None = None,
-            shown: bool = False, wanted_frames: Container[int] | None = None) -> Target:
+            wanted_frames: Container[int] | None = None) -> Target:
     """A shot's frames. plates: a folder of pictures whose names end with the frames' numbers. wanted_frames: those that
     have to have one, None for all: a farm's task may begin before the last frame is rendered.
 
@@ -227,7 +227,7 @@ def of_shot(shot: Shot, look: Look, wanted: Mapped, *, plates: Path | None = Non
         frames.append(TargetFrame(frame, replace(one, camera=camera, lights=lights), plate))
     if not frames:
         raise SettingsError("The shot has no frames; export it again.")
-    return Target(tuple(frames), read_ply(scene) if scene else None, shown)
+    return Target(tuple(frames), read_ply(scene) if scene else None)
 
 
 def _check_shape(plate: Path, camera: Camera) -> None:

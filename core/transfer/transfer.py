@@ -15,31 +15,29 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike
 
 from ..bake.bake import BakeSettings, bake_frames
 from ..bake.frames import Frame
 from ..bake.layers import FrameLayers, Rendered
 from ..capture import Camera
 from ..colour import ColourSpace, colour_space
+from ..display import decode, encode
 from ..errors import SettingsError
 from ..files import check_apart, remove_partial_of
 from ..fit.rendering import render_scene, splat_look
-from ..flare.compositing import decode, encode
 from ..flare.compositing import layers as linear_layers
 from ..flare.visibility import VisibilitySettings, share_seen
 from ..gaussians import Splats
 from ..look import LookEdits, ViewOfLight, read
 from ..look.shot import PlacedLight
-from ..pictures import Picture
+from ..pictures import Picture, Pixels
 from ..progress import Progress
 from . import query as queries
 from .plates import AUTO, ColouredPlate
 from .query import Query
 from .target import Target, TargetFrame, background
 from .visibility import smoothed
-
-Pixels = NDArray[np.float32]
 
 SURE = 0.02
 """Splats never hide all of a light, nor show all of it: a share so near to none or the whole is taken for that. Not so
@@ -69,7 +67,7 @@ class Transfer:
     """
 
     def __init__(self, flare: Path, target: Target, settings: TransferSettings | None = None,
-                 training: Sequence[Any] | None = None, config: str | None = None) -> None:
+                 training: Sequence[ArrayLike] | None = None, config: str | None = None) -> None:
         self.flare, self.target, self.settings, self.config = flare, target, settings or TransferSettings(), config
         self.look = read(flare)
         self.sources = {light.name: light for light in self.look.lights}

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
 from ...core.capture.capture import REMOVED
-from ...core.choices import Model
+from ...core.choices import OUR_PRESETS, Mode, Model
 from ...core.errors import CaptureError, RunError
 from ...core.files import atomic_folder
 from ...core.progress import Progress
@@ -44,7 +44,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
                               "flare-free frames")
     parser.add_argument("--model", choices=get_args(Model), help="the flare's form, as of `fit`")
     parser.add_argument("--iterations", type=int, metavar="N", help="length of the fit (default: the preset's)")
-    parser.add_argument("--preset", choices=("draft", "standard", "high"), default="draft",
+    parser.add_argument("--preset", choices=OUR_PRESETS, default="draft",
                         help="how long and how fine (default draft)")
 
 
@@ -64,7 +64,7 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     capture = with_lights(Capture.open(words.capture or _copy_of_sample(out, words.remove)), progress)
     if words.remove:
         capture = with_removed(capture, progress)
-    mode = "split" if words.split else fit.mode_for(capture, False, progress)
+    mode: Mode = "split" if words.split else fit.mode_for(capture, False, progress)
     progress.say(f"{source.name}: {len(capture.views)} frames, {len(capture.lights)} lights. "
                  f"{_supervision(capture, mode)}")
     given = {"model": words.model} if words.model else {}
@@ -103,7 +103,7 @@ def _check_earlier(folder: Path, settings: FitSettings, capture: Capture) -> Non
                            "another folder with --out.")
 
 
-def _supervision(capture: Capture, mode: str) -> str:
+def _supervision(capture: Capture, mode: Mode) -> str:
     """Where the flare-free frames come from, which the scene is learned from."""
     if mode == "split":
         return "No flare-free frame is looked at."

@@ -111,7 +111,7 @@ def chosen(words: argparse.Namespace, capture: Capture, progress: Progress) -> F
     return changed(settings, {**changes, **dict(map(change, words.changes))})
 
 
-def mode_for(capture: Capture, frozen: bool, progress: Progress) -> str:
+def mode_for(capture: Capture, frozen: bool, progress: Progress) -> Mode:
     """What a fit goes by where nobody says: flare-free frames if there are any."""
     if frozen or capture.has_removed or capture.has_truth:
         return "default"

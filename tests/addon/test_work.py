@@ -16,9 +16,9 @@ from core.bake.exr import read_layers
 from core.bake.shot import bake_shot
 from core.flare import file as flare_file
 from core.flare.deformation import QueryRange
-from core.flare.file import FlareFile, TrainingCamera
+from core.flare.file import FlareFile
 from core.flare.model import OURS, FlareModel, LightFlare
-from core.look import LookEdits, draw, read
+from core.look import LookEdits, TrainedCamera, draw, read
 from core.look.shot import Shot, evaluate
 from tests.core.flared import HEIGHT, LIGHT, WIDTH, cameras, flared_capture
 
@@ -38,7 +38,7 @@ def a_flare(path: Path) -> Path:
         light.gaussians["log_scales"] += torch.randn(light.gaussians["log_scales"].shape, generator=generator)
         light.gaussians["arcs"] += 0.5 * torch.randn(60, 2, generator=generator)
     model = FlareModel(["lamp"], torch.tensor(LIGHT[None]), [light])
-    flare_file.save(path, FlareFile(model, "add", TrainingCamera(WIDTH, HEIGHT, 70.0, 70.0, 33.0, 19.5)))
+    flare_file.save(path, FlareFile(model, "add", TrainedCamera(WIDTH, HEIGHT, 70.0, 70.0, 33.0, 19.5)))
     return path
 
 

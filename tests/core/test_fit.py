@@ -118,6 +118,14 @@ def test_a_fit_finds_the_flare(tmp_path: Path, capture: Capture) -> None:
     assert lines[-1]["flare_gaussians"] > 60
 
 
+def test_colours_take_up_directions_by_and_by(capture: Capture) -> None:
+    trainer = Trainer(capture, quick())
+    degrees = []
+    for trainer.iteration in (0, 7, 8, 20, 39):
+        degrees.append(trainer._sh_degree())
+    assert degrees == [0, 0, 1, 2, 3]
+
+
 def test_the_light_itself_is_not_what_its_flare_lies_before(capture: Capture) -> None:
     trainer = Trainer(capture, quick())
     targets = trainer.frames.targets(trainer.views[0])

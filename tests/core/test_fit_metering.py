@@ -16,13 +16,13 @@ import torch
 from numpy.typing import NDArray
 
 from core.capture import Camera, Capture
+from core.display import clipped, decode, encode, exposed
 from core.errors import Cancelled, RunError
 from core.files import write_text
 from core.fit import Run, fit, metering
 from core.fit.frames import Frames
 from core.fit.sky import with_sky
 from core.fit.trainer import Trainer
-from core.flare.compositing import clipped, decode, encode, exposed
 from core.pictures import linear_from_srgb, srgb_from_linear, write_png
 from tests.core.flared import cameras, flared_capture
 from tests.core.heard import Heard

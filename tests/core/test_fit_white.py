@@ -13,15 +13,16 @@ from numpy.typing import NDArray
 
 from core.bake.shot import ShotRenderer
 from core.capture import Capture, View
+from core.display import decode, encode
 from core.errors import SettingsError
 from core.fit import FitSettings, Run, fit, preset
-from core.fit.beginning import WHITEST, with_white
 from core.fit.frames import Frames, Targets
+from core.fit.metering import WHITEST, with_white
 from core.fit.run import FLARE
 from core.fit.settings import changed
 from core.fit.sky import with_sky
 from core.fit.trainer import Trainer
-from core.flare.compositing import composite, decode, encode, layers
+from core.flare.compositing import composite, layers
 from core.gaussians import Splats
 from core.look.shot import Shot, ShotFrame
 from core.pictures import Picture, holds_floats, srgb_from_linear, write_png

@@ -14,18 +14,21 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from core.capture import Camera
+from core.display import decode, encode
 from core.errors import FlareFileError
 from core.flare import file as flare_file
 from core.flare import placement
-from core.flare.compositing import composite, decode, encode, joined, layers, splat_flare
+from core.flare.compositing import composite, joined, layers, splat_flare
 from core.flare.deformation import QueryRange
 from core.flare.density import DensitySettings, clone_and_prune
 from core.flare.encoding import HashGrid, frequency_encoding
-from core.flare.file import FlareFile, TrainingCamera
-from core.flare.model import OURS, PAPER, FlareForm, FlareModel, LightFlare, ViewOfLight
+from core.flare.file import FlareFile
+from core.flare.model import OURS, PAPER, FlareModel, LightFlare, ViewOfLight
 from core.gaussians import Splats, rasterization
 from core.gaussians.optimiser import Adam
 from core.gaussians.rendering import arc_strengths
+from core.look import TrainedCamera
+from core.look.look import FlareForm
 from core.look.plane import PLANE_DEPTH
 from core.sampling import Sampling
 from tests.core.flared import cameras
@@ -351,7 +354,7 @@ def test_cloning_and_pruning_follow_opacity() -> None:
 
 # ---- the file -------------------------------------------------------------------------------------
 
-CAMERA = TrainingCamera(64, 40, 70.0, 70.0, 33.0, 19.5)
+CAMERA = TrainedCamera(64, 40, 70.0, 70.0, 33.0, 19.5)
 
 
 @pytest.mark.parametrize("form", [PAPER, OURS, replace(PAPER, line=False)])

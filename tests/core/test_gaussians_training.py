@@ -15,10 +15,11 @@ from torch import Tensor
 
 from core.capture import Camera, PointCloud
 from core.errors import RunError, SettingsError
+from core.fit.optimisers import Optimisers
+from core.fit.settings import FitSettings
 from core.gaussians import Adam, Rendering, SceneGaussians, kernels, l1_ssim, ssim
 from core.gaussians.densification import Classic, ClassicSettings, Mcmc, McmcSettings, shared
 from core.gaussians.ordering import morton_order, nearest_distances
-from core.gaussians.scene import learning_rates, means_rate, sh_degree_at
 
 
 def pictures(height: int, width: int, seed: int = 0) -> tuple[Tensor, Tensor]:
@@ -200,10 +201,16 @@ def test_morton_order_brings_neighbours_together() -> None:
     assert torch.equal(morton_order(corners), torch.arange(8))  # x the lowest bit
 
 
+def of_scene(scene: SceneGaussians, extent: float = 1.0, iterations: int = 100) -> Optimisers:
+    """What steps a scene in a fit without a flare."""
+    return Optimisers(scene, None, FitSettings(iterations=iterations), extent, display_white=1.0)
+
+
 def test_schedules() -> None:
-    assert [sh_degree_at(i) for i in (0, 999, 1000, 2500, 9999)] == [0, 0, 1, 2, 3]
-    assert means_rate(2.0, 0, 100) == pytest.approx(3.2e-4)
-    assert means_rate(2.0, 100, 100) == pytest.approx(3.2e-6)
+    optimisers = of_scene(SceneGaussians.empty(2), extent=2.0)
+    for iteration, expected in ((0, 3.2e-4), (50, 3.2e-5), (100, 3.2e-6)):
+        optimisers.set_rates(iteration)
+        assert optimisers.scene.rates["means"] == pytest.approx(expected)
 
 
 CAMERA = Camera(36, 28, 40.0, 40.0, 18.0, 14.0, np.array([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 4], [0, 0, 0, 1]]))
@@ -260,7 +267,7 @@ def some_scene(n: int = 60, seed: int = 0) -> tuple[SceneGaussians, Adam]:
         torch.randn(n, generator=generator),
         torch.randn(n, 16, 3, generator=generator) * 0.1,
     )
-    optimiser = Adam(dict(scene.named_parameters()), learning_rates(1.0))
+    optimiser = of_scene(scene).scene
     for parameter in scene.parameters():
         parameter.grad = torch.ones_like(parameter)
     optimiser.step()
@@ -438,7 +445,7 @@ def test_training_finds_a_picture() -> None:
         rng.normal(0, 0.5, (30, 3)).astype(np.float32), np.full((30, 3), 128, np.uint8), np.zeros(30, np.float32)
     )
     scene = SceneGaussians.from_points(points)
-    optimiser = Adam(dict(scene.named_parameters()), learning_rates(10.0))
+    optimiser = of_scene(scene, extent=10.0).scene
     settings = ClassicSettings(start=20, every=20, stop=100, gradient=1e-3, cap=80)
     strategy = Classic(scene, optimiser, 1.0, torch.Generator().manual_seed(0), settings)
     losses, counts = [], []

@@ -16,13 +16,23 @@ from core.bake import shot as shot_bakes
 from core.errors import FlareFileError, SettingsError
 from core.flare import file as flare_file
 from core.flare.compositing import splat_flare
-from core.flare.file import FlareFile, TrainingCamera
-from core.flare.model import OURS, PAPER, FlareForm, FlareModel
-from core.look import Edit, KeyedEdits, LookEdits, PlaneGaussians, ViewOfLight, draw, list_elements, read
+from core.flare.file import FlareFile
+from core.flare.model import OURS, PAPER, FlareModel
+from core.look import (
+    Edit,
+    KeyedEdits,
+    LookEdits,
+    PlaneGaussians,
+    TrainedCamera,
+    ViewOfLight,
+    draw,
+    list_elements,
+    read,
+)
 from core.look import elements as grouping
 from core.look.container import read_tensors, rewritten
 from core.look.edits import edited
-from core.look.look import FORM_BOUNDS, asked
+from core.look.look import FORM_BOUNDS, FlareForm, asked
 from core.look.shot import PlacedLight, Shot, ShotFrame, evaluate
 from core.pictures import linear_from_srgb, srgb_from_linear
 from tests.core.flared import cameras
@@ -32,7 +42,7 @@ FORMS = {"paper": PAPER, "ours": OURS, "plane": replace(PAPER, line=False, plane
          "bare": replace(PAPER, light_correction=False, plane_offset=False, sh_degree=1),
          "small": replace(OURS, levels=6), "arcs": replace(OURS, arcs=True)}
 SMALL = FORMS["small"]
-CAMERA = TrainingCamera(64, 40, 70.0, 70.0, 33.0, 19.5)
+CAMERA = TrainedCamera(64, 40, 70.0, 70.0, 33.0, 19.5)
 
 
 def saved(path: Path, form: FlareForm = SMALL, lights: int = 2, blend: str = "add", count: int = 40) -> FlareModel:

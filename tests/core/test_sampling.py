@@ -14,13 +14,14 @@ import torch
 
 from core.bake.shot import ShotRenderer
 from core.capture import Camera, Capture
+from core.display import decode, encode
 from core.errors import FlareFileError
 from core.fit import Run, fit
 from core.fit.fitting import FLARE, SCENE
 from core.fit.rendering import render_scene
 from core.fit.trainer import Trainer
 from core.flare import file as flare_file
-from core.flare.compositing import decode, encode, splat_flare
+from core.flare.compositing import splat_flare
 from core.flare.placement import PlaneGaussians
 from core.gaussians import SceneGaussians
 from core.gaussians.ply import read_ply, write_ply

@@ -20,10 +20,10 @@ from core.colour import colour_space
 from core.errors import RunError, SettingsError
 from core.files import write_json
 from core.flare import file as flare_file
-from core.flare.file import FlareFile, TrainingCamera
+from core.flare.file import FlareFile
 from core.gaussians import SceneGaussians
 from core.gaussians.ply import write_ply
-from core.look import KeyedEdits, Look, ViewOfLight, read
+from core.look import KeyedEdits, Look, TrainedCamera, ViewOfLight, read
 from core.look.shot import PlacedLight, Shot, ShotFrame
 from core.pictures import linear_from_srgb, read_exr, srgb_from_linear, write_exr, write_png
 from core.removal.plates import Plate
@@ -51,7 +51,7 @@ def flare(tmp_path_factory: pytest.TempPathFactory) -> Path:
             layer.weight *= 0.02
             layer.bias *= 0.02
     poses = [torch.from_numpy(camera.world_to_camera) for camera in cameras(6)]
-    flare_file.save(path, FlareFile(model, "add", TrainingCamera(64, 40, 70.0, 70.0, 33.0, 19.5),
+    flare_file.save(path, FlareFile(model, "add", TrainedCamera(64, 40, 70.0, 70.0, 33.0, 19.5),
                                     seen=model.seen_from(poses)))
     return path
 

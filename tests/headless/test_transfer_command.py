@@ -19,10 +19,10 @@ from core.bake.exr import read_description, read_layers
 from core.capture import Capture
 from core.fit import fit, preset
 from core.fit.settings import changed
-from core.flare.file import FlareFile, TrainingCamera
+from core.flare.file import FlareFile
 from core.flare.file import save as save_flare
 from core.gaussians.ply import read_ply
-from core.look import read
+from core.look import TrainedCamera, read
 from core.look.shot import Shot
 from core.pictures import read_picture, write_png
 from tests.core.captures import make_transforms
@@ -136,7 +136,7 @@ def test_a_preset_needs_a_light_in_front_of_the_camera(run: Run, tmp_path: Path)
     (folder / "transforms.json").write_text(json.dumps(poses))
     flare = some_flare(lights=2)
     flare.positions[1] = torch.tensor([0.0, 0.0, -8.0])
-    save_flare(tmp_path / "a.flare", FlareFile(flare, "add", TrainingCamera(64, 40, 70.0, 70.0, 33.0, 19.5)))
+    save_flare(tmp_path / "a.flare", FlareFile(flare, "add", TrainedCamera(64, 40, 70.0, 70.0, 33.0, 19.5)))
     words = ["export", tmp_path / "a.flare", "--capture", folder, "--as", "preset", "--out", tmp_path / "a.json"]
     told = [event["text"] for event in run(*words) if event["type"] == "say"]
     assert told[-1] == "Lights behind the camera in frame 0 are not in it: lamp 1."

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ...choices import Blend
 from ..rendering import Splats
 from . import buffers, flare, layout, raster_backward, raster_forward
 from .threads import parallel
@@ -85,7 +86,7 @@ class _Splat(torch.autograd.Function):
 
 def splat(
     centres: Tensor, covariances: Tensor, opacities: Tensor, colours: Tensor, width: int, height: int,
-    *, rings: Tensor | None, arcs: Tensor | None, blend: str,
+    *, rings: Tensor | None, arcs: Tensor | None, blend: Blend,
 ) -> Splats:  # fmt: skip
     """See `splat` of the package; full resolution."""
     given = (centres, covariances, opacities, colours, rings, arcs)

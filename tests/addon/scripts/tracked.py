@@ -19,8 +19,9 @@ from start import empty, install, leave, part
 
 package, out = sys.argv[1], Path(sys.argv[2])
 install(package)
-cameras, capture_export, lights, looks, blend_shot = (
-    part(f"flare_addon.{name}") for name in ("cameras", "capture_export", "lights", "looks", "blend_shot"))
+cameras, capture_export, lights, looks, occlusion, blend_shot = (
+    part(f"flare_addon.{name}") for name in ("cameras", "capture_export", "lights", "looks", "occlusion",
+                                           "blend_shot"))
 facts: dict[str, object] = {}
 
 FRAMES, WIDTH, HEIGHT, K1 = 20, 320, 180, -0.12
@@ -169,7 +170,7 @@ scene.collection.objects.link(wall)
 
 def share() -> float:
     bpy.context.view_layer.update()
-    return looks.visible_share(scene, bpy.context.evaluated_depsgraph_get(), eye, item)
+    return occlusion.visible_share(scene, bpy.context.evaluated_depsgraph_get(), eye, item)
 
 
 facts["behind a wall"] = share()

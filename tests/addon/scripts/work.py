@@ -20,7 +20,8 @@ package, capture, flare, out = sys.argv[1:5]
 install(package)
 sys.path.remove(str(Path(__file__).parent))
 ops = bpy.ops.fit_flare
-shots, looks, overlay, cameras = (part(f"flare_addon.{name}") for name in ("shots", "looks", "overlay", "cameras"))
+shots, looks, occlusion, overlay, cameras = (
+    part(f"flare_addon.{name}") for name in ("shots", "looks", "occlusion", "overlay", "cameras"))
 core_capture, core_look = part("core.capture"), part("core.look")
 drawing = part("core.look.drawing")
 facts: dict[str, object] = {}
@@ -333,7 +334,7 @@ for edge in np.linspace(-0.06, 0.06, 13):
     wall = bpy.data.objects.new("Wall", mesh)
     scene.collection.objects.link(wall)
     bpy.context.view_layer.update()
-    shares.append(looks.visible_share(scene, bpy.context.evaluated_depsgraph_get(), eye, state.lights[0]))
+    shares.append(occlusion.visible_share(scene, bpy.context.evaluated_depsgraph_get(), eye, state.lights[0]))
     bpy.data.objects.remove(wall)
 facts["fades"] = shares
 bpy.context.view_layer.update()

@@ -112,7 +112,7 @@ def test_a_bare_flare_is_baked_as_its_run_is(run: Run, made: Path, capture: Path
     layers = read_layers(tmp_path / "flare" / "layers.0003.exr")
     assert not layers.scene.any()
     assert layers.flare.max() > 0
-    assert read_description(tmp_path / "flare" / "layers.0003.exr")["space"] == ["acescg", None]
+    assert read_description(tmp_path / "flare" / "layers.0003.exr")["space"][:2] == ["acescg", None]
     sentence = run("bake", made / "flare.flare", "--out", tmp_path / "none", status=2)[-1]["text"]
     assert "--capture" in sentence
     assert "--blend" in sentence

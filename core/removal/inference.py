@@ -33,7 +33,7 @@ WORKING_SIZE = 384
 """Long side that the network sees: about what it was trained at last."""
 LEAST = 0.01
 """What a flare adds to display values, below which there is none."""
-SURE = 0.002
+SURE = 0.001
 """Mean over the frame of what a flare adds, below which the network is not trusted at all; from twice as much on
 it is trusted whole. It tells small flares where there are none."""
 SIZES, TURNS = (1.0, 0.75), (0, 2)

@@ -184,7 +184,11 @@ def test_a_program_that_cannot_start_is_a_sentence(tmp_path: Path) -> None:
 def test_who_waits_for_an_event_hears_a_stop_meanwhile(tmp_path: Path) -> None:
     """On Windows no signal gets through to who reads from a pipe."""
     inbox: Inbox = queue.Queue()
-    silent = Child(child(tmp_path, "time.sleep(60)"), environment(), inbox)
+    code = ("import signal\nsignal.signal(signal.SIGINT, signal.default_int_handler)\n"  # also where it is ignored here
+            "tell(type='say', text='here')\ntime.sleep(60)")
+    silent = Child(child(tmp_path, code), environment(), inbox)
+    while next_event(inbox) is None:
+        pass
     assert next_event(inbox) is None
     silent.interrupt()
     silent.end()

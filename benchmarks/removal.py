@@ -179,6 +179,14 @@ def scenes(folders: list[Path], weights: Path | None, count: int) -> None:
           f"at 45; the others {', '.join(f'{value:.1f}' for value in low) or 'none'} dB")
 
 
+def _unseen(lenses: Path | None) -> Any:
+    """The lenses of a folder that training leaves out."""
+    from core.removal.evaluation import held_out
+    from core.removal.synthesis.prescription import read_lenses
+
+    return held_out(read_lenses(lenses) if lenses else [])
+
+
 AGAINST = ("scatter", "ghosts", "streak", "glare", "mixed")
 """Classes of flares that have a light in the frame."""
 
@@ -187,12 +195,10 @@ def against(folders: list[Path], lenses: Path | None, weights: Path | None, coun
     """What removal gains where lights stand in a bright part of the scene, and where they stand anywhere."""
     from core.removal.backgrounds import read_backgrounds
     from core.removal.bank import OneFlare
-    from core.removal.evaluation import held_out
     from core.removal.pairs import pair
-    from core.removal.synthesis.prescription import read_lenses
 
     remover, backgrounds = Remover(weights), read_backgrounds(folders, "test", 480)
-    unseen = held_out(read_lenses(lenses) if lenses else [])
+    unseen = _unseen(lenses)
     for name, share in (("against the light", 1.0), ("anywhere", 0.0)):
         gains = []
         for kind in AGAINST:
@@ -208,12 +214,11 @@ def against(folders: list[Path], lenses: Path | None, weights: Path | None, coun
 def matte(folders: list[Path], lenses: Path | None, weights: Path | None, count: int) -> None:
     """What removal gains with a rough matte of the flare, and without."""
     from core.removal.backgrounds import read_backgrounds
-    from core.removal.evaluation import held_out, synthetic
+    from core.removal.evaluation import synthetic
     from core.removal.plates import Plate
-    from core.removal.synthesis.prescription import read_lenses
 
     remover, size = Remover(weights), (480, 320)
-    backgrounds, unseen = read_backgrounds(folders, "test", max(size)), held_out(read_lenses(lenses) if lenses else [])
+    backgrounds, unseen = read_backgrounds(folders, "test", max(size)), _unseen(lenses)
     gains = []
     for case in synthetic(1001, count, backgrounds, unseen, size):
         frame, truth, _ = case.read()

@@ -27,8 +27,8 @@ def windows(stream: BinaryIO) -> dict[str, tuple[int, int]]:
     return {name.decode(): (x1 - x0 + 1, y1 - y0 + 1) for name, (x0, y0, x1, y1) in corners.items()}
 
 
-HALF, FLOAT = 1, 2
-"""Kinds of a channel's numbers: 16 and 32 bit floats."""
+HALF = 1
+"""Of the kinds of a channel's numbers, 16 bit floats."""
 
 
 def channel_kinds(stream: BinaryIO) -> dict[str, int]:
@@ -51,7 +51,11 @@ def chromaticities(stream: BinaryIO) -> tuple[float, ...] | None:
 def pixel_aspect(stream: BinaryIO) -> float:
     """Width of a pixel by its height; 1 where that is not told, or makes no sense."""
     value = _attributes(stream, {b"pixelAspectRatio": b"float"}).get(b"pixelAspectRatio", b"")
-    told = float(np.frombuffer(value, "<f4")[0]) if len(value) == 4 else 1.0
+    return sensible_aspect(float(np.frombuffer(value, "<f4")[0]) if len(value) == 4 else 1.0)
+
+
+def sensible_aspect(told: float) -> float:
+    """What a header tells of a pixel's width by its height; 1 where that makes no sense."""
     return told if 0.1 < told < 10 else 1.0
 
 

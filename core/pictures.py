@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO, Literal, TypeVar, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from . import exr, jpeg, tiff
+from . import exr, jpeg, png, tiff
 from .errors import FrameError
 from .files import atomic_path
 from .typed import is_utf8
@@ -313,8 +313,8 @@ def _window(path: Path, header: Mapping[str, Any]) -> Window:
     stored, frame = (_checked(path, (int(high[0]) - int(low[0]) + 1, int(high[1]) - int(low[1]) + 1))
                      for low, high in (header["dataWindow"], header["displayWindow"]))
     (x, y), (left, top) = header["dataWindow"][0], header["displayWindow"][0]
-    aspect = float(header.get("pixelAspectRatio", 1.0))
-    return Window(stored, (int(x) - int(left), int(y) - int(top)), frame, aspect if 0.1 < aspect < 10 else 1.0)
+    aspect = exr.sensible_aspect(float(header.get("pixelAspectRatio", 1.0)))
+    return Window(stored, (int(x) - int(left), int(y) - int(top)), frame, aspect)
 
 
 def framed(pixels: Pixels, window: Window) -> Pixels:
@@ -332,7 +332,7 @@ def framed(pixels: Pixels, window: Window) -> Pixels:
 
 def _size_from_header(stream: BinaryIO) -> tuple[int, int] | None:
     head = stream.read(24)
-    if head[:8] == b"\x89PNG\r\n\x1a\n" and len(head) == 24:
+    if head[:8] == png.SIGNATURE and len(head) == 24:
         return int.from_bytes(head[16:20], "big"), int.from_bytes(head[20:24], "big")
     if head[:2] == b"\xff\xd8":
         header = jpeg.frame_header(stream)

@@ -12,7 +12,7 @@ from typing import Any
 import bpy
 
 from ..core.bake.folder import LayerFolder
-from ..core.colour.ocio import NAMES
+from ..core.colour.ocio import CONFIGURED_NAMES
 from ..core.errors import FrameError
 from ..core.pictures import exr_space
 from . import curves, wires
@@ -354,4 +354,4 @@ def misread(scene: Any) -> str:
 def _space_of(image: Any) -> str:
     """What the colour configuration calls the space that an EXR's light is in; "" where it has none."""
     known = {item.identifier for item in image.colorspace_settings.bl_rna.properties["name"].enum_items}
-    return next((one for one in NAMES.get(exr_space(absolute(image.filepath)), ()) if one in known), "")
+    return next((one for one in CONFIGURED_NAMES.get(exr_space(absolute(image.filepath)), ()) if one in known), "")

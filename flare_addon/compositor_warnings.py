@@ -7,9 +7,8 @@ from typing import Any
 
 from ..core.bake.folder import LayerFolder
 from ..core.bake.frames import Frame, absent
+from ..core.pictures import are_one_shape
 from . import compositor, flare_node, wires
-
-_SAME_SHAPE = 0.01  # of the ratio of width to height; rounding to whole pixels stays below
 
 
 def warnings(scene: Any, layers: LayerFolder, live: bool) -> Iterator[str]:
@@ -25,8 +24,7 @@ def warnings(scene: Any, layers: LayerFolder, live: bool) -> Iterator[str]:
         yield (f"The film is transparent, and {render.image_settings.file_format} files have no light where nothing is "
                "but the flare; render to OpenEXR, or without alpha (RGB).")
     width, height = layers.size()
-    shown = render.resolution_x / max(render.resolution_y, 1)
-    if abs(shown * height / width - 1) > _SAME_SHAPE:
+    if not are_one_shape((width, height), (render.resolution_x, render.resolution_y)):
         yield (f"The layers have {width} x {height} pixels and the scene renders {render.resolution_x} x "
                f"{render.resolution_y}, another shape, into which they are stretched; bake them again.")
     there = [Frame("", number, "") for number in layers.files]

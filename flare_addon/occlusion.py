@@ -14,7 +14,8 @@ from ..core.look.shot import LIGHT_MARGIN, LIGHT_RADIUS
 from .lights import stands
 from .objects import matrix_of
 
-DISC = 2 * LIGHT_RADIUS  # of a light's distance: the disc's radius where none is given, two deviations wide as a fit's
+DISK_SHARE = 2 * LIGHT_RADIUS
+"""Of a light's distance, the disk's radius where none is given: two deviations wide, as a fit's."""
 RAYS = 25
 
 
@@ -58,7 +59,7 @@ def share_seen(scene: Any, depsgraph: Any, eye: Any, light: Any, own: set[str], 
     distance = away.length
     if distance < 1e-6:
         return 1.0
-    radius = disk or DISC * distance
+    radius = disk or DISK_SHARE * distance
     forward = away / distance
     right = forward.orthogonal().normalized()
     up = forward.cross(right)

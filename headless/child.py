@@ -116,7 +116,7 @@ def _event(line: str) -> Event:
     return event if isinstance(event, dict) else {}
 
 
-def failure(failed: Sequence[Child], count: int, step: str) -> FitFlareError:
+def joint_failure(failed: Sequence[Child], count: int, step: str) -> FitFlareError:
     """One error for those of `count` processes of a step that have ended and failed, with the sentence of each; of the
     kind that they have in common. EngineError where one gave no reason; its last words are shown."""
     problems = [child.failure() for child in failed if child.told]

@@ -19,10 +19,10 @@ from ..core.errors import Cancelled, EngineError, FitFlareError, SettingsError, 
 from ..core.processes import DONE, FAILED, MISUSED, STOPPED, WINDOWS
 from ..core.progress import JsonProgress, OpenJdProgress, Progress, TerminalProgress, flush_or_drop, stoppable
 from . import hand_off
-from .command import Command, Step, Stopped
+from .command import AfterAStop, Command, Step
 from .commands import COMMANDS
 
-_HINTS: dict[Stopped, str] = {
+_HINTS: dict[AfterAStop, str] = {
     "goes on": "Give the command again to go on.",
     "goes on with --resume": "Give the command again with --resume to go on.",
     "starts over": "Given again, it starts over.",
@@ -78,7 +78,7 @@ def parser() -> argparse.ArgumentParser:
 
 def _after_a_stop() -> str:
     """What commands do that are given again after Ctrl-C."""
-    ways = {way: [name for name, command in COMMANDS.items() if command.stopped == way] for way in _HINTS}
+    ways = {way: [name for name, command in COMMANDS.items() if command.after_a_stop == way] for way in _HINTS}
     text = "; ".join(f"{', '.join(names)} {way.replace('goes', 'go')}" for way, names in ways.items()
                      if names and way != "starts over")
     return textwrap.fill(f"Stopped (Ctrl-C) and given again, {text}; the others start over.", 110)
@@ -122,7 +122,7 @@ def _status(words: Sequence[str], progress: Progress) -> int:
         return MISUSED
     except (Cancelled, KeyboardInterrupt) as stop:
         command = COMMANDS.get(getattr(arguments, "command", ""))
-        hint = f" {_HINTS[command.stopped]}" if command and isinstance(progress, TerminalProgress) else ""
+        hint = f" {_HINTS[command.after_a_stop]}" if command and isinstance(progress, TerminalProgress) else ""
         progress.error(f"{str(stop) or 'Stopped.'}{hint}")
         return STOPPED
     except FitFlareError as problem:

@@ -17,7 +17,7 @@ from ..core.progress import Progress
 from ..core.typed import MOST_SEED
 
 Side = Literal["engine", "blender"]
-Stopped = Literal["starts over", "goes on", "goes on with --resume"]
+AfterAStop = Literal["starts over", "goes on", "goes on with --resume"]
 Run = Callable[[argparse.Namespace, Progress], dict[str, Any]]
 
 
@@ -57,12 +57,12 @@ class Step:
 
 @dataclass(frozen=True)
 class Command:
-    """summary: one line of the list of commands. description: the head of its own help. stopped: what it does when it
-    is given again after it was stopped."""
+    """summary: one line of the list of commands. description: the head of its own help. after_a_stop: what it does
+    when it is given again after it was stopped."""
 
     name: str
     summary: str
     description: str
     arguments: Callable[[argparse.ArgumentParser], None]
     steps: tuple[Step, ...]
-    stopped: Stopped = "starts over"
+    after_a_stop: AfterAStop = "starts over"

@@ -22,7 +22,7 @@ from typing import Any
 from ..core.errors import Cancelled, EngineError
 from ..core.processes import DONE, WINDOWS, environment, python_at
 from ..core.progress import Progress, is_hangup, stop_signals
-from .child import Child, failure
+from .child import Child, joint_failure
 from .command import Side
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -157,7 +157,7 @@ def run_there(command: Sequence[str], words: Sequence[str], step: str, progress:
         child.end()
     progress.check()
     if child.status != DONE:
-        raise failure([child], 1, step)
+        raise joint_failure([child], 1, step)
     return result
 
 

@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from ..core.processes import DONE, cores, environment
 from ..core.progress import STOP_FILE, Progress
 from . import hand_off
-from .child import Child, Event, Inbox, failure, next_event
+from .child import Child, Event, Inbox, joint_failure, next_event
 from .command import from_1
 
 
@@ -65,15 +65,15 @@ def run_parts(words: argparse.Namespace, step: str, parts: Sequence[Sequence[str
 
     total: steps of all together, as the processes count them; where it is the number of parts, parts are counted.
     past_failures: one that fails does not stop the others, since they go past what they cannot do themselves.
-    Raises Cancelled when asked to stop, after the processes have stopped; what `child.failure` makes of those that
-    failed, after the others have been stopped or, `past_failures`, have ended; EngineError where one cannot be started.
+    Raises Cancelled when asked to stop, after the processes have stopped; the `joint_failure` of those that failed,
+    after the others have been stopped or, `past_failures`, have ended; EngineError where one cannot be started.
     """
     commands = [[sys.executable, str(hand_off.RUN),
                  *hand_off.with_options(words.words, "--step", step, *part, "--progress", "json")] for part in parts]
     progress.stage(step, total)
     failed = _run_all(commands, jobs, _Counter(progress, total == len(parts)), past_failures)
     if failed:
-        raise failure(failed, len(parts), step)
+        raise joint_failure(failed, len(parts), step)
 
 
 class _Counter:

@@ -130,7 +130,7 @@ def base() -> str | None:
 
 def cleared(folder: Path) -> bool:
     """Whether the folder is gone: as a whole, since nothing of an old engine may be left in a new one. It stays where
-    Windows has a file of it in use for long."""
+    Windows has a file of it in use for long. (core/files.py has the like, which may not be imported here.)"""
     for left in folder.parent.glob(f"{glob.escape(folder.name)}.old-*"):  # what was in use when it was removed
         shutil.rmtree(left, ignore_errors=True)
     old = folder.with_name(f"{folder.name}.old-{os.getpid()}")

@@ -17,7 +17,7 @@ from ..errors import EngineError, SettingsError
 from .spaces import REC_709, ColourSpace, colour_space, linear_space
 from .spaces import names as built_in_names
 
-NAMES = {
+CONFIGURED_NAMES = {
     "linear": ("lin_rec709_scene", "lin_rec709", "Linear Rec.709 (sRGB)", "Linear Rec.709", "Utility - Linear - sRGB",
                "Utility - Linear - Rec.709", "Linear"),
     "acescg": ("ACEScg", "lin_ap1_scene", "lin_ap1", "ACES - ACEScg"),
@@ -80,7 +80,7 @@ def _library() -> ModuleType:
 
 def _processor(library: ModuleType, config: Any, name: str, *, forward: bool) -> Any:
     """From the space to linear Rec. 709, or back."""
-    own = next((one for one in NAMES["linear"] if config.getColorSpace(one) is not None), None)
+    own = next((one for one in CONFIGURED_NAMES["linear"] if config.getColorSpace(one) is not None), None)
     try:
         if own is not None:
             made = config.getProcessor(name, own) if forward else config.getProcessor(own, name)

@@ -12,13 +12,16 @@ from ..capture import Capture, View
 from ..errors import RunError
 from ..files import content_of
 
+SAME_PLACE = 1e-5
+"""Share of the extent within which a light that was given is where it was."""
+
 
 class Given:
-    """The lights of a capture, and of each view a digest of its camera, its frame and, if the fit looks at it, its
-    flare-free frame. apart: how far two places of a light are one, in units of the capture's world."""
+    """The lights of a capture, where the fit has `lights`, and of each view a digest of its camera, its frame and, if
+    the fit looks at `removed`, its flare-free frame."""
 
-    def __init__(self, capture: Capture, *, removed: bool, lights: bool, apart: float) -> None:
-        self._capture, self._removed, self._apart = capture, removed, apart
+    def __init__(self, capture: Capture, *, removed: bool, lights: bool) -> None:
+        self._capture, self._removed = capture, removed
         self._lights = [[light.name, light.xyz.tolist()] for light in capture.lights] if lights else None
         self._views: list[list[str]] | None = None
 
@@ -34,7 +37,7 @@ class Given:
         what was learned of a frame to that frame. Notes of earlier versions say less."""
         now = self.note()
         if "lights" in now and noted.get("lights") is not None and (
-                changed := _difference(noted["lights"], now["lights"], self._apart)):
+                changed := _difference(noted["lights"], now["lights"], SAME_PLACE * self._capture.extent)):
             raise RunError(f"{self._capture.folder / 'lights.json'} has changed since the fit began ({changed}); put "
                            "the old one back, or begin the fit anew in another folder.")
         before, after = dict(noted.get("views") or []), dict(now["views"])

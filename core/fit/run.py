@@ -44,7 +44,6 @@ EVALUATION = "eval.json"
 LOG = "log.txt"
 
 
-
 @dataclass(frozen=True)
 class ViewLayers:
     """Scene-linear layers of a view, numpy: scene (h, w, 3), each light's flare (h, w, 3), depth (h, w).

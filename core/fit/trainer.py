@@ -45,8 +45,6 @@ CLEAR_EVERY = 50
 """Iterations between two looks at how much of the lights the scene leaves (`visibility.clear_shares`)."""
 UNTOLD = 0.01
 """Difference of display values between frame and flare-free frame below which nothing is told of a flare."""
-SAME_PLACE = 1e-5
-"""Share of the extent within which a light that was given is where it was."""
 ASKED = 40
 """About as many views are asked there, and for whether a scene has been found (`splitting.is_found`)."""
 
@@ -84,8 +82,7 @@ class Trainer:
                      *doubts(capture, settings, self.views, self.frames),
                      *(() if self.flare is None else moved_lights(capture, self.flare)))
         self.extent = capture.extent
-        self._given = Given(capture, removed=self.frames.reference == "removed", lights=self.flare is not None,
-                            apart=SAME_PLACE * self.extent)
+        self._given = Given(capture, removed=self.frames.reference == "removed", lights=self.flare is not None)
         self._head_start = head_start(settings.split, len(self.views), settings.iterations)
         """Iterations in which a scene of mode `split` is fitted alone; then it is asked whether it has been found."""
         self._scene_is_found = True

@@ -50,7 +50,7 @@ def plates_of(inputs: Iterable[Path], apart_from: Iterable[Path | None] = ()) ->
     return list(found.values())
 
 
-def shots_of(inputs: Sequence[Path], apart_from: Iterable[Path | None] = ()) -> list[Path]:
+def with_neighbours(inputs: Sequence[Path], apart_from: Iterable[Path | None] = ()) -> list[Path]:
     """The plates of `plates_of`, and what lies beside those that were given by themselves: one frame of a shot comes
     out as it does with all of them."""
     apart = {other.resolve() for other in apart_from if other is not None}
@@ -86,7 +86,7 @@ def remove_all(inputs: Sequence[Path], folder: Path, remover: Remover, progress:
     check_apart([*(path for path, _ in plates), *(mattes.files if mattes else ())],
                 itertools.chain.from_iterable(results.values()))
     record = Record(folder)
-    sequences = Sequences(remover, [] if stills else shots_of(inputs, apart))
+    sequences = Sequences(remover, [] if stills else with_neighbours(inputs, apart))
     if wanted is not None:
         plates = [(path, name) for path, name in plates if name in wanted]
     progress.stage("remove", len(plates))

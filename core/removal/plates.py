@@ -9,8 +9,6 @@ from __future__ import annotations
 
 import io
 import shutil
-import struct
-import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -20,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .. import jpeg, tiff
+from .. import jpeg, png, tiff
 from ..borders import Inside, inside_borders
 from ..colour import ColourSpace, colour_space, space_of_chromaticities
 from ..errors import FrameError, is_out_of_memory
@@ -37,7 +35,7 @@ from ..pictures import (
     write_exr,
 )
 
-_KEPT_CHUNKS = (b"iCCP", b"gAMA", b"cHRM", b"sRGB", b"pHYs", b"eXIf", b"cICP")
+_KEPT_CHUNKS = (b"iCCP", b"gAMA", b"cHRM", b"sRGB", b"pHYs", png.EXIF, b"cICP")
 _KEPT_TAGS = (tiff.ORIENTATION, tiff.EXTRA_SAMPLES, tiff.X_RESOLUTION, tiff.Y_RESOLUTION, tiff.RESOLUTION_UNIT,
               tiff.XMP, tiff.COLOUR_PROFILE)
 _PLACING = ("chromaticities", "dataWindow", "displayWindow", "pixelAspectRatio")
@@ -216,7 +214,8 @@ def _tagged(encoded: bytes, suffix: str, plate: Plate) -> bytes:
         data = plate.path.read_bytes()
         was_grey, is_grey = (not header[25] & 2 for header in (data, encoded))
         left_out = (b"iCCP",) if was_grey != is_grey else ()
-        kept = b"".join(chunk for name, chunk in _png_chunks(data) if name in _KEPT_CHUNKS and name not in left_out)
+        kept = b"".join(png.chunk(name, content) for name, content in png.chunks(io.BytesIO(data), _KEPT_CHUNKS)
+                        if name not in left_out)
         return encoded[:33] + kept + encoded[33:]  # behind the header chunk
     if suffix in _TIFFS and source in _TIFFS:
         tags = tiff.read_tags(io.BytesIO(plate.path.read_bytes()), _KEPT_TAGS)
@@ -248,14 +247,3 @@ def _jpeg_tags(path: Path) -> Iterator[bytes]:
         for marker, content in jpeg.segments(stream):
             if marker in (jpeg.EXIF, jpeg.PROFILE) and content[:4] in (b"Exif", b"ICC_"):
                 yield jpeg.segment(marker, content)
-
-
-def _png_chunks(data: bytes) -> Iterator[tuple[bytes, bytes]]:
-    """(name, whole chunk) of a PNG, damaged ones left out."""
-    at = 8
-    while data[:8] == b"\x89PNG\r\n\x1a\n" and at + 12 <= len(data):
-        length = struct.unpack(">I", data[at:at + 4])[0]
-        chunk = data[at:at + 12 + length]
-        if len(chunk) == 12 + length and zlib.crc32(chunk[4:-4]) == struct.unpack(">I", chunk[-4:])[0]:
-            yield chunk[4:8], chunk
-        at += 12 + length

@@ -19,7 +19,6 @@ from ..removal.plates import Plate, read_plate, write_plate
 AUTO = "auto"
 
 
-
 @dataclass(frozen=True, eq=False)
 class ColouredPlate:
     """A plate and the space its numbers are in."""

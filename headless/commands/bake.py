@@ -127,4 +127,4 @@ compositor. Frames already made with the same settings are kept.
 
   run.py bake build/desk --out build/layers --frames 1-20 --set lamp.intensity=2""",
     arguments, (Step("look", "blender", look, wanted=lambda words: words.blend is not None),
-                Step("bake", "engine", run)), stopped="goes on")
+                Step("bake", "engine", run)), after_a_stop="goes on")

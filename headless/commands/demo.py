@@ -142,4 +142,4 @@ table of scores. Given again, it goes on where it was; other settings want a fol
 
   run.py demo
   blender -b -P headless/run.py -- demo""",
-    arguments, (Step("chain", "engine", run), Step("frames", "blender", frames, optional=True)), stopped="goes on")
+    arguments, (Step("chain", "engine", run), Step("frames", "blender", frames, optional=True)), after_a_stop="goes on")

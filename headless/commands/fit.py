@@ -179,4 +179,4 @@ flare.flare, scene.ply, preview.png, metrics.jsonl. A fit that was stopped goes 
 
   run.py fit sample_scenes/desk --out build/desk --preset draft
   run.py fit my_capture --out my_run --size 960 --holdout 0 --resume""",
-    arguments, (Step("fit", "engine", run),), stopped="goes on with --resume")
+    arguments, (Step("fit", "engine", run),), after_a_stop="goes on with --resume")

@@ -133,4 +133,4 @@ is kept to the last bit. A plate that cannot be read is told at the end, and doe
   run.py remove shots/sh010 --out clean/sh010 --flare flares/sh010 --keep-glare
   run.py remove shots/sh010 --matte roto/sh010 --out clean/sh010        # where the artist says that they are
   run.py remove --run my_run --out clean          # what `fit` found, out of the frames it was fitted to""",
-    arguments, (Step("remove", "engine", run),), stopped="goes on")
+    arguments, (Step("remove", "engine", run),), after_a_stop="goes on")

@@ -96,4 +96,4 @@ named.
 
   run.py solve shot.mp4 --out captures/shot""",
     arguments, (Step("camera", "blender", of_blend, wanted=is_blend),
-                Step("solve", "engine", run, wanted=lambda words: not is_blend(words))), stopped="goes on")
+                Step("solve", "engine", run, wanted=lambda words: not is_blend(words))), after_a_stop="goes on")

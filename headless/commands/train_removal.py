@@ -139,4 +139,4 @@ for checks. Stopped, it goes on with --resume; --start box begins with the weigh
 
   run.py train-removal --backgrounds photos hdri --lenses lenses --out build/removal
   run.py train-removal --backgrounds photos --flares my_flares --start box --out build/mine --iterations 4000""",
-    arguments, (Step("train-removal", "engine", run),), stopped="goes on with --resume")
+    arguments, (Step("train-removal", "engine", run),), after_a_stop="goes on with --resume")

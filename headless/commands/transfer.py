@@ -344,4 +344,4 @@ camera, its lights, and what hides them.
   run.py transfer lamp.flare --to shots/sh010 --scene sh010.ply --out build/sh010 --use sun=lamp
   run.py transfer lamp.flare --to shot.blend --plates renders --out build/shot --jobs 2""",
     arguments, (Step("look", "blender", look_at_blend, wanted=is_blend), Step("transfer", "engine", run)),
-    stopped="goes on")
+    after_a_stop="goes on")

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from core.errors import FrameError
 from core.progress import Progress
-from core.removal.batch import remove_all, shots_of
+from core.removal.batch import remove_all, with_neighbours
 from core.removal.inference import Remover, Told
 from core.removal.plates import Plate
 from core.removal.record import RECORD
@@ -148,7 +148,7 @@ def test_mattes_and_results_beside_a_frame_are_not_its_neighbours(shot: Path) ->
     (shot / "matte.png").write_bytes((shot / "f1.png").read_bytes())
     (shot / "clean").mkdir()
     (shot / "clean" / "f1.png").write_bytes((shot / "f1.png").read_bytes())
-    found = shots_of([shot / "f1.png"], [shot / "clean", shot / "matte.png"])
+    found = with_neighbours([shot / "f1.png"], [shot / "clean", shot / "matte.png"])
     assert sorted(found) == sorted(shot.glob("f*.png"))
 
 

@@ -20,7 +20,7 @@ from fit_flare.core.capture.colmap import PointCloud
 from fit_flare.core.errors import Cancelled, CaptureError, FitFlareError, SettingsError
 from fit_flare.core.progress import Progress
 from fit_flare.headless import cli
-from fit_flare.headless.command import Command, Step, Stopped
+from fit_flare.headless.command import AfterAStop, Command, Step
 from fit_flare.headless.commands import COMMANDS, bake, compose, fit, lights, remove
 
 from tests.core.captures import make_capture
@@ -191,7 +191,7 @@ def _is_refused(words: list[str], status: int, capture: Path, tmp_path: Path,
 
 
 def ending_with(problem: BaseException | None, monkeypatch: pytest.MonkeyPatch, options: Sequence[str] = (),
-                stopped: Stopped = "starts over") -> None:
+                after_a_stop: AfterAStop = "starts over") -> None:
     """A command "try" of these options."""
     def run(_words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
         print("a library prints")
@@ -205,7 +205,7 @@ def ending_with(problem: BaseException | None, monkeypatch: pytest.MonkeyPatch, 
             parser.add_argument(option, nargs="?")
 
     monkeypatch.setitem(COMMANDS, "try", Command("try", "Tries.", "", arguments, (Step("try", "engine", run),),
-                                                 stopped))
+                                                 after_a_stop))
 
 
 @pytest.mark.parametrize(("problem", "status", "sentence"), [
@@ -232,13 +232,14 @@ def test_status_and_sentence(problem: BaseException, status: int, sentence: str,
     assert ("Traceback" in told.err) == sentence.startswith("A defect")
 
 
-@pytest.mark.parametrize(("stopped", "hint"), [
+@pytest.mark.parametrize(("after_a_stop", "hint"), [
     ("goes on", "Give the command again to go on."),
     ("goes on with --resume", "Give the command again with --resume to go on."),
     ("starts over", "Given again, it starts over.")])
-def test_who_stops_a_command_is_told_how_it_goes_on(stopped: Stopped, hint: str, monkeypatch: pytest.MonkeyPatch,
+def test_who_stops_a_command_is_told_how_it_goes_on(after_a_stop: AfterAStop, hint: str,
+                                                    monkeypatch: pytest.MonkeyPatch,
                                                     capfd: pytest.CaptureFixture[str]) -> None:
-    ending_with(Cancelled("Stopped as asked."), monkeypatch, stopped=stopped)
+    ending_with(Cancelled("Stopped as asked."), monkeypatch, after_a_stop=after_a_stop)
     assert cli.main(["try"]) == 130
     assert f"Stopped as asked. {hint}" in capfd.readouterr().err
 
@@ -250,8 +251,8 @@ def test_help_tells_what_goes_on_after_a_stop(capsys: pytest.CaptureFixture[str]
     told = told[told.index("given again,"):]
     for name, command in COMMANDS.items():
         resumes = any(option == "--resume" for option in _options(command))
-        assert (command.stopped == "goes on with --resume") == resumes, name
-        assert (f" {name}," in told or f" {name} go on" in told) == (command.stopped != "starts over"), name
+        assert (command.after_a_stop == "goes on with --resume") == resumes, name
+        assert (f" {name}," in told or f" {name} go on" in told) == (command.after_a_stop != "starts over"), name
 
 
 def _options(command: Command) -> list[str]:

@@ -8,12 +8,10 @@ from typing import BinaryIO
 
 import numpy as np
 
-from ... import tiff
+from ... import jpeg, png, tiff
 from ...pictures import Picture
 
 EXIF, FOCAL_35MM = 0x8769, 0xA405
-MOST = 1 << 20
-"""Bytes of a PNG's Exif that are read."""
 WIDTH_35MM = 36.0  # millimetres along the long side
 
 
@@ -31,21 +29,15 @@ def read_exif(path: Path) -> tuple[int, float | None]:
 def _exif_block(stream: BinaryIO) -> BinaryIO:
     """What a picture says of itself, in the form of a TIFF, as which Exif is written everywhere; empty where it says
     nothing."""
-    head = stream.read(1 << 16)
-    if head[:4] in (b"II*\0", b"MM\0*"):
+    begins = stream.read(8)
+    if begins[:4] in (b"II*\0", b"MM\0*"):
         return stream
-    if head[:2] == b"\xff\xd8" and (start := head.find(b"Exif\0\0")) >= 0:
-        return io.BytesIO(head[start + 6:])
-    at = 8
-    while head[:8] == b"\x89PNG\r\n\x1a\n":
-        stream.seek(at)
-        length, name = int.from_bytes(stream.read(4), "big"), stream.read(4)
-        if name == b"eXIf" and length < MOST:
-            return io.BytesIO(stream.read(length))
-        if len(name) < 4 or name == b"IEND":
-            break
-        at += 12 + length
-    return io.BytesIO()
+    if begins[:2] == b"\xff\xd8":
+        found = (content[6:] for marker, content in jpeg.segments(stream)
+                 if marker == jpeg.EXIF and content.startswith(b"Exif\0\0"))
+    else:
+        found = (content for _, content in png.chunks(stream, (png.EXIF,)))
+    return io.BytesIO(next(found, b""))
 
 
 def upright(picture: Picture, orientation: int) -> Picture:

@@ -71,7 +71,7 @@ def remove_all(inputs: Sequence[Path], folder: Path, remover: Remover, progress:
                flare_folder: Path | None = None, mattes: Mattes | None = None, overwrite: bool = False,
                wanted: Container[Path] | None = None, stills: bool = False) -> dict[str, Any]:
     """Clean every plate into `folder`; one whose result is there, made from the same plate, neighbours and matte in the
-    same way (`Record`), is left as it is.
+    same way (`Record`), is left as it is, and so is one that was worked on since it was made from the same plate.
 
     mattes: where the flares are; None to have them found anywhere. wanted: names below the output folder of those to be
     cleaned; None for all. stills: each by itself, in place of in line with its neighbours.
@@ -91,18 +91,21 @@ def remove_all(inputs: Sequence[Path], folder: Path, remover: Remover, progress:
         plates = [(path, name) for path, name in plates if name in wanted]
     progress.stage("remove", len(plates))
     failed: list[str] = []
-    made = kept = 0
+    made = kept = by_hand = 0
     for path, name in sorted(plates, key=lambda plate: shot_order(plate[0])):
         try:
             matte = [mattes.path(name)] if mattes else []
             how = made_from(remover.described, [path, *sequences.beside(path), *matte])
             if not overwrite and record.is_made(name, how, results[name]):
                 kept += 1
+            elif not overwrite and record.is_worked_on(name, path, results[name]):
+                by_hand += 1
             else:
                 plate, told = sequences.read(path)
                 marked = mattes.read(name, window_of(path)) if mattes else None
                 record.begin(name, path, how, results[name], overwrite)  # once it can be read: what is there goes
                 write_results(results[name], plate, *remover.remove(plate, marked, told))
+                record.end(results[name])
                 made += 1
         except Exception as problem:
             if not is_of_the_plate(problem):
@@ -118,7 +121,11 @@ def remove_all(inputs: Sequence[Path], folder: Path, remover: Remover, progress:
         progress.advance()
     if kept:
         progress.say(f"{kept} plates were in {folder} already; --overwrite makes them again.")
+    if by_hand:
+        progress.say(f"{by_hand} plates in {folder} were worked on since they were made, and are kept; --overwrite "
+                     "makes them again.")
     if failed:
         raise FrameError(f"{len(failed)} of {len(plates)} plates could not be cleaned: {spelled_out(failed)}")
+    kept += by_hand
     progress.say(f"{made + kept} clean plates are in {folder}.")
     return {"plates": str(folder), "made": made, "kept": kept}

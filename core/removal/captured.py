@@ -43,6 +43,7 @@ def remove_from(capture: Capture, remover: Remover, progress: Progress) -> Path:
                 record.begin(name, frame, how, [result], overwrite=True)
                 plate, told = sequences.read(frame)
                 write_plate(result, plate, remover.remove(plate, told=told)[0])
+                record.end([result])
             progress.advance()
         # In this order: what is missing because another has just renamed its folder is in `target` by then.
         if not all(path.is_file() for path in results) and not target.exists():

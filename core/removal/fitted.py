@@ -50,7 +50,7 @@ def remove_fitted(fitted: Renderer, capture: Capture, views: Sequence[View], fol
                   made_by: str = "", above_white: bool = False) -> dict[str, Any]:
     """Write the views' frames without the fitted flare below `folder`, each under its own name, in its own kind and
     depth; those that are there, made from the same frame, camera and lights by the same fit, their flares too where
-    those are wanted, are kept, unless `overwrite`. made_by: changes whenever the fit's pictures would. above_white:
+    those are wanted, or worked on since they were made from the same frame, are kept, unless `overwrite`. made_by: changes whenever the fit's pictures would. above_white:
     whether the fit was shown light above white.
 
     Raises CaptureError for frames with lens distortion, which the flare was not fitted with, SettingsError where frames
@@ -63,21 +63,31 @@ def remove_fitted(fitted: Renderer, capture: Capture, views: Sequence[View], fol
     check_apart([capture.frame_path(view) for view in capture.views], itertools.chain.from_iterable(results))
     progress.stage("remove", len(views))
     record, lights = Record(folder), [(light.name, light.xyz.tolist()) for light in capture.lights]
-    made, dim = 0, Counter[str]()
+    made = by_hand = 0
+    dim = Counter[str]()
     for view, targets in zip(views, results, strict=True):
         name = Path(view.name)
         how = made_from(repr((made_by, view.camera.numbers, lights)), [capture.frame_path(view)])
-        if overwrite or not record.is_made(name, how, targets):
-            record.begin(name, capture.frame_path(view), how, targets, overwrite)
+        frame = capture.frame_path(view)
+        if not overwrite and record.is_made(name, how, targets):
+            pass
+        elif not overwrite and record.is_worked_on(name, frame, targets):
+            by_hand += 1
+        else:
+            record.begin(name, frame, how, targets, overwrite)
             parts = _remove(fitted, capture, view, targets, above_white)
+            record.end(targets)
             dim.update(light for light, part in parts.items() if part < HALF)
             made += 1
         progress.advance()
     for light, count in dim.items():
         progress.say(f"{count} of {made} frames show less than half of the flare that {light!r} has in the fit; no "
                      "more than they show was taken from them.")
-    if made < len(views):
-        progress.say(f"{len(views) - made} plates were in {folder} already; --overwrite makes them again.")
+    if kept := len(views) - made - by_hand:
+        progress.say(f"{kept} plates were in {folder} already; --overwrite makes them again.")
+    if by_hand:
+        progress.say(f"{by_hand} plates in {folder} were worked on since they were made, and are kept; --overwrite "
+                     "makes them again.")
     progress.say(f"{len(views)} clean plates are in {folder}.")
     return {"plates": str(folder), "made": made, "kept": len(views) - made}
 

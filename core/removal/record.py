@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """What each clean plate of a folder was made from and how, and where its flare is, in remove.json there, so that one is
-kept as long as it would come out the same, and whatever else lies there is not taken for one."""
+kept as long as it would come out the same, and whatever else lies there, or was made of it by hand, is not taken for
+one."""
 from __future__ import annotations
 
 import errno
@@ -14,9 +15,10 @@ from ..files import content_of, locked, read_json, remove_file, remove_partial_o
 
 RECORD = "remove.json"
 LOCK = ".remove.lock"
-_TABLES = ("plates", "flares", "flares_made", "sources")
+_TABLES = ("plates", "flares", "flares_made", "sources", "written")
 """Of each plate how it was made, where from here its flare is, and how that was made: the plate may have been made in
-another way since, without one. And the content of what it was made from."""
+another way since, without one. The content of what it was made from; and by where it is, that of each file as it was
+written."""
 
 
 def made_from(maker: str, sources: Iterable[Path]) -> str:
@@ -46,7 +48,7 @@ class Record:
     def begin(self, name: Path, source: Path, how: str, results: Sequence[Path], overwrite: bool) -> None:
         """Before the files of a plate are written, itself and maybe its flare: what was made there in another way goes,
         so that a kill leaves none under what is now written down. Raises FrameError for a plate or flare that is not
-        from here, unless `overwrite`."""
+        from here, or was worked on since, unless `overwrite`."""
         key = name.as_posix()
         with locked(self._folder / LOCK):
             known = {what: self._read(what) for what in _TABLES}
@@ -58,13 +60,39 @@ class Record:
                 if not overwrite and not is_known and path.exists():
                     raise FrameError(f"{path} is there, and {self._folder / RECORD} does not tell of it: it may be "
                                      "someone's work; choose another folder, or have it written over (--overwrite).")
+            if not overwrite and (changed := self._worked_on(results)):
+                raise FrameError(f"{changed[0]} was worked on since it was made, of another {source.name} than there "
+                                 "is now; choose another folder, or have it written over (--overwrite).")
+            for path in results:
+                told["written"].pop(_from(self._folder, path), None)
             for path, what in zip(results, ("plates", "flares_made"), strict=False):
                 if known[what].get(key) != how:
                     remove_file(path)
             if told != known:
-                write_json(self._folder / RECORD, {what: dict(sorted(rows.items())) for what, rows in told.items()})
+                self._write(told)
         for path in results:
             remove_partial_of(path)
+
+    def end(self, results: Sequence[Path]) -> None:
+        """After the files of a plate are written."""
+        with locked(self._folder / LOCK):
+            known = {what: self._read(what) for what in _TABLES}
+            known["written"] |= {_from(self._folder, path): content_of(path) for path in results}
+            self._write(known)
+
+    def is_worked_on(self, name: Path, source: Path, results: Sequence[Path]) -> bool:
+        """Whether someone has gone on by hand from a plate that was made here from what `source` still holds, or from
+        its flare: that is theirs, and kept however plates are made now."""
+        return bool(self._worked_on(results)) and self._read("sources").get(name.as_posix()) == content_of(source)
+
+    def _worked_on(self, results: Sequence[Path]) -> list[Path]:
+        """Those that hold something else than was written."""
+        written = self._read("written")
+        return [path for path in results
+                if path.is_file() and written.get(_from(self._folder, path), content_of(path)) != content_of(path)]
+
+    def _write(self, tables: Mapping[str, Mapping[str, str]]) -> None:
+        write_json(self._folder / RECORD, {what: dict(sorted(rows.items())) for what, rows in tables.items()})
 
     def _row(self, how: str, results: Sequence[Path]) -> dict[str, str]:
         """What is written down of a plate, by table."""

@@ -39,6 +39,7 @@ from core.removal.plates import Plate, read_plate, write_plate
 from core.removal.recipe import Recipe, as_dict
 from core.removal.record import RECORD, Record, made_from
 from tests.core.captures import make_capture
+from tests.core.heard import Heard
 
 TINY = Recipe(widths=(8, 8, 8, 8, 8))
 
@@ -868,6 +869,28 @@ def test_a_flare_of_a_plate_that_was_made_otherwise_since_is_made_again(tmp_path
     assert remove_all(*words, other, Progress(), flare_folder=tmp_path / "flares")["made"] == 1
     assert (tmp_path / "flares" / "a.exr").read_bytes() != stale
     assert remove_all(*words, other, Progress(), flare_folder=tmp_path / "flares")["kept"] == 1
+
+
+def test_a_plate_that_was_worked_on_is_kept(tmp_path: Path, everywhere: Path) -> None:
+    """An artist has retouched one: it is kept when plates are made otherwise, until it is asked to go; and told when it
+    shows what the frame no longer is."""
+    for name in ("a", "b"):
+        write_codes(tmp_path / "in" / f"{name}.png", picture())
+    one, other = (Remover(everywhere, working_size=size) for size in (64, 96))
+    plates, out = [tmp_path / "in"], tmp_path / "out"
+    remove_all(plates, out, one, Progress(), flare_folder=tmp_path / "flares")
+    retouched = write_codes(out / "a.png", picture()[:, ::-1]).read_bytes()
+    heard = Heard()
+    found = remove_all(plates, out, other, heard, flare_folder=tmp_path / "flares")
+    assert (found["made"], found["kept"]) == (1, 1) and any("were worked on" in text for text in heard.texts)
+    assert (out / "a.png").read_bytes() == retouched
+    write_codes(tmp_path / "in" / "a.png", 255 - picture())
+    with pytest.raises(FrameError, match=r"a\.png was worked on since it was made"):
+        remove_all(plates, out, other, Progress())
+    assert (out / "a.png").read_bytes() == retouched
+    remove_all(plates, out, other, Progress(), overwrite=True)
+    assert (out / "a.png").read_bytes() != retouched
+    assert remove_all(plates, out, one, Progress())["made"] == 2  # and it is no one's work any more
 
 
 def test_another_ones_flare_is_not_taken_for_a_plates(tmp_path: Path, everywhere: Path) -> None:

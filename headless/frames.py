@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from pathlib import Path
 
 from ..core.bake.frames import Frame, absent, chosen
 from ..core.progress import Progress
@@ -24,10 +23,3 @@ def asked(known: Sequence[Frame], text: str | None, progress: Progress) -> list[
         numbers = [frame.number for frame in known]
         progress.say(f"The frames {missing} are not there: they are {min(numbers)} to {max(numbers)}.")
     return frames
-
-
-def layers_made(frames: Sequence[Frame], folder: Path, of_folder: int, progress: Progress) -> dict[str, object]:
-    """Tell that the layers of `frames` are in a folder, which has `of_folder`; what a command's result says of it."""
-    besides = "" if of_folder == len(frames) else f", which holds {of_folder}"
-    progress.say(f"Layers of {len(frames)} frame{'s' * (len(frames) != 1)} are in {folder}{besides}.")
-    return {"layers": str(folder), "frames": len(frames), "frames_in_folder": of_folder}

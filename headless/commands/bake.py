@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import argparse
-import re
 from pathlib import Path
 from typing import Any
 
 from ...core.errors import RunError, SettingsError
 from ...core.progress import Progress
-from .. import frames, jobs
+from .. import frames, jobs, layers
 from ..command import Command, Step
+from . import transfer
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -20,16 +20,10 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for layers.####.exr")
     frames.add_option(parser)
     parser.add_argument("--size", metavar="WIDTH[xHEIGHT]", help="pixels (default: the frames')")
-    parser.add_argument("--set", action="append", default=[], metavar="LIGHT.WHAT=VALUE", dest="edits",
-                        help="lamp.intensity=2, lamp.tint=1,0.8,0.6, lamp.tint=#ffcc88, lamp.scale=1.5; * for all "
-                             "lights, lamp/ghost for one element; also saturation, spread, rotation (degrees), streak, "
-                             "mute, solo; repeatable")
-    parser.add_argument("--edits", type=Path, metavar="FILE", dest="keyed",
-                        help='edits by frame (JSON or TOML): {"frames": {"1": ["lamp.intensity=0"], '
-                             '"25": ["lamp.intensity=1"]}}')
-    parser.add_argument("--float", action="store_true", help="32 bit floats (default: 16 bit, depth always 32)")
-    parser.add_argument("--overwrite", action="store_true",
-                        help="replace layers of another bake in DIR (whole ones of the same settings are kept)")
+    layers.add_options(
+        parser, halfs="depth always 32", overwritten="bake",
+        edited="lamp.intensity=2, lamp.tint=1,0.8,0.6, lamp.tint=#ffcc88, lamp.scale=1.5; * for all lights, lamp/ghost "
+               "for one element; also saturation, spread, rotation (degrees), streak, mute, solo; repeatable")
     parser.add_argument("--capture", type=Path, metavar="CAPTURE",
                         help="where the capture is, if it was moved; of a .flare: whose cameras see it, the lights "
                              "where it was learned")
@@ -38,31 +32,18 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--scene", type=Path, metavar="PLY", help="of a .flare: a 3DGS scene that hides its lights")
     parser.add_argument("--lights", metavar="NAMES", help="objects of the .blend that are lights (default: its lamps)")
     parser.add_argument("--shot", type=Path, help=argparse.SUPPRESS)
-    space_options(parser)
     jobs.add_option(parser)
 
 
-def space_options(parser: argparse.ArgumentParser) -> None:
-    """--space and --ocio."""
-    parser.add_argument("--space", default="linear", metavar="NAME",
-                        help="linear colour space of the layers: linear (Rec. 709, the default), acescg, aces2065-1, "
-                             "rec2020, p3-d65, or one of an OpenColorIO configuration")
-    parser.add_argument("--ocio", metavar="CONFIG",
-                        help="OpenColorIO configuration to look names up in (else the variable OCIO, for other names)")
-
-
 def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
-    from ...core.bake.bake import BakeSettings, bake
+    from ...core.bake.bake import bake
     from ...core.bake.frames import numbered
     from ...core.fit.run import Run
-    from ...core.look import KeyedEdits
 
     if words.run.suffix.lower() == ".json":
         return run_shot(words, progress)
     if words.run.suffix.lower() == ".flare":
-        from .transfer import bake_flare
-
-        return bake_flare(words, progress)
+        return run_flare(words, progress)
     if words.scene or words.lights:
         raise SettingsError(f"--{'scene' if words.scene else 'lights'} is for a .flare: name the run's flare.flare.")
     made = Run.open(words.run)
@@ -73,20 +54,45 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     wanted = frames.asked(numbered(cameras), words.frames, progress)
     if words.jobs != 1:
         jobs.run_jobs(words, "bake", [frame.number for frame in wanted], progress)
-    settings = BakeSettings(*size(words.size), half=not words.float, edits=tuple(words.edits),
-                            keyed=KeyedEdits.read(words.keyed) if words.keyed else KeyedEdits(), space=words.space,
-                            config=words.ocio)
+    settings = layers.settings(words, *layers.size(words.size))
     record = bake(made, wanted, cameras, words.out, settings, progress, overwrite=words.overwrite)
-    return frames.layers_made(wanted, words.out, len(record["frames"]), progress)
+    return layers.told(wanted, words.out, len(record["frames"]), progress)
 
 
 def look(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     """Blender's part of a bake for a .blend."""
-    from .transfer import look_at_blend, words_of_bake
-
     if words.run.suffix.lower() != ".flare":
         raise SettingsError("--blend is for a .flare: name the run's flare.flare.")
-    return look_at_blend(words_of_bake(words), progress)
+    return transfer.look_at_blend(_as_transfer(words), progress)
+
+
+def run_flare(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
+    """A .flare's layers: with the cameras of a capture, the lights where it was learned; or for a .blend."""
+    from ...core.capture import Capture
+    from ...core.look import read
+    from ...core.transfer.target import of_cameras
+
+    if words.blend is None and words.capture is None:
+        raise SettingsError(f"{words.run} has no cameras of its own; name a capture with --capture, or a .blend with "
+                            "--blend.")
+    if words.lights and words.blend is None:
+        raise SettingsError("--lights names objects of a .blend: it goes with --blend.")
+    asked = _as_transfer(words)
+    if words.blend is not None:
+        target = transfer.target_of(asked, words.run)
+    else:
+        target = of_cameras(Capture.open(words.capture, need_frames=False), read(words.run), words.scene)
+    return transfer.make_layers(asked, "bake", target, words.run, None, progress)
+
+
+def _as_transfer(words: argparse.Namespace) -> argparse.Namespace:
+    """What is asked of a .flare, in transfer's words. Raises SettingsError where two things name cameras."""
+    if words.blend is not None and words.capture is not None:
+        raise SettingsError("--capture and --blend each name cameras for the flare; give one of them.")
+    parser = argparse.ArgumentParser()
+    transfer.arguments(parser)
+    usual = parser.parse_args([str(words.run), "--to", str(words.blend or words.capture), "--out", str(words.out)])
+    return argparse.Namespace(**{**vars(usual), **vars(words)})
 
 
 def run_shot(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
@@ -100,23 +106,13 @@ def run_shot(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     for name in ("scene", "lights", "capture", "blend"):
         if getattr(words, name):
             raise SettingsError(f"--{name} is not for a shot, whose file says all; leave it out.")
-    shot = Shot.read(words.run).sized(*size(words.size))
+    shot = Shot.read(words.run).sized(*layers.size(words.size))
     wanted = frames.asked([Frame("", one.frame, "") for one in shot.frames], words.frames, progress)
     if words.jobs != 1:
         jobs.run_jobs(words, "bake", [frame.number for frame in wanted], progress)
     record = bake_shot(shot, words.out, half=not words.float, overwrite=words.overwrite, progress=progress,
                        wanted={frame.number for frame in wanted}, space=words.space, config=words.ocio)
-    return frames.layers_made(wanted, words.out, len(record["frames"]), progress)
-
-
-def size(text: str | None) -> tuple[int | None, int | None]:
-    """"960x540" as (960, 540), "960" as (960, None), None as (None, None)."""
-    if text is None:
-        return None, None
-    match = re.fullmatch(r"([1-9]\d{0,4})(?:x([1-9]\d{0,4}))?", text)
-    if not match:
-        raise SettingsError(f"--size {text} is not a width such as 960, or a size such as 960x540.")
-    return int(match[1]), int(match[2]) if match[2] else None
+    return layers.told(wanted, words.out, len(record["frames"]), progress)
 
 
 COMMAND = Command(

@@ -11,9 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 from ...core.errors import CaptureError, RunError, SettingsError
 from ...core.progress import Progress
-from .. import frames, jobs
+from .. import frames, jobs, layers
 from ..command import Command, Step, from_1
-from .bake import size, space_options
 
 if TYPE_CHECKING:
     from ...core.capture.camera import Floats
@@ -69,12 +68,8 @@ def arguments(parser: argparse.ArgumentParser) -> None:
                         help="colour space of the plates: srgb, rec709, linear, acescg, … or one of an OpenColorIO "
                              "configuration (default: an EXR's by its chromaticities, linear for float TIFFs, sRGB for "
                              "other files)")
-    space_options(parser)
-    plates.add_argument("--set", action="append", default=[], metavar="LIGHT.WHAT=VALUE", dest="edits",
-                        help="edits of the look, as of `bake`, by the target's lights; repeatable")
-    plates.add_argument("--edits", type=Path, metavar="FILE", dest="keyed", help="edits by frame (JSON or TOML)")
-    plates.add_argument("--float", action="store_true", help="32 bit floats (default: 16 bit, if no plate has more)")
-    plates.add_argument("--overwrite", action="store_true", help="replace layers of another transfer in DIR")
+    layers.add_options(plates, halfs="if no plate has more", overwritten="transfer",
+                       edited="edits of the look, as of `bake`, by the target's lights; repeatable")
     parser.add_argument("--shot", type=Path, help=argparse.SUPPRESS)
     jobs.add_option(parser)
 
@@ -95,7 +90,7 @@ def look_at_blend(words: argparse.Namespace, progress: Progress) -> dict[str, An
         raise SettingsError("One .blend at a time can be the target.")
     _check_numbers(words)
     _check_options(words, ".blend")
-    size(words.size)
+    layers.size(words.size)
     from_1("--jobs", words.jobs)
     flare = words.flare.resolve()
     if flare.is_dir():
@@ -130,7 +125,7 @@ def shot_path(words: argparse.Namespace) -> Path:
 def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     _check_numbers(words)
     flare, training = source(words)
-    return _made(words, "transfer", target_of(words, flare, training), flare, training, progress)
+    return make_layers(words, "transfer", target_of(words, flare, training), flare, training, progress)
 
 
 def _check_numbers(words: argparse.Namespace) -> None:
@@ -167,17 +162,15 @@ def _check_options(words: argparse.Namespace, kind: str) -> None:
             raise SettingsError(f"--{name} is not for a {kind} as the target; leave it out.")
 
 
-def _made(words: argparse.Namespace, step: str, target: Target, flare: Path, training: list[Floats] | None,
+def make_layers(words: argparse.Namespace, step: str, target: Target, flare: Path, training: list[Floats] | None,
           progress: Progress) -> dict[str, Any]:
     """The layers of a target."""
-    from ...core.bake.bake import BakeSettings
-    from ...core.look import KeyedEdits
     from ...core.transfer.target import sized
     from ...core.transfer.transfer import Transfer, TransferSettings
 
     for sentence in target.says:
         progress.say(sentence)
-    target = sized(target, *size(words.size))
+    target = sized(target, *layers.size(words.size))
     plates = [one for one in target.frames if one.plate is not None]
     if unwritten := sum(one.flared(words.out) is None for one in plates):
         progress.say(f"{unwritten} of {len(plates)} plates are not written with their flare, only its layers are: they "
@@ -188,39 +181,8 @@ def _made(words: argparse.Namespace, step: str, target: Target, flare: Path, tra
     if words.jobs != 1:
         extra = ["--shot", str(shot_path(words))] if is_blend(words) else []
         jobs.run_jobs(words, step, [frame.number for frame in wanted], progress, extra)
-    baked = BakeSettings(half=not words.float, edits=tuple(words.edits), space=words.space, config=words.ocio,
-                         keyed=KeyedEdits.read(words.keyed) if words.keyed else KeyedEdits())
-    record = transfer.bake(words.out, wanted, baked, progress, overwrite=words.overwrite)
-    return frames.layers_made(wanted, words.out, len(record["frames"]), progress)
-
-
-def words_of_bake(words: argparse.Namespace) -> argparse.Namespace:
-    """What `bake FLARE` was asked, as transfer's own words. Raises SettingsError where two things name cameras."""
-    if words.blend is not None and words.capture is not None:
-        raise SettingsError("--capture and --blend each name cameras for the flare; give one of them.")
-    given = vars(words) | {"flare": words.run, "to": [words.blend or words.capture]}
-    plain = {"query": "blend", "smooth": 1, "radius": 0.0, "scale": 1.0, "use": [], "light": [], "plates": None,
-             "scene": None, "cameras": None, "focal": None, "centre": None, "plate_space": "auto"}
-    return argparse.Namespace(**{**plain, **given})
-
-
-def bake_flare(bake_words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
-    """`bake FLARE`: with the cameras of a capture, the lights where it was learned; or for a .blend."""
-    from ...core.capture import Capture
-    from ...core.look import read
-    from ...core.transfer.target import of_cameras
-
-    if bake_words.blend is None and bake_words.capture is None:
-        raise SettingsError(f"{bake_words.run} has no cameras of its own; name a capture with --capture, or a .blend "
-                            "with --blend.")
-    if bake_words.lights and bake_words.blend is None:
-        raise SettingsError("--lights names objects of a .blend: it goes with --blend.")
-    words = words_of_bake(bake_words)
-    if words.blend is not None:
-        words.capture = None
-        return _made(words, "bake", target_of(words, words.flare), words.flare, None, progress)
-    views = Capture.open(words.capture, need_frames=False)
-    return _made(words, "bake", of_cameras(views, read(words.flare), words.scene), words.flare, None, progress)
+    record = transfer.bake(words.out, wanted, layers.settings(words), progress, overwrite=words.overwrite)
+    return layers.told(wanted, words.out, len(record["frames"]), progress)
 
 
 def source(words: argparse.Namespace) -> tuple[Path, list[Floats] | None]:

@@ -19,9 +19,9 @@ from fit_flare.core.capture import Capture
 from fit_flare.core.capture.colmap import PointCloud
 from fit_flare.core.errors import Cancelled, CaptureError, FitFlareError, SettingsError
 from fit_flare.core.progress import Progress
-from fit_flare.headless import cli
+from fit_flare.headless import cli, layers
 from fit_flare.headless.command import AfterAStop, Command, Step
-from fit_flare.headless.commands import COMMANDS, bake, compose, fit, lights, remove
+from fit_flare.headless.commands import COMMANDS, compose, fit, lights, remove
 
 from tests.core.captures import make_capture
 
@@ -359,12 +359,12 @@ def test_a_holdout_is_a_number_or_a_file(tmp_path: Path, monkeypatch: pytest.Mon
 
 
 def test_sizes() -> None:
-    assert bake.size(None) == (None, None)
-    assert bake.size("960") == (960, None)
-    assert bake.size("100x30") == (100, 30)
+    assert layers.size(None) == (None, None)
+    assert layers.size("960") == (960, None)
+    assert layers.size("100x30") == (100, 30)
     for text in ("0", "x", "12x", "-5", "1.5", "999999"):
         with pytest.raises(SettingsError):
-            bake.size(text)
+            layers.size(text)
 
 
 def test_a_blender_that_cannot_be_loaded_is_a_sentence(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 """A training of the network in the box from begin to end: shared among processes, logged, checked, kept."""
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import time
@@ -13,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..errors import Cancelled, RunError, SettingsError
+from ..files import write_text
 from ..holding import held
 from ..processes import cores
 from ..progress import Progress
@@ -145,6 +147,7 @@ def _run(trainer: Trainer, batches: Iterator[Batch], folder: Path, held_out: Map
     saved, began, first = time.monotonic(), time.monotonic(), trainer.iteration
     told, sums = first, dict.fromkeys(FIGURES, 0.0)
     best = _best_of(folder) if chosen and first else None
+    log = _log_until(folder / LOG, first)
     try:
         while trainer.iteration < iterations:
             figures = trainer.step(next(batches))
@@ -162,8 +165,8 @@ def _run(trainer: Trainer, batches: Iterator[Batch], folder: Path, held_out: Map
                     line[GAIN] = trainer.check(held_out)
                     if chosen:
                         best = _keep_better(trainer, folder, line[GAIN]["mean"], best)
-                with open(folder / LOG, "a", encoding="utf-8") as stream:
-                    stream.write(json.dumps(line) + "\n")
+                log.append(line)
+                write_text(folder / LOG, "".join(json.dumps(one) + "\n" for one in log))
             if time.monotonic() - saved > save_every_s:
                 _save(trainer, folder, best)
                 saved = time.monotonic()
@@ -188,6 +191,16 @@ def _keep_better(trainer: Trainer, folder: Path, gain: float, best: float | None
         return best
     _write_kept(trainer, folder, {**_about(trainer), GAIN: str(gain)})
     return gain
+
+
+def _log_until(path: Path, iteration: int) -> list[dict[str, Any]]:
+    """The lines of a log up to an iteration: those of a training that was killed after its last checkpoint are told
+    anew."""
+    lines: list[dict[str, Any]] = []
+    for text in path.read_text(encoding="utf-8", errors="replace").splitlines() if path.is_file() else ():
+        with contextlib.suppress(ValueError):  # cut off by an earlier program
+            lines.append(json.loads(text))
+    return [line for line in lines if line.get("iteration", math.inf) <= iteration]
 
 
 def _best_of(folder: Path) -> float | None:

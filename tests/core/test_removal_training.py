@@ -314,6 +314,18 @@ def test_the_log_has_figures_and_checks(tmp_path: Path, monkeypatch: pytest.Monk
     assert line["untouched"] == pytest.approx(np.mean(untouched), abs=1e-5), "means since the last line"
 
 
+def test_the_log_of_a_training_that_was_killed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What it told after its last checkpoint is told anew, once."""
+    monkeypatch.setattr(training, "CHECK_EVERY", 1)
+    with pytest.raises(Cancelled):
+        training.train(RECIPE, tmp_path, backgrounds(), built_in(), processes=1, progress=StopAfter(2))
+    log = tmp_path / training.LOG
+    log.write_text(log.read_text(encoding="utf-8") + '{"iteration": 3, "loss": 7.0}\n{"iterat', encoding="utf-8")
+    training.train(RECIPE, tmp_path, backgrounds(), built_in(), resume=True, processes=1)
+    lines = [json.loads(text) for text in log.read_text(encoding="utf-8").splitlines()]
+    assert [line["iteration"] for line in lines] == [1, 2, 3, 4] and lines[2]["loss"] != 7.0
+
+
 def test_the_weights_of_the_best_check_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     gains = {1: 1.0, 2: 2.5, 3: 2.0, 4: 2.5, 5: 3.0, 6: 0.0}
     monkeypatch.setattr(training, "checks", lambda *_: {"streak": []})

@@ -7,7 +7,7 @@ from typing import BinaryIO
 
 FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 """Markers of frame headers (SOF): precision, height, width, number of components."""
-PIXELS, EXIF, PROFILE = 0xDA, 0xE1, 0xE2
+PIXELS, APP1, APP2 = 0xDA, 0xE1, 0xE2
 
 
 def segments(stream: BinaryIO) -> Iterator[tuple[int, bytes]]:

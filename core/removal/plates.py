@@ -35,7 +35,9 @@ from ..pictures import (
     write_exr,
 )
 
-_KEPT_CHUNKS = (b"iCCP", b"gAMA", b"cHRM", b"sRGB", b"pHYs", png.EXIF, b"cICP")
+_KEPT_CHUNKS = (b"iCCP", b"gAMA", b"cHRM", b"sRGB", b"pHYs", png.EXIF, b"cICP", b"tEXt", b"zTXt", b"iTXt")
+_KEPT_SEGMENTS = ((jpeg.APP1, b"Exif"), (jpeg.APP1, b"http"), (jpeg.APP2, b"ICC_"))
+"""XMP goes by the address of its name space."""
 _KEPT_TAGS = (tiff.ORIENTATION, tiff.EXTRA_SAMPLES, tiff.X_RESOLUTION, tiff.Y_RESOLUTION, tiff.RESOLUTION_UNIT,
               tiff.XMP, tiff.COLOUR_PROFILE)
 _PLACING = ("chromaticities", "dataWindow", "displayWindow", "pixelAspectRatio")
@@ -230,7 +232,7 @@ def _write_exr(path: Path, plate: Plate, codes: NDArray[Any]) -> None:
 
     channels = dict(plate.rest["channels"])
     for index, name in enumerate(["Y"] if plate.grey else ["R", "G", "B"]):
-        channels[name] = np.ascontiguousarray(codes[..., index])
+        channels[name] = np.ascontiguousarray(codes[..., index], channels[name].dtype)  # each of its own depth
     header = {name: value for name, value in plate.rest["header"].items() if name not in ("channels", "chunkCount")}
     header["type"] = OpenEXR.scanlineimage
     header.pop("tiles", None)
@@ -242,8 +244,8 @@ def _write_exr(path: Path, plate: Plate, codes: NDArray[Any]) -> None:
 
 
 def _jpeg_tags(path: Path) -> Iterator[bytes]:
-    """The source's EXIF and colour profile segments, which say how it is to be shown."""
+    """The source's EXIF, XMP and colour profile segments: how it is to be shown, and whose it is."""
     with open(path, "rb") as stream:
         for marker, content in jpeg.segments(stream):
-            if marker in (jpeg.EXIF, jpeg.PROFILE) and content[:4] in (b"Exif", b"ICC_"):
+            if (marker, content[:4]) in _KEPT_SEGMENTS:
                 yield jpeg.segment(marker, content)

@@ -50,8 +50,8 @@ def remove_fitted(fitted: Renderer, capture: Capture, views: Sequence[View], fol
                   made_by: str = "", above_white: bool = False) -> dict[str, Any]:
     """Write the views' frames without the fitted flare below `folder`, each under its own name, in its own kind and
     depth; those that are there, made from the same frame, camera and lights by the same fit, their flares too where
-    those are wanted, or worked on since they were made from the same frame, are kept, unless `overwrite`. made_by: changes whenever the fit's pictures would. above_white:
-    whether the fit was shown light above white.
+    those are wanted, or worked on since they were made from the same frame, are kept, unless `overwrite`. made_by:
+    changes whenever the fit's pictures would. above_white: whether the fit was shown light above white.
 
     Raises CaptureError for frames with lens distortion, which the flare was not fitted with, SettingsError where frames
     would be overwritten, FrameError for a frame that cannot be read or whose plate in `folder` is not from here.

@@ -29,15 +29,18 @@ from .weights import IN_THE_BOX, load
 
 GAMMA = 2
 """Of the light that flares are taken from display values in: the middle of what pictures are formed with, and cheap."""
-WORKING_SIZE = 384
-"""Long side that the network sees: about what it was trained at last."""
+WORKING_SIZE = 480
+"""Long side of the largest view of a plate: a fifth more than the most that the network was trained at."""
 LEAST = 0.01
 """What a flare adds to display values, below which there is none."""
 SURE = 0.001
 """Mean over the frame of what a flare adds, below which the network is not trusted at all; from twice as much on
 it is trusted whole. It tells small flares where there are none."""
-SIZES, TURNS = (1.0, 0.75), (0, 2)
+SIZES, TURNS = (1.0, 0.8), (0, 2)
 """Of the views that the network is shown: parts of the working size, quarter turns."""
+DOUBT, MUCH = (1.0, 0.6), 0.03
+"""How much of it is doubted that is told in some views alone: where next to nothing is told, and where it adds MUCH to
+the frame in the mean, or more; then there is a flare, and only how strong it is may be in question."""
 RADIUS, SMOOTHNESS = 1, 1e-3
 """Of the guided filter, at the working size."""
 CLIPPED = 0.97
@@ -125,8 +128,9 @@ class Remover:
         The frame is shown upright and upside down, in two sizes. A flare is one in every view; what is taken for one
         in some alone seldom is. So it is the mean of what is told, less by how far the views are apart.
         """
-        views = [self._told_in_view(display, part, turns) for part in SIZES for turns in TURNS]
-        return np.maximum(np.mean(views, 0) - np.std(views, 0), 0)
+        views = np.stack([self._told_in_view(display, part, turns) for part in SIZES for turns in TURNS])
+        doubt = np.interp(views.mean(), (0, MUCH), DOUBT)
+        return np.maximum(views.mean(0) - np.float32(doubt) * views.std(0), 0)
 
     def _told_in_view(self, display: Pixels, part: float, turns: int) -> Pixels:
         """What the network tells of a view, brought back to the frame's size and upright."""

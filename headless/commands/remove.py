@@ -36,7 +36,8 @@ def arguments(parser: argparse.ArgumentParser) -> None:
                         help="clean each plate by itself, in place of in line with those before and after it in its "
                              "folder")
     parser.add_argument("--working-size", type=int, metavar="PIXELS",
-                        help="long side that the network sees (default 384, about what it was trained at)")
+                        help="long side of the largest view that the network sees (default 480, a little more than it "
+                             "was trained at)")
     parser.add_argument("--weights", type=Path, metavar="FILE",
                         help="weights of train-removal's (default: those that come with the program)")
     parser.add_argument("--model", choices=("network", "diffusion"), default="network",

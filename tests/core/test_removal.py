@@ -23,11 +23,11 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from core import tiff
+from core import jpeg, tiff
 from core.capture import Capture
 from core.colour.spaces import AP1
 from core.errors import Cancelled, CaptureError, FrameError, RunError, SettingsError
-from core.pictures import Window, read_exr, read_picture, write_exr, write_png
+from core.pictures import Window, read_exr, read_picture, save_exr, write_exr, write_png
 from core.progress import Progress
 from core.removal import batch, inference, weights
 from core.removal.batch import plates_of, remove_all
@@ -198,25 +198,28 @@ def test_a_frame_upside_down_is_told_the_same(everywhere: Path) -> None:
     np.testing.assert_allclose(told[::-1, ::-1], upright, atol=1e-5)
 
 
-def test_a_flare_in_some_views_alone_is_none(everywhere: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of the four views one tells one in the frame's right half, and all of them one in its left."""
+@pytest.mark.parametrize(("strength", "doubt"), [(0.01, 1 - 0.4 * 0.0025 / 0.03), (1.0, 0.6)])
+def test_a_flare_in_some_views_alone_is_doubted(everywhere: Path, monkeypatch: pytest.MonkeyPatch, strength: float,
+                                                doubt: float) -> None:
+    """Of the four views two tell one in the frame's right half, and all of them one in its left: by how much of the
+    deviation it comes out less goes by how much is told in all."""
     shown: list[tuple[int, ...]] = []
 
     def told(_: Remover, view: NDArray[np.float32]) -> NDArray[np.float32]:
         upright, middle = len(shown) % 2 == 0, view.shape[1] // 2
         added = np.zeros_like(view)
-        added[:, :middle] = 0.2
-        if not shown:
-            added[:, middle:] = 0.6
+        added[:, :middle] = 0.2 * strength
+        if len(shown) < 2:
+            added[:, middle:] = 0.6 * strength
         shown.append(view.shape)
         return added if upright else added[::-1, ::-1]
 
     monkeypatch.setattr(Remover, "_told", told)
-    added = Remover(everywhere).added(np.full((128, 256, 3), 0.5, np.float32))
-    assert shown == [(128, 256, 3)] * 2 + [(96, 192, 3)] * 2
-    assert added.shape == (128, 256, 3)
-    np.testing.assert_allclose(added[:, :126], 0.2, atol=1e-6)
-    assert not added[:, 130:].any()
+    added = Remover(everywhere).added(np.full((160, 320, 3), 0.5, np.float32))
+    assert shown == [(160, 320, 3)] * 2 + [(128, 256, 3)] * 2
+    assert added.shape == (160, 320, 3)
+    np.testing.assert_allclose(added[:, :158], 0.2 * strength, rtol=1e-4)
+    np.testing.assert_allclose(added[:, 162:], 0.3 * strength * (1 - doubt), rtol=0.02)
 
 
 def test_rows_are_worked_on_apart_without_a_seam(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -306,12 +309,12 @@ def test_colour_tags_are_carried_over(tmp_path: Path) -> None:
     codes = picture()
     write_codes(tmp_path / "a.jpg", codes)
     data = (tmp_path / "a.jpg").read_bytes()
-    profile = b"ICC_PROFILE\0\x01\x01" + b"profile" * 3
-    segment = b"\xff\xe2" + (len(profile) + 2).to_bytes(2, "big") + profile
-    (tmp_path / "a.jpg").write_bytes(data[:2] + segment + data[2:])
+    told = ((0xE1, b"http://ns.adobe.com/xap/1.0/\0<x:xmpmeta/>"), (0xE2, b"ICC_PROFILE\0\x01\x01" + b"profile" * 3))
+    segments = b"".join(jpeg.segment(*one) for one in told)
+    (tmp_path / "a.jpg").write_bytes(data[:2] + segments + data[2:])
     plate = read_plate(tmp_path / "a.jpg")
-    write_plate(tmp_path / "b.jpg", plate, plate.codes)
-    assert segment in (tmp_path / "b.jpg").read_bytes()
+    write_plate(tmp_path / "b.jpg", plate, plate.codes // 2)
+    assert segments in (tmp_path / "b.jpg").read_bytes()
     write_plate(tmp_path / "b.png", plate, plate.codes)
     assert np.array_equal(read_plate(tmp_path / "b.png").codes, plate.codes)
 
@@ -375,13 +378,24 @@ def test_a_profile_of_a_grey_png_is_not_given_to_colours(tmp_path: Path, everywh
 
     rows = b"".join(b"\0" + bytes([90, 200] * 64) for _ in range(64))
     header = struct.pack(">IIBBBBB", 64, 64, 8, 4, 0, 0, 0)
-    profile, size = chunk(b"iCCP", b"grey\0\0" + zlib.compress(b"profile")), chunk(b"pHYs", bytes(9))
+    profile = chunk(b"iCCP", b"grey\0\0" + zlib.compress(b"profile"))
+    size = chunk(b"pHYs", bytes(9)) + chunk(b"tEXt", b"Author\0someone")
     (tmp_path / "a.png").write_bytes(b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + profile + size
                                      + chunk(b"IDAT", zlib.compress(rows)) + chunk(b"IEND", b""))
     remove_all([tmp_path / "a.png"], tmp_path / "out", Remover(everywhere, working_size=64), Progress())
     clean = (tmp_path / "out" / "a.png").read_bytes()
     assert size in clean and b"iCCP" not in clean
     assert (read_plate(tmp_path / "out" / "a.png").alpha == 200).all()
+
+
+def test_each_channel_of_an_exr_keeps_its_depth(tmp_path: Path, everywhere: Path) -> None:
+    light = np.random.default_rng(0).uniform(0.2, 0.6, (48, 64)).astype(np.float16)
+    save_exr(tmp_path / "plate.exr", {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage},
+             {"R": light, "G": light.astype(np.float32), "B": light})
+    remove_all([tmp_path / "plate.exr"], tmp_path / "out", Remover(everywhere, working_size=64), Progress())
+    channels = read_plate(tmp_path / "out" / "plate.exr").rest["channels"]
+    assert [channels[name].dtype for name in "RGB"] == [np.float16, np.float32, np.float16]
+    assert (channels["R"] < light).all()
 
 
 def test_a_very_wide_plate(everywhere: Path) -> None:

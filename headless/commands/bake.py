@@ -8,7 +8,7 @@ from typing import Any
 
 from ...core.errors import RunError, SettingsError
 from ...core.progress import Progress
-from .. import frames, jobs, layers
+from .. import frames, jobs, layers, targets
 from ..command import Command, Step
 from . import transfer
 
@@ -79,7 +79,7 @@ def run_flare(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
         raise SettingsError("--lights names objects of a .blend: it goes with --blend.")
     asked = _as_transfer(words)
     if words.blend is not None:
-        target = transfer.target_of(asked, words.run)
+        target = targets.target_of(asked, words.run)
     else:
         target = of_cameras(Capture.open(words.capture, need_frames=False), read(words.run), words.scene)
     return transfer.make_layers(asked, "bake", target, words.run, None, progress)

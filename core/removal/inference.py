@@ -31,14 +31,14 @@ GAMMA = 2
 """Of the light that flares are taken from display values in: the middle of what pictures are formed with, and cheap."""
 WORKING_SIZE = 480
 """Long side of the largest view of a plate: a fifth more than the most that the network was trained at."""
-LEAST = 0.01
+LEAST = 0.005
 """What a flare adds to display values, below which there is none."""
 SURE = 0.001
 """Mean over the frame of what a flare adds, below which the network is not trusted at all; from twice as much on
 it is trusted whole. It tells small flares where there are none."""
 SIZES, TURNS = (1.0, 0.8), (0, 2)
 """Of the views that the network is shown: parts of the working size, quarter turns."""
-DOUBT, MUCH = (1.0, 0.6), 0.03
+DOUBT, MUCH = (1.0, 0.3), 0.03
 """How much of it is doubted that is told in some views alone: where next to nothing is told, and where it adds MUCH to
 the frame in the mean, or more; then there is a flare, and only how strong it is may be in question."""
 RADIUS, SMOOTHNESS = 1, 1e-3

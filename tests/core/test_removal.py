@@ -198,7 +198,7 @@ def test_a_frame_upside_down_is_told_the_same(everywhere: Path) -> None:
     np.testing.assert_allclose(told[::-1, ::-1], upright, atol=1e-5)
 
 
-@pytest.mark.parametrize(("strength", "doubt"), [(0.01, 1 - 0.4 * 0.0025 / 0.03), (1.0, 0.6)])
+@pytest.mark.parametrize(("strength", "doubt"), [(0.01, 1 - 0.7 * 0.0025 / 0.03), (1.0, 0.3)])
 def test_a_flare_in_some_views_alone_is_doubted(everywhere: Path, monkeypatch: pytest.MonkeyPatch, strength: float,
                                                 doubt: float) -> None:
     """Of the four views two tell one in the frame's right half, and all of them one in its left: by how much of the
@@ -466,7 +466,7 @@ def test_a_grey_matte_takes_a_part(everywhere: Path) -> None:
 
 def test_what_is_faint_is_taken_where_it_is_marked(tmp_path: Path) -> None:
     faint = Remover(network_file(tmp_path / "faint.safetensors", bias=0.9 * inference.LEAST), working_size=64)
-    codes = np.full((60, 90, 3), 180, np.uint8)
+    codes = np.full((60, 90, 3), 46_000, np.uint16)
     assert np.array_equal(_remove(faint, codes), codes)
     assert (faint.remove(plate_of(codes), np.ones((60, 90), np.float32))[0] < codes).mean() > 0.3
 

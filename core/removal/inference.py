@@ -38,9 +38,9 @@ SURE = 0.001
 it is trusted whole. It tells small flares where there are none."""
 SIZES, TURNS = (1.0, 0.8), (0, 2)
 """Of the views that the network is shown: parts of the working size, quarter turns."""
-DOUBT, MUCH = (1.0, 0.3), 0.03
-"""How much of it is doubted that is told in some views alone: where next to nothing is told, and where it adds MUCH to
-the frame in the mean, or more; then there is a flare, and only how strong it is may be in question."""
+APART, DOUBT = (0.2, 0.4), (0.2, 1.5)
+"""By how far the views are apart, as a part of what they tell, and how much of that is then taken off what they tell:
+of flares it is a sixth in the median, of haze in a scene that is taken for one a quarter to three quarters."""
 RADIUS, SMOOTHNESS = 1, 1e-3
 """Of the guided filter, at the working size."""
 CLIPPED = 0.97
@@ -126,11 +126,13 @@ class Remover:
         """What a flare adds to display values 0..1 (h, w, 3), h and w multiples of MULTIPLE.
 
         The frame is shown upright and upside down, in two sizes. A flare is one in every view; what is taken for one
-        in some alone seldom is. So it is the mean of what is told, less by how far the views are apart.
+        in some alone seldom is. So it is the mean of what is told, less how far the views are apart, the more of that
+        the less they agree.
         """
         views = np.stack([self._told_in_view(display, part, turns) for part in SIZES for turns in TURNS])
-        doubt = np.interp(views.mean(), (0, MUCH), DOUBT)
-        return np.maximum(views.mean(0) - np.float32(doubt) * views.std(0), 0)
+        told, spread = views.mean(0), views.std(0)
+        doubt = np.interp(spread.mean() / max(np.abs(told).mean(), 1e-9), APART, DOUBT)
+        return np.maximum(told - np.float32(doubt) * spread, 0)
 
     def _told_in_view(self, display: Pixels, part: float, turns: int) -> Pixels:
         """What the network tells of a view, brought back to the frame's size and upright."""

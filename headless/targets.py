@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What a flare goes on to, and where it comes from, by the words of `transfer`."""
+"""What a flare goes on to, and where it comes from: the words of `transfer`, and of `bake` for a .flare, as a target of
+`core.transfer`."""
 from __future__ import annotations
 
 import argparse
@@ -86,9 +87,9 @@ def target_of(words: argparse.Namespace, flare: Path, training: list[Floats] | N
     from ..core.lights.exposure import Exposure
     from ..core.look import read
     from ..core.look.shot import Shot
-    from ..core.transfer import target as targets
     from ..core.transfer.query import seen_by
     from ..core.transfer.sources import parsed
+    from ..core.transfer.target import of_capture, of_pictures, of_shot
 
     look, to, wanted = read(flare), words.to, parsed(words.use)
     if len(to) > 1 and not all(path.suffix.lower() in SUFFIXES for path in to):
@@ -104,27 +105,27 @@ def target_of(words: argparse.Namespace, flare: Path, training: list[Floats] | N
         seen = seen_by(flare, look.lights, training)
         distances = {light.name: _usual_distance(light, seen.get(light.name)) for light in look.lights}
         detector: Detector | None = None if words.light else Exposure()
-        return targets.of_pictures(to, look, _points(words.light), wanted, distances, detector=detector,
-                                   focal=words.focal, centre=_point(words.centre) if words.centre else None, seen=seen)
+        return of_pictures(to, look, _points(words.light), wanted, distances, detector=detector, focal=words.focal,
+                           centre=_point(words.centre) if words.centre else None, seen=seen)
     if kind in (".blend", ".json"):
         path = shot_path(words) if kind == ".blend" else to[0]
         shot = Shot.read(path)
         numbers = [Frame("", number, "") for number in sorted({one.frame for one in shot.frames})]
-        return targets.of_shot(shot, look, wanted, plates=words.plates, scene=words.scene,
-                               wanted_frames={frame.number for frame in chosen(numbers, words.frames)})
+        return of_shot(shot, look, wanted, plates=words.plates, scene=words.scene,
+                       wanted_frames={frame.number for frame in chosen(numbers, words.frames)})
     lights = Path(words.lights) if words.lights else None
     if kind == ".ply":
         if words.cameras is None:
             raise SettingsError(f"{to[0]} is a scene without cameras; name a capture that has them with --cameras.")
-        return targets.of_capture(Capture.open(words.cameras, need_frames=False), look, wanted, lights=lights,
-                                  scene=to[0], shown=True)
+        return of_capture(Capture.open(words.cameras, need_frames=False), look, wanted, lights=lights, scene=to[0],
+                          shown=True)
     if kind == "run":
         capture = (Capture.open(words.cameras, need_frames=False) if words.cameras else
                    Run.open(to[0]).capture(need_frames=False))
-        return targets.of_capture(capture, look, wanted, lights=lights, scene=words.scene or to[0] / SCENE, shown=True)
+        return of_capture(capture, look, wanted, lights=lights, scene=words.scene or to[0] / SCENE, shown=True)
     if to[0].is_dir() and not any(to[0].iterdir()):
         raise CaptureError(f"{to[0]} is empty: neither pictures nor a capture; name what the flare goes on to.")
-    return targets.of_capture(Capture.open(to[0]), look, wanted, lights=lights, scene=words.scene)
+    return of_capture(Capture.open(to[0]), look, wanted, lights=lights, scene=words.scene)
 
 
 def _is_of_plates(folder: Path) -> bool:

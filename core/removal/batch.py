@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+from collections import Counter
 from collections.abc import Container, Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from ..progress import Progress
 from .inference import Remover
 from .mattes import Mattes
 from .plates import is_of_the_plate, write_results
-from .record import RECORD, Record, made_from
+from .record import RECORD, Kept, Record, made_from
 from .steady import Sequences, shot_order
 
 
@@ -91,15 +92,13 @@ def remove_all(inputs: Sequence[Path], folder: Path, remover: Remover, progress:
         plates = [(path, name) for path, name in plates if name in wanted]
     progress.stage("remove", len(plates))
     failed: list[str] = []
-    made = kept = by_hand = 0
+    made, kept = 0, Counter[Kept]()
     for path, name in sorted(plates, key=lambda plate: shot_order(plate[0])):
         try:
             matte = [mattes.path(name)] if mattes else []
             how = made_from(remover.described, [path, *sequences.beside(path), *matte])
-            if not overwrite and record.is_made(name, how, results[name]):
-                kept += 1
-            elif not overwrite and record.is_worked_on(name, path, results[name]):
-                by_hand += 1
+            if not overwrite and (why := record.keeps(name, path, how, results[name])):
+                kept[why] += 1
             else:
                 plate, told = sequences.read(path)
                 marked = mattes.read(name, window_of(path)) if mattes else None
@@ -119,13 +118,8 @@ def remove_all(inputs: Sequence[Path], folder: Path, remover: Remover, progress:
                           if isinstance(problem, FrameError) else f"{path} does not fit into memory.")
             progress.say(f"Left out: {failed[-1]}")
         progress.advance()
-    if kept:
-        progress.say(f"{kept} plates were in {folder} already; --overwrite makes them again.")
-    if by_hand:
-        progress.say(f"{by_hand} plates in {folder} were worked on since they were made, and are kept; --overwrite "
-                     "makes them again.")
+    record.tell_kept(kept, progress)
     if failed:
         raise FrameError(f"{len(failed)} of {len(plates)} plates could not be cleaned: {spelled_out(failed)}")
-    kept += by_hand
-    progress.say(f"{made + kept} clean plates are in {folder}.")
-    return {"plates": str(folder), "made": made, "kept": kept}
+    progress.say(f"{made + kept.total()} clean plates are in {folder}.")
+    return {"plates": str(folder), "made": made, "kept": kept.total()}

@@ -28,7 +28,7 @@ from ..pictures import Pixels, linear_from_srgb, srgb_from_linear, window_of
 from ..progress import Progress
 from .inference import CLIPPED
 from .plates import Plate, finite, read_plate, write_results
-from .record import Record, made_from
+from .record import Kept, Record, made_from
 
 Floats = NDArray[np.float64]
 
@@ -63,16 +63,13 @@ def remove_fitted(fitted: Renderer, capture: Capture, views: Sequence[View], fol
     check_apart([capture.frame_path(view) for view in capture.views], itertools.chain.from_iterable(results))
     progress.stage("remove", len(views))
     record, lights = Record(folder), [(light.name, light.xyz.tolist()) for light in capture.lights]
-    made = by_hand = 0
-    dim = Counter[str]()
+    made, kept, dim = 0, Counter[Kept](), Counter[str]()
     for view, targets in zip(views, results, strict=True):
         name = Path(view.name)
-        how = made_from(repr((made_by, view.camera.numbers, lights)), [capture.frame_path(view)])
         frame = capture.frame_path(view)
-        if not overwrite and record.is_made(name, how, targets):
-            pass
-        elif not overwrite and record.is_worked_on(name, frame, targets):
-            by_hand += 1
+        how = made_from(repr((made_by, view.camera.numbers, lights)), [frame])
+        if not overwrite and (why := record.keeps(name, frame, how, targets)):
+            kept[why] += 1
         else:
             record.begin(name, frame, how, targets, overwrite)
             parts = _remove(fitted, capture, view, targets, above_white)
@@ -83,13 +80,9 @@ def remove_fitted(fitted: Renderer, capture: Capture, views: Sequence[View], fol
     for light, count in dim.items():
         progress.say(f"{count} of {made} frames show less than half of the flare that {light!r} has in the fit; no "
                      "more than they show was taken from them.")
-    if kept := len(views) - made - by_hand:
-        progress.say(f"{kept} plates were in {folder} already; --overwrite makes them again.")
-    if by_hand:
-        progress.say(f"{by_hand} plates in {folder} were worked on since they were made, and are kept; --overwrite "
-                     "makes them again.")
+    record.tell_kept(kept, progress)
     progress.say(f"{len(views)} clean plates are in {folder}.")
-    return {"plates": str(folder), "made": made, "kept": len(views) - made}
+    return {"plates": str(folder), "made": made, "kept": kept.total()}
 
 
 def _results(view: View, folder: Path, flare_folder: Path | None) -> list[Path]:

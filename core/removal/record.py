@@ -9,12 +9,15 @@ import hashlib
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import Literal
 
 from ..errors import FrameError
 from ..files import content_of, locked, read_json, remove_file, remove_partial_of, write_json
+from ..progress import Progress
 
 RECORD = "remove.json"
 LOCK = ".remove.lock"
+Kept = Literal["made", "worked on"]
 _TABLES = ("plates", "flares", "flares_made", "sources", "written")
 """Of each plate how it was made, where from here its flare is, and how that was made: the plate may have been made in
 another way since, without one. The content of what it was made from; and by where it is, that of each file as it was
@@ -80,7 +83,22 @@ class Record:
             known["written"] |= {_from(self._folder, path): content_of(path) for path in results}
             self._write(known)
 
-    def is_worked_on(self, name: Path, source: Path, results: Sequence[Path]) -> bool:
+    def keeps(self, name: Path, source: Path, how: str, results: Sequence[Path]) -> Kept | None:
+        """Why the files of a plate stay as they are: "made", as they would be now; or "worked on", by hand; None where
+        they are to be made."""
+        if self.is_made(name, how, results):
+            return "made"
+        return "worked on" if self._is_worked_on(name, source, results) else None
+
+    def tell_kept(self, kept: Mapping[Kept, int], progress: Progress) -> None:
+        """How many plates stayed as they were, and why."""
+        if count := kept.get("made"):
+            progress.say(f"{count} plates were in {self._folder} already; --overwrite makes them again.")
+        if count := kept.get("worked on"):
+            progress.say(f"{count} plates in {self._folder} were worked on since they were made, and are kept; "
+                         "--overwrite makes them again.")
+
+    def _is_worked_on(self, name: Path, source: Path, results: Sequence[Path]) -> bool:
         """Whether someone has gone on by hand from a plate that was made here from what `source` still holds, or from
         its flare: that is theirs, and kept however plates are made now."""
         return bool(self._worked_on(results)) and self._read("sources").get(name.as_posix()) == content_of(source)

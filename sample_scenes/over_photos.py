@@ -22,12 +22,12 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from core.capture import Capture
 from core.capture.colmap import Observed, write_model
 from core.capture.lens import Lens
-from core.errors import FitFlareError
 from core.files import write_json
 from core.fit import metering
 from core.fit.frames import Frames
 from core.pictures import linear_from_srgb, read_picture, srgb_from_linear, write_png
-from core.progress import Progress, TerminalProgress, stoppable
+from core.progress import Progress
+from sample_scenes.command import run
 from sample_scenes.flares import LOOKS, Look, render_flare
 from sample_scenes.layers import FLARE_LEVEL, write_layer
 
@@ -79,17 +79,9 @@ def main() -> int:
     parser.add_argument("--lens", choices=sorted(LOOKS), default="fast")
     parser.add_argument("--width", type=int, default=640, help="of the new frames, pixels")
     chosen = parser.parse_args()
-    progress = TerminalProgress()
-    try:
-        with stoppable(progress):
-            add_flares(Capture.open(chosen.capture), chosen.out, LOOKS[chosen.lens], np.array(chosen.light),
-                       tuple(chosen.colour), chosen.intensity, chosen.width, progress)
-    except FitFlareError as problem:
-        progress.error(str(problem))
-        return 1
-    finally:
-        progress.close()
-    return 0
+    return run(lambda progress: add_flares(
+        Capture.open(chosen.capture), chosen.out, LOOKS[chosen.lens], np.array(chosen.light), tuple(chosen.colour),
+        chosen.intensity, chosen.width, progress))
 
 
 if __name__ == "__main__":

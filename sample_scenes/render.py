@@ -8,10 +8,8 @@ run goes on where it stopped; delete truth/flare, images and removed to make the
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -20,7 +18,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from core.errors import CaptureError
 from core.files import read_json, write_json
 from core.pictures import read_picture
-from core.progress import Progress, TerminalProgress, stoppable
+from core.progress import Progress
+from sample_scenes.command import leave, run, silent
 from sample_scenes.description import SceneDescription, camera_positions
 from sample_scenes.flares import LOOKS, render_flare
 from sample_scenes.layers import FLARE_LEVEL, FRAME_SUFFIX, SCENE_LEVEL, write_frame, write_layer
@@ -49,25 +48,6 @@ def render_scene(scene: SceneDescription, out: Path, progress: Progress) -> None
             pixels = shots.render(camera, poses[index], scene.seed * 1000 + int(scene.numbers[index]))
         write_layer(target / f"{names[index]}.exr", pixels, SCENE_LEVEL)
         progress.advance()
-
-
-def silent() -> Any:
-    """Blender's own lines go to the null device for as long as this context lasts."""
-    import contextlib
-
-    @contextlib.contextmanager
-    def redirected() -> Any:
-        sys.stdout.flush()
-        saved, null = os.dup(1), os.open(os.devnull, os.O_WRONLY)
-        os.dup2(null, 1)
-        try:
-            yield
-        finally:
-            os.dup2(saved, 1)
-            os.close(saved)
-            os.close(null)
-
-    return redirected()
 
 
 def add_flares(scene: SceneDescription, out: Path, progress: Progress) -> None:
@@ -121,14 +101,8 @@ def main() -> int:
     parser.add_argument("--scene", choices=sorted(SCENES), default="desk")
     chosen = parser.parse_args()
     out = chosen.out or CACHE / chosen.scene
-    progress = TerminalProgress()
-    with stoppable(progress):
-        make(SCENES[chosen.scene], out, progress)
-    progress.close()
-    sys.stdout.flush()
-    return 0
+    return run(lambda progress: make(SCENES[chosen.scene], out, progress))
 
 
 if __name__ == "__main__":
-    code = main()
-    os._exit(code)  # Blender's library may hang when its interpreter winds down
+    leave(main())

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import bpy
 import numpy as np
@@ -16,6 +17,7 @@ from core.pictures import read_picture
 from .description import Array, LightSource, Pinhole
 
 SHARE_SAMPLES = 512
+Layers = TypeVar("Layers")
 
 
 def set_up(camera: Pinhole, samples: int) -> Any:
@@ -62,13 +64,17 @@ def aim(camera: Any, world_to_camera: Array) -> None:
 def render(camera: Any, world_to_camera: Array, seed: int) -> NDArray[np.float32]:
     """Scene-linear Rec. 709 pixels (height, width, 3)."""
     aim(camera, world_to_camera)
-    scene = bpy.context.scene
-    scene.cycles.seed = seed
+    bpy.context.scene.cycles.seed = seed
+    return rendered(lambda path: read_picture(path).pixels)
+
+
+def rendered(read: Callable[[Path], Layers]) -> Layers:
+    """What `read` finds in the file of a rendering of the scene as it is set up now."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "view.exr"
-        scene.render.filepath = str(path)
+        bpy.context.scene.render.filepath = str(path)
         bpy.ops.render.render(write_still=True)
-        return read_picture(path).pixels
+        return read(path)
 
 
 def visible_share(light: LightSource, eye: Array) -> float:

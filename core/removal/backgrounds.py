@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import zlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Sequence, Set
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -70,15 +70,8 @@ def read_backgrounds(folders: Iterable[Path | str], part: Part = "all", longest:
     photos, maps, looked = [], [], []
     for folder in folders:
         looked.append(str(folder))
-        if not Path(folder).is_dir():
-            raise SettingsError(f"{folder} is no folder; name one with clean photographs or environment maps.")
-        for path in sorted(Path(folder).rglob("*")):
-            suffix = path.suffix.lower()
-            if not path.is_file() or path.name.startswith("."):
-                continue
-            if suffix not in PHOTOS | MAPS or (part != "all" and kept_for_test(path.name) != (part == "test")):
-                continue
-            if suffix in PHOTOS:
+        for path in pictures_of(Path(folder), PHOTOS | MAPS, part):
+            if path.suffix.lower() in PHOTOS:
                 picture = decoded(path, cv2.IMREAD_COLOR)
                 if picture is None or min(picture.shape[:2]) < 64:
                     continue
@@ -94,6 +87,16 @@ def read_backgrounds(folders: Iterable[Path | str], part: Part = "all", longest:
         raise SettingsError(f"There are no pictures in {', '.join(looked) or 'no folder'}; name a folder of clean "
                             "photographs or environment maps.")
     return Backgrounds(photos, maps, varied)
+
+
+def pictures_of(folder: Path, suffixes: Set[str], part: Part) -> list[Path]:
+    """The files below a folder that have one of these suffixes and are of that part, in order. Raises SettingsError for
+    what is no folder."""
+    if not folder.is_dir():
+        raise SettingsError(f"{folder} is no folder; name one with clean photographs or environment maps.")
+    return [path for path in sorted(folder.rglob("*"))
+            if path.suffix.lower() in suffixes and path.is_file() and not path.name.startswith(".")
+            and (part == "all" or kept_for_test(path.name) == (part == "test"))]
 
 
 def _environment(path: Path) -> NDArray[np.float16] | None:

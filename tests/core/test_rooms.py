@@ -14,7 +14,12 @@ from core.pictures import read_picture, write_png
 from core.removal.backgrounds import kept_for_test
 
 ROOT = Path(__file__).parents[2]
-SMALL = "import sys; from sample_scenes import rooms; rooms.SIZE = (64, 48); rooms.SAMPLES = 2; sys.exit(rooms.main())"
+SMALL = """
+import sys
+from sample_scenes import random_room, rooms
+random_room.SIZE, random_room.SAMPLES = (64, 48), 2
+sys.exit(rooms.main())
+"""
 
 
 def made(*words: str | Path) -> subprocess.CompletedProcess[str]:

@@ -12,6 +12,7 @@ from typing import Any
 import bpy
 import numpy as np
 
+from core.errors import FrameError
 from core.pictures import Pixels, read_exr
 
 from . import shots, stage
@@ -30,8 +31,11 @@ def hue(random: Random, saturation: float | None = None) -> Colour:
 
 
 def loaded(path: Path) -> Any:
-    """The picture in Blender."""
-    return bpy.data.images.load(str(path), check_existing=True)
+    """The picture in Blender. Raises FrameError where it cannot be read, which Blender would show as pink."""
+    image = bpy.data.images.load(str(path), check_existing=True)
+    if not image.size[0]:
+        raise FrameError(f"{path} cannot be read; take it out of its folder.")
+    return image
 
 
 class Room:

@@ -46,7 +46,9 @@ def pictures(folder: Path, suffixes: Set[str]) -> list[Path]:
 
 
 def make(folder: Path, photos: Sequence[Path], maps: Sequence[Path], count: int, progress: Progress) -> None:
-    """The first `count` pictures of all, those that are not in the folder yet."""
+    """The first `count` pictures of all, those that are not in the folder yet. Raises SettingsError for none at all."""
+    if count < 1:
+        raise SettingsError(f"--count is the number of rooms, 1 or more, not {count}.")
     paths = [folder / f"room_{number:05d}.png" for number in range(count)]
     missing = [number for number, path in enumerate(paths) if not path.is_file()]
     folder.mkdir(parents=True, exist_ok=True)

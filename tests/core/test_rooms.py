@@ -68,3 +68,15 @@ def test_held_out_pictures_are_in_no_room_and_an_empty_folder_is_said(sources: t
     assert refused.returncode == 1
     assert f"{tmp_path} holds none of .jpeg, .jpg" in refused.stderr
     assert not (tmp_path / "out").exists()
+
+
+def test_a_picture_that_cannot_be_read_is_named_and_so_is_a_count_of_none(sources: tuple[Path, Path],
+                                                                         tmp_path: Path) -> None:
+    broken = tmp_path / "photos" / "broken.png"
+    broken.parent.mkdir()
+    broken.write_bytes(b"no picture")
+    words = ("--out", tmp_path / "out", "--photos", broken.parent, "--maps", sources[1])
+    refused = made(*words, "--count", 8)  # of eight rooms one shows a photograph for certain
+    assert refused.returncode == 1
+    assert f"{broken} cannot be read" in refused.stderr
+    assert "1 or more, not 0" in made(*words, "--count", 0).stderr

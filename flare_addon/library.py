@@ -23,6 +23,7 @@ SIDE = 192  # pixels of a thumbnail
 _previews: Any = None
 _items: list[tuple[str, str, str, int, int]] = []
 _seen: tuple[tuple[str, float], ...] | None = None
+_chosen = 0  # the number of an item
 
 
 def folder(create: bool = False) -> Path:
@@ -117,9 +118,21 @@ def items(_self: Any = None, _context: Any = None) -> list[tuple[str, str, str, 
     return _items
 
 
+def chosen(_self: Any = None) -> int:
+    """The number of the chosen item; the first's where none was chosen yet, or what was is no longer there."""
+    numbers = [item[-1] for item in items()]
+    return _chosen if _chosen in numbers else numbers[0]
+
+
+def choose(_self: Any, number: int) -> None:
+    """Choose an item by its number."""
+    global _chosen
+    _chosen = number
+
+
 def register() -> None:
     bpy.types.WindowManager.fit_flare_library = bpy.props.EnumProperty(
-        name="Library", description="A flare from the library", items=items)
+        name="Library", description="A flare from the library", items=items, get=chosen, set=choose)
 
 
 def unregister() -> None:

@@ -63,3 +63,8 @@ def test_lights_follow_a_fit_in_a_scene_that_no_window_shows(facts: Any) -> None
 
 def test_the_chosen_flare_of_the_library_stays_chosen(facts: Any) -> None:
     assert facts["chosen"] == "zed"
+
+
+def test_where_no_flare_of_the_library_is_chosen_it_is_the_first(facts: Any) -> None:
+    assert facts["chosen at first"] == "mid"
+    assert facts["chosen is gone"] == "aaa"

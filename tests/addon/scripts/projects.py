@@ -159,7 +159,10 @@ library, look = part("flare_addon.library"), part("core.look").read(flare)
 for name in ("mid", "zed"):
     library.save(look, name, "", "")
 manager = bpy.context.window_manager
+facts["chosen at first"] = Path(manager.fit_flare_library).stem
 manager.fit_flare_library = next(item[0] for item in library.items() if item[1] == "zed")
 library.save(look, "aaa", "", "")
 facts["chosen"] = Path(manager.fit_flare_library).stem
+Path(manager.fit_flare_library).unlink()
+facts["chosen is gone"] = Path(manager.fit_flare_library).stem
 leave(facts)

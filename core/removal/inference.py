@@ -31,16 +31,17 @@ GAMMA = 2
 """Of the light that flares are taken from display values in: the middle of what pictures are formed with, and cheap."""
 WORKING_SIZE = 480
 """Long side of the largest view of a plate: a fifth more than the most that the network was trained at."""
-LEAST = 0.005
-"""What a flare adds to display values, below which there is none."""
-SURE = 0.001
+LEAST = 0.002
+"""What a flare adds to display values, below which there is none: half a code of 8 bits."""
+SURE = 0.0005
 """Mean over the frame of what a flare adds, below which the network is not trusted at all; from twice as much on
 it is trusted whole. It tells small flares where there are none."""
 SIZES, TURNS = (1.0, 0.8), (0, 2)
 """Of the views that the network is shown: parts of the working size, quarter turns."""
-APART, DOUBT = (0.2, 0.4), (0.2, 1.5)
+APART, DOUBT = (0.4, 0.5), (0.0, 2.5)
 """By how far the views are apart, as a part of what they tell, and how much of that is then taken off what they tell:
-of flares it is a sixth in the median, of haze in a scene that is taken for one a quarter to three quarters."""
+nothing of what they agree on, as they do on most flares, nearly all of what they do not. Of flares it is a sixth in
+the median, of haze in a scene that is taken for one a quarter to three quarters."""
 RADIUS, SMOOTHNESS = 1, 1e-3
 """Of the guided filter, at the working size."""
 CLIPPED = 0.97

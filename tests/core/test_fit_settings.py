@@ -30,6 +30,13 @@ def test_a_run_of_a_version_with_a_setting_more_opens(tmp_path: Path) -> None:
     assert read_config(path) == preset("draft", mode="split")
 
 
+def test_a_split_fit_is_a_fifth_longer_unless_its_length_is_given() -> None:
+    split = preset("draft", mode="split")
+    assert (preset("draft").iterations, split.iterations) == (1500, 1800)
+    assert split == preset("draft", mode="split", iterations=1800)
+    assert preset("draft", mode="split", iterations=400).iterations == 400
+
+
 @pytest.mark.parametrize("name", ["a\nb\r.ply", "a\tb\x00\x1b\x7f.ply", "Straße 写真 \U0001f526.ply"])
 def test_names_of_any_characters_come_back(tmp_path: Path, name: str) -> None:
     settings = changed(preset("draft"), {"scene.start": name})

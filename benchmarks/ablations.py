@@ -44,7 +44,7 @@ from benchmarks.bilateral import GradedScene
 from benchmarks.hidden_lights import hidden_flare
 from benchmarks.known_scene import KnownScene, score
 from core.capture import Camera, Capture, Light
-from core.choices import OUR_PRESETS, Preset
+from core.choices import ITERATIONS, OUR_PRESETS, Preset
 from core.files import write_json
 from core.fit import fit
 from core.fit.frames import Frames
@@ -390,7 +390,8 @@ def main() -> None:
     results: Results = {}
     wanted: Callable[[Experiment], bool] = lambda one: (  # noqa: E731
         (not words.only or one.study in words.only) and (not words.variants or one.name in words.variants))
-    length = partial(_seeded, words.seed, words.preset, iterations=words.iterations)
+    # All of a study are as long as each other, `split` too, which is longer otherwise.
+    length = partial(_seeded, words.seed, words.preset, iterations=words.iterations or ITERATIONS[words.preset])
     made = length()
     seed = f"-seed-{words.seed}" if words.seed else ""
     section = f"ablations-{words.preset}-{made.iterations}-{words.width}{seed}"

@@ -29,6 +29,11 @@ from .synthesis.prescription import Prescription
 Random = np.random.Generator
 
 
+COLOURED = 0.15
+"""Share of a bank's flares that are of lights of one colour (traffic lights, tail lamps, neon), which the classes of
+flares have none of."""
+
+
 class SynthesisBank:
     """`count` flares of the seed, each made when it is first drawn; `renew_to` replaces the oldest, so that none is
     seen for ever.
@@ -61,8 +66,18 @@ class SynthesisBank:
 
     def _make(self, serial: int) -> Layers:
         one = flare((self._seed, serial), self._size, self._lenses)
-        rest, glare, light = (np.minimum(layer, 6e4).astype(np.float16) for layer in (one.rest, one.glare, one.light))
+        colour = _colour(np.random.default_rng((self._seed, serial, 2)))
+        rest, glare, light = (np.minimum(layer * colour, 6e4).astype(np.float16)
+                              for layer in (one.rest, one.glare, one.light))
         return Layers(rest, glare, light, one.lights)
+
+
+def _colour(random: Random) -> NDArray[np.float32]:
+    """(3,), of a light, the most 1: white, or of `COLOURED` one or two channels with little in the others."""
+    if random.random() >= COLOURED:
+        return np.ones(3, np.float32)
+    least, middle = np.sort(random.uniform(0, 1, 2) ** 2)
+    return random.permutation(np.array([1, middle, least * 0.3], np.float32))
 
 
 def _single(half: NDArray[Any]) -> NDArray[np.float32]:

@@ -38,7 +38,7 @@ SURE = 0.0005
 it is trusted whole. It tells small flares where there are none."""
 SIZES, TURNS = (1.0, 0.8), (0, 2)
 """Of the views that the network is shown: parts of the working size, quarter turns."""
-APART, DOUBT = (0.4, 0.5), (0.0, 2.5)
+APART, DOUBT = (0.4, 0.6), (0.0, 2.5)
 """By how far the views are apart, as a part of what they tell, and how much of that is then taken off what they tell:
 nothing of what they agree on, as they do on most flares, nearly all of what they do not. Of flares it is a sixth in
 the median, of haze in a scene that is taken for one a quarter to three quarters."""

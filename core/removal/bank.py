@@ -29,21 +29,17 @@ from .synthesis.prescription import Prescription
 Random = np.random.Generator
 
 
-COLOURED = 0.15
-"""Share of a bank's flares that are of lights of one colour (traffic lights, tail lamps, neon), which the classes of
-flares have none of."""
-
-
 class SynthesisBank:
     """`count` flares of the seed, each made when it is first drawn; `renew_to` replaces the oldest, so that none is
     seen for ever.
 
     What a bank holds is a function of the seed and of how far it was renewed: a resumed training sees the
-    same flares.
+    same flares. A share `coloured` are of lights of one colour (traffic lights, tail lamps, neon), which no class of
+    flares has.
     """
 
-    def __init__(self, seed: int, count: int, size: int, lenses: Sequence[Prescription]) -> None:
-        self._seed, self._size, self._lenses = seed, size, lenses
+    def __init__(self, seed: int, count: int, size: int, lenses: Sequence[Prescription], coloured: float = 0) -> None:
+        self._seed, self._size, self._lenses, self._coloured = seed, size, lenses, coloured
         self._made: list[tuple[int, Layers] | None] = [None] * count
         self._end = count
 
@@ -66,16 +62,15 @@ class SynthesisBank:
 
     def _make(self, serial: int) -> Layers:
         one = flare((self._seed, serial), self._size, self._lenses)
-        colour = _colour(np.random.default_rng((self._seed, serial, 2)))
+        random = np.random.default_rng((self._seed, serial, 2))
+        colour = _one_colour(random) if random.random() < self._coloured else np.ones(3, np.float32)
         rest, glare, light = (np.minimum(layer * colour, 6e4).astype(np.float16)
                               for layer in (one.rest, one.glare, one.light))
         return Layers(rest, glare, light, one.lights)
 
 
-def _colour(random: Random) -> NDArray[np.float32]:
-    """(3,), of a light, the most 1: white, or of `COLOURED` one or two channels with little in the others."""
-    if random.random() >= COLOURED:
-        return np.ones(3, np.float32)
+def _one_colour(random: Random) -> NDArray[np.float32]:
+    """(3,), of a light: one channel 1, little in one or both of the others."""
     least, middle = np.sort(random.uniform(0, 1, 2) ** 2)
     return random.permutation(np.array([1, middle, least * 0.3], np.float32))
 

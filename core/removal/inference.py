@@ -30,7 +30,7 @@ from .weights import IN_THE_BOX, load
 GAMMA = 2
 """Of the light that flares are taken from display values in: the middle of what pictures are formed with, and cheap."""
 WORKING_SIZE = 480
-"""Long side of the largest view of a plate: a fifth more than the most that the network was trained at."""
+"""Long side of the largest view of a plate: about the most that the network was trained at."""
 LEAST = 0.002
 """What a flare adds to display values, below which there is none: half a code of 8 bits."""
 SURE = 0.0005

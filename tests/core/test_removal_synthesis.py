@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from core.errors import SettingsError
 from core.pictures import write_png
-from core.removal import bank as banks
 from core.removal import formation, pairs, variety
 from core.removal.backgrounds import Backgrounds, kept_for_test, read_backgrounds
 from core.removal.bank import Mixed, OwnFlares, SynthesisBank
+from core.removal.recipe import Recipe
 from core.removal.synthesis import prescription as lenses
 from core.removal.synthesis import shapes
 from core.removal.synthesis.canvas import grid
@@ -200,21 +200,19 @@ def test_a_bank_is_renewed_as_if_never_stopped() -> None:
     assert len(drawn[0] & drawn[1]) == 1, "of the flares 0 to 2, two made way for 3 and 4"
 
 
-def test_some_of_a_bank_are_of_lights_of_one_colour(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_some_of_a_bank_are_of_lights_of_one_colour() -> None:
     def drawn(share: float) -> NDArray[np.float32]:
         """(flares, channels): the light of each."""
-        monkeypatch.setattr(banks, "COLOURED", share)
-        bank = SynthesisBank(3, 40, SIZE, lenses.built_in())
+        bank = SynthesisBank(3, 40, SIZE, lenses.built_in(), share)
         of_all = {int(np.random.default_rng(seed).integers(40)): bank.draw(np.random.default_rng(seed))
                   for seed in range(150)}
         return np.array([(of_all[slot].rest + of_all[slot].glare).sum((0, 1)) for slot in sorted(of_all)])
 
-    some = banks.COLOURED
     white = drawn(0)
     left = drawn(1) / white
     np.testing.assert_allclose(left.max(1), 1, rtol=1e-3)
     assert (left.min(1) < 0.31).all(), "in one channel there is little"
-    changed = (np.abs(drawn(some) / white - 1) > 0.01).any(1).mean()
+    changed = (np.abs(drawn(Recipe().coloured) / white - 1) > 0.01).any(1).mean()
     assert 0.03 < changed < 0.35
 
 

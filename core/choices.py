@@ -15,3 +15,5 @@ OUR_PRESETS: tuple[Preset, ...] = ("draft", "standard", "high")
 """Those of our form, the shortest first."""
 ITERATIONS: dict[Preset, int] = {"draft": 1500, "standard": 3000, "high": 10000, "paper": 30000}
 """Length of a fit by its preset."""
+LONGER_SPLIT = 1.2
+"""Times that, in mode `split`, which has to find out by itself what flare-free frames would say."""

@@ -39,7 +39,8 @@ PRESETS: tuple[tuple[Preset, str, str], ...] = (
 )
 MODES: tuple[tuple[Mode, str, str], ...] = (
     ("default", "Clean Frames", "The capture has the frames without flare in its folder removed/ (or truth/scene/)"),
-    ("split", "No Clean Frames", "There are no frames without flare: scene and flare are told apart by parallax"),
+    ("split", "No Clean Frames", "There are no frames without flare: scene and flare are told apart by parallax, "
+     "in a fit that is a fifth longer"),
 )
 
 

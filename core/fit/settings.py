@@ -17,7 +17,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ..choices import ITERATIONS, Blend, Kernels, Mode, Model, Preset
+from ..choices import ITERATIONS, LONGER_SPLIT, Blend, Kernels, Mode, Model, Preset
 from ..errors import RunError, SettingsError
 from ..files import WRITTEN_BY_HAND, write_text
 from ..flare.density import DensitySettings
@@ -264,10 +264,6 @@ STEADY = 0.1
 """Far less than what the picture holds delta_l with where there is a flare, far more than what pulls it elsewhere."""
 SETTLED = 0.05
 """Share of the flare's rates that is left at the end of a short schedule."""
-
-
-LONGER_SPLIT = 1.2
-"""Times a preset's iterations, of a fit that has to find out by itself what flare-free frames would say."""
 
 
 def preset(name: Preset, *, model: Model | None = None, mode: Mode = "default",

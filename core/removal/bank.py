@@ -11,6 +11,7 @@ or are any folder of pictures on black, image sequences, or video clips (stock f
 """
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,8 @@ from .synthesis.layers import flare
 from .synthesis.prescription import Prescription
 
 Random = np.random.Generator
+MOST_UNREADABLE = 20
+"""Of the user's flares drawn one after the other; a folder of nothing else is told of."""
 
 
 class SynthesisBank:
@@ -112,12 +115,22 @@ class OwnFlares:
             self._files.append((path, lights.get((path.parent.parent, path.stem))))
         if not self._files:
             raise SettingsError(f"{folder} holds no flare layers; give pictures or clips of flares on black.")
+        compound = {beside for beside, _ in lights}
+        self.without_light = [path for path, light in self._files if light is None and path.parent.parent in compound]
+        """Those whose folder has the others' lights beside it but not theirs: their lights are taken for flare."""
 
     def __len__(self) -> int:
         return len(self._files)
 
     def draw(self, random: Random) -> Layers:
-        """A random layer; the middle of the picture is taken for the principal point."""
+        """A random layer; the middle of the picture is taken for the principal point. One that cannot be read is passed
+        over: a training of days does not end for it. Raises FrameError where many cannot."""
+        for _ in range(MOST_UNREADABLE - 1):
+            with contextlib.suppress(FrameError):
+                return self._drawn(random)
+        return self._drawn(random)
+
+    def _drawn(self, random: Random) -> Layers:
         path, light_path = self._files[int(random.integers(len(self._files)))]
         flare = self._square(_frame_of(path, random))
         light = np.zeros_like(flare)

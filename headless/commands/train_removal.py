@@ -95,6 +95,9 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
         tests = None
         progress.say("There are too few clean pictures to keep some for checks; the log will have none.")
     own = OwnFlares(words.flares, recipe.canvas) if words.flares else None
+    if own and own.without_light:
+        progress.say(f"{len(own.without_light)} of your {len(own)} flares have no picture of their light in "
+                     f"Light_Source, {own.without_light[0].name} first; it is learned as a part of the flare.")
     if words.model == "diffusion":
         return _diffusion(words, recipe, backgrounds, train_on, own, progress)
     start = weights.IN_THE_BOX if str(words.start) == "box" else words.start

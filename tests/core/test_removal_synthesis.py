@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from core.errors import SettingsError
+from core.errors import FrameError, SettingsError
 from core.pictures import write_png
 from core.removal import formation, pairs, variety
 from core.removal.backgrounds import Backgrounds, kept_for_test, read_backgrounds
@@ -239,6 +239,24 @@ def test_own_flares_with_their_lights(tmp_path: Path) -> None:
     assert layers.rest[middle, middle].max() < 0.05, "the light is not flare"
     mixed = Mixed(Single(flare((2, 0), SIZE, lenses.built_in(), "rings")), own, 1.0)
     assert np.array_equal(mixed.draw(np.random.default_rng(0)).light, layers.light)
+
+
+def test_own_flares_that_cannot_be_read_or_have_no_light(tmp_path: Path) -> None:
+    compound = tmp_path / "Scattering_Flare" / "Compound_Flare"
+    picture = np.full((20, 20, 3), 0.5)
+    for name in ("1.png", "2.png"):
+        write_png(compound / name, picture)
+    write_png(tmp_path / "Scattering_Flare" / "Light_Source" / "1.png", picture)
+    write_png(tmp_path / "Reflective_Flare" / "1.png", picture)
+    own = OwnFlares(tmp_path, SIZE)
+    assert [path.name for path in own.without_light] == ["2.png"], "ghosts have no lights in them"
+    (compound / "2.png").write_bytes((compound / "2.png").read_bytes()[:60])
+    for seed in range(20):
+        assert own.draw(np.random.default_rng(seed)).rest.shape == (SIZE, SIZE, 3)
+    for path in (compound / "1.png", tmp_path / "Reflective_Flare" / "1.png"):
+        path.write_bytes(b"")
+    with pytest.raises(FrameError, match=r"\.png"):
+        own.draw(np.random.default_rng(0))
 
 
 def test_backgrounds_of_folders(tmp_path: Path) -> None:

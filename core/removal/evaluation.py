@@ -30,7 +30,7 @@ INPUTS = ("input", "flare", "blend")
 TRUTHS = ("gt", "target", "clean", "scene")
 WORST = 10
 ALIKE = 100.0
-"""PSNR in dB that pictures which are the same count for in a gain: that of an error of 0.00001."""
+"""PSNR in dB that pictures which are the same count for in gains and means: that of an error of 0.00001."""
 Scores = dict[str, float | None]
 
 
@@ -102,10 +102,10 @@ def evaluate(cases: Sequence[Case], clean: Callable[[Pixels], Pixels], progress:
     """Scores of every case, means by category and of all; JSON-able.
 
     clean: display values (height, width, 3) to the same without flare. `gain_db` is the PSNR above the untouched
-    input's (where two pictures are the same and have none, `ALIKE` counts), `made_worse` the share of pictures with a
-    gain below -0.5 dB; `failed` what is wrong with pairs that cannot be read, which are left out; `masked_psnr` counts
-    the pixels of the mask alone. lpips is null where no weights for it were given, FLIP where its package is not
-    installed. Raises FrameError where none can be read.
+    input's (where two pictures are the same and have none, `ALIKE` counts, in means too), `made_worse` the share of
+    pictures with a gain below -0.5 dB; `failed` what is wrong with pairs that cannot be read, which are left out;
+    `masked_psnr` counts the pixels of the mask alone. lpips is null where no weights for it were given, FLIP where its
+    package is not installed. Raises FrameError where none can be read.
     """
     progress = progress or Progress()
     progress.stage("eval-removal", len(cases))
@@ -123,8 +123,7 @@ def evaluate(cases: Sequence[Case], clean: Callable[[Pixels], Pixels], progress:
         row: dict[str, Any] = {"name": case.name, "category": case.category,
                                "result": _scores(result, truth, mask, lpips),
                                "input": _scores(frame, truth, mask, lpips)}
-        before, after = row["input"]["psnr"], row["result"]["psnr"]
-        row["gain_db"] = round((ALIKE if after is None else after) - (ALIKE if before is None else before), 4)
+        row["gain_db"] = round(_level(row["result"]) - _level(row["input"]), 4)
         rows.append(row)
         progress.advance()
     if not rows:
@@ -152,7 +151,13 @@ def _summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     for side in ("result", "input"):
         names = sorted({name for row in rows for name in row[side]})
         summary[side] = {name: _mean([row[side].get(name) for row in rows]) for name in names}
+        summary[side]["psnr"] = _mean([_level(row[side]) for row in rows])
     return summary
+
+
+def _level(scores: Scores) -> float:
+    """PSNR in dB; `ALIKE` where there is none, of pictures that are the same."""
+    return ALIKE if scores["psnr"] is None else scores["psnr"]
 
 
 def _mean(values: Iterable[float | None]) -> float | None:

@@ -427,6 +427,7 @@ def test_a_clean_picture_that_is_changed_was_made_worse(tmp_path: Path) -> None:
     cases = evaluation.paired(tmp_path)
     kept = evaluation.evaluate(cases, lambda frame: frame)["mean"]
     assert (kept["gain_db"], kept["made_worse"]) == (0, 0)
+    assert kept["result"]["psnr"] == kept["input"]["psnr"] == 100, "means are of the same pictures as gains"
     black = evaluation.evaluate(cases, np.zeros_like)
     assert black["mean"]["made_worse"] == 1 and black["mean"]["gain_db"] < -80
     assert evaluation.worst_sheet(cases, np.zeros_like, black, 40).any()

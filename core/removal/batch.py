@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import DISK_FULL, FrameError, SettingsError, refusal, spelled_out
+from ..exif import read_exif
 from ..files import check_apart
 from ..pictures import pictures_below, pictures_in, window_of
 from ..progress import Progress
@@ -101,7 +102,7 @@ def remove_all(inputs: Sequence[Path], folder: Path, remover: Remover, progress:
                 kept[why] += 1
             else:
                 plate, told = sequences.read(path)
-                marked = mattes.read(name, window_of(path)) if mattes else None
+                marked = mattes.read(name, window_of(path), read_exif(path)[0]) if mattes else None
                 record.begin(name, path, how, results[name], overwrite)  # once it can be read: what is there goes
                 write_results(results[name], plate, *remover.remove(plate, marked, told))
                 record.end(results[name])

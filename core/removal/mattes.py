@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FrameError, SettingsError
+from ..exif import as_stored, read_exif, upright
 from ..pictures import Window, framed, pictures_below, window_of
-from ..tiff import is_premultiplied
+from ..tiff import UPRIGHT, is_premultiplied
 from .plates import read_plate
 
 ASPECT = 0.01
@@ -42,17 +43,23 @@ class Mattes:
             raise FrameError(f"{name} has no matte in {self.given}; add one (black, where no flare is to be taken).")
         return found
 
-    def read(self, name: Path, plate: Window) -> NDArray[np.float32]:
-        """(height, width), 0..1: the brightest channel of the plate's matte, by its alpha where it has one. Raises
-        FrameError for a damaged one, and for one of another shape."""
+    def read(self, name: Path, plate: Window, orientation: int = UPRIGHT) -> NDArray[np.float32]:
+        """(height, width), 0..1: the brightest channel of the plate's matte, by its alpha where it has one, as the
+        plate is stored. orientation: the plate's, by its Exif. Raises FrameError for a damaged one, and for one of
+        another shape."""
         import cv2
 
         path = self.path(name)
         own, values = window_of(path), _painted(path)
+        turned = as_stored(upright(values, read_exif(path)[0]), orientation)
+        size = turned.shape[1], turned.shape[0]
+        if own.is_frame and _is_of_the_shape(size, plate.frame):
+            # Painted on the plate as viewers show it; else on its pixels, by a program that knows nothing of Exif.
+            own, values = Window(size, (0, 0), size), turned
         if own.is_frame and own.size == plate.size:  # painted on the very pixels of the plate, overscan and all
             return np.clip(values, 0, 1)
         (columns, rows), (width, height) = own.frame, plate.frame
-        if abs(columns * height / (rows * width) - 1) > ASPECT:
+        if not _is_of_the_shape(own.frame, plate.frame):
             raise FrameError(f"{path} is {columns} x {rows} pixels, another shape than its plate of {width} x "
                              f"{height}; make it for that plate.")
         values = framed(values, own)
@@ -61,6 +68,10 @@ class Mattes:
         x, y = plate.origin
         values = framed(values, Window(plate.frame, (-x, -y), plate.size))
         return np.clip(values, 0, 1)
+
+
+def _is_of_the_shape(size: tuple[int, int], other: tuple[int, int]) -> bool:
+    return abs(size[0] * other[1] / (size[1] * other[0]) - 1) <= ASPECT
 
 
 def _painted(path: Path) -> NDArray[np.float32]:

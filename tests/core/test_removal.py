@@ -27,6 +27,7 @@ from core import jpeg, tiff
 from core.capture import Capture
 from core.colour.spaces import AP1
 from core.errors import Cancelled, CaptureError, FrameError, RunError, SettingsError
+from core.exif import upright
 from core.pictures import Window, read_exr, read_picture, save_exr, write_exr, write_png
 from core.progress import Progress
 from core.removal import batch, inference, weights
@@ -40,6 +41,7 @@ from core.removal.recipe import Recipe, as_dict
 from core.removal.record import RECORD, Record, made_from
 from tests.core.captures import make_capture
 from tests.core.heard import Heard
+from tests.core.test_exif import exif_segment
 
 TINY = Recipe(widths=(8, 8, 8, 8, 8))
 
@@ -453,6 +455,22 @@ def test_flares_are_taken_where_the_matte_is_white_alone(tmp_path: Path, everywh
     assert not difference[:, 46:].any()
     assert not flare["R"][:, 46:].any()
     assert (flare["R"][:, :44] > 0).mean() > 0.9
+
+
+@pytest.mark.parametrize("painted", ["as shown", "on the pixels", "as the plate"])
+@pytest.mark.parametrize("orientation", [1, 3, 6, 8])
+def test_a_matte_lies_as_its_plate_is_shown(tmp_path: Path, orientation: int, painted: str) -> None:
+    """A telephone held upright stores its photographs on their sides."""
+    stored = np.zeros((60, 90), np.uint8)
+    stored[:10, :20] = 255
+    if painted == "on the pixels" and orientation == 3:
+        pytest.skip("that cannot be told from one that was painted as shown")
+    values = upright(stored, orientation) if painted == "as shown" else stored
+    raw = cv2.imencode(".jpg", values, [cv2.IMWRITE_JPEG_QUALITY, 100])[1].tobytes()
+    segment = exif_segment("MM", orientation, 27) if painted == "as the plate" else b""
+    (tmp_path / "matte.jpg").write_bytes(raw[:2] + segment + raw[2:])
+    found = Mattes(tmp_path / "matte.jpg").read(Path("a.jpg"), whole(90, 60), orientation)
+    np.testing.assert_allclose(found, stored / 255, atol=0.03)
 
 
 def test_a_grey_matte_takes_a_part(everywhere: Path) -> None:

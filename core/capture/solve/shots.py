@@ -15,11 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import CaptureError, FrameError
+from ...exif import read_exif, upright
 from ...files import read_json, write_json
 from ...pictures import Picture, Pixels, picture_size, pictures_in, read_picture, window_of, write_png
 from ...progress import Progress
 from ...video import VIDEOS, Video
-from .exif import read_exif, upright
 
 RECORD = "shots.json"
 COMBED, SOME = 1.1, 0.25
@@ -115,7 +115,11 @@ def gathered(work: Path) -> tuple[list[Shot], list[str]] | None:
 
 def original(shot: Shot) -> Picture:
     """The frame at full size, upright."""
-    return upright(read_picture(Path(shot.file)), shot.orientation)
+    return _upright(read_picture(Path(shot.file)), shot.orientation)
+
+
+def _upright(picture: Picture, orientation: int) -> Picture:
+    return Picture(upright(picture.pixels, orientation), picture.encoding)
 
 
 def _from_folder(source: Path, work: Path, number: int, size: int,
@@ -140,7 +144,7 @@ def _from_folder(source: Path, work: Path, number: int, size: int,
         try:
             picture_size(file)
             orientation, focal = read_exif(file)
-            picture = upright(read_picture(file), orientation)
+            picture = _upright(read_picture(file), orientation)
             aspect = window_of(file).aspect
         except FrameError as problem:
             left_out.append(str(problem))

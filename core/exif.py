@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The two things a photograph's Exif block says that a solve needs: which way is up, and the focal length."""
+"""Of what a photograph's Exif block says two things: which way is up, and the focal length."""
 from __future__ import annotations
 
 import io
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ... import jpeg, png, tiff
-from ...pictures import Picture
+from . import jpeg, png, tiff
 
 EXIF, FOCAL_35MM = 0x8769, 0xA405
 WIDTH_35MM = 36.0  # millimetres along the long side
@@ -40,13 +40,17 @@ def _exif_block(stream: BinaryIO) -> BinaryIO:
     return io.BytesIO(next(found, b""))
 
 
-def upright(picture: Picture, orientation: int) -> Picture:
-    """The picture turned and mirrored as an Exif orientation asks."""
-    pixels = picture.pixels
+def upright(pixels: NDArray[Any], orientation: int) -> NDArray[Any]:
+    """(height, width, ...) as stored, turned and mirrored as an Exif orientation asks: as viewers show it."""
     if orientation in (5, 6, 7, 8):
         pixels = np.swapaxes(pixels, 0, 1)
     if orientation in (3, 4, 7, 8):
         pixels = pixels[::-1]
     if orientation in (2, 3, 6, 7):
         pixels = pixels[:, ::-1]
-    return Picture(np.ascontiguousarray(pixels), picture.encoding)
+    return np.ascontiguousarray(pixels)
+
+
+def as_stored(pixels: NDArray[Any], orientation: int) -> NDArray[Any]:
+    """The inverse of `upright`."""
+    return upright(pixels, {6: 8, 8: 6}.get(orientation, orientation))

@@ -1,0 +1,71 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Which way a photograph is up, and through what lens it was taken."""
+from __future__ import annotations
+
+import zlib
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from core import tiff
+from core.exif import as_stored, read_exif, upright
+
+
+def exif_segment(order: str, orientation: int, focal: int) -> bytes:
+    """A JPEG's Exif segment with orientation and 35 mm focal length."""
+    sign = "little" if order == "II" else "big"
+
+    def number(value: int, size: int) -> bytes:
+        return value.to_bytes(size, sign)
+
+    def entry(tag: int, kind: int, value: int) -> bytes:
+        return number(tag, 2) + number(kind, 2) + number(1, 4) + (number(value, 2) + b"\0\0" if kind == 3 else
+                                                                  number(value, 4))
+
+    block = order.encode() + number(42, 2) + number(8, 4)
+    block += number(2, 2) + entry(0x0112, 3, orientation) + entry(0x8769, 4, 38) + number(0, 4)
+    block += number(1, 2) + entry(0xA405, 3, focal) + number(0, 4)
+    return b"\xff\xe1" + (len(block) + 8).to_bytes(2, "big") + b"Exif\0\0" + block
+
+
+@pytest.mark.parametrize("order", ["II", "MM"])
+def test_exif(tmp_path: Path, order: str) -> None:
+    _, data = cv2.imencode(".jpg", np.zeros((8, 8, 3), np.uint8))
+    raw = data.tobytes()
+    (tmp_path / "a.jpg").write_bytes(raw[:2] + exif_segment(order, 6, 27) + raw[2:])
+    assert read_exif(tmp_path / "a.jpg") == (6, 0.75)
+    (tmp_path / "b.jpg").write_bytes(raw)
+    assert read_exif(tmp_path / "b.jpg") == (1, None)
+    (tmp_path / "c.jpg").write_bytes(raw[:2] + exif_segment(order, 6, 27)[:40])
+    assert read_exif(tmp_path / "c.jpg") == (1, None)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".tif"])
+def test_orientation_of_pngs_and_tiffs(suffix: str, tmp_path: Path) -> None:
+    raw = cv2.imencode(suffix, np.zeros((8, 8, 3), np.uint8))[1].tobytes()
+    (tmp_path / f"plain{suffix}").write_bytes(raw)
+    assert read_exif(tmp_path / f"plain{suffix}") == (1, None)
+    block = b"eXIf" + exif_segment("MM", 6, 27)[10:]
+    chunk = (len(block) - 4).to_bytes(4, "big") + block + zlib.crc32(block).to_bytes(4, "big")
+    turned = (raw[:-12] + chunk + raw[-12:] if suffix == ".png" else
+              tiff.with_tags(raw, {tiff.ORIENTATION: tiff.short(6)}))
+    (tmp_path / f"turned{suffix}").write_bytes(turned)
+    assert read_exif(tmp_path / f"turned{suffix}") == (6, 0.75 if suffix == ".png" else None)
+    (tmp_path / f"cut{suffix}").write_bytes(turned[:60])
+    assert read_exif(tmp_path / f"cut{suffix}")[1] is None
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_upright(orientation: int) -> None:
+    """As OpenCV turns a JPEG of that orientation."""
+    picture = np.zeros((16, 24, 3), np.uint8)
+    picture[:8, :8], picture[8:, 16:] = (255, 0, 0), (0, 255, 0)
+    _, data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 100])
+    raw = data.tobytes()
+    tagged = raw[:2] + exif_segment("MM", orientation, 27) + raw[2:]
+    turned = cv2.imdecode(np.frombuffer(tagged, np.uint8), cv2.IMREAD_COLOR)
+    plain = cv2.imdecode(data, cv2.IMREAD_COLOR)
+    np.testing.assert_array_equal(upright(plain, orientation), turned)
+    np.testing.assert_array_equal(as_stored(turned, orientation), plain)

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from ..errors import FrameError, SettingsError
 from ..pictures import SUFFIXES, linear_from_srgb, read_picture
 from ..video import VIDEOS, Video
-from .pairs import Bank, Layers
+from .pairs import WHITE, Bank, Layers
 from .synthesis.layers import flare
 from .synthesis.prescription import Prescription
 
@@ -61,15 +61,14 @@ class SynthesisBank:
         if made is None or made[0] != serial:
             made = self._made[slot] = serial, self._make(serial)
         layers = made[1]
-        return Layers(_single(layers.rest), _single(layers.glare), _single(layers.light), layers.lights)
+        return layers._replace(rest=_single(layers.rest), glare=_single(layers.glare), light=_single(layers.light))
 
     def _make(self, serial: int) -> Layers:
         one = flare((self._seed, serial), self._size, self._lenses)
         random = np.random.default_rng((self._seed, serial, 2))
-        colour = _one_colour(random) if random.random() < self._coloured else np.ones(3, np.float32)
-        rest, glare, light = (np.minimum(layer * colour, 6e4).astype(np.float16)
-                              for layer in (one.rest, one.glare, one.light))
-        return Layers(rest, glare, light, one.lights)
+        colour = _one_colour(random) if random.random() < self._coloured else WHITE
+        rest, glare, light = (np.minimum(layer, 6e4).astype(np.float16) for layer in (one.rest, one.glare, one.light))
+        return Layers(rest, glare, light, one.lights, colour)
 
 
 def _one_colour(random: Random) -> NDArray[np.float32]:

@@ -13,7 +13,7 @@ from torch.utils.data import DataLoader, Dataset
 from .backgrounds import Backgrounds
 from .bank import Mixed, OwnFlares, SynthesisBank
 from .learners import ALONE, Learner, begin_process
-from .pairs import Bank, Pair, pair
+from .pairs import Bank, Pair, of_one_channel, pair
 from .recipe import Recipe
 from .synthesis.prescription import Prescription
 
@@ -57,8 +57,9 @@ class Batches(Dataset[Batch]):
         """A frame of an iteration, of that size."""
         self._made.renew_to(self._recipe.bank + iteration // self._recipe.renew_every)
         random = np.random.default_rng((self._recipe.seed, iteration, number + 1))  # to numpy, (1, 2) is (1, 2, 0)
-        return pair(random, self._bank, self._backgrounds, width, height, clean=self._recipe.clean,
-                    against_light=self._recipe.against_light)
+        one = pair(random, self._bank, self._backgrounds, width, height, clean=self._recipe.clean,
+                   against_light=self._recipe.against_light)
+        return of_one_channel(int(random.integers(3)), one) if random.random() < self._recipe.grey else one
 
 
 def drawn_ahead(batches: Batches, first: int, end: int, processes: int) -> Iterator[Batch]:

@@ -20,13 +20,18 @@ from .formation import GAMMAS, display
 Random = np.random.Generator
 
 
+WHITE: NDArray[np.float32] = np.ones(3, np.float32)
+
+
 class Layers(NamedTuple):
-    """A flare on the square canvas, as `synthesis.layers.Flare` has it: float32 where it is drawn."""
+    """A flare on the square canvas, as `synthesis.layers.Flare` has it: float32 where it is drawn. colour: (3,), by
+    which all of it is still to be multiplied."""
 
     rest: NDArray[Any]
     glare: NDArray[Any]
     light: NDArray[Any]
     lights: tuple[tuple[float, float], ...]
+    colour: NDArray[np.float32] = WHITE
 
 
 class Bank(Protocol):
@@ -77,6 +82,11 @@ def pair(random: Random, bank: Bank, backgrounds: Backgrounds, width: int, heigh
     if bare:
         return Pair(frame, clear, gentle)
     return Pair(_stored(random, frame), clear, gentle)
+
+
+def of_one_channel(channel: int, one: Pair) -> Pair:
+    """As a grey picture: a channel of a coloured light is a light, which saturates in all that a grey picture has."""
+    return Pair(*(np.repeat(part[..., channel, None], 3, -1) for part in (one.frame, one.scene, one.gentle)))
 
 
 def _exposed(random: Random, scene: Pixels) -> Pixels:
@@ -155,11 +165,11 @@ def _placed(random: Random, layers: Layers, matrix: NDArray[Any], width: int, he
         near = np.maximum(near, np.exp(-((x - at[0]) ** 2 + (y - at[1]) ** 2) / np.float32((0.35 * half) ** 2)))
     red, green, blue = np.moveaxis(rest + glare, -1, 0)
     least = np.minimum(np.minimum(red, green), blue)
-    # What a camera clips is white with flare and without.
+    # What a camera clips, and be it in a light's own colour alone, is clipped with flare and without.
     kept = np.clip((least * near - 0.5) / 0.4, 0, 1)[..., None]
     kept = kept * kept * (3 - 2 * kept)
     kept_light: Pixels = np.maximum(light, (rest + glare) * kept)
-    return rest * (1 - kept), glare * (1 - kept), kept_light
+    return rest * (1 - kept) * layers.colour, glare * (1 - kept) * layers.colour, kept_light * layers.colour
 
 
 def _developed(random: Random, shown: Sequence[Pixels]) -> list[Pixels]:

@@ -130,12 +130,12 @@ def test_synthesis_shares_nothing_with_the_sample_scenes() -> None:
 class Single:
     """A bank of one flare."""
 
-    def __init__(self, made: Flare) -> None:
-        self.made = made
+    def __init__(self, made: Flare, colour: tuple[float, float, float] = (1, 1, 1)) -> None:
+        self.layers = pairs.Layers(made.rest, made.glare, made.light, made.lights, np.array(colour, np.float32))
 
     def draw(self, random: np.random.Generator) -> pairs.Layers:
         del random
-        return pairs.Layers(self.made.rest, self.made.glare, self.made.light, self.made.lights)
+        return self.layers
 
 
 def backgrounds() -> Backgrounds:
@@ -201,19 +201,36 @@ def test_a_bank_is_renewed_as_if_never_stopped() -> None:
 
 
 def test_some_of_a_bank_are_of_lights_of_one_colour() -> None:
-    def drawn(share: float) -> NDArray[np.float32]:
-        """(flares, channels): the light of each."""
+    def colours(share: float) -> NDArray[np.float32]:
+        """(flares, channels)"""
         bank = SynthesisBank(3, 40, SIZE, lenses.built_in(), share)
-        of_all = {int(np.random.default_rng(seed).integers(40)): bank.draw(np.random.default_rng(seed))
+        of_all = {int(np.random.default_rng(seed).integers(40)): bank.draw(np.random.default_rng(seed)).colour
                   for seed in range(150)}
-        return np.array([(of_all[slot].rest + of_all[slot].glare).sum((0, 1)) for slot in sorted(of_all)])
+        return np.array([of_all[slot] for slot in sorted(of_all)])
 
-    white = drawn(0)
-    left = drawn(1) / white
-    np.testing.assert_allclose(left.max(1), 1, rtol=1e-3)
-    assert (left.min(1) < 0.31).all(), "in one channel there is little"
-    changed = (np.abs(drawn(Recipe().coloured) / white - 1) > 0.01).any(1).mean()
-    assert 0.03 < changed < 0.35
+    assert (colours(0) == 1).all()
+    np.testing.assert_allclose(colours(1).max(1), 1, rtol=1e-3)
+    assert (colours(1).min(1) < 0.31).all(), "in one channel there is little"
+    assert 0.03 < (colours(Recipe().coloured) < 0.99).any(1).mean() < 0.35
+
+
+def test_a_light_of_one_colour_is_clipped_in_that_one_with_flare_and_without() -> None:
+    made = flare((1, 0), 128, lenses.built_in(), "scatter")
+    white, red = (pairs.pair(np.random.default_rng(1), Single(made, colour), backgrounds(), 96, 64, clean=0)
+                  for colour in ((1, 1, 1), (1, 0.1, 0.01)))
+    assert (red.scene[..., 0] > 0.99).sum() > 100
+    assert np.array_equal(white.scene[..., 0], red.scene[..., 0])
+    assert np.array_equal(white.frame[..., 0], red.frame[..., 0])
+    assert red.frame[..., 2].mean() < white.frame[..., 2].mean() - 0.1
+
+
+def test_a_picture_of_one_channel() -> None:
+    one = pairs.pair(np.random.default_rng(1), Single(flare((2, 0), 128, lenses.built_in(), "glare")), backgrounds(),
+                     96, 64, clean=0)
+    grey = pairs.of_one_channel(1, one)
+    for part in ("frame", "scene", "gentle"):
+        for channel in range(3):
+            assert np.array_equal(getattr(grey, part)[..., channel], getattr(one, part)[..., 1])
 
 
 def test_own_flares_with_their_lights(tmp_path: Path) -> None:

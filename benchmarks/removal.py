@@ -9,6 +9,7 @@
     python benchmarks/removal.py matte PHOTOS... [--lenses LENSES]  # what it is worth to mark where flares are
     python benchmarks/removal.py scenes PHOTOS...            # held-out scenes without flare, as training has them
     python benchmarks/removal.py against PHOTOS... [--lenses LENSES]  # flares whose lights are in a bright sky
+    python benchmarks/removal.py coloured PHOTOS... [--lenses LENSES]  # flares of lights of one colour
     python benchmarks/removal.py coverage [--sheet FILE]     # what the synthesis spans, and a sheet of it
 
 Speed: each case in a process of its own, on the threads that torch takes; reading and writing included; the
@@ -19,7 +20,8 @@ frames. Clean: PSNR of the result against its input, not of a number where they 
 Matte: `count` synthesised pictures of every class, of held-out photographs and lenses and of another seed than
 eval-removal's; the matte is as an artist would rough it in, wide about all that the flare changes, with a soft rim.
 Scenes: as `clean`, of the exposures, colours and grain that training has, some with a light. Against: the same flares
-with their lights where the scene is bright, and anywhere.
+with their lights where the scene is bright, and anywhere. Coloured: the same flares of lights of one colour (traffic
+lights, neon), and of the white ones that their class has.
 """
 from __future__ import annotations
 
@@ -193,22 +195,50 @@ AGAINST = ("scatter", "ghosts", "streak", "glare", "mixed")
 
 def against(folders: list[Path], lenses: Path | None, weights: Path | None, count: int) -> None:
     """What removal gains where lights stand in a bright part of the scene, and where they stand anywhere."""
+    remover, drawn = Remover(weights), _drawing(folders, lenses)
+    for name, share in (("against the light", 1.0), ("anywhere", 0.0)):
+        pairs = [drawn((1003, index, number), kind, against_light=share)
+                 for index, kind in enumerate(AGAINST) for number in range(count)]
+        _tell_gains(f"{name:17}", [_gain(remover, *one) for one in pairs])
+
+
+def coloured(folders: list[Path], lenses: Path | None, weights: Path | None, count: int) -> None:
+    """What removal gains of flares whose lights have one colour, and of the same of white lights."""
+    from core.removal.bank import WHITE, one_colour
+    from core.removal.synthesis.layers import CLASSES
+
+    remover, drawn = Remover(weights), _drawing(folders, lenses)
+    for name, white in (("of one colour", False), ("white", True)):
+        seeds = [((1004, index, number), kind) for index, kind in enumerate(CLASSES) for number in range(count)]
+        gains = [_gain(remover, *drawn(seed, kind, WHITE if white else one_colour(np.random.default_rng(seed))))
+                 for seed, kind in seeds]
+        _tell_gains(f"{name:13}", gains)
+
+
+def _drawing(folders: list[Path], lenses: Path | None) -> Any:
+    """Draws (frame, scene) of held-out photographs and lenses: a function of seed, class of flare, colour and how many
+    of the lights are against the light."""
     from core.removal.backgrounds import read_backgrounds
-    from core.removal.bank import OneFlare
+    from core.removal.bank import WHITE, OneFlare
     from core.removal.pairs import pair
 
-    remover, backgrounds = Remover(weights), read_backgrounds(folders, "test", 480)
-    unseen = _unseen(lenses)
-    for name, share in (("against the light", 1.0), ("anywhere", 0.0)):
-        gains = []
-        for kind in AGAINST:
-            for number in range(count):
-                seed = (1003, AGAINST.index(kind), number)
-                one = pair(np.random.default_rng(seed), OneFlare(seed, 640, unseen, kind), backgrounds, 480, 320,
-                           clean=0, against_light=share)
-                gains.append(psnr(remover.clean_display(one.frame), one.scene) - psnr(one.frame, one.scene))
-        print(f"{name:17} gain {np.mean(gains):+.2f} dB, made worse by 0.5 dB {np.mean(np.array(gains) < -0.5):.1%} of "
-              f"{len(gains)}")
+    backgrounds, unseen = read_backgrounds(folders, "test", 480), _unseen(lenses)
+
+    def drawn(seed: tuple[int, ...], kind: str, colour: Any = WHITE, against_light: float = 0.0) -> tuple[Any, Any]:
+        one = pair(np.random.default_rng(seed), OneFlare(seed, 640, unseen, kind, colour), backgrounds, 480, 320,
+                   clean=0, against_light=against_light)
+        return one.frame, one.scene
+
+    return drawn
+
+
+def _gain(remover: Remover, frame: Any, truth: Any) -> float:
+    return psnr(remover.clean_display(frame), truth) - psnr(frame, truth)
+
+
+def _tell_gains(name: str, gains: Any) -> None:
+    print(f"{name} gain {np.mean(gains):+.2f} dB, made worse by 0.5 dB {np.mean(np.array(gains) < -0.5):.1%} of "
+          f"{len(gains)}")
 
 
 def matte(folders: list[Path], lenses: Path | None, weights: Path | None, count: int) -> None:
@@ -226,8 +256,7 @@ def matte(folders: list[Path], lenses: Path | None, weights: Path | None, count:
         results = [remover.remove(found, marked)[0] / found.top for marked in (None, _roughed_in(frame, truth))]
         gains.append([psnr(result, truth) - psnr(frame, truth) for result in results])
     for name, values in zip(("without", "with a matte"), np.transpose(gains), strict=True):
-        print(f"{name:13} gain {np.mean(values):+.2f} dB, made worse by 0.5 dB {np.mean(values < -0.5):.1%} of "
-              f"{len(values)}")
+        _tell_gains(f"{name:13}", values)
 
 
 def _roughed_in(frame: Any, truth: Any) -> Any:
@@ -266,8 +295,8 @@ def coverage(sheet: Path | None, count: int) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("speed", "sample", "clean", "scenes", "against", "matte", "coverage",
-                                         "one"))
+    parser.add_argument("what", choices=("speed", "sample", "clean", "scenes", "against", "coloured", "matte",
+                                         "coverage", "one"))
     parser.add_argument("paths", type=Path, nargs="*")
     parser.add_argument("--capture", type=Path, default=ROOT / "sample_scenes" / "desk")
     parser.add_argument("--cleaned", type=Path)
@@ -275,8 +304,8 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=WORKING_SIZE)
     parser.add_argument("--lenses", type=Path)
     parser.add_argument("--sheet", type=Path)
-    parser.add_argument("--count", type=int, help="pictures: of each class for matte and against (default 20), of "
-                                                  "scenes (64), of coverage (400)")
+    parser.add_argument("--count", type=int, help="pictures: of each class for matte, against and coloured (20), "
+                                                  "of scenes (64), of coverage (400)")
     words = parser.parse_args()
     if words.what == "one":
         one(words.paths[0], words.size, words.weights)
@@ -290,6 +319,8 @@ def main() -> None:
         scenes(words.paths, words.weights, words.count or 64)
     elif words.what == "against":
         against(words.paths, words.lenses, words.weights, words.count or 20)
+    elif words.what == "coloured":
+        coloured(words.paths, words.lenses, words.weights, words.count or 20)
     elif words.what == "matte":
         matte(words.paths, words.lenses, words.weights, words.count or 20)
     else:

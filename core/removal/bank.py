@@ -66,13 +66,13 @@ class SynthesisBank:
     def _make(self, serial: int) -> Layers:
         one = flare((self._seed, serial), self._size, self._lenses)
         random = np.random.default_rng((self._seed, serial, 2))
-        colour = _one_colour(random) if random.random() < self._coloured else WHITE
+        colour = one_colour(random) if random.random() < self._coloured else WHITE
         rest, glare, light = (np.minimum(layer, 6e4).astype(np.float16) for layer in (one.rest, one.glare, one.light))
         return Layers(rest, glare, light, one.lights, colour)
 
 
-def _one_colour(random: Random) -> NDArray[np.float32]:
-    """(3,), of a light: one channel 1, little in one or both of the others."""
+def one_colour(random: Random) -> NDArray[np.float32]:
+    """(3,), of a light of one colour: one channel 1, little in one or both of the others."""
     least, middle = np.sort(random.uniform(0, 1, 2) ** 2)
     return random.permutation(np.array([1, middle, least * 0.3], np.float32))
 
@@ -86,13 +86,14 @@ def _single(half: NDArray[Any]) -> NDArray[np.float32]:
 class OneFlare:
     """A bank of a single flare of a class, for tests: seed and what it is drawn with make it."""
 
-    def __init__(self, seed: Sequence[int], size: int, lenses: Sequence[Prescription], kind: str) -> None:
-        self._seed, self._size, self._lenses, self._kind = tuple(seed), size, lenses, kind
+    def __init__(self, seed: Sequence[int], size: int, lenses: Sequence[Prescription], kind: str,
+                 colour: NDArray[np.float32] = WHITE) -> None:
+        self._seed, self._size, self._lenses, self._kind, self._colour = tuple(seed), size, lenses, kind, colour
 
     def draw(self, random: Random) -> Layers:
         """That flare."""
         made = flare((*self._seed, int(random.integers(1 << 30))), self._size, self._lenses, self._kind)
-        return Layers(made.rest, made.glare, made.light, made.lights)
+        return Layers(made.rest, made.glare, made.light, made.lights, self._colour)
 
 
 class OwnFlares:

@@ -11,7 +11,7 @@ network tells less than a threshold the flare is exactly zero, and the plate's o
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -38,10 +38,15 @@ SURE = 0.0005
 it is trusted whole. It tells small flares where there are none."""
 SIZES, TURNS = (1.0, 0.8), (0, 2)
 """Of the views that the network is shown: parts of the working size, quarter turns."""
-APART, DOUBT = (0.4, 0.6), (0.0, 2.5)
+ALONE_SIZE = 0.8
+"""Of the views of each channel alone, as a grey picture."""
+APART, ALONE_APART, DOUBT = (0.4, 0.6), (0.2, 0.4), (0.0, 2.5)
 """By how far the views are apart, as a part of what they tell, and how much of that is then taken off what they tell:
 nothing of what they agree on, as they do on most flares, nearly all of what they do not. Of flares it is a sixth in
 the median, of haze in a scene that is taken for one a quarter to three quarters."""
+DARK, ONE_COLOUR = (0.25, 0.4), (0.15, 0.4)
+"""Median display value up to which a frame is dark, and from which on it is not; light of what the channels tell alone,
+of that which tells second most in parts of the most, up to which it is of one colour, and from which on not."""
 RADIUS, SMOOTHNESS = 1, 1e-3
 """Of the guided filter, at the working size."""
 CLIPPED = 0.97
@@ -126,14 +131,22 @@ class Remover:
     def added(self, display: Pixels) -> Pixels:
         """What a flare adds to display values 0..1 (h, w, 3), h and w multiples of MULTIPLE.
 
-        The frame is shown upright and upside down, in two sizes. A flare is one in every view; what is taken for one
-        in some alone seldom is. So it is the mean of what is told, less how far the views are apart, the more of that
-        the less they agree.
+        The frame is shown upright and upside down, in two sizes; in the dark each channel alone too, as a grey picture:
+        the glow of a traffic light is seldom told in colour, but in the red alone it is that of any lamp. Where what
+        is told so is of one colour, the more of the two counts. Of white lights it would not: where one channel is
+        clipped and another is not, their flare would leave with another colour than it came with.
         """
-        views = np.stack([self._told_in_view(display, part, turns) for part in SIZES for turns in TURNS])
-        told, spread = views.mean(0), views.std(0)
-        doubt = np.interp(spread.mean() / max(np.abs(told).mean(), 1e-9), APART, DOUBT)
-        return np.maximum(told - np.float32(doubt) * spread, 0)
+        told = agreed([self._told_in_view(display, part, turns) for part in SIZES for turns in TURNS], APART)
+        dark = np.float32(np.interp(np.median(display), DARK, (1, 0)))
+        if dark > 0:
+            alone = np.stack([agreed(self._told_of_channel(display, channel), ALONE_APART) for channel in range(3)], -1)
+            told += dark * _is_of_one_colour(flare_light(display, alone)) * np.maximum(alone - told, 0)
+        return told
+
+    def _told_of_channel(self, display: Pixels, channel: int) -> list[Pixels]:
+        """What the network tells (h, w) of a channel alone, in each of its views."""
+        alone = np.repeat(display[..., channel, None], 3, -1)
+        return [self._told_in_view(alone, ALONE_SIZE, turns).mean(-1) for turns in TURNS]
 
     def _told_in_view(self, display: Pixels, part: float, turns: int) -> Pixels:
         """What the network tells of a view, brought back to the frame's size and upright."""
@@ -191,6 +204,20 @@ def described(model: str, weights: Path | str, *settings: Any) -> str:
     digest = hashlib.sha256(Path(weights).read_bytes())
     digest.update(repr((model, *settings)).encode())
     return digest.hexdigest()[:16]
+
+
+def agreed(views: Sequence[Pixels], apart: tuple[float, float]) -> Pixels:
+    """The mean of what is told in views of a frame, less how far they are apart, the more of that the less they agree.
+    A flare is one in every view; what is taken for one in some alone seldom is."""
+    told, spread = np.mean(views, 0), np.std(views, 0)
+    doubt = np.interp(spread.mean() / max(np.abs(told).mean(), 1e-9), apart, DOUBT)
+    return np.asarray(np.maximum(told - np.float32(doubt) * spread, 0), np.float32)
+
+
+def _is_of_one_colour(light: Pixels) -> np.float32:
+    """0..1, of light (h, w, 3)."""
+    _, second, most = np.sort(light.mean((0, 1)))
+    return np.float32(np.interp(second / max(most, 1e-9), ONE_COLOUR, (1, 0)))
 
 
 def flare_light(display: Pixels, added: Pixels) -> Pixels:

@@ -40,10 +40,11 @@ SIZES, TURNS = (1.0, 0.8), (0, 2)
 """Of the views that the network is shown: parts of the working size, quarter turns."""
 ALONE_SIZE = 0.8
 """Of the views of each channel alone, as a grey picture."""
-APART, ALONE_APART, DOUBT = (0.4, 0.6), (0.2, 0.4), (0.0, 2.5)
+APART, ALONE_APART, DOUBT = (0.4, 0.6), (0.12, 0.2), (0.0, 2.5)
 """By how far the views are apart, as a part of what they tell, and how much of that is then taken off what they tell:
 nothing of what they agree on, as they do on most flares, nearly all of what they do not. Of flares it is a sixth in
-the median, of haze in a scene that is taken for one a quarter to three quarters."""
+the median, of haze in a scene that is taken for one a quarter to three quarters. Of what a channel tells alone they are
+nearer: a tenth for the glow of a traffic light, a fifth for neon that has none."""
 DARK, ONE_COLOUR = (0.25, 0.4), (0.15, 0.4)
 """Median display value up to which a frame is dark, and from which on it is not; light of what the channels tell alone,
 of that which tells second most in parts of the most, up to which it is of one colour, and from which on not."""

@@ -48,6 +48,8 @@ nearer: a tenth for the glow of a traffic light, a fifth for neon that has none.
 DARK, ONE_COLOUR = (0.25, 0.4), (0.15, 0.4)
 """Median display value up to which a frame is dark, and from which on it is not; light of what the channels tell alone,
 of that which tells second most in parts of the most, up to which it is of one colour, and from which on not."""
+ALONE_SURE = 0.004
+"""As `SURE`, of what the channels tell alone above what is told in colour."""
 RADIUS, SMOOTHNESS = 1, 1e-3
 """Of the guided filter, at the working size."""
 CLIPPED = 0.97
@@ -141,7 +143,8 @@ class Remover:
         dark = np.float32(np.interp(np.median(display), DARK, (1, 0)))
         if dark > 0:
             alone = np.stack([agreed(self._told_of_channel(display, channel), ALONE_APART) for channel in range(3)], -1)
-            told += dark * _is_of_one_colour(flare_light(display, alone)) * np.maximum(alone - told, 0)
+            more = dark * _is_of_one_colour(flare_light(display, alone)) * np.maximum(alone - told, 0)
+            told += _trusted(more, ALONE_SURE)
         return told
 
     def _told_of_channel(self, display: Pixels, channel: int) -> list[Pixels]:
@@ -178,7 +181,7 @@ class Remover:
         if not marked:
             # A ramp from nothing to the whole, so that a faint flare has no rim.
             added = added * np.clip((added - LEAST) / LEAST, 0, 1)
-            added = added * np.clip((added.mean() - self.sure) / max(self.sure, 1e-9), 0, 1)
+            added = _trusted(added, self.sure)
         return np.where(added > 0, flare_light(told.display, added), np.float32(0))
 
     def shown(self, plate: Plate) -> Pixels:
@@ -213,6 +216,11 @@ def agreed(views: Sequence[Pixels], apart: tuple[float, float]) -> Pixels:
     told, spread = np.mean(views, 0), np.std(views, 0)
     doubt = np.interp(spread.mean() / max(np.abs(told).mean(), 1e-9), apart, DOUBT)
     return np.asarray(np.maximum(told - np.float32(doubt) * spread, 0), np.float32)
+
+
+def _trusted(added: Pixels, sure: float) -> Pixels:
+    """None of it where its mean over the frame is `sure` or less, all from twice as much on."""
+    return np.asarray(added * np.clip((added.mean() - sure) / max(sure, 1e-9), 0, 1), np.float32)
 
 
 def _is_of_one_colour(light: Pixels) -> np.float32:

@@ -224,22 +224,23 @@ def test_a_flare_in_some_views_alone_is_doubted(everywhere: Path, monkeypatch: p
     np.testing.assert_allclose(added[:, 162:], in_two / 2 * (1 - doubt), rtol=0.02, atol=1e-6)
 
 
-@pytest.mark.parametrize(("frame", "lit", "counts"), [
-    ((0.24, 0.1, 0.05), (0.24,), 1.0),
-    pytest.param((0.24, 0.23, 0.05), (0.24, 0.23), 0.0, id="yellow"),
-    pytest.param((0.7, 0.325, 0.1), (0.7,), 0.5, id="at dusk"),
-    pytest.param((0.7, 0.5, 0.4), (0.7,), 0.0, id="by day")])
+@pytest.mark.parametrize(("frame", "lit", "alone", "counts"), [
+    pytest.param((0.24, 0.1, 0.05), (0.24,), 0.1, 1.0, id="red"),
+    pytest.param((0.24, 0.1, 0.05), (0.24,), 0.03, 0.0, id="next to nothing"),
+    pytest.param((0.24, 0.23, 0.05), (0.24, 0.23), 0.1, 0.0, id="yellow"),
+    pytest.param((0.7, 0.325, 0.1), (0.7,), 0.1, 0.5, id="at dusk"),
+    pytest.param((0.7, 0.5, 0.4), (0.7,), 0.1, 0.0, id="by day")])
 def test_what_a_channel_tells_alone_counts_of_one_colour_in_the_dark(
         everywhere: Path, monkeypatch: pytest.MonkeyPatch, frame: tuple[float, ...], lit: tuple[float, ...],
-        counts: float) -> None:
+        alone: float, counts: float) -> None:
     """As the glow of a red light does."""
     def told(_: Remover, view: NDArray[np.float32]) -> NDArray[np.float32]:
-        alone = view[0, 0, 0] == view[0, 0, 1]
-        return np.full_like(view, 0.1 if alone and np.isclose(view[0, 0, 0], lit, atol=1e-3).any() else 0.02)
+        is_grey = view[0, 0, 0] == view[0, 0, 1]
+        return np.full_like(view, alone if is_grey and np.isclose(view[0, 0, 0], lit, atol=1e-3).any() else 0.02)
 
     monkeypatch.setattr(Remover, "_told", told)
     added = Remover(everywhere).added(np.full((160, 320, 3), frame, np.float32))
-    expected = 0.02 + 0.08 * counts * np.isclose(frame, lit[0])
+    expected = 0.02 + (alone - 0.02) * counts * np.isclose(frame, lit[0])
     np.testing.assert_allclose(added[80, 160], expected, rtol=1e-3)
 
 

@@ -8,6 +8,8 @@ import pytest
 from core.numeric_environment import prepare_for_numpy_and_torch
 
 prepare_for_numpy_and_torch()
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as shells start what runs in the background
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Of what a photograph's Exif block says two things: which way is up, and the focal length."""
+"""Which way a photograph is up, and through how long a lens it was taken, as its Exif block says."""
 from __future__ import annotations
 
 import io

@@ -59,7 +59,7 @@ class Batches(Dataset[Batch]):
         random = np.random.default_rng((self._recipe.seed, iteration, number + 1))  # to numpy, (1, 2) is (1, 2, 0)
         one = pair(random, self._bank, self._backgrounds, width, height, clean=self._recipe.clean,
                    against_light=self._recipe.against_light)
-        return of_one_channel(int(random.integers(3)), one) if random.random() < self._recipe.grey else one
+        return of_one_channel(one, int(random.integers(3))) if random.random() < self._recipe.grey else one
 
 
 def drawn_ahead(batches: Batches, first: int, end: int, processes: int) -> Iterator[Batch]:

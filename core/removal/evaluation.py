@@ -149,9 +149,9 @@ def _summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     summary: dict[str, Any] = {"count": len(rows), "gain_db": _mean(gains),
                                "made_worse": round(sum(gain < -0.5 for gain in gains) / max(len(gains), 1), 4)}
     for side in ("result", "input"):
-        names = sorted({name for row in rows for name in row[side]})
-        summary[side] = {name: _mean([row[side].get(name) for row in rows]) for name in names}
-        summary[side]["psnr"] = _mean([_level(row[side]) for row in rows])
+        others = sorted({name for row in rows for name in row[side]} - {"psnr"})
+        summary[side] = {"psnr": _mean([_level(row[side]) for row in rows]),
+                         **{name: _mean([row[side].get(name) for row in rows]) for name in others}}
     return summary
 
 

@@ -157,7 +157,7 @@ def _least_squares(product: Floats, goal: Floats, begin: Floats, low: Floats, hi
 
 def _light(plate: Plate) -> Pixels:
     """Linear light of the codes by sRGB's curve, which is that of a fit's layers; the network's has its own
-    (`inference.GAMMA`)."""
+    (`formation.GAMMA`)."""
     if plate.encoding == "srgb":
         return linear_from_srgb(_display(plate))
     return finite(plate.codes)

@@ -13,11 +13,18 @@ import numpy as np
 from ..pictures import Pixels
 
 GAMMAS = (1.8, 2.2)
+GAMMA = 2
+"""Of the light that flares are taken from display values in: the middle of what pictures are formed with, and cheap."""
 
 
 def display(linear: Pixels, gamma: float) -> Pixels:
     """Linear light as display values, clipped to 0..1."""
     return np.power(np.clip(linear, 0, 1), np.float32(1 / gamma)).astype(np.float32)
+
+
+def flare_light(display: Pixels, added: Pixels) -> Pixels:
+    """Linear flare (of GAMMA): what the frame's light has more than that of the clean display values."""
+    return np.asarray(display**GAMMA - np.maximum(display - added, 0) ** GAMMA, np.float32)
 
 
 def coverage(flare: Pixels, share: float = 0.9) -> float:

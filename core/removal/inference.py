@@ -11,7 +11,7 @@ network tells less than a threshold the flare is exactly zero, and the plate's o
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -23,12 +23,12 @@ from numpy.typing import NDArray
 from ..errors import SettingsError
 from ..pictures import Encoding, Pixels, linear_from_srgb
 from . import formation
+from .formation import GAMMA, flare_light
 from .network import MULTIPLE, RemovalNetwork
 from .plates import Plate, finite
+from .views import told_in_views, trusted
 from .weights import IN_THE_BOX, load
 
-GAMMA = 2
-"""Of the light that flares are taken from display values in: the middle of what pictures are formed with, and cheap."""
 WORKING_SIZE = 480
 """Long side of the largest view of a plate: about the most that the network was trained at."""
 LEAST = 0.002
@@ -36,20 +36,6 @@ LEAST = 0.002
 SURE = 0.0005
 """Mean over the frame of what a flare adds, below which the network is not trusted at all; from twice as much on
 it is trusted whole. It tells small flares where there are none."""
-SIZES, TURNS = (1.0, 0.8), (0, 2)
-"""Of the views that the network is shown: parts of the working size, quarter turns."""
-ALONE_SIZE = 0.8
-"""Of the views of each channel alone, as a grey picture."""
-APART, ALONE_APART, DOUBT = (0.4, 0.6), (0.12, 0.2), (0.0, 2.5)
-"""By how far the views are apart, as a part of what they tell, and how much of that is then taken off what they tell:
-nothing of what they agree on, as they do on most flares, nearly all of what they do not. Of flares it is a sixth in
-the median, of haze in a scene that is taken for one a quarter to three quarters. Of what a channel tells alone they are
-nearer: a tenth for the glow of a traffic light, a fifth for neon that has none."""
-DARK, ONE_COLOUR = (0.25, 0.4), (0.15, 0.4)
-"""Median display value up to which a frame is dark, and from which on it is not; light of what the channels tell alone,
-of that which tells second most in parts of the most, up to which it is of one colour, and from which on not."""
-ALONE_SURE = 0.004
-"""As `SURE`, of what the channels tell alone above what is told in colour."""
 RADIUS, SMOOTHNESS = 1, 1e-3
 """Of the guided filter, at the working size."""
 CLIPPED = 0.97
@@ -132,38 +118,8 @@ class Remover:
         return Told(display, self.added(display))
 
     def added(self, display: Pixels) -> Pixels:
-        """What a flare adds to display values 0..1 (h, w, 3), h and w multiples of MULTIPLE.
-
-        The frame is shown upright and upside down, in two sizes; in the dark each channel alone too, as a grey picture:
-        the glow of a traffic light is seldom told in colour, but in the red alone it is that of any lamp. Where what
-        is told so is of one colour, the more of the two counts. Of white lights it would not: where one channel is
-        clipped and another is not, their flare would leave with another colour than it came with.
-        """
-        told = agreed([self._told_in_view(display, part, turns) for part in SIZES for turns in TURNS], APART)
-        dark = np.float32(np.interp(np.median(display), DARK, (1, 0)))
-        if dark > 0:
-            alone = np.stack([agreed(self._told_of_channel(display, channel), ALONE_APART) for channel in range(3)], -1)
-            more = dark * _is_of_one_colour(flare_light(display, alone)) * np.maximum(alone - told, 0)
-            told += _trusted(more, ALONE_SURE)
-        return told
-
-    def _told_of_channel(self, display: Pixels, channel: int) -> list[Pixels]:
-        """What the network tells (h, w) of a channel alone, in each of its views."""
-        alone = np.repeat(display[..., channel, None], 3, -1)
-        return [self._told_in_view(alone, ALONE_SIZE, turns).mean(-1) for turns in TURNS]
-
-    def _told_in_view(self, display: Pixels, part: float, turns: int) -> Pixels:
-        """What the network tells of a view, brought back to the frame's size and upright."""
-        import cv2
-
-        height, width = display.shape[:2]
-        high, wide = (max(round(side * part / MULTIPLE), 2) * MULTIPLE for side in (height, width))
-        view = display
-        if (high, wide) != (height, width):
-            light = cv2.resize(display**GAMMA, (wide, high), interpolation=cv2.INTER_AREA)
-            view = _display(np.asarray(light, np.float32))
-        told = np.ascontiguousarray(np.rot90(self._told(np.rot90(view, turns)), -turns))
-        return np.asarray(cv2.resize(told, (width, height), interpolation=cv2.INTER_LINEAR), np.float32)
+        """What a flare adds to display values 0..1 (h, w, 3), h and w multiples of MULTIPLE."""
+        return told_in_views(display, self._told)
 
     @torch.inference_mode()
     def _told(self, display: Pixels) -> Pixels:
@@ -181,7 +137,7 @@ class Remover:
         if not marked:
             # A ramp from nothing to the whole, so that a faint flare has no rim.
             added = added * np.clip((added - LEAST) / LEAST, 0, 1)
-            added = _trusted(added, self.sure)
+            added = trusted(added, self.sure)
         return np.where(added > 0, flare_light(told.display, added), np.float32(0))
 
     def shown(self, plate: Plate) -> Pixels:
@@ -208,30 +164,6 @@ def described(model: str, weights: Path | str, *settings: Any) -> str:
     digest = hashlib.sha256(Path(weights).read_bytes())
     digest.update(repr((model, *settings)).encode())
     return digest.hexdigest()[:16]
-
-
-def agreed(views: Sequence[Pixels], apart: tuple[float, float]) -> Pixels:
-    """The mean of what is told in views of a frame, less how far they are apart, the more of that the less they agree.
-    A flare is one in every view; what is taken for one in some alone seldom is."""
-    told, spread = np.mean(views, 0), np.std(views, 0)
-    doubt = np.interp(spread.mean() / max(np.abs(told).mean(), 1e-9), apart, DOUBT)
-    return np.asarray(np.maximum(told - np.float32(doubt) * spread, 0), np.float32)
-
-
-def _trusted(added: Pixels, sure: float) -> Pixels:
-    """None of it where its mean over the frame is `sure` or less, all from twice as much on."""
-    return np.asarray(added * np.clip((added.mean() - sure) / max(sure, 1e-9), 0, 1), np.float32)
-
-
-def _is_of_one_colour(light: Pixels) -> np.float32:
-    """0..1, of light (h, w, 3)."""
-    _, second, most = np.sort(light.mean((0, 1)))
-    return np.float32(np.interp(second / max(most, 1e-9), ONE_COLOUR, (1, 0)))
-
-
-def flare_light(display: Pixels, added: Pixels) -> Pixels:
-    """Linear flare (of GAMMA): what the frame's light has more than that of the clean display values."""
-    return np.asarray(display**GAMMA - np.maximum(display - added, 0) ** GAMMA, np.float32)
 
 
 def _reduced(codes: NDArray[Any], encoding: Encoding, top: float, width: int, height: int) -> Pixels:

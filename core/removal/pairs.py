@@ -18,9 +18,8 @@ from .backgrounds import Backgrounds
 from .formation import GAMMAS, display
 
 Random = np.random.Generator
-
-
 WHITE: NDArray[np.float32] = np.ones(3, np.float32)
+"""The colour of lights that have what colour they have in their layers."""
 
 
 class Layers(NamedTuple):
@@ -84,7 +83,7 @@ def pair(random: Random, bank: Bank, backgrounds: Backgrounds, width: int, heigh
     return Pair(_stored(random, frame), clear, gentle)
 
 
-def of_one_channel(channel: int, one: Pair) -> Pair:
+def of_one_channel(one: Pair, channel: int) -> Pair:
     """As a grey picture: a channel of a coloured light is a light, which saturates in all that a grey picture has."""
     return Pair(*(np.repeat(part[..., channel, None], 3, -1) for part in (one.frame, one.scene, one.gentle)))
 
@@ -169,7 +168,8 @@ def _placed(random: Random, layers: Layers, matrix: NDArray[Any], width: int, he
     kept = np.clip((least * near - 0.5) / 0.4, 0, 1)[..., None]
     kept = kept * kept * (3 - 2 * kept)
     kept_light: Pixels = np.maximum(light, (rest + glare) * kept)
-    return rest * (1 - kept) * layers.colour, glare * (1 - kept) * layers.colour, kept_light * layers.colour
+    rest, glare, light = (part * layers.colour for part in (rest * (1 - kept), glare * (1 - kept), kept_light))
+    return rest, glare, light
 
 
 def _developed(random: Random, shown: Sequence[Pixels]) -> list[Pixels]:

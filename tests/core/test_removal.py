@@ -33,7 +33,8 @@ from core.progress import Progress
 from core.removal import batch, inference, weights
 from core.removal.batch import plates_of, remove_all
 from core.removal.captured import UNFINISHED, _names, check_removed, remove_from
-from core.removal.inference import FlareMap, Remover, Told, carried_up, flare_light
+from core.removal.formation import flare_light
+from core.removal.inference import FlareMap, Remover, Told, carried_up
 from core.removal.mattes import Mattes
 from core.removal.network import LEVELS, SHOWN, RemovalNetwork, seen
 from core.removal.plates import Plate, read_plate, write_plate

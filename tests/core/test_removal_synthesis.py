@@ -227,7 +227,7 @@ def test_a_light_of_one_colour_is_clipped_in_that_one_with_flare_and_without() -
 def test_a_picture_of_one_channel() -> None:
     one = pairs.pair(np.random.default_rng(1), Single(flare((2, 0), 128, lenses.built_in(), "glare")), backgrounds(),
                      96, 64, clean=0)
-    grey = pairs.of_one_channel(1, one)
+    grey = pairs.of_one_channel(one, 1)
     for part in ("frame", "scene", "gentle"):
         for channel in range(3):
             assert np.array_equal(getattr(grey, part)[..., channel], getattr(one, part)[..., 1])

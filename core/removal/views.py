@@ -1,0 +1,89 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What a network tells of a frame in several views, as one: the less they agree, the less of it counts.
+
+A flare is one in every view; what is taken for one in some alone seldom is. So the frame is shown upright and upside
+down, in two sizes. In the dark each channel is shown alone too, as a grey picture: the glow of a traffic light is
+seldom told in colour, but in the red alone it is that of any lamp. Where what is told so is of one colour, the more of
+the two counts. Of white lights it would not: where one channel is clipped and another is not, their flare would leave
+with another colour than it came with.
+"""
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from ..pictures import Pixels
+from .formation import GAMMA, flare_light
+from .formation import display as shown
+from .network import MULTIPLE
+
+Tell = Callable[[Pixels], Pixels]
+"""What a flare adds to display values 0..1 (h, w, 3), h and w multiples of MULTIPLE, by one pass of the network."""
+
+SIZES, TURNS = (1.0, 0.8), (0, 2)
+"""Of the views in colour: parts of the frame's size, quarter turns."""
+ALONE_SIZE = 0.8
+"""Of the views of a channel alone."""
+APART, ALONE_APART, DOUBT = (0.4, 0.6), (0.12, 0.2), (0.0, 2.5)
+"""By how far the views are apart, as a part of what they tell, and how much of that is then taken off what they tell:
+nothing of what they agree on, as they do on most flares, nearly all of what they do not. Of flares it is a sixth in
+the median, of haze in a scene that is taken for one a quarter to three quarters. Of what a channel tells alone they are
+nearer: a tenth for the glow of a traffic light, a fifth for neon that has none."""
+DARK = (0.25, 0.4)
+"""Median display value up to which a frame is dark, and from which on it is not."""
+ONE_COLOUR = (0.15, 0.4)
+"""Light of the channel that tells second most alone, in parts of that which tells most, up to which it is of one
+colour, and from which on it is not."""
+ALONE_SURE = 0.004
+"""Mean over the frame of what the channels tell alone above what is told in colour, up to which they are not `trusted`.
+"""
+
+
+def told_in_views(display: Pixels, tell: Tell) -> Pixels:
+    """What a flare adds to display values 0..1 (h, w, 3), h and w multiples of MULTIPLE."""
+    told = _agreed([_in_view(tell, display, size, turns) for size in SIZES for turns in TURNS], APART)
+    dark = np.float32(np.interp(np.median(display), DARK, (1, 0)))
+    if dark > 0:
+        alone = np.stack([_told_alone(tell, display, channel) for channel in range(3)], -1)
+        more = dark * _is_of_one_colour(flare_light(display, alone)) * np.maximum(alone - told, 0)
+        told += trusted(more, ALONE_SURE)
+    return told
+
+
+def trusted(added: Pixels, sure: float) -> Pixels:
+    """None of it where its mean over the frame is `sure` or less, all from twice as much on."""
+    return np.asarray(added * np.clip((added.mean() - sure) / max(sure, 1e-9), 0, 1), np.float32)
+
+
+def _told_alone(tell: Tell, display: Pixels, channel: int) -> Pixels:
+    """(h, w), of a channel shown as a grey picture."""
+    grey = np.repeat(display[..., channel, None], 3, -1)
+    return _agreed([_in_view(tell, grey, ALONE_SIZE, turns).mean(-1) for turns in TURNS], ALONE_APART)
+
+
+def _agreed(views: Sequence[Pixels], apart: tuple[float, float]) -> Pixels:
+    """The mean of what is told in views of a frame, less how far they are apart, the more of that the less they agree.
+    """
+    told, spread = np.mean(views, 0), np.std(views, 0)
+    doubt = np.interp(spread.mean() / max(np.abs(told).mean(), 1e-9), apart, DOUBT)
+    return np.asarray(np.maximum(told - np.float32(doubt) * spread, 0), np.float32)
+
+
+def _is_of_one_colour(light: Pixels) -> np.float32:
+    """0..1, of light (h, w, 3)."""
+    _, second, most = np.sort(light.mean((0, 1)))
+    return np.float32(np.interp(second / max(most, 1e-9), ONE_COLOUR, (1, 0)))
+
+
+def _in_view(tell: Tell, display: Pixels, size: float, turns: int) -> Pixels:
+    """What is told of a view, brought back to the frame's size and upright."""
+    import cv2
+
+    height, width = display.shape[:2]
+    high, wide = (max(round(side * size / MULTIPLE), 2) * MULTIPLE for side in (height, width))
+    view = display
+    if (high, wide) != (height, width):
+        view = shown(np.asarray(cv2.resize(display**GAMMA, (wide, high), interpolation=cv2.INTER_AREA)), GAMMA)
+    told = np.ascontiguousarray(np.rot90(tell(np.rot90(view, turns)), -turns))
+    return np.asarray(cv2.resize(told, (width, height), interpolation=cv2.INTER_LINEAR), np.float32)

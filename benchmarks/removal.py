@@ -35,10 +35,14 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
+
+from core.numeric_environment import prepare_for_numpy_and_torch
+
+prepare_for_numpy_and_torch()
+
+import numpy as np
 
 from benchmarks.resident import held_at_most
 from core.metrics.pictures import psnr

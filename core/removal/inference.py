@@ -113,9 +113,13 @@ class Remover:
         return np.where(clean == codes, display, clean.astype(np.float32) / 65535)
 
     def tell(self, plate: Plate) -> Told:
-        """What the network tells of a plate, of what lies inside its black borders: it is shown pictures alone."""
-        display = self.shown(replace(plate, codes=plate.codes[plate.inside.part]))
+        """What the network tells of a plate."""
+        display = self.seen(plate)
         return Told(display, self.added(display))
+
+    def seen(self, plate: Plate) -> Pixels:
+        """What the network is shown of a plate, as `shown`: what lies inside its black borders, pictures alone."""
+        return self.shown(replace(plate, codes=plate.codes[plate.inside.part]))
 
     def added(self, display: Pixels) -> Pixels:
         """What a flare adds to display values 0..1 (h, w, 3), h and w multiples of MULTIPLE."""

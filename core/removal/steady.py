@@ -13,7 +13,6 @@ photographs is no sequence.
 from __future__ import annotations
 
 import re
-from collections import OrderedDict
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -40,42 +39,60 @@ NO_DETAIL = 1e-6
 """Mean square of detail that is none: that of a quarter of an 8 bit code."""
 
 
-class Calm(NamedTuple):
-    """What was told of a frame, the same blurred, and what the blurred frame has of detail."""
+class Look(NamedTuple):
+    """What the network is shown of a frame, the same blurred, and what that has of detail."""
 
-    told: Told
     display: Pixels
-    added: Pixels
+    blurred: Pixels
     detail: Pixels
 
 
-def calm(told: Told) -> Calm:
-    """With the blurs of it."""
+class Calm(NamedTuple):
+    """A frame's look, what was told of it, and the same blurred."""
+
+    look: Look
+    told: Told
+    added: Pixels
+
+
+def look(display: Pixels) -> Look:
+    """Of what the network is shown."""
     import cv2
 
-    long_side = max(told.display.shape[:2])
-    display, added = (np.asarray(cv2.GaussianBlur(part, (0, 0), BLUR * long_side), np.float32) for part in told)
-    few = np.ascontiguousarray(display[::STEP, ::STEP])
-    detail: Pixels = few - np.asarray(cv2.GaussianBlur(few, (0, 0), COARSE * long_side / STEP), np.float32)
-    return Calm(told, display, added, detail)
+    blurred = _blurred(display)
+    few = np.ascontiguousarray(blurred[::STEP, ::STEP])
+    deviation = COARSE * max(display.shape[:2]) / STEP
+    detail: Pixels = few - np.asarray(cv2.GaussianBlur(few, (0, 0), deviation), np.float32)
+    return Look(display, blurred, detail)
+
+
+def calm(told: Told, seen: Look | None = None) -> Calm:
+    """seen: the frame's look, where it is there already."""
+    return Calm(seen or look(told.display), told, _blurred(told.added))
+
+
+def _blurred(values: Pixels) -> Pixels:
+    import cv2
+
+    return np.asarray(cv2.GaussianBlur(values, (0, 0), BLUR * max(values.shape[:2])), np.float32)
 
 
 def steadied(here: Calm, about: Iterable[Calm]) -> Told:
     """What was told of `here`, in line with the frames about it; those of another shape or shot are passed over."""
     total, weights = here.added, np.ones((*here.added.shape[:2], 1), np.float32)
     for other in about:
-        share = _of_one_shot(here, other)
+        share = _of_one_shot(here.look, other.look)
         if share > 0:
-            apart = np.square(other.display - here.display).mean(-1, keepdims=True)
+            apart = np.square(other.look.blurred - here.look.blurred).mean(-1, keepdims=True)
             weight = share * np.exp(-apart / np.float32(ALIKE**2))
             total, weights = total + weight * other.added, weights + weight
     # In this order, so that without neighbours it is what was told to the last bit.
     return Told(here.told.display, np.maximum(here.told.added + (total / weights - here.added), 0))
 
 
-def _of_one_shot(one: Calm, other: Calm) -> np.float32:
+def _of_one_shot(one: Look, other: Look) -> np.float32:
     """How far two frames count for each other, 0..1."""
-    if one.added.shape != other.added.shape:
+    if one.display.shape != other.display.shape:
         return np.float32(0)
     a, b = one.detail, other.detail
     alike = ((a * b).mean() + NO_DETAIL) / (np.sqrt(np.square(a).mean() * np.square(b).mean()) + NO_DETAIL)
@@ -96,7 +113,8 @@ class Sequences:
             those.sort(key=by_number)
             for at, path in enumerate(those):
                 self._beside[path] = those[max(at - REACH, 0):at] + those[at + 1:at + 1 + REACH]
-        self._kept: OrderedDict[Path, Calm | None] = OrderedDict()
+        self._looks: dict[Path, Look | None] = {}
+        self._calm: dict[Path, Calm] = {}
 
     def beside(self, path: Path) -> Sequence[Path]:
         """The neighbours that count for a plate, in their order."""
@@ -105,30 +123,38 @@ class Sequences:
     def read(self, path: Path) -> tuple[Plate, Told]:
         """The plate, and what is told of it.
 
-        Its neighbours are read before it, so that one plate is in memory at a time; each is told of once. Those that
-        cannot be read are passed over. Raises FrameError where the plate itself cannot.
+        Its neighbours are read before it, so that one plate is in memory at a time. Those that cannot be read are
+        passed over, and so are those of another shot, before the network is asked: a photograph among others takes no
+        longer than by itself. Each is told of once. Raises FrameError where the plate itself cannot be read.
         """
-        about = [self._of(other) for other in self.beside(path)]
+        self._forget_all_but([path, *self.beside(path)])
+        about = {other: self._look_of(other) for other in self.beside(path)}
         plate = read_plate(path)
-        here = self._kept.get(path) or self._keep(path, calm(self._remover.tell(plate)))
-        return plate, steadied(here, [other for other in about if other is not None])
+        seen = self._looks.get(path) or look(self._remover.seen(plate))
+        self._looks[path] = seen
+        here = self._told_of(path, seen)
+        return plate, steadied(here, [self._told_of(other, its) for other, its in about.items()
+                                      if its is not None and _of_one_shot(seen, its) > 0])
 
-    def _of(self, path: Path) -> Calm | None:
-        if path in self._kept:
-            return self._kept[path]
-        try:
-            return self._keep(path, calm(self._remover.tell(read_plate(path))))
-        except Exception as problem:
-            if not is_of_the_plate(problem):
-                raise
-            self._kept[path] = None
-            return None
+    def _told_of(self, path: Path, seen: Look) -> Calm:
+        if path not in self._calm:
+            self._calm[path] = calm(Told(seen.display, self._remover.added(seen.display)), seen)
+        return self._calm[path]
 
-    def _keep(self, path: Path, found: Calm) -> Calm:
-        self._kept[path] = found
-        while len(self._kept) > 2 * REACH + 1:
-            self._kept.popitem(last=False)
-        return found
+    def _look_of(self, path: Path) -> Look | None:
+        """None where it cannot be read."""
+        if path not in self._looks:
+            try:
+                self._looks[path] = look(self._remover.seen(read_plate(path)))
+            except Exception as problem:
+                if not is_of_the_plate(problem):
+                    raise
+                self._looks[path] = None
+        return self._looks[path]
+
+    def _forget_all_but(self, paths: Sequence[Path]) -> None:
+        self._looks = {path: self._looks[path] for path in paths if path in self._looks}
+        self._calm = {path: self._calm[path] for path in paths if path in self._calm}
 
 
 def by_number(path: Path) -> list[tuple[int, str]]:

@@ -682,11 +682,13 @@ def test_frames_without_leading_noughts_are_told_once_each(tmp_path: Path, every
         (folder / "images" / f"{number:04d}.png").rename(folder / "images" / f"{number}.png")
         words = words.replace(f" {number:04d}.png", f" {number}.png")
     model.write_text(words)
-    remover, told = Remover(everywhere, working_size=64), []
-    tell = remover.tell
-    monkeypatch.setattr(remover, "tell", lambda plate: told.append(plate.path.name) or tell(plate))
+    remover = Remover(everywhere, working_size=64)
+    shown, told = [], []
+    seen, added = remover.seen, remover.added
+    monkeypatch.setattr(remover, "seen", lambda plate: shown.append(plate.path.name) or seen(plate))
+    monkeypatch.setattr(remover, "added", lambda display: told.append(1) or added(display))
     remove_from(Capture.open(folder), remover, Progress())
-    assert len(told) == len(set(told)) == 24
+    assert len(shown) == len(set(shown)) == len(told) == 24
 
 
 def test_frames_that_differ_in_their_suffix_alone_are_told_before_any_is_cleaned(tmp_path: Path,
@@ -986,14 +988,14 @@ def test_a_plate_that_does_not_fit_into_memory_is_left_out(tmp_path: Path, nowhe
                                                            monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("a", "b"):
         write_codes(tmp_path / "in" / f"{name}.png", picture())
-    tell = Remover.tell
+    seen = Remover.seen
 
-    def told(remover: Remover, plate: Plate) -> Any:
+    def shown(remover: Remover, plate: Plate) -> Any:
         if plate.path.name == "a.png":
             raise short
-        return tell(remover, plate)
+        return seen(remover, plate)
 
-    monkeypatch.setattr(Remover, "tell", told)
+    monkeypatch.setattr(Remover, "seen", shown)
     with pytest.raises(FrameError, match=r"1 of 2 plates could not be cleaned: \S*a\.png does not fit into memory"):
         remove_all([tmp_path / "in"], tmp_path / "out", Remover(nowhere, working_size=64), Progress())
     assert (tmp_path / "out" / "b.png").exists()
@@ -1001,7 +1003,7 @@ def test_a_plate_that_does_not_fit_into_memory_is_left_out(tmp_path: Path, nowhe
 
 def test_a_defect_is_not_taken_for_a_bad_plate(tmp_path: Path, nowhere: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_codes(tmp_path / "in" / "a.png", picture())
-    monkeypatch.setattr(Remover, "tell", lambda *_: 1 / 0)
+    monkeypatch.setattr(Remover, "seen", lambda *_: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         remove_all([tmp_path / "in"], tmp_path / "out", Remover(nowhere, working_size=64), Progress())
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -92,7 +92,7 @@ class Remover:
         is known that there is one, so little of it counts too as would be doubted otherwise. told: of the plate, where
         that is known already (`steady.Sequences`).
         """
-        told = told or self.tell(plate)
+        told = told or self.tell(self.shown(plate))
         found = _carrier(told.display, self.flare(told, marked=matte is not None))
         codes = plate.codes.copy()
         flare = np.zeros(plate.codes.shape, np.float16)
@@ -112,14 +112,9 @@ class Remover:
         clean = self.remove(Plate(Path("display.png"), codes, "srgb"))[0]
         return np.where(clean == codes, display, clean.astype(np.float32) / 65535)
 
-    def tell(self, plate: Plate) -> Told:
-        """What the network tells of a plate."""
-        display = self.seen(plate)
+    def tell(self, display: Pixels) -> Told:
+        """What the network tells of what it is `shown`."""
         return Told(display, self.added(display))
-
-    def seen(self, plate: Plate) -> Pixels:
-        """What the network is shown of a plate, as `shown`: what lies inside its black borders, pictures alone."""
-        return self.shown(replace(plate, codes=plate.codes[plate.inside.part]))
 
     def added(self, display: Pixels) -> Pixels:
         """What a flare adds to display values 0..1 (h, w, 3), h and w multiples of MULTIPLE."""
@@ -145,10 +140,11 @@ class Remover:
         return np.where(added > 0, flare_light(told.display, added), np.float32(0))
 
     def shown(self, plate: Plate) -> Pixels:
-        """Display values 0..1 of a plate as the network is shown it: reduced, sides multiples of what it takes."""
+        """Display values 0..1 of a plate as the network is shown it: what lies inside its black borders, pictures
+        alone; reduced, sides multiples of what it takes."""
         import cv2
 
-        codes, encoding, top = plate.codes, plate.encoding, plate.top
+        codes, encoding, top = plate.codes[plate.inside.part], plate.encoding, plate.top
         height, width = codes.shape[:2]
         scale = self.working_size / max(height, width)
         fit = [int(np.clip(round(side * scale / MULTIPLE), 2, max(self.working_size // MULTIPLE, 2))) * MULTIPLE

@@ -39,8 +39,8 @@ NO_DETAIL = 1e-6
 """Mean square of detail that is none: that of a quarter of an 8 bit code."""
 
 
-class Look(NamedTuple):
-    """What the network is shown of a frame, the same blurred, and what that has of detail."""
+class Guide(NamedTuple):
+    """By what frames are compared: what the network is shown of one, the same blurred, and what that has of detail."""
 
     display: Pixels
     blurred: Pixels
@@ -48,27 +48,27 @@ class Look(NamedTuple):
 
 
 class Calm(NamedTuple):
-    """A frame's look, what was told of it, and the same blurred."""
+    """A frame's guide, what was told of it, and the same blurred."""
 
-    look: Look
+    guide: Guide
     told: Told
     added: Pixels
 
 
-def look(display: Pixels) -> Look:
-    """Of what the network is shown."""
+def guide(display: Pixels) -> Guide:
+    """Of what the network is shown of a frame."""
     import cv2
 
     blurred = _blurred(display)
     few = np.ascontiguousarray(blurred[::STEP, ::STEP])
     deviation = COARSE * max(display.shape[:2]) / STEP
     detail: Pixels = few - np.asarray(cv2.GaussianBlur(few, (0, 0), deviation), np.float32)
-    return Look(display, blurred, detail)
+    return Guide(display, blurred, detail)
 
 
-def calm(told: Told, seen: Look | None = None) -> Calm:
-    """seen: the frame's look, where it is there already."""
-    return Calm(seen or look(told.display), told, _blurred(told.added))
+def calm(told: Told, its: Guide | None = None) -> Calm:
+    """its: the frame's guide, where it is there already."""
+    return Calm(its or guide(told.display), told, _blurred(told.added))
 
 
 def _blurred(values: Pixels) -> Pixels:
@@ -81,16 +81,16 @@ def steadied(here: Calm, about: Iterable[Calm]) -> Told:
     """What was told of `here`, in line with the frames about it; those of another shape or shot are passed over."""
     total, weights = here.added, np.ones((*here.added.shape[:2], 1), np.float32)
     for other in about:
-        share = _of_one_shot(here.look, other.look)
+        share = _of_one_shot(here.guide, other.guide)
         if share > 0:
-            apart = np.square(other.look.blurred - here.look.blurred).mean(-1, keepdims=True)
+            apart = np.square(other.guide.blurred - here.guide.blurred).mean(-1, keepdims=True)
             weight = share * np.exp(-apart / np.float32(ALIKE**2))
             total, weights = total + weight * other.added, weights + weight
     # In this order, so that without neighbours it is what was told to the last bit.
     return Told(here.told.display, np.maximum(here.told.added + (total / weights - here.added), 0))
 
 
-def _of_one_shot(one: Look, other: Look) -> np.float32:
+def _of_one_shot(one: Guide, other: Guide) -> np.float32:
     """How far two frames count for each other, 0..1."""
     if one.display.shape != other.display.shape:
         return np.float32(0)
@@ -113,8 +113,8 @@ class Sequences:
             those.sort(key=by_number)
             for at, path in enumerate(those):
                 self._beside[path] = those[max(at - REACH, 0):at] + those[at + 1:at + 1 + REACH]
-        self._looks: dict[Path, Look | None] = {}
-        self._calm: dict[Path, Calm] = {}
+        self._guides: dict[Path, Guide | None] = {}
+        self._told: dict[Path, Calm] = {}
 
     def beside(self, path: Path) -> Sequence[Path]:
         """The neighbours that count for a plate, in their order."""
@@ -124,37 +124,38 @@ class Sequences:
         """The plate, and what is told of it.
 
         Its neighbours are read before it, so that one plate is in memory at a time. Those that cannot be read are
-        passed over, and so are those of another shot, before the network is asked: a photograph among others takes no
-        longer than by itself. Each is told of once. Raises FrameError where the plate itself cannot be read.
+        passed over, and so are those of another shot, before the network is asked, which takes far longer than reading
+        them. Each is told of once. Raises FrameError where the plate itself cannot be read.
         """
         self._forget_all_but([path, *self.beside(path)])
-        about = {other: self._look_of(other) for other in self.beside(path)}
+        about = {other: self._guide_of(other) for other in self.beside(path)}
         plate = read_plate(path)
-        seen = self._looks.get(path) or look(self._remover.seen(plate))
-        self._looks[path] = seen
-        here = self._told_of(path, seen)
-        return plate, steadied(here, [self._told_of(other, its) for other, its in about.items()
-                                      if its is not None and _of_one_shot(seen, its) > 0])
+        own = self._guides[path] = self._guides.get(path) or self._guide(plate)
+        return plate, steadied(self._calm(path, own), [self._calm(other, its) for other, its in about.items()
+                                                       if its is not None and _of_one_shot(own, its) > 0])
 
-    def _told_of(self, path: Path, seen: Look) -> Calm:
-        if path not in self._calm:
-            self._calm[path] = calm(Told(seen.display, self._remover.added(seen.display)), seen)
-        return self._calm[path]
+    def _guide(self, plate: Plate) -> Guide:
+        return guide(self._remover.shown(plate))
 
-    def _look_of(self, path: Path) -> Look | None:
-        """None where it cannot be read."""
-        if path not in self._looks:
+    def _guide_of(self, path: Path) -> Guide | None:
+        """None where the plate cannot be read."""
+        if path not in self._guides:
             try:
-                self._looks[path] = look(self._remover.seen(read_plate(path)))
+                self._guides[path] = self._guide(read_plate(path))
             except Exception as problem:
                 if not is_of_the_plate(problem):
                     raise
-                self._looks[path] = None
-        return self._looks[path]
+                self._guides[path] = None
+        return self._guides[path]
+
+    def _calm(self, path: Path, its: Guide) -> Calm:
+        if path not in self._told:
+            self._told[path] = calm(self._remover.tell(its.display), its)
+        return self._told[path]
 
     def _forget_all_but(self, paths: Sequence[Path]) -> None:
-        self._looks = {path: self._looks[path] for path in paths if path in self._looks}
-        self._calm = {path: self._calm[path] for path in paths if path in self._calm}
+        self._guides = {path: self._guides[path] for path in paths if path in self._guides}
+        self._told = {path: self._told[path] for path in paths if path in self._told}
 
 
 def by_number(path: Path) -> list[tuple[int, str]]:

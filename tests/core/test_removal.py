@@ -683,12 +683,12 @@ def test_frames_without_leading_noughts_are_told_once_each(tmp_path: Path, every
         words = words.replace(f" {number:04d}.png", f" {number}.png")
     model.write_text(words)
     remover = Remover(everywhere, working_size=64)
-    shown, told = [], []
-    seen, added = remover.seen, remover.added
-    monkeypatch.setattr(remover, "seen", lambda plate: shown.append(plate.path.name) or seen(plate))
-    monkeypatch.setattr(remover, "added", lambda display: told.append(1) or added(display))
+    names, told = [], []
+    shown, tell = remover.shown, remover.tell
+    monkeypatch.setattr(remover, "shown", lambda plate: names.append(plate.path.name) or shown(plate))
+    monkeypatch.setattr(remover, "tell", lambda display: told.append(1) or tell(display))
     remove_from(Capture.open(folder), remover, Progress())
-    assert len(shown) == len(set(shown)) == len(told) == 24
+    assert len(names) == len(set(names)) == len(told) == 24
 
 
 def test_frames_that_differ_in_their_suffix_alone_are_told_before_any_is_cleaned(tmp_path: Path,
@@ -988,14 +988,14 @@ def test_a_plate_that_does_not_fit_into_memory_is_left_out(tmp_path: Path, nowhe
                                                            monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("a", "b"):
         write_codes(tmp_path / "in" / f"{name}.png", picture())
-    seen = Remover.seen
+    shown = Remover.shown
 
-    def shown(remover: Remover, plate: Plate) -> Any:
+    def shown_or_not(remover: Remover, plate: Plate) -> Any:
         if plate.path.name == "a.png":
             raise short
-        return seen(remover, plate)
+        return shown(remover, plate)
 
-    monkeypatch.setattr(Remover, "seen", shown)
+    monkeypatch.setattr(Remover, "shown", shown_or_not)
     with pytest.raises(FrameError, match=r"1 of 2 plates could not be cleaned: \S*a\.png does not fit into memory"):
         remove_all([tmp_path / "in"], tmp_path / "out", Remover(nowhere, working_size=64), Progress())
     assert (tmp_path / "out" / "b.png").exists()
@@ -1003,7 +1003,7 @@ def test_a_plate_that_does_not_fit_into_memory_is_left_out(tmp_path: Path, nowhe
 
 def test_a_defect_is_not_taken_for_a_bad_plate(tmp_path: Path, nowhere: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_codes(tmp_path / "in" / "a.png", picture())
-    monkeypatch.setattr(Remover, "seen", lambda *_: 1 / 0)
+    monkeypatch.setattr(Remover, "shown", lambda *_: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         remove_all([tmp_path / "in"], tmp_path / "out", Remover(nowhere, working_size=64), Progress())
 

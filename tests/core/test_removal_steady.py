@@ -100,8 +100,8 @@ class Wavering(Remover):
     def __init__(self) -> None:
         self.working_size, self.keep_glare, self.asked = 64, False, 0
 
-    def seen(self, plate: Plate) -> Pixels:
-        display = super().seen(plate)
+    def shown(self, plate: Plate) -> Pixels:
+        display = super().shown(plate)
         display[0, 0] = 0.1 * (int(plate.path.stem[1:]) % 3)  # by which `added` knows the frame
         return display
 

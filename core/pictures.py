@@ -297,6 +297,13 @@ class Window:
         """Whether what is stored is the frame and no more."""
         return self.size == self.frame and self.origin == (0, 0)
 
+    def header(self) -> dict[str, Any]:
+        """The attributes of an EXR that say so, of a frame that begins at 0."""
+        (x, y), (width, height) = self.origin, self.size
+        boxes = {"dataWindow": ((x, y), (x + width - 1, y + height - 1)),
+                 "displayWindow": ((0, 0), (self.frame[0] - 1, self.frame[1] - 1))}
+        return {name: tuple(np.array(corner, np.int32) for corner in box) for name, box in boxes.items()}
+
 
 def window_of(path: Path | str) -> Window:
     """Where a picture's pixels lie on its frame: only EXRs have others than those of the frame. Raises FrameError."""

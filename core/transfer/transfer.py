@@ -31,7 +31,7 @@ from ..flare.visibility import VisibilitySettings, share_seen
 from ..gaussians import Splats
 from ..look import LookEdits, ViewOfLight, read
 from ..look.shot import PlacedLight
-from ..pictures import Picture, Pixels
+from ..pictures import Picture, Pixels, Window, window_of
 from ..progress import Progress
 from . import query as queries
 from .plates import AUTO, ColouredPlate
@@ -232,6 +232,13 @@ class _OfFrame:
         """The plate with its flare, where one is written."""
         target = self._one.flared(self._out) if self._out is not None else None
         return [] if target is None else [target]
+
+    def window(self, camera: Camera) -> Window | None:
+        """The plate's, of whose file these are the pixels."""
+        if self._one.plate is None or self._one.undistorted is not None:
+            return None
+        window = window_of(self._one.plate)
+        return window if window.size == camera.size and not window.is_frame else None
 
     def render(self, camera: Camera, edits: LookEdits | None = None) -> Rendered:
         """Scene, flare of each light, depth; scene-linear Rec. 709."""

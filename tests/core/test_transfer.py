@@ -25,12 +25,12 @@ from core.gaussians import SceneGaussians
 from core.gaussians.ply import write_ply
 from core.look import KeyedEdits, Look, TrainedCamera, ViewOfLight, read
 from core.look.shot import PlacedLight, Shot, ShotFrame
-from core.pictures import linear_from_srgb, read_exr, srgb_from_linear, write_exr, write_png
+from core.pictures import Window, linear_from_srgb, read_exr, srgb_from_linear, window_of, write_exr, write_png
 from core.removal.plates import Plate
 from core.transfer import query as queries
 from core.transfer.plates import ColouredPlate
 from core.transfer.sources import assigned, parsed
-from core.transfer.target import Target, _most_alike, background, of_capture, of_pictures, of_shot
+from core.transfer.target import Target, _most_alike, background, of_capture, of_pictures, of_shot, sized
 from core.transfer.transfer import Transfer, TransferSettings
 from tests.core.captures import make_capture
 from tests.core.flared import cameras
@@ -409,6 +409,11 @@ def test_the_flare_lies_on_the_frame_whatever_of_it_is_stored(flare: Path, look:
     with OpenEXR.File(str(flared), header_only=True) as file:
         assert file.parts[0].header["dataWindow"][0].tolist() == list(origin)
     np.testing.assert_allclose(read_exr(flared)["R"] - 0.1, found[..., 0], atol=1e-5)
+    layers = by_shot.frames[0].frame.file
+    assert window_of(tmp_path / "out" / layers) == window_of(plate), "where the plate's own pixels lie"
+    np.testing.assert_allclose(read_exr(tmp_path / "out" / layers)["flare.R"], found[..., 0], atol=1e-5)
+    Transfer(flare, sized(by_shot, 50, 30)).bake(tmp_path / "small")
+    assert window_of(tmp_path / "small" / layers) == Window((50, 30), (0, 0), (50, 30))
 
 
 def test_a_plate_of_another_frame_with_overscan_is_refused(flare: Path, look: Look, tmp_path: Path) -> None:

@@ -10,6 +10,7 @@
     python benchmarks/removal.py scenes PHOTOS...            # held-out scenes without flare, as training has them
     python benchmarks/removal.py against PHOTOS... [--lenses LENSES]  # flares whose lights are in a bright sky
     python benchmarks/removal.py coloured PHOTOS... [--lenses LENSES]  # flares of lights of one colour
+    python benchmarks/removal.py aspheric PHOTOS...          # ghosts of moulded lenses alone
     python benchmarks/removal.py coverage [--sheet FILE]     # what the synthesis spans, and a sheet of it
 
 Speed: each case in a process of its own, on the threads that torch takes; reading and writing included; the
@@ -21,7 +22,8 @@ Matte: `count` synthesised pictures of every class, of held-out photographs and 
 eval-removal's; the matte is as an artist would rough it in, wide about all that the flare changes, with a soft rim.
 Scenes: as `clean`, of the exposures, colours and grain that training has, some with a light. Against: the same flares
 with their lights where the scene is bright, and anywhere. Coloured: the same flares of lights of one colour (traffic
-lights, neon), and of the white ones that their class has.
+lights, neon), and of the white ones that their class has. Aspheric: lights with no other flare than the ghosts of
+telephones' lenses, which no class has.
 """
 from __future__ import annotations
 
@@ -199,38 +201,68 @@ AGAINST = ("scatter", "ghosts", "streak", "glare", "mixed")
 
 def against(folders: list[Path], lenses: Path | None, weights: Path | None, count: int) -> None:
     """What removal gains where lights stand in a bright part of the scene, and where they stand anywhere."""
-    remover, drawn = Remover(weights), _drawing(folders, lenses)
+    from core.removal.bank import OneFlare
+
+    remover, drawn, unseen = Remover(weights), _drawing(folders), _unseen(lenses)
     for name, share in (("against the light", 1.0), ("anywhere", 0.0)):
-        pairs = [drawn((1003, index, number), kind, against_light=share)
-                 for index, kind in enumerate(AGAINST) for number in range(count)]
-        _tell_gains(f"{name:17}", [_gain(remover, *one) for one in pairs])
+        seeds = [((1003, index, number), kind) for index, kind in enumerate(AGAINST) for number in range(count)]
+        _tell_gains(f"{name:17}", [_gain(remover, *drawn(seed, OneFlare(seed, CANVAS, unseen, kind), share))
+                                   for seed, kind in seeds])
 
 
 def coloured(folders: list[Path], lenses: Path | None, weights: Path | None, count: int) -> None:
     """What removal gains of flares whose lights have one colour, and of the same of white lights."""
-    from core.removal.bank import WHITE, one_colour
+    from core.removal.bank import WHITE, OneFlare, one_colour
     from core.removal.synthesis.layers import CLASSES
 
-    remover, drawn = Remover(weights), _drawing(folders, lenses)
+    remover, drawn, unseen = Remover(weights), _drawing(folders), _unseen(lenses)
     for name, white in (("of one colour", False), ("white", True)):
         seeds = [((1004, index, number), kind) for index, kind in enumerate(CLASSES) for number in range(count)]
-        gains = [_gain(remover, *drawn(seed, kind, WHITE if white else one_colour(np.random.default_rng(seed))))
-                 for seed, kind in seeds]
+        colours = [WHITE if white else one_colour(np.random.default_rng(seed)) for seed, _ in seeds]
+        gains = [_gain(remover, *drawn(seed, OneFlare(seed, CANVAS, unseen, kind, colour)))
+                 for (seed, kind), colour in zip(seeds, colours, strict=True)]
         _tell_gains(f"{name:13}", gains)
 
 
-def _drawing(folders: list[Path], lenses: Path | None) -> Any:
-    """Draws (frame, scene) of held-out photographs and lenses: a function of seed, class of flare, colour and how many
-    of the lights are against the light."""
+CANVAS = 640
+"""Pixels a side of the flares' canvas."""
+
+
+class _Moulded:
+    """A bank of a single flare: the ghosts of one light through moulded aspheres."""
+
+    def __init__(self, seed: tuple[int, ...]) -> None:
+        self._seed = seed
+
+    def draw(self, random: np.random.Generator) -> Any:
+        """Another light and lens at every call."""
+        from core.removal.pairs import Layers
+        from core.removal.synthesis.layers import flare, through_aspheres
+        from core.removal.synthesis.prescription import built_in
+
+        seed = (*self._seed, int(random.integers(1 << 30)))
+        made = flare(seed, CANVAS, built_in(), "scatter")
+        ghosts = through_aspheres(made, (*seed, 3)).rest - made.rest
+        return Layers(ghosts, np.zeros_like(ghosts), made.light, made.lights)
+
+
+def aspheric(folders: list[Path], weights: Path | None, count: int) -> None:
+    """What removal gains of the ghosts of moulded lenses, of lights that have no other flare."""
+    remover, drawn = Remover(weights), _drawing(folders)
+    seeds = [(1005, number) for number in range(count)]
+    _tell_gains("moulded lenses", [_gain(remover, *drawn(seed, _Moulded(seed))) for seed in seeds])
+
+
+def _drawing(folders: list[Path]) -> Any:
+    """Draws (frame, scene) of held-out photographs: a function of seed, bank of flares, and how many of the lights are
+    against the light."""
     from core.removal.backgrounds import read_backgrounds
-    from core.removal.bank import WHITE, OneFlare
     from core.removal.pairs import pair
 
-    backgrounds, unseen = read_backgrounds(folders, "test", 480), _unseen(lenses)
+    backgrounds = read_backgrounds(folders, "test", 480)
 
-    def drawn(seed: tuple[int, ...], kind: str, colour: Any = WHITE, against_light: float = 0.0) -> tuple[Any, Any]:
-        one = pair(np.random.default_rng(seed), OneFlare(seed, 640, unseen, kind, colour), backgrounds, 480, 320,
-                   clean=0, against_light=against_light)
+    def drawn(seed: tuple[int, ...], bank: Any, against_light: float = 0.0) -> tuple[Any, Any]:
+        one = pair(np.random.default_rng(seed), bank, backgrounds, 480, 320, clean=0, against_light=against_light)
         return one.frame, one.scene
 
     return drawn
@@ -277,10 +309,10 @@ def _roughed_in(frame: Any, truth: Any) -> Any:
 def coverage(sheet: Path | None, count: int) -> None:
     """A histogram of the coverage of synthesised flares, as text, and a sheet of pictures."""
     from core.removal.formation import coverage as covered
-    from core.removal.synthesis.layers import CLASSES, flare
+    from core.removal.synthesis.layers import CLASSES, flare, through_aspheres
     from core.removal.synthesis.prescription import built_in
 
-    lenses, tiles = built_in(), []
+    lenses = built_in()
     shares = [covered(flare((1, number), 160, lenses).whole) for number in range(count)]
     counts, edges = np.histogram(shares, [0, 0.005, 0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 1])
     for k, value in enumerate(counts):
@@ -288,9 +320,9 @@ def coverage(sheet: Path | None, count: int) -> None:
     print(f"median {np.median(shares):.1%}, below 2 %: {np.mean(np.array(shares) < 0.02):.0%}, above 70 %: "
           f"{np.mean(np.array(shares) > 0.7):.0%} of {count}")
     if sheet:
-        for kind in CLASSES:
-            row = [flare((5, number), 256, lenses, kind) for number in range(9)]
-            tiles.append(np.concatenate([np.clip(one.whole + one.light, 0, 1) ** (1 / 2.2) for one in row], 1))
+        rows = [[flare((5, number), 256, lenses, kind) for number in range(9)] for kind in CLASSES]
+        rows.append([through_aspheres(flare((5, number), 256, lenses, "glare"), (5, number, 3)) for number in range(9)])
+        tiles = [np.concatenate([np.clip(one.whole + one.light, 0, 1) ** (1 / 2.2) for one in row], 1) for row in rows]
         import cv2
 
         picture = (np.concatenate(tiles)[::2, ::2, ::-1] * 255).astype(np.uint8)
@@ -299,8 +331,8 @@ def coverage(sheet: Path | None, count: int) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("speed", "sample", "clean", "scenes", "against", "coloured", "matte",
-                                         "coverage", "one"))
+    parser.add_argument("what", choices=("speed", "sample", "clean", "scenes", "against", "coloured", "aspheric",
+                                         "matte", "coverage", "one"))
     parser.add_argument("paths", type=Path, nargs="*")
     parser.add_argument("--capture", type=Path, default=ROOT / "sample_scenes" / "desk")
     parser.add_argument("--cleaned", type=Path)
@@ -309,7 +341,7 @@ def main() -> None:
     parser.add_argument("--lenses", type=Path)
     parser.add_argument("--sheet", type=Path)
     parser.add_argument("--count", type=int, help="pictures: of each class for matte, against and coloured (20), "
-                                                  "of scenes (64), of coverage (400)")
+                                                  "of scenes and aspheric (64), of coverage (400)")
     words = parser.parse_args()
     if words.what == "one":
         one(words.paths[0], words.size, words.weights)
@@ -325,6 +357,8 @@ def main() -> None:
         against(words.paths, words.lenses, words.weights, words.count or 20)
     elif words.what == "coloured":
         coloured(words.paths, words.lenses, words.weights, words.count or 20)
+    elif words.what == "aspheric":
+        aspheric(words.paths, words.weights, words.count or 64)
     elif words.what == "matte":
         matte(words.paths, words.lenses, words.weights, words.count or 20)
     else:

@@ -24,7 +24,7 @@ from ..errors import FrameError, SettingsError
 from ..pictures import SUFFIXES, linear_from_srgb, read_picture
 from ..video import VIDEOS, Video
 from .pairs import WHITE, Bank, Layers
-from .synthesis.layers import flare
+from .synthesis.layers import flare, through_aspheres
 from .synthesis.prescription import Prescription
 
 Random = np.random.Generator
@@ -37,12 +37,14 @@ class SynthesisBank:
     seen for ever.
 
     What a bank holds is a function of the seed and of how far it was renewed: a resumed training sees the
-    same flares. A share `coloured` are of lights of one colour (traffic lights, tail lamps, neon), which no class of
-    flares has.
+    same flares. A share `coloured` are of lights of one colour (traffic lights, tail lamps, neon), and a share
+    `aspheric` have the ghosts of moulded lenses too, neither of which any class of flares has.
     """
 
-    def __init__(self, seed: int, count: int, size: int, lenses: Sequence[Prescription], coloured: float = 0) -> None:
-        self._seed, self._size, self._lenses, self._coloured = seed, size, lenses, coloured
+    def __init__(self, seed: int, count: int, size: int, lenses: Sequence[Prescription], coloured: float = 0,
+                 aspheric: float = 0) -> None:
+        self._seed, self._size, self._lenses = seed, size, lenses
+        self._coloured, self._aspheric = coloured, aspheric
         self._made: list[tuple[int, Layers] | None] = [None] * count
         self._end = count
 
@@ -67,6 +69,8 @@ class SynthesisBank:
         one = flare((self._seed, serial), self._size, self._lenses)
         random = np.random.default_rng((self._seed, serial, 2))
         colour = one_colour(random) if random.random() < self._coloured else WHITE
+        if random.random() < self._aspheric:
+            one = through_aspheres(one, (self._seed, serial, 3))
         rest, glare, light = (np.minimum(layer, 6e4).astype(np.float16) for layer in (one.rest, one.glare, one.light))
         return Layers(rest, glare, light, one.lights, colour)
 

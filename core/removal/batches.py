@@ -41,7 +41,8 @@ class Batches(Dataset[Batch]):
     def __init__(self, recipe: Recipe, backgrounds: Backgrounds, lenses: Sequence[Prescription],
                  own: OwnFlares | None = None, learner: Learner = ALONE) -> None:
         self._recipe, self._backgrounds, self._learner = recipe, backgrounds, learner
-        self._made = SynthesisBank(recipe.seed, recipe.bank, recipe.canvas, lenses, recipe.coloured)
+        self._made = SynthesisBank(recipe.seed, recipe.bank, recipe.canvas, lenses, recipe.coloured,
+                                    recipe.aspheric)
         self._bank: Bank = Mixed(self._made, own, recipe.own_share) if own else self._made
 
     def __getitem__(self, iteration: int) -> Batch:

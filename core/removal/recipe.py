@@ -40,6 +40,7 @@ class Recipe:
     bank: int = 400                # flares at hand at a time, 2.7 MB each
     renew_every: int = 6           # iterations for each new flare
     coloured: float = 0.15         # of the synthesised flares are of lights of one colour
+    aspheric: float = 0.3          # of them have the ghosts of moulded lenses too
     grey: float = 0.2              # of the frames are of one of their channels alone
     own_share: float = 0.3         # of the user's own flares, where there are any
     clean: float = 0.12            # of the frames have no flare
@@ -48,7 +49,8 @@ class Recipe:
     def __post_init__(self) -> None:
         if min(self.iterations, self.pixels, self.bank, self.renew_every, self.warm) < 1:
             raise SettingsError("A recipe needs at least one iteration, pixel and flare.")
-        for name in ("begun", "polish", "coloured", "grey", "own_share", "clean", "against_light", "average"):
+        for name in ("begun", "polish", "coloured", "aspheric", "grey", "own_share", "clean", "against_light",
+                     "average"):
             if not 0 <= getattr(self, name) <= 1:
                 raise SettingsError(f"A recipe's {name} is a share from 0 to 1, not {getattr(self, name)}.")
         if self.seed < 0 or self.decay < 0 or not 32 <= self.canvas <= 8192:

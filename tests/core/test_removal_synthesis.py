@@ -15,8 +15,8 @@ from core.removal import formation, pairs, variety
 from core.removal.backgrounds import Backgrounds, kept_for_test, read_backgrounds
 from core.removal.bank import Mixed, OwnFlares, SynthesisBank
 from core.removal.recipe import Recipe
+from core.removal.synthesis import aspheric, shapes
 from core.removal.synthesis import prescription as lenses
-from core.removal.synthesis import shapes
 from core.removal.synthesis.canvas import grid
 from core.removal.synthesis.layers import CLASSES, Flare, flare
 
@@ -212,6 +212,59 @@ def test_some_of_a_bank_are_of_lights_of_one_colour() -> None:
     np.testing.assert_allclose(colours(1).max(1), 1, rtol=1e-3)
     assert (colours(1).min(1) < 0.31).all(), "in one channel there is little"
     assert 0.03 < (colours(Recipe().coloured) < 0.99).any(1).mean() < 0.35
+
+
+def test_ghosts_of_aspheres_are_light_on_the_line_through_the_middle() -> None:
+    turn = np.deg2rad(70)
+    for seed in range(12):
+        here, again = (aspheric.aspheric(np.random.default_rng(seed), (0.5, 0.1), SIZE) for _ in range(2))
+        assert np.array_equal(here, again)
+        assert np.isfinite(here).all()
+        assert here.min() >= 0
+        turned = (0.5 * np.cos(turn) - 0.1 * np.sin(turn), 0.5 * np.sin(turn) + 0.1 * np.cos(turn))
+        there = aspheric.aspheric(np.random.default_rng(seed), turned, SIZE)
+        reach = [(layer.mean(-1) * np.hypot(*grid(SIZE))).sum() for layer in (here, there)]
+        assert there.sum() == pytest.approx(here.sum(), rel=0.25), "about the middle it is the same"
+        assert reach[1] == pytest.approx(reach[0], rel=0.35)
+
+
+@pytest.mark.parametrize("radius", [0.05, 0.3])
+def test_an_even_stop_gives_an_even_ghost(monkeypatch: pytest.MonkeyPatch, radius: float) -> None:
+    monkeypatch.setattr(aspheric, "_drawn_map", lambda _: aspheric._Map(np.ones(3, np.float32), np.zeros(3, np.float32),
+                                                                        0.0, 0.0, 0.0))
+    monkeypatch.setattr(aspheric, "_stop", lambda _, u, v: (np.hypot(u, v) < 1).astype(np.float32))
+    layer = np.zeros((256, 256, 3), np.float32)
+    colour = np.array([1, 0.5, 0.25], np.float32)
+    aspheric._add(layer, np.random.default_rng(1), np.array([0.2, -0.1]), radius, np.ones((8, 8), np.float32), colour)
+    x, y = grid(256)
+    from_it = np.hypot(x - 0.2, y + 0.1)
+    assert np.abs(layer[from_it < 0.6 * radius] / colour - 1).max() < 0.02
+    assert layer[from_it > 1.4 * radius].max() < 0.02
+
+
+def test_a_fold_of_the_map_piles_light_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    third = np.full(3, -0.6, np.float32)  # past r = 0.75 the stop's light turns back
+    monkeypatch.setattr(aspheric, "_drawn_map", lambda _: aspheric._Map(np.ones(3, np.float32), third, 0.0, 0.0, 0.0))
+    monkeypatch.setattr(aspheric, "_stop", lambda _, u, v: (np.hypot(u, v) < 1).astype(np.float32))
+    layer = np.zeros((256, 256, 3), np.float32)
+    aspheric._add(layer, np.random.default_rng(1), np.zeros(2), 0.5, np.ones((8, 8), np.float32),
+                  np.ones(3, np.float32))
+    rim = 0.5 * 0.745 * (1 - 0.6 * 0.745**2)
+    middle, folded = layer[128, 128, 0], layer[128, 128 + int(rim * 128) - 2:128 + int(rim * 128) + 2, 0].max()
+    assert folded > 2 * middle
+    assert layer[128, 128 + int(rim * 128) + 12:, 0].max() < 0.05
+
+
+def test_some_of_a_bank_come_through_aspheres() -> None:
+    def rests(share: float) -> list[NDArray[np.float32]]:
+        bank = SynthesisBank(3, 12, SIZE, lenses.built_in(), 0, share)
+        return [bank.draw(np.random.default_rng(seed)).rest for seed in range(12)]
+
+    without, some, of_all = rests(0), rests(0.4), rests(1)
+    assert all((more >= less - 1e-3).all() for less, more in zip(without, of_all, strict=True))
+    changed = [[not np.array_equal(one, other) for one, other in zip(without, those, strict=True)]
+               for those in (some, of_all)]
+    assert 0 < sum(changed[0]) < sum(changed[1])
 
 
 def test_a_light_of_one_colour_is_clipped_in_that_one_with_flare_and_without() -> None:

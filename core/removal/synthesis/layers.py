@@ -9,11 +9,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from . import ghosts, scatter, shapes
+from .aspheric import aspheric
 from .canvas import Array, Point, Random, grid, tint, uniform_log
 from .prescription import Prescription
 
@@ -66,6 +67,14 @@ def flare(seed: int | Sequence[int], size: int, lenses: Sequence[Prescription], 
             if kind in ("ghosts", "mixed") and random.random() < 0.4:
                 rest += ghosts.mirrored(random, source, place) * strength
     return Flare(kind, tuple(places), rest, glare, light)
+
+
+def through_aspheres(one: Flare, seed: int | Sequence[int]) -> Flare:
+    """The same flare through a lens of moulded aspheres: its ghosts come to the others."""
+    ghosts_of_all = sum((aspheric(np.random.default_rng(seed), light, one.rest.shape[0]) for light in one.lights),
+                        np.zeros_like(one.rest))
+    level = uniform_log(np.random.default_rng((*np.atleast_1d(seed), 1)), 0.03, 1.0)
+    return replace(one, rest=one.rest + ghosts_of_all * np.float32(level))
 
 
 def _place(random: Random, kind: str) -> Point:

@@ -202,74 +202,73 @@ AGAINST = ("scatter", "ghosts", "streak", "glare", "mixed")
 def against(folders: list[Path], lenses: Path | None, weights: Path | None, count: int) -> None:
     """What removal gains where lights stand in a bright part of the scene, and where they stand anywhere."""
     from core.removal.bank import OneFlare
+    from core.removal.evaluation import CANVAS
 
-    remover, drawn, unseen = Remover(weights), _drawing(folders), _unseen(lenses)
+    remover, backgrounds, unseen = Remover(weights), _held_out(folders), _unseen(lenses)
+    seeds = [((1003, index, number), kind) for index, kind in enumerate(AGAINST) for number in range(count)]
     for name, share in (("against the light", 1.0), ("anywhere", 0.0)):
-        seeds = [((1003, index, number), kind) for index, kind in enumerate(AGAINST) for number in range(count)]
-        _tell_gains(f"{name:17}", [_gain(remover, *drawn(seed, OneFlare(seed, CANVAS, unseen, kind), share))
+        _tell_gains(f"{name:17}", [_gain(remover, seed, OneFlare(seed, CANVAS, unseen, kind), backgrounds, share)
                                    for seed, kind in seeds])
 
 
 def coloured(folders: list[Path], lenses: Path | None, weights: Path | None, count: int) -> None:
     """What removal gains of flares whose lights have one colour, and of the same of white lights."""
     from core.removal.bank import WHITE, OneFlare, one_colour
+    from core.removal.evaluation import CANVAS
     from core.removal.synthesis.layers import CLASSES
 
-    remover, drawn, unseen = Remover(weights), _drawing(folders), _unseen(lenses)
+    remover, backgrounds, unseen = Remover(weights), _held_out(folders), _unseen(lenses)
+    seeds = [((1004, index, number), kind) for index, kind in enumerate(CLASSES) for number in range(count)]
     for name, white in (("of one colour", False), ("white", True)):
-        seeds = [((1004, index, number), kind) for index, kind in enumerate(CLASSES) for number in range(count)]
         colours = [WHITE if white else one_colour(np.random.default_rng(seed)) for seed, _ in seeds]
-        gains = [_gain(remover, *drawn(seed, OneFlare(seed, CANVAS, unseen, kind, colour)))
-                 for (seed, kind), colour in zip(seeds, colours, strict=True)]
-        _tell_gains(f"{name:13}", gains)
-
-
-CANVAS = 640
-"""Pixels a side of the flares' canvas."""
+        _tell_gains(f"{name:13}", [_gain(remover, seed, OneFlare(seed, CANVAS, unseen, kind, colour), backgrounds)
+                                   for (seed, kind), colour in zip(seeds, colours, strict=True)])
 
 
 class _Moulded:
-    """A bank of a single flare: the ghosts of one light through moulded aspheres."""
+    """A bank of a single flare, the ghosts of lights through moulded aspheres and nothing besides."""
 
     def __init__(self, seed: tuple[int, ...]) -> None:
         self._seed = seed
 
     def draw(self, random: np.random.Generator) -> Any:
         """Another light and lens at every call."""
+        from core.removal.evaluation import CANVAS
         from core.removal.pairs import Layers
-        from core.removal.synthesis.layers import flare, through_aspheres
+        from core.removal.synthesis.aspheric import ghosts as ghosts_of
+        from core.removal.synthesis.layers import flare
         from core.removal.synthesis.prescription import built_in
 
         seed = (*self._seed, int(random.integers(1 << 30)))
         made = flare(seed, CANVAS, built_in(), "scatter")
-        ghosts = through_aspheres(made, (*seed, 3)).rest - made.rest
+        ghosts = ghosts_of((*seed, 3), made.lights, CANVAS)
         return Layers(ghosts, np.zeros_like(ghosts), made.light, made.lights)
 
 
 def aspheric(folders: list[Path], weights: Path | None, count: int) -> None:
     """What removal gains of the ghosts of moulded lenses, of lights that have no other flare."""
-    remover, drawn = Remover(weights), _drawing(folders)
+    remover, backgrounds = Remover(weights), _held_out(folders)
     seeds = [(1005, number) for number in range(count)]
-    _tell_gains("moulded lenses", [_gain(remover, *drawn(seed, _Moulded(seed))) for seed in seeds])
+    _tell_gains("moulded lenses", [_gain(remover, seed, _Moulded(seed), backgrounds) for seed in seeds])
 
 
-def _drawing(folders: list[Path]) -> Any:
-    """Draws (frame, scene) of held-out photographs: a function of seed, bank of flares, and how many of the lights are
-    against the light."""
+SIZE = (480, 320)
+"""Of synthesised pictures, width and height."""
+
+
+def _held_out(folders: list[Path]) -> Any:
+    """The photographs that training leaves out."""
     from core.removal.backgrounds import read_backgrounds
+
+    return read_backgrounds(folders, "test", max(SIZE))
+
+
+def _gain(remover: Remover, seed: tuple[int, ...], bank: Any, backgrounds: Any, against_light: float = 0.0) -> float:
+    """Of the picture of a seed under a flare of the bank, a share of those with their lights against the light."""
     from core.removal.pairs import pair
 
-    backgrounds = read_backgrounds(folders, "test", 480)
-
-    def drawn(seed: tuple[int, ...], bank: Any, against_light: float = 0.0) -> tuple[Any, Any]:
-        one = pair(np.random.default_rng(seed), bank, backgrounds, 480, 320, clean=0, against_light=against_light)
-        return one.frame, one.scene
-
-    return drawn
-
-
-def _gain(remover: Remover, frame: Any, truth: Any) -> float:
-    return psnr(remover.clean_display(frame), truth) - psnr(frame, truth)
+    one = pair(np.random.default_rng(seed), bank, backgrounds, *SIZE, clean=0, against_light=against_light)
+    return psnr(remover.clean_display(one.frame), one.scene) - psnr(one.frame, one.scene)
 
 
 def _tell_gains(name: str, gains: Any) -> None:
@@ -279,14 +278,11 @@ def _tell_gains(name: str, gains: Any) -> None:
 
 def matte(folders: list[Path], lenses: Path | None, weights: Path | None, count: int) -> None:
     """What removal gains with a rough matte of the flare, and without."""
-    from core.removal.backgrounds import read_backgrounds
     from core.removal.evaluation import synthetic
     from core.removal.plates import Plate
 
-    remover, size = Remover(weights), (480, 320)
-    backgrounds, unseen = read_backgrounds(folders, "test", max(size)), _unseen(lenses)
-    gains = []
-    for case in synthetic(1001, count, backgrounds, unseen, size):
+    remover, gains = Remover(weights), []
+    for case in synthetic(1001, count, _held_out(folders), _unseen(lenses), SIZE):
         frame, truth, _ = case.read()
         found = Plate(Path("frame.png"), (frame * 65535 + 0.5).astype(np.uint16), "srgb")
         results = [remover.remove(found, marked)[0] / found.top for marked in (None, _roughed_in(frame, truth))]

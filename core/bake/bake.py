@@ -19,7 +19,7 @@ from ..colour import colour_space
 from ..errors import FrameError, RunError
 from ..files import inside, locked, read_json, remove_file, remove_partial_of, write_json
 from ..look import KeyedEdits, LookEdits
-from ..pictures import Window, exr_is_cut_off, window_of
+from ..pictures import exr_is_cut_off, window_of
 from ..progress import Progress
 from ..typed import value_of
 from .exr import read_description, write_layers
@@ -41,7 +41,7 @@ class FrameRenderer(OfCamera, Protocol):
     """What renders one frame. fingerprint: changes whenever this frame's picture would, beyond the whole's; empty
     where nothing is this frame's alone. words: edits that the frame comes with, for `LookEdits.parse`. rest: the
     files that `finished` writes beside the layers. finished: its layers, already in the space asked for, as
-    they are to be written. window: where on its frame a camera's picture lies; None where it is the frame."""
+    they are to be written."""
 
     @property
     def fingerprint(self) -> str: ...
@@ -49,7 +49,6 @@ class FrameRenderer(OfCamera, Protocol):
     def words(self) -> Sequence[str]: ...
     @property
     def rest(self) -> Sequence[Path]: ...
-    def window(self, camera: Camera) -> Window | None: ...
     def finished(self, layers: FrameLayers, camera: Camera) -> FrameLayers: ...
 
 
@@ -85,9 +84,6 @@ class _OfView:
 
     def render(self, camera: Camera, edits: LookEdits | None = None) -> Rendering:
         return self.renderer.render(camera) if edits is None else self.renderer.render(camera, edits)
-
-    def window(self, camera: Camera) -> None:
-        """The frame."""
 
     def finished(self, layers: FrameLayers, camera: Camera) -> FrameLayers:  # noqa: ARG002 - nothing to add
         return layers
@@ -178,10 +174,9 @@ def bake_frames(source: Sequenced, frames: Sequence[Frame], cameras: Mapping[str
         path = out / frame.file
         _check_is_of_this(out, made_from, names)  # before it is rendered in vain
         remove_partial_of(path)
-        camera = settings.scaled(cameras[frame.view])
         # Not kept in a name: at 4K the layers of one frame are half a gigabyte.
         write_layers(path, made(frame), half=settings.half, chromaticities=space.chromaticities, notes=notes(frame),
-                     pixel_aspect=camera.pixel_aspect, window=of_frame(frame).window(camera), turn=in_turn())
+                     pixel_aspect=settings.scaled(cameras[frame.view]).pixel_aspect, turn=in_turn())
         record = _add_to_record(out, made_from, names, [_entry(out, frame, of_frame(frame).rest)])
         progress.advance()
     return record

@@ -15,8 +15,8 @@ from typing import Any
 
 from ..colour import REC_709, Chromaticities
 from ..errors import FrameError
-from ..pictures import Window, exr_header, read_exr, write_exr
-from .layers import FrameLayers, Pixels, layer_names
+from ..pictures import Pixels, exr_header, read_exr, window_of, write_exr
+from .layers import FrameLayers, layer_names
 
 ATTRIBUTE = "fitFlare"
 VERSION = 1
@@ -24,14 +24,12 @@ VERSION = 1
 
 def write_layers(path: Path | str, layers: FrameLayers, *, half: bool = True,
                  notes: Mapping[str, Any] | None = None, chromaticities: Chromaticities | None = REC_709,
-                 pixel_aspect: float = 1.0, window: Window | None = None,
-                 turn: AbstractContextManager[None] | None = None) -> None:
+                 pixel_aspect: float = 1.0, turn: AbstractContextManager[None] | None = None) -> None:
     """Write a frame's layers atomically, ZIP compressed; depth stays 32 bit when the rest is `half`. turn: see
     `atomic_path`.
 
     notes: JSON-able entries for the header (view, frame, …). chromaticities: of the layers' linear space. pixel_aspect:
-    as `Camera.pixel_aspect`. window: where the layers lie on the frame, that of a plate with overscan or cut to a part;
-    None where they are the frame.
+    as `Camera.pixel_aspect`.
     """
     lights = {layer: light for light, layer in layer_names(layers.flares).items()}
     description = json.dumps({"version": VERSION, "lights": lights, **(notes or {})})
@@ -39,8 +37,8 @@ def write_layers(path: Path | str, layers: FrameLayers, *, half: bool = True,
                               "pixelAspectRatio": pixel_aspect}
     if chromaticities is not None:
         header["chromaticities"] = chromaticities
-    if window is not None:
-        header |= window.header()
+    if layers.window is not None:
+        header |= layers.window.header()
     write_exr(path, layers.channels(), half=half, header=header, turn=turn)
 
 
@@ -68,6 +66,6 @@ def read_layers(path: Path | str) -> FrameLayers:
 
     try:
         return FrameLayers(colour("scene"), {light: colour(layer) for layer, light in lights.items()},
-                           channels["depth.Z"])
+                           channels["depth.Z"], window_of(path))
     except KeyError as problem:
         raise FrameError(f"{path} lacks the channel {problem}; bake it again.") from problem

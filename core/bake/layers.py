@@ -14,16 +14,14 @@ from __future__ import annotations
 import re
 import unicodedata
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..colour import ColourSpace
 from ..errors import SettingsError
-
-Pixels = NDArray[np.float32]
+from ..pictures import Pixels, Window
 
 FARTHEST = 1e10
 """Depth where there is nothing, as Blender writes it."""
@@ -56,11 +54,16 @@ class Rendered:
 
 @dataclass(frozen=True)
 class FrameLayers:
-    """Scene (h, w, 3), one flare layer (h, w, 3) for each light, by the light's name, and depth (h, w)."""
+    """Scene (h, w, 3), one flare layer (h, w, 3) for each light, by the light's name, and depth (h, w).
+
+    window: where these pixels lie on the frame, those of a plate with overscan or cut to a part; None where they are
+    the frame.
+    """
 
     scene: Pixels
     flares: Mapping[str, Pixels]
     depth: Pixels
+    window: Window | None = None
 
     @property
     def flare(self) -> Pixels:
@@ -78,7 +81,7 @@ class FrameLayers:
             raise SettingsError(f"Layers add in linear light, and {space.name} is not linear; choose linear, acescg, "
                                 "or another linear space.")
         flares = {light: space.from_linear(layer) for light, layer in self.flares.items()}
-        return FrameLayers(space.from_linear(self.scene), flares, self.depth)
+        return replace(self, scene=space.from_linear(self.scene), flares=flares)
 
     def channels(self) -> dict[str, Pixels]:
         """Channel name to (h, w), for one EXR part. One dot in a name at most.

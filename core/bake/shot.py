@@ -99,9 +99,6 @@ class _OfFrame:
     def render(self, camera: Camera, edits: LookEdits | None = None) -> Rendered:
         return self.renderer.render(self.one, camera, edits)
 
-    def window(self, camera: Camera) -> None:
-        """The frame."""
-
     def finished(self, layers: FrameLayers, camera: Camera) -> FrameLayers:  # noqa: ARG002 - nothing to add
         return layers
 

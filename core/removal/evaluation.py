@@ -29,6 +29,8 @@ from .synthesis.prescription import Prescription, built_in
 INPUTS = ("input", "flare", "blend")
 TRUTHS = ("gt", "target", "clean", "scene")
 WORST = 10
+CANVAS = 640
+"""Pixels a side of the canvas of synthesised flares."""
 ALIKE = 100.0
 """PSNR in dB that pictures which are the same count for in gains and means: that of an error of 0.00001."""
 Scores = dict[str, float | None]
@@ -219,7 +221,7 @@ def synthetic(seed: int, count: int, backgrounds: Backgrounds, lenses: Sequence[
     def reader(index: int, number: int) -> Callable[[], tuple[Pixels, Pixels, None]]:
         def read() -> tuple[Pixels, Pixels, None]:
             random = np.random.default_rng((seed, index, number))
-            bank = OneFlare((seed, index, number), 640, lenses, CLASSES[index])
+            bank = OneFlare((seed, index, number), CANVAS, lenses, CLASSES[index])
             made = pair(random, bank, backgrounds, *size, clean=0)
             return np.round(made.frame * 255).astype(np.float32) / 255, made.scene, None
 

@@ -31,7 +31,7 @@ from ..flare.visibility import VisibilitySettings, share_seen
 from ..gaussians import Splats
 from ..look import LookEdits, ViewOfLight, read
 from ..look.shot import PlacedLight
-from ..pictures import Picture, Pixels, Window, window_of
+from ..pictures import Picture, Pixels, window_of
 from ..progress import Progress
 from . import query as queries
 from .plates import AUTO, ColouredPlate
@@ -233,13 +233,6 @@ class _OfFrame:
         target = self._one.flared(self._out) if self._out is not None else None
         return [] if target is None else [target]
 
-    def window(self, camera: Camera) -> Window | None:
-        """The plate's, of whose file these are the pixels."""
-        if self._one.plate is None or self._one.undistorted is not None:
-            return None
-        window = window_of(self._one.plate)
-        return window if window.size == camera.size and not window.is_frame else None
-
     def render(self, camera: Camera, edits: LookEdits | None = None) -> Rendered:
         """Scene, flare of each light, depth; scene-linear Rec. 709."""
         with torch.no_grad():
@@ -272,14 +265,16 @@ class _OfFrame:
         return np.zeros((camera.height, camera.width, 3), np.float32), nothing
 
     def finished(self, layers: FrameLayers, camera: Camera) -> FrameLayers:
-        """The layers, with the plate's own numbers where the spaces are one; writes the plate with its flare."""
+        """The layers where their plate lies, with its own numbers where the spaces are one; writes the plate with its
+        flare."""
         if self._plate is None or self._plate.size != camera.size:
             return layers
         target = self._one.flared(self._out) if self._out is not None else None
         if target is not None:
             remove_partial_of(target)  # of a task that was killed
             self._plate.write(target, self._space.to_linear(layers.flare))
+        layers = replace(layers, window=window_of(self._plate.plate.path))
         own = self._plate.space.matrix
         if own is not None and self._space.matrix is not None and np.allclose(own, self._space.matrix, atol=1e-9):
-            return FrameLayers(self._plate.values, layers.flares, layers.depth)
+            return replace(layers, scene=self._plate.values)
         return layers

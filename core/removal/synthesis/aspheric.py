@@ -9,6 +9,7 @@ own. What lies on the way shows within: rings that the mould's turning left, dus
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -19,13 +20,15 @@ TEXTURE = 256
 """Samples across the stop's texture."""
 CHANNELS = np.array([-1.0, 0.0, 1.0])
 """What is of a wavelength differs by it about evenly: red, green, blue."""
+SAMPLES = (64, 640)
+"""Across the stop at least and at most; between those, two to a pixel of the ghost."""
 BRIGHTEST = 6.0
 """Of an evenly lit ghost's brightness, what a caustic has at most: lights are no points."""
 
 
-class _Map(NamedTuple):
-    """From the stop (1 its edge) to the sensor, in parts of the ghost's radius; the first axis away from the middle of
-    the frame. third, fifth: spherical aberration; by channel, (3,)."""
+class Aberrations(NamedTuple):
+    """The map from the stop (1 its edge) to the sensor, in parts of the ghost's radius; the first axis away from the
+    middle of the frame. scale and third, of red, green and blue (3,); third, fifth: spherical aberration."""
 
     scale: Array
     third: Array
@@ -33,8 +36,22 @@ class _Map(NamedTuple):
     coma: float
     astigmatism: float
 
+    def on_sensor(self, channel: int, u: Array, v: Array) -> tuple[Array, Array]:
+        """Where the stop's points (u, v) come to lie."""
+        r2 = u * u + v * v
+        even = self.scale[channel] * (1 + self.third[channel] * r2 + self.fifth * r2 * r2)
+        return (u * (even + self.astigmatism) + self.coma * (3 * u * u + v * v),
+                v * (even - self.astigmatism) + self.coma * 2 * u * v)
 
-def aspheric(random: Random, light: Point, size: int) -> Array:
+
+def ghosts(seed: Sequence[int], lights: Sequence[Point], size: int) -> Array:
+    """(size, size, 3), linear light >= 0: the ghosts of all lights through the lens of a seed, at its brightness."""
+    of_all = sum((of_light(np.random.default_rng(seed), light, size) for light in lights),
+                 np.zeros((size, size, 3), np.float32))
+    return of_all * np.float32(uniform_log(np.random.default_rng((*seed, 1)), 0.03, 1.0))
+
+
+def of_light(random: Random, light: Point, size: int) -> Array:
     """(size, size, 3) ghosts of one light, evenly lit ones of a brightness of 0.1 to 1."""
     layer = np.zeros((size, size, 3), np.float32)
     texture = _texture(random)
@@ -45,46 +62,39 @@ def aspheric(random: Random, light: Point, size: int) -> Array:
         radius = uniform_log(random, 0.015, 0.5)
         shown = 1 + min(strong * uniform_log(random, 0.3, 3), 1.0) * (texture - 1)
         level = uniform_log(random, 0.1, 1.0)
-        _add(layer, random, centre, radius, np.maximum(shown, 0), _coating(random) * level)
+        colour = _coating(random) * level
+        layer += _ghost(random, centre, radius, np.maximum(shown, 0), size) * colour
     return layer
 
 
-def _add(layer: Array, random: Random, centre: Array, radius: float, texture: Array, colour: Array) -> None:
-    """Add one ghost of the stop's texture (TEXTURE, TEXTURE)."""
+def _ghost(random: Random, centre: Array, radius: float, texture: Array, size: int) -> Array:
+    """(size, size, 3) one ghost, 1 where it is evenly lit, of a stop with that texture."""
     import cv2
 
-    size = layer.shape[0]
-    bent = _drawn_map(random)
-    count = int(np.clip(2 * radius * size, 64, 640))
+    aberrations = _aberrations(random)
+    count = int(np.clip(2 * radius * size, *SAMPLES))
     u, v = grid(count)
-    passing = cv2.resize(texture, (count, count), interpolation=cv2.INTER_AREA) * _stop(random, u, v)
+    passing = cv2.resize(texture, (count, count), interpolation=cv2.INTER_AREA) * _opening(random, u, v)
     away = math.atan2(centre[1], centre[0])
-    light = np.zeros_like(layer)
+    light = np.zeros((size, size, 3), np.float32)
     for channel in range(3):
-        x, y = _bent(bent, channel, u, v)
+        x, y = aberrations.on_sensor(channel, u, v)
         at = (np.stack([x * math.cos(away) - y * math.sin(away), x * math.sin(away) + y * math.cos(away)])
               * radius + centre[:, None, None] + 1) * size / 2 - 0.5
         light[..., channel] = _splatted(at, passing, size) * (radius * size / count) ** 2
     soft = max(0.6, radius * size * uniform_log(random, 0.003, 0.06))
-    layer += np.minimum(cv2.GaussianBlur(light, (0, 0), soft), BRIGHTEST) * colour
+    return np.asarray(np.minimum(cv2.GaussianBlur(light, (0, 0), soft), BRIGHTEST), np.float32)
 
 
-def _drawn_map(random: Random) -> _Map:
+def _aberrations(random: Random) -> Aberrations:
     strength = random.random() ** 2 * 1.2  # many are nearly flat
     spread, spread_of_rim = random.normal(0, 0.04), random.normal(0, 0.1)
-    return _Map(1 + spread * CHANNELS, strength * random.normal(0, 0.5) + spread_of_rim * CHANNELS,
-                strength * random.normal(0, 0.4), strength * random.normal(0, 0.25), strength * random.normal(0, 0.3))
+    return Aberrations(1 + spread * CHANNELS, strength * random.normal(0, 0.5) + spread_of_rim * CHANNELS,
+                       strength * random.normal(0, 0.4), strength * random.normal(0, 0.25),
+                       strength * random.normal(0, 0.3))
 
 
-def _bent(bent: _Map, channel: int, u: Array, v: Array) -> tuple[Array, Array]:
-    """Where the stop's points (u, v) come to lie."""
-    r2 = u * u + v * v
-    even = bent.scale[channel] * (1 + bent.third[channel] * r2 + bent.fifth * r2 * r2)
-    return (u * (even + bent.astigmatism) + bent.coma * (3 * u * u + v * v),
-            v * (even - bent.astigmatism) + bent.coma * 2 * u * v)
-
-
-def _stop(random: Random, u: Array, v: Array) -> Array:
+def _opening(random: Random, u: Array, v: Array) -> Array:
     """What passes: a circle, in a third of ghosts cut by the rim of another lens, in a fifth with a hole."""
     edge = 60.0 if random.random() < 0.7 else uniform_log(random, 4, 40)
 

@@ -13,8 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from . import ghosts, scatter, shapes
-from .aspheric import aspheric
+from . import aspheric, ghosts, scatter, shapes
 from .canvas import Array, Point, Random, grid, tint, uniform_log
 from .prescription import Prescription
 
@@ -69,12 +68,9 @@ def flare(seed: int | Sequence[int], size: int, lenses: Sequence[Prescription], 
     return Flare(kind, tuple(places), rest, glare, light)
 
 
-def through_aspheres(one: Flare, seed: int | Sequence[int]) -> Flare:
-    """The same flare through a lens of moulded aspheres: its ghosts come to the others."""
-    ghosts_of_all = sum((aspheric(np.random.default_rng(seed), light, one.rest.shape[0]) for light in one.lights),
-                        np.zeros_like(one.rest))
-    level = uniform_log(np.random.default_rng((*np.atleast_1d(seed), 1)), 0.03, 1.0)
-    return replace(one, rest=one.rest + ghosts_of_all * np.float32(level))
+def through_aspheres(one: Flare, seed: Sequence[int]) -> Flare:
+    """The same flare through a lens of moulded aspheres, that of a seed: its ghosts come to the others."""
+    return replace(one, rest=one.rest + aspheric.ghosts(seed, one.lights, one.rest.shape[0]))
 
 
 def _place(random: Random, kind: str) -> Point:

@@ -28,6 +28,7 @@ telephones' lenses, which no class has.
 from __future__ import annotations
 
 import argparse
+import inspect
 import json
 import subprocess
 import sys
@@ -55,12 +56,13 @@ from core.removal.inference import WORKING_SIZE, Remover
 from core.removal.plates import read_plate
 from core.removal.steady import Sequences
 
+DESK = ROOT / "sample_scenes" / "desk"
 SHOWN = 3
 """Frames on a sheet of the sample."""
 CASES = {"1920x1080 png": (1920, 1080), "4096x2160 exr": (4096, 2160)}
 
 
-def plate(path: Path, width: int, height: int) -> None:
+def write_plate(path: Path, width: int, height: int) -> None:
     """A smooth picture with a bright spot, so that there is a flare to take."""
     x, y = np.meshgrid(np.linspace(-1, 1, width), np.linspace(-1, 1, height))
     glow = 0.5 / (1 + 30 * ((x - 0.4) ** 2 + (y + 0.3) ** 2))
@@ -73,24 +75,24 @@ def plate(path: Path, width: int, height: int) -> None:
         write_png(path, pixels)
 
 
-def one(path: Path, size: int, weights: Path | None) -> None:
+def one(plate: Path, size: int = WORKING_SIZE, weights: Path | None = None) -> None:
     """The measured process: says seconds and peak megabytes."""
     began = time.perf_counter()
     remover = Remover(weights, working_size=size)
     loaded = time.perf_counter()
-    remove_all([path], path.parent / "out", remover, Progress(), overwrite=True)
+    remove_all([plate], plate.parent / "out", remover, Progress(), overwrite=True)
     first = time.perf_counter()
-    remove_all([path], path.parent / "out", remover, Progress(), overwrite=True)
+    remove_all([plate], plate.parent / "out", remover, Progress(), overwrite=True)
     print(json.dumps({"load_s": loaded - began, "first_s": first - loaded, "again_s": time.perf_counter() - first,
                       "peak_mb": held_at_most()}))
 
 
-def speed(weights: Path | None) -> None:
+def speed(weights: Path | None = None) -> None:
     """Time and memory of each case, at the working size and at full size."""
     for name, (width, height) in CASES.items():
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / f"plate.{name.split()[1]}"
-            plate(path, width, height)
+            write_plate(path, width, height)
             figures: dict[str, dict[str, float]] = {}
             for kind, size in (("working", WORKING_SIZE), ("full", width)):
                 words = [sys.executable, __file__, "one", str(path), "--size", str(size)]
@@ -107,19 +109,20 @@ def speed(weights: Path | None) -> None:
                 print(f"{name:16} ratio    {figures['full']['again_s'] / figures['working']['again_s']:.1f}")
 
 
-def sample(capture: Path, weights: Path | None, cleaned: Path | None, sheet: Path | None) -> None:
+def sample(capture: Path = DESK, weights: Path | None = None, cleaned: Path | None = None,
+           sheet: Path | None = None) -> None:
     """PSNR of every frame against the exact scene, and flicker."""
     before: Any = None
     scores, flicker, rows = [], [], []
     paths = sorted((capture / "images").iterdir())
-    clean_codes = _by_network(paths, weights) if cleaned is None else _cleaned(paths, cleaned)
-    for number, (path, codes) in enumerate(zip(paths, clean_codes, strict=True)):
+    results = _by_network(paths, weights) if cleaned is None else _cleaned(paths, cleaned)
+    for number, (path, codes) in enumerate(zip(paths, results, strict=True)):
         truth = read_picture(capture / "truth" / "scene" / f"{path.stem}.exr").display()
-        frame, clean = (part.astype(np.float32) / 255 for part in (read_plate(path).codes, codes))
-        scores.append((psnr(frame, truth), psnr(clean, truth)))
+        frame, result = (part.astype(np.float32) / 255 for part in (read_plate(path).codes, codes))
+        scores.append((psnr(frame, truth), psnr(result, truth)))
         if number % max(len(paths) // SHOWN, 1) == 5:
-            rows.append(np.concatenate([frame, clean, np.clip(truth, 0, 1)], 1))
-        errors = (frame - truth, clean - truth)
+            rows.append(np.concatenate([frame, result, np.clip(truth, 0, 1)], 1))
+        errors = (frame - truth, result - truth)
         if before is not None:
             flicker.append([float(np.abs(now - then).mean()) for now, then in zip(errors, before, strict=True)])
         before = errors
@@ -150,26 +153,26 @@ def _cleaned(paths: list[Path], folder: Path) -> Iterator[Any]:
     return (read_plate(there[path.stem]).codes for path in paths)
 
 
-def clean_pictures(folders: list[Path], weights: Path | None) -> None:
+def clean(folders: list[Path], weights: Path | None = None) -> None:
     """What happens to pictures without flare."""
     remover = Remover(weights)
     values, kept = [], 0
     for path in sorted(path for folder in folders for path in folder.rglob("*")
                        if path.suffix.lower() in (".png", ".jpg", ".jpeg", ".tif")):
         found = read_plate(path)
-        clean = remover.remove(found)[0]
-        if np.array_equal(clean, found.codes):
+        codes = remover.remove(found)[0]
+        if np.array_equal(codes, found.codes):
             kept += 1
             values.append(100.0)
             continue
-        values.append(psnr(clean / found.top, found.codes / found.top))
+        values.append(psnr(codes / found.top, found.codes / found.top))
     print(f"{len(values)} pictures, {kept} kept to the last bit; PSNR against the input: median "
           f"{np.median(values):.2f}, mean with 100 for the kept {np.mean(values):.2f}, 5 % below "
           f"{np.percentile(values, 5):.2f}, lowest {min(values):.2f} dB; {np.mean(np.array(values) >= 45):.0%} at 45 "
           "dB or more")
 
 
-def scenes(folders: list[Path], weights: Path | None, count: int) -> None:
+def scenes(folders: list[Path], weights: Path | None = None, count: int = 64) -> None:
     """What happens to held-out scenes without flare."""
     from core.removal.backgrounds import read_backgrounds
     from core.removal.bank import OneFlare
@@ -199,7 +202,7 @@ AGAINST = ("scatter", "ghosts", "streak", "glare", "mixed")
 """Classes of flares that have a light in the frame."""
 
 
-def against(folders: list[Path], lenses: Path | None, weights: Path | None, count: int) -> None:
+def against(folders: list[Path], lenses: Path | None = None, weights: Path | None = None, count: int = 20) -> None:
     """What removal gains where lights stand in a bright part of the scene, and where they stand anywhere."""
     from core.removal.bank import OneFlare
     from core.removal.evaluation import CANVAS
@@ -211,10 +214,11 @@ def against(folders: list[Path], lenses: Path | None, weights: Path | None, coun
                                    for seed, kind in seeds])
 
 
-def coloured(folders: list[Path], lenses: Path | None, weights: Path | None, count: int) -> None:
+def coloured(folders: list[Path], lenses: Path | None = None, weights: Path | None = None, count: int = 20) -> None:
     """What removal gains of flares whose lights have one colour, and of the same of white lights."""
-    from core.removal.bank import WHITE, OneFlare, one_colour
+    from core.removal.bank import OneFlare, one_colour
     from core.removal.evaluation import CANVAS
+    from core.removal.pairs import WHITE
     from core.removal.synthesis.layers import CLASSES
 
     remover, backgrounds, unseen = Remover(weights), _held_out(folders), _unseen(lenses)
@@ -245,7 +249,7 @@ class _Moulded:
         return Layers(ghosts, np.zeros_like(ghosts), made.light, made.lights)
 
 
-def aspheric(folders: list[Path], weights: Path | None, count: int) -> None:
+def aspheric(folders: list[Path], weights: Path | None = None, count: int = 64) -> None:
     """What removal gains of the ghosts of moulded lenses, of lights that have no other flare."""
     remover, backgrounds = Remover(weights), _held_out(folders)
     seeds = [(1005, number) for number in range(count)]
@@ -276,7 +280,7 @@ def _tell_gains(name: str, gains: Any) -> None:
           f"{len(gains)}")
 
 
-def matte(folders: list[Path], lenses: Path | None, weights: Path | None, count: int) -> None:
+def matte(folders: list[Path], lenses: Path | None = None, weights: Path | None = None, count: int = 20) -> None:
     """What removal gains with a rough matte of the flare, and without."""
     from core.removal.evaluation import synthetic
     from core.removal.plates import Plate
@@ -302,7 +306,7 @@ def _roughed_in(frame: Any, truth: Any) -> Any:
     return cv2.blur(wide.astype(np.float32), (reach // 2, reach // 2))
 
 
-def coverage(sheet: Path | None, count: int) -> None:
+def coverage(sheet: Path | None = None, count: int = 400) -> None:
     """A histogram of the coverage of synthesised flares, as text, and a sheet of pictures."""
     from core.removal.formation import coverage as covered
     from core.removal.synthesis.layers import CLASSES, flare, through_aspheres
@@ -325,40 +329,33 @@ def coverage(sheet: Path | None, count: int) -> None:
         cv2.imwrite(str(sheet), picture, [cv2.IMWRITE_JPEG_QUALITY, 88])
 
 
+WORDS: dict[str, dict[str, Any]] = {
+    "folders": {"type": Path, "nargs": "+", "metavar": "PHOTOS"},
+    "plate": {"type": Path},
+    "--capture": {"type": Path, "metavar": "CAPTURE"},
+    "--cleaned": {"type": Path, "metavar": "FOLDER", "help": "frames that were cleaned before, as by remove --run"},
+    "--weights": {"type": Path, "metavar": "FILE", "help": "others than those in the box"},
+    "--lenses": {"type": Path, "metavar": "FOLDER", "help": "prescriptions; without, those that come along"},
+    "--sheet": {"type": Path, "metavar": "FILE", "help": "a picture of it"},
+    "--count": {"type": int, "help": "pictures, or pictures of every class"},
+    "--size": {"type": int, "help": "the network's, in pixels"},
+}
+"""What can be said of the parameters of a benchmark on the command line."""
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("speed", "sample", "clean", "scenes", "against", "coloured", "aspheric",
-                                         "matte", "coverage", "one"))
-    parser.add_argument("paths", type=Path, nargs="*")
-    parser.add_argument("--capture", type=Path, default=ROOT / "sample_scenes" / "desk")
-    parser.add_argument("--cleaned", type=Path)
-    parser.add_argument("--weights", type=Path)
-    parser.add_argument("--size", type=int, default=WORKING_SIZE)
-    parser.add_argument("--lenses", type=Path)
-    parser.add_argument("--sheet", type=Path)
-    parser.add_argument("--count", type=int, help="pictures: of each class for matte, against and coloured (20), "
-                                                  "of scenes and aspheric (64), of coverage (400)")
-    words = parser.parse_args()
-    if words.what == "one":
-        one(words.paths[0], words.size, words.weights)
-    elif words.what == "speed":
-        speed(words.weights)
-    elif words.what == "sample":
-        sample(words.capture, words.weights, words.cleaned, words.sheet)
-    elif words.what == "clean":
-        clean_pictures(words.paths, words.weights)
-    elif words.what == "scenes":
-        scenes(words.paths, words.weights, words.count or 64)
-    elif words.what == "against":
-        against(words.paths, words.lenses, words.weights, words.count or 20)
-    elif words.what == "coloured":
-        coloured(words.paths, words.lenses, words.weights, words.count or 20)
-    elif words.what == "aspheric":
-        aspheric(words.paths, words.weights, words.count or 64)
-    elif words.what == "matte":
-        matte(words.paths, words.lenses, words.weights, words.count or 20)
-    else:
-        coverage(words.sheet, words.count or 400)
+    names = parser.add_subparsers(required=True, metavar="BENCHMARK")
+    for benchmark in (speed, one, sample, clean, scenes, matte, against, coloured, aspheric, coverage):
+        words = names.add_parser(benchmark.__name__, help=inspect.getdoc(benchmark))
+        words.set_defaults(benchmark=benchmark)
+        for name, parameter in inspect.signature(benchmark).parameters.items():
+            if parameter.default is parameter.empty:
+                words.add_argument(name, **WORDS[name])
+            else:
+                words.add_argument(f"--{name}", default=parameter.default, **WORDS[f"--{name}"])
+    given = vars(parser.parse_args())
+    given.pop("benchmark")(**given)
 
 
 if __name__ == "__main__":

@@ -59,7 +59,7 @@ class Batches(Dataset[Batch]):
         self._made.renew_to(self._recipe.bank + iteration // self._recipe.renew_every)
         random = np.random.default_rng((self._recipe.seed, iteration, number + 1))  # to numpy, (1, 2) is (1, 2, 0)
         one = pair(random, self._bank, self._backgrounds, width, height, clean=self._recipe.clean,
-                   against_light=self._recipe.against_light)
+                   against_light=self._recipe.against_light, shoulder=self._recipe.shoulder)
         return of_one_channel(one, int(random.integers(3))) if random.random() < self._recipe.grey else one
 
 

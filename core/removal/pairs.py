@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ..pictures import Pixels
 from .backgrounds import Backgrounds
-from .formation import GAMMAS, display
+from .formation import GAMMAS, display, under_shoulder
 
 Random = np.random.Generator
 WHITE: NDArray[np.float32] = np.ones(3, np.float32)
@@ -50,9 +50,10 @@ class Pair:
 
 
 def pair(random: Random, bank: Bank, backgrounds: Backgrounds, width: int, height: int, *,
-         clean: float = 0.08, against_light: float = 0.0) -> Pair:
+         clean: float = 0.08, against_light: float = 0.0, shoulder: float = 0.0) -> Pair:
     """One frame of that size; a share `clean` of all has no flare. In a share `against_light` the lights are where
-    the scene is bright, as a sun is in its sky; in the others anywhere."""
+    the scene is bright, as a sun is in its sky; in the others anywhere. A share `shoulder` are of cameras whose curves
+    bend towards white."""
     gamma = float(random.uniform(*GAMMAS))
     scene = _exposed(random, backgrounds.draw(random, width, height, gamma))
     rest, glare, light = (np.zeros_like(scene) for _ in range(3))
@@ -74,7 +75,12 @@ def pair(random: Random, bank: Bank, backgrounds: Backgrounds, width: int, heigh
     if random.random() < 0.5:  # of the sensor; the same in both pictures, since removal is no denoising
         grain = np.sqrt(np.maximum(scene, 0) * 0.002 + 1e-5).astype(np.float32) * random.chisquare(1) * 0.3
         scene = np.maximum(scene + grain * random.standard_normal(scene.shape, np.float32), 0)
-    shown = [display(linear, gamma) for linear in (scene + rest + glare, scene, scene + glare)]
+    if shoulder > 0 and random.random() < shoulder:
+        bend = float(random.uniform(0.3, 1))
+        formed = [under_shoulder(scene, rest + glare, bend), scene, under_shoulder(scene, glare, bend)]
+    else:
+        formed = [scene + rest + glare, scene, scene + glare]
+    shown = [display(linear, gamma) for linear in formed]
     if random.random() < 0.35:
         shown = _developed(random, shown)
     frame, clear, gentle = shown

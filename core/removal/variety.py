@@ -39,6 +39,8 @@ def varied(random: Random, film: Film, width: int, height: int) -> Pixels:
     if random.random() < 0.4:
         scene = _graded(random, scene)
     if random.random() < 0.15:
+        scene = _hazy(random, scene)
+    if random.random() < 0.15:
         scene = _with_bright_things(random, scene)
     return scene
 
@@ -167,6 +169,32 @@ def _joined(random: Random, scene: Pixels, other: Pixels) -> Pixels:
     beside = (x * np.float32(math.cos(angle)) + y * np.float32(math.sin(angle)) - random.uniform(-0.7, 0.7)) / soft
     of_other = (1 / (1 + np.exp(-np.clip(beside, -30, 30)))).astype(np.float32)[..., None]
     return _mixed(scene, other, of_other)
+
+
+def _hazy(random: Random, scene: Pixels) -> Pixels:
+    """Under haze of its own, lit by a low sun in half of them: bright and soft as a veil of flare, but behind what is
+    near. How far a place is, is guessed: farther up to a horizon, and where it is bright, with the edges of the picture
+    (Koschmieder's law; He, Sun and Tang 2009, "Single image haze removal using dark channel prior", take it out so)."""
+    import cv2
+
+    height, width = scene.shape[:2]
+    across = math.hypot(width, height)
+    grey = np.log(scene.mean(-1) + np.float32(0.01))
+    grey = (grey - grey.mean()) / max(float(grey.std()), 1e-2)
+    x, y = np.meshgrid(np.arange(width, dtype=np.float32) - random.uniform(-0.3, 1.3) * width,
+                       np.arange(height, dtype=np.float32) - random.uniform(0, 0.7) * height)
+    up = np.float32(random.uniform(0.5, 4)) * np.minimum(-y / height, 0)
+    distance = cv2.ximgproc.guidedFilter(grey, up + grey, max(round(across * uniform_log(random, 0.01, 0.05)), 2), 0.02)
+    distance -= np.quantile(distance, random.uniform(0.15, 0.5))
+    thick = uniform_log(random, 0.4, 4) / max(float(distance.max()), 1e-3)
+    hidden = 1 - np.exp(-np.maximum(distance, 0) * np.float32(thick))[..., None]
+    colour = np.exp(random.normal(0, 0.12, 3)).astype(np.float32)
+    air = np.float32(np.quantile(scene.mean(-1), 0.9) * uniform_log(random, 0.5, 1.5)) * colour
+    if random.random() < 0.5:
+        warm = np.exp(random.normal((0.2, 0, -0.3), 0.2)).astype(np.float32)
+        near_sun = np.exp(-np.hypot(x, y) / np.float32(across * uniform_log(random, 0.15, 0.8)))[..., None]
+        air = air * (1 + near_sun * warm * np.float32(uniform_log(random, 0.5, 6)))
+    return _mixed(scene, air, hidden)
 
 
 def _with_bright_things(random: Random, scene: Pixels) -> Pixels:

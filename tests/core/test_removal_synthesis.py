@@ -38,6 +38,30 @@ def test_flare_adds_in_light() -> None:
     assert formation.display(scene**1.8, 1.8) == pytest.approx(0.5, abs=1e-6)
 
 
+def test_a_flare_adds_less_to_what_a_bent_curve_shows_brighter() -> None:
+    random = np.random.default_rng(1)
+    scene, glow = (random.random((4, 5, 3)).astype(np.float32) * reach for reach in (0.95, 2))
+    for shoulder in (0.3, 0.7, 1.0):
+        light = -np.log(1 - shoulder * scene) / shoulder
+        expected = (1 - np.exp(-shoulder * (light + glow))) / shoulder
+        assert formation.under_shoulder(scene, glow, shoulder) == pytest.approx(expected, abs=1e-5)
+    assert formation.under_shoulder(scene, glow * 0, 0.5) == pytest.approx(scene)
+    assert formation.under_shoulder(scene, glow, 1e-3) == pytest.approx(scene + glow, abs=0.01), "hardly bent"
+
+
+def test_some_pairs_are_of_cameras_with_bent_curves() -> None:
+    bright = Backgrounds([np.full((120, 160, 3), 200, np.uint8)], [])
+    added: list[list[float]] = []
+    for seed in range(12):
+        made = Single(flare((2, seed), 128, lenses.built_in(), "glare"))
+        both = [pairs.pair(np.random.default_rng(seed), made, bright, 96, 64, clean=0, shoulder=share)
+                for share in (0, 1)]
+        added.append([float((one.frame - one.scene).mean()) for one in both])
+        assert all((one.frame - one.scene).min() > -0.1 for one in both), "no darker, but for JPEG"
+    straight, bent = np.mean(added, 0)
+    assert 0 < bent < 0.8 * straight
+
+
 def test_coverage_is_the_share_of_the_frame_that_holds_the_energy() -> None:
     layer = np.zeros((10, 10, 3), np.float32)
     assert formation.coverage(layer) == 0
@@ -385,6 +409,19 @@ def test_some_backgrounds_hold_bright_things_that_are_no_flare() -> None:
     bright = [one for one in drawn if one.max() > 4 * np.median(one)]
     assert 0.05 < len(bright) / len(drawn) < 0.2
     assert all(np.isfinite(one).all() and one.min() >= 0 for one in drawn)
+
+
+def test_haze_lies_behind_what_is_near() -> None:
+    random = np.random.default_rng(3)
+    scene = (0.3 + 0.2 * random.random((80, 120, 3))).astype(np.float32)
+    scene[50:, 20:70] = 0.01 * random.random((30, 50, 3))  # someone in front of it, against the light
+    hidden = []
+    for seed in range(30):
+        hazy = variety._hazy(np.random.default_rng(seed), scene)
+        near, far = hazy[54:, 24:66], hazy[:30]
+        assert np.abs(near - scene[54:, 24:66]).max() < 0.01, "no veil over it"
+        hidden.append(1 - float(np.abs(np.diff(far, axis=1)).mean() / np.abs(np.diff(scene[:30], axis=1)).mean()))
+    assert np.mean(hidden) > 0.2, "of what is far away less is seen"
 
 
 def test_a_light_out_of_focus_is_a_disc_or_a_polygon_of_as_much_light() -> None:

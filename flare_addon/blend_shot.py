@@ -14,6 +14,7 @@ from typing import Any
 import bpy
 import numpy as np
 
+from ..core.capture import LIGHTS
 from ..core.errors import CaptureError
 from ..core.files import write_json
 from ..core.look.shot import PlacedLight, Shot, ShotFrame
@@ -104,7 +105,7 @@ def capture_of(scene: Any, plates: Mapping[int, Path], folder: Path, names: Sequ
     entries = capture_export.write_frames(scene, None, plates, folder, done)
     if things:
         eye, depsgraph = scene.camera.matrix_world.translation, bpy.context.evaluated_depsgraph_get()
-        write_json(folder / "lights.json", {"lights": [
+        write_json(folder / LIGHTS, {"lights": [
             {"name": thing.name, "xyz": list(map(float, lights.stands(thing, matrix_of(thing, depsgraph), eye)))}
             for thing in things]})
     capture_export.write_cameras(folder, entries)

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.bake.frames import numbered
-from ..core.capture import Capture, PointCloud, Twins, View
+from ..core.capture import REMOVED, Capture, PointCloud, Twins, View
 from ..core.capture.camera import Camera, quaternion_from_rotation
 from ..core.errors import CaptureError
 from . import cameras, curves
@@ -270,7 +270,7 @@ def show_footage(scene: Any, which: str) -> int:
             if back.image is None:
                 continue
             path = absolute(back.image.filepath, back.image.library).resolve()
-            inner = next((path.relative_to((base / name).resolve()) for name in ("images", "removed")
+            inner = next((path.relative_to((base / name).resolve()) for name in ("images", REMOVED)
                           if path.is_relative_to((base / name).resolve())), None)
             if inner is None:
                 continue

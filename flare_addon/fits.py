@@ -9,7 +9,7 @@ from typing import Any
 import bpy
 
 from ..core import exposures
-from ..core.capture.capture import REMOVED
+from ..core.capture import REMOVED
 from ..core.errors import CaptureError, FitFlareError, RunError
 from ..core.look import Look, read
 from . import engine, jobs, lights, looks

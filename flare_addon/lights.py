@@ -11,7 +11,7 @@ import numpy as np
 from mathutils import Vector
 from numpy.typing import ArrayLike
 
-from ..core.capture import read_lights
+from ..core.capture import LIGHTS, read_lights
 from ..core.errors import CaptureError
 from ..core.files import named_by, read_json, rounded, write_json
 from . import cameras
@@ -114,7 +114,7 @@ def write(scene: Any, folder: Path) -> int:
     if len(set(names)) < len(names):
         twice = next(name for name in names if names.count(name) > 1)
         raise CaptureError(f"Two lights have the name {twice!r}; rename one in the panel Lights.")
-    path = folder / "lights.json"
+    path = folder / LIGHTS
     data: dict[str, Any] = read_json(path, CaptureError) if path.is_file() else {}
     known = {entry.get("name"): entry for entry in data.get("lights", []) if isinstance(entry, dict)}
     eye = scene.camera.matrix_world.translation if scene.camera is not None else objects[0].matrix_world.translation
@@ -136,7 +136,7 @@ def remember(scene: Any) -> None:
     names = {*state.known_lights.split("\n"), *map(name_of, of_scene(scene))} - {""}
     if not state.is_property_set("known_lights") and state.capture:  # a .blend of the version before: it had them all
         with contextlib.suppress(CaptureError):
-            names |= {light.name for light in read_lights(absolute(state.capture, scene.library) / "lights.json")}
+            names |= {light.name for light in read_lights(absolute(state.capture, scene.library) / LIGHTS)}
     state.known_lights = "\n".join(sorted(names))
 
 
@@ -145,7 +145,7 @@ def unknown(scene: Any, folder: Path) -> list[str]:
     .blend was closed, or by a command. None where a .blend of the version before says nothing of those it had."""
     if not scene.fit_flare.is_property_set("known_lights"):
         return []
-    found = _names_in(folder / "lights.json")
+    found = _names_in(folder / LIGHTS)
     had = {*scene.fit_flare.known_lights.split("\n"), *map(name_of, of_scene(scene))} if found else set()
     return [name for name in found if name not in had]
 
@@ -168,7 +168,7 @@ def bring_in(scene: Any, folder: Path) -> int:
     many. Those that are there stay where they are, which may be elsewhere by now. Raises CaptureError."""
     there = of_scene(scene)
     wanted = set(unknown(scene, folder)) if there else None
-    found = [light for light in read_lights(folder / "lights.json") if wanted is None or light.name in wanted]
+    found = [light for light in read_lights(folder / LIGHTS) if wanted is None or light.name in wanted]
     root = scene.fit_flare.root
     collection = root.users_collection[0] if root is not None and root.users_collection else scene.collection
     size = max((item.empty_display_size for item in there if item.type == "EMPTY"), default=0.2)
@@ -187,7 +187,7 @@ def _put(light: Any, xyz: ArrayLike) -> None:
 def follow(scene: Any, places: Mapping[str, ArrayLike], capture: Path | None) -> None:
     """Move lights to where a fit has put them (3,), by name, in the capture's coordinates: those that still are where
     the fit was given them, as the capture's lights.json has it, and that nothing else moves."""
-    path = None if capture is None else capture / "lights.json"
+    path = None if capture is None else capture / LIGHTS
     given = {} if path is None or not path.is_file() else {light.name: light.xyz for light in read_lights(path)}
     view_layer_of(scene).update()  # Blender has not looked at one that no window shows since the file was opened
     for item in of_scene(scene):

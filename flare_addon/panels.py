@@ -9,6 +9,7 @@ from typing import Any
 
 import bpy
 
+from ..core.capture import REMOVED
 from ..core.errors import FitFlareError
 from . import engine, fits, flare_node, jobs, library, lights, looks, overlay, shots, wires
 from .layouts import draw_progress, lines
@@ -128,7 +129,7 @@ def _cleaning(layout: Any, state: Any, capture: Any, stage: str) -> None:
         return
     if job is not None and job.state in ("failed", "stopped"):
         lines(layout, job.error, "ERROR" if job.state == "failed" else "INFO")
-    there = (capture / "removed").is_dir() and (job is None or job.state == "done")
+    there = (capture / REMOVED).is_dir() and (job is None or job.state == "done")
     by_network = stage != "finished" and (not there or job is not None)
     if not there:
         lines(layout, "The fit can take its flare out of the frames." if stage == "finished" else

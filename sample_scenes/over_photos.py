@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from core.capture import Capture
+from core.capture import LIGHTS, Capture
 from core.capture.colmap import Observed, write_model
 from core.capture.lens import Lens
 from core.files import write_json
@@ -52,7 +52,7 @@ def add_flares(capture: Capture, out: Path, look: Look, light: NDArray[np.float6
             write_png(clean, photo)
             write_png(frame, srgb_from_linear(np.clip(linear_from_srgb(photo) + flare, 0, 1)))
         progress.advance()
-    write_json(out / "lights.json", {"lights": [{"name": "light", "xyz": light.tolist()}]})
+    write_json(out / LIGHTS, {"lights": [{"name": "light", "xyz": light.tolist()}]})
     _write_model(capture, out / "sparse" / "0", width)
 
 

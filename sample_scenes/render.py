@@ -15,6 +15,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from core.capture import LIGHTS
 from core.errors import CaptureError
 from core.files import read_json, write_json
 from core.pictures import read_picture
@@ -77,7 +78,7 @@ def add_flares(scene: SceneDescription, out: Path, progress: Progress) -> None:
 
 def write_lists(scene: SceneDescription, out: Path) -> None:
     """lights.json and split.json."""
-    write_json(out / "lights.json", {"lights": [
+    write_json(out / LIGHTS, {"lights": [
         {"name": light.name, "xyz": list(light.xyz), "radius": light.radius, "colour": list(light.colour)}
         for light in scene.lights]})
     test = sorted(set(scene.stems[4::8]) | {f"{number:04d}" for number in scene.test})

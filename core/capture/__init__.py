@@ -7,8 +7,8 @@ OpenEXR, imported when the first one is asked for.
 from __future__ import annotations
 
 from .camera import Camera
-from .capture import Capture, Light, Twins, View, read_lights
+from .capture import LIGHTS, REMOVED, Capture, Light, Twins, View, read_lights
 from .colmap import PointCloud
 from .lens import Lens
 
-__all__ = ["Camera", "Capture", "Lens", "Light", "PointCloud", "Twins", "View", "read_lights"]
+__all__ = ["LIGHTS", "REMOVED", "Camera", "Capture", "Lens", "Light", "PointCloud", "Twins", "View", "read_lights"]

@@ -34,8 +34,8 @@ from .lens import PINHOLES, Lens, straightened
 from .transforms import FILE as TRANSFORMS
 from .transforms import read_transforms
 
-REMOVED = "removed"
-"""The folder of a capture that has its flare-free frames."""
+LIGHTS, REMOVED = "lights.json", "removed"
+"""Of a capture's folder: its lights, and the folder of its flare-free frames."""
 HOLDOUT = 8  # every 8th view is held out where nothing else is said, as 3DGS and mip-NeRF 360 do
 
 
@@ -102,7 +102,7 @@ class Capture:
                 raise CaptureError(f"{folder}: the frame {name} has two poses; remove one of them.")
             views.append(_view(name, frame, size))
             frames[name] = path
-        capture = cls(folder, views, points, read_lights(folder / "lights.json"), frames=frames,
+        capture = cls(folder, views, points, read_lights(folder / LIGHTS), frames=frames,
                       cache_bytes=cache_bytes)
         if need_frames:
             capture._check_layers()

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import torch
 
-from ..capture import Capture, View
+from ..capture import LIGHTS, Capture, View
 from ..errors import CaptureError
 from ..flare.deformation import QueryRange
 from ..flare.model import FlareModel, LightFlare, ViewOfLight
@@ -66,8 +66,8 @@ def _scene(capture: Capture, settings: FitSettings, views: tuple[View, ...], fra
 def first_flare(capture: Capture, views: tuple[View, ...], frames: Frames, settings: FitSettings) -> FlareModel:
     """The flares a fit begins with. Raises CaptureError where there are no lights, or one is behind all cameras."""
     if not capture.lights:
-        there = (capture.folder / "lights.json").exists()
-        raise CaptureError(f"{capture.folder / 'lights.json'} lists no light; add one by hand, or fit with --mode 3dgs."
+        there = (capture.folder / LIGHTS).exists()
+        raise CaptureError(f"{capture.folder / LIGHTS} lists no light; add one by hand, or fit with --mode 3dgs."
                            if there else
                            f"{capture.folder} has no lights.json; run lights on it first, or fit with --mode 3dgs.")
     generator = torch.Generator().manual_seed(settings.seed)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..capture import Capture, View
+from ..capture import LIGHTS, Capture, View
 from ..errors import RunError
 from ..files import content_of
 
@@ -38,7 +38,7 @@ class Given:
         now = self.note()
         if "lights" in now and noted.get("lights") is not None and (
                 changed := _difference(noted["lights"], now["lights"], SAME_PLACE * self._capture.extent)):
-            raise RunError(f"{self._capture.folder / 'lights.json'} has changed since the fit began ({changed}); put "
+            raise RunError(f"{self._capture.folder / LIGHTS} has changed since the fit began ({changed}); put "
                            "the old one back, or begin the fit anew in another folder.")
         before, after = dict(noted.get("views") or []), dict(now["views"])
         if before and (others := [name for name in {**before, **after} if before.get(name) != after.get(name)]):

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..capture import Capture
+from ..capture import LIGHTS, Capture
 from ..errors import SettingsError
 from ..files import write_json
 from ..progress import Progress
@@ -89,7 +89,7 @@ def record(capture: Capture, findings: Findings, keep: bool = False) -> dict[str
     from .overlay import write_sheets
 
     views = [(view.name, view.camera) for view in capture.views]
-    entries = write_lights(capture.folder / "lights.json", findings.lights, views, keep)
+    entries = write_lights(capture.folder / LIGHTS, findings.lights, views, keep)
     named = [(str(entry["name"]), _shown(entry, findings.lights)) for entry in entries]
     sheets = write_sheets(capture.folder / SHEETS, capture, findings.detections, named)
     report = {

@@ -5,8 +5,7 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
-from ..capture import Capture
-from ..capture.capture import REMOVED
+from ..capture import REMOVED, Capture
 from ..errors import CaptureError
 from ..files import inside, patiently
 from ..progress import Progress

@@ -9,14 +9,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
-from ...core.capture.capture import REMOVED
+from ...core.capture import LIGHTS, REMOVED
 from ...core.choices import OUR_PRESETS, Mode, Model
 from ...core.errors import CaptureError, RunError
 from ...core.files import atomic_folder
 from ...core.progress import Progress
 from ..command import Command, Step
 from . import compose, evaluate, fit
-from .lights import LIGHTS, with_lights
+from .lights import with_lights
 from .remove import with_removed
 
 if TYPE_CHECKING:

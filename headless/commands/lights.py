@@ -7,6 +7,7 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ...core.capture import LIGHTS
 from ...core.errors import CaptureError, SettingsError
 from ...core.progress import Progress
 from ..command import Command, Step, seed
@@ -17,7 +18,6 @@ if TYPE_CHECKING:
     from ...core.lights.detection import Detector
 
 METHODS = ("exposure", "grounded")
-LIGHTS = "lights.json"
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:

@@ -24,6 +24,7 @@ from ...errors import CaptureError, SettingsError
 from ...files import read_json, remove_file, write_json
 from ...pictures import pictures_in
 from ...progress import Progress
+from ..capture import LIGHTS, REMOVED
 from ..lens import MODELS
 
 REPORT, PICTURE, WORK, ASKED = "solve.json", "solve.png", ".solve", "request.json"
@@ -137,7 +138,7 @@ def _claim(source: Path, out: Path, request: dict[str, Any], progress: Progress)
         if report.get("request") == request:
             progress.say(f"{out} is solved already.")
             return dict(report)
-        belongs = [name for name in ("lights.json", "removed", "split.json", "truth") if (out / name).exists()]
+        belongs = [name for name in (LIGHTS, REMOVED, "split.json", "truth") if (out / name).exists()]
         if belongs:
             raise CaptureError(f"{out} holds {' and '.join(belongs)} of an earlier solve, which fit no other; choose "
                                "another folder for the capture, or remove them.")

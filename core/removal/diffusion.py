@@ -29,6 +29,7 @@ from ..pictures import Pixels
 from ..progress import Progress
 from . import weights
 from .inference import WORKING_SIZE, Remover, described
+from .views import Views, told_once
 
 PROMPT = "remove flares and keep the original image. High quality. Retain original colors"
 STEP = 199
@@ -204,11 +205,11 @@ class DiffusionRemover(Remover):
         self.described = described("diffusion", lora, str(base), working_size)
 
     @torch.inference_mode()
-    def added(self, display: Pixels) -> Pixels:
-        """What a flare adds to display values whose sides are multiples of MULTIPLE."""
+    def views(self, display: Pixels) -> Views:
+        """Of display values whose sides are multiples of MULTIPLE, which the model is shown once."""
         frame = torch.from_numpy(np.ascontiguousarray(display.transpose(2, 0, 1)))[None]
         added = (frame - self.model(frame).clamp(0, 1)).clamp(min=0)
-        return np.ascontiguousarray(added[0].permute(1, 2, 0).numpy())
+        return told_once(np.ascontiguousarray(added[0].permute(1, 2, 0).numpy()))
 
 
 def train_diffusion(model: DiffusionRemoval, folder: Path | str, draw: Callable[[int], tuple[Pixels, Pixels]],

@@ -26,7 +26,7 @@ from . import formation
 from .formation import GAMMA, flare_light
 from .network import MULTIPLE, RemovalNetwork
 from .plates import Plate, finite
-from .views import told_in_views, trusted
+from .views import Views, believed, doubt_of, told_in_views, trusted
 from .weights import IN_THE_BOX, load
 
 WORKING_SIZE = 480
@@ -60,8 +60,8 @@ class FlareMap:
 
 
 class Told(NamedTuple):
-    """Of a plate the display values 0..1 that the network was shown (h, w, 3), and what a flare adds to them as it
-    told, not yet doubted."""
+    """Of a plate the display values 0..1 that the network was shown (h, w, 3), and what a flare adds to them as far
+    as its views are believed."""
 
     display: Pixels
     added: Pixels
@@ -92,7 +92,7 @@ class Remover:
         is known that there is one, so little of it counts too as would be doubted otherwise. told: of the plate, where
         that is known already (`steady.Sequences`).
         """
-        told = told or self.tell(self.shown(plate))
+        told = told or self.told(self.shown(plate))
         found = _carrier(told.display, self.flare(told, marked=matte is not None))
         codes = plate.codes.copy()
         flare = np.zeros(plate.codes.shape, np.float16)
@@ -112,12 +112,13 @@ class Remover:
         clean = self.remove(Plate(Path("display.png"), codes, "srgb"))[0]
         return np.where(clean == codes, display, clean.astype(np.float32) / 65535)
 
-    def tell(self, display: Pixels) -> Told:
-        """What the network tells of what it is `shown`."""
-        return Told(display, self.added(display))
+    def told(self, display: Pixels) -> Told:
+        """Of what the network is `shown` of a plate by itself."""
+        views = self.views(display)
+        return Told(display, believed(views, doubt_of([(views, 1)])))
 
-    def added(self, display: Pixels) -> Pixels:
-        """What a flare adds to display values 0..1 (h, w, 3), h and w multiples of MULTIPLE."""
+    def views(self, display: Pixels) -> Views:
+        """What the network tells of display values 0..1 (h, w, 3), h and w multiples of MULTIPLE."""
         return told_in_views(display, self._told)
 
     @torch.inference_mode()

@@ -8,7 +8,8 @@ weighted by how alike their blurs look there: a joint bilateral filter (Petschni
 Photography with Flash and No-Flash Image Pairs") over time. Where a light comes out from behind something, nothing is
 alike, and that place is left as it was told. Places of one colour are alike anywhere, a black sky in two photographs
 say: so frames count for each other only as far as their details lie alike, which ends at a cut, and a folder of single
-photographs is no sequence.
+photographs is no sequence. How far the network is believed (`views`) is one for the frames about a place in a shot,
+too: where its views agree on most of them, a flare does not go out on the others.
 """
 from __future__ import annotations
 
@@ -22,6 +23,7 @@ import numpy as np
 from ..pictures import Pixels
 from .inference import Remover, Told
 from .plates import Plate, is_of_the_plate, read_plate
+from .views import Views, believed, doubt_of
 
 REACH = 4
 """Frames to either side that count."""
@@ -47,12 +49,11 @@ class Guide(NamedTuple):
     detail: Pixels
 
 
-class Calm(NamedTuple):
-    """A frame's guide, what was told of it, and the same blurred."""
+class Frame(NamedTuple):
+    """A frame's guide, and what was told of it."""
 
     guide: Guide
-    told: Told
-    added: Pixels
+    views: Views
 
 
 def guide(display: Pixels) -> Guide:
@@ -66,28 +67,25 @@ def guide(display: Pixels) -> Guide:
     return Guide(display, blurred, detail)
 
 
-def calm(told: Told, its: Guide | None = None) -> Calm:
-    """its: the frame's guide, where it is there already."""
-    return Calm(its or guide(told.display), told, _blurred(told.added))
-
-
 def _blurred(values: Pixels) -> Pixels:
     import cv2
 
     return np.asarray(cv2.GaussianBlur(values, (0, 0), BLUR * max(values.shape[:2])), np.float32)
 
 
-def steadied(here: Calm, about: Iterable[Calm]) -> Told:
+def steadied(here: Frame, about: Iterable[Frame]) -> Told:
     """What was told of `here`, in line with the frames about it; those of another shape or shot are passed over."""
-    total, weights = here.added, np.ones((*here.added.shape[:2], 1), np.float32)
-    for other in about:
-        share = _of_one_shot(here.guide, other.guide)
-        if share > 0:
-            apart = np.square(other.guide.blurred - here.guide.blurred).mean(-1, keepdims=True)
-            weight = share * np.exp(-apart / np.float32(ALIKE**2))
-            total, weights = total + weight * other.added, weights + weight
+    shot = [(other, share) for other in about if (share := _of_one_shot(here.guide, other.guide)) > 0]
+    doubt = doubt_of([(here.views, 1), *((other.views, float(share)) for other, share in shot)])
+    added = believed(here.views, doubt)
+    blurred = _blurred(added)
+    total, weights = blurred, np.ones((*added.shape[:2], 1), np.float32)
+    for other, share in shot:
+        apart = np.square(other.guide.blurred - here.guide.blurred).mean(-1, keepdims=True)
+        weight = share * np.exp(-apart / np.float32(ALIKE**2))
+        total, weights = total + weight * _blurred(believed(other.views, doubt)), weights + weight
     # In this order, so that without neighbours it is what was told to the last bit.
-    return Told(here.told.display, np.maximum(here.told.added + (total / weights - here.added), 0))
+    return Told(here.guide.display, np.maximum(added + (total / weights - blurred), 0))
 
 
 def _of_one_shot(one: Guide, other: Guide) -> np.float32:
@@ -114,7 +112,7 @@ class Sequences:
             for at, path in enumerate(those):
                 self._beside[path] = those[max(at - REACH, 0):at] + those[at + 1:at + 1 + REACH]
         self._guides: dict[Path, Guide | None] = {}
-        self._told: dict[Path, Calm] = {}
+        self._frames: dict[Path, Frame] = {}
 
     def beside(self, path: Path) -> Sequence[Path]:
         """The neighbours that count for a plate, in their order."""
@@ -131,7 +129,7 @@ class Sequences:
         about = {other: self._guide_of(other) for other in self.beside(path)}
         plate = read_plate(path)
         own = self._guides[path] = self._guides.get(path) or self._guide(plate)
-        return plate, steadied(self._calm(path, own), [self._calm(other, its) for other, its in about.items()
+        return plate, steadied(self._frame(path, own), [self._frame(other, its) for other, its in about.items()
                                                        if its is not None and _of_one_shot(own, its) > 0])
 
     def _guide(self, plate: Plate) -> Guide:
@@ -148,14 +146,14 @@ class Sequences:
                 self._guides[path] = None
         return self._guides[path]
 
-    def _calm(self, path: Path, its: Guide) -> Calm:
-        if path not in self._told:
-            self._told[path] = calm(self._remover.tell(its.display), its)
-        return self._told[path]
+    def _frame(self, path: Path, its: Guide) -> Frame:
+        if path not in self._frames:
+            self._frames[path] = Frame(its, self._remover.views(its.display))
+        return self._frames[path]
 
     def _forget_all_but(self, paths: Sequence[Path]) -> None:
         self._guides = {path: self._guides[path] for path in paths if path in self._guides}
-        self._told = {path: self._told[path] for path in paths if path in self._told}
+        self._frames = {path: self._frames[path] for path in paths if path in self._frames}
 
 
 def by_number(path: Path) -> list[tuple[int, str]]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What a network tells of a frame in several views, as one: the less they agree, the less of it counts.
+"""What a network tells of a frame in several views, and what is believed of it: the less they agree, the less.
 
 A flare is one in every view; what is taken for one in some alone seldom is. So the frame is shown upright and upside
 down, in two sizes. In the dark each channel is shown alone too, as a grey picture: the glow of a traffic light is
@@ -10,6 +10,7 @@ with another colour than it came with.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -40,14 +41,48 @@ ALONE_SURE = 0.004
 """
 
 
-def told_in_views(display: Pixels, tell: Tell) -> Pixels:
-    """What a flare adds to display values 0..1 (h, w, 3), h and w multiples of MULTIPLE."""
-    told = _agreed([_in_view(tell, display, size, turns) for size in SIZES for turns in TURNS], APART)
+class Views(NamedTuple):
+    """What a flare adds to a frame's display values as several views of it tell, each (h, w, 3): in the mean, and how
+    far the views are apart from that (standard deviation); what the channels tell alone, and how far, 0..1, that
+    counts where it is more."""
+
+    mean: Pixels
+    apart: Pixels
+    alone: Pixels
+    alone_counts: np.float32
+
+
+def told_in_views(display: Pixels, tell: Tell) -> Views:
+    """Of display values 0..1 (h, w, 3), h and w multiples of MULTIPLE."""
+    told = [_in_view(tell, display, size, turns) for size in SIZES for turns in TURNS]
+    mean, apart = np.mean(told, 0), np.std(told, 0)
     dark = np.float32(np.interp(np.median(display), DARK, (1, 0)))
-    if dark > 0:
-        alone = np.stack([_told_alone(tell, display, channel) for channel in range(3)], -1)
-        more = dark * _is_of_one_colour(flare_light(display, alone)) * np.maximum(alone - told, 0)
-        told += trusted(more, ALONE_SURE)
+    if dark == 0:
+        return Views(mean, apart, np.zeros_like(mean), dark)
+    alone = np.stack([_told_alone(tell, display, channel) for channel in range(3)], -1)
+    return Views(mean, apart, alone, dark * _is_of_one_colour(flare_light(display, alone)))
+
+
+def told_once(added: Pixels) -> Views:
+    """Of a frame of which there is a single view."""
+    none = np.zeros_like(added)
+    return Views(added, none, none, np.float32(0))
+
+
+def doubt_of(frames: Sequence[tuple[Views, float]]) -> np.float32:
+    """How many times their deviation is taken off what views of a frame tell: by how far they are apart in parts of
+    what they tell. Of several frames of a shot, each with a share, by that of all of them, so that a flare which is
+    plain to see in those about a frame is believed in it too, and does not go and come back."""
+    apart = sum(share * views.apart.mean() for views, share in frames)
+    told = sum(share * np.abs(views.mean).mean() for views, share in frames)
+    return np.float32(np.interp(apart / max(told, 1e-9), APART, DOUBT))
+
+
+def believed(views: Views, doubt: np.float32) -> Pixels:
+    """What a flare adds to display values (h, w, 3), after a doubt (`doubt_of`)."""
+    told = _less_doubt(views.mean, views.apart, doubt)
+    if views.alone_counts > 0:
+        told += trusted(views.alone_counts * np.maximum(views.alone - told, 0), ALONE_SURE)
     return told
 
 
@@ -59,15 +94,14 @@ def trusted(added: Pixels, sure: float) -> Pixels:
 def _told_alone(tell: Tell, display: Pixels, channel: int) -> Pixels:
     """(h, w), of a channel shown as a grey picture."""
     grey = np.repeat(display[..., channel, None], 3, -1)
-    return _agreed([_in_view(tell, grey, ALONE_SIZE, turns).mean(-1) for turns in TURNS], ALONE_APART)
+    views = [_in_view(tell, grey, ALONE_SIZE, turns).mean(-1) for turns in TURNS]
+    mean, apart = np.mean(views, 0), np.std(views, 0)
+    doubt = np.float32(np.interp(apart.mean() / max(np.abs(mean).mean(), 1e-9), ALONE_APART, DOUBT))
+    return _less_doubt(mean, apart, doubt)
 
 
-def _agreed(views: Sequence[Pixels], apart: tuple[float, float]) -> Pixels:
-    """The mean of what is told in views of a frame, less how far they are apart, the more of that the less they agree.
-    """
-    told, spread = np.mean(views, 0), np.std(views, 0)
-    doubt = np.interp(spread.mean() / max(np.abs(told).mean(), 1e-9), apart, DOUBT)
-    return np.asarray(np.maximum(told - np.float32(doubt) * spread, 0), np.float32)
+def _less_doubt(mean: Pixels, apart: Pixels, doubt: np.float32) -> Pixels:
+    return np.asarray(np.maximum(mean - doubt * apart, 0), np.float32)
 
 
 def _is_of_one_colour(light: Pixels) -> np.float32:

@@ -195,8 +195,8 @@ def test_a_network_that_sees_nothing_changes_nothing(nowhere: Path) -> None:
 
 def test_a_frame_upside_down_is_told_the_same(everywhere: Path) -> None:
     display = picture(64, 96, 1, np.float32)
-    upright = Remover(everywhere).added(display)
-    told = Remover(everywhere).added(np.ascontiguousarray(display[::-1, ::-1]))
+    upright = Remover(everywhere).told(display).added
+    told = Remover(everywhere).told(np.ascontiguousarray(display[::-1, ::-1])).added
     assert np.ptp(upright) > 1e-3
     np.testing.assert_allclose(told[::-1, ::-1], upright, atol=1e-5)
 
@@ -218,7 +218,7 @@ def test_a_flare_in_some_views_alone_is_doubted(everywhere: Path, monkeypatch: p
         return added if upright else added[::-1, ::-1]
 
     monkeypatch.setattr(Remover, "_told", told)
-    added = Remover(everywhere).added(np.full((160, 320, 3), (0.5, 0.6, 0.7), np.float32))  # no dark frame
+    added = Remover(everywhere).told(np.full((160, 320, 3), (0.5, 0.6, 0.7), np.float32)).added  # no dark frame
     assert shown == [(160, 320, 3)] * 2 + [(128, 256, 3)] * 2
     assert added.shape == (160, 320, 3)
     np.testing.assert_allclose(added[:, :158], 0.2, rtol=1e-4)
@@ -240,7 +240,7 @@ def test_what_a_channel_tells_alone_counts_of_one_colour_in_the_dark(
         return np.full_like(view, alone if is_grey and np.isclose(view[0, 0, 0], lit, atol=1e-3).any() else 0.02)
 
     monkeypatch.setattr(Remover, "_told", told)
-    added = Remover(everywhere).added(np.full((160, 320, 3), frame, np.float32))
+    added = Remover(everywhere).told(np.full((160, 320, 3), frame, np.float32)).added
     expected = 0.02 + (alone - 0.02) * counts * np.isclose(frame, lit[0])
     np.testing.assert_allclose(added[80, 160], expected, rtol=1e-3)
 

@@ -107,7 +107,7 @@ def test_lora_files_load_back(base: Path, tmp_path: Path) -> None:
         diffusion.train_diffusion(model, tmp_path, draw, 5, Progress())
     diffusion.train_diffusion(again, tmp_path, draw, 5, Progress(), resume=True)
     assert drawn == [0, 1, 2, 3, 4]
-    added = diffusion.DiffusionRemover(base, path).added(pairs()[0][0])
+    added = diffusion.DiffusionRemover(base, path).told(pairs()[0][0]).added
     assert added.shape == (32, 32, 3)
     assert added.min() >= 0
     with pytest.raises(RunError, match="not trained on this base"):

@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 from core.errors import FrameError
 from core.progress import Progress
 from core.removal.batch import remove_all, with_neighbours
-from core.removal.inference import Remover, Told
+from core.removal.inference import Remover
 from core.removal.plates import Plate
 from core.removal.record import RECORD
-from core.removal.steady import Sequences, by_number, calm, steadied
+from core.removal.steady import Frame, Sequences, by_number, guide, steadied
+from core.removal.views import Views, told_once
 
 Pixels = NDArray[np.float32]
 
@@ -27,25 +28,26 @@ def scene(seed: int) -> Pixels:
     return np.asarray(cv2.resize(coarse, (64, 48), interpolation=cv2.INTER_LINEAR), np.float32)
 
 
-def told(display: Pixels, level: float) -> Told:
-    return Told(display, np.full_like(display, level))
+def told(display: Pixels, added: Pixels | float) -> Frame:
+    """A frame of which that is told in every view."""
+    return Frame(guide(display), told_once(np.broadcast_to(np.float32(added), display.shape)))
 
 
 def test_what_wavers_is_calmed_and_its_detail_stays() -> None:
     random = np.random.default_rng(0)
     detail = random.uniform(0, 0.05, (48, 64, 3)).astype(np.float32)
     levels = 0.2 + 0.05 * random.standard_normal(9)
-    frames = [calm(Told(scene(1), (level + detail).astype(np.float32))) for level in levels]
+    frames = [told(scene(1), level + detail) for level in levels]
     made = [steadied(here, [other for other in frames if other is not here]).added for here in frames]
     assert np.std([one.mean() for one in made]) < 0.01 * np.std(levels)
     np.testing.assert_allclose(made[3] - made[3].mean(), detail - detail.mean(), atol=2e-3)
 
 
 def test_a_cut_and_a_frame_of_another_shape_change_nothing() -> None:
-    here = calm(told(np.full((48, 64, 3), 0.1, np.float32), 0.05))
-    after = [calm(told(np.full((48, 64, 3), level, np.float32), 0.4)) for level in (0.5, 0.9)]
-    made = steadied(here, [*after, calm(told(scene(2)[:32, :32], 0.4))]).added
-    np.testing.assert_allclose(made, here.told.added, atol=1e-6)
+    here = told(np.full((48, 64, 3), 0.1, np.float32), 0.05)
+    after = [told(np.full((48, 64, 3), level, np.float32), 0.4) for level in (0.5, 0.9)]
+    made = steadied(here, [*after, told(scene(2)[:32, :32], 0.4)]).added
+    np.testing.assert_allclose(made, here.views.mean, atol=1e-6)
 
 
 def test_photographs_of_other_things_change_nothing_however_dark_they_are() -> None:
@@ -56,7 +58,7 @@ def test_photographs_of_other_things_change_nothing_however_dark_they_are() -> N
 
     others = [night(seed) for seed in range(1, 9)]
     for level in (0.05, 0.0):
-        made = steadied(calm(told(night(0), level)), [calm(told(other, 0.05 - level)) for other in others]).added
+        made = steadied(told(night(0), level), [told(other, 0.05 - level) for other in others]).added
         np.testing.assert_allclose(made, level, atol=1e-3)
 
 
@@ -64,7 +66,7 @@ def test_frames_of_a_pan_and_of_a_sky_without_anything_are_of_one_shot() -> None
     wide = np.asarray(cv2.resize(np.random.default_rng(0).random((12, 40, 3)), (160, 48)), np.float32) * np.float32(0.1)
     grain = np.random.default_rng(1).normal(0.1, 0.002, (2, 48, 64, 3)).astype(np.float32)
     for here, after in ((wide[:, :64], wide[:, 1:65]), grain):
-        made = steadied(calm(told(here, 0.1)), [calm(told(after, 0.2))]).added
+        made = steadied(told(here, 0.1), [told(after, 0.2)]).added
         assert made.mean() > 0.14
 
 
@@ -74,16 +76,26 @@ def test_a_flare_that_comes_out_is_not_drawn_into_the_frames_before() -> None:
     lit[10:30, 10:30] += 0.5
     flare = np.zeros_like(lit)
     flare[10:30, 10:30] = 0.5
-    made = steadied(calm(Told(dark, np.zeros_like(dark))), [calm(Told(lit, flare))]).added
+    made = steadied(told(dark, 0), [told(lit, flare)]).added
     assert made.max() < 0.1
     assert made[12:28, 12:28].max() < 0.001
-    assert steadied(calm(Told(lit, flare)), [calm(Told(dark, np.zeros_like(dark)))]).added[12:28, 12:28].min() > 0.499
+    assert steadied(told(lit, flare), [told(dark, 0)]).added[12:28, 12:28].min() > 0.499
 
 
 def test_without_neighbours_it_is_what_was_told() -> None:
     random = np.random.default_rng(0)
-    alone = Told(scene(4), random.random((48, 64, 3)).astype(np.float32) * random.integers(0, 2, (48, 64, 1)))
-    assert np.array_equal(steadied(calm(alone), []).added, alone.added)
+    alone = told(scene(4), random.random((48, 64, 3)).astype(np.float32) * random.integers(0, 2, (48, 64, 1)))
+    assert np.array_equal(steadied(alone, []).added, alone.views.mean)
+
+
+def test_a_flare_is_believed_as_far_as_in_the_frames_of_its_shot() -> None:
+    """Its views are apart by as much as they tell, those of the others agree; in another shot that says nothing."""
+    even = np.full((48, 64, 3), 0.1, np.float32)
+    doubted = Frame(guide(scene(6)), Views(even, even, 0 * even, np.float32(0)))
+    sure = [told(scene(6), even) for _ in range(2)]
+    assert steadied(doubted, []).added.max() == 0
+    assert steadied(doubted, [told(scene(7), even)]).added.max() == 0
+    np.testing.assert_allclose(steadied(doubted, sure).added, 0.1, rtol=1e-5)
 
 
 def test_names_go_by_their_numbers() -> None:
@@ -102,12 +114,12 @@ class Wavering(Remover):
 
     def shown(self, plate: Plate) -> Pixels:
         display = super().shown(plate)
-        display[0, 0] = 0.1 * (int(plate.path.stem[1:]) % 3)  # by which `added` knows the frame
+        display[0, 0] = 0.1 * (int(plate.path.stem[1:]) % 3)  # by which `views` knows the frame
         return display
 
-    def added(self, display: Pixels) -> Pixels:
+    def views(self, display: Pixels) -> Views:
         self.asked += 1
-        return np.full_like(display, 0.1 + 0.2 * display[0, 0, 0])
+        return told_once(np.full_like(display, 0.1 + 0.2 * display[0, 0, 0]))
 
 
 @pytest.fixture

@@ -23,6 +23,7 @@ from . import exr, jpeg, png, tiff
 from .errors import FrameError
 from .files import atomic_path
 from .typed import is_utf8
+from .video import is_video
 
 if TYPE_CHECKING:
     from .colour import Chromaticities
@@ -108,6 +109,14 @@ def are_one_shape(size: tuple[int, int], other: tuple[int, int]) -> bool:
             and abs(large[1] - small[1] * scale) <= max(scale, 1.0) + 1e-9)
 
 
+def no_picture(path: Path) -> FrameError:
+    """Of a file of another kind, by its name."""
+    if is_video(path):
+        return FrameError(f"{path} is a video; take its frames out first, as by `ffmpeg -i {path.name} "
+                          "frames/%06d.png`, and give their folder.")
+    return FrameError(f"{path} is not a picture this program reads; use PNG, JPEG, TIFF or EXR.")
+
+
 def read_picture(path: Path | str, *, own_primaries: bool = False) -> Picture:
     """Decode PNG, JPEG, TIFF (8 or 16 bit, grey or colour, alpha dropped) or EXR.
 
@@ -119,7 +128,7 @@ def read_picture(path: Path | str, *, own_primaries: bool = False) -> Picture:
     """
     path = Path(path)
     if path.suffix.lower() not in SUFFIXES:
-        raise FrameError(f"{path} is not a picture this program reads; use PNG, JPEG, TIFF or EXR.")
+        raise no_picture(path)
     if not path.is_file():
         raise FrameError(f"{path} is missing.")
     if path.suffix.lower() == ".exr":

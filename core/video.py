@@ -31,6 +31,11 @@ MOVIE_BYTES = 1 << 24
 """Of a file's description that are looked at."""
 
 
+def is_video(path: Path) -> bool:
+    """Whether a file's name is a video's."""
+    return path.suffix.lower() in VIDEOS
+
+
 class Video:
     """The frames of a video, (h, w, 3) uint8 B G R, in order. Raises FrameError where there are none to be had."""
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..core.errors import CaptureError, RunError, SettingsError
-from ..core.pictures import SUFFIXES, pictures_in
+from ..core.pictures import SUFFIXES, no_picture, pictures_in
 
 if TYPE_CHECKING:
     from ..core.capture.camera import Floats
@@ -42,12 +42,14 @@ def shot_path(words: argparse.Namespace) -> Path:
 
 
 def _kind(target: Path) -> str:
-    """Of OPTIONS."""
+    """Of OPTIONS. FrameError for a file of no kind of those."""
     from ..core.fit.run import CONFIG
 
     suffix = target.suffix.lower()
     if suffix in SUFFIXES:
         return "picture"
+    if target.is_file() and suffix not in OPTIONS:
+        raise no_picture(target)
     return suffix if suffix in OPTIONS else "run" if (target / CONFIG).is_file() else "capture"
 
 

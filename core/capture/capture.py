@@ -27,7 +27,8 @@ from numpy.typing import NDArray
 
 from ..errors import CaptureError, FrameError
 from ..files import inside, read_json
-from ..pictures import SUFFIXES, Picture, are_one_shape, picture_size, pictures_below, read_picture
+from ..pictures import SUFFIXES, Picture, are_one_shape, no_picture, picture_size, pictures_below, read_picture
+from ..video import is_video
 from .camera import Camera, Floats
 from .colmap import PointCloud, Posed, find_model, read_model
 from .lens import PINHOLES, Lens, straightened
@@ -86,6 +87,9 @@ class Capture:
         Raises CaptureError (model, lights, split) or FrameError (pictures), naming the file.
         """
         folder = Path(folder)
+        if folder.is_file() and is_video(folder):
+            raise CaptureError(f"{folder} is a video; make a capture of it by `solve {folder.name} --out my_capture`, "
+                               "and name that.")
         if not folder.is_dir():
             raise CaptureError(f"{folder} is {'no folder' if folder.exists() else 'missing'}; name a capture's folder.")
         posed, points, root = _read_poses(folder)
@@ -392,7 +396,7 @@ def _checked_size(path: Path, lens: Lens) -> tuple[int, int]:
         raise FrameError(f"{path} is {size[0]} x {size[1]} pixels and its camera {lens.width} x {lens.height}, "
                          "which is another shape; use the frames that were solved.")
     if path.suffix.lower() not in SUFFIXES:
-        raise FrameError(f"{path} is not a picture this program reads; use PNG, JPEG, TIFF or EXR.")
+        raise no_picture(path)
     return size
 
 

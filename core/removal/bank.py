@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from ..errors import FrameError, SettingsError
 from ..pictures import SUFFIXES, linear_from_srgb, read_picture
-from ..video import VIDEOS, Video
+from ..video import VIDEOS, Video, is_video
 from .pairs import WHITE, Bank, Layers
 from .synthesis.layers import flare, through_aspheres
 from .synthesis.prescription import Prescription
@@ -162,7 +162,7 @@ class OwnFlares:
 
 def _frame_of(path: Path, random: Random) -> NDArray[np.float32]:
     """A picture's linear light, or that of a random frame of a clip."""
-    if path.suffix.lower() not in VIDEOS:
+    if not is_video(path):
         return read_picture(path).linear()
     with Video(path) as clip:
         clip.seek(int(random.integers(max(clip.length, 1))))

@@ -28,6 +28,7 @@ from ..pictures import (
     SUFFIXES,
     Encoding,
     exr_parts,
+    no_picture,
     picture_size,
     save_exr,
     srgb_from_linear,
@@ -121,7 +122,7 @@ def read_plate(path: Path | str) -> Plate:
     if not path.exists():
         raise FrameError(f"{path} is missing.")
     if path.suffix.lower() not in SUFFIXES:
-        raise FrameError(f"{path} is not a picture this program reads; use PNG, JPEG, TIFF or EXR.")
+        raise no_picture(path)
     picture_size(path)
     return _read_exr(path) if path.suffix.lower() == ".exr" else _read_codes(path)
 

@@ -16,8 +16,9 @@ import OpenEXR
 import pytest
 
 from core import pictures, tiff
+from core.capture import Capture
 from core.colour import colour_space
-from core.errors import FrameError
+from core.errors import CaptureError, FrameError
 from core.pictures import (
     Picture,
     channel_names,
@@ -107,6 +108,16 @@ def test_broken_files_are_refused_by_name(tmp_path: Path) -> None:
     for name in ("empty.png", "text.jpg", "folder.png", "missing.png", "clip.mov"):
         with pytest.raises(FrameError, match=name):
             read_picture(tmp_path / name)
+
+
+@pytest.mark.parametrize("read", [read_picture, read_plate])
+def test_who_gives_a_video_is_told_how_to_get_its_frames(read: Callable[[Path], object], tmp_path: Path) -> None:
+    for name, told in (("a.MP4", r"a\.MP4 is a video; .*ffmpeg -i a\.MP4"), ("a.txt", r"a\.txt is not a picture")):
+        (tmp_path / name).touch()
+        with pytest.raises(FrameError, match=told):
+            read(tmp_path / name)
+    with pytest.raises(CaptureError, match=r"a\.MP4 is a video; .*solve a\.MP4"):
+        Capture.open(tmp_path / "a.MP4")
 
 
 def test_a_header_that_claims_too_much_is_refused_before_memory_is_taken(tmp_path: Path) -> None:

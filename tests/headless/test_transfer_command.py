@@ -247,6 +247,13 @@ def test_a_target_that_is_missing_may_have_been_anything(run: Run, made: Path, t
                              "or a shot.")
 
 
+def test_a_target_of_no_kind_is_told_as_what_it_is(run: Run, made: Path, tmp_path: Path) -> None:
+    for name, told in (("a.mov", "a.mov is a video; take its frames out first"), ("a.txt", "a.txt is not a picture")):
+        (tmp_path / name).touch()
+        text = run("transfer", made, "--to", tmp_path / name, "--light", "9,9", "--out", tmp_path / "o", status=1)[-1]
+        assert told in text["text"]
+
+
 def test_the_animated_camera_of_a_blend_is_a_capture(run: Run, blend: Path, tmp_path: Path) -> None:
     for frame in range(1, 5):
         write_png(tmp_path / "renders" / f"render.{frame:04d}.png", np.full((54, 96, 3), 0.1 * frame))

@@ -24,6 +24,7 @@ from ...errors import CaptureError, SettingsError
 from ...files import read_json, remove_file, write_json
 from ...pictures import pictures_in
 from ...progress import Progress
+from ...video import is_video
 from ..capture import LIGHTS, REMOVED
 from ..lens import MODELS
 
@@ -97,7 +98,7 @@ def solve(source: Path | str, out: Path | str, settings: SolveSettings | None = 
             shutil.rmtree(work, ignore_errors=True)
         return finished
     chosen, left_out = shots.gather(source, work, settings.frames, settings.size, progress)
-    solved = mapping.solve(chosen, work, settings, shots.is_video(source), progress)
+    solved = mapping.solve(chosen, work, settings, is_video(source), progress)
     world.align(solved.model)
     missing = sorted(set(range(len(chosen))) - {frame.shot for frame in solved.frames})
     if missing:

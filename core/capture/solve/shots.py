@@ -19,7 +19,7 @@ from ...exif import read_exif, upright
 from ...files import read_json, write_json
 from ...pictures import Picture, Pixels, picture_size, pictures_in, read_picture, window_of, write_png
 from ...progress import Progress
-from ...video import VIDEOS, Video
+from ...video import Video, is_video
 
 RECORD = "shots.json"
 COMBED, SOME = 1.1, 0.25
@@ -38,11 +38,6 @@ class Shot:
     height: int
     focal: float | None
     orientation: int
-
-
-def is_video(source: Path) -> bool:
-    """Whether a file's name is a video's."""
-    return source.suffix.lower() in VIDEOS
 
 
 def choose(sharpness: Sequence[float], number: int) -> list[int]:

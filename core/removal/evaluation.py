@@ -23,6 +23,7 @@ from ..errors import FrameError, SettingsError
 from ..metrics.pictures import Perceptual, flip, psnr, ssim
 from ..pictures import Pixels, pictures_in, read_picture
 from ..progress import Progress
+from ..sheets import labelled, side_by_side
 from .backgrounds import Backgrounds, kept_for_test
 from .synthesis.prescription import Prescription, built_in
 
@@ -198,11 +199,9 @@ def worst_sheet(cases: Sequence[Case], clean: Callable[[Pixels], Pixels], scores
         height = round(width * frame.shape[0] / frame.shape[1])
         parts = [np.asarray(cv2.resize(part, (width, height), interpolation=cv2.INTER_AREA), np.float32)
                  for part in (frame, result, truth, taken)]
-        head = np.zeros((20, 4 * width, 3), np.float32)
         text = f"{case.category} / {case.name}: {gain:+.2f} dB   input | result | truth | taken away x2"
-        cv2.putText(head, text, (4, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (0.9, 0.9, 0.9), 1, cv2.LINE_AA)
-        strips += [head, np.concatenate(parts, 1)]
-    return np.concatenate(strips, 0) if strips else np.zeros((20, 4 * width, 3), np.float32)
+        strips.append(labelled(text, side_by_side(parts)))
+    return np.concatenate(strips) if strips else np.zeros((20, 4 * width, 3), np.float32)
 
 
 def held_out(lenses: Iterable[Prescription]) -> list[Prescription]:

@@ -108,7 +108,7 @@ def _supervision(capture: Capture, mode: Mode) -> str:
     if mode == "split":
         return "No flare-free frame is looked at."
     if capture.has_removed:
-        return f"The flare-free frames are those in {capture.folder / 'removed'}; no flare is removed here."
+        return f"The flare-free frames are those in {capture.folder / REMOVED}; no flare is removed here."
     if capture.has_truth:
         return f"The flare-free frames are the exact ones in {capture.folder / 'truth' / 'scene'}."
     return "There are no flare-free frames."

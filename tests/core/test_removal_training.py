@@ -28,6 +28,7 @@ from core.removal.optimiser import Optimiser
 from core.removal.recipe import Recipe, as_dict, from_dict
 from core.removal.synthesis.prescription import built_in
 from core.removal.trainer import Trainer
+from core.sheets import GAP, HEAD
 
 torch.set_num_threads(1)  # small tensors, on which threads only wait for each other
 
@@ -417,7 +418,7 @@ def test_scores_beside_the_untouched_input(tmp_path: Path) -> None:
     assert worse["mean"]["made_worse"] == 1
     assert "real" in evaluation.table(worse)
     sheet = evaluation.worst_sheet(cases, lambda frame: frame, worse, 40)
-    assert sheet.shape == (4 * (20 + 32), 160, 3)
+    assert sheet.shape == (4 * (HEAD + 32), 4 * 40 + 3 * GAP, 3)
 
 
 def test_a_clean_picture_that_is_changed_was_made_worse(tmp_path: Path) -> None:

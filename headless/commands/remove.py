@@ -18,7 +18,8 @@ if TYPE_CHECKING:
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("plates", type=Path, nargs="*", metavar="PLATE",
-                        help="pictures (PNG, JPEG, TIFF, EXR), or folders of them; clean plates in these are left out")
+                        help="pictures (PNG, JPEG, TIFF, EXR), folders of them, where clean plates are left out, "
+                             "or videos, whose frames are taken out into DIR/NAME.frames")
     parser.add_argument("--run", type=Path, metavar="RUN",
                         help="instead of PLATE: the frames of the capture that this run was fitted to, less the flare "
                              "that it found in them")
@@ -51,6 +52,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     from ...core.bake.frames import numbered
     from ...core.removal.batch import plates_of, remove_all
+    from ...core.removal.footage import with_frames
     from ...core.removal.mattes import Mattes
 
     if (words.run is None) == (not words.plates):
@@ -58,16 +60,17 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     if words.run is not None:
         return _by_run(words, progress)
     refuse_useless(words, {"capture": None}, "--run")
+    given = with_frames(words.plates, words.out, progress)
     wanted = None
     if words.frames is not None or words.jobs != 1:
-        names = [name.as_posix() for _, name in plates_of(words.plates, [words.out, words.flare, words.matte])]
+        names = [name.as_posix() for _, name in plates_of(given, [words.out, words.flare, words.matte])]
         chosen = frames.asked(numbered(names), words.frames, progress)
         wanted = {Path(frame.view) for frame in chosen}
         if words.jobs != 1:
             jobs.run_jobs(words, "remove", [frame.number for frame in chosen], progress, past_failures=True)
             progress.say(f"The clean plates are in {words.out}.")
             return {"plates": str(words.out)}
-    return remove_all(words.plates, words.out, _remover(words), progress, flare_folder=words.flare,
+    return remove_all(given, words.out, _remover(words), progress, flare_folder=words.flare,
                       mattes=Mattes(words.matte) if words.matte else None, overwrite=words.overwrite, wanted=wanted,
                       stills=words.stills)
 
@@ -132,6 +135,7 @@ is kept to the last bit. A plate that cannot be read is told at the end, and doe
 
   run.py remove plate.exr --out clean
   run.py remove shots/sh010 --out clean/sh010 --flare flares/sh010 --keep-glare
+  run.py remove clip.mp4 --out clean/clip                               # the clean frames as PNG
   run.py remove shots/sh010 --matte roto/sh010 --out clean/sh010        # where the artist says that they are
   run.py remove --run my_run --out clean          # what `fit` found, out of the frames it was fitted to""",
     arguments, (Step("remove", "engine", run),), after_a_stop="goes on")

@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from core.errors import FrameError
+from core.errors import Cancelled, FrameError, SettingsError
 from core.pictures import linear_from_srgb
+from core.progress import Progress
 from core.removal import bank
 from core.removal.bank import OwnFlares
+from core.removal.footage import frames_of, with_frames
 from core.video import Video
 
 PATCHES = np.array([(200, 60, 40), (40, 180, 60), (50, 70, 210), (128, 128, 128), (230, 200, 40), (240, 240, 240)])
@@ -156,3 +158,41 @@ def test_the_shape_of_pixels_is_told(tmp_path: Path) -> None:
         assert video.aspect == 1
     with Video(with_pixels(path, 4, 3)) as video:
         assert video.aspect == pytest.approx(4 / 3) and len(list(video)) == 3
+
+
+def test_the_frames_of_a_video_are_taken_out_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    clip, out = patches(tmp_path / "clip.mp4", 64, (0.299, 0.114)), tmp_path / "out"
+    frames = frames_of(clip, out, Progress())
+    assert frames == out / "clip.mp4.frames"
+    assert sorted(path.name for path in frames.glob("*.png")) == [f"clip.{number:06d}.png" for number in (1, 2, 3)]
+    first = cv2.imread(str(frames / "clip.000001.png"))
+    assert np.abs(first[32, STRIPE // 2::STRIPE, ::-1].astype(int) - PATCHES).max() < 12
+    with Video(clip) as again:
+        assert np.array_equal(first, next(iter(again)))
+    with monkeypatch.context() as patch:
+        patch.setattr("core.removal.footage._take_out", lambda *_: pytest.fail("they are there"))
+        assert frames_of(clip, out, Progress()) == frames
+    patches(clip, 96, (0.299, 0.114))
+    with pytest.raises(SettingsError, match=r"another video of that name"):
+        frames_of(clip, out, Progress())
+
+
+def test_what_another_task_has_taken_out_meanwhile_is_taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    clip, out = patches(tmp_path / "clip.mp4", 64, (0.299, 0.114)), tmp_path / "out"
+    there = frames_of(clip, tmp_path / "other", Progress())
+    monkeypatch.setattr("core.removal.footage._take_out", lambda *_: there.rename(out / there.name))
+    assert len(list(frames_of(clip, out, Progress()).glob("*.png"))) == 3
+
+
+def test_a_video_that_cannot_be_read_or_is_stopped_leaves_no_frames(tmp_path: Path) -> None:
+    (tmp_path / "empty.mov").touch()
+    clip, out = patches(tmp_path / "clip.mp4", 64, (0.299, 0.114)), tmp_path / "out"
+    stopped = Progress()
+    stopped.request_stop()
+    with pytest.raises(Cancelled):
+        frames_of(clip, out, stopped)
+    with pytest.raises(FrameError, match=r"empty\.mov cannot be decoded"):
+        frames_of(tmp_path / "empty.mov", out, Progress())
+    assert list(out.iterdir()) == []
+    given = [tmp_path / "empty.mov", clip, tmp_path / "plate.png"]
+    assert with_frames(given, out, Progress()) == [given[0], out / "clip.mp4.frames", given[2]]

@@ -40,6 +40,7 @@ from core.removal.network import LEVELS, SHOWN, RemovalNetwork, seen
 from core.removal.plates import Plate, read_plate, write_plate
 from core.removal.recipe import Recipe, as_dict
 from core.removal.record import RECORD, Record, made_from
+from core.removal.views import told_once
 from tests.core.captures import make_capture
 from tests.core.heard import Heard
 from tests.core.test_exif import exif_segment
@@ -684,9 +685,9 @@ def test_frames_without_leading_noughts_are_told_once_each(tmp_path: Path, every
     model.write_text(words)
     remover = Remover(everywhere, working_size=64)
     names, told = [], []
-    shown, tell = remover.shown, remover.tell
+    shown, views = remover.shown, remover.views
     monkeypatch.setattr(remover, "shown", lambda plate: names.append(plate.path.name) or shown(plate))
-    monkeypatch.setattr(remover, "tell", lambda display: told.append(1) or tell(display))
+    monkeypatch.setattr(remover, "views", lambda display: told.append(1) or views(display))
     remove_from(Capture.open(folder), remover, Progress())
     assert len(names) == len(set(names)) == len(told) == 24
 
@@ -772,7 +773,7 @@ def test_a_grey_plate_loses_the_luminance_of_a_flare(suffix: str, tmp_path: Path
     remover = Remover(everywhere, working_size=64)
     blue = np.zeros((64, 96, 3), np.float32)
     blue[..., 2] = 0.2
-    monkeypatch.setattr(remover, "added", lambda display: blue[:display.shape[0], :display.shape[1]])
+    monkeypatch.setattr(remover, "views", lambda display: told_once(blue[:display.shape[0], :display.shape[1]]))
     path = tmp_path / f"a{suffix}"
     if suffix == ".png":
         cv2.imwrite(str(path), np.full((64, 96), 180, np.uint8))

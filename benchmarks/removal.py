@@ -62,7 +62,7 @@ SHOWN = 3
 CASES = {"1920x1080 png": (1920, 1080), "4096x2160 exr": (4096, 2160)}
 
 
-def write_plate(path: Path, width: int, height: int) -> None:
+def draw_plate(path: Path, width: int, height: int) -> None:
     """A smooth picture with a bright spot, so that there is a flare to take."""
     x, y = np.meshgrid(np.linspace(-1, 1, width), np.linspace(-1, 1, height))
     glow = 0.5 / (1 + 30 * ((x - 0.4) ** 2 + (y + 0.3) ** 2))
@@ -92,7 +92,7 @@ def speed(weights: Path | None = None) -> None:
     for name, (width, height) in CASES.items():
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / f"plate.{name.split()[1]}"
-            write_plate(path, width, height)
+            draw_plate(path, width, height)
             figures: dict[str, dict[str, float]] = {}
             for kind, size in (("working", WORKING_SIZE), ("full", width)):
                 words = [sys.executable, __file__, "one", str(path), "--size", str(size)]

@@ -36,6 +36,11 @@ def is_video(path: Path) -> bool:
     return path.suffix.lower() in VIDEOS
 
 
+def displayed(frame: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Display values 0..1, R G B, of a video's frame."""
+    return frame[..., ::-1].astype(np.float32) / np.float32(255)
+
+
 class Video:
     """The frames of a video, (h, w, 3) uint8 B G R, in order. Raises FrameError where there are none to be had."""
 

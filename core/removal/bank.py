@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from ..errors import FrameError, SettingsError
 from ..pictures import SUFFIXES, linear_from_srgb, read_picture
-from ..video import VIDEOS, Video, is_video
+from ..video import VIDEOS, Video, displayed, is_video
 from .pairs import WHITE, Bank, Layers
 from .synthesis.layers import flare, through_aspheres
 from .synthesis.prescription import Prescription
@@ -172,7 +172,7 @@ def _frame_of(path: Path, random: Random) -> NDArray[np.float32]:
             frame = next(iter(clip), None)
     if frame is None:
         raise FrameError(f"{path} is no clip that can be read; convert it to pictures.")
-    return np.asarray(linear_from_srgb(frame[..., ::-1].astype(np.float32) / 255), np.float32)
+    return np.asarray(linear_from_srgb(displayed(frame)), np.float32)
 
 
 class Mixed:

@@ -7,8 +7,9 @@ from pathlib import Path
 
 from ..errors import FrameError, SettingsError
 from ..files import atomic_folder, content_of, read_json, write_json
+from ..pictures import write_png
 from ..progress import Progress
-from ..video import Video, is_video
+from ..video import Video, displayed, is_video
 
 RECORD = "video.json"
 """In the folder of a video's frames, of which video they are."""
@@ -49,16 +50,13 @@ def frames_of(video: Path, folder: Path, progress: Progress) -> Path:
 
 
 def _take_out(video: Path, folder: Path, progress: Progress) -> None:
-    import cv2
-
     with Video(video) as clip:
         progress.stage(f"take the frames out of {video.name}", clip.length)
         for sentence in clip.says:
             progress.say(sentence)
         number = 0
         for number, frame in enumerate(clip, 1):
-            png = cv2.imencode(".png", frame, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1]
-            (folder / f"{video.stem}.{number:06d}.png").write_bytes(png.tobytes())
+            write_png(folder / f"{video.stem}.{number:06d}.png", displayed(frame))
             progress.advance()
     if number == 0:
         raise FrameError(f"{video} has no frame that can be read; copy it again, or convert it to MP4 (H.264).")

@@ -22,12 +22,12 @@ def display(linear: Pixels, gamma: float) -> Pixels:
     return np.power(np.clip(linear, 0, 1), np.float32(1 / gamma)).astype(np.float32)
 
 
-def under_shoulder(scene: Pixels, flare: Pixels, shoulder: float) -> Pixels:
-    """Linear light as a camera develops it whose curve f(x) = (1 - exp(-shoulder x)) / shoulder bends towards white:
+def under_shoulder(scene: Pixels, flare: Pixels, bend: float) -> Pixels:
+    """Linear light as a camera develops it whose curve f(x) = (1 - exp(-bend x)) / bend bends towards white:
     f(f^-1(scene) + flare), where `scene` is 0..1 as that camera shows it. A flare adds less where the scene is bright;
-    a shoulder of 1 is what compositors call screen."""
-    through = np.exp(-np.float32(shoulder) * flare)
-    return np.asarray(np.clip(scene, 0, 1) * through + (1 - through) / np.float32(shoulder), np.float32)
+    a bend of 1 is what compositors call screen."""
+    through = np.exp(-np.float32(bend) * flare)
+    return np.asarray(np.clip(scene, 0, 1) * through + (1 - through) / np.float32(bend), np.float32)
 
 
 def flare_light(display: Pixels, added: Pixels) -> Pixels:

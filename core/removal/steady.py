@@ -49,8 +49,8 @@ class Guide(NamedTuple):
     detail: Pixels
 
 
-class Frame(NamedTuple):
-    """A frame's guide, and what was told of it."""
+class Sighting(NamedTuple):
+    """A frame's guide, and what was told of it in its views."""
 
     guide: Guide
     views: Views
@@ -73,7 +73,7 @@ def _blurred(values: Pixels) -> Pixels:
     return np.asarray(cv2.GaussianBlur(values, (0, 0), BLUR * max(values.shape[:2])), np.float32)
 
 
-def steadied(here: Frame, about: Iterable[Frame]) -> Told:
+def steadied(here: Sighting, about: Iterable[Sighting]) -> Told:
     """What was told of `here`, in line with the frames about it; those of another shape or shot are passed over."""
     shot = [(other, share) for other in about if (share := _of_one_shot(here.guide, other.guide)) > 0]
     doubt = doubt_of([(here.views, 1), *((other.views, float(share)) for other, share in shot)])
@@ -112,7 +112,7 @@ class Sequences:
             for at, path in enumerate(those):
                 self._beside[path] = those[max(at - REACH, 0):at] + those[at + 1:at + 1 + REACH]
         self._guides: dict[Path, Guide | None] = {}
-        self._frames: dict[Path, Frame] = {}
+        self._sightings: dict[Path, Sighting] = {}
 
     def beside(self, path: Path) -> Sequence[Path]:
         """The neighbours that count for a plate, in their order."""
@@ -129,7 +129,7 @@ class Sequences:
         about = {other: self._guide_of(other) for other in self.beside(path)}
         plate = read_plate(path)
         own = self._guides[path] = self._guides.get(path) or self._guide(plate)
-        return plate, steadied(self._frame(path, own), [self._frame(other, its) for other, its in about.items()
+        return plate, steadied(self._sighting(path, own), [self._sighting(other, its) for other, its in about.items()
                                                        if its is not None and _of_one_shot(own, its) > 0])
 
     def _guide(self, plate: Plate) -> Guide:
@@ -146,14 +146,14 @@ class Sequences:
                 self._guides[path] = None
         return self._guides[path]
 
-    def _frame(self, path: Path, its: Guide) -> Frame:
-        if path not in self._frames:
-            self._frames[path] = Frame(its, self._remover.views(its.display))
-        return self._frames[path]
+    def _sighting(self, path: Path, its: Guide) -> Sighting:
+        if path not in self._sightings:
+            self._sightings[path] = Sighting(its, self._remover.views(its.display))
+        return self._sightings[path]
 
     def _forget_all_but(self, paths: Sequence[Path]) -> None:
         self._guides = {path: self._guides[path] for path in paths if path in self._guides}
-        self._frames = {path: self._frames[path] for path in paths if path in self._frames}
+        self._sightings = {path: self._sightings[path] for path in paths if path in self._sightings}
 
 
 def by_number(path: Path) -> list[tuple[int, str]]:

@@ -173,21 +173,13 @@ def _joined(random: Random, scene: Pixels, other: Pixels) -> Pixels:
 
 def _hazy(random: Random, scene: Pixels) -> Pixels:
     """Under haze of its own, lit by a low sun in half of them: bright and soft as a veil of flare, but behind what is
-    near. How far a place is, is guessed: farther up to a horizon, and where it is bright, with the edges of the picture
-    (Koschmieder's law; He, Sun and Tang 2009, "Single image haze removal using dark channel prior", take it out so)."""
-    import cv2
-
+    near (Koschmieder's law; He, Sun and Tang 2009, "Single image haze removal using dark channel prior", take it out
+    so)."""
     height, width = scene.shape[:2]
     across = math.hypot(width, height)
-    grey = np.log(scene.mean(-1) + np.float32(0.01))
-    grey = (grey - grey.mean()) / max(float(grey.std()), 1e-2)
     x, y = np.meshgrid(np.arange(width, dtype=np.float32) - random.uniform(-0.3, 1.3) * width,
                        np.arange(height, dtype=np.float32) - random.uniform(0, 0.7) * height)
-    up = np.float32(random.uniform(0.5, 4)) * np.minimum(-y / height, 0)
-    distance = cv2.ximgproc.guidedFilter(grey, up + grey, max(round(across * uniform_log(random, 0.01, 0.05)), 2), 0.02)
-    distance -= np.quantile(distance, random.uniform(0.15, 0.5))
-    thick = uniform_log(random, 0.4, 4) / max(float(distance.max()), 1e-3)
-    hidden = 1 - np.exp(-np.maximum(distance, 0) * np.float32(thick))[..., None]
+    hidden = np.float32(1) - np.exp(-_haze_before(random, scene, y / height))[..., None]
     colour = np.exp(random.normal(0, 0.12, 3)).astype(np.float32)
     air = np.float32(np.quantile(scene.mean(-1), 0.9) * uniform_log(random, 0.5, 1.5)) * colour
     if random.random() < 0.5:
@@ -195,6 +187,21 @@ def _hazy(random: Random, scene: Pixels) -> Pixels:
         near_sun = np.exp(-np.hypot(x, y) / np.float32(across * uniform_log(random, 0.15, 0.8)))[..., None]
         air = air * (1 + near_sun * warm * np.float32(uniform_log(random, 0.5, 6)))
     return _mixed(scene, air, hidden)
+
+
+def _haze_before(random: Random, scene: Pixels, below_horizon: Pixels) -> Pixels:
+    """(height, width), how much haze lies before each place: none before what is near. How far a place is, is guessed:
+    farther up to a horizon, and where it is bright, with the edges of the picture. below_horizon: in heights."""
+    import cv2
+
+    grey = np.log(scene.mean(-1) + np.float32(0.01))
+    grey = (grey - grey.mean()) / max(float(grey.std()), 1e-2)
+    up = np.float32(random.uniform(0.5, 4)) * np.minimum(-below_horizon, 0)
+    radius = max(round(math.hypot(*scene.shape[:2]) * uniform_log(random, 0.01, 0.05)), 2)
+    distance = cv2.ximgproc.guidedFilter(grey, up + grey, radius, 0.02)
+    distance -= np.quantile(distance, random.uniform(0.15, 0.5))
+    thick = uniform_log(random, 0.4, 4) / max(float(distance.max()), 1e-3)
+    return np.asarray(np.maximum(distance, 0) * np.float32(thick), np.float32)
 
 
 def _with_bright_things(random: Random, scene: Pixels) -> Pixels:

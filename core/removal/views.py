@@ -10,7 +10,7 @@ with another colour than it came with.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -75,7 +75,7 @@ def doubt_of(frames: Sequence[tuple[Views, float]]) -> np.float32:
     plain to see in those about a frame is believed in it too, and does not go and come back."""
     apart = sum(share * views.apart.mean() for views, share in frames)
     told = sum(share * np.abs(views.mean).mean() for views, share in frames)
-    return np.float32(np.interp(apart / max(told, 1e-9), APART, DOUBT))
+    return _doubt(apart, told, APART)
 
 
 def believed(views: Views, doubt: np.float32) -> Pixels:
@@ -96,8 +96,12 @@ def _told_alone(tell: Tell, display: Pixels, channel: int) -> Pixels:
     grey = np.repeat(display[..., channel, None], 3, -1)
     views = [_in_view(tell, grey, ALONE_SIZE, turns).mean(-1) for turns in TURNS]
     mean, apart = np.mean(views, 0), np.std(views, 0)
-    doubt = np.float32(np.interp(apart.mean() / max(np.abs(mean).mean(), 1e-9), ALONE_APART, DOUBT))
-    return _less_doubt(mean, apart, doubt)
+    return _less_doubt(mean, apart, _doubt(apart.mean(), np.abs(mean).mean(), ALONE_APART))
+
+
+def _doubt(apart: Any, told: Any, bounds: tuple[float, float]) -> np.float32:
+    """Of views that tell `told` and are `apart`, both in the mean over a frame."""
+    return np.float32(np.interp(apart / max(told, 1e-9), bounds, DOUBT))
 
 
 def _less_doubt(mean: Pixels, apart: Pixels, doubt: np.float32) -> Pixels:

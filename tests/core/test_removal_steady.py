@@ -16,7 +16,7 @@ from core.removal.batch import remove_all, with_neighbours
 from core.removal.inference import Remover
 from core.removal.plates import Plate
 from core.removal.record import RECORD
-from core.removal.steady import Frame, Sequences, by_number, guide, steadied
+from core.removal.steady import Sequences, Sighting, by_number, guide, steadied
 from core.removal.views import Views, told_once
 
 Pixels = NDArray[np.float32]
@@ -28,9 +28,9 @@ def scene(seed: int) -> Pixels:
     return np.asarray(cv2.resize(coarse, (64, 48), interpolation=cv2.INTER_LINEAR), np.float32)
 
 
-def told(display: Pixels, added: Pixels | float) -> Frame:
+def told(display: Pixels, added: Pixels | float) -> Sighting:
     """A frame of which that is told in every view."""
-    return Frame(guide(display), told_once(np.broadcast_to(np.float32(added), display.shape)))
+    return Sighting(guide(display), told_once(np.broadcast_to(np.float32(added), display.shape)))
 
 
 def test_what_wavers_is_calmed_and_its_detail_stays() -> None:
@@ -91,7 +91,7 @@ def test_without_neighbours_it_is_what_was_told() -> None:
 def test_a_flare_is_believed_as_far_as_in_the_frames_of_its_shot() -> None:
     """Its views are apart by as much as they tell, those of the others agree; in another shot that says nothing."""
     even = np.full((48, 64, 3), 0.1, np.float32)
-    doubted = Frame(guide(scene(6)), Views(even, even, 0 * even, np.float32(0)))
+    doubted = Sighting(guide(scene(6)), Views(even, even, 0 * even, np.float32(0)))
     sure = [told(scene(6), even) for _ in range(2)]
     assert steadied(doubted, []).added.max() == 0
     assert steadied(doubted, [told(scene(7), even)]).added.max() == 0

@@ -19,7 +19,7 @@ from ...exif import read_exif, upright
 from ...files import read_json, write_json
 from ...pictures import Picture, Pixels, picture_size, pictures_in, read_picture, window_of, write_png
 from ...progress import Progress
-from ...video import Video, is_video
+from ...video import Video, displayed, is_video
 
 RECORD = "shots.json"
 COMBED, SOME = 1.1, 0.25
@@ -177,7 +177,7 @@ def _from_video(source: Path, work: Path, number: int, size: int,
     with Video(source) as video:
         for index, frame in enumerate(video):
             if index in wanted:
-                picture = Picture(frame[..., ::-1].astype(np.float32) / np.float32(255), "srgb")
+                picture = Picture(displayed(frame), "srgb")
                 file = work / "full" / f"{index:06d}.png"
                 write_png(file, picture.pixels)
                 shots.append(Shot(file.name, str(file.resolve()), *picture.size, None, 1))

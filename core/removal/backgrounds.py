@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+import tempfile
 import zlib
-from collections.abc import Iterable, Sequence, Set
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Sequence, Set
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -15,6 +17,7 @@ from numpy.typing import NDArray
 from ..errors import SettingsError
 from ..pictures import Pixels, decoded
 from . import variety
+from .mapped import Mapped
 from .synthesis.canvas import uniform_log
 
 Part = Literal["train", "test", "all"]
@@ -40,6 +43,17 @@ class Backgrounds:
     photos: Sequence[NDArray[np.uint8]]
     maps: Sequence[NDArray[np.float16]]
     varied: bool = False
+
+    @contextmanager
+    def mapped(self) -> Iterator[Backgrounds]:
+        """The same out of temporary files, for processes that share them."""
+        with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
+            photos, maps = Mapped(Path(folder) / "photos", self.photos), Mapped(Path(folder) / "maps", self.maps)
+            try:
+                yield replace(self, photos=photos, maps=maps)
+            finally:
+                photos.clear()
+                maps.clear()
 
     def draw(self, random: Random, width: int, height: int, gamma: float) -> Pixels:
         """(height, width, 3) linear light: a random window of a random picture, at a random scale; one in eight out

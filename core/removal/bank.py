@@ -42,22 +42,24 @@ class SynthesisBank:
     """
 
     def __init__(self, seed: int, count: int, size: int, lenses: Sequence[Prescription], coloured: float = 0,
-                 aspheric: float = 0) -> None:
+                 aspheric: float = 0, turns: int = 1) -> None:
+        """turns: parts of the bank, of which one is at hand at a time."""
         self._seed, self._size, self._lenses = seed, size, lenses
         self._coloured, self._aspheric = coloured, aspheric
         self._made: list[tuple[int, Layers] | None] = [None] * count
-        self._end = count
+        self._end, self._turn, self._turns = count, 0, min(turns, count)
 
     def __len__(self) -> int:
         return len(self._made)
 
-    def renew_to(self, end: int) -> None:
-        """Hold the flares of the `count` serial numbers below `end`."""
-        self._end = end
+    def renew_to(self, end: int, turn: int = 0) -> None:
+        """Hold the flares of the `count` serial numbers below `end`, and draw from the part whose turn it is."""
+        self._end, self._turn = end, turn % self._turns
 
     def draw(self, random: Random) -> Layers:
         """One of the flares that are there."""
-        slot = int(random.integers(len(self._made)))
+        at_hand = range(self._turn, len(self._made), self._turns)
+        slot = at_hand[int(random.integers(len(at_hand)))]
         serial = self._end - 1 - (self._end - 1 - slot) % len(self._made)
         made = self._made[slot]
         if made is None or made[0] != serial:
@@ -72,7 +74,7 @@ class SynthesisBank:
         if random.random() < self._aspheric:
             one = through_aspheres(one, (self._seed, serial, 3))
         rest, glare, light = (np.minimum(layer, 6e4).astype(np.float16) for layer in (one.rest, one.glare, one.light))
-        return Layers(rest, glare, light, one.lights, colour)
+        return Layers(rest, glare, light, one.lights, colour, one.kind)
 
 
 def one_colour(random: Random) -> NDArray[np.float32]:
@@ -97,7 +99,7 @@ class OneFlare:
     def draw(self, random: Random) -> Layers:
         """That flare."""
         made = flare((*self._seed, int(random.integers(1 << 30))), self._size, self._lenses, self._kind)
-        return Layers(made.rest, made.glare, made.light, made.lights, self._colour)
+        return Layers(made.rest, made.glare, made.light, made.lights, self._colour, made.kind)
 
 
 class OwnFlares:

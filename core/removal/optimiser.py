@@ -9,7 +9,8 @@ that it takes thirty times as long as this one, and on those that are not it tak
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from typing import cast
 
 import torch
 from torch import Tensor, nn
@@ -44,19 +45,20 @@ class Optimiser:
     def step(self, rate: float, learner: Learner = ALONE) -> None:
         """One step by the gradients that the parameters have, which they have no more afterwards. Learners have the
         same gradients, and share the work of Muon's steps, which is nearly a third of an iteration's."""
-        stepping: list[Tensor] = []
-        directions: list[Tensor] = []
-        for name, rows in self._matrices.items():
-            gradient = self._parameters[name].grad
-            if gradient is not None:
-                momentum = self._momenta[name].lerp_(_rows(gradient), 1 - MOMENTUM)
-                mine = learner.makes(len(stepping))
-                directions.append(orthogonalised(_rows(gradient).lerp(momentum, MOMENTUM)).contiguous() if mine
-                                  else torch.empty_like(rows))
-                stepping.append(rows)
+        stepping = {name: rows for name, rows in self._matrices.items() if self._parameters[name].grad is not None}
+        gradients = [_rows(cast(Tensor, self._parameters[name].grad)) for name in stepping]
+        momenta = [self._momenta[name] for name in stepping]
+        torch._foreach_lerp_(momenta, gradients, 1 - MOMENTUM)
+        directions = [ahead.contiguous() for ahead in torch._foreach_lerp(gradients, momenta, MOMENTUM)]
+        for together in _parcels(directions, filter(learner.makes, range(len(directions)))):
+            made = orthogonalised(torch.stack([directions[number] for number in together]))
+            for number, direction in zip(together, made.contiguous().unbind(), strict=True):
+                directions[number] = direction
         learner.hand_round(directions)
-        for rows, direction in zip(stepping, directions, strict=True):
-            rows.mul_(1 - rate * self._decay).sub_(direction, alpha=rate * LENGTH * math.sqrt(max(rows.shape)))
+        rows = list(stepping.values())
+        torch._foreach_mul_(rows, 1 - rate * self._decay)
+        torch._foreach_mul_(directions, [rate * LENGTH * math.sqrt(max(matrix.shape)) for matrix in rows])
+        torch._foreach_sub_(rows, directions)
         for group in self._adam.param_groups:
             group["lr"] = rate
         self._adam.step()
@@ -85,23 +87,34 @@ class Optimiser:
                 self._adam.state[parameter][moment] = value.to(parameter.device, copy=True)
 
 
+def _parcels(matrices: Sequence[Tensor], numbers: Iterable[int]) -> Iterable[list[int]]:
+    """The numbers, each alone on a processor; on a graphics card, which one does not keep busy, those of matrices of
+    the same shape together."""
+    found: dict[object, list[int]] = {}
+    for number in numbers:
+        matrix = matrices[number]
+        found.setdefault(matrix.shape if matrix.is_cuda else number, []).append(number)
+    return found.values()
+
+
 def orthogonalised(matrix: Tensor) -> Tensor:
-    """(n, m), float32: the same singular vectors, singular values between about 0.7 and 1.2.
+    """(k, n, m), float32: the same singular vectors, singular values between about 0.7 and 1.2.
 
     Each round multiplies the matrix by a polynomial of its square x x^T, and those of all rounds commute. So they are
     multiplied with each other first, as matrices of the shorter side alone, and the matrix itself comes in twice."""
     a, b, c = QUINTIC
-    wide = matrix.mT if matrix.shape[0] > matrix.shape[1] else matrix
-    wide = wide / wide.norm().clamp(min=1e-7)
+    tall = matrix.shape[-2] > matrix.shape[-1]
+    wide = matrix.mT if tall else matrix
+    wide = wide / torch.linalg.matrix_norm(wide, keepdim=True).clamp(min=1e-7)
     square = wide @ wide.mT
-    factors = torch.eye(len(square), dtype=square.dtype, device=square.device)
+    factors = torch.eye(square.shape[-1], dtype=square.dtype, device=square.device)
     for _ in range(ROUNDS):
-        factor = torch.addmm(square, square, square, beta=b, alpha=c)
-        factor.diagonal().add_(a)
+        factor = torch.baddbmm(square, square, square, beta=b, alpha=c)
+        factor.diagonal(dim1=-2, dim2=-1).add_(a)
         factors = factors @ factor
         square = square @ factor @ factor
     found = factors @ wide
-    return found.mT if matrix.shape[0] > matrix.shape[1] else found
+    return found.mT if tall else found
 
 
 def has_bfloat16(on: torch.device) -> bool:

@@ -85,7 +85,7 @@ class Trainer:
         is told where there is none counts for more. Over the last `polish` of a training the logarithm of the
         error in parts of that square, which is the picture's gain in PSNR; what a picture loses counts twice. At half
         the weight the same of the gentle part."""
-        frame, scene, gentle = (torch.from_numpy(part).permute(0, 3, 1, 2).to(self.device)
+        frame, scene, gentle = (torch.from_numpy(part).permute(0, 3, 1, 2).to(self.device).float()
                                 for part in (batch.frame, batch.scene, batch.gentle))
         with _precision(self.device):
             told = self.network(frame)
@@ -101,20 +101,23 @@ class Trainer:
             left = torch.log((error + unseen) / (before + unseen))
             left = left + left.clamp(min=0)
         loss = left[0].mean() + 0.5 * left[1].mean()
-        gain = 10 * torch.log10((before[0] + UNSEEN[1]) / (error[0].detach() + UNSEEN[1]))
-        return loss, {"loss": float(loss.detach()), "error": float(error[0].detach().mean()),
-                      "untouched": float(before[0].mean()), "gain": float(gain.mean())}
+        with torch.no_grad():
+            gain = 10 * torch.log10((before[0] + UNSEEN[1]) / (error[0] + UNSEEN[1]))
+            figures = torch.stack([loss, error[0].mean(), before[0].mean(), gain.mean()]).tolist()
+        return loss, dict(zip(FIGURES, figures, strict=True))
 
     @torch.no_grad()
     def check(self, pairs: Mapping[str, Sequence[Pair]]) -> dict[str, float]:
         """PSNR gained over the untouched frame, dB, by class and on average, by the weights that are kept."""
         network = RemovalNetwork(self.recipe.widths, self.recipe.blocks, self.recipe.attention)
-        network.load_state_dict({name: value.cpu() for name, value in self.kept().items()})
+        network.load_state_dict(self.kept())
+        network.to(self.device)
         gains: dict[str, float] = {}
         for kind, some in pairs.items():
             values = []
             for one in some:
-                frame, scene = (torch.from_numpy(part).permute(2, 0, 1)[None] for part in (one.frame, one.scene))
+                frame, scene = (torch.from_numpy(part).permute(2, 0, 1)[None].to(self.device)
+                                for part in (one.frame, one.scene))
                 told = network(frame).flare.clamp(min=0)
                 after = ((frame - told).clamp(min=0) - scene).square().mean()
                 before = (frame - scene).square().mean()

@@ -21,7 +21,7 @@ from ..progress import Progress
 from . import weights
 from .backgrounds import Backgrounds
 from .bank import OneFlare, OwnFlares
-from .batches import Batch, Batches, drawn_ahead
+from .batches import TURNS, Batch, Batches, drawn_ahead
 from .learners import ALONE, Learner, shared
 from .pairs import Pair, pair
 from .recipe import Recipe, as_dict, from_dict
@@ -37,13 +37,14 @@ CHECKS = 64
 CHECK_SIZE, CHECK_CANVAS = (384, 256), 448
 MOST_LEARNERS = 4
 """Large frames are not many in an iteration."""
-MOST_BESIDE_A_CARD = 8
-"""More do not draw pictures faster than a graphics card learns from them."""
 
 
 def processes_here() -> int:
-    """How many processes a training is best shared among on this machine."""
-    return min(cores(), MOST_LEARNERS if device().type == "cpu" else MOST_BESIDE_A_CARD)
+    """How many processes a training is best shared among on this machine: learners on a processor; beside a graphics
+    card that learns, those that draw pictures, by whose turns none draws the flares of another."""
+    if device().type == "cpu":
+        return min(cores(), MOST_LEARNERS)
+    return 1 + max(drawing for drawing in range(1, TURNS + 1) if TURNS % drawing == 0 and drawing <= cores())
 
 
 def checks(backgrounds: Backgrounds, lenses: Sequence[Prescription], count: int = CHECKS) -> dict[str, list[Pair]]:
@@ -85,11 +86,11 @@ def train(recipe: Recipe, folder: Path | str, backgrounds: Backgrounds, lenses: 
     processes = processes_here() if processes is None else processes
     if processes < 1:
         raise SettingsError(f"A training has at least one process, not {processes}.")
-    with held(folder):
+    with held(folder), backgrounds.mapped() if processes > 1 else contextlib.nullcontext(backgrounds) as pictures:
         path = folder / CHECKPOINT
         if path.exists() and not resume:
             raise RunError(f"{folder} holds a training already; go on with --resume, or choose another folder.")
-        beginning = Beginning(recipe, path if path.exists() else start, path.exists(), backgrounds, lenses, own)
+        beginning = Beginning(recipe, path if path.exists() else start, path.exists(), pictures, lenses, own)
         trainer = beginning.trainer(ALONE)  # before others are asked: it may refuse
         learners, drawing = (processes, 0) if trainer.device.type == "cpu" else (1, processes - 1)
         with shared(learners, _learn, beginning) as learner:

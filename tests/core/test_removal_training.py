@@ -231,7 +231,7 @@ def test_muon_s_rounds_in_one_are_the_rounds_one_by_one(rows: int, columns: int,
     for _ in range(optimiser.ROUNDS):
         square = expected @ expected.mT
         expected = a * expected + (b * square + c * square @ square) @ expected
-    found = optimiser.orthogonalised(matrix)
+    found = optimiser.orthogonalised(matrix[None])[0]
     assert found.dtype == torch.float32
     assert float((found - expected).norm() / expected.norm()) < 2e-3
 

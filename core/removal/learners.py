@@ -153,8 +153,15 @@ def shared(count: int, learn: Callable[..., None], *words: Any) -> Iterator[Lear
             torch.set_num_threads(threads)
 
 
-def begin_process(_number: int = 0) -> None:
-    """Of any process beside the first, that learns or draws: a stop is for the first alone, which ends the others."""
+def begin_drawing(_number: int) -> None:
+    """Of a process that draws: it gives way to the one that keeps a graphics card busy."""
+    _begin()
+    if hasattr(os, "nice"):
+        os.nice(10)
+
+
+def _begin() -> None:
+    """Of any process beside the first: a stop is for the first alone, which ends the others."""
     import cv2
 
     cv2.setNumThreads(1)
@@ -164,7 +171,7 @@ def begin_process(_number: int = 0) -> None:
 
 def _other(rank: int, count: int, folder: str, barrier: Barrier, threads: int, learn: Callable[..., None],
            words: tuple[Any, ...]) -> None:
-    begin_process()
+    _begin()
     first = multiprocessing.parent_process()
     if first is not None:
         _watch([first.sentinel], barrier)

@@ -36,6 +36,7 @@ class Recipe:
     widths: tuple[int, ...] = (32, 48, 96, 128, 160)
     blocks: tuple[int, ...] = (0, 1, 4, 8, 6)
     attention: tuple[int, ...] = (3, 2)  # layers of it between the blocks of the two coarsest levels
+    repeats: int = 1               # iterations that have the same pictures, later ones mirrored, in other colours
     canvas: int = 384              # pixels a side of the flares' canvas
     bank: int = 400                # flares at hand at a time, 2.7 MB each
     renew_every: int = 6           # iterations for each new flare
@@ -49,8 +50,8 @@ class Recipe:
     lamps: float = 0.2             # of them have the flares of what lamps the scene has, and those mirrored
 
     def __post_init__(self) -> None:
-        if min(self.iterations, self.pixels, self.bank, self.renew_every, self.warm) < 1:
-            raise SettingsError("A recipe needs at least one iteration, pixel and flare.")
+        if min(self.iterations, self.pixels, self.repeats, self.bank, self.renew_every, self.warm) < 1:
+            raise SettingsError("A recipe needs at least one iteration, pixel, use of a picture and flare.")
         for name in ("begun", "polish", "coloured", "aspheric", "grey", "own_share", "clean", "against_light",
                      "shoulder", "lamps", "average"):
             if not 0 <= getattr(self, name) <= 1:

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ..errors import RunError
-from .batches import Batch
+from .batches import LOOKS, Batch, Look
 from .learners import ALONE, Learner
 from .network import RemovalNetwork
 from .optimiser import Optimiser, has_bfloat16
@@ -85,7 +85,7 @@ class Trainer:
         is told where there is none counts for more. Over the last `polish` of a training the logarithm of the
         error in parts of that square, which is the picture's gain in PSNR; what a picture loses counts twice. At half
         the weight the same of the gentle part."""
-        frame, scene, gentle = (torch.from_numpy(part).permute(0, 3, 1, 2).to(self.device).float()
+        frame, scene, gentle = (_shown(torch.from_numpy(part).to(self.device), LOOKS[batch.look])
                                 for part in (batch.frame, batch.scene, batch.gentle))
         with _precision(self.device):
             told = self.network(frame)
@@ -167,6 +167,12 @@ class Trainer:
             self.begun_with = {name: value.clone() for name, value in self.averaged.items()
                                if name not in grown or any(part in name for part in NOTHING_AT_FIRST)}
         self.optimiser.load_state(state)
+
+
+def _shown(pictures: Tensor, look: Look) -> Tensor:
+    """(n, 3, h, w), float32, of pictures (n, h, w, 3)."""
+    planes = pictures[..., look.channels].permute(0, 3, 1, 2).float()
+    return planes.flip(3) if look.mirrored else planes
 
 
 def _precision(on: torch.device) -> Any:

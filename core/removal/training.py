@@ -135,9 +135,8 @@ class Beginning(NamedTuple):
 def _learn(learner: Learner, beginning: Beginning) -> None:
     """What the learners beside the first do."""
     trainer = beginning.trainer(learner)
-    batches = beginning.batches(trainer)
-    while trainer.iteration < trainer.recipe.iterations:
-        trainer.step(batches[trainer.iteration])
+    for batch in drawn_ahead(beginning.batches(trainer), trainer.iteration, trainer.recipe.iterations, 0):
+        trainer.step(batch)
 
 
 def _run(trainer: Trainer, batches: Iterator[Batch], folder: Path, held_out: Mapping[str, Sequence[Pair]],

@@ -14,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import SettingsError
+from ..errors import RunError, SettingsError
 from ..pictures import Pixels, decoded
 from . import variety
 from .mapped import Mapped
@@ -46,9 +46,14 @@ class Backgrounds:
 
     @contextmanager
     def mapped(self) -> Iterator[Backgrounds]:
-        """The same out of temporary files, for processes that share them."""
+        """The same out of temporary files, for processes that share them. Raises RunError where they cannot be
+        written."""
         with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
-            photos, maps = Mapped(Path(folder) / "photos", self.photos), Mapped(Path(folder) / "maps", self.maps)
+            try:
+                photos, maps = Mapped(Path(folder) / "photos", self.photos), Mapped(Path(folder) / "maps", self.maps)
+            except OSError as problem:
+                raise RunError(f"The pictures that processes share cannot be written to {tempfile.gettempdir()} "
+                               f"({problem.strerror}); make room there, or train with --processes 1.") from problem
             try:
                 yield replace(self, photos=photos, maps=maps)
             finally:

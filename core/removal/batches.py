@@ -20,7 +20,7 @@ from .recipe import Recipe
 from .synthesis.prescription import Prescription
 
 AHEAD = 16
-"""Iterations that each process draws ahead, so that one that draws new flares holds nobody up."""
+"""Drawings that each process has ready, so that one that draws new flares holds nobody up."""
 LAG = 8
 """Drawings that lie between uses of the same one."""
 TURNS = 16

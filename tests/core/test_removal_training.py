@@ -2,8 +2,10 @@
 """Training and scoring of the removal network: it learns, it can be stopped, its scores are right."""
 from __future__ import annotations
 
+import errno
 import json
 import multiprocessing
+import pickle
 import shutil
 from dataclasses import replace
 from functools import partial
@@ -18,16 +20,18 @@ from core.holding import held
 from core.metrics.lpips import Lpips
 from core.pictures import Pixels, write_png
 from core.progress import Progress
+from core.removal import backgrounds as removal_backgrounds
 from core.removal import evaluation, network, optimiser, training, weights
 from core.removal.backgrounds import Backgrounds
 from core.removal.bank import OwnFlares
-from core.removal.batches import Batch, Batches, drawn_ahead
+from core.removal.batches import LAG, LOOKS, Batch, Batches, drawn_ahead
 from core.removal.learners import ALONE, Learner, Table, shared
+from core.removal.mapped import Mapped
 from core.removal.network import Attention, RemovalNetwork
 from core.removal.optimiser import Optimiser
 from core.removal.recipe import Recipe, as_dict, from_dict
 from core.removal.synthesis.prescription import built_in
-from core.removal.trainer import Trainer
+from core.removal.trainer import Trainer, _shown
 from core.sheets import GAP, HEAD
 
 torch.set_num_threads(1)  # small tensors, on which threads only wait for each other
@@ -157,8 +161,68 @@ def test_pictures_are_the_same_when_others_draw_them() -> None:
     here, ahead = (list(drawn_ahead(batches, 1, 4, processes)) for processes in (0, 2))
     assert len(here) == len(ahead) == 3
     for one, other in zip(here, ahead, strict=True):
-        assert np.array_equal(one.frame, other.frame)
-        assert np.array_equal(one.gentle, other.gentle)
+        assert np.array_equal(one.frame.astype(np.float16), other.frame)
+        assert np.array_equal(one.gentle.astype(np.float16), other.gentle)
+
+
+def test_a_drawing_serves_several_iterations() -> None:
+    recipe = replace(RECIPE, repeats=3)
+    batches = Batches(recipe, backgrounds(), built_in())
+    number = {batches[drawing].frame.tobytes(): drawing for drawing in range(40)}
+    assert len(number) == 40, "no two are the same"
+
+    def uses(first: int, end: int) -> list[tuple[int, int]]:
+        return [(number[batch.frame.tobytes()], batch.look) for batch in drawn_ahead(batches, first, end, 0)]
+
+    through = uses(0, 120)
+    for drawing in range(5):
+        assert next(look for used, look in through if used == drawing) == 0, "first as it is"
+    looks = [look for used, look in through if used == 20]
+    assert looks[:2] == [0, 1], "then mirrored"
+    assert len(looks) == 3
+    assert [at for at, (used, _) in enumerate(through) if used == 20] == [60, 60 + 3 * LAG + 1, 60 + 6 * LAG + 2]
+    assert uses(85, 120) == through[85:], "a resumed training sees the same"
+
+
+def test_looks_are_of_all_three_pictures() -> None:
+    pictures = torch.rand(2, 4, 6, 3)
+    assert torch.equal(_shown(pictures, LOOKS[0]), pictures.permute(0, 3, 1, 2))
+    assert torch.equal(_shown(pictures, LOOKS[1]), pictures.permute(0, 3, 1, 2).flip(3))
+    assert len({_shown(pictures, look).numpy().tobytes() for look in LOOKS}) == len(LOOKS) == 12
+    recipe = replace(RECIPE, clean=1.0)
+    batch = Batches(recipe, backgrounds(), built_in())[0]
+    for look in range(12):
+        assert Trainer(recipe).loss(batch._replace(look=look))[1]["untouched"] == 0
+
+
+def test_pictures_that_processes_share_are_mapped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    arrays = [np.arange(5, dtype=np.uint8), np.arange(7, dtype=np.float16)[:, None], np.zeros((0, 2), np.float32)]
+    mapped = Mapped(tmp_path / "some", arrays)
+    there = pickle.loads(pickle.dumps(mapped))
+    for some in (mapped, there):
+        assert len(some) == 3
+        for one, other in zip(some, arrays, strict=True):
+            assert one.dtype == other.dtype
+            assert np.array_equal(one, other)
+        assert np.array_equal(some[-2], arrays[1])
+        assert len(some[1:]) == 2
+    with pytest.raises(ValueError, match="read-only"):
+        there[0][0] = 1
+    assert len(pickle.dumps(there)) < 1000, "what has been mapped is not sent"
+    with backgrounds().mapped() as shared_by_all:
+        sent = pickle.loads(pickle.dumps(shared_by_all))
+        for random in (np.random.default_rng(seed) for seed in range(4)):
+            state = random.bit_generator.state
+            drawn = sent.draw(random, 96, 64, 2.0)
+            random.bit_generator.state = state
+            assert np.array_equal(drawn, backgrounds().draw(random, 96, 64, 2.0))
+
+    def full(*_: object) -> Mapped:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(removal_backgrounds, "Mapped", full)
+    with pytest.raises(RunError, match=r"No space left on device.*--processes 1"), backgrounds().mapped():
+        pass
 
 
 def test_a_handful_of_pairs_is_learned() -> None:
@@ -231,7 +295,8 @@ def test_muon_s_rounds_in_one_are_the_rounds_one_by_one(rows: int, columns: int,
     for _ in range(optimiser.ROUNDS):
         square = expected @ expected.mT
         expected = a * expected + (b * square + c * square @ square) @ expected
-    found = optimiser.orthogonalised(matrix[None])[0]
+    stack = torch.stack([torch.randn(rows, columns), matrix])
+    found = optimiser.orthogonalised(stack)[1]
     assert found.dtype == torch.float32
     assert float((found - expected).norm() / expected.norm()) < 2e-3
 
@@ -388,7 +453,7 @@ def test_recipes() -> None:
     for stage in ((1.0, 32, 64), (1.0, 96, 64), (1.0, 96)):
         with pytest.raises(SettingsError, match="stages"):
             Recipe(stages=(stage,))  # type: ignore[arg-type]
-    with pytest.raises(SettingsError, match="one iteration, pixel and flare"):
+    with pytest.raises(SettingsError, match="one iteration, pixel, use of a picture and flare"):
         Recipe(pixels=0)
 
 

@@ -74,7 +74,7 @@ class SynthesisBank:
         if random.random() < self._aspheric:
             one = through_aspheres(one, (self._seed, serial, 3))
         rest, glare, light = (np.minimum(layer, 6e4).astype(np.float16) for layer in (one.rest, one.glare, one.light))
-        return Layers(rest, glare, light, one.lights, colour, one.kind)
+        return Layers(rest, glare, light, one.lights, colour)
 
 
 def one_colour(random: Random) -> NDArray[np.float32]:
@@ -99,7 +99,7 @@ class OneFlare:
     def draw(self, random: Random) -> Layers:
         """That flare."""
         made = flare((*self._seed, int(random.integers(1 << 30))), self._size, self._lenses, self._kind)
-        return Layers(made.rest, made.glare, made.light, made.lights, self._colour, made.kind)
+        return Layers(made.rest, made.glare, made.light, made.lights, self._colour)
 
 
 class OwnFlares:

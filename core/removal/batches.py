@@ -80,7 +80,7 @@ class Batches(Dataset[Batch]):
         self._made.renew_to(self.recipe.bank + drawing // self.recipe.renew_every, drawing)
         random = np.random.default_rng((self.recipe.seed, drawing, number + 1))  # to numpy, (1, 2) is (1, 2, 0)
         one = pair(random, self._bank, self._backgrounds, width, height, clean=self.recipe.clean,
-                   against_light=self.recipe.against_light, shoulder=self.recipe.shoulder, lamps=self.recipe.lamps)
+                   against_light=self.recipe.against_light, shoulder=self.recipe.shoulder)
         return of_one_channel(one, int(random.integers(3))) if random.random() < self.recipe.grey else one
 
 

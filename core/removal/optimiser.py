@@ -106,14 +106,14 @@ def orthogonalised(matrix: Tensor) -> Tensor:
     tall = matrix.shape[-2] > matrix.shape[-1]
     wide = matrix.mT if tall else matrix
     wide = wide / torch.linalg.matrix_norm(wide, keepdim=True).clamp(min=1e-7)
-    square = wide @ wide.mT
-    factors = torch.eye(square.shape[-1], dtype=square.dtype, device=square.device)
+    square = torch.bmm(wide, wide.mT)
+    factors = torch.eye(square.shape[-1], dtype=square.dtype, device=square.device).expand_as(square)
     for _ in range(ROUNDS):
         factor = torch.baddbmm(square, square, square, beta=b, alpha=c)
         factor.diagonal(dim1=-2, dim2=-1).add_(a)
-        factors = factors @ factor
-        square = square @ factor @ factor
-    found = factors @ wide
+        factors = torch.bmm(factors, factor)
+        square = torch.bmm(torch.bmm(square, factor), factor)
+    found = torch.bmm(factors, wide)
     return found.mT if tall else found
 
 

@@ -8,8 +8,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
-from itertools import product
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -18,7 +16,6 @@ from numpy.typing import NDArray
 from ..pictures import Pixels
 from .backgrounds import Backgrounds
 from .formation import GAMMAS, display, under_shoulder
-from .lamps import Lamps, lamps_of, mirrored
 
 Random = np.random.Generator
 WHITE: NDArray[np.float32] = np.ones(3, np.float32)
@@ -34,7 +31,6 @@ class Layers(NamedTuple):
     light: NDArray[Any]
     lights: tuple[tuple[float, float], ...]
     colour: NDArray[np.float32] = WHITE
-    kind: str = ""
 
 
 class Bank(Protocol):
@@ -54,22 +50,16 @@ class Pair:
 
 
 def pair(random: Random, bank: Bank, backgrounds: Backgrounds, width: int, height: int, *,
-         clean: float = 0.08, against_light: float = 0.0, shoulder: float = 0.0, lamps: float = 0.0) -> Pair:
+         clean: float = 0.08, against_light: float = 0.0, shoulder: float = 0.0) -> Pair:
     """One frame of that size; a share `clean` of all has no flare. In a share `against_light` the lights are where
     the scene is bright, as a sun is in its sky; in the others anywhere. A share `shoulder` are of cameras whose curves
-    bend towards white. In a share `lamps` the flares are of the lamps that the scene has of its own, where it has some.
-    """
+    bend towards white."""
     gamma = float(random.uniform(*GAMMAS))
     scene = _exposed(random, backgrounds.draw(random, width, height, gamma))
     rest, glare, light = (np.zeros_like(scene) for _ in range(3))
     bare = random.random() < clean
     against = against_light > 0 and random.random() < against_light
-    count = 1 if random.random() < 0.85 else 2
-    own = lamps_of(random, scene) if lamps > 0 and random.random() < lamps else None
-    if own is not None:
-        count, scene = 0, scene + own.light
-        rest, glare, light = _of_lamps(random, bank, own, scene)
-    for number in range(count):
+    for number in range(1 if random.random() < 0.85 else 2):
         layers = bank.draw(random)
         strength = 1.0 if number == 0 else random.uniform(0.1, 1)
         matrix = _laid(random, layers, width, height)
@@ -77,7 +67,7 @@ def pair(random: Random, bank: Bank, backgrounds: Backgrounds, width: int, heigh
             matrix, bright = _against_light(random, layers, matrix, scene)
             if number == 0 and random.random() < 0.5:
                 scene = scene * np.float32(np.clip(random.uniform(0.4, 2) / max(bright, 1e-3), 0.3, 3))
-        r, g, li = _placed(random, layers, [(matrix, WHITE)], width, height, strength)
+        r, g, li = _placed(random, layers, matrix, width, height, strength)
         rest, glare, light = rest + r, glare + g, np.maximum(light, li)
     if bare:
         rest, glare, light = rest * 0, glare * 0, light * float(random.random() < 0.5)
@@ -127,10 +117,6 @@ def _laid(random: Random, layers: Layers, width: int, height: int) -> NDArray[An
     return np.concatenate([linear, offset[:, None]], 1)
 
 
-ABOUT_A_LIGHT = ("scatter", "streak", "shimmer", "glare", "halo")
-"""Classes of flares that go with their light where it goes; ghosts and rings do otherwise."""
-TRIES = 8
-"""Flares drawn from a bank to find one of those."""
 TURNS = 12
 """Ways of laying a flare, of which the one with its light in the brightest place is taken."""
 
@@ -154,50 +140,23 @@ def _against_light(random: Random, layers: Layers, matrix: NDArray[Any],
     return matrix, best
 
 
-def _of_lamps(random: Random, bank: Bank, own: Lamps, scene: Pixels) -> tuple[Pixels, Pixels, Pixels]:
-    """The same flare about each lamp, or all of them mirrored, or both."""
-    height, width = scene.shape[:2]
-    rest, glare, light = (np.zeros_like(scene) for _ in range(3))
-    how = random.random()
-    layers = next((one for one in (bank.draw(random) for _ in range(TRIES)) if one.kind in ABOUT_A_LIGHT
-                   and len(one.lights) == 1 and math.hypot(*one.lights[0]) < 0.7), None) if how < 0.7 else None
-    if layers is not None:
-        matrix = _laid(random, layers, width, height)
-        at = _on_frame(matrix, layers, layers.lights[0])
-        laid = [(np.concatenate([matrix[:, :2], (matrix[:, 2] + lamp.place - at)[:, None]], 1), lamp.brightness)
-                for lamp in own.each]
-        faded = _faded(layers.rest.shape[0])
-        alone = layers._replace(rest=layers.rest * faded, glare=layers.glare * faded, light=layers.light * 0)
-        rest, glare, light = _placed(random, alone, laid, width, height, 1.0)
-    if how > 0.4:
-        rest = rest + mirrored(random, scene)
-    return rest, glare, light
-
-
-@lru_cache(maxsize=1)
-def _faded(size: int) -> NDArray[np.float32]:
-    """(size, size, 1): 1, and 0 at the edges, so that a canvas whose edges come onto the frame is not seen to end."""
-    inward = np.minimum(np.arange(size), np.arange(size)[::-1]).astype(np.float32) / (0.25 * size)
-    ramp = np.clip(np.minimum(inward[:, None], inward[None, :]), 0, 1)
-    return (ramp * ramp * (3 - 2 * ramp))[..., None]
-
-
 def _on_frame(matrix: NDArray[Any], layers: Layers, place: tuple[float, float]) -> NDArray[Any]:
     """(x, y) in pixels of a place on the canvas."""
     return matrix[:, :2] @ ((np.array(place) + 1) * layers.rest.shape[0] / 2) + matrix[:, 2]
 
 
-def _placed(random: Random, layers: Layers, laid: Sequence[tuple[NDArray[Any], NDArray[np.float32]]], width: int,
-            height: int, strength: float) -> tuple[Pixels, Pixels, Pixels]:
-    """The canvas cut to the frame, once for each matrix and brightness (3,) of `laid`; then coloured, and what the glow
-    saturates near a light given to the light."""
+def _placed(random: Random, layers: Layers, matrix: NDArray[Any], width: int, height: int,
+            strength: float) -> tuple[Pixels, Pixels, Pixels]:
+    """The canvas cut to the frame; then coloured, and what the glow saturates near a light given to the light."""
     import cv2
 
     half = math.hypot(width, height) / 2
-    rest, glare, light = (_summed(layer, laid, width, height) for layer in (layers.rest, layers.glare, layers.light))
+    rest, glare, light = (cv2.warpAffine(layer, matrix, (width, height),
+                                         flags=cv2.INTER_LINEAR)
+                          for layer in (layers.rest, layers.glare, layers.light))
     if random.random() < 0.25:
         blur = random.uniform(0.3, 2.0)
-        rest = np.asarray(cv2.GaussianBlur(rest, (0, 0), blur), np.float32)
+        rest = cv2.GaussianBlur(rest, (0, 0), blur)
     colour = np.exp(random.normal(0, 0.12, 3)).astype(np.float32)
     gain = np.float32(math.exp(random.normal(0, 0.6)) * strength)
     # Frames that are washed out altogether teach nothing: the flare's mean light is bounded.
@@ -206,7 +165,7 @@ def _placed(random: Random, layers: Layers, laid: Sequence[tuple[NDArray[Any], N
     rest, glare = rest * (colour * gain), glare * (colour * gain)
     near = np.zeros((height, width), np.float32)
     x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
-    for place, (matrix, _) in product(layers.lights, laid):
+    for place in layers.lights:
         at = _on_frame(matrix, layers, place)
         near = np.maximum(near, np.exp(-((x - at[0]) ** 2 + (y - at[1]) ** 2) / np.float32((0.35 * half) ** 2)))
     red, green, blue = np.moveaxis(rest + glare, -1, 0)
@@ -217,16 +176,6 @@ def _placed(random: Random, layers: Layers, laid: Sequence[tuple[NDArray[Any], N
     kept_light: Pixels = np.maximum(light, (rest + glare) * kept)
     rest, glare, light = (part * layers.colour for part in (rest * (1 - kept), glare * (1 - kept), kept_light))
     return rest, glare, light
-
-
-def _summed(layer: Pixels, laid: Sequence[tuple[NDArray[Any], NDArray[np.float32]]], width: int,
-            height: int) -> Pixels:
-    import cv2
-
-    cut = [(cv2.warpAffine(layer, matrix, (width, height), flags=cv2.INTER_LINEAR), brightness)
-           for matrix, brightness in laid]
-    of_each = [part if brightness is WHITE else part * brightness for part, brightness in cut]
-    return np.asarray(of_each[0] if len(of_each) == 1 else np.sum(of_each, 0), np.float32)
 
 
 def _developed(random: Random, shown: Sequence[Pixels]) -> list[Pixels]:

@@ -47,13 +47,12 @@ class Recipe:
     clean: float = 0.12            # of the frames have no flare
     against_light: float = 0.3     # of the frames have their lights where the scene is bright
     shoulder: float = 0.3          # of them are of cameras whose curves bend towards white
-    lamps: float = 0.2             # of them have the flares of what lamps the scene has, and those mirrored
 
     def __post_init__(self) -> None:
         if min(self.iterations, self.pixels, self.repeats, self.bank, self.renew_every, self.warm) < 1:
             raise SettingsError("A recipe needs at least one iteration, pixel, use of a picture and flare.")
         for name in ("begun", "polish", "coloured", "aspheric", "grey", "own_share", "clean", "against_light",
-                     "shoulder", "lamps", "average"):
+                     "shoulder", "average"):
             if not 0 <= getattr(self, name) <= 1:
                 raise SettingsError(f"A recipe's {name} is a share from 0 to 1, not {getattr(self, name)}.")
         if self.seed < 0 or self.decay < 0 or not 32 <= self.canvas <= 8192:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ast
 from pathlib import Path
-from typing import cast
 
 import numpy as np
 import pytest
@@ -12,7 +11,7 @@ from numpy.typing import NDArray
 
 from core.errors import FrameError, SettingsError
 from core.pictures import write_png
-from core.removal import formation, lamps, pairs, variety
+from core.removal import formation, pairs, variety
 from core.removal.backgrounds import Backgrounds, kept_for_test, read_backgrounds
 from core.removal.bank import Mixed, OwnFlares, SynthesisBank
 from core.removal.recipe import Recipe
@@ -156,8 +155,7 @@ class Single:
     """A bank of one flare."""
 
     def __init__(self, made: Flare, colour: tuple[float, float, float] = (1, 1, 1)) -> None:
-        self.layers = pairs.Layers(made.rest, made.glare, made.light, made.lights, np.array(colour, np.float32),
-                                   made.kind)
+        self.layers = pairs.Layers(made.rest, made.glare, made.light, made.lights, np.array(colour, np.float32))
 
     def draw(self, random: np.random.Generator) -> pairs.Layers:
         del random
@@ -237,58 +235,6 @@ def test_parts_of_a_bank_take_turns() -> None:
     assert drawn[4:] == drawn[:4]
     assert len(SynthesisBank(4, 2, SIZE, lenses.built_in(), turns=4)) == 2, "more turns than flares"
     SynthesisBank(4, 2, SIZE, lenses.built_in(), turns=4).draw(np.random.default_rng(0))
-
-
-def street() -> NDArray[np.float32]:
-    """(80, 120, 3) linear light: dusk with a large white and a small orange lamp."""
-    scene = np.full((80, 120, 3), 0.05, np.float32)
-    scene[20:26, 30:36] = 0.9
-    scene[50:53, 90:93] = (0.9, 0.6, 0.2)
-    return scene
-
-
-def test_lamps_of_a_scene() -> None:
-    found = lamps.lamps_of(np.random.default_rng(1), street())
-    assert found is not None
-    large, small = found.each
-    assert large.place == pytest.approx([33, 23])
-    assert small.place == pytest.approx([91.5, 51.5])
-    assert large.brightness.max() > small.brightness.max()
-    assert small.brightness == pytest.approx(small.brightness[0] * np.array([1, 2 / 3, 2 / 9]))
-    assert found.light[22, 32].min() > 0
-    assert found.light[60, 60].max() == 0
-    for none in (np.zeros((80, 120, 3), np.float32), np.full((80, 120, 3), 0.5, np.float32)):
-        assert lamps.lamps_of(np.random.default_rng(1), none) is None
-    speck = np.full((80, 120, 3), 0.1, np.float32)
-    speck[4, 4] = 1
-    assert lamps.lamps_of(np.random.default_rng(1), speck) is None
-
-
-def test_lamps_are_seen_once_more_about_the_middle() -> None:
-    y, x = np.mgrid[:80, :120]
-    for seed in range(8):
-        ghost = lamps.mirrored(np.random.default_rng(seed), street()).sum(-1)
-        assert ghost.min() >= 0
-        assert 0 < ghost.max() < 1.6
-        left = ghost * (x > 60)  # of the large lamp, which is on the left
-        assert (left * x).sum() / left.sum() == pytest.approx(120 - 33, abs=6)
-        assert (left * y).sum() / left.sum() == pytest.approx(80 - 23, abs=6)
-
-
-def test_flares_of_a_scene_s_own_lamps() -> None:
-    class Street:
-        def draw(self, *_: object) -> NDArray[np.float32]:
-            return street()
-
-    made = (flare((seed, 0), 128, lenses.built_in(), "glare") for seed in range(20))
-    bank = Single(next(one for one in made if len(one.lights) == 1 and np.hypot(*one.lights[0]) < 0.6))
-    kind = [pairs.pair(np.random.default_rng(seed), bank, cast(Backgrounds, Street()), 120, 80, clean=0, lamps=1)
-            for seed in range(12)]
-    about = [one.frame - one.scene for one in kind]
-    assert all(np.quantile(part, 0.01) > -0.03 for part in about), "but for what JPEG makes of the lamps' edges"
-    glow = [part for part in about if part[28, 33].mean() > part[75, 5].mean() + 0.02]
-    assert len(glow) >= 4, "round a lamp where it is"
-    assert all((one.gentle >= one.scene - 1e-6).all() for one in kind)
 
 
 def test_some_of_a_bank_are_of_lights_of_one_colour() -> None:

@@ -7,7 +7,7 @@ import tempfile
 import zlib
 from collections.abc import Iterable, Iterator, Sequence, Set
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -43,22 +43,6 @@ class Backgrounds:
     photos: Sequence[NDArray[np.uint8]]
     maps: Sequence[NDArray[np.float16]]
     varied: bool = False
-
-    @contextmanager
-    def mapped(self) -> Iterator[Backgrounds]:
-        """The same out of temporary files, for processes that share them. Raises RunError where they cannot be
-        written."""
-        with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
-            try:
-                photos, maps = Mapped(Path(folder) / "photos", self.photos), Mapped(Path(folder) / "maps", self.maps)
-            except OSError as problem:
-                raise RunError(f"The pictures that processes share cannot be written to {tempfile.gettempdir()} "
-                               f"({problem.strerror}); make room there, or train with --processes 1.") from problem
-            try:
-                yield replace(self, photos=photos, maps=maps)
-            finally:
-                photos.clear()
-                maps.clear()
 
     def draw(self, random: Random, width: int, height: int, gamma: float) -> Pixels:
         """(height, width, 3) linear light: a random window of a random picture, at a random scale; one in eight out
@@ -106,6 +90,26 @@ def read_backgrounds(folders: Iterable[Path | str], part: Part = "all", longest:
         raise SettingsError(f"There are no pictures in {', '.join(looked) or 'no folder'}; name a folder of clean "
                             "photographs or environment maps.")
     return Backgrounds(photos, maps, varied)
+
+
+@contextmanager
+def mapped_backgrounds(folders: Iterable[Path | str], part: Part = "all", longest: int = 720, *,
+                       varied: bool = False) -> Iterator[Backgrounds]:
+    """What `read_backgrounds` reads, out of temporary files: in memory once, however many processes share it. Raises
+    RunError too, where they cannot be written."""
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
+        found = read_backgrounds(folders, part, longest, varied=varied)
+        try:
+            photos, maps = Mapped(Path(folder) / "photos", found.photos), Mapped(Path(folder) / "maps", found.maps)
+        except OSError as problem:
+            raise RunError(f"The clean pictures cannot be laid down in {tempfile.gettempdir()} ({problem.strerror}); "
+                           "make room there, or name another folder in TMPDIR.") from problem
+        found = Backgrounds(photos, maps, varied)
+        try:
+            yield found
+        finally:
+            photos.clear()
+            maps.clear()
 
 
 def pictures_of(folder: Path, suffixes: Set[str], part: Part) -> list[Path]:

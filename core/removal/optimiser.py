@@ -97,14 +97,14 @@ def _parcels(matrices: Sequence[Tensor], numbers: Iterable[int]) -> Iterable[lis
     return found.values()
 
 
-def orthogonalised(matrix: Tensor) -> Tensor:
+def orthogonalised(matrices: Tensor) -> Tensor:
     """(k, n, m), float32: the same singular vectors, singular values between about 0.7 and 1.2.
 
-    Each round multiplies the matrix by a polynomial of its square x x^T, and those of all rounds commute. So they are
+    Each round multiplies a matrix by a polynomial of its square x x^T, and those of all rounds commute. So they are
     multiplied with each other first, as matrices of the shorter side alone, and the matrix itself comes in twice."""
     a, b, c = QUINTIC
-    tall = matrix.shape[-2] > matrix.shape[-1]
-    wide = matrix.mT if tall else matrix
+    tall = matrices.shape[-2] > matrices.shape[-1]
+    wide = matrices.mT if tall else matrices
     wide = wide / torch.linalg.matrix_norm(wide, keepdim=True).clamp(min=1e-7)
     square = torch.bmm(wide, wide.mT)
     factors = torch.eye(square.shape[-1], dtype=square.dtype, device=square.device).expand_as(square)

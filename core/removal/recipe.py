@@ -38,7 +38,7 @@ class Recipe:
     attention: tuple[int, ...] = (3, 2)  # layers of it between the blocks of the two coarsest levels
     repeats: int = 1               # iterations that have the same pictures, later ones mirrored, in other colours
     canvas: int = 384              # pixels a side of the flares' canvas
-    bank: int = 400                # flares at hand at a time, 2.7 MB each
+    bank: int = 400                # flares kept at a time, 2.7 MB each; a sixteenth are at hand in an iteration
     renew_every: int = 6           # iterations for each new flare
     coloured: float = 0.15         # of the synthesised flares are of lights of one colour
     aspheric: float = 0.3          # of them have the ghosts of moulded lenses too

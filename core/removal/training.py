@@ -86,11 +86,11 @@ def train(recipe: Recipe, folder: Path | str, backgrounds: Backgrounds, lenses: 
     processes = processes_here() if processes is None else processes
     if processes < 1:
         raise SettingsError(f"A training has at least one process, not {processes}.")
-    with held(folder), backgrounds.mapped() if processes > 1 else contextlib.nullcontext(backgrounds) as pictures:
+    with held(folder):
         path = folder / CHECKPOINT
         if path.exists() and not resume:
             raise RunError(f"{folder} holds a training already; go on with --resume, or choose another folder.")
-        beginning = Beginning(recipe, path if path.exists() else start, path.exists(), pictures, lenses, own)
+        beginning = Beginning(recipe, path if path.exists() else start, path.exists(), backgrounds, lenses, own)
         trainer = beginning.trainer(ALONE)  # before others are asked: it may refuse
         learners, drawing = (processes, 0) if trainer.device.type == "cpu" else (1, processes - 1)
         with shared(learners, _learn, beginning) as learner:

@@ -60,7 +60,7 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
 
     from ...core.removal import recipe as recipes
     from ...core.removal import weights
-    from ...core.removal.backgrounds import kept_for_test, read_backgrounds
+    from ...core.removal.backgrounds import kept_for_test, mapped_backgrounds, read_backgrounds
     from ...core.removal.bank import OwnFlares
     from ...core.removal.evaluation import held_out
     from ...core.removal.synthesis.prescription import built_in, read_lenses
@@ -88,25 +88,25 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     lenses = read_lenses(words.lenses, words.most_lenses) if words.lenses else []
     train_on = [lens for lens in lenses if not kept_for_test(lens.name)] + built_in()
     test_on = held_out(lenses)
-    backgrounds = read_backgrounds(words.backgrounds, "train", varied=True)
-    try:
-        tests = read_backgrounds(words.backgrounds, "test"), test_on
-    except SettingsError:
-        tests = None
-        progress.say("There are too few clean pictures to keep some for checks; the log will have none.")
-    own = OwnFlares(words.flares, recipe.canvas) if words.flares else None
-    if own and own.without_light:
-        progress.say(f"{len(own.without_light)} of your {len(own)} flares have no picture of their light in "
-                     f"Light_Source, {own.without_light[0].name} first; it is learned as a part of the flare.")
-    if words.model == "diffusion":
-        return _diffusion(words, recipe, backgrounds, train_on, own, progress)
-    start = weights.IN_THE_BOX if str(words.start) == "box" else words.start
-    progress.say(f"{len(backgrounds.photos)} photographs, {len(backgrounds.maps)} environment maps, {len(train_on)} "
-                 f"lenses, {len(own) if own else 'no'} flares of your own.")
-    path = train(recipe, words.out, backgrounds, train_on, tests=tests, own=own, resume=words.resume, start=start,
-                 processes=words.processes, progress=progress)
-    progress.say(f"The weights are in {path}; use them with `remove --weights`.")
-    return {"weights": str(path)}
+    with mapped_backgrounds(words.backgrounds, "train", varied=True) as backgrounds:
+        try:
+            tests = read_backgrounds(words.backgrounds, "test"), test_on
+        except SettingsError:
+            tests = None
+            progress.say("There are too few clean pictures to keep some for checks; the log will have none.")
+        own = OwnFlares(words.flares, recipe.canvas) if words.flares else None
+        if own and own.without_light:
+            progress.say(f"{len(own.without_light)} of your {len(own)} flares have no picture of their light in "
+                         f"Light_Source, {own.without_light[0].name} first; it is learned as a part of the flare.")
+        if words.model == "diffusion":
+            return _diffusion(words, recipe, backgrounds, train_on, own, progress)
+        start = weights.IN_THE_BOX if str(words.start) == "box" else words.start
+        progress.say(f"{len(backgrounds.photos)} photographs, {len(backgrounds.maps)} environment maps, "
+                     f"{len(train_on)} lenses, {len(own) if own else 'no'} flares of your own.")
+        path = train(recipe, words.out, backgrounds, train_on, tests=tests, own=own, resume=words.resume, start=start,
+                     processes=words.processes, progress=progress)
+        progress.say(f"The weights are in {path}; use them with `remove --weights`.")
+        return {"weights": str(path)}
 
 
 def _diffusion(words: argparse.Namespace, recipe: Recipe, backgrounds: Backgrounds,

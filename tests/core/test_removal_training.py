@@ -195,7 +195,7 @@ def test_looks_are_of_all_three_pictures() -> None:
         assert Trainer(recipe).loss(batch._replace(look=look))[1]["untouched"] == 0
 
 
-def test_pictures_that_processes_share_are_mapped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pictures_that_processes_share_are_mapped(tmp_path: Path) -> None:
     arrays = [np.arange(5, dtype=np.uint8), np.arange(7, dtype=np.float16)[:, None], np.zeros((0, 2), np.float32)]
     mapped = Mapped(tmp_path / "some", arrays)
     there = pickle.loads(pickle.dumps(mapped))
@@ -209,19 +209,25 @@ def test_pictures_that_processes_share_are_mapped(tmp_path: Path, monkeypatch: p
     with pytest.raises(ValueError, match="read-only"):
         there[0][0] = 1
     assert len(pickle.dumps(there)) < 1000, "what has been mapped is not sent"
-    with backgrounds().mapped() as shared_by_all:
-        sent = pickle.loads(pickle.dumps(shared_by_all))
-        for random in (np.random.default_rng(seed) for seed in range(4)):
-            state = random.bit_generator.state
-            drawn = sent.draw(random, 96, 64, 2.0)
-            random.bit_generator.state = state
-            assert np.array_equal(drawn, backgrounds().draw(random, 96, 64, 2.0))
+
+
+def test_backgrounds_out_of_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for number in range(3):
+        write_png(tmp_path / f"{number}.png", np.random.default_rng(number).random((80, 96, 3)).astype(np.float32))
+    held_in_memory = removal_backgrounds.read_backgrounds([tmp_path], varied=True)
+    with removal_backgrounds.mapped_backgrounds([tmp_path], varied=True) as found:
+        sent = pickle.loads(pickle.dumps(found))
+        assert sent.varied
+        for seed in range(4):
+            drawn, expected = (some.draw(np.random.default_rng(seed), 96, 64, 2.0) for some in (sent, held_in_memory))
+            assert np.array_equal(drawn, expected)
 
     def full(*_: object) -> Mapped:
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(removal_backgrounds, "Mapped", full)
-    with pytest.raises(RunError, match=r"No space left on device.*--processes 1"), backgrounds().mapped():
+    with pytest.raises(RunError, match=r"No space left on device.*TMPDIR"), \
+            removal_backgrounds.mapped_backgrounds([tmp_path]):
         pass
 
 

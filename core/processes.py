@@ -22,6 +22,8 @@ DONE, FAILED, MISUSED, STOPPED = 0, 1, 2, 130
 PROC = Path("/proc")
 SLACK_S = 5.0
 """By which the clocks of the two may differ."""
+DAY_S = 86400
+CENTURY_S = 36525 * DAY_S
 
 
 def python_at(place: Path) -> Path | None:
@@ -153,4 +155,5 @@ def _told_by_ps(pid: int) -> float | None:
     age = 0
     for part in clock.split(":"):
         age = age * 60 + int(part)
-    return time.time() - age - 86400 * int(days or 0)
+    age += DAY_S * int(days or 0)
+    return time.time() - (age if age < CENTURY_S else 0)  # procps tells 441077234 days of one that has just begun

@@ -49,7 +49,8 @@ def test_one_that_ended_unasked_does_not_run() -> None:
 
 
 def test_ages_as_ps_tells_them(monkeypatch: pytest.MonkeyPatch) -> None:
-    for told, age in (("      03:07\n", 187), ("1-02:03:04", 93784), ("   12:00:00", 43200)):
+    for told, age in (("      03:07\n", 187), ("1-02:03:04", 93784), ("   12:00:00", 43200),
+                      ("441077234-00:18:40\n", 0)):
         monkeypatch.setattr(processes.subprocess, "run",
                             lambda *_words, told=told, **_options: subprocess.CompletedProcess([], 0, told))
         assert processes._told_by_ps(1) == pytest.approx(time.time() - age, abs=1)

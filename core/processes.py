@@ -24,6 +24,7 @@ SLACK_S = 5.0
 """By which the clocks of the two may differ."""
 DAY_S = 86400
 CENTURY_S = 36525 * DAY_S
+"""No process is as old."""
 
 
 def python_at(place: Path) -> Path | None:
@@ -147,7 +148,8 @@ def _told_by_proc(pid: int) -> float | None:
 
 
 def _told_by_ps(pid: int) -> float | None:
-    """By its age: [[days-]hours:]minutes:seconds."""
+    """By its age: [[days-]hours:]minutes:seconds. Of one that has just begun procps tells 441077234 days now and
+    then."""
     told = subprocess.run(["ps", "-o", "etime=", "-p", str(pid)], capture_output=True, text=True, check=False)
     days, _, clock = told.stdout.strip().rpartition("-")
     if not clock:
@@ -156,4 +158,4 @@ def _told_by_ps(pid: int) -> float | None:
     for part in clock.split(":"):
         age = age * 60 + int(part)
     age += DAY_S * int(days or 0)
-    return time.time() - (age if age < CENTURY_S else 0)  # procps tells 441077234 days of one that has just begun
+    return time.time() - (age if age < CENTURY_S else 0)

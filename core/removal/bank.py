@@ -36,14 +36,15 @@ class SynthesisBank:
     """`count` flares of the seed, each made when it is first drawn; `renew_to` replaces the oldest, so that none is
     seen for ever.
 
-    What a bank holds is a function of the seed and of how far it was renewed: a resumed training sees the
-    same flares. A share `coloured` are of lights of one colour (traffic lights, tail lamps, neon), and a share
-    `aspheric` have the ghosts of moulded lenses too, neither of which any class of flares has.
+    What a bank holds is a function of the seed and of how far it was renewed: a resumed training sees the same flares.
+    Of its parts one is at hand at a time, so that processes can share its flares out among them. A share `coloured`
+    are of lights of one colour (traffic lights, tail lamps, neon), and a share `aspheric` have the ghosts of moulded
+    lenses too, neither of which any class of flares has.
     """
 
     def __init__(self, seed: int, count: int, size: int, lenses: Sequence[Prescription], coloured: float = 0,
                  aspheric: float = 0, turns: int = 1) -> None:
-        """turns: parts of the bank, of which one is at hand at a time."""
+        """turns: how many parts there are."""
         self._seed, self._size, self._lenses = seed, size, lenses
         self._coloured, self._aspheric = coloured, aspheric
         self._made: list[tuple[int, Layers] | None] = [None] * count

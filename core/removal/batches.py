@@ -1,8 +1,13 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """What a training sees: the pictures of each iteration, a function of recipe and iteration; for a learner its share,
-beside a graphics card drawn ahead."""
+beside a graphics card drawn ahead.
+
+A drawing is what `Batches` make at a time: the frames of an iteration, or of several, which see them in different
+looks.
+"""
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Sequence
 from itertools import permutations
 from typing import Any, NamedTuple
@@ -14,7 +19,7 @@ from torch.utils.data import DataLoader, Dataset
 
 from .backgrounds import Backgrounds
 from .bank import Mixed, OwnFlares, SynthesisBank
-from .learners import ALONE, Learner, begin_drawing
+from .learners import ALONE, Learner, begin_process
 from .pairs import Bank, Pair, of_one_channel, pair
 from .recipe import Recipe
 from .synthesis.prescription import Prescription
@@ -47,7 +52,7 @@ class Look(NamedTuple):
 
 
 LOOKS = tuple(Look(mirrored, channels) for channels in permutations(range(3)) for mirrored in (False, True))
-"""The picture itself, mirrored, and in other colours."""
+"""The picture itself, then the same mirrored, then both in other colours."""
 
 
 class Batches(Dataset[Batch]):
@@ -98,13 +103,21 @@ def drawn_ahead(batches: Batches, first: int, end: int, processes: int) -> Itera
                         # of single samples, with batch_size=None
                         collate_fn=_to_send if processes else _as_they_are,  # type: ignore[arg-type]
                         pin_memory=processes > 0 and torch.cuda.is_available(),  # by a thread, which also receives
-                        worker_init_fn=begin_drawing,
+                        worker_init_fn=_begin_drawing,
                         multiprocessing_context="spawn" if processes else None)  # OpenCV's threads survive no fork
     drawn = enumerate(loader, earliest)  # the processes begin here, not when the first batch is asked for
     return _repeated(drawn, first, end, batches.recipe)
 
 
+def _begin_drawing(_number: int) -> None:
+    """A process that draws gives way to the one that keeps a graphics card busy."""
+    begin_process()
+    if hasattr(os, "nice"):
+        os.nice(10)
+
+
 def _repeated(drawn: Iterator[tuple[int, Batch]], first: int, end: int, recipe: Recipe) -> Iterator[Batch]:
+    """The batches of iterations first..end-1, of numbered drawings in order that begin early enough."""
     kept: dict[int, Batch] = {}
     for iteration in range(first, end):
         newest, again = divmod(iteration, recipe.repeats)
@@ -117,11 +130,11 @@ def _repeated(drawn: Iterator[tuple[int, Batch]], first: int, end: int, recipe: 
 
 
 def _as_they_are(batch: Batch) -> Batch:
-    """Not as tensors, which would be sent through shared memory: containers often have little of it."""
     return batch
 
 
 def _to_send(batch: Batch) -> Batch:
-    """Half as much, by torch, which takes a tenth of numpy's time; its steps of 0.0005 are not seen."""
+    """Half as much, by torch, which takes a tenth of numpy's time; steps of 0.0005 are not seen. Not as tensors, which
+    would be sent through shared memory: containers often have little of it."""
     frame, scene, gentle = (torch.from_numpy(part).half().numpy() for part in batch[:3])
     return Batch(frame, scene, gentle, batch.share)

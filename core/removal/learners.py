@@ -153,15 +153,8 @@ def shared(count: int, learn: Callable[..., None], *words: Any) -> Iterator[Lear
             torch.set_num_threads(threads)
 
 
-def begin_drawing(_number: int) -> None:
-    """Of a process that draws: it gives way to the one that keeps a graphics card busy."""
-    _begin()
-    if hasattr(os, "nice"):
-        os.nice(10)
-
-
-def _begin() -> None:
-    """Of any process beside the first: a stop is for the first alone, which ends the others."""
+def begin_process() -> None:
+    """Of any process beside the first, that learns or draws: a stop is for the first alone, which ends the others."""
     import cv2
 
     cv2.setNumThreads(1)
@@ -171,7 +164,7 @@ def _begin() -> None:
 
 def _other(rank: int, count: int, folder: str, barrier: Barrier, threads: int, learn: Callable[..., None],
            words: tuple[Any, ...]) -> None:
-    _begin()
+    begin_process()
     first = multiprocessing.parent_process()
     if first is not None:
         _watch([first.sentinel], barrier)

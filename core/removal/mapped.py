@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Arrays that several processes read and none holds."""
+"""Arrays that several processes read and none holds: the photographs of a training."""
 from __future__ import annotations
 
 import math

@@ -256,6 +256,22 @@ def test_what_is_told_of_clean_pictures_counts_for_more_in_the_end() -> None:
     assert losses[80] == losses[99]
 
 
+def test_a_local_goal_minds_what_is_told_where_no_flare_is() -> None:
+    scene = np.full((1, 96, 192, 3), 0.25, np.float32)
+    frame = scene.copy()
+    frame[:, :, :96] += 0.5
+    batch = Batch(frame, scene, scene, 1.0)
+    losses = {}
+    for local in (0.0, 0.5, 1.0):
+        trainer = Trainer(replace(RECIPE, polish=1.0, local=local))
+        torch.nn.init.constant_(trainer.network.head.bias, 0.1)
+        losses[local] = float(trainer.loss(batch)[0].detach())
+    # All of the picture is nearer to its scene; of its squares one half is, by less than what the other half loses.
+    assert losses[0.0] < -0.3
+    assert losses[1.0] > 0.5
+    assert losses[0.5] == pytest.approx((losses[0.0] + losses[1.0]) / 2, rel=0.02)
+
+
 def test_the_steps_of_hidden_weights_are_as_long_in_every_direction() -> None:
     """And as long as AdamW's usually are, a fifth of the rate; other weights take AdamW's, whose first is the rate."""
     recipe = Recipe(widths=(16, 16, 16, 16, 16), decay=0)
@@ -449,6 +465,8 @@ def test_recipes() -> None:
     assert from_dict(as_dict(recipe)) == recipe
     with pytest.raises(SettingsError, match="has no speed"):
         from_dict({"speed": 1})
+    with pytest.raises(SettingsError, match="local is a share from 0 to 1, not 2"):
+        Recipe(local=2)
     with pytest.raises(SettingsError, match="5 levels"):
         Recipe(widths=())
     with pytest.raises(SettingsError, match="5 levels"):

@@ -33,7 +33,7 @@ class Recipe:
     average: float = 0.9995        # of the weights that are kept, over iterations
     begun: float = 0.0             # share, in the weights that are kept, of those that a training began with
     polish: float = 0.15           # of the iterations, the last of them, go for each picture's PSNR
-    local: float = 0.0             # of that goal is the PSNR of each square of a picture rather than of all of it
+    local: float = 0.0             # of that goal is the PSNR of each patch of a picture rather than of all of it
     widths: tuple[int, ...] = (32, 48, 96, 128, 160)
     blocks: tuple[int, ...] = (0, 1, 4, 8, 6)
     attention: tuple[int, ...] = (3, 2)  # layers of it between the blocks of the two coarsest levels

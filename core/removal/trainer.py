@@ -29,8 +29,8 @@ UNSEEN, SEEN_FROM = (3e-4, 3e-5), 0.8
 iteration on, pictures without any flare have the larger part of the gradients, and what is told of flares that are
 plain to see is held down with the rest."""
 
-SQUARE = 48
-"""Pixels a side of the squares of a picture whose own gains count beside the picture's, by the recipe's `local`."""
+PATCH = 48
+"""Pixels a side of the patches of a picture whose own gains count beside the picture's, by the recipe's `local`."""
 
 NOTHING_AT_FIRST = (".second.", ".told.")
 """In the names of the last convolutions of blocks and of layers of attention, which are zero before training."""
@@ -88,14 +88,15 @@ class Trainer:
         one: at first strong flares lead, which are learned sooner, in the end faint ones count as much, and what
         is told where there is none counts for more. Over the last `polish` of a training the logarithm of the
         error in parts of that square, which is the picture's gain in PSNR; what a picture loses counts twice. A
-        share of it, `local`, is the mean of the same over squares of the picture. At half the weight the same of the
-        gentle part."""
+        share of that goal, `local`, is the mean of the same over patches of the picture. At half the weight the same of
+        the gentle part."""
         frame, scene, gentle = (_shown(torch.from_numpy(part).to(self.device), LOOKS[batch.look])
                                 for part in (batch.frame, batch.scene, batch.gentle))
         with _precision(self.device):
             told = self.network(frame)
         goals = torch.stack([frame - scene, frame - gentle])
-        flares, errors = (part.square().mean(2) for part in (goals, torch.stack([told.flare, told.gentle]) - goals))
+        flares = goals.square().mean(2)
+        errors = (torch.stack([told.flare, told.gentle]) - goals).square().mean(2)
         before, error = flares.mean((2, 3)), errors.mean((2, 3))
         done = min(self.iteration / self.recipe.iterations, 1.0)
         faint = FAINT[0] * (FAINT[1] / FAINT[0]) ** max(4 * done - 3, 0.0)
@@ -103,10 +104,10 @@ class Trainer:
             left = error / (before[0] + faint) ** (0.5 + 0.5 * done)
         else:
             unseen = UNSEEN[0] * (UNSEEN[1] / UNSEEN[0]) ** min(done / SEEN_FROM, 1.0)
-            left = _lost(error, before, unseen)
+            left = _log_left(error, before, unseen)
             if self.recipe.local:
-                in_squares = _lost(_in_squares(errors), _in_squares(flares), unseen).mean((2, 3))
-                left = torch.lerp(left, in_squares, self.recipe.local)
+                in_patches = _log_left(_by_patch(errors), _by_patch(flares), unseen).mean((2, 3))
+                left = torch.lerp(left, in_patches, self.recipe.local)
         loss = left[0].mean() + 0.5 * left[1].mean()
         with torch.no_grad():
             gain = 10 * torch.log10((before[0] + UNSEEN[1]) / (error[0] + UNSEEN[1]))
@@ -176,16 +177,16 @@ class Trainer:
         self.optimiser.load_state(state)
 
 
-def _lost(error: Tensor, before: Tensor, unseen: float) -> Tensor:
-    """The logarithm of errors in parts of what they were before; what has become worse counts twice."""
+def _log_left(error: Tensor, before: Tensor, unseen: float) -> Tensor:
+    """The logarithm of squared errors in parts of what they were untouched; what has become worse counts twice."""
     left = torch.log((error + unseen) / (before + unseen))
     return left + left.clamp(min=0)
 
 
-def _in_squares(squared: Tensor) -> Tensor:
-    """Means over squares of SQUARE pixels a side, the last of a row or column being narrower: (2, n, h, w) to
-    (2, n, rows, columns)."""
-    return F.avg_pool2d(squared, SQUARE, ceil_mode=True)
+def _by_patch(squared: Tensor) -> Tensor:
+    """Means over patches, of which the last of a row or column may be narrower: (2, n, h, w) to (2, n, rows,
+    columns)."""
+    return F.avg_pool2d(squared, PATCH, ceil_mode=True)
 
 
 def _shown(pictures: Tensor, look: Look) -> Tensor:

@@ -71,12 +71,14 @@ def _itself_and_its_folders(path: Path) -> list[Path]:
 
 def remove_all(inputs: Sequence[Path], folder: Path, remover: Remover, progress: Progress, *,
                flare_folder: Path | None = None, mattes: Mattes | None = None, overwrite: bool = False,
-               wanted: Container[Path] | None = None, stills: bool = False) -> dict[str, Any]:
+               wanted: Container[Path] | None = None, stills: bool = False,
+               left_out: Sequence[str] = ()) -> dict[str, Any]:
     """Clean every plate into `folder`; one whose result is there, made from the same plate, neighbours and matte in the
     same way (`Record`), is left as it is, and so is one that was worked on since it was made from the same plate.
 
     mattes: where the flares are; None to have them found anywhere. wanted: names below the output folder of those to be
-    cleaned; None for all. stills: each by itself, in place of in line with its neighbours.
+    cleaned; None for all. stills: each by itself, in place of in line with its neighbours. left_out: what is to be said
+    of inputs that turned out to be no plates (`footage.with_frames`), which have failed with it.
 
     Raises SettingsError before anything is written, FrameError at once where the folder may not be written to, and
     FrameError after everything was tried, with a list of the plates that failed.
@@ -92,7 +94,9 @@ def remove_all(inputs: Sequence[Path], folder: Path, remover: Remover, progress:
     if wanted is not None:
         plates = [(path, name) for path, name in plates if name in wanted]
     progress.stage("remove", len(plates))
-    failed: list[str] = []
+    failed = list(left_out)
+    for sentence in failed:
+        progress.say(f"Left out: {sentence}")
     made, kept = 0, Counter[Kept]()
     for path, name in sorted(plates, key=lambda plate: shot_order(plate[0])):
         try:
@@ -121,6 +125,7 @@ def remove_all(inputs: Sequence[Path], folder: Path, remover: Remover, progress:
         progress.advance()
     record.tell_kept(kept, progress)
     if failed:
-        raise FrameError(f"{len(failed)} of {len(plates)} plates could not be cleaned: {spelled_out(failed)}")
+        raise FrameError(f"{len(failed)} of {len(plates) + len(left_out)} plates could not be cleaned: "
+                         f"{spelled_out(failed)}")
     progress.say(f"{made + kept.total()} clean plates are in {folder}.")
     return {"plates": str(folder), "made": made, "kept": kept.total()}

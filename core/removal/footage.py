@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from pathlib import Path
 
-from ..errors import FrameError, SettingsError
+from ..errors import FrameError, SettingsError, spelled_out
 from ..files import atomic_folder, content_of, read_json, write_json
 from ..pictures import write_png
 from ..progress import Progress
@@ -15,17 +15,18 @@ RECORD = "video.json"
 """In the folder of a video's frames, of which video they are."""
 
 
-def with_frames(inputs: Iterable[Path], folder: Path, progress: Progress) -> list[Path]:
-    """`inputs` with each video replaced by the folder of its frames, below `folder`. One that cannot be read is told
-    and stays what it is: no plate."""
-    found = []
+def with_frames(inputs: Iterable[Path], folder: Path, progress: Progress) -> tuple[list[Path], list[str]]:
+    """`inputs` with each video replaced by the folder of its frames, below `folder`; what is to be said of videos that
+    cannot be read, which are left out. Raises FrameError where nothing else was given."""
+    found, left_out = list[Path](), list[str]()
     for given in inputs:
         try:
             found.append(frames_of(given, folder, progress) if given.is_file() and is_video(given) else given)
         except FrameError as problem:
-            progress.say(f"Left out: {problem}")
-            found.append(given)
-    return found
+            left_out.append(str(problem))
+    if left_out and not found:
+        raise FrameError(spelled_out(left_out))
+    return found, left_out
 
 
 def frames_of(video: Path, folder: Path, progress: Progress) -> Path:

@@ -60,7 +60,7 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     if words.run is not None:
         return _by_run(words, progress)
     refuse_useless(words, {"capture": None}, "--run")
-    given = with_frames(words.plates, words.out, progress)
+    given, left_out = with_frames(words.plates, words.out, progress)
     wanted = None
     if words.frames is not None or words.jobs != 1:
         names = [name.as_posix() for _, name in plates_of(given, [words.out, words.flare, words.matte])]
@@ -72,7 +72,7 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
             return {"plates": str(words.out)}
     return remove_all(given, words.out, _remover(words), progress, flare_folder=words.flare,
                       mattes=Mattes(words.matte) if words.matte else None, overwrite=words.overwrite, wanted=wanted,
-                      stills=words.stills)
+                      stills=words.stills, left_out=left_out)
 
 
 def _by_run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:

@@ -195,4 +195,8 @@ def test_a_video_that_cannot_be_read_or_is_stopped_leaves_no_frames(tmp_path: Pa
         frames_of(tmp_path / "empty.mov", out, Progress())
     assert list(out.iterdir()) == []
     given = [tmp_path / "empty.mov", clip, tmp_path / "plate.png"]
-    assert with_frames(given, out, Progress()) == [given[0], out / "clip.mp4.frames", given[2]]
+    plates, left_out = with_frames(given, out, Progress())
+    assert plates == [out / "clip.mp4.frames", given[2]]
+    assert len(left_out) == 1 and left_out[0].startswith(f"{given[0]} cannot be decoded")
+    with pytest.raises(FrameError, match=r"^\S+empty\.mov cannot be decoded[^;]+$"):
+        with_frames(given[:1], out, Progress())

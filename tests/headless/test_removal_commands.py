@@ -65,6 +65,19 @@ def test_bad_plates_are_listed_at_the_end(backgrounds: Path, tmp_path: Path,
     assert {path.name for path in (tmp_path / "clean").iterdir()} == {"a.png", "b.png", "remove.json"}
 
 
+def test_a_video_that_cannot_be_read_is_left_out_for_one_reason(backgrounds: Path, tmp_path: Path,
+                                                                capfd: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "take.mov").touch()
+    words = ["remove", str(backgrounds / "a.png"), str(tmp_path / "take.mov"), "--out", str(tmp_path / "clean"),
+             "--progress", "json"]
+    assert cli.main(words) == 1
+    told = [event["text"] for line in capfd.readouterr().out.splitlines() if "take.mov" in (event := json.loads(line))
+            .get("text", "")]
+    assert [text.count("take.mov") for text in told] == [1, 1]  # when it is left out, and at the end
+    assert all("cannot be decoded" in text for text in told) and "1 of 2 plates" in told[-1]
+    assert (tmp_path / "clean" / "a.png").exists()
+
+
 def test_bad_plates_do_not_stop_other_processes(backgrounds: Path, tmp_path: Path,
                                                 capsys: pytest.CaptureFixture[str]) -> None:
     folder = tmp_path / "plates"

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from ..capture.camera import Camera
-from ..colour import colour_space
+from ..colour import ColourSpace, colour_space
 from ..errors import FrameError, RunError
 from ..files import inside, locked, read_json, remove_file, remove_partial_of, write_json
 from ..look import KeyedEdits, LookEdits
@@ -110,6 +110,10 @@ class BakeSettings:
         """A frame's camera at the size asked for."""
         return camera.scaled(self.width, self.height) if self.width else camera
 
+    def colour_space(self) -> ColourSpace:
+        """What the layers are written in. Raises SettingsError."""
+        return colour_space(self.space, self.config)
+
 
 def bake(renderer: Renderer, frames: Sequence[Frame], cameras: Mapping[str, Camera], out: Path | str,
          settings: BakeSettings | None = None, progress: Progress | None = None, *,
@@ -136,13 +140,8 @@ def bake_frames(source: Sequenced, frames: Sequence[Frame], cameras: Mapping[str
         return LookEdits.parse([*own, *asked.words()], lights, elements) if own else asked
 
     edits = {frame.view: asked_of(frame) for frame in frames}  # before anything that is there makes way for it
+    space = settings.colour_space()
     made_from = _made_from(source.fingerprint, settings, keyed)
-    space = colour_space(settings.space, settings.config)
-    if settings.space != "linear" or settings.config is not None:
-        made_from["space"] = [settings.space, settings.config, space.meaning]
-    if keyed.frames:
-        made_from["keyed"] = keyed.described()["frames"]
-    made_from = json.loads(json.dumps(made_from))  # as it is read again
     names = layer_names(lights)
     _begin(out, made_from, names, overwrite)
 
@@ -191,8 +190,15 @@ def _layers(renderer: OfCamera, camera: Camera, edits: LookEdits, lights: Sequen
 
 
 def _made_from(fingerprint: str, settings: BakeSettings, keyed: KeyedEdits) -> dict[str, Any]:
-    return {"renderer": fingerprint, "half": settings.half, "edits": list(keyed.always),
-            "size": [settings.width, settings.height]}
+    """What layers come out otherwise by, as bake.json and their headers have it, and as it is read again."""
+    made_from = {"renderer": fingerprint, "half": settings.half, "edits": list(keyed.always),
+                 "size": [settings.width, settings.height]}
+    if settings.space != "linear" or settings.config is not None:
+        made_from["space"] = [settings.space, settings.config, settings.colour_space().meaning]
+    if keyed.frames:
+        made_from["keyed"] = keyed.described()["frames"]
+    as_read: dict[str, Any] = json.loads(json.dumps(made_from))
+    return as_read
 
 
 def replaced(out: Path | str, fingerprint: Callable[[], str], lights: Iterable[str],

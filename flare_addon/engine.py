@@ -102,7 +102,7 @@ def run(kind: str, folder: Path, words: Sequence[object]) -> Job:
 
 
 def test() -> Job:
-    """Ask the engine what it is; the answer is the job's result (version, torch, device, kernels)."""
+    """Ask the engine what it is; the answer is the job's result (version, python, torch, device)."""
     folder = user_folder("test", create=True)
     write_text(folder / TESTED, str(find()))
     return run("test", folder, ["engine"])

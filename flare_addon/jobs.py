@@ -52,11 +52,14 @@ _jobs: dict[str, Job] = {}
 
 class Job:
     """One command of the engine. done, total: steps of `stage`; left_s: seconds left, None where unknown. log_from:
-    bytes of the log that commands before it have written. host: its machine, which people call `host_name`."""
+    bytes of the log that commands before it have written. host: its machine, which people call `host_name`.
+    started: when, in seconds since the epoch, by which one of an earlier Blender is known."""
 
     def __init__(self, kind: str, folder: Path, pid: int, process: subprocess.Popen[bytes] | None,
-                 words: Sequence[str] = (), host: str = HOST, log_from: int = 0, host_name: str = "") -> None:
+                 words: Sequence[str] = (), host: str = HOST, log_from: int = 0, host_name: str = "",
+                 started: float = 0.0) -> None:
         self.kind, self.folder, self.pid, self.host, self.log_from = kind, folder, pid, host, log_from
+        self.started = started
         self.host_name = host_name or host
         self.words = [word for word in words if word != "--overwrite"]
         self.state: State = "running"
@@ -102,15 +105,15 @@ class Job:
         """Ask it to stop; it keeps what it has, and ends by itself.
 
         By a file, since on Windows a signal reaches only who shares a console; elsewhere by a signal too, which is
-        heard in start-up, and of which a second one ends what does not answer. On another machine the number is
-        another process's, so there the file is all.
+        heard in start-up, and of which a second one ends what does not answer. The number may be another process's, as
+        it is on another machine, and then the file is all.
         """
         if not self.running or not self._alive():
             return
         self.stage = "stopping"
         with contextlib.suppress(OSError):
             (self.folder / STOP).touch()
-        if not WINDOWS and self.host == HOST:
+        if not WINDOWS and self.host == HOST and (self._process or processes.is_same(self.pid, self.started)):
             with contextlib.suppress(OSError):
                 os.kill(self.pid, signal.SIGINT)
 
@@ -274,9 +277,10 @@ def find(folder: Path | str | None) -> Job | None:
         record = json.loads((folder / RECORD).read_text(encoding="utf-8"))
         pid, host = int(record["pid"]), str(record.get("host", HOST))  # an early version wrote none,
         host = HOST if host == platform.node() else host  # and the next a Mac's name
-        here = host == HOST and processes.is_same(pid, float(record["started"]))
+        started = float(record["started"])
+        here = host == HOST and processes.is_same(pid, started)
         job = Job(str(record["kind"]), folder, pid if here else 0, None, list(map(str, record.get("words", ()))), host,
-                  int(record.get("log_from", 0)), str(record.get("host_name", "")))
+                  int(record.get("log_from", 0)), str(record.get("host_name", "")), started)
     except (OSError, ValueError, KeyError, TypeError):
         return None
     _jobs[_key(folder)] = job

@@ -170,6 +170,8 @@ def _other(rank: int, count: int, folder: str, barrier: Barrier, threads: int, l
         _watch([first.sentinel], barrier)
     _take_share(threads, count)
     learn(Learner(rank, count, Table(folder, barrier)), *words)
+    if first is not None:  # the first may not have woken from their last meeting, which an end here would break up
+        wait([first.sentinel])
 
 
 def _take_share(threads: int, count: int) -> None:

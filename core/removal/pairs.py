@@ -117,7 +117,7 @@ def _laid(random: Random, layers: Layers, width: int, height: int) -> NDArray[An
     return np.concatenate([linear, offset[:, None]], 1)
 
 
-TURNS = 12
+TRIES = 12
 """Ways of laying a flare, of which the one with its light in the brightest place is taken."""
 
 
@@ -131,7 +131,7 @@ def _against_light(random: Random, layers: Layers, matrix: NDArray[Any],
     columns, rows = max(width // 16, 1), max(height // 16, 1)
     brightness = cv2.resize(scene, (columns, rows), interpolation=cv2.INTER_AREA).mean(-1)
     best = -1.0
-    for other in [matrix, *(_laid(random, layers, width, height) for _ in range(TURNS - 1))]:
+    for other in [matrix, *(_laid(random, layers, width, height) for _ in range(TRIES - 1))]:
         x, y = _on_frame(other, layers, layers.lights[0])
         there = float(brightness[int(np.clip(y / height * rows, 0, rows - 1)),
                                  int(np.clip(x / width * columns, 0, columns - 1))])

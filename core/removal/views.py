@@ -22,7 +22,7 @@ from .network import MULTIPLE
 Tell = Callable[[Pixels], Pixels]
 """What a flare adds to display values 0..1 (h, w, 3), h and w multiples of MULTIPLE, by one pass of the network."""
 
-SIZES, TURNS = (1.0, 0.8), (0, 2)
+SIZES, QUARTER_TURNS = (1.0, 0.8), (0, 2)
 """Of the views in colour: parts of the frame's size, quarter turns."""
 ALONE_SIZE = 0.8
 """Of the views of a channel alone."""
@@ -54,7 +54,7 @@ class Views(NamedTuple):
 
 def told_in_views(display: Pixels, tell: Tell) -> Views:
     """Of display values 0..1 (h, w, 3), h and w multiples of MULTIPLE."""
-    told = [_in_view(tell, display, size, turns) for size in SIZES for turns in TURNS]
+    told = [_in_view(tell, display, size, turns) for size in SIZES for turns in QUARTER_TURNS]
     mean, apart = np.mean(told, 0), np.std(told, 0)
     dark = np.float32(np.interp(np.median(display), DARK, (1, 0)))
     if dark == 0:
@@ -94,7 +94,7 @@ def trusted(added: Pixels, sure: float) -> Pixels:
 def _told_alone(tell: Tell, display: Pixels, channel: int) -> Pixels:
     """(h, w), of a channel shown as a grey picture."""
     grey = np.repeat(display[..., channel, None], 3, -1)
-    views = [_in_view(tell, grey, ALONE_SIZE, turns).mean(-1) for turns in TURNS]
+    views = [_in_view(tell, grey, ALONE_SIZE, turns).mean(-1) for turns in QUARTER_TURNS]
     mean, apart = np.mean(views, 0), np.std(views, 0)
     return _less_doubt(mean, apart, _doubt(apart.mean(), np.abs(mean).mean(), ALONE_APART))
 

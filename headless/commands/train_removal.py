@@ -52,7 +52,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--threads", type=int, metavar="N", help="processor threads (default: all)")
     parser.add_argument("--processes", type=int, metavar="N",
                         help="to share the work among; beside a GPU all but one draw pictures (default: one for each "
-                             "processor core up to four, with a GPU up to eight)")
+                             "processor core up to four, with a GPU up to seventeen)")
 
 
 def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:

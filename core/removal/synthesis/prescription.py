@@ -70,8 +70,8 @@ class Ghost:
 
     A ray that enters at height h with slope u meets the stop at `stop[:, 0] h + stop[:, 1] u` (where it
     passes it first, `again` where it passes it last) and the sensor at `sensor[:, 0] h + sensor[:, 1] u`.
-    `reflectance` is the product of the two bare or coated reflectances for a coating made for each
-    wavelength; see `reflectance`. `surfaces` are (i, j).
+    `surfaces` are (i, j); `contrast` (3, 4) has, by wavelength, the indices before and behind each of the two, for
+    `reflectance`.
     """
 
     surfaces: tuple[int, int]

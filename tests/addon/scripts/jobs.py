@@ -60,7 +60,12 @@ facts["written by the version before"] = [jobs.find(begun("old", GOES_ON)).state
                                           jobs.find(begun("by name", GOES_ON, host=platform.node())).host == jobs.HOST]
 later = jobs.find(begun("later", GOES_ON, started=time.time() + 3600))  # as when this machine was started anew since
 facts["its number is an older process's"] = later.state
+found = jobs.find(begun("given out again", GOES_ON))
+found.started -= 3600  # as when its engine ended unseen, and the number went to another process
+found.stop()
+time.sleep(0.5)
 facts["the stranger lives"] = sleeper.poll() is None
+facts["asked by the file alone"] = (found.folder / jobs.STOP).exists()
 
 # ---- of this scene, and of none ---------------------------------------------------------------------
 sleepers = [subprocess.Popen([sys.executable, "-c", "import time; time.sleep(100)"]) for _ in range(3)]
@@ -72,7 +77,7 @@ for folder in (own, other, bake):
     jobs.find(folder)
 facts["of the scene"] = [job.folder.name for job in shots.jobs_of(scene)]
 facts["of none"] = [job.folder.name for job in shots.unnamed()
-                    if job.folder not in (out / "old", out / "by name")]
+                    if job.folder.name not in ("old", "by name", "given out again")]
 cancel = part("flare_addon.operators.fit").FITFLARE_OT_cancel_by_key
 over = SimpleNamespace(region=SimpleNamespace(type="UI", active_panel_category="Fit Flare"), scene=scene,
                        screen=SimpleNamespace(is_animation_playing=True))

@@ -22,6 +22,9 @@ from ..pictures import LARGEST
 from .camera import Floats, quaternion_from_rotation, rotation_from_quaternion
 from .lens import MODELS, NAMES, Lens
 
+TOO_FAR = 1e12
+"""World units, from which on a pose makes no sense: no pixel would tell it from another."""
+
 
 @dataclass(frozen=True, eq=False)
 class PointCloud:
@@ -79,8 +82,8 @@ def read_model(folder: Path) -> tuple[list[Posed], PointCloud]:
         where = f"{_path(folder, 'images')}, {name}:"
         pose = np.eye(4)
         length = math.sqrt(sum(q * q for q in quaternion))
-        if not all(map(math.isfinite, (*quaternion, *translation))):
-            raise CaptureError(f"{where} the pose is not finite numbers; solve the cameras again.")
+        if not all(abs(number) < TOO_FAR for number in (*quaternion, *translation)):
+            raise CaptureError(f"{where} the pose is not finite numbers of a sensible size; solve the cameras again.")
         if abs(length - 1.0) > 0.01:
             raise CaptureError(f"{where} the quaternion's length is {length:.4g}, so it is no rotation; "
                                "solve the cameras again.")

@@ -17,7 +17,7 @@ from ..errors import CaptureError
 from ..files import inside, read_json
 from ..pictures import SUFFIXES, picture_size
 from .camera import Floats
-from .colmap import PointCloud, Posed, check_lens, find_model, read_model
+from .colmap import TOO_FAR, PointCloud, Posed, check_lens, find_model, read_model
 from .lens import Lens
 from .ply import read_points
 
@@ -61,7 +61,7 @@ def _with_suffix(folder: Path, name: str) -> str:
 
 def _number(meta: dict[str, Any], key: str, where: str, default: float | None = None) -> float:
     value = meta.get(key, default)
-    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e12:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < TOO_FAR:
         raise CaptureError(f"{where} {key} should be a finite number, not {value!r:.40}; correct it or export the file "
                            "again.")
     return float(value)
@@ -106,13 +106,14 @@ def _focal(angle: float, size: int, where: str) -> float:
 
 
 def _matrix(value: Any, where: str, what: str) -> Floats:
-    """(4, 4) from nested lists of 3 or 4 rows of 4 finite numbers."""
+    """(4, 4) from nested lists of 3 or 4 rows of 4 numbers."""
     try:
         matrix = np.asarray(value, np.float64)
     except (TypeError, ValueError):
         matrix = np.zeros(0)
-    if matrix.shape not in ((3, 4), (4, 4)) or not np.isfinite(matrix).all():
-        raise CaptureError(f"{where} {what} should be 4 rows of 4 finite numbers; export the file again.")
+    if matrix.shape not in ((3, 4), (4, 4)) or not (np.abs(matrix) < TOO_FAR).all():
+        raise CaptureError(f"{where} {what} should be 4 rows of 4 finite numbers of a sensible size; export the file "
+                           "again.")
     full = np.eye(4)
     full[:len(matrix)] = matrix
     return full

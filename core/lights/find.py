@@ -71,7 +71,7 @@ def find_lights(capture: Capture, detector: Detector, progress: Progress | None 
         if lights:
             says.append("No frame shows a light; one out of frame was found by its ghosts, its direction surer than "
                         "its distance.")
-    if not lights:
+    if not lights and not doubtful:
         says.append("No light was found: none is in frame in enough views, or none is over-exposed.")
     return Findings(lights, doubtful, detections, says)
 

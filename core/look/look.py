@@ -321,7 +321,9 @@ def checked(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
             raise ValueError("two lights have one name")
         if description["blend"] not in ("over", "add"):
             raise ValueError(f"blend {description['blend']!r}")
-        table_of(TrainedCamera, description["camera"])
+        camera = table_of(TrainedCamera, description["camera"])
+        if min(camera.width, camera.height, camera.fx, camera.fy) <= 0:
+            raise ValueError("its camera makes no sense")
         Sampling.read(description.get("sampling"))
         for rows in description.get("seen", {}).values():
             if any(len([float(value) for value in row]) != 5 for row in rows):

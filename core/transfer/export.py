@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ from ..files import write_json
 from ..gaussians.ply import write_ply
 from ..gaussians.scene import COEFFICIENTS, SceneGaussians
 from ..gaussians.spherical_harmonics import dc_from_colour
-from ..look import Look, LookEdits, PlaneGaussians, ViewOfLight
+from ..look import Element, LightLook, Look, LookEdits, PlaneGaussians, ViewOfLight
 from ..look.plane import PLANE_DEPTH, joined
 from ..sampling import DILATION, Sampling, dilation
 from ..splatting import OPACITY_MAX
@@ -111,9 +111,8 @@ def preset(look: Look, view: Mapping[str, ViewOfLight], edits: LookEdits | None 
             continue
         seen = seen.exposed(exposure, look.blend)
         at = view[light.name].light.astype(np.float64)
-        elements = [{"name": element.name, "kind": element.kind,
-                     "parts": [_part(seen, row, at, width) for row in element.members]}
-                    for element in light.elements]
+        elements = [{"name": element.name, "kind": element.kind, "parts": [_part(seen, row, at, width) for row in rows]}
+                    for element, rows in _shown(light, edits, len(seen))]
         lights.append({"name": light.name, "at": (at / width).tolist(), "elements": elements})
     return {"version": PRESET_VERSION, "made_by": "Fit Flare", "blend": look.blend, "unit": "picture width",
             "offset": "0 at the light, 1 at the principal point", "licence": look.licence, "notes": look.notes,
@@ -124,6 +123,16 @@ def write_preset(path: Path | str, look: Look, view: Mapping[str, ViewOfLight], 
                  camera: Camera | None = None) -> None:
     """Write `preset` as JSON."""
     write_json(path, preset(look, view, edits, camera))
+
+
+def _shown(light: LightLook, edits: LookEdits | None, count: int) -> Iterator[tuple[Element, list[int]]]:
+    """The elements that edits leave, with their rows among the `count` Gaussians that are left."""
+    hidden = edits.hidden(light.name, light.elements) if edits is not None else set()
+    gone = [row for element in light.elements if element.name in hidden for row in element.members]
+    left = np.setdiff1d(np.arange(count + len(gone)), gone)
+    for element in light.elements:
+        if element.name not in hidden:
+            yield element, np.searchsorted(left, element.members).tolist()
 
 
 def _part(seen: PlaneGaussians, row: int, light: NDArray[np.float64], width: float) -> dict[str, Any]:

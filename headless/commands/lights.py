@@ -85,8 +85,9 @@ def _find(capture: Capture, detector: Detector, progress: Progress, settings: Ga
     for light in report["lights"]:
         progress.say(_sentence(light))
     if findings.doubtful:
-        progress.say(f"{len(findings.doubtful)} more are doubtful, in too few of the views that should show them, and "
-                     f"left out: {capture.folder / SHEETS / REPORT} lists them.")
+        progress.say(f"Left out as doubtful: {len(findings.doubtful)}, which too few of the views show that should, or "
+                     "so few that chance could have put them there. For adding them by hand, "
+                     f"{capture.folder / SHEETS / REPORT} lists them.")
     progress.say(f"Look at {capture.folder / report['sheets'][0]}; {LIGHTS} can be edited, and `lights --keep` "
                  "respects it.")
     return report

@@ -36,6 +36,15 @@ def test_frames_of_other_lights_are_not_taken_for_one_sequence(tmp_path: Path) -
         LayerFolder.open(tmp_path)
 
 
+def test_layers_that_lie_one_folder_down_are_named(tmp_path: Path) -> None:
+    (tmp_path / "cam0").mkdir()
+    frame(tmp_path / "cam0", 1, ["sun"])
+    with pytest.raises(FrameError, match=r"holds its layers in cam0; choose"):
+        LayerFolder.open(tmp_path)
+    with pytest.raises(FrameError, match="holds no baked layers"):
+        LayerFolder.open(tmp_path / "absent")
+
+
 def test_a_damaged_frame_is_named(tmp_path: Path) -> None:
     frame(tmp_path, 1, ["sun"])
     frame(tmp_path, 2, ["sun"]).write_bytes(b"torn")

@@ -418,6 +418,8 @@ def test_damaged_flares_are_refused_by_name(saved: Path) -> None:
 
 @pytest.mark.parametrize("changes", [
     {"version": 99}, {"version": "1"}, {"blend": "multiply"}, {"lights": [{}]}, {"lights": 3}, {"camera": {}},
+    {"camera": {"width": 0, "height": 40, "fx": 64, "fy": 64, "cx": 32, "cy": 20}},
+    {"camera": {"width": 64, "height": 40, "fx": 0, "fy": 64, "cx": 32, "cy": 20}},
     {"lights": [{"name": "a", "xyz": [0, 0, float("inf")], "form": {}, "range": {}, "count": 1}]},
     {"lights": [{"name": "a", "xyz": [0, 0, 1], "form": {}, "range": {}, "count": 10**12}]},
 ])

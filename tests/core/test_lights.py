@@ -476,6 +476,7 @@ class TestFind:
             cv2.imwrite(str(folder / "images" / f"{i:04d}.png"), picture(i, SIZE) // 2)
         findings = find_lights(Capture.open(folder), Exposure(0.3))
         assert not findings.lights and len(findings.doubtful) == 1
+        assert not any("No light was found" in sentence for sentence in findings.says)
         assert np.linalg.norm(findings.doubtful[0].xyz - (0.4, -0.5, 0.3)) < 4 * findings.doubtful[0].uncertainty
 
     def test_bad_settings(self, tmp_path: Path) -> None:

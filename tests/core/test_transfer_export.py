@@ -136,6 +136,22 @@ def test_a_preset_is_of_the_lights_that_are_shown_as_the_frame_is_exposed(blend:
     np.testing.assert_allclose(after, np.multiply(before, brightness(0.5, blend)), rtol=1e-5)
 
 
+@pytest.mark.parametrize("word", ["mute", "solo"])
+def test_a_preset_lacks_the_elements_that_are_hidden_and_no_others(word: str, tmp_path: Path) -> None:
+    saved(tmp_path / "a.flare", OURS, 1)
+    look, camera = read(tmp_path / "a.flare"), cameras(3)[1]
+    light = look.lights[0]
+    view = {light.name: ViewOfLight.of(camera.world_to_camera, light.xyz)}
+    everything = {one["name"]: one for one in preset(look, view)["lights"][0]["elements"]}
+    assert len(everything) == len(light.elements) > 2
+    for element in light.elements:
+        edits = LookEdits.parse([f"{light.name}/{element.name}.{word}=1"], look.names,
+                                {light.name: [one.name for one in light.elements]})
+        left = set(everything) - {element.name} if word == "mute" else {element.name}
+        found = preset(look, view, edits)["lights"][0]["elements"]
+        assert found == [everything[name] for name in everything if name in left]
+
+
 def test_a_preset_is_in_widths_of_the_picture_it_is_of(tmp_path: Path) -> None:
     """Not of the footage the flare was trained on."""
     saved(tmp_path / "a.flare", OURS, 1)

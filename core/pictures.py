@@ -196,12 +196,20 @@ def _misread(path: Path) -> str:
             return _CMYK if header is not None and header[2] == 4 else ""
         if begins not in (b"II*\0", b"MM\0*"):
             return ""
-        wanted = (tiff.BITS, tiff.PHOTOMETRIC, tiff.SAMPLES, tiff.PLANES)
+        wanted = (tiff.BITS, tiff.PHOTOMETRIC, tiff.SAMPLES, tiff.PLANES, tiff.SAMPLE_FORMAT)
         told = {name: tag.values[0] for name, tag in tiff.read_tags(stream, wanted).items()}
     if told.get(tiff.SAMPLES) == 2:
         return "is grey with alpha; save it as RGB with alpha, or as PNG"
     if told.get(tiff.PHOTOMETRIC) == tiff.SEPARATED:
         return _CMYK
+    if told.get(tiff.PHOTOMETRIC) in tiff.LAB:
+        return "is in Lab colours; convert it to RGB"
+    if told.get(tiff.SAMPLES, 1) > 4:
+        return f"has {told[tiff.SAMPLES]} channels; save it as RGB, or RGB with alpha"
+    numbers = told.get(tiff.BITS, 1), told.get(tiff.SAMPLE_FORMAT, tiff.WHOLE)
+    if numbers in ((16, tiff.FLOATS), (32, tiff.WHOLE)):
+        kind = "floats" if numbers[1] == tiff.FLOATS else "whole numbers"
+        return f"holds {kind} of {numbers[0]} bits; save it as 8 or 16 bit or as 32 bit float"
     if told.get(tiff.BITS, 1) <= 8:
         return ""
     if told.get(tiff.PLANES) == tiff.IN_PLANES and told.get(tiff.SAMPLES, 1) > 1:
@@ -233,6 +241,9 @@ def picture_size(path: Path | str) -> tuple[int, int]:
         raise FrameError(f"{path} is missing.")
     try:
         with open(path, "rb") as stream:
+            if stream.read(4) in tiff.BIG:
+                raise FrameError(f"{path} is a BigTIFF; save it as a plain TIFF, of less than 4 GB.")
+            stream.seek(0)
             size = _size_from_header(stream)
     except OSError as problem:
         raise FrameError(f"{path} cannot be read: {problem.strerror or problem}.") from problem

@@ -12,13 +12,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 SUBFILE, WIDTH, HEIGHT, BITS, PHOTOMETRIC, ORIENTATION, SAMPLES = 254, 256, 257, 258, 262, 274, 277
-PLANES, EXTRA_SAMPLES = 284, 338
+PLANES, EXTRA_SAMPLES, SAMPLE_FORMAT = 284, 338, 339
 X_RESOLUTION, Y_RESOLUTION, RESOLUTION_UNIT, XMP, COLOUR_PROFILE = 282, 283, 296, 700, 34675
 
 UPRIGHT = 1
 """Orientation: rows from the top, columns from the left."""
-WHITE_IS_0, SEPARATED = 0, 5
-"""Photometric interpretation: ink on paper; inks, CMYK."""
+WHITE_IS_0, SEPARATED, LAB = 0, 5, (8, 9, 10)
+"""Photometric interpretation: ink on paper; inks, CMYK; lightness and two differences of colour, of three kinds."""
+WHOLE, FLOATS = 1, 3
+"""Sample format: unsigned whole numbers, floats."""
+BIG = (b"II+\0", b"MM\0+")
+"""How a BigTIFF begins, which has 64 bits for each place in the file."""
 IN_PLANES = 2
 """Planar configuration: all of one colour, then all of the next."""
 PREMULTIPLIED, STRAIGHT = 1, 2

@@ -29,10 +29,10 @@ def plates_of(inputs: Iterable[Path], apart_from: Iterable[Path | None] = ()) ->
     SettingsError where there are none, or where two would be written to one name; on Windows and macOS a.png is A.png.
     """
     found: dict[str, tuple[Path, Path]] = {}
-    others = [other.resolve() for other in apart_from if other is not None]
+    apart = [other for other in apart_from if other is not None]
     for given in inputs:
         if given.is_dir():
-            inner = {other for other in others if given.resolve() in other.parents}
+            inner = _no_plates(given, apart)
             for record in given.rglob(RECORD):
                 if record.parent != given:
                     inner.update(Record(record.parent).results())
@@ -55,13 +55,20 @@ def plates_of(inputs: Iterable[Path], apart_from: Iterable[Path | None] = ()) ->
 def with_neighbours(inputs: Sequence[Path], apart_from: Iterable[Path | None] = ()) -> list[Path]:
     """The plates of `plates_of`, and what lies beside those that were given by themselves: one frame of a shot comes
     out as it does with all of them."""
-    apart = {other.resolve() for other in apart_from if other is not None}
+    apart = [other for other in apart_from if other is not None]
     found = dict.fromkeys(path for path, _ in plates_of(inputs, apart))
     for folder in dict.fromkeys(given.parent for given in inputs if not given.is_dir()):
+        others = _no_plates(folder, apart)
         with contextlib.suppress(OSError):  # a plate may be read out of a folder that may not be
-            found.update(dict.fromkeys(path for path in pictures_in(folder)
-                                       if apart.isdisjoint(_itself_and_its_folders(path))))
+            found.update(dict.fromkeys(path for path in pictures_in(folder) if path.resolve() not in others))
     return list(found)
+
+
+def _no_plates(folder: Path, apart: Iterable[Path]) -> set[Path]:
+    """Files and folders in `folder` that hold none: those of `apart` that lie in it, and the results of an earlier run
+    that wrote to one of them."""
+    inner = {other.resolve() for other in apart if folder.resolve() in other.resolve().parents}
+    return inner.union(*(Record(other).results() for other in apart))
 
 
 def _itself_and_its_folders(path: Path) -> list[Path]:

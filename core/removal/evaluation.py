@@ -30,6 +30,8 @@ from .synthesis.prescription import Prescription, built_in
 INPUTS = ("input", "flare", "blend")
 TRUTHS = ("gt", "target", "clean", "scene")
 WORST = 10
+TALLEST = 2
+"""Heights of a picture on the sheet by its width: what is taller, a column of pixels say, is squeezed."""
 CANVAS = 640
 """Pixels a side of the canvas of synthesised flares."""
 ALIKE = 100.0
@@ -196,7 +198,7 @@ def worst_sheet(cases: Sequence[Case], clean: Callable[[Pixels], Pixels], scores
         frame, truth, _ = case.read()
         result = clean(frame)
         taken = np.clip((frame - result) * 2, 0, 1)
-        height = round(width * frame.shape[0] / frame.shape[1])
+        height = int(np.clip(round(width * frame.shape[0] / frame.shape[1]), 1, TALLEST * width))
         parts = [np.asarray(cv2.resize(part, (width, height), interpolation=cv2.INTER_AREA), np.float32)
                  for part in (frame, result, truth, taken)]
         text = f"{case.category} / {case.name}: {gain:+.2f} dB   input | result | truth | taken away x2"

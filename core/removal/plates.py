@@ -137,7 +137,7 @@ def _read_codes(path: Path) -> Plate:
         raise FrameError(f"{path} holds {stored.dtype} pixels; save it as 8 or 16 bit or as 32 bit float.")
     grey, alpha = stored.ndim == 2 or _is_grey_with_alpha(path), None
     if stored.ndim == 2:
-        codes = np.repeat(stored[..., None], 3, axis=2)
+        codes, alpha = np.repeat(stored[..., None], 3, axis=2), _transparency(path, stored)
     else:
         alpha = stored[..., 3].copy() if stored.shape[2] == 4 else None
         codes = np.ascontiguousarray(stored[..., 2::-1])
@@ -149,6 +149,19 @@ def _is_grey_with_alpha(path: Path) -> bool:
     with open(path, "rb") as stream:
         header = stream.read(26)
     return header[:4] == b"\x89PNG" and header[25:] == b"\x04"
+
+
+def _transparency(path: Path, stored: NDArray[Any]) -> NDArray[Any] | None:
+    """Alpha (height, width) of a grey PNG of which one code is transparent (PNG specification, 11.3.2.1), which OpenCV
+    reads without; None where none is."""
+    with open(path, "rb") as stream:
+        depth = stream.read(25)[24:]
+        key = next((content for _, content in png.chunks(stream, (b"tRNS",)) if len(content) == 2), None)
+    if key is None:
+        return None
+    top = np.iinfo(stored.dtype).max
+    code = int.from_bytes(key, "big") * top // (2 ** depth[0] - 1)  # depths below 8 bits are spread over all codes
+    return np.where(stored == code, 0, top).astype(stored.dtype)
 
 
 def _read_exr(path: Path) -> Plate:
@@ -187,13 +200,23 @@ def write_plate(path: Path | str, plate: Plate, codes: NDArray[Any]) -> None:
     stored: NDArray[Any] = codes[..., 0] if plate.grey and plate.alpha is None else codes[..., ::-1]
     if plate.alpha is not None:
         stored = np.concatenate([stored, plate.alpha[..., None]], -1)
-    options = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY, cv2.IMWRITE_JPEG_SAMPLING_FACTOR,
-               cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444] if suffix in _JPEGS else []
-    done, data = cv2.imencode(suffix, np.ascontiguousarray(stored), options)
+    done, data = cv2.imencode(suffix, np.ascontiguousarray(stored), _options(suffix, codes.dtype))
     if not done:
         raise FrameError(f"{path} could not be encoded as {suffix[1:].upper()}.")
     with atomic_path(path) as temporary:
         temporary.write_bytes(_tagged(data.tobytes(), suffix, plate))
+
+
+def _options(suffix: str, kind: np.dtype[Any]) -> list[int]:
+    """What OpenCV is to encode by."""
+    import cv2
+
+    if suffix in _JPEGS:
+        return [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY, cv2.IMWRITE_JPEG_SAMPLING_FACTOR,
+                cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
+    if suffix in _TIFFS and kind.kind == "f":  # which it would make LogLuv of, with 16 bits for three floats
+        return [cv2.IMWRITE_TIFF_COMPRESSION, cv2.IMWRITE_TIFF_COMPRESSION_NONE]
+    return []
 
 
 def write_flare(path: Path | str, plate: Plate, flare: NDArray[Any]) -> None:
@@ -239,7 +262,8 @@ def _write_exr(path: Path, plate: Plate, codes: NDArray[Any]) -> None:
     header.pop("tiles", None)
     if header.get("lineOrder") == OpenEXR.RANDOM_Y:  # as renderers write tiles, in the order that they are done
         header["lineOrder"] = OpenEXR.INCREASING_Y
-    if header.get("compression") in (OpenEXR.DWAA_COMPRESSION, OpenEXR.DWAB_COMPRESSION):  # loses some at each writing
+    if header.get("compression") in (OpenEXR.B44_COMPRESSION, OpenEXR.B44A_COMPRESSION, OpenEXR.DWAA_COMPRESSION,
+                                     OpenEXR.DWAB_COMPRESSION):  # lose some at each writing
         header["compression"] = OpenEXR.ZIP_COMPRESSION
     save_exr(path, header, channels)
 

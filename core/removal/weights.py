@@ -58,6 +58,8 @@ def _foreign(path: Path | str) -> RunError:
 def load(path: Path = IN_THE_BOX) -> RemovalNetwork:
     """The network of a weights file, on the processor, ready to tell flares. Raises RunError."""
     tensors, about = read(path)
+    if not all(bool(value.isfinite().all()) for value in tensors.values()):
+        raise RunError(f"{path} holds weights that are no finite numbers; get it again, or train it anew.")
     made_with = form(path, about)
     try:
         network = RemovalNetwork(*made_with)

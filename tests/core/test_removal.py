@@ -23,7 +23,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from core import jpeg, tiff
+from core import jpeg, png, tiff
 from core.capture import Capture
 from core.colour.spaces import AP1
 from core.errors import Cancelled, CaptureError, FrameError, RunError, SettingsError
@@ -135,6 +135,11 @@ def test_weights_keep_their_recipe_and_damage_is_told(tmp_path: Path, everywhere
     weights.write(tmp_path / "other.safetensors", {"a": torch.zeros(2)}, {})
     with pytest.raises(RunError, match="no weights of the removal network"):
         weights.load(tmp_path / "other.safetensors")
+    tensors, about = weights.read(everywhere)
+    tensors[next(iter(tensors))].view(-1)[0] = torch.nan
+    weights.write(tmp_path / "nan.safetensors", tensors, about)
+    with pytest.raises(RunError, match="no finite numbers"):
+        weights.load(tmp_path / "nan.safetensors")
 
 
 # Carried up.
@@ -420,6 +425,38 @@ def test_each_channel_of_an_exr_keeps_its_depth(tmp_path: Path, everywhere: Path
     channels = read_plate(tmp_path / "out" / "plate.exr").rest["channels"]
     assert [channels[name].dtype for name in "RGB"] == [np.float16, np.float32, np.float16]
     assert (channels["R"] < light).all()
+
+
+@pytest.mark.parametrize("channels", [1, 3, 4])
+def test_floats_of_a_tiff_stay_floats(channels: int, tmp_path: Path) -> None:
+    light = np.random.default_rng(0).uniform(-1, 30, (24, 32, channels)).astype(np.float32)
+    _, data = cv2.imencode(".tif", light, [cv2.IMWRITE_TIFF_COMPRESSION, 1])
+    (tmp_path / "a.tif").write_bytes(data.tobytes())
+    plate = read_plate(tmp_path / "a.tif")
+    codes = plate.codes.copy()
+    codes[4:9, 5:11] *= np.float32(0.5)
+    write_plate(tmp_path / "b.tif", plate, codes)
+    again = read_plate(tmp_path / "b.tif")
+    np.testing.assert_array_equal(again.codes, codes)
+    assert again.codes.dtype == np.float32
+    if plate.alpha is not None:
+        np.testing.assert_array_equal(again.alpha, plate.alpha)
+
+
+@pytest.mark.parametrize(("depth", "key"), [(2, 1), (8, 90), (16, 90 * 257)])
+def test_the_transparent_code_of_a_grey_png_is_its_alpha(depth: int, key: int, tmp_path: Path) -> None:
+    top = 2**depth - 1
+    grey = np.where(np.random.default_rng(0).random((8, 8)) < 0.5, key, top).astype(">u2" if depth == 16 else np.uint8)
+    packed = grey if depth != 2 else sum(grey[:, part::4] << (6 - 2 * part) for part in range(4)).astype(np.uint8)
+    parts = [(b"IHDR", struct.pack(">IIBBBBB", 8, 8, depth, 0, 0, 0, 0)), (b"tRNS", struct.pack(">H", key)),
+             (b"IDAT", zlib.compress(b"".join(b"\0" + row.tobytes() for row in packed))), (b"IEND", b"")]
+    (tmp_path / "a.png").write_bytes(png.SIGNATURE + b"".join(png.chunk(*part) for part in parts))
+    plate = read_plate(tmp_path / "a.png")
+    np.testing.assert_array_equal(plate.alpha == 0, grey == key)
+    write_plate(tmp_path / "b.png", plate, plate.codes // 2)
+    again = read_plate(tmp_path / "b.png")
+    np.testing.assert_array_equal(again.alpha, plate.alpha)
+    np.testing.assert_array_equal(again.codes, plate.codes // 2)
 
 
 def test_a_very_wide_plate(everywhere: Path) -> None:
@@ -787,7 +824,7 @@ def test_a_grey_plate_loses_the_luminance_of_a_flare(suffix: str, tmp_path: Path
     assert np.ptp(flare.astype(np.float32), -1).max() < 1e-3
 
 
-@pytest.mark.parametrize("compression", ["DWAA", "DWAB", "B44", "ZIP"])
+@pytest.mark.parametrize("compression", ["DWAA", "DWAB", "B44", "B44A", "ZIP"])
 def test_what_stays_of_an_exr_stays_whatever_its_compression(compression: str, tmp_path: Path) -> None:
     random = np.random.default_rng(0)
     noise = cv2.GaussianBlur(random.random((64, 96, 4)).astype(np.float32), (0, 0), 1.5).astype(np.float16)
@@ -795,10 +832,10 @@ def test_what_stays_of_an_exr_stays_whatever_its_compression(compression: str, t
               header={"compression": getattr(OpenEXR, f"{compression}_COMPRESSION")})
     plate = read_plate(tmp_path / "a.exr")
     codes = plate.codes.copy()
-    codes[40:44, 60:64] *= np.float16(0.5)
+    codes[41:43, 59:66] *= np.float16(0.5)  # across the blocks of 4 x 4 that some compress by
     write_plate(tmp_path / "b.exr", plate, codes)
     again = read_plate(tmp_path / "b.exr")
-    np.testing.assert_array_equal(again.codes[:32], plate.codes[:32])
+    np.testing.assert_array_equal(again.codes, codes)
     np.testing.assert_array_equal(again.rest["channels"]["mask.R"], plate.rest["channels"]["mask.R"])
 
 
@@ -1171,6 +1208,21 @@ def test_pictures_that_would_come_out_as_something_else_are_refused_by_name(tmp_
     _tiff_with(tmp_path / "grey.tif", np.zeros((8, 8), np.uint8), {tiff.SAMPLES: tiff.short(2)})
     with pytest.raises(FrameError, match="grey with alpha"):
         read_plate(tmp_path / "grey.tif")
+    _tiff_with(tmp_path / "lab.tif", np.zeros((8, 8, 3), np.uint16), {tiff.PHOTOMETRIC: tiff.short(tiff.LAB[0])})
+    with pytest.raises(FrameError, match=r"lab\.tif is in Lab colours"):
+        read_plate(tmp_path / "lab.tif")
+    _tiff_with(tmp_path / "mask.tif", np.zeros((8, 8, 4), np.uint8), {tiff.SAMPLES: tiff.short(5)})
+    with pytest.raises(FrameError, match=r"mask\.tif has 5 channels"):
+        read_plate(tmp_path / "mask.tif")
+    _tiff_with(tmp_path / "half.tif", np.zeros((8, 8), np.uint16), {tiff.SAMPLE_FORMAT: tiff.short(tiff.FLOATS)})
+    with pytest.raises(FrameError, match="holds floats of 16 bits"):
+        read_plate(tmp_path / "half.tif")
+    _tiff_with(tmp_path / "long.tif", np.zeros((8, 8), np.float32), {tiff.SAMPLE_FORMAT: tiff.short(tiff.WHOLE)})
+    with pytest.raises(FrameError, match="holds whole numbers of 32 bits"):
+        read_plate(tmp_path / "long.tif")
+    (tmp_path / "big.tif").write_bytes(tiff.BIG[0] + bytes(40))
+    with pytest.raises(FrameError, match="is a BigTIFF"):
+        read_plate(tmp_path / "big.tif")
     _, pages = cv2.imencodemulti(".tif", [codes, codes, codes])
     (tmp_path / "pages.tif").write_bytes(pages.tobytes())
     with pytest.raises(FrameError, match="3 pages"):

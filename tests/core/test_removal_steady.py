@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from core.errors import FrameError
 from core.progress import Progress
-from core.removal.batch import remove_all, with_neighbours
+from core.removal.batch import plates_of, remove_all, with_neighbours
 from core.removal.inference import Remover
 from core.removal.plates import Plate
 from core.removal.record import RECORD
@@ -167,6 +167,15 @@ def test_mattes_and_results_beside_a_frame_are_not_its_neighbours(shot: Path) ->
     (shot / "clean" / "f1.png").write_bytes((shot / "f1.png").read_bytes())
     found = with_neighbours([shot / "f1.png"], [shot / "clean", shot / "matte.png"])
     assert sorted(found) == sorted(shot.glob("f*.png"))
+
+
+def test_a_frame_has_its_neighbours_where_results_go_above_or_beside_them(shot: Path, tmp_path: Path) -> None:
+    for out, flare in ((shot.parent, None), (tmp_path / "clean", shot)):
+        frames = sorted(shot.glob("f*.png"))
+        for _ in range(2):
+            assert sorted(with_neighbours([shot / "f1.png"], [out, flare])) == frames
+            assert sorted(path for path, _ in plates_of([shot], [out, flare])) == frames
+            remove_all([shot / "f1.png"], out, Wavering(), Progress(), flare_folder=flare)
 
 
 def test_neighbours_are_those_of_the_folder(shot: Path) -> None:

@@ -510,6 +510,16 @@ def test_scores_beside_the_untouched_input(tmp_path: Path) -> None:
     assert sheet.shape == (4 * (HEAD + 32), 4 * 40 + 3 * GAP, 3)
 
 
+@pytest.mark.parametrize(("shape", "height"), [((1, 1200), 1), ((1200, 1), 80)])
+def test_rows_and_columns_of_pixels_have_a_place_on_the_sheet(shape: tuple[int, int], height: int,
+                                                              tmp_path: Path) -> None:
+    for kind, level in (("input", 200), ("gt", 100)):
+        write_png(tmp_path / kind / "0.png", np.full((*shape, 3), level / 255))
+    cases = evaluation.paired(tmp_path)
+    scores = evaluation.evaluate(cases, lambda frame: frame)
+    assert evaluation.worst_sheet(cases, lambda frame: frame, scores, 40).shape[0] == HEAD + height
+
+
 def test_a_clean_picture_that_is_changed_was_made_worse(tmp_path: Path) -> None:
     pair_folder(tmp_path)
     shutil.rmtree(tmp_path / "gt")

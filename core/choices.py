@@ -10,6 +10,8 @@ Model = Literal["paper", "ours"]
 Blend = Literal["over", "add"]
 Kernels = Literal["auto", "torch", "tiles", "cpu", "cuda"]
 Matching = Literal["auto", "exhaustive", "sequential", "similar"]
+Asked = Literal["source", "target", "blend"]
+"""What the appearance of a transferred flare follows: `core.transfer.query`."""
 
 OUR_PRESETS: tuple[Preset, ...] = ("draft", "standard", "high")
 """Those of our form, the shortest first."""

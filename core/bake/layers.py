@@ -44,15 +44,6 @@ class Rendering(Protocol):
 
 
 @dataclass(frozen=True)
-class Rendered:
-    """A `Rendering` that is made already."""
-
-    scene: Pixels
-    flare_by_light: Mapping[str, Pixels]
-    depth: Pixels
-
-
-@dataclass(frozen=True)
 class FrameLayers:
     """Scene (h, w, 3), one flare layer (h, w, 3) for each light, by the light's name, and depth (h, w).
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from ..capture.camera import Camera
 from ..fit.rendering import render_scene, splat_look
-from ..fit.run import Run
+from ..fit.run import Run, ViewLayers
 from ..flare.compositing import layers as linear_layers
 from ..flare.visibility import share_seen
 from ..look import LookEdits, read
@@ -25,7 +25,7 @@ from ..look.shot import PlacedLight, Shot, ShotFrame, evaluate
 from ..progress import Progress
 from .bake import BakeSettings, bake_frames
 from .frames import Frame, layers_file
-from .layers import FrameLayers, Rendered
+from .layers import FrameLayers
 
 
 class ShotRenderer:
@@ -49,7 +49,7 @@ class ShotRenderer:
         """Changes whenever all pictures would; what is a frame's alone, its renderer's tells."""
         return self.shot.fingerprint(self.run.fingerprint if self.run is not None else "")
 
-    def render(self, one: ShotFrame, camera: Camera, edits: LookEdits | None = None) -> Rendered:
+    def render(self, one: ShotFrame, camera: Camera, edits: LookEdits | None = None) -> ViewLayers:
         """The layers of a frame, under its camera at the size asked for."""
         import torch
 
@@ -64,7 +64,7 @@ class ShotRenderer:
         found = {name: np.maximum(layer.numpy(), 0) if scene is None else layer.numpy()
                  for name, layer in parts.flares.items()}
         depth = dark[..., 0] if scene is None else scene.depth
-        return Rendered(parts.scene.numpy(), {name: found.get(name, dark.numpy()) for name in self.lights},
+        return ViewLayers(parts.scene.numpy(), {name: found.get(name, dark.numpy()) for name in self.lights},
                         depth.detach().numpy())
 
     def _behind_the_scene(self, light: PlacedLight, camera: Camera) -> PlacedLight:
@@ -96,7 +96,7 @@ class _OfFrame:
         """The shot's own edits."""
         return self.one.edits
 
-    def render(self, camera: Camera, edits: LookEdits | None = None) -> Rendered:
+    def render(self, camera: Camera, edits: LookEdits | None = None) -> ViewLayers:
         return self.renderer.render(self.one, camera, edits)
 
     def finished(self, layers: FrameLayers, camera: Camera) -> FrameLayers:  # noqa: ARG002 - nothing to add

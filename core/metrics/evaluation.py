@@ -208,13 +208,13 @@ def table(scores: dict[str, Any]) -> str:
         if layer not in scores:
             continue
         part = scores[layer]
-        cells = [_cell(part.get(key), decimals) for key, decimals in
+        cells = [cell(part.get(key), decimals) for key, decimals in
                  (("psnr", 2), ("empty_psnr", 2), ("ssim", 4), ("lpips", 4), ("flip", 4))]
         scored = [view for view in scores["views"] if view.get(layer, {}).get("psnr") is not None]
         worst = min(scored, key=lambda view: view[layer]["psnr"], default=None)
         where = f"{worst[layer]['psnr']:.2f} in {worst['name']}" if worst else "-"
         lines.append(f"{layer:13}{''.join(f'{cell:>8}' for cell in cells)}"
-                     f"{_cell(part.get('relative_l2'), 3):>9}  {where}")
+                     f"{cell(part.get('relative_l2'), 3):>9}  {where}")
     for layer in LAYERS:
         without = sum(_is_without_flare(view[layer]) for view in scores["views"] if layer in view)
         if without:
@@ -230,5 +230,6 @@ def worse_than_none(scores: dict[str, Any]) -> bool:
     return found is not None and empty is not None and found < empty
 
 
-def _cell(value: float | None, decimals: int) -> str:
+def cell(value: float | None, decimals: int) -> str:
+    """A number of a table; a dash where there is none."""
     return "-" if value is None else f"{value:.{decimals}f}"

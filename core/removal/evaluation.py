@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import FrameError, SettingsError
+from ..metrics.evaluation import cell
 from ..metrics.pictures import Perceptual, flip, psnr, ssim
 from ..pictures import Pixels, pictures_in, read_picture
 from ..progress import Progress
@@ -175,15 +176,11 @@ def table(scores: dict[str, Any]) -> str:
     lines = [f"{'category':24}{'n':>5}{'PSNR':>16}{'gain':>7}{'SSIM':>18}{'LPIPS':>8}{'FLIP':>8}{'worse':>7}"]
     for name, part in [*scores["categories"].items(), ("all", scores["mean"])]:
         after, before = part["result"], part["input"]
-        levels = f"{_cell(after['psnr'], 2)} ({_cell(before['psnr'], 2)})"
-        likeness = f"{_cell(after['ssim'], 4)} ({_cell(before['ssim'], 4)})"
-        lines.append(f"{name:24.24}{part['count']:>5}{levels:>16}{_cell(part['gain_db'], 2):>7}{likeness:>18}"
-                     f"{_cell(after['lpips'], 4):>8}{_cell(after['flip'], 4):>8}{part['made_worse']:>7.1%}")
+        levels = f"{cell(after['psnr'], 2)} ({cell(before['psnr'], 2)})"
+        likeness = f"{cell(after['ssim'], 4)} ({cell(before['ssim'], 4)})"
+        lines.append(f"{name:24.24}{part['count']:>5}{levels:>16}{cell(part['gain_db'], 2):>7}{likeness:>18}"
+                     f"{cell(after['lpips'], 4):>8}{cell(after['flip'], 4):>8}{part['made_worse']:>7.1%}")
     return "\n".join(lines)
-
-
-def _cell(value: float | None, decimals: int) -> str:
-    return "-" if value is None else f"{value:.{decimals}f}"
 
 
 def worst_sheet(cases: Sequence[Case], clean: Callable[[Pixels], Pixels], scores: dict[str, Any],

@@ -19,13 +19,15 @@ from numpy.typing import ArrayLike
 
 from ..bake.bake import BakeSettings, bake_frames
 from ..bake.frames import Frame
-from ..bake.layers import FrameLayers, Rendered
+from ..bake.layers import FrameLayers
 from ..capture import Camera
+from ..choices import Asked
 from ..colour import ColourSpace, colour_space
 from ..display import decode, encode
 from ..errors import SettingsError
 from ..files import check_apart, remove_partial_of
 from ..fit.rendering import render_scene, splat_look
+from ..fit.run import ViewLayers
 from ..flare.compositing import layers as linear_layers
 from ..flare.visibility import VisibilitySettings, share_seen
 from ..gaussians import Splats
@@ -35,7 +37,6 @@ from ..pictures import Picture, Pixels, window_of
 from ..progress import Progress
 from . import query as queries
 from .plates import AUTO, ColouredPlate
-from .query import Query
 from .target import Target, TargetFrame, background
 from .visibility import smoothed
 
@@ -53,7 +54,7 @@ class TransferSettings:
     smooth: frames over which a light's visibility is smoothed on either side, 0 for none. plate_space: of the
     plates, "auto" by their files. visibility: how the target's scene hides lights."""
 
-    query: Query = "blend"
+    query: Asked = "blend"
     scale: float = 1.0
     smooth: int = 1
     plate_space: str = AUTO
@@ -233,7 +234,7 @@ class _OfFrame:
         target = self._one.flared(self._out) if self._out is not None else None
         return [] if target is None else [target]
 
-    def render(self, camera: Camera, edits: LookEdits | None = None) -> Rendered:
+    def render(self, camera: Camera, edits: LookEdits | None = None) -> ViewLayers:
         """Scene, flare of each light, depth; scene-linear Rec. 709."""
         with torch.no_grad():
             scene, depth = self._background(camera)
@@ -242,7 +243,7 @@ class _OfFrame:
             display = encode(torch.from_numpy(np.clip(scene, 0, 1)))
             parts = linear_layers(display, flares, self._transfer.look.blend)
         dark = np.zeros_like(scene)
-        return Rendered(scene, {name: parts.flares[name].numpy() if name in parts.flares else dark
+        return ViewLayers(scene, {name: parts.flares[name].numpy() if name in parts.flares else dark
                                   for name in self._transfer.lights}, depth)
 
     def _background(self, camera: Camera) -> tuple[Pixels, Pixels]:

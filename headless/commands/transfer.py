@@ -5,8 +5,9 @@ from __future__ import annotations
 import argparse
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
+from ...core.choices import Asked
 from ...core.errors import SettingsError
 from ...core.progress import Progress
 from .. import frames, jobs, layers, targets
@@ -17,7 +18,6 @@ if TYPE_CHECKING:
     from ...core.transfer.target import Target
 
 MOST_SMOOTH = 1000  # frames
-QUERIES = ("source", "target", "blend")
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -27,7 +27,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
                              "a shot (JSON)")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR",
                         help="folder for layers.####.exr, and frames/ with the plates under their own names")
-    parser.add_argument("--query", choices=QUERIES, default="blend",
+    parser.add_argument("--query", choices=get_args(Asked), default="blend",
                         help="what the flare's appearance follows: one training view (source), the target's view "
                              "(target), or the target's view kept inside what was trained (blend, the default)")
     frames.add_option(parser)

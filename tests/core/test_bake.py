@@ -14,11 +14,12 @@ from core.bake import bake as baking
 from core.bake.bake import RECORD, BakeSettings, bake, read_record
 from core.bake.exr import read_description, read_layers, write_layers
 from core.bake.frames import absent, chosen, numbered, plates_by_number
-from core.bake.layers import FARTHEST, FrameLayers, Rendered, layer_names, layers_of
+from core.bake.layers import FARTHEST, FrameLayers, layer_names, layers_of
 from core.capture.camera import Camera
 from core.colour import REC_709, colour_space
 from core.errors import Cancelled, FrameError, RunError, SettingsError
 from core.files import write_json
+from core.fit.run import ViewLayers
 from core.look import KeyedEdits, LookEdits
 from core.pictures import exr_header, exr_space, read_exr, write_exr
 from core.progress import Progress
@@ -430,10 +431,10 @@ def another_fit() -> FakeRenderer:
 def test_colours_of_layers_are_light_and_plain_factors_exact() -> None:
     """A covering flare may take light away: a factor leaves that, so that scene + flare stays the composite."""
     layer = np.full((2, 2, 3), (1.0, 0.0, -0.25), np.float32)
-    rendering = Rendered(np.zeros_like(layer), {"lamp": layer}, layer[..., 0])
+    rendering = ViewLayers(np.zeros_like(layer), {"lamp": layer}, layer[..., 0])
     vivid, hardly, double = (LookEdits.parse([f"lamp.{edit}"], ["lamp"]).matrices(["lamp"])
                              for edit in ("saturation=2", "saturation=0.999", "intensity=2"))
-    light = Rendered(np.zeros_like(layer), {"lamp": np.abs(layer)}, layer[..., 0])
+    light = ViewLayers(np.zeros_like(layer), {"lamp": np.abs(layer)}, layer[..., 0])
     assert (layers_of(light, vivid).flares["lamp"] >= 0).all()
     np.testing.assert_allclose(layers_of(rendering, hardly).flares["lamp"], layer, atol=2e-3)
     np.testing.assert_array_equal(layers_of(rendering, double).flares["lamp"], 2 * layer)

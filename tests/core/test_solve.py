@@ -25,7 +25,7 @@ from core.capture.lens import Lens
 from core.capture.solve import SolveSettings, develop, solve
 from core.capture.solve.mapping import Model, Solved, SolvedFrame
 from core.capture.solve.pairs import choose_matching, choose_pairs
-from core.capture.solve.shots import Shot, choose, gather, usable
+from core.capture.solve.stills import Still, choose, gather, usable
 from core.capture.solve.world import up_direction
 from core.errors import Cancelled, CaptureError, FrameError, SettingsError
 from core.pictures import Picture, linear_from_srgb, picture_size, read_picture, stored_pixels, write_exr
@@ -198,7 +198,7 @@ def test_stopped_and_taken_up_again(tmp_path: Path) -> None:
     assert report["registered"] == 9 and len(Capture.open(out).views) == 9
 
 
-@pytest.mark.parametrize("damaged", ["request.json", "shots.json", "mapped.json", "database.db",
+@pytest.mark.parametrize("damaged", ["request.json", "stills.json", "mapped.json", "database.db",
                                      "models/0/points3D.bin"])
 def test_what_a_power_failure_has_damaged_is_made_again(stopped: Path, tmp_path: Path, damaged: str) -> None:
     out, heard = tmp_path / "out", Heard()
@@ -304,13 +304,13 @@ def test_straightened_frames_keep_what_their_files_hold(name: str, kind: type, t
     stored[:, :] = kind(0.1 * full)
     stored[16:32, 20:44] = kind(top * full)
     cv2.imwrite(str(tmp_path / name), stored, [cv2.IMWRITE_TIFF_COMPRESSION, 1])
-    shot = Shot("000000.png", str(tmp_path / name), 64, 48, None, 1)
+    still = Still("000000.png", str(tmp_path / name), 64, 48, None, 1)
     lens = Lens("SIMPLE_RADIAL", (58.0, 32.0, 24.0, -0.1), 64, 48)
     frame = SolvedFrame(0, lens, np.eye(4), np.zeros((0, 2)), np.zeros(0, np.int64))
     model = Model(np.zeros((1, 3)), np.zeros((1, 3), np.uint8), np.zeros(1), np.zeros(1, np.int64), [frame])
     out = tmp_path / "out"
     out.mkdir()
-    develop.write([shot], Solved(model, [1], "exhaustive", 0), out, tmp_path / "work", 0, Progress())
+    develop.write([still], Solved(model, [1], "exhaustive", 0), out, tmp_path / "work", 0, Progress())
     (written,) = (out / "images").iterdir()
     assert written.name == "a" + suffix and read_picture(written).pixels.max() == pytest.approx(top, rel=1e-3)
     if suffix == ".png":
@@ -339,10 +339,10 @@ def test_a_video(tmp_path: Path) -> None:
 def test_the_small_frames_of_a_squeezed_video_are_not(tmp_path: Path) -> None:
     frames = [render(camera) for camera in orbit(4, size=SIZE, arc=0.3)]
     video = with_pixels(write_video(tmp_path / "shot.mp4", frames), 4, 3)
-    shots, _ = gather(video, tmp_path / "work", 0, 400, Progress())
-    assert [(shot.width, shot.height) for shot in shots] == [SIZE] * 4
-    assert picture_size(tmp_path / "work" / "small" / shots[0].name) == (400, 225)
-    assert picture_size(tmp_path / "work" / "masks" / f"{shots[0].name}.png") == (400, 225)
+    stills, _ = gather(video, tmp_path / "work", 0, 400, Progress())
+    assert [(still.width, still.height) for still in stills] == [SIZE] * 4
+    assert picture_size(tmp_path / "work" / "small" / stills[0].name) == (400, 225)
+    assert picture_size(tmp_path / "work" / "masks" / f"{stills[0].name}.png") == (400, 225)
 
 
 def refusal(source: Path, out: Path, settings: SolveSettings = QUICK) -> str:
@@ -587,5 +587,5 @@ def test_who_asks_a_solve_to_end_is_heard() -> None:
 
 
 def test_frames_whose_names_differ_by_case_or_suffix_alone_are_two_on_every_disk() -> None:
-    shots = [Shot(name, f"/shoot/{name}", 8, 8, None, 1) for name in ("a.jpg", "A.jpeg", "b.jpg")]
-    assert develop._names(shots) == ["a.png", "A.jpeg.png", "b.png"]
+    stills = [Still(name, f"/shoot/{name}", 8, 8, None, 1) for name in ("a.jpg", "A.jpeg", "b.jpg")]
+    assert develop._names(stills) == ["a.png", "A.jpeg.png", "b.png"]

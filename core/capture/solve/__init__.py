@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Structure from motion: from frames or a video to a capture.
 
-    shots.py      which frames; small pictures and masks of them
+    stills.py      which frames; small pictures and masks of them
     pairs.py      which frames to match with which
     mapping.py    pycolmap: features, matches, incremental mapping
     world.py      which way is up, where the floor is, how large things are
@@ -56,7 +56,6 @@ class SolveSettings:
     principal_point: bool = True
     mask: bool = True
     seed: int = 0
-    keep_work: bool = False
 
     def __post_init__(self) -> None:
         if self.lens not in MODELS or self.lens == "EQUIRECTANGULAR":
@@ -84,23 +83,22 @@ def solve(source: Path | str, out: Path | str, settings: SolveSettings | None = 
     Raises CaptureError where there is nothing to solve or no parallax to solve it by, FrameError for a video
     that cannot be read, Cancelled when asked to stop, EngineError without pycolmap.
     """
-    from . import develop, mapping, report, shots, world
+    from . import develop, mapping, report, stills, world
 
     source, out, settings, progress = Path(source), Path(out), settings or SolveSettings(), progress or Progress()
     if not source.exists():
         raise CaptureError(f"{source} is missing.")
     began = time.monotonic()
-    request = {"source": _fingerprint(source), "settings": {**asdict(settings), "keep_work": False}}
+    request = {"source": _fingerprint(source), "settings": asdict(settings)}
     finished = _claim(source, out, request, progress)
     work = out / WORK
     if finished is not None:
-        if not settings.keep_work:
-            shutil.rmtree(work, ignore_errors=True)
+        shutil.rmtree(work, ignore_errors=True)
         return finished
-    chosen, left_out = shots.gather(source, work, settings.frames, settings.size, progress)
+    chosen, left_out = stills.gather(source, work, settings.frames, settings.size, progress)
     solved = mapping.solve(chosen, work, settings, is_video(source), progress)
     world.align(solved.model)
-    missing = sorted(set(range(len(chosen))) - {frame.shot for frame in solved.frames})
+    missing = sorted(set(range(len(chosen))) - {frame.still for frame in solved.frames})
     if missing:
         names = ", ".join(Path(chosen[i].file).name for i in missing[:12]) + (", …" if len(missing) > 12 else "")
         progress.say(f"{len(missing)} of {len(chosen)} frames found no place in the model and are left out: {names}.")
@@ -109,8 +107,7 @@ def solve(source: Path | str, out: Path | str, settings: SolveSettings | None = 
     data = report.figures(chosen, solved, left_out, request, time.monotonic() - began)
     report.picture(solved, out / PICTURE)
     write_json(out / REPORT, data)
-    if not settings.keep_work:
-        shutil.rmtree(work, ignore_errors=True)
+    shutil.rmtree(work, ignore_errors=True)
     return data
 
 
@@ -155,12 +152,12 @@ def _claim(source: Path, out: Path, request: dict[str, Any], progress: Progress)
 
 def _goes_on(work: Path, request: dict[str, Any], progress: Progress) -> bool:
     """Whether an earlier solve of the same was stopped here, and what it left is whole."""
-    from . import mapping, shots
+    from . import mapping, stills
 
     try:
         if not (work / ASKED).is_file() or read_json(work / ASKED, CaptureError) != request:
             return False
-        shots.gathered(work)
+        stills.gathered(work)
         mapping.check(work)
     except CaptureError as problem:
         progress.say(f"The solve begins anew: {problem}")

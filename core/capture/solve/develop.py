@@ -15,34 +15,34 @@ from ..camera import Camera
 from ..colmap import Observed, PointCloud, write_model
 from ..lens import Lens, straightened
 from .mapping import Solved, SolvedFrame
-from .shots import Shot, original
+from .stills import Still, original
 
 STRAIGHT = 0.1  # pixels; a lens that bends less than this is left as it is, and the pixels untouched
 
 
-def write(shots: Sequence[Shot], solved: Solved, out: Path, work: Path, size: int, progress: Progress) -> None:
+def write(stills: Sequence[Still], solved: Solved, out: Path, work: Path, size: int, progress: Progress) -> None:
     """Write images/ and sparse/0 of the capture `out`; `size` is the long side of the frames, 0 as filmed.
 
     They are made below `work`, where a stopped run finds its frames again, and moved when all are there.
     """
     progress.stage("write frames", len(solved.frames))
-    names = _names(shots)
+    names = _names(stills)
     straight: dict[Lens, Camera] = {}
     lenses: dict[tuple[Lens, tuple[int, int]], Lens] = {}
     written = []
     for frame in solved.frames:
-        shot = shots[frame.shot]
-        scale = min(1.0, size / max(shot.width, shot.height)) if size else 1.0
-        target = (round(shot.width * scale), round(shot.height * scale))
+        still = stills[frame.still]
+        scale = min(1.0, size / max(still.width, still.height)) if size else 1.0
+        target = (round(still.width * scale), round(still.height * scale))
         if frame.lens not in straight:
             straight[frame.lens] = _straight(frame.lens)
         camera = straight[frame.lens].scaled(*target)
-        _develop(shot, frame, camera, work / "images" / names[frame.shot])
+        _develop(still, frame, camera, work / "images" / names[frame.still])
         lens = lenses.setdefault((frame.lens, target), Lens("PINHOLE", (camera.fx, camera.fy, camera.cx, camera.cy),
                                                             *target))
         pixels = frame.lens.undistort(frame.pixels) * (camera.fx, camera.fy) + (camera.cx, camera.cy)
         good = np.isfinite(pixels).all(axis=1)
-        written.append(Observed(names[frame.shot], lens, frame.world_to_camera, pixels[good], frame.points[good]))
+        written.append(Observed(names[frame.still], lens, frame.world_to_camera, pixels[good], frame.points[good]))
         progress.advance()
     larger = sum(frame.lens.width for frame in written) / sum(frame.lens.width for frame in solved.frames)
     model = solved.model
@@ -53,13 +53,13 @@ def write(shots: Sequence[Shot], solved: Solved, out: Path, work: Path, size: in
         patiently((work / name).rename, out / name)
 
 
-def _names(shots: Sequence[Shot]) -> list[str]:
+def _names(stills: Sequence[Still]) -> list[str]:
     """A name for each frame: its file's, with the suffix of a lossless format that holds the file's light. No two are
     one, on any file system."""
     names: list[str] = []
     taken: set[str] = set()
-    for shot in shots:
-        file = Path(shot.file)
+    for still in stills:
+        file = Path(still.file)
         suffix = ".exr" if holds_floats(file) else ".png"
         name = file.stem + suffix
         names.append(file.name + suffix if name.casefold() in taken else name)
@@ -73,18 +73,18 @@ def _straight(lens: Lens) -> Camera:
     return Camera(lens.width, lens.height, fx, fy, cx, cy, np.eye(4))
 
 
-def _develop(shot: Shot, frame: SolvedFrame, camera: Camera, target: Path) -> None:
+def _develop(still: Still, frame: SolvedFrame, camera: Camera, target: Path) -> None:
     """Write one frame as `camera` sees it, unless an earlier run has."""
     if target.is_file():
         return
-    source = Path(shot.file)
+    source = Path(still.file)
     bends = frame.lens.bend >= STRAIGHT
-    if (not bends and camera.size == (shot.width, shot.height) and shot.orientation == 1
+    if (not bends and camera.size == (still.width, still.height) and still.orientation == 1
             and source.suffix.lower() == target.suffix):
         with atomic_path(target) as temporary:
             shutil.copyfile(source, temporary)
         return
-    picture = original(shot)
+    picture = original(still)
     if bends:
         picture = straightened(picture, frame.lens.maps(camera.scaled(*picture.size)))
     picture = picture.resized(*camera.size)

@@ -26,7 +26,7 @@ from ..camera import Floats
 from ..colmap import read_model
 from ..lens import MODELS, Lens
 from .pairs import choose_matching, choose_pairs
-from .shots import Shot
+from .stills import Still
 
 if TYPE_CHECKING:
     from . import SolveSettings
@@ -42,9 +42,9 @@ MOVED = 1.0          # pixels of the small pictures; less is no motion
 
 @dataclass(eq=False)
 class SolvedFrame:
-    """A registered frame: index of its shot, lens and observations at the size of its small picture."""
+    """A registered frame: index of its still, lens and observations at the size of its small picture."""
 
-    shot: int
+    still: int
     lens: Lens
     world_to_camera: Floats
     pixels: Floats
@@ -77,18 +77,18 @@ class Solved:
         return self.model.frames
 
 
-def solve(shots: Sequence[Shot], work: Path, settings: SolveSettings, video: bool, progress: Progress) -> Solved:
+def solve(stills: Sequence[Still], work: Path, settings: SolveSettings, video: bool, progress: Progress) -> Solved:
     """From small pictures and masks below `work` to the largest model. See `core.capture.solve.solve`."""
     pycolmap = load_pycolmap()
     pycolmap.logging.minloglevel = int(pycolmap.logging.Level.ERROR)
     pycolmap.set_random_seed(settings.seed)
     database = work / DATABASE
-    _refuse_one_picture(shots, work)
-    _extract(pycolmap, shots, work, database, settings, progress)
-    matching = choose_matching(settings.matching, len(shots), video)
-    pairs = _match(pycolmap, shots, work, database, matching, settings, progress)
+    _refuse_one_picture(stills, work)
+    _extract(pycolmap, stills, work, database, settings, progress)
+    matching = choose_matching(settings.matching, len(stills), video)
+    pairs = _match(pycolmap, stills, work, database, matching, settings, progress)
     _refuse_without_parallax(pycolmap, database, settings.size)
-    models = _map(pycolmap, work, database, len(shots), settings, progress)
+    models = _map(pycolmap, work, database, len(stills), settings, progress)
     if not models:
         raise CaptureError("The frames match, but no two of them give a reliable start; film with more sideways "
                            "motion or choose more frames.")
@@ -97,7 +97,7 @@ def solve(shots: Sequence[Shot], work: Path, settings: SolveSettings, video: boo
         progress.stage("find principal point", 1)
         largest = _with_principal_point(pycolmap, largest)
         progress.advance()
-    names = {shot.name: index for index, shot in enumerate(shots)}
+    names = {still.name: index for index, still in enumerate(stills)}
     return Solved(_model(largest, names), sorted((m.num_reg_images() for m in models), reverse=True), matching, pairs)
 
 
@@ -135,21 +135,21 @@ def load_pycolmap() -> Any:
     return pycolmap
 
 
-def _refuse_one_picture(shots: Sequence[Shot], work: Path) -> None:
+def _refuse_one_picture(stills: Sequence[Still], work: Path) -> None:
     """Stop early where every frame shows the same: nothing moves."""
     import cv2
 
     first: Any = None
-    for shot in shots:
-        small = _grey(work / "small" / shot.name)
+    for still in stills:
+        small = _grey(work / "small" / still.name)
         tiny = cv2.resize(small, (64, 64), interpolation=cv2.INTER_AREA).astype(np.float32)
         first = tiny if first is None else first
         if np.abs(tiny - first).max() > 3:
             return
-    raise CaptureError(f"All {len(shots)} frames show the same picture; a solve needs a camera that moves.")
+    raise CaptureError(f"All {len(stills)} frames show the same picture; a solve needs a camera that moves.")
 
 
-def _extract(pycolmap: Any, shots: Sequence[Shot], work: Path, database: Path, settings: SolveSettings,
+def _extract(pycolmap: Any, stills: Sequence[Still], work: Path, database: Path, settings: SolveSettings,
              progress: Progress) -> None:
     """Features of every frame that has none yet; one camera for all frames of one size and focal length."""
     with _opened(pycolmap, database) as db:
@@ -158,16 +158,16 @@ def _extract(pycolmap: Any, shots: Sequence[Shot], work: Path, database: Path, s
         cameras: dict[tuple[int, int, float | None], int] = {}
         known = {(c.width, c.height, round(c.params[0], 6)): c.camera_id for c in db.read_all_cameras()}
         groups: dict[tuple[int, bool], list[str]] = {}
-        for shot in shots:
-            key = (shot.width, shot.height, shot.focal)
+        for still in stills:
+            key = (still.width, still.height, still.focal)
             if key not in cameras:
-                camera = _camera(pycolmap, picture_size(work / "small" / shot.name), shot.focal, settings.lens)
+                camera = _camera(pycolmap, picture_size(work / "small" / still.name), still.focal, settings.lens)
                 mark = (camera.width, camera.height, round(camera.params[0], 6))
                 cameras[key] = known.get(mark) or db.write_camera(camera)
                 known[mark] = cameras[key]
-            if shot.name not in done:
-                groups.setdefault((cameras[key], _is_plain(work / "small" / shot.name)), []).append(shot.name)
-    progress.stage("find features", len(shots), len(done))
+            if still.name not in done:
+                groups.setdefault((cameras[key], _is_plain(work / "small" / still.name)), []).append(still.name)
+    progress.stage("find features", len(stills), len(done))
     options = pycolmap.FeatureExtractionOptions()
     options.sift.max_num_features = settings.features
     options.use_gpu = False
@@ -211,12 +211,12 @@ def _camera(pycolmap: Any, size: tuple[int, int], focal: float | None, model: st
     return camera
 
 
-def _match(pycolmap: Any, shots: Sequence[Shot], work: Path, database: Path, matching: Any,
+def _match(pycolmap: Any, stills: Sequence[Still], work: Path, database: Path, matching: Any,
            settings: SolveSettings, progress: Progress) -> int:
     """Match and verify the chosen pairs that have not been; returns how many were chosen."""
     with _opened(pycolmap, database) as db:
-        ids = [db.read_image_with_name(shot.name).image_id for shot in shots]
-        pairs = choose_pairs(matching, len(shots), lambda i: np.asarray(db.read_descriptors(ids[i]).data),
+        ids = [db.read_image_with_name(still.name).image_id for still in stills]
+        pairs = choose_pairs(matching, len(stills), lambda i: np.asarray(db.read_descriptors(ids[i]).data),
                              settings.seed)
         open_pairs = [(i, j) for i, j in pairs if not db.exists_two_view_geometry(ids[i], ids[j])]
     progress.stage("match frames", len(pairs), len(pairs) - len(open_pairs))
@@ -228,7 +228,7 @@ def _match(pycolmap: Any, shots: Sequence[Shot], work: Path, database: Path, mat
     listing.match_list_path = str(work / "pairs.txt")
     for at in range(0, len(open_pairs), 100):
         batch = open_pairs[at:at + 100]
-        write_text(work / "pairs.txt", "".join(f"{shots[i].name} {shots[j].name}\n" for i, j in batch))
+        write_text(work / "pairs.txt", "".join(f"{stills[i].name} {stills[j].name}\n" for i, j in batch))
         pycolmap.match_image_pairs(database, matching_options=options, pairing_options=listing,
                                    verification_options=verification, device=pycolmap.Device.cpu)
         progress.advance(len(batch))
@@ -364,7 +364,7 @@ def _model(reconstruction: Any, names: dict[str, int]) -> Model:
                  np.array([point.color for point in points], np.uint8).reshape(-1, 3),
                  np.array([point.error for point in points], np.float64),
                  np.array([point.track.length() for point in points], np.int64),
-                 sorted(frames, key=lambda frame: frame.shot))
+                 sorted(frames, key=lambda frame: frame.still))
 
 
 @contextlib.contextmanager

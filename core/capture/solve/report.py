@@ -11,21 +11,21 @@ import numpy as np
 from ...pictures import write_png
 from ..camera import Floats
 from .mapping import Solved
-from .shots import Shot
+from .stills import Still
 
 PANEL = 720  # pixels, each of the two views
 INK, PATH, PAPER = (0.15, 0.15, 0.15), (0.85, 0.2, 0.1), 1.0
 
 
-def figures(shots: Sequence[Shot], solved: Solved, left_out: list[str], request: dict[str, Any],
+def figures(stills: Sequence[Still], solved: Solved, left_out: list[str], request: dict[str, Any],
             seconds: float) -> dict[str, Any]:
     """The report, JSON-able. Errors are in pixels of the small pictures features were found in."""
-    registered = {frame.shot for frame in solved.frames}
+    registered = {frame.still for frame in solved.frames}
     model = solved.model
     lenses = list(dict.fromkeys(frame.lens for frame in solved.frames))
     return {
-        "frames": len(shots), "registered": len(registered), "models": solved.sizes,
-        "unregistered": [Path(shots[i].file).name for i in range(len(shots)) if i not in registered],
+        "frames": len(stills), "registered": len(registered), "models": solved.sizes,
+        "unregistered": [Path(stills[i].file).name for i in range(len(stills)) if i not in registered],
         "left_out": left_out, "matching": solved.matching, "pairs": solved.pairs,
         "points": len(model.xyz), "observations": int(model.tracks.sum()),
         "reprojection_error_px": round(float(model.error.mean()), 4),

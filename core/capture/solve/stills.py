@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """What is to be solved: the frames of a folder or a video, chosen, checked, and made small enough to match.
 
-From a video, or where fewer frames are asked for than there are, the shot is cut into equal stretches
+From a video, or where fewer frames are asked for than there are, the footage is cut into equal stretches
 and the sharpest frame of each is taken: blur costs features, and even spacing keeps the overlap.
 """
 from __future__ import annotations
@@ -21,14 +21,14 @@ from ...pictures import Picture, Pixels, picture_size, pictures_in, read_picture
 from ...progress import Progress
 from ...video import Video, displayed, is_video
 
-RECORD = "shots.json"
+RECORD = "stills.json"
 COMBED, SOME = 1.1, 0.25
 """Times, in more than which part of the frames. Photographs have 0.6 to 0.8, moving fields 1.5 to 2.3."""
 CLIPPED = 0.98  # of full scale: at or above it the sensor says nothing about the surface
 
 
 @dataclass(frozen=True)
-class Shot:
+class Still:
     """A frame to solve: `name` of its small picture and mask, the file it comes from, its full size in
     pixels and its focal length as a multiple of the long side, where the file tells."""
 
@@ -72,11 +72,11 @@ def _say_if_interlaced(combed: Sequence[bool], progress: Progress) -> None:
                      "many times less exact; deinterlace it first.")
 
 
-def gather(source: Path, work: Path, number: int, size: int, progress: Progress) -> tuple[list[Shot], list[str]]:
+def gather(source: Path, work: Path, number: int, size: int, progress: Progress) -> tuple[list[Still], list[str]]:
     """Choose frames and write small pictures and masks of them below `work`.
 
     `number`: how many (0: all of a folder, 150 of a video); `size`: long side of the small pictures.
-    Returns the shots, in order, and sentences about frames that had to be left out. What an earlier run
+    Returns the stills, in order, and sentences about frames that had to be left out. What an earlier run
     wrote is taken as it is. Raises CaptureError where there is nothing to choose from, FrameError for a video that
     cannot be read.
     """
@@ -84,33 +84,33 @@ def gather(source: Path, work: Path, number: int, size: int, progress: Progress)
     if before is not None:
         return before
     if source.is_dir():
-        shots, left_out = _from_folder(source, work, number, size, progress)
+        stills, left_out = _from_folder(source, work, number, size, progress)
     elif source.is_file() and is_video(source):
-        shots, left_out = _from_video(source, work, number or 150, size, progress)
+        stills, left_out = _from_video(source, work, number or 150, size, progress)
     else:
         raise CaptureError(f"{source} is neither a folder of frames nor a video.")
-    if len(shots) < 3:
+    if len(stills) < 3:
         why = f"; {left_out[0]}" if left_out else ""
-        raise CaptureError(f"{source} gives {len(shots)} usable frames, and a solve needs at least 3 that see the "
+        raise CaptureError(f"{source} gives {len(stills)} usable frames, and a solve needs at least 3 that see the "
                            f"scene from different places{why}".rstrip(".") + ".")
-    write_json(work / RECORD, {"shots": [asdict(shot) for shot in shots], "left_out": left_out})
-    return shots, left_out
+    write_json(work / RECORD, {"stills": [asdict(still) for still in stills], "left_out": left_out})
+    return stills, left_out
 
 
-def gathered(work: Path) -> tuple[list[Shot], list[str]] | None:
+def gathered(work: Path) -> tuple[list[Still], list[str]] | None:
     """What `gather` has given before, None where it has not. Raises CaptureError where that is damaged."""
     if not (work / RECORD).is_file():
         return None
     data = read_json(work / RECORD, CaptureError)
     try:
-        return [Shot(**shot) for shot in data["shots"]], list(data["left_out"])
+        return [Still(**still) for still in data["stills"]], list(data["left_out"])
     except (KeyError, TypeError) as problem:
         raise CaptureError(f"{work / RECORD} is damaged.") from problem
 
 
-def original(shot: Shot) -> Picture:
+def original(still: Still) -> Picture:
     """The frame at full size, upright."""
-    return _upright(read_picture(Path(shot.file)), shot.orientation)
+    return _upright(read_picture(Path(still.file)), still.orientation)
 
 
 def _upright(picture: Picture, orientation: int) -> Picture:
@@ -118,7 +118,7 @@ def _upright(picture: Picture, orientation: int) -> Picture:
 
 
 def _from_folder(source: Path, work: Path, number: int, size: int,
-                 progress: Progress) -> tuple[list[Shot], list[str]]:
+                 progress: Progress) -> tuple[list[Still], list[str]]:
     files = pictures_in(source)
     if not files:
         raise CaptureError(f"{source} holds no frames (PNG, JPEG, TIFF or EXR).")
@@ -134,7 +134,7 @@ def _from_folder(source: Path, work: Path, number: int, size: int,
             progress.advance()
         files = [files[i] for i in choose(scores, number)]
     progress.stage("read frames", len(files))
-    shots, combed = list[Shot](), list[bool]()
+    stills, combed = list[Still](), list[bool]()
     for file in files:
         try:
             picture_size(file)
@@ -146,17 +146,17 @@ def _from_folder(source: Path, work: Path, number: int, size: int,
             progress.say(f"Left out: {problem}")
         else:
             # Not its own name, which COLMAP would cut at a space, and which is another picture's without its suffix.
-            shot = Shot(f"{len(shots):06d}.png", str(file.resolve()), *picture.size, focal, orientation)
-            _write_small(picture, aspect, work, shot.name, size)
-            shots.append(shot)
+            still = Still(f"{len(stills):06d}.png", str(file.resolve()), *picture.size, focal, orientation)
+            _write_small(picture, aspect, work, still.name, size)
+            stills.append(still)
             combed.append(is_combed(picture))
         progress.advance()
     _say_if_interlaced(combed, progress)
-    return shots, left_out
+    return stills, left_out
 
 
 def _from_video(source: Path, work: Path, number: int, size: int,
-                progress: Progress) -> tuple[list[Shot], list[str]]:
+                progress: Progress) -> tuple[list[Still], list[str]]:
     """Two passes: the sharpness of every frame, then the chosen ones."""
     import cv2
 
@@ -172,7 +172,7 @@ def _from_video(source: Path, work: Path, number: int, size: int,
         raise CaptureError(f"{source} holds no frame that can be decoded; convert it to MP4 (H.264).")
     chosen = choose(scores, number)
     progress.stage("read frames", len(chosen))
-    shots, combed = list[Shot](), list[bool]()
+    stills, combed = list[Still](), list[bool]()
     wanted = set(chosen)
     with Video(source) as video:
         for index, frame in enumerate(video):
@@ -180,12 +180,12 @@ def _from_video(source: Path, work: Path, number: int, size: int,
                 picture = Picture(displayed(frame), "srgb")
                 file = work / "full" / f"{index:06d}.png"
                 write_png(file, picture.pixels)
-                shots.append(Shot(file.name, str(file.resolve()), *picture.size, None, 1))
+                stills.append(Still(file.name, str(file.resolve()), *picture.size, None, 1))
                 _write_small(picture, video.aspect, work, file.name, size)
                 combed.append(is_combed(picture))
                 progress.advance()
     _say_if_interlaced(combed, progress)
-    return shots, []
+    return stills, []
 
 
 def _write_small(picture: Picture, aspect: float, work: Path, name: str, size: int) -> None:

@@ -31,8 +31,8 @@ from core.capture import Capture
 from core.errors import EngineError, FitFlareError
 from core.lights import Detection, Detector, detector_for, find_lights, union
 from core.pictures import read_picture
+from core.removal.backgrounds import PHOTOS, pictures_of
 
-PHOTOS = (".jpg", ".jpeg", ".png")
 THRESHOLDS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
 
 
@@ -130,7 +130,7 @@ def main() -> None:
             print(f"{method}: skipped. {problem}")
             continue
         if words.photos is not None:
-            photos = sorted(path for path in words.photos.rglob("*") if path.suffix.lower() in PHOTOS)
+            photos = pictures_of(words.photos, PHOTOS, "all")
             if not photos:
                 print(f"{method}: skipped, {words.photos} holds no photographs.")
             else:

@@ -155,10 +155,11 @@ def _cleaned(paths: list[Path], folder: Path) -> Iterator[Any]:
 
 def clean(folders: list[Path], weights: Path | None = None) -> None:
     """What happens to pictures without flare."""
+    from core.removal.backgrounds import PHOTOS, pictures_of
+
     remover = Remover(weights)
     values, kept = [], 0
-    for path in sorted(path for folder in folders for path in folder.rglob("*")
-                       if path.suffix.lower() in (".png", ".jpg", ".jpeg", ".tif")):
+    for path in (path for folder in folders for path in pictures_of(folder, PHOTOS, "all")):
         found = read_plate(path)
         codes = remover.remove(found)[0]
         if np.array_equal(codes, found.codes):

@@ -40,8 +40,10 @@ def threads(count: int) -> Iterator[None]:
     """Runs the body on this many threads of torch, and of the kernels that follow it."""
     before = torch.get_num_threads()
     torch.set_num_threads(count)
-    yield
-    torch.set_num_threads(before)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def on_threads(count: int, work: Callable[[], object]) -> Callable[[], object]:

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import importlib.util
-import sys
-from collections.abc import Callable
 from pathlib import Path
-from types import ModuleType
 
 import pytest
+
+from tests.core.flared import flared_capture
 
 ROOT = Path(__file__).resolve().parents[2]
 RUN = ROOT / "headless" / "run.py"
@@ -24,9 +23,4 @@ _run.load()
 @pytest.fixture(scope="session")
 def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A tiny capture with everything, shared by the tests."""
-    folder = ROOT / "tests" / "core"
-    if str(folder) not in sys.path:
-        sys.path.append(str(folder))
-    flared: ModuleType = __import__("flared")
-    make: Callable[..., Path] = flared.flared_capture
-    return make(tmp_path_factory.mktemp("capture") / "tiny", count=9, dots=60)
+    return flared_capture(tmp_path_factory.mktemp("capture") / "tiny", count=9, dots=60)

@@ -17,7 +17,7 @@ import shutil
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from ...choices import Matching
 from ...errors import CaptureError, SettingsError
@@ -61,9 +61,8 @@ class SolveSettings:
         if self.lens not in MODELS or self.lens == "EQUIRECTANGULAR":
             raise SettingsError(f"{self.lens!r} is not a camera model to solve with; take one of "
                                f"{', '.join(name for name in MODELS if name != 'EQUIRECTANGULAR')}.")
-        if self.matching not in ("auto", "exhaustive", "sequential", "similar"):
-            raise SettingsError(f"{self.matching!r} is not a way of matching; take auto, exhaustive, sequential "
-                               "or similar.")
+        if self.matching not in (ways := get_args(Matching)):
+            raise SettingsError(f"{self.matching!r} is not a way of matching; take one of {', '.join(ways)}.")
         if self.frames < 0 or self.output_size < 0:
             raise SettingsError("Neither the number of frames nor their size can be negative; leave out what is to be "
                                 "as it is.")

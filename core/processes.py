@@ -31,7 +31,7 @@ def python_at(place: Path) -> Path | None:
     """The interpreter that `place` is, or that the virtual environment in it has; on Windows conda has it at the top of
     the environment. None, too, where the Python that the environment was made from is gone."""
     for path in (place, place / "Scripts" / "python.exe", place / "bin" / "python", place / "python.exe"):
-        if path.is_file() and not (WINDOWS and _lacks_its_base(path)):
+        if os.path.isfile(path) and not (WINDOWS and _lacks_its_base(path)):  # noqa: PTH113 - pathlib's may raise
             return path.absolute()  # not resolved: a virtual environment's python is a link
     return None
 

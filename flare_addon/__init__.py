@@ -35,14 +35,22 @@ def _loaded(_path: str) -> None:
         wires.go_by_numbers(scene)
 
 
+@bpy.app.handlers.persistent
+def _to_be_saved(_path: str) -> None:
+    for scene in bpy.data.scenes:
+        wires.remember(scene)
+
+
 def register() -> None:
     for module in _MODULES:
         module.register()
     bpy.app.handlers.load_post.append(_loaded)
+    bpy.app.handlers.save_pre.append(_to_be_saved)
 
 
 def unregister() -> None:
     bpy.app.handlers.load_post.remove(_loaded)
+    bpy.app.handlers.save_pre.remove(_to_be_saved)
     jobs.unregister()
     fits.unregister()
     looks.forget()

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ..core.capture import Camera
 from ..core.errors import CaptureError
+from .objects import matrix_of
 
 Floats = NDArray[np.float64]
 
@@ -76,16 +77,22 @@ def core_camera(data: Any, matrix: Any, render: Any) -> Camera:
     return Camera(width, height, fx, fy, cx, cy, np.linalg.inv(camera_to_world(matrix)))
 
 
-def to_capture(root: Any) -> Floats:
-    """(4, 4) from Blender's world to the capture's, as the root that carries it stands now; one where it is None."""
+def to_capture(root: Any, depsgraph: Any) -> Floats:
+    """(4, 4) from Blender's world to the capture's, as the root that carries it stands now; one where it is None.
+    Raises CaptureError as `matrix_of` does."""
     if root is None:
         return np.eye(4)
-    matrix = np.array([list(row) for row in root.matrix_world], np.float64)
+    matrix = np.array([list(row) for row in matrix_of(root, depsgraph)], np.float64)
     return np.linalg.inv(matrix) if abs(np.linalg.det(matrix[:3, :3])) > 1e-18 else np.eye(4)
 
 
-def pose_in_capture(matrix: Any, root: Any) -> Floats:
-    """world_to_camera (4, 4) in the capture's coordinates of a camera with this matrix_world."""
-    placed = to_capture(root) @ camera_to_world(matrix)
+def point_in_capture(point: Any, root: Any, depsgraph: Any) -> Floats:
+    """(3,) in the capture's coordinates of a point (3,) of Blender's world. Raises CaptureError."""
+    return (to_capture(root, depsgraph) @ np.array([*point, 1.0]))[:3]
+
+
+def pose_in_capture(matrix: Any, root: Any, depsgraph: Any) -> Floats:
+    """world_to_camera (4, 4) in the capture's coordinates of a camera with this matrix_world. Raises CaptureError."""
+    placed = to_capture(root, depsgraph) @ camera_to_world(matrix)
     placed[:3, :3] /= np.linalg.norm(placed[:3, :3], axis=0)
     return np.linalg.inv(placed)

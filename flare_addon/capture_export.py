@@ -149,10 +149,12 @@ def write_cameras(folder: Path, entries: list[dict[str, Any]]) -> None:
 
 
 def entry_of(scene: Any, camera: Any, frame: int, path: Path, folder: Path) -> dict[str, Any]:
-    """A frame of transforms.json; its picture is linked or copied into the capture."""
+    """A frame of transforms.json; its picture is linked or copied into the capture. Raises CaptureError for a camera
+    that is mirrored or skewed."""
     depsgraph = bpy.context.evaluated_depsgraph_get()
     evaluated = camera.evaluated_get(depsgraph)
     core = cameras.core_camera(evaluated.data, evaluated.matrix_world, scene.render)
+    pose = _pose_of(evaluated, frame)
     name = _picture(frame, path)
     target = folder / name
     target.parent.mkdir(parents=True, exist_ok=True)
@@ -162,9 +164,18 @@ def entry_of(scene: Any, camera: Any, frame: int, path: Path, folder: Path) -> d
             os.link(path.resolve(), target)  # of a symbolic link Linux would link that, to where it leads from here
         except OSError:  # another disk, or a file system without links
             shutil.copy2(path, target)
-    pose = cameras.camera_to_world(evaluated.matrix_world) @ cameras.FLIP
     return {"file_path": name, "w": core.width, "h": core.height, "fl_x": core.fx, "fl_y": core.fy, "cx": core.cx,
             "cy": core.cy, **distortion_of(camera, path), "transform_matrix": pose.tolist()}
+
+
+def _pose_of(camera: Any, frame: int) -> cameras.Floats:
+    """camera_to_world (4, 4) of an evaluated camera in Blender's axes. Raises CaptureError where it is no rotation."""
+    pose = cameras.camera_to_world(camera.matrix_world) @ cameras.FLIP
+    rotation = pose[:3, :3]
+    if not np.allclose(rotation.T @ rotation, np.eye(3), atol=1e-3) or np.linalg.det(rotation) < 0:
+        raise CaptureError(f"The camera {camera.name!r} is mirrored or skewed at frame {frame}; apply the scale of it "
+                           "and of its parents.")
+    return pose
 
 
 def _picture(frame: int, plate: Path) -> str:

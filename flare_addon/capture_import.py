@@ -23,6 +23,7 @@ from ..core.capture.camera import Camera, quaternion_from_rotation
 from ..core.errors import CaptureError
 from . import cameras, curves
 from .cameras import FLIP
+from .compositor import footage_nodes
 from .images import loaded
 from .paths import absolute, stored
 from .rendering import show_as_filmed
@@ -257,28 +258,44 @@ def _footage(camera: Any, capture: Capture, views: Sequence[View], numbers: Sequ
 
 
 def show_footage(scene: Any, which: str) -> int:
-    """Show the frames of the capture's folder images/ or removed/ behind its cameras; how many images changed. A frame
-    that has no twin there stays as it is."""
+    """Show the frames of the capture's folder images/ or removed/ behind its cameras, and under the flare where they
+    are that; how many images changed. A frame that has no twin there stays as it is, and so does an image wherever
+    else it is shown."""
     root, folder = scene.fit_flare.root, scene.fit_flare.capture
     if root is None or not folder:
         return 0
     base = absolute(folder, scene.library)
     twins = Twins(base / which) if (base / which).is_dir() else None
+    showing: dict[Any, list[Any]] = {}
+    for one in (*_backdrops(root), *footage_nodes(scene)):
+        showing.setdefault(one.image, []).append(one)
     changed = 0
-    for camera in (item for item in root.children if item.type == "CAMERA"):
-        for back in camera.data.background_images:
-            if back.image is None:
-                continue
-            path = absolute(back.image.filepath, back.image.library).resolve()
-            inner = next((path.relative_to((base / name).resolve()) for name in ("images", REMOVED)
-                          if path.is_relative_to((base / name).resolve())), None)
-            if inner is None:
-                continue
-            twin = twins.of(inner) if twins is not None else None
-            if twin is not None and (base / which / twin).resolve() != path:
-                back.image.filepath = stored(base / which / twin)
-                changed += 1
+    for image, those in showing.items():
+        path = absolute(image.filepath, image.library).resolve()
+        inner = next((path.relative_to((base / name).resolve()) for name in ("images", REMOVED)
+                      if path.is_relative_to((base / name).resolve())), None)
+        if inner is None:
+            continue
+        twin = twins.of(inner) if twins is not None else None
+        if twin is not None and (base / which / twin).resolve() != path:
+            _of_their_own(image, those).filepath = stored(base / which / twin)
+            changed += 1
     return changed
+
+
+def _backdrops(root: Any) -> Iterator[Any]:
+    """What has an image behind the cameras of a capture."""
+    for camera in (item for item in root.children if item.type == "CAMERA"):
+        yield from (back for back in camera.data.background_images if back.image is not None)
+
+
+def _of_their_own(image: Any, those: Sequence[Any]) -> Any:
+    """The image that `those` show, or a copy of it for them where others have it too."""
+    if image.users > len(those):
+        image = image.copy()
+        for one in those:
+            one.image = image
+    return image
 
 
 def _backdrop(camera: Any, image: Any) -> Any:

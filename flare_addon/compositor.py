@@ -112,12 +112,19 @@ def set_up(scene: Any, layers: LayerFolder, *, keep_image: bool = False, plate: 
 
 def _own_tree(scene: Any) -> Any:
     """The scene's compositor tree, None where it has none. One that another scene has as well is copied first: what is
-    done to it would be done to the other scene's."""
+    done to it would be done to the other scene's. So is one that is linked, to which nothing can be done."""
     tree = tree_of(scene)
-    if GROUPS_ARE_TREES and tree is not None and any(other != scene and tree_of(other) == tree
-                                                     for other in bpy.data.scenes):
+    if GROUPS_ARE_TREES and tree is not None and (tree.library is not None or any(
+            other != scene and tree_of(other) == tree for other in bpy.data.scenes)):
         tree = scene.compositing_node_group = tree.copy()
     return tree
+
+
+def footage_nodes(scene: Any) -> list[Any]:
+    """The node that lays footage under the flare, if there is one."""
+    tree = tree_of(scene)
+    node = tree.nodes.get(PLATE) if tree is not None else None
+    return [node] if getattr(node, "image", None) is not None else []
 
 
 def plate_of(scene: Any) -> tuple[Any, int, int, int]:

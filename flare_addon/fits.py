@@ -16,7 +16,7 @@ from . import engine, jobs, lights, looks
 from .capture_import import expose
 from .images import read_again
 from .jobs import Job
-from .paths import absolute, stored
+from .paths import absolute, is_file, is_folder, stored
 from .reports import NO_CAPTURE
 
 FLARE, SCENE, PREVIEW, CONFIG = "flare.flare", "scene.ply", "preview_small.png", "config.toml"
@@ -35,7 +35,7 @@ def capture_of(scene: Any) -> Path | None:
 def has_clean_frames(scene: Any) -> bool:
     """Whether the imported capture has frames without flare, to be shown behind its cameras."""
     folder = capture_of(scene)
-    return scene.fit_flare.root is not None and folder is not None and (folder / REMOVED).is_dir()
+    return scene.fit_flare.root is not None and folder is not None and is_folder(folder / REMOVED)
 
 
 def job_of(scene: Any) -> Job | None:
@@ -58,11 +58,11 @@ def state_of(scene: Any) -> str:
     job = jobs.find(folder)
     if job is not None and job.running:
         return "running"
-    if (folder / FLARE).is_file():
+    if is_file(folder / FLARE):
         return "finished"
-    if (folder / CONFIG).is_file():
+    if is_file(folder / CONFIG):
         return "resumable"
-    return "none" if not scene.fit_flare.run or folder.is_dir() else "lost"
+    return "none" if not scene.fit_flare.run or is_folder(folder) else "lost"
 
 
 def why_not(scene: Any) -> str:
@@ -70,7 +70,7 @@ def why_not(scene: Any) -> str:
     capture = capture_of(scene)
     if capture is None:
         return NO_CAPTURE
-    if not capture.is_dir():
+    if not is_folder(capture):
         return f"The capture {capture} is not there any more; choose where it is now"
     if not lights.of_scene(scene):
         return "Add a light first, or find the lights in the frames"
@@ -99,7 +99,7 @@ def start(scene: Any) -> Job:
     Raises EngineError without an engine, CaptureError without a capture or lights, RunError for the folder.
     """
     capture = capture_of(scene)
-    if capture is None or not capture.is_dir():
+    if capture is None or not is_folder(capture):
         raise CaptureError(f"The capture {capture} is not there any more; import it from where it is now."
                            if capture else "There is no capture yet; import one first.")
     engine.command()  # says so before anything is written
@@ -110,7 +110,7 @@ def start(scene: Any) -> Job:
     try:
         return _run(scene, capture, folder)
     except FitFlareError:
-        if not (folder / CONFIG).is_file():  # refused before it began: an earlier fit is still what there is
+        if not is_file(folder / CONFIG):  # refused before it began: an earlier fit is still what there is
             scene.fit_flare.run = before
         raise
 
@@ -118,12 +118,12 @@ def start(scene: Any) -> Job:
 def resume(scene: Any) -> Job:
     """Go on with the run of the scene. Raises as `start` does."""
     capture, folder = capture_of(scene), folder_of(scene)
-    if folder is None or not (folder / CONFIG).is_file():
+    if folder is None or not is_file(folder / CONFIG):
         raise RunError(f"There is no fit to go on with in {folder}; start a new one.")
     begun = _begun_with(folder)
     if begun is None or _has_moved(folder, capture):
         begun = capture
-    if begun is None or not begun.is_dir():
+    if begun is None or not is_folder(begun):
         raise CaptureError(f"The capture {begun} that this fit was begun with is not there; put it back, or start a "
                            "new fit.")
     return _run(scene, begun, folder)
@@ -172,13 +172,13 @@ def _may_be_of(folder: Path, capture: Path) -> bool:
     begun = _begun_with(folder)
     if begun is None:
         return True
-    return begun.samefile(capture) if begun.is_dir() and capture.is_dir() else begun.name == capture.name
+    return begun.samefile(capture) if is_folder(begun) and is_folder(capture) else begun.name == capture.name
 
 
 def _has_moved(folder: Path, capture: Path | None) -> bool:
     """Whether the capture of a run is gone from where it was, and may be the one that is given now."""
     begun = _begun_with(folder)
-    return (begun is not None and not begun.is_dir() and capture is not None and capture.is_dir()
+    return (begun is not None and not is_folder(begun) and capture is not None and is_folder(capture)
             and _may_be_of(folder, capture))
 
 
@@ -194,13 +194,18 @@ def finished(job: Job) -> None:
     """Show the flare of a fit that ended well, in every scene that has this run."""
     if job.state != "done":
         return
-    scenes = [scene for scene in bpy.data.scenes if folder_of(scene) == job.folder]
+    scenes = [scene for scene in _own_scenes() if folder_of(scene) == job.folder]
     for scene in scenes:
         try:
             show(scene, job.folder)
         except FitFlareError as problem:
             job.error = str(problem)
     _remember("Fit", scenes)
+
+
+def _own_scenes() -> list[Any]:
+    """The scenes of this .blend, without those that are linked from another and cannot be changed here."""
+    return [scene for scene in bpy.data.scenes if scene.library is None]
 
 
 def _remember(what: str, scenes: Sequence[Any]) -> None:
@@ -215,7 +220,7 @@ def _remember(what: str, scenes: Sequence[Any]) -> None:
 def find_lights(scene: Any) -> Job:
     """Have the engine look for lights in the frames; those of the scene stay. Raises EngineError, CaptureError."""
     capture = capture_of(scene)
-    if capture is None or not capture.is_dir():
+    if capture is None or not is_folder(capture):
         raise CaptureError("There is no capture yet; import one first.")
     if lights.of_scene(scene):
         lights.write(scene, capture)
@@ -227,7 +232,7 @@ def clean(scene: Any) -> Job:
     """Have the engine take the flares out of the frames, into the capture's removed/. Raises EngineError,
     CaptureError."""
     capture = capture_of(scene)
-    if capture is None or not (capture / "images").is_dir():
+    if capture is None or not is_folder(capture / "images"):
         raise CaptureError("There is no capture with a folder images/ yet; import one first.")
     words = cleaning(scene, capture)
     made = cleaning_of(capture)
@@ -264,7 +269,7 @@ def cleaned(job: Job) -> None:
     read_again(job.folder.parent / REMOVED)
     if job.state != "done":
         return
-    scenes = [scene for scene in bpy.data.scenes
+    scenes = [scene for scene in _own_scenes()
               if (capture := capture_of(scene)) is not None and _cleaning_folder(capture) == job.folder]
     for scene in scenes:
         scene.fit_flare.mode = "default"
@@ -275,7 +280,7 @@ def lights_found(job: Job) -> None:
     """Bring found lights into every scene with this capture."""
     if job.state != "done":
         return
-    scenes = [scene for scene in bpy.data.scenes
+    scenes = [scene for scene in _own_scenes()
               if (capture := capture_of(scene)) is not None and capture / "lights" == job.folder]
     for scene in scenes:
         try:

@@ -21,6 +21,7 @@ import shutil
 import signal
 import subprocess
 import time
+import traceback
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -32,6 +33,7 @@ from ..core.errors import DISK_FULL, EngineError, FitFlareError, RunError, refus
 from ..core.files import remove_file, write_json
 from ..core.processes import STOPPED, WINDOWS, own_group
 from ..core.progress import STOP_FILE
+from .paths import is_file, is_folder
 
 State = Literal["running", "done", "failed", "stopped"]
 
@@ -173,16 +175,16 @@ class Job:
             self.state = "stopped"
         elif self.error:
             self.state = "failed"
-        elif self.host != HOST and self.folder.is_dir():
+        elif self.host != HOST and is_folder(self.folder):
             self.state = "failed"
             self.error = (f"The engine on {self.host_name} has told nothing for an hour; see there whether it works in "
                           f"{self.folder}.")
-        elif not self.folder.is_dir():
+        elif not is_folder(self.folder):
             self.state, self.error = "failed", f"The folder {self.folder} was removed while the engine worked in it."
         elif _is_full(self.folder):  # then its last words found no room either
             self.state = "failed"
             self.error = f"The disk of {self.folder} is full; make room and start it again, what is finished is kept."
-        elif (self.folder / STOP).exists():  # before it listened
+        elif is_file(self.folder / STOP):  # before it listened
             self.state, self.error = "stopped", "Stopped as asked before it began."
         else:
             self.state = "failed"
@@ -318,10 +320,23 @@ def _watch() -> None:
 
 
 def _tick() -> float | None:
-    news = [job.poll() for job in running()]
+    news = [_polled(job) for job in running()]
     if any(news):
         _redraw_bars()
     return EVERY_S if running() else None
+
+
+def _polled(job: Job) -> bool:
+    """Whether anything is new of it. What nobody foresaw ends the watching of no other work: the panel tells that it
+    was, and the console what."""
+    try:
+        return job.poll()
+    except Exception as problem:
+        traceback.print_exc()
+        job.error = (f"What the engine left in {job.folder} cannot be shown ({' '.join(str(problem).split())}); report "
+                     "it with what the console says.")
+        job.state = "failed" if job.running else job.state
+        return True
 
 
 def _redraw_bars() -> None:

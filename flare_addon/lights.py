@@ -16,7 +16,7 @@ from ..core.errors import CaptureError
 from ..core.files import named_by, read_json, rounded, write_json
 from . import cameras
 from .capture_import import add_light
-from .objects import matrix_of, view_layer_of
+from .objects import depsgraph_of, matrix_of, view_layer_of
 from .paths import absolute
 
 SUN_DISTANCE = 1e4
@@ -47,16 +47,9 @@ def name_of(light: Any) -> str:
     return light.fit_flare.light or light.name
 
 
-def _depsgraph_of(scene: Any) -> Any:
-    layer = view_layer_of(scene)
-    layer.update()
-    return layer.depsgraph
-
-
-def place_of(light: Any, root: Any, matrix: Any = None) -> Any:
-    """(3,) position in the capture's coordinates. matrix: the light's matrix_world, if not the present one."""
-    world = np.array([*(matrix or light.matrix_world).translation, 1.0])
-    return (cameras.to_capture(root) @ world)[:3]
+def place_of(light: Any, root: Any, depsgraph: Any) -> Any:
+    """(3,) position in the capture's coordinates. Raises CaptureError as `matrix_of` does."""
+    return cameras.point_in_capture(matrix_of(light, depsgraph).translation, root, depsgraph)
 
 
 def stands(light: Any, matrix: Any, eye: Any) -> Any:
@@ -68,15 +61,22 @@ def stands(light: Any, matrix: Any, eye: Any) -> Any:
 
 
 def add(scene: Any, where: Any, name: str = "") -> Any:
-    """A new light at a point (3,) of Blender's world."""
+    """A new light at a point (3,) of Blender's world. Raises CaptureError as `matrix_of` does."""
     state = scene.fit_flare
     root = state.root
     taken = {name_of(item) for item in of_scene(scene)}
     name = free_name(name or "light1", taken)
-    collection = root.users_collection[0] if root is not None and root.users_collection else scene.collection
     size = max((item.empty_display_size for item in of_scene(scene) if item.type == "EMPTY"), default=0.2)
-    local = (cameras.to_capture(root) @ np.array([*where, 1.0]))[:3]
-    return add_light(collection, root, name, local, size)
+    local = cameras.point_in_capture(where, root, depsgraph_of(scene))
+    return add_light(_collection_of(scene), root, name, local, size)
+
+
+def _collection_of(scene: Any) -> Any:
+    """Where new lights of a scene go: beside its root, unless that is another scene's or file's."""
+    root, own = scene.fit_flare.root, {scene.collection, *scene.collection.children_recursive}
+    beside = () if root is None else root.users_collection
+    return next((one for one in beside if one in own and one.library is None and one.override_library is None),
+                scene.collection)
 
 
 def take(objects: Iterable[Any], taken: set[str]) -> int:
@@ -117,13 +117,12 @@ def write(scene: Any, folder: Path) -> int:
     path = folder / LIGHTS
     data: dict[str, Any] = read_json(path, CaptureError) if path.is_file() else {}
     known = {entry.get("name"): entry for entry in data.get("lights", []) if isinstance(entry, dict)}
+    lights, depsgraph = [known[name] for name in unknown(scene, folder)], depsgraph_of(scene)
     eye = scene.camera.matrix_world.translation if scene.camera is not None else objects[0].matrix_world.translation
-    lights, depsgraph = [known[name] for name in unknown(scene, folder)], _depsgraph_of(scene)
     for item, name in zip(objects, names, strict=True):
-        matrix = matrix_of(item, depsgraph).copy()
-        matrix.translation = stands(item, matrix, eye)
-        xyz = [rounded(float(value)) for value in place_of(item, scene.fit_flare.root, matrix)]
-        lights.append({**known.get(name, {}), "name": name, "xyz": xyz})
+        where = stands(item, matrix_of(item, depsgraph), eye)
+        xyz = cameras.point_in_capture(where, scene.fit_flare.root, depsgraph)
+        lights.append({**known.get(name, {}), "name": name, "xyz": [rounded(float(value)) for value in xyz]})
     if lights != data.get("lights"):
         write_json(named_by(path), {**data, "lights": lights})
     remember(scene)
@@ -169,11 +168,10 @@ def bring_in(scene: Any, folder: Path) -> int:
     there = of_scene(scene)
     wanted = set(unknown(scene, folder)) if there else None
     found = [light for light in read_lights(folder / LIGHTS) if wanted is None or light.name in wanted]
-    root = scene.fit_flare.root
-    collection = root.users_collection[0] if root is not None and root.users_collection else scene.collection
+    collection = _collection_of(scene)
     size = max((item.empty_display_size for item in there if item.type == "EMPTY"), default=0.2)
     for light in found:
-        add_light(collection, root, light.name, light.xyz, size)
+        add_light(collection, scene.fit_flare.root, light.name, light.xyz, size)
     remember(scene)
     return len(found)
 
@@ -186,14 +184,14 @@ def _put(light: Any, xyz: ArrayLike) -> None:
 
 def follow(scene: Any, places: Mapping[str, ArrayLike], capture: Path | None) -> None:
     """Move lights to where a fit has put them (3,), by name, in the capture's coordinates: those that still are where
-    the fit was given them, as the capture's lights.json has it, and that nothing else moves."""
+    the fit was given them, as the capture's lights.json has it, and that nothing else moves. Raises CaptureError."""
     path = None if capture is None else capture / LIGHTS
     given = {} if path is None or not path.is_file() else {light.name: light.xyz for light in read_lights(path)}
-    view_layer_of(scene).update()  # Blender has not looked at one that no window shows since the file was opened
+    depsgraph = depsgraph_of(scene)
     for item in of_scene(scene):
         name = name_of(item)
         if name in places and name in given and item.parent == scene.fit_flare.root and item.animation_data is None:
-            where = place_of(item, scene.fit_flare.root)
+            where = place_of(item, scene.fit_flare.root, depsgraph)
             if np.allclose(where, given[name], atol=1e-4) and not np.allclose(where, places[name], atol=1e-4):
                 _put(item, places[name])
     view_layer_of(scene).update()

@@ -14,7 +14,7 @@ from ..core.look.look import Query
 from ..core.look.shot import PlacedLight, evaluate
 from . import cameras, curves, occlusion, wires
 from .lights import name_of, of_scene, place_of, stands
-from .objects import matrix_of
+from .objects import depsgraph_of, matrix_of
 from .paths import absolute, stored
 from .properties import edit_of
 
@@ -56,14 +56,15 @@ def is_placed(item: Any, scene: Any) -> bool:
 def use(scene: Any, path: Path | str) -> Look:
     """Show a .flare in the scene: one flare for each of its lights, at the light object of that name.
 
-    Edits of flares that stay are kept. Raises FlareFileError.
+    Edits of flares that stay are kept. Raises FlareFileError, and CaptureError for a light that is switched off in the
+    viewport and moved there.
     """
     path = Path(path)
     look = read(path)
     state = scene.fit_flare
-    before = state.flare
-    state.flare = stored(path)
     objects = {name_of(item): item for item in of_scene(scene)}
+    native = _is_of(look, state, objects, depsgraph_of(scene))
+    before, state.flare = state.flare, stored(path)
     if before != state.flare:
         for index in reversed(range(len(state.lights))):
             if state.lights[index].source not in look.names:
@@ -77,7 +78,7 @@ def use(scene: Any, path: Path | str) -> Look:
             item.target = objects[light.name]
         _elements(item, light)
     state.light = min(state.light, max(len(state.lights) - 1, 0))
-    state.native = _is_of(look, state, objects)
+    state.native = native
     return look
 
 
@@ -90,7 +91,7 @@ def remove(scene: Any, number: int) -> None:
         wires.wire(scene, {layer: one - (one > number) for layer, one in gains.items() if one != number})
 
 
-def _is_of(look: Look, state: Any, objects: dict[str, Any]) -> bool:
+def _is_of(look: Look, state: Any, objects: dict[str, Any], depsgraph: Any) -> bool:
     """Whether the look was learned in the scene's capture: its lights are where they were then. The world of a capture
     that was made of Blender's own camera, which has no root, is Blender's."""
     root = state.root
@@ -99,7 +100,8 @@ def _is_of(look: Look, state: Any, objects: dict[str, Any]) -> bool:
         return False
     extent = max(float(np.linalg.norm(light.query_range.camera_high - light.query_range.camera_low))
                  for light in shared)
-    return all(np.linalg.norm(place_of(objects[light.name], root) - light.xyz) < 0.05 * extent for light in shared)
+    return all(np.linalg.norm(place_of(objects[light.name], root, depsgraph) - light.xyz) < 0.05 * extent
+               for light in shared)
 
 
 def add_instance(scene: Any, target: Any, source: str) -> Any:
@@ -157,9 +159,8 @@ def placed(scene: Any, depsgraph: Any, camera: Any) -> tuple[NDArray[np.float64]
     """world_to_camera (4, 4) of a camera object and the lights with their visible shares, in the coordinates
     that the look is asked in: the capture's, or Blender's where there is no capture. Raises CaptureError."""
     state = scene.fit_flare
-    root = state.root.evaluated_get(depsgraph) if state.root is not None else None
     matrix = camera.evaluated_get(depsgraph).matrix_world
-    into = cameras.to_capture(root)
+    into = cameras.to_capture(state.root, depsgraph)
     lights = []
     for item in state.lights:
         if not is_placed(item, scene):
@@ -168,7 +169,7 @@ def placed(scene: Any, depsgraph: Any, camera: Any) -> tuple[NDArray[np.float64]
         share = occlusion.visible_share(scene, depsgraph, matrix.translation, item) if state.occlusion else 1.0
         xyz = (into @ np.array([*where, 1.0]))[:3]
         lights.append(PlacedLight(item.name, item.source, xyz, share))
-    return cameras.pose_in_capture(matrix, root), lights
+    return cameras.pose_in_capture(matrix, state.root, depsgraph), lights
 
 
 def seen(scene: Any, depsgraph: Any, camera: Any) -> dict[str, PlaneGaussians]:

@@ -53,3 +53,10 @@ def collections_shown(layer: Any, hidden: Literal["hide_viewport", "hide_render"
 def view_layer_of(scene: Any) -> Any:
     """The view layer in which a scene's objects are looked at."""
     return bpy.context.view_layer if bpy.context.scene == scene else scene.view_layers[0]
+
+
+def depsgraph_of(scene: Any) -> Any:
+    """Where the objects of a scene stand now, of one too that no window shows."""
+    layer = view_layer_of(scene)
+    layer.update()
+    return layer.depsgraph

@@ -13,6 +13,7 @@ from ..core.capture import REMOVED
 from ..core.errors import FitFlareError
 from . import engine, fits, flare_node, jobs, library, lights, looks, overlay, shots, wires
 from .layouts import draw_progress, lines
+from .paths import is_folder
 
 
 class _Part:
@@ -31,7 +32,7 @@ class FITFLARE_PT_capture(_Part, bpy.types.Panel):
         if folder is None:
             lines(layout, "Footage with a camera solve: a folder with images/ and sparse/0/ (COLMAP) or "
                           "transforms.json.", "INFO")
-        elif not folder.is_dir():
+        elif not is_folder(folder):
             lines(layout, f"The capture {folder} is not there any more: choose where it is now.", "ERROR")
         row = layout.row()
         row.scale_y = 1.3
@@ -116,7 +117,7 @@ class FITFLARE_PT_fit(_Part, bpy.types.Panel):
         row = layout.row()
         row.scale_y = 1.3
         row.operator("fit_flare.fit", text="Fit" if stage in ("none", "lost") else "New Fit", icon="RENDER_ANIMATION")
-        if folder is not None and folder.is_dir():
+        if folder is not None and is_folder(folder):
             _reading(layout, folder)
 
 
@@ -127,9 +128,9 @@ def _cleaning(layout: Any, state: Any, capture: Any, stage: str) -> None:
     if job is not None and job.running:
         draw_progress(layout, job, "Clean frames")
         return
-    if job is not None and job.state in ("failed", "stopped"):
-        lines(layout, job.error, "ERROR" if job.state == "failed" else "INFO")
-    there = (capture / REMOVED).is_dir() and (job is None or job.state == "done")
+    if job is not None and job.error:
+        lines(layout, job.error, "INFO" if job.state == "stopped" else "ERROR")
+    there = is_folder(capture / REMOVED) and (job is None or job.state == "done")
     by_network = stage != "finished" and (not there or job is not None)
     if not there:
         lines(layout, "The fit can take its flare out of the frames." if stage == "finished" else
@@ -312,8 +313,8 @@ class FITFLARE_PT_bake(_Part, bpy.types.Panel):
             column.prop(state, "layers")
             column.prop(state, "bake_live")
             column.prop(state, "bake_scene")
-            if job is not None and job.state in ("failed", "stopped"):
-                lines(layout, job.error, "ERROR" if job.state == "failed" else "INFO")
+            if job is not None and job.error:
+                lines(layout, job.error, "INFO" if job.state == "stopped" else "ERROR")
             elif job is not None and job.state == "done":
                 lines(layout, f"{job.result.get('frames', 0)} frames of layers are baked.", "CHECKMARK")
             row = layout.row(align=True)
@@ -335,7 +336,7 @@ class FITFLARE_PT_bake(_Part, bpy.types.Panel):
         if node is not None and node.node_tree is not None:
             sliders = [node.inputs[name] for name in ("Intensity", "Tint") if name in node.inputs]  # not renamed ones
             drivers = wires.drivers(scene)
-            if not all(curve.driver.is_valid for curve in drivers):
+            if not wires.act(scene):
                 lines(box, "Some sliders of the panel Look act on it no longer: set it up again.", "ERROR")
             elif drivers or any(socket.is_linked for socket in sliders if socket.name == "Intensity"):
                 lines(box, "Set up: the sliders of the panel Look act on it.", "CHECKMARK")

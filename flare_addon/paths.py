@@ -28,6 +28,17 @@ def absolute(text: str, library: Any = None) -> Path:
     return Path(os.path.normpath(bpy.path.abspath(text, library=library)))
 
 
+def is_folder(path: Path) -> bool:
+    """Whether a folder is there to be looked at: a name that is too long for the disk, or no leave to look, is no error
+    of the panel that asks."""
+    return os.path.isdir(path)  # noqa: PTH112 - pathlib's raises then
+
+
+def is_file(path: Path) -> bool:
+    """Whether a file is there to be looked at, as `is_folder`."""
+    return os.path.isfile(path)  # noqa: PTH113
+
+
 def _relative(path: Path, blend: str) -> str:
     if not blend:
         return os.fspath(path)

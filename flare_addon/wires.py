@@ -6,13 +6,15 @@ They act on what the layers were baked without: intensity, tint, mute and solo o
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import bpy
 
 from . import curves
-from .flare_node import GROUP, find_node, gain_of, layer_of, tree_of
+from .flare_node import GROUP, GROUPS_ARE_TREES, find_node, gain_of, layer_of, tree_of
 
+SOLOS = "solos"  # a property of the node: how many flares are solo
 _OF_AN_INPUT = re.compile(rf'nodes\["{GROUP}"\]\.inputs\[(\d+)\]\.default_value')
 _LIVE = re.compile(r"fit_flare\.(master|lights\[\d+\])\.(intensity|tint|mute|solo)$")
 _OF_A_LIGHT = re.compile(r'fit_flare\.lights\[(?:(\d+)|"(.*)")\]\.intensity')
@@ -26,16 +28,17 @@ def wire(scene: Any, gains: dict[str, int]) -> None:
     """
     node = find_node(scene)
     cut(scene)
-    _drive(scene, node, "Intensity", -1, "i*(1-m)", {"i": "master.intensity", "m": "master.mute"})
+    _drive(node, "Intensity", -1, "i*(1-m)", {"i": _slider(scene, "master.intensity"),
+                                              "m": _slider(scene, "master.mute")})
     for channel in range(3):
-        _drive(scene, node, "Tint", channel, "t", {"t": f"master.tint[{channel}]"})
-    solos = {f"s{number}": f"lights[{number}].solo" for number in sorted(set(gains.values()))}
+        _drive(node, "Tint", channel, "t", {"t": _slider(scene, f"master.tint[{channel}]")})
+    solos = _count_solos(scene, node, sorted(set(gains.values())))
     for layer, number in gains.items():
-        path, own = f"lights[{number}]", f"s{number}"
-        most = f"max({','.join(solos)})" if len(solos) > 1 else own
+        path = f"lights[{number}]"
         for channel in range(3):
-            _drive(scene, node, gain_of(layer), channel, f"i*t*(1-m)*({own} if {most} else 1)",
-                   {"i": f"{path}.intensity", "t": f"{path}.tint[{channel}]", "m": f"{path}.mute", **solos})
+            _drive(node, gain_of(layer), channel, "i*t*(1-m)*(s if n else 1)", {
+                "i": _slider(scene, f"{path}.intensity"), "t": _slider(scene, f"{path}.tint[{channel}]"),
+                "m": _slider(scene, f"{path}.mute"), "s": _slider(scene, f"{path}.solo"), "n": solos})
 
 
 def wired(scene: Any) -> dict[str, int]:
@@ -74,6 +77,34 @@ def is_animated(scene: Any) -> bool:
     return any(_LIVE.match(curve.data_path) for some in (*curves.of(scene), own) for curve in some)
 
 
+def act(scene: Any) -> bool:
+    """Whether all that should drive the node's sliders does."""
+    return all(curve.driver.is_valid and all(_value(target) is not None for target in _targets(curve))
+               for curve in drivers(scene))
+
+
+def remember(scene: Any) -> None:
+    """Have the drivers know where the panel's sliders stand now, for a Blender that renders the file without this
+    extension, where those are not."""
+    for curve in drivers(scene):
+        for target in _targets(curve):
+            if curve.id_data.library is None and (value := _value(target)) is not None:
+                target.fallback_value = value
+
+
+def _targets(curve: Any) -> Iterator[Any]:
+    for variable in curve.driver.variables:
+        yield from variable.targets
+
+
+def _value(target: Any) -> float | None:
+    """Where the slider stands that a driver reads; None where there is no such."""
+    try:
+        return float(target.id.path_resolve(target.data_path))
+    except (ValueError, AttributeError):
+        return None
+
+
 def drivers(scene: Any) -> list[Any]:
     """The drivers of the node's sliders."""
     tree = tree_of(scene)
@@ -93,6 +124,8 @@ def cut(scene: Any) -> None:
             socket.default_value = 1.0
         elif socket is not None:
             socket.default_value[channel] = 1.0
+    if node is not None:
+        node.pop(SOLOS, None)
 
 
 def _driven(node: Any, curve: Any) -> Any:
@@ -101,15 +134,37 @@ def _driven(node: Any, curve: Any) -> Any:
     return node.inputs[int(match[1])] if node and match and int(match[1]) < len(node.inputs) else None
 
 
-def _drive(scene: Any, node: Any, name: str, index: int, expression: str, variables: dict[str, str]) -> None:
+def _slider(scene: Any, path: str) -> tuple[Any, str]:
+    """The data block and the path of a slider of the panel."""
+    return scene, f"fit_flare.{path}"
+
+
+def _count_solos(scene: Any, node: Any, numbers: Sequence[int]) -> tuple[Any, str]:
+    """Have the node count which of those flares are solo; the data block and the path of the count. Said in each Gain's
+    own expression they would be cut off at 255 characters."""
+    node[SOLOS] = 0.0
+    driver = node.driver_add(f'["{SOLOS}"]').driver
+    driver.type = "SUM"
+    for number in numbers:
+        _read(driver, f"s{number}", *_slider(scene, f"lights[{number}].solo"))
+    path = f'nodes["{GROUP}"]["{SOLOS}"]'
+    return (node.id_data, path) if GROUPS_ARE_TREES else (scene, f"node_tree.{path}")  # whose tree is a part of it
+
+
+def _drive(node: Any, name: str, index: int, expression: str, variables: dict[str, tuple[Any, str]]) -> None:
     if name not in node.inputs:  # someone has renamed it
         return
-    curve = node.inputs[name].driver_add("default_value", index)
-    driver = curve.driver
+    driver = node.inputs[name].driver_add("default_value", index).driver
     driver.type = "SCRIPTED"
-    for short, path in variables.items():
-        variable = driver.variables.new()
-        variable.name, variable.type = short, "SINGLE_PROP"
-        target = variable.targets[0]
-        target.id_type, target.id, target.data_path = "SCENE", scene, f"fit_flare.{path}"
+    for short, (block, path) in variables.items():
+        _read(driver, short, block, path)
     driver.expression = expression  # of the plain kind that needs no permission to run
+
+
+def _read(driver: Any, name: str, block: Any, path: str) -> None:
+    """Give a driver a variable: what is at `path` of a data block."""
+    variable = driver.variables.new()
+    variable.name, variable.type = name, "SINGLE_PROP"
+    target = variable.targets[0]
+    target.id_type, target.id, target.data_path = block.id_type, block, path
+    target.use_fallback_value = True

@@ -10,7 +10,7 @@ import bpy
 from ...core.bake.folder import LayerFolder
 from ...core.errors import CaptureError
 from .. import compositor, compositor_warnings, engine, flare_node, jobs, rendering, shots, wires
-from ..paths import absolute
+from ..paths import absolute, is_folder
 from ..reports import NO_CAMERA, NO_FLARE, Action, reported
 
 
@@ -178,7 +178,7 @@ class FITFLARE_OT_open_folder(bpy.types.Operator):
     folder: bpy.props.StringProperty(options={"HIDDEN"})  # type: ignore[valid-type]
 
     def execute(self, _context: bpy.types.Context) -> set[str]:
-        if not Path(self.folder).is_dir():
+        if not is_folder(Path(self.folder)):
             self.report({"ERROR"}, f"The folder {self.folder} is not there any more.")
             return {"CANCELLED"}
         bpy.ops.wm.path_open(filepath=self.folder)

@@ -7,6 +7,7 @@ from pathlib import Path
 import bpy
 
 from .. import engine, fits, jobs, shots
+from ..paths import is_file, is_folder
 from ..reports import NO_CAPTURE, Action
 
 _keymaps: list[tuple[object, object]] = []
@@ -54,7 +55,7 @@ class FITFLARE_OT_clean_frames(Action, bpy.types.Operator):
     @classmethod
     def why_not(cls, context: bpy.types.Context) -> str:
         capture = fits.capture_of(context.scene)
-        if capture is None or not (capture / "images").is_dir():
+        if capture is None or not is_folder(capture / "images"):
             return NO_CAPTURE
         return engine.missing()
 
@@ -120,7 +121,7 @@ class FITFLARE_OT_show_log(bpy.types.Operator):
         parts = []
         for name in ("log.txt", jobs.EVENTS, jobs.LOG):
             path = Path(self.folder, name)
-            if path.is_file():
+            if is_file(path):
                 parts.append(f"==== {path}\n{path.read_text(encoding='utf-8', errors='replace')[-200_000:]}")
         if not parts:
             self.report({"ERROR"}, f"There is no log in {self.folder}.")
@@ -141,7 +142,7 @@ class FITFLARE_OT_show_preview(Action, bpy.types.Operator):
     @classmethod
     def why_not(cls, context: bpy.types.Context) -> str:
         folder = fits.folder_of(context.scene)
-        if folder is None or not (folder / "preview.png").is_file():
+        if folder is None or not is_file(folder / "preview.png"):
             return "The fit has not made a preview yet"
         return ""
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import bpy
 
 from .. import engine, fits, lights
+from ..paths import is_folder
 from ..reports import NO_CAPTURE, Action
 
 
@@ -22,8 +23,9 @@ class FITFLARE_OT_add_light(Action, bpy.types.Operator):
         light = lights.add(context.scene, context.scene.cursor.location, self.name)
         for item in context.selected_objects:
             item.select_set(False)
-        light.select_set(True)
-        context.view_layer.objects.active = light
+        if context.view_layer.objects.get(light.name) == light:  # one in an excluded collection is not
+            light.select_set(True)
+            context.view_layer.objects.active = light
 
 
 class FITFLARE_OT_lights_from_selected(Action, bpy.types.Operator):
@@ -78,7 +80,7 @@ class FITFLARE_OT_find_lights(Action, bpy.types.Operator):
     @classmethod
     def why_not(cls, context: bpy.types.Context) -> str:
         capture = fits.capture_of(context.scene)
-        if capture is None or not capture.is_dir():
+        if capture is None or not is_folder(capture):
             return NO_CAPTURE
         return engine.missing()
 
@@ -96,7 +98,7 @@ class FITFLARE_OT_use_lights(Action, bpy.types.Operator):
     @classmethod
     def why_not(cls, context: bpy.types.Context) -> str:
         capture = fits.capture_of(context.scene)
-        if capture is None or not capture.is_dir():
+        if capture is None or not is_folder(capture):
             return NO_CAPTURE
         return "" if lights.unknown(context.scene, capture) else "All lights that were found are in the scene"
 

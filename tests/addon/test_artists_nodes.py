@@ -55,3 +55,8 @@ def test_the_output_that_counts_gets_the_flare(facts: Any) -> None:
 def test_it_is_shown_and_goes_where_a_slider_was_renamed(facts: Any) -> None:
     assert facts["renamed in the panel"] == ["Tint"]
     assert facts["renamed sockets"] == [PLATE, ["Plate"]]
+
+
+def test_a_linked_compositor_gets_the_flare_in_a_copy(facts: Any) -> None:
+    assert facts["linked"] == [PLATE + FLARE, True]
+    assert facts["linked, removed"] == [PLATE, ["Plate"]]

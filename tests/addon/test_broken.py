@@ -92,6 +92,13 @@ def test_a_full_disk_is_told_and_what_is_finished_is_kept(said: Any) -> None:
     assert said["its engine is not left alone"]
 
 
+def test_what_is_made_and_cannot_be_shown_is_told(said: Any) -> None:
+    state, fit, bake = said["done, and not shown"]
+    assert state == "done"
+    assert "It cannot be shown." in fit
+    assert "It cannot be shown." in bake
+
+
 def test_an_engine_that_dies_is_told(said: Any) -> None:
     fits = said["fits"]
     assert "out of memory" in fits["dies"]
@@ -142,6 +149,13 @@ def test_folders_that_went_are_told(said: Any) -> None:
     assert "is not there any more" in capture
     assert "is not there any more" in fit
     assert all(text and "Traceback" not in text for text in said["operators of a moved capture"])
+
+
+def test_panels_stand_a_name_that_is_too_long_for_the_disk(said: Any) -> None:
+    told = {name: panels for name, *panels in said["a name too long for the disk"]}
+    assert "is not there any more" in told["capture"][0]
+    assert "is gone: start a new fit" in told["run"][2]
+    assert len(told) == 6
 
 
 def test_cameras_lights_and_scenes(said: Any) -> None:

@@ -31,6 +31,14 @@ def test_work_of_another_machine_goes_by_what_it_tells(facts: Any) -> None:
     assert facts["silent on a Mac"].startswith("The engine on studio-mac has told nothing")
 
 
+def test_what_goes_wrong_with_one_ends_the_watching_of_no_other(facts: Any) -> None:
+    again, state, error, is_traced, other = facts["ends badly"]
+    assert again and other == "running"
+    assert state == "done"
+    assert error.endswith("ends badly cannot be shown (pop from empty list); report it with what the console says.")
+    assert is_traced
+
+
 def test_another_process_of_the_number_is_left_alone(facts: Any) -> None:
     assert facts["the stranger lives"] and facts["asked by the file alone"]
     assert facts["its number is an older process's"] == "failed"

@@ -27,6 +27,15 @@ def test_one_that_is_moved_by_itself_is_refused(facts: Any) -> None:
     assert facts["moved by itself"].startswith("'Headlamp' is switched off in the viewport")
 
 
+@pytest.mark.parametrize("how", ["excluded", "disabled"])
+def test_lights_of_a_capture_that_is_switched_off_stay_where_they_are(facts: Any, how: str) -> None:
+    """Though Blender does not say where that is once the file is opened again."""
+    lamp, learned, added, placed, native = facts[f"capture {how}"]
+    assert lamp == placed == learned
+    assert added == [0, 0, 0]
+    assert native
+
+
 def test_a_light_parented_where_it_stood_stays_there(facts: Any) -> None:
     assert facts["parented, brought back"] == [True, True, True]
 
@@ -56,6 +65,12 @@ def test_what_was_moved_or_renamed_while_lights_were_looked_for_stays_so(facts: 
 
 def test_a_scene_that_has_no_light_left_gets_all_that_are_found(facts: Any) -> None:
     assert set(facts["found with none left"]) >= {"lamp", "more"}
+
+
+def test_each_scene_with_the_capture_has_lights_of_its_own(facts: Any) -> None:
+    assert facts["added in the second"] == ""
+    assert facts["of each scene"] == {"Linked": ["lamp"], "First": ["lamp", "later"], "Second": ["later", "own"]}
+    assert facts["beside a linked root"] == ["", True]
 
 
 def test_only_an_empty_that_was_made_for_a_light_goes_with_it(facts: Any) -> None:

@@ -38,6 +38,14 @@ def test_pictures_of_another_shape_are_told_at_once(facts: Any) -> None:
                                               "shape; set the scene's resolution to that of the pictures.")
 
 
+def test_a_camera_that_is_mirrored_or_skewed_is_refused_before_anything_is_written(facts: Any) -> None:
+    mirrored, skewed, written = facts["mirrored"]
+    for said in (mirrored, skewed):
+        assert said == ("The camera 'Camera' is mirrored or skewed at frame 1; apply the scale of it and of its "
+                        "parents.")
+    assert not written
+
+
 def test_plates_that_are_links_are_the_captures_as_pictures(facts: Any) -> None:
     assert facts["links"] == [6, 6]
 

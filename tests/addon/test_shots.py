@@ -22,6 +22,13 @@ def test_another_capture_has_its_own_run_and_lights(facts: Any) -> None:
     assert facts["exported"] == ["", 2], "without a root all lights of the scene are where they stand"
 
 
+def test_footage_changes_where_it_is_chosen_alone(facts: Any) -> None:
+    assert facts["shared footage"] == [
+        ["removed", "images", "removed", "images"], ["removed", "removed", "removed", "images"],
+        ["images", "removed", "images", "images"], ["images"] * 4], "the artist's own node shows what it showed"
+    assert facts["images of it"] == [3, 5], "no more than show different things, each of all frames"
+
+
 def test_a_capture_from_a_camera_has_the_plates_of_now(facts: Any) -> None:
     assert facts["newer plates"] == [[True, True, ["000001.png"]]] * 2
 

@@ -26,7 +26,11 @@ def facts(blender: Blender, package: Path, tmp_path_factory: pytest.TempPathFact
     for number in range(1, 6):
         write_layers(layers / f"layers.{number:04d}.exr", FrameLayers(SCENE, {"lamp": FLARE}, SCENE[..., 0]))
     write_json(layers / "live.json", {"lights": ["lamp"]})
-    return blender.run(SCRIPTS / "wired.py", package, a_flare(base / "lamp.flare"), layers, base, user=base / "user")
+    many, lamps = base / "many", ["lamp", *(f"lamp{number}" for number in range(1, 60))]
+    write_layers(many / "layers.0001.exr", FrameLayers(SCENE, dict.fromkeys(lamps, FLARE), SCENE[..., 0]))
+    write_json(many / "live.json", {"lights": lamps})
+    return blender.run(SCRIPTS / "wired.py", package, a_flare(base / "lamp.flare"), layers, many, base,
+                       user=base / "user")
 
 
 @pytest.mark.parametrize("before", ["bare", "grey", "unused"])
@@ -43,3 +47,18 @@ def test_the_panels_sliders_act_on_the_render(facts: Any, name: str, gain: tuple
     assert facts["valid"]
     picture = read_picture(facts["files"][name]).pixels
     np.testing.assert_allclose(picture, SCENE + FLARE * np.array(gain, np.float32), rtol=1e-5)
+
+
+def test_a_worker_without_the_extension_has_the_sliders_as_they_were_saved(facts: Any) -> None:
+    picture = read_picture(facts["files"]["on a worker"]).pixels
+    np.testing.assert_allclose(picture, SCENE + FLARE * np.array((3, 1.5, 0.75), np.float32), rtol=1e-5)
+
+
+def test_sliders_whose_flare_is_gone_are_known(facts: Any) -> None:
+    assert facts["act"] == [True, True, False]
+
+
+@pytest.mark.parametrize(("name", "gain"), [
+    ("many", 60), ("many, two solo", 3 + 1), ("many, one solo in a copy", 3), ("many, none solo", 3 + 59)])
+def test_many_flares_stay_live(facts: Any, name: str, gain: float) -> None:
+    np.testing.assert_allclose(read_picture(facts["files"][name]).pixels, SCENE + gain * FLARE, rtol=1e-5)

@@ -70,6 +70,7 @@ def test_a_process_of_somebody_else_runs(monkeypatch: pytest.MonkeyPatch, tmp_pa
 @pytest.mark.parametrize("inner", ["python.exe", "Scripts/python.exe", "bin/python"])
 def test_a_python_is_found_in_an_environment_of_every_kind(inner: str, tmp_path: Path) -> None:
     assert processes.python_at(tmp_path) is None
+    assert processes.python_at(tmp_path / ("x" * 300)) is None
     python = tmp_path / inner
     python.parent.mkdir(exist_ok=True)
     python.touch()

@@ -195,6 +195,23 @@ facts["renamed in the panel"] = [call.kwargs["text"] for call in layout.mock_cal
 compositor.remove(scene)
 facts["renamed sockets"] = [shown(scene), names(scene)]
 
+# ---- a compositor that is linked from another file (up to 4.5 it is its scene's) --------------------
+scene = empty()
+tree, _ = plate(scene)
+if GROUPS:
+    bpy.data.libraries.write(str(out / "studio.blend"), {tree}, fake_user=True)
+    scene = empty()
+    with bpy.data.libraries.load(str(out / "studio.blend"), link=True) as (there, linked):
+        linked.node_groups = there.node_groups
+    scene.compositing_node_group = linked.node_groups[0]
+compositor.set_up(scene, layers, keep_image=True)
+bpy.ops.wm.save_as_mainfile(filepath=str(out / "shot.blend"))
+bpy.ops.wm.open_mainfile(filepath=str(out / "shot.blend"))
+scene = bpy.context.scene
+facts["linked"] = [shown(scene), "Plate" in names(scene)]
+compositor.remove(scene)
+facts["linked, removed"] = [shown(scene), names(scene)]
+
 print(json.dumps(facts))
 sys.stdout.flush()
 os._exit(0)

@@ -194,6 +194,21 @@ said["panels of a moved capture"] = [shown("capture"), shown("fit")]
 said["operators of a moved capture"] = [refusal(ops.find_lights), refusal(ops.clean_frames), refusal(ops.fit)]
 Path(capture).with_name("away").rename(capture)
 
+# ---- places that cannot be looked at ----------------------------------------------------------------
+state, asking = scene.fit_flare, ("fit", "find_lights", "clean_frames", "use_lights", "use_result", "resume",
+                                  "show_preview", "bake")
+kept, unseen = {name: getattr(state, name) for name in paths.OURS}, "x" * 300
+said["a name too long for the disk"] = []
+for name in paths.OURS:
+    setattr(state, name, str(folder / unseen))
+    said["a name too long for the disk"].append([name, *map(shown, PANELS), *map(polls, asking)])
+    setattr(state, name, kept[name])
+state.run, state.mode = str(folder / unseen), "split"
+state.capture = str(folder / unseen)
+said["a name too long for the disk"].append(["all", *map(shown, PANELS), *map(polls, asking)])
+for name in paths.OURS:
+    setattr(state, name, kept[name])
+
 # ---- .flare files -----------------------------------------------------------------------------------
 data = Path(flare).read_bytes()
 (folder / "cut.flare").write_bytes(data[: len(data) // 2])
@@ -222,6 +237,11 @@ for how in ("breaks", "fills", "bakes"):
     baked.append([refusal(lambda: ops.bake()), shown("bake"), sorted(
         path.name for path in (folder / "layers").glob("*.exr"))])
 said["bakes"] = baked
+job = jobs._jobs[jobs._key(fits._cleaning_folder(Path(capture)))] = jobs.find(folder / "layers")
+job.error = "It cannot be shown."
+said["done, and not shown"] = [job.state, shown("fit"), shown("bake")]
+job.error = ""
+jobs.forget(fits._cleaning_folder(Path(capture)))
 
 
 def full(*_words: object, **_named: object) -> None:

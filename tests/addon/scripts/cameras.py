@@ -85,7 +85,8 @@ learned = SimpleNamespace(lights=[SimpleNamespace(name="lamp", xyz=np.zeros(3), 
 facts["native"] = []
 for away in (0, 5):
     lamp.location = (away, 0, 0)
-    bpy.context.view_layer.update()
-    facts["native"].append([bool(looks._is_of(learned, SimpleNamespace(root=its, capture=capture), {"lamp": lamp}))
+    depsgraph = part("flare_addon.objects").depsgraph_of(scene)
+    facts["native"].append([bool(looks._is_of(learned, SimpleNamespace(root=its, capture=capture), {"lamp": lamp},
+                                              depsgraph))
                             for its, capture in ((root, "//capture"), (None, "//of this camera"), (None, ""))])
 leave(facts)

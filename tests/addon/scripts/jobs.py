@@ -2,6 +2,8 @@
 """Inside Blender: work that other machines, files and scenes have begun. Words: the zip, a folder."""
 from __future__ import annotations
 
+import contextlib
+import io
 import json
 import os
 import platform
@@ -54,6 +56,16 @@ named = begun("named", GOES_ON, host="6f1c", host_name="studio-mac")
 os.utime(named / jobs.EVENTS, (0, time.time() - 2 * jobs.SILENT_S))
 facts["silent on a Mac"] = jobs.find(named).error
 facts["silent elsewhere"] = [jobs.find(silent).state, jobs.find(silent).error]
+
+# ---- what is done in the scenes with one goes wrong ---------------------------------------------------
+goes_on, ends = (jobs.find(begun(name, GOES_ON, host="another")) for name in ("goes on still", "ends badly"))
+jobs.FINISHERS["fit"] = lambda _job: [].pop()
+with open(ends.folder / jobs.EVENTS, "a") as stream:
+    stream.write(RESULT)
+with contextlib.redirect_stderr(io.StringIO()) as console:
+    again = jobs._tick()
+facts["ends badly"] = [again, ends.state, ends.error, "IndexError" in console.getvalue(), goes_on.state]
+jobs.forget(goes_on.folder)
 
 # ---- this machine -----------------------------------------------------------------------------------
 facts["written by the version before"] = [jobs.find(begun("old", GOES_ON)).state,

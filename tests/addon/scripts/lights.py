@@ -15,13 +15,14 @@ import bpy
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent))
-from start import empty, install, leave, part
+from start import empty, install, leave, part, refusal
 
 package, capture, flare, out = sys.argv[1], *map(Path, sys.argv[2:5])
 install(package)
 sys.path.remove(str(Path(__file__).parent))
 ops = bpy.ops.fit_flare
 fits, lights, looks, shots = (part(f"flare_addon.{name}") for name in ("fits", "lights", "looks", "shots"))
+depsgraph_of = part("flare_addon.objects").depsgraph_of
 read_lights, errors = part("core.capture").read_lights, part("core.errors")
 facts: dict[str, object] = {}
 
@@ -68,6 +69,25 @@ try:
     places([1])
 except errors.FitFlareError as problem:
     facts["moved by itself"] = str(problem)
+
+# ---- the whole capture switched off, and the file opened again --------------------------------------
+learned = part("core.look").read(flare).lights[0].xyz
+for how in ("excluded", "disabled"):
+    scene = empty()
+    ops.import_capture(directory=str(capture), up="-Y", scale=2.0)
+    scene.camera = linked("Camera", bpy.data.cameras.new("Camera"))
+    layer = bpy.context.view_layer.layer_collection.children[capture.name]
+    layer.exclude, layer.collection.hide_viewport = how == "excluded", how == "disabled"
+    ops.add_light(name="added")
+    bpy.ops.wm.save_as_mainfile(filepath=str(out / "off.blend"))
+    bpy.ops.wm.open_mainfile(filepath=str(out / "off.blend"))
+    scene = bpy.context.scene
+    ops.open_flare(filepath=str(flare))
+    lights.write(scene, out)
+    placed = looks.placed(scene, depsgraph_of(scene), scene.camera)[1][0]
+    written = {light.name: light.xyz.round(3).tolist() for light in read_lights(out / "lights.json")}
+    facts[f"capture {how}"] = [written["lamp"], learned.round(3).tolist(), written["added"],
+                               placed.xyz.round(3).tolist(), scene.fit_flare.native]
 
 # ---- parented where it stood ------------------------------------------------------------------------
 scene = empty()
@@ -172,7 +192,6 @@ for how, x, y in (("beside the picture", 50, 100), ("below the view", 150, -5), 
 overlay.frame_in = frame_in
 
 # ---- a fit that has ended while the .blend was closed -----------------------------------------------
-learned = part("core.look").read(flare).lights[0].xyz
 run = out / "run"
 run.mkdir()
 shutil.copy(flare, run / fits.FLARE)
@@ -192,8 +211,8 @@ for how in ("open", "closed"):
         fits.finished(job)
     else:
         assert ops.use_result() == {"FINISHED"}
-    facts[f"fitted, {how}"] = [bool(np.allclose(lights.place_of(lamp, scene.fit_flare.root), learned, atol=1e-4)),
-                               scene.fit_flare.native]
+    place = lights.place_of(lamp, scene.fit_flare.root, depsgraph_of(scene))
+    facts[f"fitted, {how}"] = [bool(np.allclose(place, learned, atol=1e-4)), scene.fit_flare.native]
 
 # ---- lights that were found while the .blend was closed ---------------------------------------------
 path = capture / "lights.json"
@@ -229,4 +248,30 @@ scene.fit_flare.property_unset("known_lights")
 path.write_text(json.dumps({"lights": [*content["lights"], {"name": "found", "xyz": [1, 2, 3]}]}))
 lights.write(scene, capture)
 facts["of the version before"] = [light.name for light in read_lights(path)]
+
+# ---- other scenes with the capture: linked from a file, and made of this one's settings -----------------
+only = [entry for entry in content["lights"] if entry["name"] == "lamp"]
+path.write_text(json.dumps({"lights": only}))
+for name in ("Linked", "First"):
+    scene = empty()
+    scene.name = name
+    ops.import_capture(directory=str(capture))
+    bpy.ops.wm.save_as_mainfile(filepath=str(out / f"{name}.blend"))
+with bpy.data.libraries.load(str(out / "Linked.blend"), link=True) as (_, wanted):
+    wanted.scenes = ["Linked"]
+root = wanted.scenes[0].fit_flare.root
+bpy.ops.scene.new(type="EMPTY")
+bpy.context.scene.name = "Second"
+facts["added in the second"] = refusal(lambda: ops.add_light(name="own"))
+path.write_text(json.dumps({"lights": [*only, {"name": "later", "xyz": [1, 2, 3]}]}))
+job = part("flare_addon.jobs").Job("lights", capture / "lights", 0, None)
+job.state = "done"
+fits.lights_found(job)
+facts["of each scene"] = {one.name: [lights.name_of(item) for item in lights.of_scene(one)] for one in bpy.data.scenes}
+bpy.ops.scene.new(type="NEW")
+scene = bpy.context.scene
+scene.collection.children.link(root.users_collection[0])
+scene.fit_flare.root = root
+facts["beside a linked root"] = [refusal(lambda: ops.add_light(name="own")), "own" in map(
+    lights.name_of, lights.of_scene(scene))]
 leave(facts)

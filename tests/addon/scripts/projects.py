@@ -79,6 +79,15 @@ facts["begun before"] = refusal(lambda: ops.capture_from_camera(directory=str(ou
 filmed(first).render.resolution_x = 1920
 facts["of another shape"] = refusal(lambda: ops.capture_from_camera(directory=str(out / "shape")))
 
+mirrored = filmed(first)
+mirrored.camera.scale.x = -1
+facts["mirrored"] = [refusal(lambda: ops.capture_from_camera(directory=str(out / "mirrored")))]
+mirrored.camera.scale.x, stretched = 1, bpy.data.objects.new("Stretched", None)
+mirrored.collection.objects.link(stretched)
+stretched.scale.z, mirrored.camera.parent, mirrored.camera.rotation_euler.x = 2, stretched, 1
+facts["mirrored"] += [refusal(lambda: ops.capture_from_camera(directory=str(out / "mirrored"))),
+                      (out / "mirrored" / "images").exists()]
+
 # ---- plates that are links ---------------------------------------------------------------------------
 links = out / "links"
 links.mkdir()
@@ -151,7 +160,8 @@ bpy.ops.wm.open_mainfile(filepath=str(out / "two.blend"))
 scene = bpy.data.scenes["Shot"]
 place = {light.name: light.xyz + 0.1 for light in part("core.capture").read_lights(capture / "lights.json")}
 lights.follow(scene, place, capture)
-facts["moved unseen"] = max(abs(float(lights.place_of(item, scene.fit_flare.root)[0])
+depsgraph = part("flare_addon.objects").depsgraph_of(scene)
+facts["moved unseen"] = max(abs(float(lights.place_of(item, scene.fit_flare.root, depsgraph)[0])
                                 - float(place[lights.name_of(item)][0])) for item in lights.of_scene(scene))
 
 # ---- another flare is saved into the library while one is chosen ----------------------------------------

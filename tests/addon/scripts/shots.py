@@ -11,7 +11,7 @@ from pathlib import Path
 import bpy
 
 sys.path.insert(0, str(Path(__file__).parent))
-from start import empty, install, leave, part, refusal
+from start import artists_tree, empty, install, leave, part, refusal
 
 package, capture, flare, out = sys.argv[1], *map(Path, sys.argv[2:5])
 install(package)
@@ -164,4 +164,22 @@ facts["linked"] = looks.path_of(linked) == out / "moved" / "my.flare"
 with bpy.context.temp_override(scene=linked):
     facts["changed when linked"] = [refusal(lambda: bpy.ops.fit_flare.open_flare(filepath=str(project / "my.flare"))),
                                     part("flare_addon.preferences").FITFLARE_OT_test_engine.changes_scene]
+
+# ---- footage that an artist's own nodes and another scene show too ----------------------------------
+scene = empty()
+ops.import_capture(directory=str(second))
+other = bpy.data.scenes.new("Other")
+part("flare_addon.capture_import").import_capture(other, second)
+backs = [one.camera.data.background_images[0] for one in (scene, other)]
+tree = artists_tree(scene)
+own, under = (tree.nodes.new("CompositorNodeImage") for _ in range(2))
+own.image = under.image = backs[0].image
+under.name = part("flare_addon.compositor").PLATE
+facts["shared footage"] = []
+for which, one in (("removed", scene), ("removed", other), ("images", scene), ("images", other)):
+    one.fit_flare.footage = which
+    facts["shared footage"].append([Path(bpy.path.abspath(item.image.filepath)).parent.name
+                                    for item in (*backs, under, own)])
+facts["images of it"] = [sum(image.source == "SEQUENCE" for image in bpy.data.images),
+                         backs[0].image_user.frame_duration]
 leave(facts)

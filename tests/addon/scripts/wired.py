@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Inside Blender: the compositor wired to the panel, rendered, and taken away. Words: zip, .flare, layers, folder."""
+"""Inside Blender: the compositor wired to the panel, rendered, and taken away. Words: zip, .flare, layers,
+those of many flares, folder."""
 from __future__ import annotations
 
 import sys
@@ -8,9 +9,9 @@ from pathlib import Path
 import bpy
 
 sys.path.insert(0, str(Path(__file__).parent))
-from start import artists_tree, empty, install, leave, part
+from start import NAME, artists_tree, empty, install, leave, part
 
-package, flare, layers, out = sys.argv[1:5]
+package, flare, layers, many, out = sys.argv[1:6]
 install(package)
 sys.path.remove(str(Path(__file__).parent))
 ops = bpy.ops.fit_flare
@@ -71,21 +72,22 @@ for make in (bare, grey, unused):
         facts[f"{make.__name__}, {over}"] = [changed, after == before, "" if after == before else f"{before} {after}"]
 
 # Driven: the panel's sliders, animated too, in rendered pixels.
-scene = empty()
-camera = bpy.data.objects.new("Camera", bpy.data.cameras.new("Camera"))
-scene.collection.objects.link(camera)
-scene.camera = camera
-ops.open_flare(filepath=flare)
-state = scene.fit_flare
-state.layers, state.over = layers, "scene"
-ops.set_up_baked()
-scene.render.resolution_x, scene.render.resolution_y = 16, 8
-settings = scene.render.image_settings
-if hasattr(settings, "media_type"):
-    settings.media_type = "IMAGE"
-settings.file_format, settings.color_depth = "OPEN_EXR", "32"
-if hasattr(scene.render, "compositor_device"):
-    scene.render.compositor_device = "CPU"
+def shot():
+    """A scene with a camera and the flare, that renders as many pixels as the layers have."""
+    scene = empty()
+    camera = bpy.data.objects.new("Camera", bpy.data.cameras.new("Camera"))
+    scene.collection.objects.link(camera)
+    scene.camera = camera
+    ops.open_flare(filepath=flare)
+    scene.fit_flare.over = "scene"
+    scene.render.resolution_x, scene.render.resolution_y = 16, 8
+    settings = scene.render.image_settings
+    if hasattr(settings, "media_type"):
+        settings.media_type = "IMAGE"
+    settings.file_format, settings.color_depth = "OPEN_EXR", "32"
+    if hasattr(scene.render, "compositor_device"):
+        scene.render.compositor_device = "CPU"
+    return scene
 
 
 def rendered(name):
@@ -94,6 +96,10 @@ def rendered(name):
     return scene.render.filepath
 
 
+scene = shot()
+state = scene.fit_flare
+state.layers = layers
+ops.set_up_baked()
 scene.frame_set(1)
 files = {"plain": rendered("plain")}
 state.master.intensity, state.master.tint = 2.0, (1, 0.5, 0.25)
@@ -117,4 +123,43 @@ scene.frame_set(3)
 files["animated"] = rendered("animated")
 facts["files"] = files
 facts["valid"] = all(curve.driver.is_valid for curve in flare_node.tree_of(scene).animation_data.drivers)
+
+# As many flares as a driver's expression could not name.
+scene = shot()
+state = scene.fit_flare
+for number in range(1, 60):
+    item = state.lights.add()
+    item.name, item.source = f"lamp{number}", "lamp"
+state.layers = many
+ops.set_up_baked()
+files["many"] = rendered("many")
+state.lights[1].solo = state.lights[59].solo = True
+state.lights[1].intensity = 3
+files["many, two solo"] = rendered("many, two solo")
+bpy.ops.scene.new(type="FULL_COPY")
+scene = bpy.context.scene
+scene.fit_flare.lights[59].solo = False
+bpy.ops.wm.save_as_mainfile(filepath=str(Path(out) / "many.blend"))
+bpy.ops.wm.open_mainfile(filepath=str(Path(out) / "many.blend"))
+scene = bpy.context.scene
+files["many, one solo in a copy"] = rendered("many, one solo in a copy")
+scene.fit_flare.lights[1].solo = False
+ops.set_up_baked()
+files["many, none solo"] = rendered("many, none solo")
+
+# Rendered where the extension is not, after a save.
+scene = shot()
+scene.fit_flare.layers = layers
+ops.set_up_baked()
+scene.fit_flare.lights[0].intensity, scene.fit_flare.master.tint = 3.0, (1, 0.5, 0.25)
+facts["act"] = [part("flare_addon.wires").act(scene)]
+bpy.ops.wm.save_as_mainfile(filepath=str(Path(out) / "worker.blend"))
+facts["act"].append(part("flare_addon.wires").act(scene))
+scene.fit_flare.lights.clear()
+facts["act"].append(part("flare_addon.wires").act(scene))
+bpy.ops.preferences.addon_disable(module=NAME)
+bpy.ops.wm.open_mainfile(filepath=str(Path(out) / "worker.blend"))
+scene = bpy.context.scene
+scene.frame_set(2)
+files["on a worker"] = rendered("on a worker")
 leave(facts)

@@ -177,11 +177,13 @@ key.location.x += 0.5
 bpy.context.view_layer.update()
 lights.follow(scene, places, Path(capture))
 bpy.context.view_layer.update()
-facts["followed"] = {name: bool(np.allclose(lights.place_of(item, scene.fit_flare.root), places[name], atol=1e-4))
+depsgraph = part("flare_addon.objects").depsgraph_of(scene)
+facts["followed"] = {name: bool(np.allclose(lights.place_of(item, scene.fit_flare.root, depsgraph), places[name],
+                                            atol=1e-4))
                      for name in places for item in lights.of_scene(scene) if lights.name_of(item) == name}
 lights.follow(scene, {light.name: light.xyz for light in written}, Path(capture))
 bpy.context.view_layer.update()
-facts["followed back"] = lights.place_of(scene.objects["lamp"], scene.fit_flare.root).tolist()
+facts["followed back"] = lights.place_of(scene.objects["lamp"], scene.fit_flare.root, depsgraph).tolist()
 scene.objects["lamp"].location = next(light.xyz for light in written if light.name == "lamp").tolist()
 bpy.context.view_layer.update()
 ops.remove_light(object="key")

@@ -285,13 +285,13 @@ def show_footage(scene: Any, which: str) -> int:
 
 def _backdrops(root: Any) -> Iterator[Any]:
     """What has an image behind the cameras of a capture."""
-    for camera in (item for item in root.children if item.type == "CAMERA"):
-        yield from (back for back in camera.data.background_images if back.image is not None)
+    for data in {item.data for item in root.children if item.type == "CAMERA"}:  # which two cameras may share
+        yield from (back for back in data.background_images if back.image is not None)
 
 
 def _of_their_own(image: Any, those: Sequence[Any]) -> Any:
     """The image that `those` show, or a copy of it for them where others have it too."""
-    if image.users > len(those):
+    if image.users - image.use_fake_user > len(those):
         image = image.copy()
         for one in those:
             one.image = image

@@ -12,14 +12,13 @@ from ..core import exposures
 from ..core.capture import REMOVED
 from ..core.errors import CaptureError, FitFlareError, RunError
 from ..core.look import Look, read
+from ..core.run_files import CONFIG, FLARE, SMALL_PREVIEW
 from . import engine, jobs, lights, looks
 from .capture_import import expose
 from .images import read_again
 from .jobs import Job
 from .paths import absolute, is_file, is_folder, stored
 from .reports import NO_CAPTURE
-
-FLARE, SCENE, PREVIEW, CONFIG = "flare.flare", "scene.ply", "preview_small.png", "config.toml"
 
 
 def folder_of(scene: Any) -> Path | None:
@@ -302,7 +301,7 @@ _shown: dict[str, float] = {}
 def preview_icon(folder: Path) -> int:
     """An icon of the run's newest preview picture; 0 where there is none yet."""
     global _previews
-    path = folder / PREVIEW
+    path = folder / SMALL_PREVIEW
     try:
         changed = path.stat().st_mtime
     except OSError:

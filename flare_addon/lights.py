@@ -184,14 +184,17 @@ def _put(light: Any, xyz: ArrayLike) -> None:
 
 def follow(scene: Any, places: Mapping[str, ArrayLike], capture: Path | None) -> None:
     """Move lights to where a fit has put them (3,), by name, in the capture's coordinates: those that still are where
-    the fit was given them, as the capture's lights.json has it, and that nothing else moves. Raises CaptureError."""
+    the fit was given them, as the capture's lights.json has it, and that nothing else moves."""
     path = None if capture is None else capture / LIGHTS
     given = {} if path is None or not path.is_file() else {light.name: light.xyz for light in read_lights(path)}
     depsgraph = depsgraph_of(scene)
     for item in of_scene(scene):
         name = name_of(item)
         if name in places and name in given and item.parent == scene.fit_flare.root and item.animation_data is None:
-            where = place_of(item, scene.fit_flare.root, depsgraph)
+            try:
+                where = place_of(item, scene.fit_flare.root, depsgraph)
+            except CaptureError:  # it is switched off, and something else moves it
+                continue
             if np.allclose(where, given[name], atol=1e-4) and not np.allclose(where, places[name], atol=1e-4):
                 _put(item, places[name])
     view_layer_of(scene).update()

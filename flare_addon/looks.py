@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.errors import FlareFileError
+from ..core.errors import CaptureError, FlareFileError
 from ..core.look import Edit, Look, LookEdits, PlaneGaussians, read
 from ..core.look.look import Query
 from ..core.look.shot import PlacedLight, evaluate
@@ -56,8 +56,7 @@ def is_placed(item: Any, scene: Any) -> bool:
 def use(scene: Any, path: Path | str) -> Look:
     """Show a .flare in the scene: one flare for each of its lights, at the light object of that name.
 
-    Edits of flares that stay are kept. Raises FlareFileError, and CaptureError for a light that is switched off in the
-    viewport and moved there.
+    Edits of flares that stay are kept. Raises FlareFileError.
     """
     path = Path(path)
     look = read(path)
@@ -100,8 +99,11 @@ def _is_of(look: Look, state: Any, objects: dict[str, Any], depsgraph: Any) -> b
         return False
     extent = max(float(np.linalg.norm(light.query_range.camera_high - light.query_range.camera_low))
                  for light in shared)
-    return all(np.linalg.norm(place_of(objects[light.name], root, depsgraph) - light.xyz) < 0.05 * extent
-               for light in shared)
+    try:
+        return all(np.linalg.norm(place_of(objects[light.name], root, depsgraph) - light.xyz) < 0.05 * extent
+                   for light in shared)
+    except CaptureError:  # nobody knows where one is
+        return False
 
 
 def add_instance(scene: Any, target: Any, source: str) -> Any:

@@ -20,6 +20,8 @@ def matrix_of(thing: Any, depsgraph: Any) -> Any:
     if not _is_off(thing, depsgraph.view_layer):
         return thing.evaluated_get(depsgraph).matrix_world
     if _is_moved(thing) or thing.constraints or thing.parent_type != "OBJECT":
+        if thing.name not in depsgraph.scene.objects:  # another scene's, which keeps up with it
+            return thing.matrix_world.copy()
         raise CaptureError(f"{thing.name!r} is switched off in the viewport, or in an excluded collection, so that "
                            "Blender does not move it; switch it on there, and hide it by its eye instead.")
     if thing.parent is None:

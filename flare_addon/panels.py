@@ -11,6 +11,7 @@ import bpy
 
 from ..core.capture import REMOVED
 from ..core.errors import FitFlareError
+from ..core.run_files import FLARE
 from . import engine, fits, flare_node, jobs, library, lights, looks, overlay, shots, wires
 from .layouts import draw_progress, lines
 from .paths import is_folder
@@ -181,7 +182,7 @@ def _finished(layout: Any, scene: Any, job: jobs.Job | None) -> None:
     used = looks.path_of(scene)
     if job is not None and job.error:
         lines(layout, job.error, "ERROR")
-    if used is None or used != folder / fits.FLARE:
+    if used is None or used != folder / FLARE:
         lines(layout, "The fit is finished.", "CHECKMARK")
         layout.operator("fit_flare.use_result", icon="LIGHT_SUN")
     else:

@@ -18,6 +18,7 @@ from ..core.errors import CaptureError, FrameError, RunError, SettingsError
 from ..core.files import digest_of, remove_file, write_json
 from ..core.look import Edit, LookEdits
 from ..core.look.shot import Shot, ShotFrame
+from ..core.run_files import FLARE, SCENE
 from . import cameras, engine, fits, jobs, library, looks
 from .images import read_again
 from .jobs import Job
@@ -174,7 +175,7 @@ def replaced(scene: Any, chosen: Sequence[Any]) -> list[int]:
 
     def fingerprint() -> str:
         run = shot.run
-        return shot.fingerprint("" if run is None else digest_of(run / name for name in (fits.SCENE, fits.FLARE)))
+        return shot.fingerprint("" if run is None else digest_of(run / name for name in (SCENE, FLARE)))
 
     return bakes.replaced(folder, fingerprint, shot.lights, files)
 
@@ -197,7 +198,7 @@ def _run(scene: Any) -> Path | None:
     if not scene.fit_flare.bake_scene:
         return None
     run = fits.folder_of(scene)
-    if run is None or not (run / fits.SCENE).is_file():
+    if run is None or not (run / SCENE).is_file():
         raise RunError("There is no fitted scene to bake; switch Fitted Scene Too off, or finish a fit.")
     return run.resolve()
 

@@ -5,8 +5,9 @@ They act on what the layers were baked without: intensity, tint, mute and solo o
 """
 from __future__ import annotations
 
+import contextlib
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 import bpy
@@ -16,6 +17,7 @@ from .flare_node import GROUP, GROUPS_ARE_TREES, find_node, gain_of, layer_of, t
 
 SOLOS = "solos"  # a property of the node: how many flares are solo
 _OF_AN_INPUT = re.compile(rf'nodes\["{GROUP}"\]\.inputs\[(\d+)\]\.default_value')
+_OURS = re.compile(rf'fit_flare\.|(node_tree\.)?nodes\["{GROUP}"\]\["{SOLOS}"\]$')
 _LIVE = re.compile(r"fit_flare\.(master|lights\[\d+\])\.(intensity|tint|mute|solo)$")
 _OF_A_LIGHT = re.compile(r'fit_flare\.lights\[(?:(\d+)|"(.*)")\]\.intensity')
 
@@ -79,30 +81,36 @@ def is_animated(scene: Any) -> bool:
 
 def act(scene: Any) -> bool:
     """Whether all that should drive the node's sliders does."""
-    return all(curve.driver.is_valid and all(_value(target) is not None for target in _targets(curve))
-               for curve in drivers(scene))
+    own = drivers(scene)
+    return all(curve.driver.is_valid for curve in own) and None not in _standing(own).values()
 
 
 def remember(scene: Any) -> None:
     """Have the drivers know where the panel's sliders stand now, for a Blender that renders the file without this
     extension, where those are not."""
-    for curve in drivers(scene):
-        for target in _targets(curve):
-            if curve.id_data.library is None and (value := _value(target)) is not None:
-                target.fallback_value = value
+    own = [curve for curve in drivers(scene) if curve.id_data.library is None]
+    standing = _standing(own)
+    for target in _targets(own):
+        if (value := standing[target.id, target.data_path]) is not None:
+            target.use_fallback_value, target.fallback_value = True, value
 
 
-def _targets(curve: Any) -> Iterator[Any]:
-    for variable in curve.driver.variables:
-        yield from variable.targets
+def _targets(curves_of_drivers: Iterable[Any]) -> Iterator[Any]:
+    """What our drivers read; an artist's own, on the same sliders, read something else."""
+    for curve in curves_of_drivers:
+        for variable in curve.driver.variables:
+            yield from (target for target in variable.targets
+                        if target.id is not None and _OURS.match(target.data_path))
 
 
-def _value(target: Any) -> float | None:
-    """Where the slider stands that a driver reads; None where there is no such."""
-    try:
-        return float(target.id.path_resolve(target.data_path))
-    except (ValueError, AttributeError):
-        return None
+def _standing(curves_of_drivers: Iterable[Any]) -> dict[tuple[Any, str], float | None]:
+    """Where the sliders stand that our drivers read, by data block and path; None where there is no such."""
+    found: dict[tuple[Any, str], float | None] = dict.fromkeys(
+        (target.id, target.data_path) for target in _targets(curves_of_drivers))
+    for block, path in found:
+        with contextlib.suppress(ValueError):  # its flare is gone
+            found[block, path] = float(block.path_resolve(path))
+    return found
 
 
 def drivers(scene: Any) -> list[Any]:
@@ -167,4 +175,3 @@ def _read(driver: Any, name: str, block: Any, path: str) -> None:
     variable.name, variable.type = name, "SINGLE_PROP"
     target = variable.targets[0]
     target.id_type, target.id, target.data_path = block.id_type, block, path
-    target.use_fallback_value = True

@@ -43,7 +43,7 @@ def shot_path(words: argparse.Namespace) -> Path:
 
 def _kind(target: Path) -> str:
     """Of OPTIONS. FrameError for a file of no kind of those."""
-    from ..core.fit.run import CONFIG
+    from ..core.run_files import CONFIG
 
     suffix = target.suffix.lower()
     if suffix in SUFFIXES:
@@ -64,7 +64,8 @@ def check_options(words: argparse.Namespace, kind: str) -> None:
 def source(words: argparse.Namespace) -> tuple[Path, list[Floats] | None]:
     """The .flare, and the poses of its training views where they can be had."""
     from ..core.capture import Capture
-    from ..core.fit.run import FLARE, Run
+    from ..core.fit.run import Run
+    from ..core.run_files import FLARE
 
     capture, holdout = words.capture, None
     flare = words.flare
@@ -84,11 +85,12 @@ def target_of(words: argparse.Namespace, flare: Path, training: list[Floats] | N
     """The target, by what --to names. training: poses, for a .flare that does not tell."""
     from ..core.bake.frames import Frame, chosen
     from ..core.capture import Capture
-    from ..core.fit.run import SCENE, Run
+    from ..core.fit.run import Run
     from ..core.lights.detection import Detector
     from ..core.lights.exposure import Exposure
     from ..core.look import read
     from ..core.look.shot import Shot
+    from ..core.run_files import SCENE
     from ..core.transfer.query import seen_by
     from ..core.transfer.sources import parsed
     from ..core.transfer.target import of_capture, of_pictures, of_shot

@@ -19,13 +19,14 @@ from ..gaussians.ply import write_ply
 from ..holding import held
 from ..look import TrainedCamera, list_elements
 from ..progress import Progress
+from ..run_files import CHECKPOINT, CONFIG, FLARE, LOG, METRICS, PREVIEW, SCENE, SMALL_PREVIEW
 from ..sampling import Sampling
 from . import checkpoint
 from .doubts import unlike
 from .metering import with_white
 from .preview import row, spread, write_preview, write_small
 from .rendering import render
-from .run import CHECKPOINT, CONFIG, FLARE, LOG, METRICS, PREVIEW, SCENE, SMALL_PREVIEW, Run
+from .run import Run
 from .settings import FitSettings
 from .trainer import Trainer
 

@@ -28,20 +28,10 @@ from ..gaussians.scene import SceneGaussians
 from ..look import Look, LookEdits
 from ..look import read as read_look
 from ..pictures import Pixels
+from ..run_files import CAPTURE, CONFIG, FLARE, SCENE
 from ..typed import is_utf8
 from .rendering import RenderedView, render
 from .settings import FitSettings, read_config, write_config
-
-CONFIG = "config.toml"
-CAPTURE = "capture.txt"
-FLARE = "flare.flare"
-SCENE = "scene.ply"
-CHECKPOINT = "checkpoint/state.safetensors"
-METRICS = "metrics.jsonl"
-PREVIEW = "preview.png"
-SMALL_PREVIEW = "preview_small.png"
-EVALUATION = "eval.json"
-LOG = "log.txt"
 
 
 @dataclass(frozen=True)

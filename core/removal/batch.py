@@ -84,7 +84,7 @@ def remove_all(inputs: Sequence[Path], folder: Path, remover: Remover, progress:
     same way (`Record`), is left as it is, and so is one that was worked on since it was made from the same plate.
 
     mattes: where the flares are; None to have them found anywhere. wanted: names below the output folder of those to be
-    cleaned; None for all. stills: each by itself, in place of in line with its neighbours. left_out: what is to be said
+    cleaned; None for all. stills: each by itself, in place of in line with its neighbours. left_out: what was said
     of inputs that turned out to be no plates (`footage.with_frames`), which have failed with it.
 
     Raises SettingsError before anything is written, FrameError at once where the folder may not be written to, and
@@ -102,8 +102,6 @@ def remove_all(inputs: Sequence[Path], folder: Path, remover: Remover, progress:
         plates = [(path, name) for path, name in plates if name in wanted]
     progress.stage("remove", len(plates))
     failed = list(left_out)
-    for sentence in failed:
-        progress.say(f"Left out: {sentence}")
     made, kept = 0, Counter[Kept]()
     for path, name in sorted(plates, key=lambda plate: shot_order(plate[0])):
         try:

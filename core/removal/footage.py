@@ -59,8 +59,8 @@ def _take_out(video: Path, folder: Path, progress: Progress) -> None:
         for number, frame in enumerate(clip, 1):
             write_png(folder / f"{video.stem}.{number:06d}.png", displayed(frame))
             progress.advance()
+    if number == 0:
+        raise FrameError(f"{video} has no frame that can be read; copy it again, or convert it to MP4 (H.264).")
     if number < clip.length:
         progress.say(f"{video} tells of {clip.length} frames, and {number} could be read; if it is cut off, copy it "
                      "again.")
-    if number == 0:
-        raise FrameError(f"{video} has no frame that can be read; copy it again, or convert it to MP4 (H.264).")

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import bpy
 
+from ...core.run_files import LOG, PREVIEW
 from .. import engine, fits, jobs, shots
 from ..paths import is_file, is_folder
 from ..reports import NO_CAPTURE, Action
@@ -119,7 +120,7 @@ class FITFLARE_OT_show_log(bpy.types.Operator):
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         parts = []
-        for name in ("log.txt", jobs.EVENTS, jobs.LOG):
+        for name in (LOG, jobs.EVENTS, jobs.LOG):
             path = Path(self.folder, name)
             if is_file(path):
                 parts.append(f"==== {path}\n{path.read_text(encoding='utf-8', errors='replace')[-200_000:]}")
@@ -142,14 +143,14 @@ class FITFLARE_OT_show_preview(Action, bpy.types.Operator):
     @classmethod
     def why_not(cls, context: bpy.types.Context) -> str:
         folder = fits.folder_of(context.scene)
-        if folder is None or not is_file(folder / "preview.png"):
+        if folder is None or not is_file(folder / PREVIEW):
             return "The fit has not made a preview yet"
         return ""
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         folder = fits.folder_of(context.scene)
         assert folder is not None
-        image = bpy.data.images.load(str(folder / "preview.png"), check_existing=True)
+        image = bpy.data.images.load(str(folder / PREVIEW), check_existing=True)
         image.reload()
         _show(context, "IMAGE_EDITOR", lambda space: setattr(space, "image", image))
         return {"FINISHED"}

@@ -93,7 +93,8 @@ def _copy_of_sample(out: Path, remove: bool) -> Path:
 
 def _check_earlier(folder: Path, settings: FitSettings, capture: Capture) -> None:
     """An earlier run is gone on with, so it must be the one that is asked for now."""
-    from ...core.fit.run import CONFIG, Run
+    from ...core.fit.run import Run
+    from ...core.run_files import CONFIG
 
     if (folder / CONFIG).exists():
         earlier = Run.open(folder)

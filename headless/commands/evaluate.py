@@ -30,8 +30,9 @@ def scores_of(folder: Path, progress: Progress, *, which: str = "held-out",
     """Score a run's views, write its eval.json, show the table."""
     from ...core.files import write_json
     from ...core.fit.frames import Frames
-    from ...core.fit.run import EVALUATION, Run
+    from ...core.fit.run import Run
     from ...core.metrics.evaluation import evaluate, table, worse_than_none
+    from ...core.run_files import EVALUATION
 
     perceptual = None
     if lpips_folder is not None:

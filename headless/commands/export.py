@@ -31,8 +31,9 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     from ...core.bake.frames import numbered
     from ...core.capture import Capture
-    from ...core.fit.run import FLARE, Run
+    from ...core.fit.run import Run
     from ...core.look import LookEdits, ViewOfLight, read
+    from ...core.run_files import FLARE
     from ...core.transfer.export import write_flare_ply, write_preset
 
     folder = words.capture

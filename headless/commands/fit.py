@@ -65,7 +65,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     from ...core.capture import Capture
     from ...core.fit import Run, fit
-    from ...core.fit.run import CONFIG
+    from ...core.run_files import CONFIG
 
     if words.listed is not None and words.capture is not None:
         raise SettingsError("fit takes a capture, or a list of them with --list: the one or the other.")

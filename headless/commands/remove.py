@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ...core.errors import RunError, SettingsError
+from ...core.errors import FrameError, RunError, SettingsError, spelled_out
 from ...core.progress import Progress
 from .. import frames, jobs
 from ..command import Command, Step, refuse_useless
@@ -61,6 +61,8 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
         return _by_run(words, progress)
     refuse_useless(words, {"capture": None}, "--run")
     given, left_out = with_frames(words.plates, words.out, progress)
+    for sentence in left_out:
+        progress.say(f"Left out: {sentence}")
     wanted = None
     if words.frames is not None or words.jobs != 1:
         names = [name.as_posix() for _, name in plates_of(given, [words.out, words.flare, words.matte])]
@@ -68,11 +70,13 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
         wanted = {Path(frame.view) for frame in chosen}
         if words.jobs != 1:
             jobs.run_jobs(words, "remove", [frame.number for frame in chosen], progress, past_failures=True)
+            if left_out and words.frames is None:
+                raise FrameError(f"The other clean plates are in {words.out}. {spelled_out(left_out)}")
             progress.say(f"The clean plates are in {words.out}.")
             return {"plates": str(words.out)}
     return remove_all(given, words.out, _remover(words), progress, flare_folder=words.flare,
                       mattes=Mattes(words.matte) if words.matte else None, overwrite=words.overwrite, wanted=wanted,
-                      stills=words.stills, left_out=left_out)
+                      stills=words.stills, left_out=left_out if words.frames is None else ())
 
 
 def _by_run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:

@@ -73,8 +73,8 @@ def look_at_blend(words: argparse.Namespace, progress: Progress) -> dict[str, An
     """Blender's part: the .blend's camera, lights and what hides them, written down for the engine."""
     from ...core.bake.frames import Frame, chosen
     from ...core.look import read
+    from ...core.run_files import FLARE
     from ...flare_addon.blend_shot import opened, shot_of
-    from ...flare_addon.fits import FLARE
 
     if len(words.to) > 1:
         raise SettingsError("One .blend at a time can be the target.")

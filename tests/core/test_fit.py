@@ -27,7 +27,6 @@ from core.fit import FitSettings, Run, checkpoint, fit, preset
 from core.fit.beginning import NEAREST_PART, nearest_depth
 from core.fit.frames import Frames
 from core.fit.rendering import render_flare
-from core.fit.run import CHECKPOINT, FLARE, SCENE
 from core.fit.settings import SplitSettings, changed
 from core.fit.sky import COUNT, with_sky
 from core.fit.splitting import from_below, haze, is_found, nearness, scene_beside_flare
@@ -40,6 +39,7 @@ from core.look import LookEdits, draw
 from core.look.look import FORM_BOUNDS
 from core.pictures import read_picture, write_png
 from core.progress import Progress
+from core.run_files import CHECKPOINT, FLARE, SCENE
 from tests.core.flared import flared_capture
 from tests.core.heard import Heard
 

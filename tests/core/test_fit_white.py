@@ -18,7 +18,6 @@ from core.errors import SettingsError
 from core.fit import FitSettings, Run, fit, preset
 from core.fit.frames import Frames, Targets
 from core.fit.metering import WHITEST, with_white
-from core.fit.run import FLARE
 from core.fit.settings import changed
 from core.fit.sky import with_sky
 from core.fit.trainer import Trainer
@@ -26,6 +25,7 @@ from core.flare.compositing import composite, layers
 from core.gaussians import Splats
 from core.look.shot import Shot, ShotFrame
 from core.pictures import Picture, holds_floats, srgb_from_linear, write_png
+from core.run_files import FLARE
 from tests.core.flared import flared_capture, write_light
 from tests.core.heard import Heard
 

@@ -17,7 +17,6 @@ from core.capture import Camera, Capture
 from core.display import decode, encode
 from core.errors import FlareFileError
 from core.fit import Run, fit
-from core.fit.fitting import FLARE, SCENE
 from core.fit.rendering import render_scene
 from core.fit.trainer import Trainer
 from core.flare import file as flare_file
@@ -29,6 +28,7 @@ from core.look import PlaneGaussians as LookGaussians
 from core.look import draw, pixels, read
 from core.look.container import read_tensors, rewritten
 from core.look.shot import PlacedLight, Shot, ShotFrame
+from core.run_files import FLARE, SCENE
 from core.sampling import DILATION, MOST_PIXELS, PIXEL, Sampling, dilation
 from tests.core.flared import HEIGHT, LIGHT, WIDTH, cameras, flared_capture
 from tests.core.test_fit import quick

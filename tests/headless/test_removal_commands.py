@@ -78,6 +78,20 @@ def test_a_video_that_cannot_be_read_is_left_out_for_one_reason(backgrounds: Pat
     assert (tmp_path / "clean" / "a.png").exists()
 
 
+@pytest.mark.parametrize(("more", "status"), [(["--frames", "1-2"], 0), (["--jobs", "2"], 1)])
+def test_a_video_that_cannot_be_read_fails_no_share_of_the_frames(more: list[str], status: int, backgrounds: Path,
+                                                                  tmp_path: Path,
+                                                                  capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "take.mov").touch()
+    for number in (1, 2):
+        shutil.copyfile(backgrounds / "a.png", tmp_path / f"f{number}.png")
+    words = ["remove", *(str(tmp_path / name) for name in ("f1.png", "f2.png", "take.mov"))]
+    assert cli.main([*words, "--out", str(tmp_path / "clean"), *more]) == status
+    said = capsys.readouterr().err
+    assert said.count("Left out:") == 1 and "plates could not be cleaned" not in said
+    assert {path.name for path in (tmp_path / "clean").iterdir()} == {"f1.png", "f2.png", "remove.json"}
+
+
 def test_bad_plates_do_not_stop_other_processes(backgrounds: Path, tmp_path: Path,
                                                 capsys: pytest.CaptureFixture[str]) -> None:
     folder = tmp_path / "plates"

@@ -1,0 +1,14 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What the folder of a run holds, by name, for those who look into one where the engine itself cannot be imported."""
+from __future__ import annotations
+
+CONFIG = "config.toml"
+CAPTURE = "capture.txt"
+FLARE = "flare.flare"
+SCENE = "scene.ply"
+CHECKPOINT = "checkpoint/state.safetensors"
+METRICS = "metrics.jsonl"
+PREVIEW = "preview.png"
+SMALL_PREVIEW = "preview_small.png"
+EVALUATION = "eval.json"
+LOG = "log.txt"

@@ -24,6 +24,7 @@ from ..errors import FrameError, SettingsError
 from ..pictures import SUFFIXES, linear_from_srgb, read_picture
 from ..video import VIDEOS, Video, displayed, is_video
 from .pairs import WHITE, Bank, Layers
+from .plates import read_plate
 from .synthesis.layers import flare, through_aspheres
 from .synthesis.prescription import Prescription
 
@@ -142,7 +143,7 @@ class OwnFlares:
         flare = self._square(_frame_of(path, random))
         light = np.zeros_like(flare)
         if light_path is not None:
-            light = np.minimum(self._square(read_picture(light_path).linear()), flare)
+            light = np.minimum(self._square(_light_of(light_path)), flare)
         lights: tuple[tuple[float, float], ...] = ()
         if float(light.max()) > 0.3:
             y, x = np.unravel_index(int(light.sum(-1).argmax()), light.shape[:2])
@@ -163,10 +164,17 @@ class OwnFlares:
         return canvas
 
 
+def _light_of(path: Path) -> NDArray[np.float32]:
+    """Of a picture, linear, over black where it is painted on nothing."""
+    light = read_picture(path).linear()
+    alpha = None if path.suffix.lower() == ".exr" else read_plate(path).straight_alpha
+    return light if alpha is None else np.asarray(light * alpha[..., None], np.float32)
+
+
 def _frame_of(path: Path, random: Random) -> NDArray[np.float32]:
     """A picture's linear light, or that of a random frame of a clip."""
     if not is_video(path):
-        return read_picture(path).linear()
+        return _light_of(path)
     with Video(path) as clip:
         clip.seek(int(random.integers(max(clip.length, 1))))
         frame = next(iter(clip), None)

@@ -25,6 +25,8 @@ from ..progress import stop_signals
 
 PATIENCE_S = 600.0
 """How long one waits for the others: they may have flares to make."""
+PARTING_S = 2.0
+"""How long one that is through stays for the first to wake from their last meeting."""
 
 ENDED = ("A process of the training ended before it was through; where memory is short, go on with --resume and fewer "
          "--processes.")
@@ -170,8 +172,8 @@ def _other(rank: int, count: int, folder: str, barrier: Barrier, threads: int, l
         _watch([first.sentinel], barrier)
     _take_share(threads, count)
     learn(Learner(rank, count, Table(folder, barrier)), *words)
-    if first is not None:  # the first may not have woken from their last meeting, which an end here would break up
-        wait([first.sentinel])
+    if first is not None:  # which may not have woken from their last meeting: an end here would break that up
+        wait([first.sentinel], PARTING_S)
 
 
 def _take_share(threads: int, count: int) -> None:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from ..errors import FrameError, SettingsError
 from ..exif import as_stored, read_exif, upright
 from ..pictures import Window, framed, pictures_below, window_of
-from ..tiff import UPRIGHT, is_premultiplied
+from ..tiff import UPRIGHT
 from .plates import read_plate
 
 ASPECT = 0.01
@@ -78,8 +78,8 @@ def _painted(path: Path) -> NDArray[np.float32]:
     """(height, width): a matte's brightest channel by its alpha; what is painted on nothing counts as black."""
     matte = read_plate(path)
     values = np.nan_to_num(matte.codes.max(-1).astype(np.float32) / np.float32(matte.top), nan=0.0, posinf=1.0)
-    if matte.alpha is not None and matte.encoding == "srgb" and not is_premultiplied(path):
-        return values * (matte.alpha.astype(np.float32) / np.float32(matte.top))
+    if matte.straight_alpha is not None:
+        return values * matte.straight_alpha
     in_exr = matte.rest.get("channels", {}).get("A")
     if in_exr is None:
         return values

@@ -84,7 +84,10 @@ class Optimiser:
                 self._momenta[name].copy_(value)
             elif name not in self._matrices:  # AdamW had all of them once
                 parameter = self._parameters[name]
-                self._adam.state[parameter][moment] = value.to(parameter.device, copy=True)
+                # Laid as the parameter is: a fused step goes through both as they lie in memory.
+                self._adam.state[parameter][moment] = (
+                    torch.empty_like(parameter, requires_grad=False).copy_(value) if value.shape == parameter.shape
+                    else value.to(parameter.device, copy=True))
 
 
 def _parcels(matrices: Sequence[Tensor], numbers: Iterable[int]) -> Iterable[list[int]]:

@@ -86,6 +86,13 @@ class Plate:
             np.clip(np.nan_to_num(line.astype(np.float32), nan=1.0), 0, 1)))
 
     @property
+    def straight_alpha(self) -> NDArray[np.float32] | None:
+        """(height, width), 0..1: alpha that integer codes are not multiplied with yet; None where there is no such."""
+        if self.alpha is None or self.encoding != "srgb" or tiff.is_premultiplied(self.path):
+            return None
+        return self.alpha.astype(np.float32) / np.float32(self.top)
+
+    @property
     def space(self) -> ColourSpace:
         """What the codes are: sRGB where they are integers; linear, in an EXR's own primaries where it names some.
 

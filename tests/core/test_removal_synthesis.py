@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -452,3 +453,12 @@ def test_a_light_out_of_focus_is_a_disc_or_a_polygon_of_as_much_light() -> None:
             assert np.median(inside) > 0.8 * shape.max(), "as bright everywhere, unlike a glow"
     sizes = [int((shape[..., 0] > 0.01 * shape.max()).sum()) for shape in shapes]
     assert min(sizes) < 15 < 60 < max(sizes)
+
+
+def test_a_flare_that_is_painted_on_nothing_lies_on_black(tmp_path: Path) -> None:
+    painted = np.full((64, 64, 4), 255, np.uint8)
+    painted[..., 3] = 0
+    painted[24:40, 24:40, 3] = 255
+    cv2.imwrite(str(tmp_path / "a.png"), painted)
+    drawn = OwnFlares(tmp_path, SIZE).draw(np.random.default_rng(0)).rest
+    assert 0 < (drawn.max(-1) > 0.01).mean() < 0.1

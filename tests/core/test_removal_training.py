@@ -82,6 +82,21 @@ def test_a_training_that_was_stopped_goes_on_as_if_it_was_not(tmp_path: Path) ->
     assert widths_of(whole) == RECIPE.widths
 
 
+def test_the_step_after_a_stop_is_the_one_that_would_have_come() -> None:
+    """To the last bit, of moments too: those of weights that lie channels last are saved in rows."""
+    batches = Batches(RECIPE, backgrounds(), built_in())
+    drawn = [batches[number] for number in range(3)]
+    whole = Trainer(RECIPE)
+    for batch in drawn[:2]:
+        whole.step(batch)
+    gone_on = Trainer(RECIPE)
+    gone_on.load_state({name: value.clone() for name, value in whole.state().items()}, 2)
+    for one in (whole, gone_on):
+        one.step(drawn[2])
+    expected = whole.state()
+    assert [name for name, value in gone_on.state().items() if not torch.equal(value, expected[name])] == []
+
+
 def test_learners_share_the_frames_of_one(tmp_path: Path) -> None:
     alone = training.train(RECIPE, tmp_path / "alone", backgrounds(), built_in(), processes=1)
     by_three = training.train(RECIPE, tmp_path / "three", backgrounds(), built_in(), processes=3)

@@ -10,7 +10,7 @@ Model = Literal["paper", "ours"]
 Blend = Literal["over", "add"]
 Kernels = Literal["auto", "torch", "tiles", "cpu", "cuda"]
 Matching = Literal["auto", "exhaustive", "sequential", "similar"]
-Asked = Literal["source", "target", "blend"]
+Follows = Literal["source", "target", "blend"]
 """What the appearance of a transferred flare follows: `core.transfer.query`."""
 
 OUR_PRESETS: tuple[Preset, ...] = ("draft", "standard", "high")

@@ -36,21 +36,22 @@ def _loaded(_path: str) -> None:
 
 
 @bpy.app.handlers.persistent
-def _to_be_saved(_path: str) -> None:
+def _before_a_save(_path: str) -> None:
+    """What a Blender without this extension needs to render the file goes into it."""
     for scene in bpy.data.scenes:
-        wires.remember(scene)
+        wires.keep_standing(scene)
 
 
 def register() -> None:
     for module in _MODULES:
         module.register()
     bpy.app.handlers.load_post.append(_loaded)
-    bpy.app.handlers.save_pre.append(_to_be_saved)
+    bpy.app.handlers.save_pre.append(_before_a_save)
 
 
 def unregister() -> None:
     bpy.app.handlers.load_post.remove(_loaded)
-    bpy.app.handlers.save_pre.remove(_to_be_saved)
+    bpy.app.handlers.save_pre.remove(_before_a_save)
     jobs.unregister()
     fits.unregister()
     looks.forget()

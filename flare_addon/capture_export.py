@@ -17,6 +17,7 @@ from typing import Any
 import bpy
 import numpy as np
 
+from ..core.capture.camera import is_rotation
 from ..core.capture.colmap import find_model
 from ..core.capture.transforms import FILE as TRANSFORMS
 from ..core.errors import CaptureError
@@ -171,8 +172,7 @@ def entry_of(scene: Any, camera: Any, frame: int, path: Path, folder: Path) -> d
 def _pose_of(camera: Any, frame: int) -> cameras.Floats:
     """camera_to_world (4, 4) of an evaluated camera in Blender's axes. Raises CaptureError where it is no rotation."""
     pose = cameras.camera_to_world(camera.matrix_world) @ cameras.FLIP
-    rotation = pose[:3, :3]
-    if not np.allclose(rotation.T @ rotation, np.eye(3), atol=1e-3) or np.linalg.det(rotation) < 0:
+    if not is_rotation(pose[:3, :3]):
         raise CaptureError(f"The camera {camera.name!r} is mirrored or skewed at frame {frame}; apply the scale of it "
                            "and of its parents.")
     return pose

@@ -61,9 +61,9 @@ def use(scene: Any, path: Path | str) -> Look:
     path = Path(path)
     look = read(path)
     state = scene.fit_flare
+    before = state.flare
+    state.flare = stored(path)
     objects = {name_of(item): item for item in of_scene(scene)}
-    native = _is_of(look, state, objects, depsgraph_of(scene))
-    before, state.flare = state.flare, stored(path)
     if before != state.flare:
         for index in reversed(range(len(state.lights))):
             if state.lights[index].source not in look.names:
@@ -77,7 +77,7 @@ def use(scene: Any, path: Path | str) -> Look:
             item.target = objects[light.name]
         _elements(item, light)
     state.light = min(state.light, max(len(state.lights) - 1, 0))
-    state.native = native
+    state.native = _is_of(look, state, objects, depsgraph_of(scene))
     return look
 
 

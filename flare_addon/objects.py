@@ -15,12 +15,12 @@ _PLACING = ("location", "rotation_", "scale", "delta_")  # what begins the names
 
 def matrix_of(thing: Any, depsgraph: Any) -> Any:
     """matrix_world of an object as it stands now, also of one that is switched off in the viewport or in an excluded
-    collection, which Blender does not keep up with. Raises CaptureError where such a one is moved by more than its
-    parents."""
+    collection, which Blender does not keep up with; of another scene's as it was when that was looked at last. Raises
+    CaptureError where one of this scene is switched off and moved by more than its parents."""
     if not _is_off(thing, depsgraph.view_layer):
         return thing.evaluated_get(depsgraph).matrix_world
     if _is_moved(thing) or thing.constraints or thing.parent_type != "OBJECT":
-        if thing.name not in depsgraph.scene.objects:  # another scene's, which keeps up with it
+        if thing.name not in depsgraph.scene.objects:
             return thing.matrix_world.copy()
         raise CaptureError(f"{thing.name!r} is switched off in the viewport, or in an excluded collection, so that "
                            "Blender does not move it; switch it on there, and hide it by its eye instead.")

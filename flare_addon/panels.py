@@ -337,7 +337,7 @@ class FITFLARE_PT_bake(_Part, bpy.types.Panel):
         if node is not None and node.node_tree is not None:
             sliders = [node.inputs[name] for name in ("Intensity", "Tint") if name in node.inputs]  # not renamed ones
             drivers = wires.drivers(scene)
-            if not wires.act(scene):
+            if not wires.complete(scene):
                 lines(box, "Some sliders of the panel Look act on it no longer: set it up again.", "ERROR")
             elif drivers or any(socket.is_linked for socket in sliders if socket.name == "Intensity"):
                 lines(box, "Set up: the sliders of the panel Look act on it.", "CHECKMARK")

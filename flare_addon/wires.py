@@ -79,13 +79,13 @@ def is_animated(scene: Any) -> bool:
     return any(_LIVE.match(curve.data_path) for some in (*curves.of(scene), own) for curve in some)
 
 
-def act(scene: Any) -> bool:
+def complete(scene: Any) -> bool:
     """Whether all that should drive the node's sliders does."""
     own = drivers(scene)
     return all(curve.driver.is_valid for curve in own) and None not in _standing(own).values()
 
 
-def remember(scene: Any) -> None:
+def keep_standing(scene: Any) -> None:
     """Have the drivers know where the panel's sliders stand now, for a Blender that renders the file without this
     extension, where those are not."""
     own = [curve for curve in drivers(scene) if curve.id_data.library is None]
@@ -154,7 +154,7 @@ def _count_solos(scene: Any, node: Any, numbers: Sequence[int]) -> tuple[Any, st
     driver = node.driver_add(f'["{SOLOS}"]').driver
     driver.type = "SUM"
     for number in numbers:
-        _read(driver, f"s{number}", *_slider(scene, f"lights[{number}].solo"))
+        _add_variable(driver, f"s{number}", *_slider(scene, f"lights[{number}].solo"))
     path = f'nodes["{GROUP}"]["{SOLOS}"]'
     return (node.id_data, path) if GROUPS_ARE_TREES else (scene, f"node_tree.{path}")  # whose tree is a part of it
 
@@ -165,11 +165,11 @@ def _drive(node: Any, name: str, index: int, expression: str, variables: dict[st
     driver = node.inputs[name].driver_add("default_value", index).driver
     driver.type = "SCRIPTED"
     for short, (block, path) in variables.items():
-        _read(driver, short, block, path)
+        _add_variable(driver, short, block, path)
     driver.expression = expression  # of the plain kind that needs no permission to run
 
 
-def _read(driver: Any, name: str, block: Any, path: str) -> None:
+def _add_variable(driver: Any, name: str, block: Any, path: str) -> None:
     """Give a driver a variable: what is at `path` of a data block."""
     variable = driver.variables.new()
     variable.name, variable.type = name, "SINGLE_PROP"

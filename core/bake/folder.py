@@ -30,10 +30,10 @@ class LayerFolder:
             match = _NUMBERED.fullmatch(path.name)
             if match and not path.name.startswith("."):
                 sequences.setdefault(match[1], {})[int(match[2])] = path
-        if not sequences and (inner := sorted({path.parent.name for path in folder.glob("*/*")
-                                               if _NUMBERED.fullmatch(path.name)})):
-            raise FrameError(f"{folder} holds its layers in {', '.join(inner)}; choose one of these.")
         if not sequences:
+            below = sorted({path.parent.name for path in folder.glob("*/*") if _NUMBERED.fullmatch(path.name)})
+            if below:
+                raise FrameError(f"{folder} holds its layers in {', '.join(below)}; choose one of these.")
             raise FrameError(f"{folder} holds no baked layers (files such as layers.0001.exr); bake into it first.")
         if len(sequences) > 1:
             heads = " and ".join(f"{head}*.exr" for head in sorted(sequences)[:2])

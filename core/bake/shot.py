@@ -65,7 +65,7 @@ class ShotRenderer:
                  for name, layer in parts.flares.items()}
         depth = dark[..., 0] if scene is None else scene.depth
         return ViewLayers(parts.scene.numpy(), {name: found.get(name, dark.numpy()) for name in self.lights},
-                        depth.detach().numpy())
+                          depth.detach().numpy())
 
     def _behind_the_scene(self, light: PlacedLight, camera: Camera) -> PlacedLight:
         """The light with what the fitted scene hides of it: the very share that the flare was fitted with. Over any

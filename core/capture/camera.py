@@ -130,6 +130,11 @@ class Camera:
             return np.asarray((np.asarray(depth) > 0) & (at >= 0).all(axis=1) & (at <= self.size).all(axis=1))
 
 
+def is_rotation(matrix: Floats) -> bool:
+    """Whether (3, 3) is one, but for the rounding of files."""
+    return bool(np.allclose(matrix.T @ matrix, np.eye(3), atol=2e-3) and np.linalg.det(matrix) > 0)
+
+
 def rotation_from_quaternion(wxyz: ArrayLike) -> Floats:
     """(3, 3) rotation of a quaternion (w, x, y, z), normalised first (Hamilton's convention, as COLMAP)."""
     w, x, y, z = np.asarray(wxyz, np.float64) / np.linalg.norm(wxyz)

@@ -22,8 +22,8 @@ from ..pictures import LARGEST
 from .camera import Floats, quaternion_from_rotation, rotation_from_quaternion
 from .lens import MODELS, NAMES, Lens
 
-TOO_FAR = 1e12
-"""World units, from which on a pose makes no sense: no pixel would tell it from another."""
+SENSELESS = 1e12
+"""From which on a number of a pose or a lens makes no sense, whatever its unit."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +82,7 @@ def read_model(folder: Path) -> tuple[list[Posed], PointCloud]:
         where = f"{_path(folder, 'images')}, {name}:"
         pose = np.eye(4)
         length = math.sqrt(sum(q * q for q in quaternion))
-        if not all(abs(number) < TOO_FAR for number in (*quaternion, *translation)):
+        if not all(abs(number) < SENSELESS for number in (*quaternion, *translation)):
             raise CaptureError(f"{where} the pose is not finite numbers of a sensible size; solve the cameras again.")
         if abs(length - 1.0) > 0.01:
             raise CaptureError(f"{where} the quaternion's length is {length:.4g}, so it is no rotation; "

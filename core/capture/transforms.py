@@ -16,8 +16,8 @@ import numpy as np
 from ..errors import CaptureError
 from ..files import inside, read_json
 from ..pictures import SUFFIXES, picture_size
-from .camera import Floats
-from .colmap import TOO_FAR, PointCloud, Posed, check_lens, find_model, read_model
+from .camera import Floats, is_rotation
+from .colmap import SENSELESS, PointCloud, Posed, check_lens, find_model, read_model
 from .lens import Lens
 from .ply import read_points
 
@@ -61,7 +61,7 @@ def _with_suffix(folder: Path, name: str) -> str:
 
 def _number(meta: dict[str, Any], key: str, where: str, default: float | None = None) -> float:
     value = meta.get(key, default)
-    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < TOO_FAR:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < SENSELESS:
         raise CaptureError(f"{where} {key} should be a finite number, not {value!r:.40}; correct it or export the file "
                            "again.")
     return float(value)
@@ -111,7 +111,7 @@ def _matrix(value: Any, where: str, what: str) -> Floats:
         matrix = np.asarray(value, np.float64)
     except (TypeError, ValueError):
         matrix = np.zeros(0)
-    if matrix.shape not in ((3, 4), (4, 4)) or not (np.abs(matrix) < TOO_FAR).all():
+    if matrix.shape not in ((3, 4), (4, 4)) or not (np.abs(matrix) < SENSELESS).all():
         raise CaptureError(f"{where} {what} should be 4 rows of 4 finite numbers of a sensible size; export the file "
                            "again.")
     full = np.eye(4)
@@ -123,7 +123,7 @@ def _pose(frame: dict[str, Any], where: str) -> Floats:
     """world_to_camera with OpenCV axes, of camera_to_world with OpenGL axes."""
     pose = _matrix(frame.get("transform_matrix"), where, "transform_matrix")
     rotation = pose[:3, :3]
-    if not np.allclose(rotation.T @ rotation, np.eye(3), atol=2e-3) or np.linalg.det(rotation) < 0:
+    if not is_rotation(rotation):
         raise CaptureError(f"{where} transform_matrix is not a rotation and a translation; export the file again.")
     left, _, right = np.linalg.svd(rotation)  # the nearest rotation: files round their numbers
     rotation = left @ right @ np.diag([1.0, -1.0, -1.0])

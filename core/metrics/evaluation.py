@@ -213,7 +213,7 @@ def table(scores: dict[str, Any]) -> str:
         scored = [view for view in scores["views"] if view.get(layer, {}).get("psnr") is not None]
         worst = min(scored, key=lambda view: view[layer]["psnr"], default=None)
         where = f"{worst[layer]['psnr']:.2f} in {worst['name']}" if worst else "-"
-        lines.append(f"{layer:13}{''.join(f'{cell:>8}' for cell in cells)}"
+        lines.append(f"{layer:13}{''.join(f'{text:>8}' for text in cells)}"
                      f"{cell(part.get('relative_l2'), 3):>9}  {where}")
     for layer in LAYERS:
         without = sum(_is_without_flare(view[layer]) for view in scores["views"] if layer in view)

@@ -65,8 +65,8 @@ def with_neighbours(inputs: Sequence[Path], apart_from: Iterable[Path | None] = 
 
 
 def _no_plates(folder: Path, apart: Iterable[Path]) -> set[Path]:
-    """Files and folders in `folder` that hold none: those of `apart` that lie in it, and the results of an earlier run
-    that wrote to one of them."""
+    """Files and folders in `folder` that hold no plates: those of `apart` that lie in it, and the results of an earlier
+    run that wrote to one of them."""
     inner = {other.resolve() for other in apart if folder.resolve() in other.resolve().parents}
     return inner.union(*(Record(other).results() for other in apart))
 

@@ -78,8 +78,9 @@ def _painted(path: Path) -> NDArray[np.float32]:
     """(height, width): a matte's brightest channel by its alpha; what is painted on nothing counts as black."""
     matte = read_plate(path)
     values = np.nan_to_num(matte.codes.max(-1).astype(np.float32) / np.float32(matte.top), nan=0.0, posinf=1.0)
-    if matte.straight_alpha is not None:
-        return values * matte.straight_alpha
+    alpha = matte.straight_alpha
+    if alpha is not None:
+        return values * alpha
     in_exr = matte.rest.get("channels", {}).get("A")
     if in_exr is None:
         return values

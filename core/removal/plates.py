@@ -207,15 +207,15 @@ def write_plate(path: Path | str, plate: Plate, codes: NDArray[Any]) -> None:
     stored: NDArray[Any] = codes[..., 0] if plate.grey and plate.alpha is None else codes[..., ::-1]
     if plate.alpha is not None:
         stored = np.concatenate([stored, plate.alpha[..., None]], -1)
-    done, data = cv2.imencode(suffix, np.ascontiguousarray(stored), _options(suffix, codes.dtype))
+    done, data = cv2.imencode(suffix, np.ascontiguousarray(stored), _encoding(suffix, codes.dtype))
     if not done:
         raise FrameError(f"{path} could not be encoded as {suffix[1:].upper()}.")
     with atomic_path(path) as temporary:
         temporary.write_bytes(_tagged(data.tobytes(), suffix, plate))
 
 
-def _options(suffix: str, kind: np.dtype[Any]) -> list[int]:
-    """What OpenCV is to encode by."""
+def _encoding(suffix: str, kind: np.dtype[Any]) -> list[int]:
+    """What OpenCV is to encode by, pixels of this kind."""
     import cv2
 
     if suffix in _JPEGS:

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..choices import Asked
+from ..choices import Follows
 from ..errors import FlareFileError
 from ..look import LightLook, LookEdits, PlaneGaussians, ViewOfLight
 from ..look.look import describe
@@ -75,7 +75,7 @@ def seen_by(path: Path | str, lights: Sequence[LightLook],
     return found
 
 
-def evaluate(light: LightLook, view: ViewOfLight, xyz: ArrayLike, query: Asked, seen: Seen | None, *,
+def evaluate(light: LightLook, view: ViewOfLight, xyz: ArrayLike, query: Follows, seen: Seen | None, *,
              share: float = 1.0, edits: LookEdits | None = None, name: str | None = None, scale: float = 1.0,
              fixed: ViewOfLight | None = None) -> PlaneGaussians | None:
     """The Gaussians of `light` placed in `view`, where the target's light stands at `xyz` (3,) in its own world.
@@ -119,7 +119,7 @@ def fade(light: LightLook, view: ViewOfLight) -> float:
     return t * t * (3 - 2 * t)
 
 
-def _asked(light: LightLook, view: ViewOfLight, xyz: Floats, query: Asked, seen: Seen | None, scale: float,
+def _asked(light: LightLook, view: ViewOfLight, xyz: Floats, query: Follows, seen: Seen | None, scale: float,
            fixed: ViewOfLight | None) -> list[tuple[float, ViewOfLight]]:
     """Views to ask the network for, with weights that sum to 1."""
     away = (view.camera - xyz) / scale

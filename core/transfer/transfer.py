@@ -21,7 +21,7 @@ from ..bake.bake import BakeSettings, bake_frames
 from ..bake.frames import Frame
 from ..bake.layers import FrameLayers
 from ..capture import Camera
-from ..choices import Asked
+from ..choices import Follows
 from ..colour import ColourSpace, colour_space
 from ..display import decode, encode
 from ..errors import SettingsError
@@ -54,7 +54,7 @@ class TransferSettings:
     smooth: frames over which a light's visibility is smoothed on either side, 0 for none. plate_space: of the
     plates, "auto" by their files. visibility: how the target's scene hides lights."""
 
-    query: Asked = "blend"
+    query: Follows = "blend"
     scale: float = 1.0
     smooth: int = 1
     plate_space: str = AUTO

@@ -63,6 +63,7 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     given, left_out = with_frames(words.plates, words.out, progress)
     for sentence in left_out:
         progress.say(f"Left out: {sentence}")
+    failed = left_out if words.frames is None else []  # a share of the frames does not fail by a video without any
     wanted = None
     if words.frames is not None or words.jobs != 1:
         names = [name.as_posix() for _, name in plates_of(given, [words.out, words.flare, words.matte])]
@@ -70,13 +71,13 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
         wanted = {Path(frame.view) for frame in chosen}
         if words.jobs != 1:
             jobs.run_jobs(words, "remove", [frame.number for frame in chosen], progress, past_failures=True)
-            if left_out and words.frames is None:
-                raise FrameError(f"The other clean plates are in {words.out}. {spelled_out(left_out)}")
+            if failed:
+                raise FrameError(f"The other clean plates are in {words.out}. {spelled_out(failed)}")
             progress.say(f"The clean plates are in {words.out}.")
             return {"plates": str(words.out)}
     return remove_all(given, words.out, _remover(words), progress, flare_folder=words.flare,
                       mattes=Mattes(words.matte) if words.matte else None, overwrite=words.overwrite, wanted=wanted,
-                      stills=words.stills, left_out=left_out if words.frames is None else ())
+                      stills=words.stills, left_out=failed)
 
 
 def _by_run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:

@@ -7,7 +7,7 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
-from ...core.choices import Asked
+from ...core.choices import Follows
 from ...core.errors import SettingsError
 from ...core.progress import Progress
 from .. import frames, jobs, layers, targets
@@ -27,7 +27,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
                              "a shot (JSON)")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR",
                         help="folder for layers.####.exr, and frames/ with the plates under their own names")
-    parser.add_argument("--query", choices=get_args(Asked), default="blend",
+    parser.add_argument("--query", choices=get_args(Follows), default="blend",
                         help="what the flare's appearance follows: one training view (source), the target's view "
                              "(target), or the target's view kept inside what was trained (blend, the default)")
     frames.add_option(parser)

@@ -55,7 +55,7 @@ def test_a_worker_without_the_extension_has_the_sliders_as_they_were_saved(facts
 
 
 def test_sliders_whose_flare_is_gone_are_known(facts: Any) -> None:
-    assert facts["act"] == [True, True, False]
+    assert facts["complete"] == [True, True, False]
 
 
 @pytest.mark.parametrize(("name", "gain"), [

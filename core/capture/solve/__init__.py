@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Structure from motion: from frames or a video to a capture.
 
-    stills.py      which frames; small pictures and masks of them
+    stills.py     which frames; small pictures and masks of them
     pairs.py      which frames to match with which
     mapping.py    pycolmap: features, matches, incremental mapping
     world.py      which way is up, where the floor is, how large things are

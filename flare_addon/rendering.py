@@ -20,9 +20,11 @@ PLAIN_VIEWS = ("Standard", "Un-tone-mapped")  # of Blender's own colour configur
 
 
 def match_scene(scene: Any, layers: LayerFolder, size: tuple[int, int]) -> None:
-    """Give the scene the layers' frames and size (width, height). Its pixels keep their aspect: the camera goes by
-    that."""
+    """Give the scene the layers' frames and size (width, height), and stand on one of those frames. Its pixels keep
+    their aspect: the camera goes by that."""
     scene.frame_start, scene.frame_end = layers.first, layers.last
+    if not layers.first <= scene.frame_current <= layers.last:  # where there is nothing to see
+        scene.frame_set(layers.first)
     render = scene.render
     render.resolution_x, render.resolution_y = size
     render.resolution_percentage = 100

@@ -155,6 +155,10 @@ def test_what_the_camera_goes_by_stays(made: Made) -> None:
     assert nothing
 
 
+def test_a_scene_that_is_given_the_layers_frames_stands_on_one(made: Made) -> None:
+    assert made.facts["stands at"] == NUMBERS[0]
+
+
 def test_the_saved_file_shows_the_same_elsewhere_and_without_us(made: Made, blender: Blender, tmp_path: Path) -> None:
     shutil.copytree(made.layers, tmp_path / "layers")
     shutil.copytree(made.out / "scene", tmp_path / "out" / "scene")

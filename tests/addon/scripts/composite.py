@@ -32,6 +32,7 @@ layers = LayerFolder.open(folder)
 def empty() -> bpy.types.Scene:
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
     scene = bpy.context.scene
+    scene.frame_set(layers.last + 1)
     rendering.match_scene(scene, layers, layers.size())
     rendering.plain_view(scene)
     return scene
@@ -45,6 +46,7 @@ facts: dict[str, object] = {"version": bpy.app.version_string}
 
 # The graph as it comes, rendered and saved.
 scene = empty()
+facts["stands at"] = scene.frame_current
 node = compositor.set_up(scene, layers)
 facts["inputs"] = [socket.name for socket in node.inputs]
 facts["outputs"] = [socket.name for socket in node.outputs]

@@ -205,6 +205,32 @@ def raster_section(engines: dict[str, Engine], counts: list[int], rounds: int, d
     return "\n\n".join(parts)
 
 
+GPU_JOBS = (*RASTER_JOBS, Job(1_000_000, 1920, 1080))
+
+
+def gpu_section(rounds: int) -> str:
+    """Forward, and forward + backward, on an NVIDIA GPU and beside it on all of the processor's threads."""
+    engines = {"cuda": "cuda", "tiles": "cuda", "cpu": "cpu"}
+    cases: dict[str, Callable[[], object]] = {}
+    for job in GPU_JOBS:
+        for name, device in engines.items():
+            if not too_slow(name, job):
+                raster = Raster(job, our_engine(name), name, device)
+                cases |= {f"{job}|{name}|forward": raster.forward, f"{job}|{name}|both": raster.both}
+    times = medians(cases, rounds)
+    head = [
+        f"ms; {torch.cuda.get_device_name()}, {_count(torch.get_num_threads())}",
+        *[f"{name}, {kind}" for kind in ("forward", "both") for name in engines],
+        "tiles / cuda, both", "cpu / cuda, both",
+    ]  # fmt: skip
+    rows = []
+    for job in GPU_JOBS:
+        found = {(kind, n): times.get(f"{job}|{n}|{kind}") for kind in ("forward", "both") for n in engines}
+        ratios = [_ratio(found["both", name], found["both", "cuda"]) for name in ("tiles", "cpu")]
+        rows.append([str(job), *[milliseconds(v) for v in found.values()], *ratios])
+    return table(head, rows)
+
+
 def iteration_section(sets: list[str], counts: list[int], rounds: int) -> str:
     """Whole iterations."""
     cases: dict[str, Callable[[], object]] = {}
@@ -494,9 +520,10 @@ def main() -> None:
         "curve": lambda: curve_section(engines, rounds, arguments.device, arguments.out.parent / "engine-curve.png"),
         "process": lambda: process_section(arguments.kernels),
         "peer": lambda: peer_section(arguments.opensplat, rounds),
+        "gpu": lambda: gpu_section(rounds),
     }
     for section in arguments.only:
-        if section == "peer" and arguments.opensplat is None:
+        if (section == "peer" and arguments.opensplat is None) or (section == "gpu" and arguments.device == "cpu"):
             continue
         conditions = report.conditions()
         text = f"## {SECTIONS[section]}\n\n{write[section]()}\n\n{conditions}"
@@ -513,6 +540,7 @@ SECTIONS = {
     "curve": "Against the number of Gaussians",
     "process": "Memory, first calls, instruction sets",
     "peer": "Beside a C++ rasterizer",
+    "gpu": "On a GPU",
 }
 
 if __name__ == "__main__":

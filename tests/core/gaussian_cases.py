@@ -220,10 +220,14 @@ def _off_the_steps(
     raise AssertionError(f"{case.what}: no place off the steps was found")
 
 
-def render(case: Case, kernels: str, dtype: torch.dtype) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-    """Pictures and, by a loss that weighs every pixel of them at random, gradients of every input."""
-    inputs = {name: value.to(dtype, copy=True).requires_grad_() for name, value in case.inputs.items()}
-    arguments = {**inputs, **case.options, "kernels": kernels}
+def render(
+    case: Case, kernels: str, dtype: torch.dtype, device: str = "cpu"
+) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    """Pictures and, by a loss that weighs every pixel of them at random, gradients of every input; made on a device,
+    told on the CPU."""
+    inputs = {name: value.to(device, dtype, copy=True).requires_grad_() for name, value in case.inputs.items()}
+    options = {name: value.to(device) if isinstance(value, Tensor) else value for name, value in case.options.items()}
+    arguments = {**inputs, **options, "kernels": kernels}
     if "means" in inputs:
         full = rasterization(**arguments)  # type: ignore[arg-type]
         pictures = {name: getattr(full, name) for name in ("colour", "alpha", "depth")}
@@ -234,7 +238,7 @@ def render(case: Case, kernels: str, dtype: torch.dtype) -> tuple[dict[str, Tens
         more = {}
     generator = torch.Generator().manual_seed(0)
     loss = sum(
-        (picture * torch.randn(picture.shape, generator=generator, dtype=torch.float64)).sum()
+        (picture.cpu() * torch.randn(picture.shape, generator=generator, dtype=torch.float64)).sum()
         for picture in pictures.values()
     )
     gradients = {}
@@ -245,13 +249,14 @@ def render(case: Case, kernels: str, dtype: torch.dtype) -> tuple[dict[str, Tens
         }
         if more:
             gradients["centre_gradients"] = full.centre_gradients
-    return {name: p.detach() for name, p in {**pictures, **more}.items()}, gradients
+    told = {name: p.detach().cpu() for name, p in {**pictures, **more}.items()}
+    return told, {name: gradient.cpu() for name, gradient in gradients.items()}
 
 
-def differences(case: Case, kernels: str) -> list[str]:
-    """What a kernel set in float32 gets wrong, one sentence each, against the definition in float64."""
+def differences(case: Case, kernels: str, device: str = "cpu") -> list[str]:
+    """What a kernel set in float32 on a device gets wrong, one sentence each, against the definition in float64."""
     pictures, gradients = render(case, "torch", torch.float64)
-    tried, tried_gradients = render(case, kernels, torch.float32)
+    tried, tried_gradients = render(case, kernels, torch.float32, device)
     wrong = []
     for name, picture in pictures.items():
         error = (tried[name] - picture).abs().max().item() if picture.numel() else 0.0

@@ -25,6 +25,8 @@ Random = np.random.Generator
 
 PHOTOS = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff"})
 MAPS = frozenset({".hdr", ".exr"})
+LEAST_SIDE = 64
+"""Pixels of a photograph's shorter side."""
 HELD_OUT = 10  # one in so many, by name, is kept for tests
 
 
@@ -37,12 +39,14 @@ def kept_for_test(name: str) -> bool:
 class Backgrounds:
     """Decoded pictures: photos as uint8 (h, w, 3) display values, maps as float16 equirectangular light.
 
-    varied: for training, to which few pictures are to look like many (`variety`).
+    varied: for training, to which few pictures are to look like many (`variety`). left_out: files in the folders that
+    are of no use.
     """
 
     photos: Sequence[NDArray[np.uint8]]
     maps: Sequence[NDArray[np.float16]]
     varied: bool = False
+    left_out: Sequence[Path] = ()
 
     def draw(self, random: Random, width: int, height: int, gamma: float) -> Pixels:
         """(height, width, 3) linear light: a random window of a random picture, at a random scale; one in eight out
@@ -61,22 +65,35 @@ class Backgrounds:
         return _window(random, self.photos[int(random.integers(photos))], width, height, gamma)
 
 
+def told_left_out(paths: Sequence[Path]) -> str | None:
+    """A sentence for the user about pictures that were left out, where some were."""
+    if not paths:
+        return None
+    return (f"Left out: {len(paths)} of the pictures, {paths[0]} first; each cannot be read, has a side below "
+            f"{LEAST_SIDE} pixels, or is .hdr or .exr and not twice as wide as high.")
+
+
 def read_backgrounds(folders: Iterable[Path | str], part: Part = "all", longest: int = 720, *,
                      varied: bool = False) -> Backgrounds:
     """Read every photograph and environment map below the folders, photographs reduced to `longest` pixels.
 
-    Environment maps are .hdr, or .exr twice as wide as high. Pictures that cannot be read are left out. Raises
-    SettingsError for what is no folder, and where nothing is found.
+    Environment maps are .hdr, or .exr twice as wide as high. Pictures that cannot be read are left out, and told in
+    `left_out`. Raises SettingsError for what is no folder, and where nothing is found; EngineError where `varied` ones
+    are wanted and OpenCV lacks what varies them.
     """
     import cv2
 
+    if varied:
+        variety.need()
     photos, maps, looked = [], [], []
+    left_out: list[Path] = []
     for folder in folders:
         looked.append(str(folder))
         for path in pictures_of(Path(folder), PHOTOS | MAPS, part):
             if path.suffix.lower() in PHOTOS:
                 picture = decoded(path, cv2.IMREAD_COLOR)
-                if picture is None or min(picture.shape[:2]) < 64:
+                if picture is None or min(picture.shape[:2]) < LEAST_SIDE:
+                    left_out.append(path)
                     continue
                 scale = longest / max(picture.shape[:2])
                 if scale < 1:
@@ -84,12 +101,14 @@ def read_backgrounds(folders: Iterable[Path | str], part: Part = "all", longest:
                 photos.append(np.ascontiguousarray(picture[..., ::-1]))
             else:
                 light = _environment(path)
-                if light is not None:
+                if light is None:
+                    left_out.append(path)
+                else:
                     maps.append(light)
     if not photos and not maps:
         raise SettingsError(f"There are no pictures in {', '.join(looked) or 'no folder'}; name a folder of clean "
                             "photographs or environment maps.")
-    return Backgrounds(photos, maps, varied)
+    return Backgrounds(photos, maps, varied, left_out)
 
 
 @contextmanager
@@ -104,7 +123,7 @@ def mapped_backgrounds(folders: Iterable[Path | str], part: Part = "all", longes
         except OSError as problem:
             raise RunError(f"The clean pictures cannot be laid down in {tempfile.gettempdir()} ({problem.strerror}); "
                            "make room there, or name another folder in TMPDIR.") from problem
-        found = Backgrounds(photos, maps, varied)
+        found = Backgrounds(photos, maps, varied, found.left_out)
         try:
             yield found
         finally:

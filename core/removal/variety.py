@@ -14,6 +14,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from ..errors import EngineError
 from ..pictures import Pixels
 from .synthesis.canvas import uniform_log
 
@@ -25,6 +26,15 @@ ROOM = 1.4
 """Parts of its size by which a picture to be laid askew is filmed larger."""
 SQUARE = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
 """The corners of a frame, from its middle in halves of its sides."""
+
+
+def need() -> None:
+    """Raises EngineError where OpenCV has not what `varied` asks of it."""
+    import cv2
+
+    if not hasattr(cv2, "ximgproc"):
+        raise EngineError("A training needs OpenCV's extra modules, which the OpenCV of this Python has not; remove "
+                          "every opencv package there and install opencv-contrib-python-headless alone.")
 
 
 def varied(random: Random, film: Film, width: int, height: int) -> Pixels:

@@ -49,7 +49,7 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
 
     size = WORKING_SIZE if words.working_size is None else words.working_size
     remover = Remover(words.weights, working_size=size, keep_glare=words.keep_glare)
-    cases = _cases(words)
+    cases = _cases(words, progress)
     perceptual = None
     if words.lpips:
         from ...core.metrics.lpips import Lpips
@@ -68,9 +68,9 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
             "categories": scores["categories"]}
 
 
-def _cases(words: argparse.Namespace) -> list[Case]:
+def _cases(words: argparse.Namespace, progress: Progress) -> list[Case]:
     from ...core.removal import evaluation
-    from ...core.removal.backgrounds import read_backgrounds
+    from ...core.removal.backgrounds import read_backgrounds, told_left_out
     from ...core.removal.synthesis.prescription import read_lenses
 
     if (words.pairs is None) == (words.synthetic is None):
@@ -84,6 +84,8 @@ def _cases(words: argparse.Namespace) -> list[Case]:
     if words.synthetic < 1 or min(words.size) < 64:
         raise SettingsError("--synthetic wants one picture a class at least, of 64 pixels a side at least.")
     backgrounds = read_backgrounds(words.backgrounds, "all" if words.all_backgrounds else "test", max(words.size))
+    if left_out := told_left_out(backgrounds.left_out):
+        progress.say(left_out)
     lenses = evaluation.held_out(read_lenses(words.lenses) if words.lenses else [])
     return evaluation.synthetic(words.seed, words.synthetic, backgrounds, lenses, tuple(words.size))
 

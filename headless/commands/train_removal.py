@@ -60,7 +60,7 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
 
     from ...core.removal import recipe as recipes
     from ...core.removal import weights
-    from ...core.removal.backgrounds import kept_for_test, mapped_backgrounds, read_backgrounds
+    from ...core.removal.backgrounds import kept_for_test, mapped_backgrounds, read_backgrounds, told_left_out
     from ...core.removal.bank import OwnFlares
     from ...core.removal.evaluation import held_out
     from ...core.removal.synthesis.prescription import built_in, read_lenses
@@ -94,6 +94,9 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
         except SettingsError:
             tests = None
             progress.say("There are too few clean pictures to keep some for checks; the log will have none.")
+        left_out = [*backgrounds.left_out, *(tests[0].left_out if tests else ())]
+        if sentence := told_left_out(left_out):
+            progress.say(sentence)
         own = OwnFlares(words.flares, recipe.canvas) if words.flares else None
         if own and own.without_light:
             progress.say(f"{len(own.without_light)} of your {len(own)} flares have no picture of their light in "

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from core.errors import FrameError, SettingsError
 from core.pictures import write_png
 from core.removal import formation, pairs, variety
-from core.removal.backgrounds import Backgrounds, kept_for_test, read_backgrounds
+from core.removal.backgrounds import Backgrounds, kept_for_test, read_backgrounds, told_left_out
 from core.removal.bank import Mixed, OwnFlares, SynthesisBank
 from core.removal.recipe import Recipe
 from core.removal.synthesis import aspheric, shapes
@@ -379,7 +379,10 @@ def test_backgrounds_of_folders(tmp_path: Path) -> None:
     both = [len(read_backgrounds([tmp_path], part).photos) for part in ("train", "test")]
     assert sum(both) == 30
     assert both[1] == sum(map(kept_for_test, names)) > 0
-    drawn = read_backgrounds([tmp_path]).draw(np.random.default_rng(0), 48, 32, 2.2)
+    found = read_backgrounds([tmp_path])
+    assert found.left_out == [tmp_path / "empty.jpg"]
+    assert "empty.jpg first" in str(told_left_out(found.left_out))
+    drawn = found.draw(np.random.default_rng(0), 48, 32, 2.2)
     assert drawn.shape == (32, 48, 3)
     assert drawn.dtype == np.float32
 

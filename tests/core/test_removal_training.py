@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import torch
 
-from core.errors import Cancelled, RunError, SettingsError
+from core.errors import Cancelled, EngineError, RunError, SettingsError
 from core.holding import held
 from core.metrics.lpips import Lpips
 from core.pictures import Pixels, write_png
@@ -229,8 +229,10 @@ def test_pictures_that_processes_share_are_mapped(tmp_path: Path) -> None:
 def test_backgrounds_out_of_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for number in range(3):
         write_png(tmp_path / f"{number}.png", np.random.default_rng(number).random((80, 96, 3)).astype(np.float32))
+    (tmp_path / "cut_off.png").write_bytes(b"\x89PNG")
     held_in_memory = removal_backgrounds.read_backgrounds([tmp_path], varied=True)
     with removal_backgrounds.mapped_backgrounds([tmp_path], varied=True) as found:
+        assert found.left_out == [tmp_path / "cut_off.png"]
         sent = pickle.loads(pickle.dumps(found))
         assert sent.varied
         for seed in range(4):
@@ -244,6 +246,16 @@ def test_backgrounds_out_of_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     with pytest.raises(RunError, match=r"No space left on device.*TMPDIR"), \
             removal_backgrounds.mapped_backgrounds([tmp_path]):
         pass
+
+
+def test_a_training_without_opencvs_extra_modules_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import cv2
+
+    write_png(tmp_path / "a.png", np.zeros((80, 96, 3), np.float32))
+    monkeypatch.delattr(cv2, "ximgproc")
+    with pytest.raises(EngineError, match="opencv-contrib-python-headless"):
+        removal_backgrounds.read_backgrounds([tmp_path], varied=True)
+    assert removal_backgrounds.read_backgrounds([tmp_path]).photos
 
 
 def test_a_handful_of_pairs_is_learned() -> None:

@@ -52,6 +52,16 @@ def test_training_is_stopped_by_its_length_and_goes_on(backgrounds: Path, tmp_pa
     assert "speed" in capsys.readouterr().err
 
 
+def test_a_training_tells_what_it_cannot_read(backgrounds: Path, tmp_path: Path,
+                                              capsys: pytest.CaptureFixture[str]) -> None:
+    folder = tmp_path / "pictures"
+    shutil.copytree(backgrounds, folder)
+    (folder / "0_bad.png").write_bytes(b"no picture")
+    words = ["train-removal", "--backgrounds", str(folder), "--out", str(tmp_path / "made"), *SMALL]
+    assert cli.main([*words, "--processes", "1", "--iterations", "1"]) == 0
+    assert f"Left out: 1 of the pictures, {folder / '0_bad.png'} first" in "".join(capsys.readouterr())
+
+
 def test_bad_plates_are_listed_at_the_end(backgrounds: Path, tmp_path: Path,
                                           capfd: pytest.CaptureFixture[str]) -> None:
     folder = tmp_path / "plates"

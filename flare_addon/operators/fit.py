@@ -11,6 +11,8 @@ from .. import engine, fits, jobs, shots
 from ..paths import is_file, is_folder
 from ..reports import NO_CAPTURE, Action
 
+SHOWN_OF_A_LOG = 200_000  # bytes, its last
+
 _keymaps: list[tuple[object, object]] = []
 
 
@@ -123,7 +125,7 @@ class FITFLARE_OT_show_log(bpy.types.Operator):
         for name in (LOG, jobs.EVENTS, jobs.LOG):
             path = Path(self.folder, name)
             if is_file(path):
-                parts.append(f"==== {path}\n{path.read_text(encoding='utf-8', errors='replace')[-200_000:]}")
+                parts.append(f"==== {path}\n{_end_of(path)}")
         if not parts:
             self.report({"ERROR"}, f"There is no log in {self.folder}.")
             return {"CANCELLED"}
@@ -131,6 +133,16 @@ class FITFLARE_OT_show_log(bpy.types.Operator):
         text.from_string("\n".join(parts))
         _show(context, "TEXT_EDITOR", lambda space: setattr(space, "text", text))
         return {"FINISHED"}
+
+
+def _end_of(path: Path) -> str:
+    """The last of a log; why there is nothing to show where it may not be read."""
+    try:
+        with open(path, "rb") as file:
+            file.seek(max(path.stat().st_size - SHOWN_OF_A_LOG, 0))
+            return file.read().decode("utf-8", "replace")
+    except OSError as problem:
+        return f"(This cannot be read: {problem.strerror or problem}.)"
 
 
 class FITFLARE_OT_show_preview(Action, bpy.types.Operator):
@@ -178,7 +190,7 @@ class FITFLARE_OT_use_result(Action, bpy.types.Operator):
 def _show(context: bpy.types.Context, kind: str, give: object) -> None:
     """Give something to an editor of that kind: one that is open, or a new window's."""
     assert callable(give)
-    if context.window is None:
+    if context.window is None or bpy.app.background:
         return
     area = next((area for area in context.screen.areas if area.type == kind), None)
     if area is None:

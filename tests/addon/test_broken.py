@@ -181,3 +181,12 @@ def test_uninstalled_leaves_nothing(said: Any) -> None:
     assert said["after disabling"] == [False, False]
     assert said["left behind"] == []
     assert not said["modules left"]
+
+
+@pytest.mark.skipif(not Path("/proc/self/mem").exists(), reason="wants a file that may not be read")
+def test_of_logs_the_end_is_shown_or_why_there_is_none(said: Any) -> None:
+    finished, text = said["shows logs"]
+    assert finished == "FINISHED"
+    assert "cannot be read" in text
+    assert "last" in text
+    assert "first" not in text

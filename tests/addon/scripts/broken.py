@@ -368,6 +368,11 @@ said["undone"] = undone
 # ---- the rest ---------------------------------------------------------------------------------------
 said["online"] = [bpy.app.online_access, polls("set_up_engine")]
 said["log of nothing"] = refusal(lambda: ops.show_log(folder=str(folder / "nowhere")))
+logs = folder / "logs"
+logs.mkdir()
+(logs / "log.txt").symlink_to("/proc/self/mem")  # a file that may be looked at and not read, by root neither
+(logs / "events.jsonl").write_bytes(b"first" + b"." * 300_000 + b"last")
+said["shows logs"] = [*ops.show_log(folder=str(logs)), bpy.data.texts["Fit Flare Log"].as_string()]
 said["folder of nothing"] = refusal(lambda: ops.open_folder(folder=str(folder / "nowhere")))
 said["layers of nothing"] = refusal(lambda: ops.set_up_compositor(directory=str(folder)))
 said["library name"] = refusal(lambda: ops.save_flare(name="///"))

@@ -4,6 +4,7 @@ kept as long as it would come out the same, and whatever else lies there, or was
 one."""
 from __future__ import annotations
 
+import contextlib
 import errno
 import hashlib
 import os
@@ -85,8 +86,13 @@ class Record:
 
     def keeps(self, name: Path, source: Path, how: str, results: Sequence[Path]) -> Kept | None:
         """Why the files of a plate stay as they are: "made", as they would be now; or "worked on", by hand; None where
-        they are to be made."""
+        they are to be made. Where a process was killed before it wrote down what these hold, that is done now, so that
+        it is known of those that are worked on from here on."""
         if self.is_made(name, how, results):
+            written = self._read("written")
+            if not all(_from(self._folder, path) in written for path in results):  # a kill came before `end`
+                with contextlib.suppress(OSError):  # a plate is kept in a folder that may not be written to, too
+                    self.end(results)
             return "made"
         return "worked on" if self._is_worked_on(name, source, results) else None
 

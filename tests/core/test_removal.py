@@ -768,6 +768,21 @@ def test_a_plate_that_was_begun_is_made(tmp_path: Path, everywhere: Path) -> Non
     assert remove_all([source], tmp_path / "out", other, Progress())["made"] == 1
 
 
+def test_a_plate_that_a_kill_left_without_its_content_written_down_is_kept_once_it_is_worked_on(
+        tmp_path: Path, everywhere: Path, nowhere: Path) -> None:
+    """A kill after the plate, before the record tells what was written: a later call tells it."""
+    source, remover = write_codes(tmp_path / "in" / "a.png", picture()), Remover(everywhere, working_size=64)
+    clean, told = tmp_path / "out" / "a.png", tmp_path / "out" / RECORD
+    remove_all([source], tmp_path / "out", remover, Progress())
+    as_it_ended = told.read_text()
+    told.write_text(json.dumps({**json.loads(as_it_ended), "written": {}}))
+    assert remove_all([source], tmp_path / "out", remover, Progress())["kept"] == 1
+    assert json.loads(told.read_text()) == json.loads(as_it_ended)
+    work = write_codes(clean, picture() // 2).read_bytes()
+    assert remove_all([source], tmp_path / "out", Remover(nowhere, working_size=64), Progress())["kept"] == 1
+    assert clean.read_bytes() == work
+
+
 def whole(width: int, height: int) -> Window:
     return Window((width, height), (0, 0), (width, height))
 

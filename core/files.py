@@ -309,7 +309,7 @@ def check_apart(sources: Iterable[Path], results: Iterable[Path]) -> None:
 def _file_of(path: Path) -> object:
     """The same of every name that a file has: of one that is there its place on the disk, which file systems that do
     not tell Plates from plates know by both names."""
-    whole = path.resolve()
+    whole = Path(os.path.realpath(path))  # `resolve` raises for a link that leads back to itself
     try:
         folder, file = whole.parent.stat(), whole.stat()
     except OSError:

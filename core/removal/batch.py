@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import os
 from collections import Counter
 from collections.abc import Container, Iterable, Sequence
 from pathlib import Path
@@ -72,7 +73,7 @@ def _no_plates(folder: Path, apart: Iterable[Path]) -> set[Path]:
 
 
 def _itself_and_its_folders(path: Path) -> list[Path]:
-    whole = path.resolve()
+    whole = Path(os.path.realpath(path))  # `resolve` raises for a link that leads back to itself
     return [whole, *whole.parents]
 
 

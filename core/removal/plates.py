@@ -127,7 +127,7 @@ def read_plate(path: Path | str) -> Plate:
     """
     path = Path(path)
     if not path.exists():
-        raise FrameError(f"{path} is missing.")
+        raise FrameError(f"{path} is missing{': it is a link that leads nowhere' if path.is_symlink() else ''}.")
     if path.suffix.lower() not in SUFFIXES:
         raise no_picture(path)
     picture_size(path)

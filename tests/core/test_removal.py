@@ -954,6 +954,15 @@ def test_a_link_that_leads_nowhere_is_told_as_a_plate_that_is_missing(tmp_path: 
     assert (tmp_path / "out" / "a.3.png").exists()
 
 
+@pytest.mark.skipif(os.name == "nt", reason="links want rights on Windows")
+def test_a_link_that_leads_back_to_itself_does_not_stop_the_others(tmp_path: Path, everywhere: Path) -> None:
+    write_codes(tmp_path / "in" / "a.1.png", picture())
+    (tmp_path / "in" / "a.0.png").symlink_to(tmp_path / "in" / "a.0.png")
+    with pytest.raises(FrameError, match=r"1 of 2 plates could not be cleaned: .*a\.0\.png is missing: it is a link"):
+        remove_all([tmp_path / "in"], tmp_path / "out", Remover(everywhere, working_size=64), Progress())
+    assert (tmp_path / "out" / "a.1.png").exists()
+
+
 def test_a_clean_plate_stays_when_its_plate_can_no_longer_be_read(tmp_path: Path, everywhere: Path) -> None:
     write_codes(tmp_path / "in" / "a.png", picture())
     remover = Remover(everywhere, working_size=64)

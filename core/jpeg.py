@@ -25,11 +25,11 @@ def segments(stream: BinaryIO) -> Iterator[tuple[int, bytes]]:
         yield byte[0], content
 
 
-def frame_header(stream: BinaryIO) -> tuple[int, int, int] | None:
-    """(width, height, components); None where it is missing."""
+def frame_header(stream: BinaryIO) -> tuple[int, int, int, int] | None:
+    """(width, height, components, bits of each); None where it is missing."""
     for marker, content in segments(stream):
         if marker in FRAMES and len(content) >= 6:
-            return int.from_bytes(content[3:5], "big"), int.from_bytes(content[1:3], "big"), content[5]
+            return int.from_bytes(content[3:5], "big"), int.from_bytes(content[1:3], "big"), content[5], content[0]
     return None
 
 

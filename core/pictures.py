@@ -179,20 +179,32 @@ def stored_pixels(path: Path) -> NDArray[Any]:
         raise FrameError(f"{path} {misread}.")
     stored = decoded(path, cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
     if stored is None or stored.shape[:2] != (height, width):
-        raise FrameError(f"{path} is damaged or truncated; export it again.")
+        raise FrameError(f"{path} {_unread(path) or 'is damaged or truncated; export it again'}.")
     return stored
+
+
+def _unread(path: Path) -> str:
+    """How a TIFF that OpenCV cannot read is compressed, and what to do; "" where it reads such ones, if they are
+    whole."""
+    with open(path, "rb") as stream:
+        told = tiff.whole_numbers(tiff.read_tags(stream, (tiff.COMPRESSION,)))
+    found = tiff.SELDOM_READ.get(told.get(tiff.COMPRESSION, 0))
+    return f"is compressed by {found}, which this program does not read; save it with LZW, ZIP or none" if found else ""
 
 
 _CMYK = "is CMYK, for print; convert it to RGB"
 
 
 def _misread(path: Path) -> str:
-    """What OpenCV would read without a word as something else, and what to do; "" where there is no such thing."""
+    """What OpenCV would read without a word as something else, or not though it is whole, and what to do; "" where
+    there is no such thing."""
     with open(path, "rb") as stream:
         begins = stream.read(4)
         stream.seek(0)
         if begins[:2] == b"\xff\xd8":  # whatever it is named
             header = jpeg.frame_header(stream)
+            if header is not None and header[3] > 8:
+                return f"holds {header[3]} bits a colour; save it with 8, or as PNG or TIFF with 16"
             return _CMYK if header is not None and header[2] == 4 else ""
         if begins not in (b"II*\0", b"MM\0*"):
             return ""
@@ -455,7 +467,8 @@ def exr_parts(path: Path) -> list[tuple[dict[str, Any], dict[str, NDArray[Any]]]
 def _rgb_from_channels(path: Path, channels: Mapping[str, NDArray[Any]]) -> Pixels:
     names = "RGB" if all(name in channels for name in "RGB") else "YYY" if "Y" in channels else ""
     if not names:
-        raise FrameError(f"{path} has no R, G, B channels at its root (it has {', '.join(sorted(channels))}).")
+        raise FrameError(f"{path} has no R, G, B channels at its root (it has {', '.join(sorted(channels))}); "
+                         "export the picture under those names.")
     return np.stack([_finite(path, name, channels[name]) for name in names], axis=-1)
 
 

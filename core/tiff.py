@@ -11,7 +11,7 @@ from typing import BinaryIO, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-SUBFILE, WIDTH, HEIGHT, BITS, PHOTOMETRIC, ORIENTATION, SAMPLES = 254, 256, 257, 258, 262, 274, 277
+SUBFILE, WIDTH, HEIGHT, BITS, COMPRESSION, PHOTOMETRIC, ORIENTATION, SAMPLES = 254, 256, 257, 258, 259, 262, 274, 277
 PLANES, EXTRA_SAMPLES, SAMPLE_FORMAT = 284, 338, 339
 X_RESOLUTION, Y_RESOLUTION, RESOLUTION_UNIT, XMP, COLOUR_PROFILE = 282, 283, 296, 700, 34675
 
@@ -19,6 +19,8 @@ UPRIGHT = 1
 """Orientation: rows from the top, columns from the left."""
 WHITE_IS_0, SEPARATED, LAB = 0, 5, (8, 9, 10)
 """Photometric interpretation: ink on paper; inks, CMYK; lightness and two differences of colour, of three kinds."""
+SELDOM_READ = {34712: "JPEG 2000", 34887: "LERC", 34925: "LZMA", 50000: "Zstandard", 50001: "WebP", 50002: "JPEG XL"}
+"""Compressions that the library in OpenCV is mostly built without."""
 WHOLE, FLOATS = 1, 3
 """Sample format: unsigned whole numbers, floats."""
 BIG = (b"II+\0", b"MM\0+")

@@ -142,6 +142,8 @@ def _read_codes(path: Path) -> Plate:
     stored = stored_pixels(path)
     if stored.dtype not in (np.uint8, np.uint16, np.float32):
         raise FrameError(f"{path} holds {stored.dtype} pixels; save it as 8 or 16 bit or as 32 bit float.")
+    if _is_animated(path):
+        raise FrameError(f"{path} is an animated PNG; export its frames as files of their own.")
     grey, alpha = stored.ndim == 2 or _is_grey_with_alpha(path), None
     if stored.ndim == 2:
         codes, alpha = np.repeat(stored[..., None], 3, axis=2), _transparency(path, stored)
@@ -156,6 +158,12 @@ def _is_grey_with_alpha(path: Path) -> bool:
     with open(path, "rb") as stream:
         header = stream.read(26)
     return header[:4] == b"\x89PNG" and header[25:] == b"\x04"
+
+
+def _is_animated(path: Path) -> bool:
+    """A PNG of several frames (PNG specification, third edition, 11.3.6.1), of which OpenCV reads the first alone."""
+    with open(path, "rb") as stream:
+        return any(int.from_bytes(content[:4], "big") > 1 for _, content in png.chunks(stream, (b"acTL",)))
 
 
 def _transparency(path: Path, stored: NDArray[Any]) -> NDArray[Any] | None:
@@ -178,7 +186,8 @@ def _read_exr(path: Path) -> Plate:
         raise FrameError(f"{path} has {len(parts)} parts; export the plate as a file of its own.")
     names = ["R", "G", "B"] if all(name in channels for name in "RGB") else ["Y"] if "Y" in channels else []
     if not names:
-        raise FrameError(f"{path} has no R, G, B channels at its root (it has {', '.join(sorted(channels))}).")
+        raise FrameError(f"{path} has no R, G, B channels at its root (it has {', '.join(sorted(channels))}); "
+                         "export the picture under those names.")
     if any(channels[name].dtype not in (np.float16, np.float32) for name in names):
         raise FrameError(f"{path} has colour channels that are no floats; export it as half or float.")
     if len({channel.shape for channel in channels.values()}) > 1:

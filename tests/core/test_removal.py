@@ -1244,6 +1244,20 @@ def test_pictures_that_would_come_out_as_something_else_are_refused_by_name(tmp_
     _tiff_with(tmp_path / "long.tif", np.zeros((8, 8), np.float32), {tiff.SAMPLE_FORMAT: tiff.short(tiff.WHOLE)})
     with pytest.raises(FrameError, match="holds whole numbers of 32 bits"):
         read_plate(tmp_path / "long.tif")
+    _tiff_with(tmp_path / "zstd.tif", codes, {tiff.COMPRESSION: tiff.short(50000)})
+    with pytest.raises(FrameError, match=r"zstd\.tif is compressed by Zstandard, which .*; save it with LZW"):
+        read_plate(tmp_path / "zstd.tif")
+    jpeg[frame + 9], jpeg[frame + 4] = 3, 12
+    (tmp_path / "deep.jpg").write_bytes(jpeg)
+    with pytest.raises(FrameError, match=r"deep\.jpg holds 12 bits a colour; save it with 8"):
+        read_plate(tmp_path / "deep.jpg")
+    _, still = cv2.imencode(".png", codes)
+    for frames in (1, 2):
+        told = png.chunk(b"acTL", frames.to_bytes(4, "big") + bytes(4))
+        (tmp_path / f"{frames}.png").write_bytes(still.tobytes()[:33] + told + still.tobytes()[33:])
+    assert read_plate(tmp_path / "1.png").codes.shape == codes.shape
+    with pytest.raises(FrameError, match=r"2\.png is an animated PNG; export its frames"):
+        read_plate(tmp_path / "2.png")
     (tmp_path / "big.tif").write_bytes(tiff.BIG[0] + bytes(40))
     with pytest.raises(FrameError, match="is a BigTIFF"):
         read_plate(tmp_path / "big.tif")

@@ -147,13 +147,13 @@ def _is_being_written(partial: Path) -> bool:
 
 
 def remove_partial_of(target: Path | str) -> None:
-    """Remove what a killed process left of `target` half written, where the system lets it. What another one is writing
-    stays: on a farm a task may be given again while its first worker still lives."""
+    """Remove what a killed process left of `target`, a file or a folder, half written, where the system lets it. What
+    another one is writing stays: on a farm a task may be given again while its first worker still lives."""
     target = Path(target)
     for path in target.parent.glob(f"{glob.escape(_partial_of(target))}*"):
         if not _is_being_written(path):
             with contextlib.suppress(OSError):
-                remove_file(path)
+                shutil.rmtree(path) if path.is_dir() else remove_file(path)
 
 
 @contextlib.contextmanager
@@ -201,10 +201,11 @@ def _remove_lock(lock: Path, made_ns: int) -> None:
 @contextlib.contextmanager
 def atomic_folder(target: Path | str) -> Iterator[Path]:
     """A temporary folder beside `target`, which must not be there yet, renamed to it when the block ends well and
-    removed when not."""
+    removed when not. What a killed process left of it goes, too."""
     target = Path(target)
     target.parent.mkdir(parents=True, exist_ok=True)
-    temporary = Path(tempfile.mkdtemp(prefix=_PARTIAL, dir=target.parent))
+    remove_partial_of(target)
+    temporary = Path(tempfile.mkdtemp(prefix=_partial_of(target) + _writer(), dir=target.parent))
     try:
         yield temporary
         _share(temporary, 0o777)

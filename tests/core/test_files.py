@@ -283,6 +283,23 @@ def test_what_a_killed_process_left_of_a_file_can_be_removed(tmp_path: Path) -> 
     assert sorted(path.name for path in tmp_path.iterdir()) == ["layers.0001.exr", "layers.0002.exr"]
 
 
+def test_what_a_killed_process_left_of_a_folder_goes_when_that_is_made_again(tmp_path: Path) -> None:
+    """And what a living one makes stays."""
+    makes = ("import os, sys\nfrom core.files import atomic_folder\n"
+             "with atomic_folder(sys.argv[1]) as folder:\n    (folder / 'a').touch()\n    ")
+    words = [sys.executable, "-c", f"{makes}os._exit(9)", str(tmp_path / "frames")]
+    assert subprocess.run(words, cwd=ROOT, check=False).returncode == 9
+    words[2] = f"{makes}print('begun', flush=True)\n    sys.stdin.read()"
+    other = subprocess.Popen(words, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    assert other.stdout is not None and other.stdout.readline() == b"begun\n"
+    assert len(list(tmp_path.iterdir())) == 1, "what the killed one left is gone"
+    with atomic_folder(tmp_path / "frames"):
+        assert len(list(tmp_path.iterdir())) == 2, "theirs and mine"
+    assert len(list(tmp_path.iterdir())) == 2, "theirs, and the whole one"
+    other.kill()
+    other.communicate()
+
+
 def test_what_another_machine_writes_stays_for_an_hour(tmp_path: Path) -> None:
     target, theirs = tmp_path / "a.exr", tmp_path / f".partial-a.exr-{os.getpid()}@01234567-abc.exr"
     theirs.touch()

@@ -27,7 +27,9 @@ from core.capture.solve.mapping import Model, Solved, SolvedFrame
 from core.capture.solve.pairs import choose_matching, choose_pairs
 from core.capture.solve.stills import Still, choose, gather, usable
 from core.capture.solve.world import up_direction
-from core.errors import Cancelled, CaptureError, FrameError, SettingsError
+from core.errors import Cancelled, CaptureError, FrameError, RunError, SettingsError
+from core.files import atomic_path
+from core.holding import held
 from core.pictures import Picture, linear_from_srgb, picture_size, read_picture, stored_pixels, write_exr
 from core.progress import Progress
 from tests.core.captures import look_at, make_capture, orbit
@@ -196,6 +198,27 @@ def test_stopped_and_taken_up_again(tmp_path: Path) -> None:
     assert last.seen["find features"] == (9, 9) and last.seen["match frames"] == (36, 36)
     assert "place cameras" not in last.seen
     assert report["registered"] == 9 and len(Capture.open(out).views) == 9
+
+
+def test_what_a_killed_solve_left_half_written_is_not_in_the_capture(stopped: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    shutil.copytree(stopped / "out", out)
+    gone = subprocess.Popen([sys.executable, "-c", ""])
+    gone.wait()
+    for name in ("images/000.png", "images/of_no_frame.png", "sparse/0/cameras.bin"):
+        target = out / ".solve" / name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with atomic_path(target) as half:
+            left = half.with_name(half.name.replace(f"-{os.getpid()}@", f"-{gone.pid}@"))
+            left.write_bytes(b"half")
+        target.unlink()
+    solve(stopped / "frames", out, QUICK)
+    assert not list(out.rglob(".*"))
+
+
+def test_one_solves_into_a_folder_at_a_time(stopped: Path, tmp_path: Path) -> None:
+    with held(tmp_path / "out"), pytest.raises(RunError, match="Another process is at work in"):
+        solve(stopped / "frames", tmp_path / "out", QUICK)
 
 
 @pytest.mark.parametrize("damaged", ["request.json", "stills.json", "mapped.json", "database.db",

@@ -21,7 +21,8 @@ from typing import Any, get_args
 
 from ...choices import Matching
 from ...errors import CaptureError, SettingsError
-from ...files import read_json, remove_file, write_json
+from ...files import read_json, remove_file, remove_partial, write_json
+from ...holding import held
 from ...pictures import pictures_in
 from ...progress import Progress
 from ...video import is_video
@@ -80,13 +81,21 @@ def solve(source: Path | str, out: Path | str, settings: SolveSettings | None = 
     An earlier run with the same source and settings is taken up where it stopped.
 
     Raises CaptureError where there is nothing to solve or no parallax to solve it by, FrameError for a video
-    that cannot be read, Cancelled when asked to stop, EngineError without pycolmap.
+    that cannot be read, RunError where another process solves there, Cancelled when asked to stop, EngineError without
+    pycolmap.
     """
-    from . import develop, mapping, report, stills, world
-
-    source, out, settings, progress = Path(source), Path(out), settings or SolveSettings(), progress or Progress()
+    source, out = Path(source), Path(out)
     if not source.exists():
         raise CaptureError(f"{source} is missing.")
+    if out.exists() and not out.is_dir():
+        raise CaptureError(f"{out} is a file; give a folder for the capture.")
+    with held(out):  # two in one database would be the end of both
+        return _solve(source, out, settings or SolveSettings(), progress or Progress())
+
+
+def _solve(source: Path, out: Path, settings: SolveSettings, progress: Progress) -> dict[str, Any]:
+    from . import develop, mapping, report, stills, world
+
     began = time.monotonic()
     request = {"source": _fingerprint(source), "settings": asdict(settings)}
     finished = _claim(source, out, request, progress)
@@ -122,8 +131,6 @@ def _claim(source: Path, out: Path, request: dict[str, Any], progress: Progress)
 
     Refused where `out` holds a capture that did not come from here, or the frames to be read.
     """
-    if out.exists() and not out.is_dir():
-        raise CaptureError(f"{out} is a file; give a folder for the capture.")
     if source.resolve() in (out.resolve(), (out / "images").resolve()):
         raise CaptureError(f"The frames in {source} would be overwritten by their undistorted selves; give another "
                            "folder for the capture.")
@@ -142,6 +149,7 @@ def _claim(source: Path, out: Path, request: dict[str, Any], progress: Progress)
     elif theirs and not (out / WORK).is_dir():
         raise CaptureError(f"{out} holds {theirs[0]} that did not come from a solve; give another folder.")
     if _goes_on(out / WORK, request, progress):
+        remove_partial(out / WORK)
         progress.say("Going on with the solve that was stopped.")
     else:
         shutil.rmtree(out / WORK, ignore_errors=True)

@@ -71,4 +71,6 @@ def refusal(problem: OSError) -> str:
         return f"There is a folder where a file is to be written{where}; name another."
     if isinstance(problem, FileExistsError | NotADirectoryError):
         return f"There is a file where a folder is to be{where}; name another, or move it away."
+    if problem.errno == errno.ELOOP:
+        return f"A symbolic link leads back to itself{where}; remove it, or name another place."
     return f"The system refused: {problem.strerror or problem}{where}."

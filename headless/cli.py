@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import errno
 import io
 import os
 import sys
@@ -134,6 +135,10 @@ def _status(words: Sequence[str], progress: Progress) -> int:
         progress.error(refusal(problem))
         return FAILED
     except Exception as problem:
+        looped = problem.__context__
+        if isinstance(problem, RuntimeError) and isinstance(looped, OSError) and looped.errno == errno.ELOOP:
+            progress.error(refusal(looped))  # as pathlib tells it before Python 3.13
+            return FAILED
         if is_out_of_memory(problem):
             progress.error(f"It does not fit into the memory of this machine; {_memory_spared(arguments)}.")
             return FAILED

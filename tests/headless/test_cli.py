@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import errno
 import json
 import os
 import subprocess
@@ -208,7 +209,15 @@ def ending_with(problem: BaseException | None, monkeypatch: pytest.MonkeyPatch, 
                                                  after_a_stop))
 
 
+def looped() -> RuntimeError:
+    """As Path.resolve raises it before Python 3.13."""
+    problem = RuntimeError("Symlink loop from 'x'")
+    problem.__context__ = OSError(errno.ELOOP, "Too many levels of symbolic links", "x")
+    return problem
+
+
 @pytest.mark.parametrize(("problem", "status", "sentence"), [
+    (looped(), 1, "A symbolic link leads back to itself (x); remove it, or name another place."),
     (FitFlareError("It is broken."), 1, "It is broken."),
     (Cancelled("Stopped as asked."), 130, "Stopped as asked."),
     (KeyboardInterrupt(), 130, "Stopped."),

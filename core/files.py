@@ -40,10 +40,11 @@ def atomic_path(target: Path | str, turn: contextlib.AbstractContextManager[None
     while it is renamed.
 
     The temporary name keeps the suffix, since writers choose their format by it. A symbolic link becomes a file of its
-    own: what it names may be another run's.
+    own: what it names may be another run's. What a killed process left of the file goes, see `remove_partial_of`.
     """
     target = Path(target)
     target.parent.mkdir(parents=True, exist_ok=True)
+    remove_partial_of(target)
     temporary = target
     try:
         handle, name = tempfile.mkstemp(prefix=_partial_of(target) + _writer(), suffix=target.suffix, dir=target.parent)

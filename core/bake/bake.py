@@ -17,7 +17,7 @@ from typing import Any, Protocol
 from ..capture.camera import Camera
 from ..colour import ColourSpace, colour_space
 from ..errors import FrameError, RunError
-from ..files import inside, locked, read_json, remove_file, remove_partial_of, write_json
+from ..files import inside, locked, read_json, remove_file, write_json
 from ..look import KeyedEdits, LookEdits
 from ..pictures import exr_is_cut_off, window_of
 from ..progress import Progress
@@ -172,7 +172,6 @@ def bake_frames(source: Sequenced, frames: Sequence[Frame], cameras: Mapping[str
             continue
         path = out / frame.file
         _check_is_of_this(out, made_from, names)  # before it is rendered in vain
-        remove_partial_of(path)
         # Not kept in a name: at 4K the layers of one frame are half a gigabyte.
         write_layers(path, made(frame), half=settings.half, chromaticities=space.chromaticities, notes=notes(frame),
                      pixel_aspect=settings.scaled(cameras[frame.view]).pixel_aspect, turn=in_turn())
@@ -275,7 +274,6 @@ def _add_to_record(out: Path, made_from: dict[str, Any], names: dict[str, str],
         frames = sorted(known.values(), key=lambda entry: (Path(entry["file"]).parent.as_posix(), entry["frame"]))
         record = {"version": VERSION, "made_from": made_from, "layers": names, "frames": frames}
         if record != found:
-            remove_partial_of(out / RECORD)
             write_json(out / RECORD, record)
     return record
 

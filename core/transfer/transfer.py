@@ -25,7 +25,7 @@ from ..choices import Follows
 from ..colour import ColourSpace, colour_space
 from ..display import decode, encode
 from ..errors import SettingsError
-from ..files import check_apart, remove_partial_of
+from ..files import check_apart
 from ..fit.rendering import render_scene, splat_look
 from ..fit.run import ViewLayers
 from ..flare.compositing import layers as linear_layers
@@ -272,7 +272,6 @@ class _OfFrame:
             return layers
         target = self._one.flared(self._out) if self._out is not None else None
         if target is not None:
-            remove_partial_of(target)  # of a task that was killed
             self._plate.write(target, self._space.to_linear(layers.flare))
         layers = replace(layers, window=window_of(self._plate.plate.path))
         own = self._plate.space.matrix

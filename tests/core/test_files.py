@@ -59,6 +59,8 @@ def test_what_the_system_refuses_is_one_sentence_that_names_the_file(tmp_path: P
     assert list(tmp_path.iterdir()) == [target]
     assert refusal(PermissionError(errno.EACCES, "Permission denied", "/a")) == (
         "The system refused: Permission denied (/a).")
+    assert refusal(OSError(errno.ELOOP, os.strerror(errno.ELOOP), "/a")) == (
+        "A symbolic link leads back to itself (/a); remove it, or name another place.")
 
 
 def test_a_write_replaces_the_file_and_makes_its_folder(tmp_path: Path) -> None:
@@ -281,6 +283,17 @@ def test_what_a_killed_process_left_of_a_file_can_be_removed(tmp_path: Path) -> 
         remove_partial_of(target)
         assert sorted(tmp_path.iterdir()) == sorted([mine, next_one])
     assert sorted(path.name for path in tmp_path.iterdir()) == ["layers.0001.exr", "layers.0002.exr"]
+
+
+def test_what_a_killed_process_left_of_a_file_goes_when_that_is_written_again(tmp_path: Path) -> None:
+    """Whatever writes it, and nothing of another file's."""
+    dies = "import os, sys\nfrom core.files import atomic_path\nwith atomic_path(sys.argv[1]):\n    os._exit(9)"
+    for name in ("eval.json", "report.json"):
+        assert subprocess.run([sys.executable, "-c", dies, str(tmp_path / name)], cwd=ROOT, check=False).returncode == 9
+    assert len(list(tmp_path.iterdir())) == 2
+    write_json(tmp_path / "eval.json", {})
+    left = sorted(path.name for path in tmp_path.iterdir())
+    assert len(left) == 2 and left[0].startswith(".partial-report.json-") and left[1] == "eval.json"
 
 
 def test_what_a_killed_process_left_of_a_folder_goes_when_that_is_made_again(tmp_path: Path) -> None:

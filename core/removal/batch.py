@@ -77,6 +77,12 @@ def _itself_and_its_folders(path: Path) -> list[Path]:
     return [whole, *whole.parents]
 
 
+def _in_place_of(folder: Path) -> Path | None:
+    """What bars a folder from being made: a file, or a link that leads nowhere, of its name or that of one it is in."""
+    first = next((path for path in (folder, *folder.parents) if os.path.lexists(path)), None)
+    return None if first is None or first.is_dir() else first
+
+
 def remove_all(inputs: Sequence[Path], folder: Path, remover: Remover, progress: Progress, *,
                flare_folder: Path | None = None, mattes: Mattes | None = None, overwrite: bool = False,
                wanted: Container[Path] | None = None, stills: bool = False,
@@ -91,6 +97,9 @@ def remove_all(inputs: Sequence[Path], folder: Path, remover: Remover, progress:
     Raises SettingsError before anything is written, FrameError at once where the folder may not be written to, and
     FrameError after everything was tried, with a list of the plates that failed.
     """
+    for place in (folder, flare_folder):
+        if place is not None and (other := _in_place_of(place)):
+            raise SettingsError(f"{other} is no folder, and results are to go into {place}; name another.")
     apart = [folder, flare_folder, mattes.given if mattes else None]
     plates = plates_of(inputs, apart)
     results = {name: [folder / name, *([flare_folder / name.with_suffix(".exr")] if flare_folder else [])]

@@ -954,6 +954,17 @@ def test_a_link_that_leads_nowhere_is_told_as_a_plate_that_is_missing(tmp_path: 
     assert (tmp_path / "out" / "a.3.png").exists()
 
 
+@pytest.mark.parametrize("place", ["file", "file/below"])
+def test_results_cannot_go_where_a_file_is(tmp_path: Path, everywhere: Path, place: str) -> None:
+    """Which is said once, before the network is asked about every plate."""
+    source = write_codes(tmp_path / "in" / "a.png", picture())
+    (tmp_path / "file").touch()
+    for folders in ({"folder": tmp_path / place}, {"folder": tmp_path / "out", "flare_folder": tmp_path / place}):
+        with pytest.raises(SettingsError, match=r"file is no folder, and results are to go into .*; name another"):
+            remove_all([source], remover=Remover(everywhere, working_size=64), progress=Progress(), **folders)
+    assert not (tmp_path / "out").exists()
+
+
 @pytest.mark.skipif(os.name == "nt", reason="links want rights on Windows")
 def test_a_link_that_leads_back_to_itself_does_not_stop_the_others(tmp_path: Path, everywhere: Path) -> None:
     write_codes(tmp_path / "in" / "a.1.png", picture())

@@ -71,10 +71,15 @@ def camera_to_world(matrix: Any) -> Floats:
 
 
 def core_camera(data: Any, matrix: Any, render: Any) -> Camera:
-    """The core's camera of a Blender camera (its evaluated data and matrix_world), in Blender's world."""
+    """The core's camera of a Blender camera (its evaluated data and matrix_world), in Blender's world. Raises
+    CaptureError as `intrinsics_of` does, and for one that is scaled to nothing or whose place is no number."""
     fx, fy, cx, cy = intrinsics_of(data, render)
     width, height = render_size(render)
-    return Camera(width, height, fx, fy, cx, cy, np.linalg.inv(camera_to_world(matrix)))
+    pose = camera_to_world(matrix)
+    if not np.isfinite(pose).all() or np.linalg.matrix_rank(pose[:3, :3]) < 3:
+        raise CaptureError(f"The camera {data.name!r} is scaled to nothing, or its place is not finite; mend its "
+                           "transform, and the drivers and parents that move it.")
+    return Camera(width, height, fx, fy, cx, cy, np.linalg.inv(pose))
 
 
 def to_capture(root: Any, depsgraph: Any) -> Floats:

@@ -53,6 +53,15 @@ def test_a_shot_with_cuts_is_one_whatever_part_of_it_is_asked_for(facts: Any) ->
     assert same, "so a farm's chunks are those of the whole"
 
 
+def test_a_light_or_a_camera_that_is_nowhere_is_told(facts: Any) -> None:
+    """As drivers leave them: not as a defect of ours, when the shot is written down."""
+    (light, of_light), *of_cameras = facts["nowhere"]
+    assert light == "CaptureError" and of_light.startswith("The place of the light 'Nowhere' is not finite at frame 1;")
+    assert len(of_cameras) == 2
+    for kind, said in of_cameras:
+        assert kind == "CaptureError" and said.startswith("The camera 'Second' is scaled to nothing, or its place is")
+
+
 def test_what_renders_do_not_show_hides_nothing(facts: Any) -> None:
     assert facts["behind a wall"] == 0
     assert facts["that renders do not show"] == pytest.approx(1)

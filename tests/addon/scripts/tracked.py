@@ -157,6 +157,18 @@ whole, part_of_it = (blend_shot.shot_of(scene, out / "lamp.flare", [], frames) f
 facts["cut"] = [list(whole.folders.values()), list(part_of_it.folders.values()),
                 whole.frames[1].described() == part_of_it.frames[0].described()]
 scene.timeline_markers.clear()
+nowhere = []
+lamp = bpy.data.objects.new("Nowhere", bpy.data.lights.new("Nowhere", "POINT"))
+scene.collection.objects.link(lamp)
+lamp.location.x = math.nan
+for filming, scale, place in ((camera, 1, 0), (second, 0, 0), (second, 1, math.nan)):
+    scene.camera, second.scale, second.location.x = filming, (scale,) * 3, place
+    try:
+        blend_shot.shot_of(scene, out / "lamp.flare", ["Nowhere"], [1])
+    except Exception as problem:
+        nowhere.append([type(problem).__name__, str(problem)])
+facts["nowhere"] = nowhere
+bpy.data.objects.remove(lamp)
 scene.camera = camera
 item = scene.fit_flare.lights.add()
 item.name, item.source, item.target = "lamp", "lamp", sun

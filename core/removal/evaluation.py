@@ -22,7 +22,7 @@ import numpy as np
 from ..errors import FrameError, SettingsError
 from ..metrics.evaluation import cell
 from ..metrics.pictures import Perceptual, flip, psnr, ssim
-from ..pictures import Pixels, pictures_in, read_picture
+from ..pictures import Pixels, are_one_shape, pictures_in, read_picture
 from ..progress import Progress
 from ..sheets import labelled, side_by_side
 from .backgrounds import Backgrounds, kept_for_test
@@ -97,8 +97,11 @@ def _reader(path: Path, truth: Path, mask: Path | None) -> Callable[[], tuple[Pi
         if frame.size != clean.size:
             raise FrameError(f"{path} is {frame.size[0]} x {frame.size[1]} pixels and {truth} {clean.size[0]} x "
                              f"{clean.size[1]}; make them one size.")
-        marked = read_picture(mask).resized(*frame.size).display() if mask else None
-        return frame.display(), clean.display(), marked
+        marked = read_picture(mask) if mask else None
+        if marked and not are_one_shape(marked.size, frame.size):
+            raise FrameError(f"{mask} is {marked.size[0]} x {marked.size[1]} pixels, another shape than {path} of "
+                             f"{frame.size[0]} x {frame.size[1]}; make it for that picture, or remove it.")
+        return frame.display(), clean.display(), marked.resized(*frame.size).display() if marked else None
 
     return read
 

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import torch
 
-from core.errors import Cancelled, EngineError, RunError, SettingsError
+from core.errors import Cancelled, EngineError, FrameError, RunError, SettingsError
 from core.holding import held
 from core.metrics.lpips import Lpips
 from core.pictures import Pixels, write_png
@@ -574,6 +574,17 @@ def test_masks_count_alone(tmp_path: Path) -> None:
 
     result = evaluation.evaluate(evaluation.paired(tmp_path), half)["mean"]["result"]
     assert result["masked_psnr"] > 45 > result["psnr"]
+
+
+def test_a_mask_of_another_shape_is_refused(tmp_path: Path) -> None:
+    """Stretched over its picture it would count other pixels than it marks; a smaller one is only coarser."""
+    for name, shape in (("input", (24, 30, 3)), ("gt", (24, 30, 3)), ("mask", (12, 15, 3))):
+        write_png(tmp_path / name / "0.png", np.ones(shape))
+    marked = evaluation.paired(tmp_path)[0].read()[2]
+    assert marked is not None and marked.shape == (24, 30, 3)
+    write_png(tmp_path / "mask" / "0.png", np.ones((30, 24, 3)))
+    with pytest.raises(FrameError, match=r"0\.png is 24 x 30 pixels, another shape than .* of 30 x 24; make it for"):
+        evaluation.paired(tmp_path)[0].read()
 
 
 def test_what_was_taken_away_is_no_input_where_there_is_one(tmp_path: Path) -> None:

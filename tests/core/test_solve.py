@@ -359,6 +359,20 @@ def test_a_video(tmp_path: Path) -> None:
     assert names == [f"{i:06d}.png" for i in range(1, 30, 3)]
 
 
+def test_a_video_that_is_cut_off_is_told(tmp_path: Path) -> None:
+    """An AVI has its frames before its index: what there is of it can be read."""
+    video, heard = tmp_path / "shot.avi", Heard()
+    writer = cv2.VideoWriter(str(video), cv2.VideoWriter.fourcc(*"MJPG"), 25, SIZE)
+    for camera in orbit(12, size=SIZE, arc=0.3):
+        writer.write(render(camera))
+    writer.release()
+    gather(video, tmp_path / "whole", 4, 400, heard)
+    assert not heard.texts
+    video.write_bytes(video.read_bytes()[:video.stat().st_size // 2])
+    gather(video, tmp_path / "cut", 4, 400, heard)
+    assert len(heard.texts) == 1 and "shot.avi tells of 12 frames, and " in heard.texts[0], heard.texts
+
+
 def test_the_small_frames_of_a_squeezed_video_are_not(tmp_path: Path) -> None:
     frames = [render(camera) for camera in orbit(4, size=SIZE, arc=0.3)]
     video = with_pixels(write_video(tmp_path / "shot.mp4", frames), 4, 3)

@@ -170,6 +170,9 @@ def _from_video(source: Path, work: Path, number: int, size: int,
             progress.advance()
     if not scores:
         raise CaptureError(f"{source} holds no frame that can be decoded; convert it to MP4 (H.264).")
+    if len(scores) < video.length:
+        progress.say(f"{source} tells of {video.length} frames, and {len(scores)} could be read; if it is cut off, "
+                     "copy it again.")
     chosen = choose(scores, number)
     progress.stage("read frames", len(chosen))
     stills, combed = list[Still](), list[bool]()

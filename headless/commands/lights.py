@@ -78,6 +78,9 @@ def _find(capture: Capture, detector: Detector, progress: Progress, settings: Ga
     if not os.access(capture.folder, os.W_OK):
         raise CaptureError(f"{capture.folder} cannot be written to, where {LIGHTS} belongs; copy the capture to where "
                            "it can, or have the rights to it.")
+    sheets = capture.folder / SHEETS
+    if sheets.exists() and not sheets.is_dir():
+        raise CaptureError(f"{sheets} is a file, where the pictures of what is found belong; move it away.")
     findings = find_lights(capture, detector, progress, settings, gaussians=gaussians)
     report = record(capture, findings, keep=keep)
     for sentence in findings.says:

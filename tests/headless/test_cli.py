@@ -70,6 +70,14 @@ def test_a_capture_that_may_not_be_written_to_is_told_before_lights_are_looked_f
         lights.with_lights(Capture(tmp_path, (), PointCloud.empty()), Progress())
 
 
+def test_a_file_in_the_place_of_the_pictures_of_lights_is_told_before_they_are_looked_for(
+        tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "lights").touch()
+    monkeypatch.setattr("fit_flare.core.lights.find_lights", lambda *_: pytest.fail("it looked"))
+    with pytest.raises(CaptureError, match=r"lights is a file, where the pictures of what is found belong"):
+        lights.with_lights(Capture(tmp_path, (), PointCloud.empty()), Progress())
+
+
 def test_lights_and_clean_frames_that_are_made_leave_the_room_for_pictures_as_it_was(
         tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A fit keeps few pictures decoded here, since it has its own."""

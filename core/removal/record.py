@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Literal
 
 from ..errors import FrameError
-from ..files import content_of, locked, read_json, remove_file, remove_partial_of, write_json
+from ..files import content_of, locked, read_json, remove_file, write_json
 from ..progress import Progress
 
 RECORD = "remove.json"
@@ -74,8 +74,6 @@ class Record:
                     remove_file(path)
             if told != known:
                 self._write(told)
-        for path in results:
-            remove_partial_of(path)
 
     def end(self, results: Sequence[Path]) -> None:
         """After the files of a plate are written."""

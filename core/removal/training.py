@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..errors import Cancelled, RunError, SettingsError
-from ..files import remove_partial_of, write_text
+from ..files import write_text
 from ..holding import held
 from ..processes import cores
 from ..progress import Progress
@@ -87,8 +87,6 @@ def train(recipe: Recipe, folder: Path | str, backgrounds: Backgrounds, lenses: 
     if processes < 1:
         raise SettingsError(f"A training has at least one process, not {processes}.")
     with held(folder):
-        for name in (CHECKPOINT, WEIGHTS, LOG):
-            remove_partial_of(folder / name)
         path = folder / CHECKPOINT
         if path.exists() and not resume:
             raise RunError(f"{folder} holds a training already; go on with --resume, or choose another folder.")

@@ -89,20 +89,24 @@ def solve(source: Path | str, out: Path | str, settings: SolveSettings | None = 
         raise CaptureError(f"{source} is missing.")
     if out.exists() and not out.is_dir():
         raise CaptureError(f"{out} is a file; give a folder for the capture.")
+    settings, progress = settings or SolveSettings(), progress or Progress()
+    request = {"source": _fingerprint(source), "settings": asdict(settings)}
+    finished = _report_in(out)
+    if finished is not None and finished.get("request") == request:  # where nothing may be written, too
+        progress.say(f"{out} is solved already.")
+        shutil.rmtree(out / WORK, ignore_errors=True)
+        return finished
     with held(out):  # two in one database would be the end of both
-        return _solve(source, out, settings or SolveSettings(), progress or Progress())
+        return _solve(source, out, request, settings, progress)
 
 
-def _solve(source: Path, out: Path, settings: SolveSettings, progress: Progress) -> dict[str, Any]:
+def _solve(source: Path, out: Path, request: dict[str, Any], settings: SolveSettings,
+           progress: Progress) -> dict[str, Any]:
     from . import develop, mapping, report, stills, world
 
     began = time.monotonic()
-    request = {"source": _fingerprint(source), "settings": asdict(settings)}
-    finished = _claim(source, out, request, progress)
+    _claim(source, out, request, progress)
     work = out / WORK
-    if finished is not None:
-        shutil.rmtree(work, ignore_errors=True)
-        return finished
     chosen, left_out = stills.gather(source, work, settings.frames, settings.size, progress)
     solved = mapping.solve(chosen, work, settings, is_video(source), progress)
     world.align(solved.model)
@@ -126,22 +130,23 @@ def _fingerprint(source: Path) -> list[Any]:
     return [str(source.resolve()), *([name, stat.st_size, stat.st_mtime_ns] for name, stat in stats)]
 
 
-def _claim(source: Path, out: Path, request: dict[str, Any], progress: Progress) -> dict[str, Any] | None:
-    """Make `out` ours, or return the report of a finished solve of the same.
+def _report_in(out: Path) -> dict[str, Any] | None:
+    """Of a finished solve; None where there is none."""
+    if not (out / REPORT).is_file():
+        return None
+    report = read_json(out / REPORT, CaptureError)
+    if not isinstance(report, dict):
+        raise CaptureError(f"{out / REPORT} is not the report of a solve; choose another folder for the capture.")
+    return dict(report)
 
-    Refused where `out` holds a capture that did not come from here, or the frames to be read.
-    """
+
+def _claim(source: Path, out: Path, request: dict[str, Any], progress: Progress) -> None:
+    """Make `out` ours. Refused where it holds a capture that did not come from here, or the frames to be read."""
     if source.resolve() in (out.resolve(), (out / "images").resolve()):
         raise CaptureError(f"The frames in {source} would be overwritten by their undistorted selves; give another "
                            "folder for the capture.")
     theirs = [name for name in ("images", "sparse", "transforms.json") if (out / name).exists()]
     if (out / REPORT).is_file():
-        report = read_json(out / REPORT, CaptureError)
-        if not isinstance(report, dict):
-            raise CaptureError(f"{out / REPORT} is not the report of a solve; choose another folder for the capture.")
-        if report.get("request") == request:
-            progress.say(f"{out} is solved already.")
-            return dict(report)
         belongs = [name for name in (LIGHTS, REMOVED, "split.json", "truth") if (out / name).exists()]
         if belongs:
             raise CaptureError(f"{out} holds {' and '.join(belongs)} of an earlier solve, which fit no other; choose "
@@ -154,7 +159,6 @@ def _claim(source: Path, out: Path, request: dict[str, Any], progress: Progress)
     else:
         shutil.rmtree(out / WORK, ignore_errors=True)
         write_json(out / WORK / ASKED, request)
-    return None
 
 
 def _goes_on(work: Path, request: dict[str, Any], progress: Progress) -> bool:

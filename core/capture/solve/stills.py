@@ -91,8 +91,8 @@ def gather(source: Path, work: Path, number: int, size: int, progress: Progress)
         raise CaptureError(f"{source} is neither a folder of frames nor a video.")
     if len(stills) < 3:
         why = f"; {left_out[0]}" if left_out else ""
-        raise CaptureError(f"{source} gives {len(stills)} usable frames, and a solve needs at least 3 that see the "
-                           f"scene from different places{why}".rstrip(".") + ".")
+        raise CaptureError(f"{source} gives {len(stills)} frames of use, and a solve needs at least 3 that see "
+                           f"the scene from different places{why}".rstrip(".") + ".")
     write_json(work / RECORD, {"stills": [asdict(still) for still in stills], "left_out": left_out})
     return stills, left_out
 

@@ -522,8 +522,10 @@ def main() -> None:
         "peer": lambda: peer_section(arguments.opensplat, rounds),
         "gpu": lambda: gpu_section(rounds),
     }
+    lacking = {"peer"} if arguments.opensplat is None else set()
+    lacking |= {"gpu"} if arguments.device == "cpu" else set()
     for section in arguments.only:
-        if (section == "peer" and arguments.opensplat is None) or (section == "gpu" and arguments.device == "cpu"):
+        if section in lacking:
             continue
         conditions = report.conditions()
         text = f"## {SECTIONS[section]}\n\n{write[section]()}\n\n{conditions}"

@@ -69,7 +69,7 @@ def named_by(target: Path) -> Path:
     hand. Raises OSError for a link that leads back to itself."""
     if not target.is_symlink():
         return target
-    named = Path(os.path.realpath(target))
+    named = resolved(target)
     if named.is_symlink():
         raise OSError(errno.ELOOP, os.strerror(errno.ELOOP), str(target))
     return named
@@ -147,14 +147,23 @@ def _is_being_written(partial: Path) -> bool:
     return int(told["process"]) == os.getpid() or runs(int(told["process"]))
 
 
+def _remove_abandoned(partial: Path) -> None:
+    """A file or a folder, unless it is being written, where the system lets it."""
+    if _is_being_written(partial):
+        return
+    if partial.is_dir():
+        shutil.rmtree(partial, ignore_errors=True)
+    else:
+        with contextlib.suppress(OSError):
+            remove_file(partial)
+
+
 def remove_partial_of(target: Path | str) -> None:
     """Remove what a killed process left of `target`, a file or a folder, half written, where the system lets it. What
     another one is writing stays: on a farm a task may be given again while its first worker still lives."""
     target = Path(target)
     for path in target.parent.glob(f"{glob.escape(_partial_of(target))}*"):
-        if not _is_being_written(path):
-            with contextlib.suppress(OSError):
-                shutil.rmtree(path) if path.is_dir() else remove_file(path)
+        _remove_abandoned(path)
 
 
 @contextlib.contextmanager
@@ -218,11 +227,7 @@ def atomic_folder(target: Path | str) -> Iterator[Path]:
 def remove_partial(folder: Path | str) -> None:
     """Remove what a killed process left half written below `folder`; only for whom the folder belongs to alone."""
     for path in Path(folder).rglob(f"{_PARTIAL}*"):
-        if path.is_dir():
-            shutil.rmtree(path, ignore_errors=True)
-        elif not _is_being_written(path):
-            with contextlib.suppress(OSError):
-                remove_file(path)
+        _remove_abandoned(path)
 
 
 def _umask() -> int:
@@ -308,10 +313,15 @@ def check_apart(sources: Iterable[Path], results: Iterable[Path]) -> None:
         written.add(whole)
 
 
+def resolved(path: Path) -> Path:
+    """`Path.resolve`, which before Python 3.13 raises for a link that leads back to itself; that stays as it is."""
+    return Path(os.path.realpath(path))
+
+
 def _file_of(path: Path) -> object:
     """The same of every name that a file has: of one that is there its place on the disk, which file systems that do
     not tell Plates from plates know by both names."""
-    whole = Path(os.path.realpath(path))  # `resolve` raises for a link that leads back to itself
+    whole = resolved(path)
     try:
         folder, file = whole.parent.stat(), whole.stat()
     except OSError:

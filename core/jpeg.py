@@ -2,8 +2,9 @@
 """The segments of a JPEG (ITU-T T.81, annex B) before its pixels: its size, and how it is to be shown."""
 from __future__ import annotations
 
+import struct
 from collections.abc import Iterator
-from typing import BinaryIO
+from typing import BinaryIO, NamedTuple
 
 FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 """Markers of frame headers (SOF): precision, height, width, number of components."""
@@ -25,11 +26,21 @@ def segments(stream: BinaryIO) -> Iterator[tuple[int, bytes]]:
         yield byte[0], content
 
 
-def frame_header(stream: BinaryIO) -> tuple[int, int, int, int] | None:
-    """(width, height, components, bits of each); None where it is missing."""
+class Header(NamedTuple):
+    """Of a picture: pixels, how many components each has, of how many bits."""
+
+    width: int
+    height: int
+    components: int
+    bits: int
+
+
+def frame_header(stream: BinaryIO) -> Header | None:
+    """None where it is missing."""
     for marker, content in segments(stream):
         if marker in FRAMES and len(content) >= 6:
-            return int.from_bytes(content[3:5], "big"), int.from_bytes(content[1:3], "big"), content[5], content[0]
+            bits, height, width, components = struct.unpack(">BHHB", content[:6])
+            return Header(width, height, components, bits)
     return None
 
 

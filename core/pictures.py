@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import errno
 import os
-from collections.abc import Container, Mapping, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
@@ -109,6 +109,12 @@ def are_one_shape(size: tuple[int, int], other: tuple[int, int]) -> bool:
             and abs(large[1] - small[1] * scale) <= max(scale, 1.0) + 1e-9)
 
 
+def no_rgb(path: Path, channels: Iterable[str]) -> FrameError:
+    """Of an EXR that has other channels alone."""
+    return FrameError(f"{path} has no R, G, B channels at its root (it has {', '.join(sorted(channels))}); export the "
+                      "picture under those names.")
+
+
 def no_picture(path: Path) -> FrameError:
     """Of a file of another kind, by its name."""
     if is_video(path):
@@ -203,9 +209,9 @@ def _misread(path: Path) -> str:
         stream.seek(0)
         if begins[:2] == b"\xff\xd8":  # whatever it is named
             header = jpeg.frame_header(stream)
-            if header is not None and header[3] > 8:
-                return f"holds {header[3]} bits a colour; save it with 8, or as PNG or TIFF with 16"
-            return _CMYK if header is not None and header[2] == 4 else ""
+            if header is not None and header.bits > 8:
+                return f"holds {header.bits} bits a colour; save it with 8, or as PNG or TIFF with 16"
+            return _CMYK if header is not None and header.components == 4 else ""
         if begins not in (b"II*\0", b"MM\0*"):
             return ""
         wanted = (tiff.BITS, tiff.PHOTOMETRIC, tiff.SAMPLES, tiff.PLANES, tiff.SAMPLE_FORMAT)
@@ -375,7 +381,7 @@ def _size_from_header(stream: BinaryIO) -> tuple[int, int] | None:
         return int.from_bytes(head[16:20], "big"), int.from_bytes(head[20:24], "big")
     if head[:2] == b"\xff\xd8":
         header = jpeg.frame_header(stream)
-        return header[:2] if header else None
+        return (header.width, header.height) if header else None
     if head[:4] in (b"II*\0", b"MM\0*"):
         sides = tiff.whole_numbers(tiff.read_tags(stream, (tiff.WIDTH, tiff.HEIGHT)))
         return (sides[tiff.WIDTH], sides[tiff.HEIGHT]) if len(sides) == 2 else None
@@ -467,8 +473,7 @@ def exr_parts(path: Path) -> list[tuple[dict[str, Any], dict[str, NDArray[Any]]]
 def _rgb_from_channels(path: Path, channels: Mapping[str, NDArray[Any]]) -> Pixels:
     names = "RGB" if all(name in channels for name in "RGB") else "YYY" if "Y" in channels else ""
     if not names:
-        raise FrameError(f"{path} has no R, G, B channels at its root (it has {', '.join(sorted(channels))}); "
-                         "export the picture under those names.")
+        raise no_rgb(path, channels)
     return np.stack([_finite(path, name, channels[name]) for name in names], axis=-1)
 
 

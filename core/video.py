@@ -36,6 +36,11 @@ def is_video(path: Path) -> bool:
     return path.suffix.lower() in VIDEOS
 
 
+def told_short(path: Path, length: int, read: int) -> str:
+    """A sentence for the user about a video of which fewer frames could be read than it tells of."""
+    return f"{path} tells of {length} frames, and {read} could be read; if it is cut off, copy it again."
+
+
 def displayed(frame: NDArray[np.uint8]) -> NDArray[np.float32]:
     """Display values 0..1, R G B, of a video's frame."""
     return frame[..., ::-1].astype(np.float32) / np.float32(255)

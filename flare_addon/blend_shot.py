@@ -81,13 +81,13 @@ def _lights(scene: Any, names: Sequence[str]) -> list[Any]:
 
 
 def _placed(scene: Any, depsgraph: Any, thing: Any, eye: Any, radius: float) -> PlacedLight:
-    where = _place(depsgraph, thing, eye)
+    where = _position(depsgraph, thing, eye)
     item = SimpleNamespace(target=thing, radius=radius or _radius(thing))
     share = occlusion.visible_share(scene, depsgraph, eye, item)
     return PlacedLight(thing.name, thing.name, where, float(share))
 
 
-def _place(depsgraph: Any, thing: Any, eye: Any) -> cameras.Floats:
+def _position(depsgraph: Any, thing: Any, eye: Any) -> cameras.Floats:
     """(3,) in the world. Raises CaptureError where it is no number, as a driver may have it."""
     where = np.array(lights.stands(thing, matrix_of(thing, depsgraph), eye), np.float64)
     if not np.isfinite(where).all():
@@ -116,6 +116,6 @@ def capture_of(scene: Any, plates: Mapping[int, Path], folder: Path, names: Sequ
     if things:
         eye, depsgraph = scene.camera.matrix_world.translation, bpy.context.evaluated_depsgraph_get()
         write_json(folder / LIGHTS, {"lights": [
-            {"name": thing.name, "xyz": _place(depsgraph, thing, eye).tolist()} for thing in things]})
+            {"name": thing.name, "xyz": _position(depsgraph, thing, eye).tolist()} for thing in things]})
     capture_export.write_cameras(folder, entries)
     return len(entries)

@@ -12,7 +12,7 @@ from typing import Any
 
 from ..errors import DISK_FULL, FrameError, SettingsError, refusal, spelled_out
 from ..exif import read_exif
-from ..files import check_apart
+from ..files import check_apart, resolved
 from ..pictures import pictures_below, pictures_in, window_of
 from ..progress import Progress
 from .inference import Remover
@@ -73,7 +73,7 @@ def _no_plates(folder: Path, apart: Iterable[Path]) -> set[Path]:
 
 
 def _itself_and_its_folders(path: Path) -> list[Path]:
-    whole = Path(os.path.realpath(path))  # `resolve` raises for a link that leads back to itself
+    whole = resolved(path)
     return [whole, *whole.parents]
 
 

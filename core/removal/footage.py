@@ -9,7 +9,7 @@ from ..errors import FrameError, SettingsError, spelled_out
 from ..files import atomic_folder, content_of, read_json, write_json
 from ..pictures import write_png
 from ..progress import Progress
-from ..video import Video, displayed, is_video
+from ..video import Video, displayed, is_video, told_short
 
 RECORD = "video.json"
 """In the folder of a video's frames, of which video they are."""
@@ -62,5 +62,4 @@ def _take_out(video: Path, folder: Path, progress: Progress) -> None:
     if number == 0:
         raise FrameError(f"{video} has no frame that can be read; copy it again, or convert it to MP4 (H.264).")
     if number < clip.length:
-        progress.say(f"{video} tells of {clip.length} frames, and {number} could be read; if it is cut off, copy it "
-                     "again.")
+        progress.say(told_short(video, clip.length, number))

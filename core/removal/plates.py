@@ -29,6 +29,7 @@ from ..pictures import (
     Encoding,
     exr_parts,
     no_picture,
+    no_rgb,
     picture_size,
     save_exr,
     srgb_from_linear,
@@ -186,8 +187,7 @@ def _read_exr(path: Path) -> Plate:
         raise FrameError(f"{path} has {len(parts)} parts; export the plate as a file of its own.")
     names = ["R", "G", "B"] if all(name in channels for name in "RGB") else ["Y"] if "Y" in channels else []
     if not names:
-        raise FrameError(f"{path} has no R, G, B channels at its root (it has {', '.join(sorted(channels))}); "
-                         "export the picture under those names.")
+        raise no_rgb(path, channels)
     if any(channels[name].dtype not in (np.float16, np.float32) for name in names):
         raise FrameError(f"{path} has colour channels that are no floats; export it as half or float.")
     if len({channel.shape for channel in channels.values()}) > 1:

@@ -19,7 +19,7 @@ from ...exif import read_exif, upright
 from ...files import read_json, write_json
 from ...pictures import Picture, Pixels, picture_size, pictures_in, read_picture, window_of, write_png
 from ...progress import Progress
-from ...video import Video, displayed, is_video
+from ...video import Video, displayed, is_video, told_short
 
 RECORD = "stills.json"
 COMBED, SOME = 1.1, 0.25
@@ -171,8 +171,7 @@ def _from_video(source: Path, work: Path, number: int, size: int,
     if not scores:
         raise CaptureError(f"{source} holds no frame that can be decoded; convert it to MP4 (H.264).")
     if len(scores) < video.length:
-        progress.say(f"{source} tells of {video.length} frames, and {len(scores)} could be read; if it is cut off, "
-                     "copy it again.")
+        progress.say(told_short(source, video.length, len(scores)))
     chosen = choose(scores, number)
     progress.stage("read frames", len(chosen))
     stills, combed = list[Still](), list[bool]()

@@ -29,9 +29,9 @@ from .inference import Remover, Told
 from .plates import Plate, is_of_the_plate, read_plate
 from .views import Views, believed, doubt_of
 
-OFFSETS = (1, 2, 3, 4, 6, 8)
+OFFSETS = (1, 2, 3, 4, 6, 8, 12, 16)
 """Frames to either side that count: near ones, which a place is surely found in, and far ones, which have the flare
-elsewhere."""
+elsewhere where a camera moves slowly."""
 FAINT = 0.03
 """What a flare adds to display values where a frame counts half of what it counts where there is none."""
 SMOOTH, WITHIN = 2.5, 4.0
@@ -177,7 +177,7 @@ class Sequences:
         passed over, and so are those of another shot, before the network is asked, which takes far longer than reading
         them. Each is told of once. Raises FrameError where the plate itself cannot be read.
         """
-        self._forget_all_but({path, *self.beside(path)})
+        self._forget_all_but({path, *self.beside(path)}, self._beside.get(path, ((), ()))[0])
         for other in self.beside(path):
             self._guide_of(other)
         plate = read_plate(path)
@@ -224,10 +224,12 @@ class Sequences:
             self._flows[path, other] = motion.flow(here.grey, there.grey)
         return self._flows[path, other]
 
-    def _forget_all_but(self, paths: Container[Path]) -> None:
+    def _forget_all_but(self, paths: Container[Path], before: Container[Path]) -> None:
+        """Flows between two frames of those `before` have been looked at by both."""
         self._guides = {path: its for path, its in self._guides.items() if path in paths}
         self._sightings = {path: its for path, its in self._sightings.items() if path in paths}
-        self._flows = {ends: its for ends, its in self._flows.items() if ends[0] in paths and ends[1] in paths}
+        self._flows = {(one, other): its for (one, other), its in self._flows.items()
+                       if one in paths and other in paths and not (one in before and other in before)}
 
 
 def by_number(path: Path) -> list[tuple[int, str]]:

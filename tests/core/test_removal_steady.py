@@ -249,13 +249,13 @@ def test_of_frames_of_another_shot_nothing_is_asked(shot: Path) -> None:
     assert remover.asked == 2
 
 
-def test_what_counts_for_a_frame_is_eight_to_each_side_and_its_shot_alone(tmp_path: Path) -> None:
+def test_what_counts_for_a_frame_is_sixteen_to_each_side_and_its_shot_alone(tmp_path: Path) -> None:
     """The shot is followed from frame to frame: the first and the last of a pan have nothing in common."""
     wide = np.asarray(cv2.resize(np.random.default_rng(0).random((12, 60, 3)), (240, 48)), np.float32)
-    for number in range(20):
-        frame = wide[:, 4 * number:4 * number + 64] if number < 15 else scene(number)
+    for number in range(40):
+        frame = wide[:, 4 * number:4 * number + 64] if number < 25 else scene(number)
         cv2.imwrite(str(tmp_path / f"f{number}.png"), (frame * 255).astype(np.uint8))
-    paths = [tmp_path / f"f{number}.png" for number in range(20)]
+    paths = [tmp_path / f"f{number}.png" for number in range(40)]
     asked: list[Path] = []
 
     class Counting(Wavering):
@@ -268,7 +268,7 @@ def test_what_counts_for_a_frame_is_eight_to_each_side_and_its_shot_alone(tmp_pa
             return super().views(display)
 
     sequences = Sequences(Counting(), paths)
-    assert list(sequences.beside(paths[10])) == [*paths[2:10], *paths[11:19]]
-    own = sequences.read(paths[10])[1]
-    assert len(asked) == 1 + sum(10 - offset >= 0 for offset in OFFSETS) + sum(10 + offset < 15 for offset in OFFSETS)
+    assert list(sequences.beside(paths[20])) == [*paths[4:20], *paths[21:37]]
+    own = sequences.read(paths[20])[1]
+    assert len(asked) == 1 + len(OFFSETS) + sum(20 + offset < 25 for offset in OFFSETS)
     assert own.added.shape == own.display.shape

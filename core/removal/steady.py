@@ -3,11 +3,12 @@
 
 A flare moves as nothing in the scene does: what it covers in one frame lies bare in another. So every place is followed
 to where it is in the frames about it (`motion`), and the scene's colour there is taken to be the median of what their
-clean frames have, each weighted by how far the flow can be relied on and by how little had to be taken away: where
-hardly any flare is told, the scene was seen. A network that sees each frame by itself tells a little more now and a
-little less then; what it missed, or took too much, is put right by those that saw better, and the clean plates do not
-breathe. Only what is smooth is put right, since a frame's detail is its own, and by no more than was told about there:
-where there is no flare, a lamp that comes on changes nothing. What is not found again stays as it was told.
+clean frames have, at one exposure, each weighted by how far the flow can be relied on and by how little had to be taken
+away: where hardly any flare is told, the scene was seen. A network that sees each frame by itself tells a little more
+now and a little less then; what it missed, or took too much, is put right by those that saw better, and the clean
+plates do not breathe. Only what is smooth is put right, since a frame's detail is its own, and by no more than was told
+about there: where there is no flare, a lamp that comes on changes nothing. What is not found again stays as it was
+told.
 
 Frames count for each other as far as their details lie alike, which ends at a cut, and a folder of single photographs
 is no sequence. How far the network is believed (`views`) is one for the frames about a place in a shot, too: where its
@@ -25,7 +26,7 @@ from numpy.typing import NDArray
 
 from ..pictures import Pixels
 from . import motion
-from .inference import Remover, Told
+from .inference import CLIPPED, Remover, Told
 from .plates import Plate, is_of_the_plate, read_plate
 from .views import Views, believed, doubt_of
 
@@ -41,6 +42,9 @@ DETAIL = 0.7
 """Pixels of the flow: that finer than which the scene is not compared."""
 WITNESSES = 2.0
 """Frames that a place has to be found again in for all of what they say to be put right; with fewer, less."""
+BLACK, BARE = 0.05, 0.02
+"""Display value from which on frames' exposures are compared, and the part of a frame that has to be without flare for
+that."""
 BLUR, COARSE, STEP = 0.01, 0.08, 4
 """Of the long side, deviations of the blurs between which what counts as detail lies; pixels from one that is looked at
 to the next."""
@@ -103,10 +107,11 @@ def steadied(here: Sighting, about: Sequence[Neighbour]) -> Told:
     for other in about:
         its, its_told = _seen(other.sighting, doubt)
         laid = motion.brought(np.dstack([its, its_told]), other.there)
+        its, its_told = laid[..., :3], laid[..., 3]
         sure = other.share * motion.followed(other.there, other.back)
-        seen.append(laid[..., :3])
-        weights.append(sure * _worth(laid[..., 3]))
-        most, found = np.maximum(most, sure * laid[..., 3]), found + sure
+        weights.append(sure * _worth(its_told))
+        seen.append(its * _exposed(clean, its, sure * (np.maximum(told, its_told) < FAINT)))
+        most, found = np.maximum(most, sure * its_told), found + sure
     sure = np.minimum(found / np.float32(WITNESSES), 1)
     amiss = (_weighted_median(np.stack(seen), np.stack(weights)) - clean) * sure[..., None]
     amiss = _blurred(amiss, SMOOTH) / (_blurred(sure, SMOOTH) + np.float32(0.1))[..., None]
@@ -119,6 +124,18 @@ def _seen(frame: Sighting, doubt: np.float32) -> tuple[Pixels, Pixels]:
     to a channel (h, w)."""
     added = motion.coarser(believed(frame.views, doubt))
     return _blurred(motion.coarser(frame.guide.display) - added, DETAIL), np.asarray(added.max(-1))
+
+
+def _exposed(clean: Pixels, its: Pixels, sure: Pixels) -> np.float32:
+    """How many times as bright a frame is as another's `its`, laid over it: the median over what both show, neither
+    black nor clipped, and so surely; else a camera that changes its exposure, or a fade, would pass for a flare."""
+    here, there = clean.mean(-1), its.mean(-1)
+    both = np.minimum(here, there) > BLACK
+    both &= np.maximum(clean.max(-1), its.max(-1)) < CLIPPED
+    sure = sure[both]
+    if sure.sum() < BARE * here.size:
+        return np.float32(1)
+    return np.float32(_weighted_median((here[both] / there[both])[:, None, None, None], sure[:, None, None]).item())
 
 
 def _worth(told: Pixels) -> Pixels:

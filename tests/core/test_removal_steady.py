@@ -91,6 +91,17 @@ def test_what_is_missed_or_taken_too_much_is_put_right_by_frames_that_have_the_f
     assert after < 0.4 * before
 
 
+def test_a_camera_that_changes_its_exposure_makes_no_flare() -> None:
+    """Of a flare that is told right, under exposures that go to and fro."""
+    frames, flares = pan(1)
+    levels = 0.7 + 0.3 * np.cos(np.arange(13, dtype=np.float32))
+    frames = [told(frame.guide.display * level, flare * level)
+              for frame, flare, level in zip(frames, flares, levels, strict=True)]
+    made = [in_line(frames[at], [frame for frame in frames if frame is not frames[at]]) for at in range(3, 10)]
+    for here, flare, level in zip(made, flares[3:10], levels[3:10], strict=True):
+        np.testing.assert_allclose(here, flare * level, atol=0.03)
+
+
 def test_a_ghost_that_is_told_in_one_frame_is_not_drawn_into_those_that_have_it_elsewhere() -> None:
     frames, flares = pan(1)
     made = in_line(frames[6], [frame for frame in frames if frame is not frames[6]])

@@ -54,7 +54,7 @@ from core.progress import Progress
 from core.removal.batch import remove_all
 from core.removal.inference import WORKING_SIZE, Remover
 from core.removal.plates import read_plate
-from core.removal.steady import Sequences
+from core.removal.sequences import Sequences
 
 DESK = ROOT / "sample_scenes" / "desk"
 SHOWN = 3

@@ -19,7 +19,7 @@ from .inference import Remover
 from .mattes import Mattes
 from .plates import is_of_the_plate, write_results
 from .record import RECORD, Kept, Record, made_from
-from .steady import Sequences, shot_order
+from .sequences import Sequences, shot_order
 
 
 def plates_of(inputs: Iterable[Path], apart_from: Iterable[Path | None] = ()) -> list[tuple[Path, Path]]:

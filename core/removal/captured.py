@@ -12,7 +12,7 @@ from ..progress import Progress
 from .inference import Remover
 from .plates import write_plate
 from .record import Record, made_from
-from .steady import Sequences, shot_order
+from .sequences import Sequences, shot_order
 
 UNFINISHED = "removed.unfinished"
 """Where they are until they are all there: half a removed/ would be taken for a whole one."""

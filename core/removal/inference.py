@@ -90,7 +90,7 @@ class Remover:
 
         matte: (height, width), 0..1, where someone has marked a flare: that share of it is taken there, and since it
         is known that there is one, so little of it counts too as would be doubted otherwise. told: of the plate, where
-        that is known already (`steady.Sequences`).
+        that is known already (`sequences.Sequences`).
         """
         told = told or self.told(self.shown(plate))
         found = _carrier(told.display, self.flare(told, marked=matte is not None))

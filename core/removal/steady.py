@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Sequences: what is told of a frame is brought into line with the frames about it, which show the same scene.
+"""What is told of a frame of a shot, put right by the frames about it, which show the same scene.
 
 A flare moves as nothing in the scene does: what it covers in one frame lies bare in another. So every place is followed
 to where it is in the frames about it (`motion`), and the scene's colour there is taken to be the median of what their
@@ -10,15 +10,13 @@ plates do not breathe. Only what is smooth is put right, since a frame's detail 
 about there: where there is no flare, a lamp that comes on changes nothing. What is not found again stays as it was
 told.
 
-Frames count for each other as far as their details lie alike, which ends at a cut, and a folder of single photographs
-is no sequence. How far the network is believed (`views`) is one for the frames about a place in a shot, too: where its
-views agree on most of them, a flare does not go out on the others.
+How far the network is believed (`views`) is one for the frames about a place in a shot, too: where its views agree on
+most of them, a flare does not go out on the others. Which frames are of one shot, their details say (`of_one_shot`);
+`sequences` finds them among files.
 """
 from __future__ import annotations
 
-import re
-from collections.abc import Container, Iterable, Iterator, Sequence
-from pathlib import Path
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -26,22 +24,19 @@ from numpy.typing import NDArray
 
 from ..pictures import Pixels
 from . import motion
-from .inference import CLIPPED, Remover, Told
-from .plates import Plate, is_of_the_plate, read_plate
+from .inference import CLIPPED, Told
 from .views import Views, believed, doubt_of
 
-OFFSETS = (1, 2, 3, 4, 6, 8, 12, 16)
-"""Frames to either side that count: near ones, which a place is surely found in, and far ones, which have the flare
-elsewhere where a camera moves slowly."""
 FAINT = 0.03
 """What a flare adds to display values where a frame counts half of what it counts where there is none."""
 SMOOTH, WITHIN = 2.5, 4.0
-"""Pixels of the flow: standard deviations of what is put right, and of the blur of what was told about there, by which
+"""Pixels of the flow: standard deviations of the blurs of what is put right, and of what was told about there, by which
 it is bounded."""
 DETAIL = 0.7
 """Pixels of the flow: that finer than which the scene is not compared."""
-WITNESSES = 2.0
-"""Frames that a place has to be found again in for all of what they say to be put right; with fewer, less."""
+WITNESSES, HARDLY_FOUND = 2.0, 0.1
+"""Frames that a place has to be found again in for all of what they say to be put right; with fewer, less. Part of
+those below which what is put right fades, where none of the places about it is found."""
 BLACK, BARE = 0.05, 0.02
 """Display value from which on frames' exposures are compared, and the part of a frame that has to be without flare for
 that."""
@@ -96,56 +91,76 @@ def of_one_shot(one: Guide, other: Guide) -> np.float32:
 
 
 def steadied(here: Sighting, about: Sequence[Neighbour]) -> Told:
-    """What was told of `here`, in line with the frames about it."""
+    """What was told of `here`, put right by the frames about it."""
     display = here.guide.display
     doubt = doubt_of([(here.views, 1), *((other.sighting.views, float(other.share)) for other in about)])
     added = np.minimum(believed(here.views, doubt), display)
     if not about:
         return Told(display, added)
-    clean, told = _seen(here, doubt)
-    seen, weights, most, found = [clean], [_worth(told)], told, np.zeros_like(told)
-    for other in about:
-        its, its_told = _seen(other.sighting, doubt)
-        laid = motion.brought(np.dstack([its, its_told]), other.there)
-        its, its_told = laid[..., :3], laid[..., 3]
-        sure = other.share * motion.followed(other.there, other.back)
-        weights.append(sure * _worth(its_told))
-        seen.append(its * _exposed(clean, its, sure * (np.maximum(told, its_told) < FAINT)))
-        most, found = np.maximum(most, sure * its_told), found + sure
-    sure = np.minimum(found / np.float32(WITNESSES), 1)
-    amiss = (_weighted_median(np.stack(seen), np.stack(weights)) - clean) * sure[..., None]
-    amiss = _blurred(amiss, SMOOTH) / (_blurred(sure, SMOOTH) + np.float32(0.1))[..., None]
-    bound = _blurred(most, WITHIN)[..., None]
-    return Told(display, np.clip(added - _finer(np.clip(amiss, -bound, bound), display), 0, display))
+    own = _seen(here, doubt)
+    missed = _missed(own, [_found_again(own, other, doubt) for other in about])
+    return Told(display, np.clip(added + _finer(missed, display), 0, display))
 
 
-def _seen(frame: Sighting, doubt: np.float32) -> tuple[Pixels, Pixels]:
-    """Of a frame at the flow's size, without its detail: what is left of it (h, w, 3), and the most that a flare adds
-    to a channel (h, w)."""
+class _Seen(NamedTuple):
+    """Of a frame, at the flow's size: what is left of it without its flare and its detail (h, w, 3), the most that the
+    flare adds to a channel (h, w), and how far a place of it can be relied on to be the one that is looked at (h, w).
+    """
+
+    scene: Pixels
+    told: Pixels
+    sure: Pixels
+
+    @property
+    def weights(self) -> Pixels:
+        """The less flare, the more of the scene was seen."""
+        return self.sure / (1 + np.square(self.told / np.float32(FAINT)))
+
+
+def _seen(frame: Sighting, doubt: np.float32) -> _Seen:
     added = motion.coarser(believed(frame.views, doubt))
-    return _blurred(motion.coarser(frame.guide.display) - added, DETAIL), np.asarray(added.max(-1))
+    scene = _blurred(motion.coarser(frame.guide.display) - added, DETAIL)
+    told: Pixels = added.max(-1)
+    return _Seen(scene, told, np.ones_like(told))
 
 
-def _exposed(clean: Pixels, its: Pixels, sure: Pixels) -> np.float32:
-    """How many times as bright a frame is as another's `its`, laid over it: the median over what both show, neither
-    black nor clipped, and so surely; else a camera that changes its exposure, or a fade, would pass for a flare."""
-    here, there = clean.mean(-1), its.mean(-1)
+def _found_again(own: _Seen, other: Neighbour, doubt: np.float32) -> _Seen:
+    """Of a frame what it shows of the places of `own`, laid where those are, as bright as it is there."""
+    scene, told, _ = _seen(other.sighting, doubt)
+    laid = motion.brought(np.dstack([scene, told]), other.there)
+    found = _Seen(laid[..., :3], laid[..., 3], other.share * motion.followed(other.there, other.back))
+    return found._replace(scene=found.scene * _exposure(own, found))
+
+
+def _exposure(own: _Seen, found: _Seen) -> np.float32:
+    """How many times as bright the one is as the other: the median over what both show without a flare, neither black
+    nor clipped. Else a camera that changes its exposure, or a fade, would pass for a flare."""
+    here, there = own.scene.mean(-1), found.scene.mean(-1)
     both = np.minimum(here, there) > BLACK
-    both &= np.maximum(clean.max(-1), its.max(-1)) < CLIPPED
-    sure = sure[both]
-    if sure.sum() < BARE * here.size:
+    both &= np.maximum(own.scene.max(-1), found.scene.max(-1)) < CLIPPED
+    both &= np.maximum(own.told, found.told) < FAINT
+    sure = found.sure[both]
+    if sure.sum() < BARE * both.size:
         return np.float32(1)
-    return np.float32(_weighted_median((here[both] / there[both])[:, None, None, None], sure[:, None, None]).item())
+    return np.float32(_weighted_median(here[both] / there[both], sure))
 
 
-def _worth(told: Pixels) -> Pixels:
-    return 1 / (1 + np.square(told / np.float32(FAINT)))
+def _missed(own: _Seen, found: Sequence[_Seen]) -> Pixels:
+    """What there is more of a flare than was told of `own` (h, w, 3), by what was found of its places elsewhere; below
+    0 where too much was told."""
+    seen = [own, *found]
+    scene = _weighted_median(np.stack([one.scene for one in seen]), np.stack([one.weights for one in seen])[..., None])
+    sure = np.minimum(np.sum([one.sure for one in found], 0) / np.float32(WITNESSES), 1)
+    smooth = _blurred((own.scene - scene) * sure[..., None], SMOOTH)
+    smooth /= (_blurred(sure, SMOOTH) + np.float32(HARDLY_FOUND))[..., None]
+    bound = _blurred(np.max([own.told, *(one.sure * one.told for one in found)], 0), WITHIN)[..., None]
+    return np.clip(smooth, -bound, bound)
 
 
 def _weighted_median(values: Pixels, weights: Pixels) -> Pixels:
-    """(h, w, c), over the first of values (n, h, w, c), weighted by (n, h, w)."""
+    """Over the first axis; of a shape that the weights' broadcasts to."""
     order = np.argsort(values, 0)
-    sums = np.cumsum(np.take_along_axis(np.broadcast_to(weights[..., None], values.shape), order, 0), 0)
+    sums = np.cumsum(np.take_along_axis(np.broadcast_to(weights, values.shape), order, 0), 0)
     middle = (sums >= sums[-1:] / 2).argmax(0)[None]
     return np.take_along_axis(values, np.take_along_axis(order, middle, 0), 0)[0]
 
@@ -162,98 +177,3 @@ def _finer(values: Pixels, display: Pixels) -> Pixels:
 
     height, width = display.shape[:2]
     return np.asarray(cv2.resize(values, (width, height), interpolation=cv2.INTER_LINEAR), np.float32)
-
-
-class Sequences:
-    """Plates of which each is seen beside its neighbours: those of its folder, in the order of the numbers in their
-    names. What is told of a plate does not depend on which of the others are cleaned, or in what order."""
-
-    def __init__(self, remover: Remover, paths: Iterable[Path]) -> None:
-        self._remover = remover
-        self._beside: dict[Path, tuple[Sequence[Path], Sequence[Path]]] = {}
-        folders: dict[Path, list[Path]] = {}
-        for path in paths:
-            folders.setdefault(path.parent, []).append(path)
-        for those in folders.values():
-            those.sort(key=by_number)
-            for at, path in enumerate(those):
-                self._beside[path] = those[max(at - OFFSETS[-1], 0):at][::-1], those[at + 1:at + 1 + OFFSETS[-1]]
-        self._guides: dict[Path, Guide | None] = {}
-        self._sightings: dict[Path, Sighting] = {}
-        self._flows: dict[tuple[Path, Path], Pixels] = {}
-
-    def beside(self, path: Path) -> Sequence[Path]:
-        """The frames that what is told of a plate depends on, in their order."""
-        before, after = self._beside.get(path, ((), ()))
-        return [*before[::-1], *after]
-
-    def read(self, path: Path) -> tuple[Plate, Told]:
-        """The plate, and what is told of it.
-
-        Its neighbours are read before it, so that one plate is in memory at a time. Those that cannot be read are
-        passed over, and so are those of another shot, before the network is asked, which takes far longer than reading
-        them. Each is told of once. Raises FrameError where the plate itself cannot be read.
-        """
-        self._forget_all_but({path, *self.beside(path)}, self._beside.get(path, ((), ()))[0])
-        for other in self.beside(path):
-            self._guide_of(other)
-        plate = read_plate(path)
-        own = self._guides[path] = self._guides.get(path) or self._guide(plate)
-        here = self._sighting(path, own)
-        return plate, steadied(here, [
-            Neighbour(self._sighting(other, its), share, self._flow(path, other), self._flow(other, path))
-            for side in self._beside.get(path, ()) for other, its, share in self._of_its_shot(own, side)])
-
-    def _of_its_shot(self, own: Guide, side: Sequence[Path]) -> Iterator[tuple[Path, Guide, np.float32]]:
-        """(frame, its guide, how far it counts) of those at OFFSETS from a frame, to one side of it. A camera that
-        moves soon sees other things; so the shot is followed from each of its frames to the next, past a flash or
-        what else differs from it."""
-        share, last = np.float32(1), own
-        for offset, path in enumerate(side, 1):
-            its = self._guides[path]
-            if its is not None and (alike := of_one_shot(last, its)) > 0:
-                share, last = min(share, alike), its
-                if offset in OFFSETS:
-                    yield path, its, share
-
-    def _guide(self, plate: Plate) -> Guide:
-        return guide(self._remover.shown(plate))
-
-    def _guide_of(self, path: Path) -> Guide | None:
-        """None where the plate cannot be read."""
-        if path not in self._guides:
-            try:
-                self._guides[path] = self._guide(read_plate(path))
-            except Exception as problem:
-                if not is_of_the_plate(problem):
-                    raise
-                self._guides[path] = None
-        return self._guides[path]
-
-    def _sighting(self, path: Path, its: Guide) -> Sighting:
-        if path not in self._sightings:
-            self._sightings[path] = Sighting(its, self._remover.views(its.display))
-        return self._sightings[path]
-
-    def _flow(self, path: Path, other: Path) -> Pixels:
-        if (path, other) not in self._flows:
-            here, there = self._sightings[path].guide, self._sightings[other].guide
-            self._flows[path, other] = motion.flow(here.grey, there.grey)
-        return self._flows[path, other]
-
-    def _forget_all_but(self, paths: Container[Path], before: Container[Path]) -> None:
-        """Flows between two frames of those `before` have been looked at by both."""
-        self._guides = {path: its for path, its in self._guides.items() if path in paths}
-        self._sightings = {path: its for path, its in self._sightings.items() if path in paths}
-        self._flows = {(one, other): its for (one, other), its in self._flows.items()
-                       if one in paths and other in paths and not (one in before and other in before)}
-
-
-def by_number(path: Path) -> list[tuple[int, str]]:
-    """A key that sorts paths by the numbers in their names: a2 before a10."""
-    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", path.name)]
-
-
-def shot_order(path: Path) -> tuple[Path, list[tuple[int, str]]]:
-    """For sorting plates of any folders: in this order `Sequences` has the neighbours of each at hand."""
-    return path.parent, by_number(path)

@@ -16,16 +16,8 @@ from core.removal.batch import plates_of, remove_all, with_neighbours
 from core.removal.inference import Remover
 from core.removal.plates import Plate
 from core.removal.record import RECORD
-from core.removal.steady import (
-    OFFSETS,
-    Neighbour,
-    Sequences,
-    Sighting,
-    by_number,
-    guide,
-    of_one_shot,
-    steadied,
-)
+from core.removal.sequences import OFFSETS, Sequences, by_number
+from core.removal.steady import Neighbour, Sighting, guide, of_one_shot, steadied
 from core.removal.views import Views, told_once
 
 Pixels = NDArray[np.float32]

@@ -210,7 +210,9 @@ def test_a_stop_reaches_the_other_process_which_ends_by_itself(tmp_path: Path, n
             "    sys.exit(130)\n"
             "signal.signal(signal.SIGINT, stop)\n"
             "tell(type='stage', name='fit', total=5, done=0)\n"
-            "time.sleep(30)\n")
+            # In short pieces: a signal that comes just before a sleep is heard only after it.
+            "for _ in range(300):\n"
+            "    time.sleep(0.1)\n")
 
     class Stopping(Heard):
         def _show_stage(self) -> None:

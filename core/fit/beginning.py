@@ -59,7 +59,7 @@ def _scene(capture: Capture, settings: FitSettings, views: tuple[View, ...], fra
         return scene
     if not len(capture.points):
         raise CaptureError(f"{capture.folder} has no 3D points to start from; solve it again.")
-    sky = settings.mode == "split" and settings.split.sky
+    sky = settings.by_parallax and settings.split.sky
     return SceneGaussians.from_points(with_sky(capture, views, frames) if sky else capture.points)
 
 

@@ -38,7 +38,7 @@ NAMED = 5
 def doubts(capture: Capture, settings: FitSettings, views: Sequence[View], frames: Frames) -> tuple[str, ...]:
     """Sentences on footage that a flare can hardly be told from."""
     found = []
-    if settings.mode == "split" and capture.only_turns:
+    if settings.by_parallax and capture.only_turns:
         found.append("The camera only turns: without parallax scene and flare cannot be told apart; give flare-free "
                      "frames in removed/, or footage for which the camera moves.")
     if settings.mode != "3dgs" and len(views) < FEW:

@@ -197,7 +197,7 @@ def with_white(settings: FitSettings, capture: Capture) -> tuple[FitSettings, tu
     if not any(_is_above_white(capture, view) for view in views):
         return replace(settings, white=1.0), ()
     files = [capture.frame_path(view) for view in views]
-    if capture.has_removed and settings.supervised:
+    if capture.has_removed and settings.looks_at_removed:
         files += [capture.removed_path(view) for view in views]
     clipped = next((path for path in files if not holds_floats(path)), None)
     if clipped is not None:

@@ -17,7 +17,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ..choices import ITERATIONS, LONGER_SPLIT, Blend, Kernels, Mode, Model, Preset
+from ..choices import BY_PARALLAX, ITERATIONS, LONGER_BY_PARALLAX, Blend, Kernels, Mode, Model, Preset
 from ..errors import RunError, SettingsError
 from ..files import WRITTEN_BY_HAND, write_text
 from ..flare.density import DensitySettings
@@ -117,7 +117,7 @@ class SceneSettings:
 
 @dataclass(frozen=True)
 class SplitSettings:
-    """Mode `split`: how a scene is told from flare without flare-free frames.
+    """Modes `split` and `estimated`: how a scene is told from flare without exact flare-free frames.
 
     A flare adds light, and its place in the picture changes from view to view as no part of the scene's does. So the
     scene is fitted alone first, until every view was looked at `rounds` times (a third of the iterations at most), to
@@ -131,6 +131,8 @@ class SplitSettings:
     When the flare is due it is asked whether the scene has been found: flares only add, but errors go both ways. Where
     the square of what the frames have more than the scene is less than `found` times that of what they have less, the
     flare's light costs `haze` away from the lights: what could be either's is the flare's near them alone.
+    Mode `estimated`: from the moment the flare is due to the middle of the fit the scene is drawn to the estimated
+    flare-free frames as well, less and less: what they have left of the flare goes again by parallax.
     """
 
     rounds: int = 2
@@ -176,8 +178,18 @@ class FitSettings:
 
     @property
     def supervised(self) -> bool:
-        """Whether the scene is taught by flare-free frames."""
+        """Whether the scene is taught by flare-free frames that are taken for exact."""
         return self.mode in ("default", "2d")
+
+    @property
+    def by_parallax(self) -> bool:
+        """Whether scene and flare are told apart by parallax."""
+        return self.mode in BY_PARALLAX
+
+    @property
+    def looks_at_removed(self) -> bool:
+        """Whether the fit needs flare-free frames, exact or estimated."""
+        return self.supervised or self.mode == "estimated"
 
     @property
     def display_white(self) -> float:
@@ -273,14 +285,15 @@ def preset(name: Preset, *, model: Model | None = None, mode: Mode = "default",
     paper     the paper's form and figures, 30,000 iterations
     draft, standard, high: our form, shorter schedules with higher rates (README has times and figures)
 
-    All are a fifth longer in mode `split`, unless `iterations` says how long. `model` and `blend` choose another form:
+    All are a fifth longer in the modes `estimated` and `split`, unless `iterations` says how long. `model` and `blend`
+    choose another form:
     the paper's covers in display space, ours adds in linear light and is hidden by the scene.
     """
     if name not in ITERATIONS:
         raise SettingsError(f"There is no preset {name!r}; choose {', '.join(ITERATIONS)}.")
     length = iterations
     if length is None:
-        length = round(ITERATIONS[name] * (LONGER_SPLIT if mode == "split" else 1))
+        length = round(ITERATIONS[name] * (LONGER_BY_PARALLAX if mode in BY_PARALLAX else 1))
     model = model or ("paper" if name == "paper" else "ours")
     form = replace(PAPER if model == "paper" else OURS, line=mode != "2d")
     if blend is None:

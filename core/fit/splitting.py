@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What teaches the scene of a mode `split` fit, which has no flare-free frames.
+"""What teaches the scene of a fit by parallax, which has no exact flare-free frames.
 
 Frame = encode(scene + flare) leaves open who takes what both could make. Two things decide. A flare only adds light,
 so no frame is darker than the scene. And what both could make is the flare's: above all the glow about a light, which
@@ -27,18 +27,23 @@ def head_start(settings: SplitSettings, views: int, iterations: int) -> int:
     return min(settings.rounds * views, iterations // 3)
 
 
+def settled(progress: float) -> float:
+    """How far, 0..1, a scene counts as found at a point of the fit, 0..1: wholly from its middle on."""
+    return min(2 * progress, 1.0)
+
+
 def scene_beside_flare(scene: Tensor, targets: Targets, lights: ArrayLike, discs: Tensor | None,
                        settings: SplitSettings, progress: float) -> Tensor:
     """Loss of a scene (height, width, 3) of display values that is fitted with the flare, besides that of the two
     together. lights: (n, 3), world. discs: (height, width), the lights' own clipped pixels, if they are told.
 
-    progress: of the fit, 0..1. Until its middle the scene, which is still to be found, is less and less drawn up to
-    brighter frames, and more and more held down near the lights.
+    progress: of the fit, 0..1. The more the scene counts as found, the less it is drawn up to brighter frames, and the
+    more held down near the lights.
     """
-    settled = min(2 * progress, 1.0)
-    loss = settings.weight * from_below(scene, targets.frame, settings.excess * (1 - settled))
+    share = settled(progress)
+    loss = settings.weight * from_below(scene, targets.frame, settings.excess * (1 - share))
     near = torch.from_numpy(nearness(targets.camera, lights, settings.reach))
-    loss = loss + settings.glow * settled * (scene * near[..., None]).mean()
+    loss = loss + settings.glow * share * (scene * near[..., None]).mean()
     if discs is not None:
         loss = loss + ((scene - targets.frame).abs() * discs[..., None]).mean()
     return loss

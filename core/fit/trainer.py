@@ -39,7 +39,7 @@ from .given import Given
 from .optimisers import Optimisers
 from .rendering import render_flare, render_scene
 from .settings import FitSettings
-from .splitting import from_below, haze, head_start, is_found, scene_beside_flare
+from .splitting import from_below, haze, head_start, is_found, scene_beside_flare, settled
 
 CLEAR_EVERY = 50
 """Iterations between two looks at how much of the lights the scene leaves (`visibility.clear_shares`)."""
@@ -61,7 +61,7 @@ class Trainer:
         torch.manual_seed(settings.seed)
         self.settings = settings
         self.frames = Frames(capture, settings.width, display_white=settings.display_white,
-                             alone=not settings.supervised)
+                             alone=not settings.looks_at_removed)
         if exposures is None:
             exposures = metering.found(capture, self.frames, progress) if settings.exposure == "found" else {}
         self.exposures = exposures
@@ -73,9 +73,10 @@ class Trainer:
         self.losses: dict[str, float] = {}
         """Of each view, by name, when it was last looked at."""
         self.scene_is_fitted = not settings.scene.frozen
-        if settings.supervised and not self.frames.reference and self.scene_is_fitted:
+        missing = self.frames.reference != "removed" if settings.mode == "estimated" else not self.frames.reference
+        if settings.looks_at_removed and missing and self.scene_is_fitted:
             raise CaptureError(f"{capture.folder} has no flare-free frames (removed/); run remove on it first, "
-                               "or fit with --mode unsup.")
+                               "or fit with --mode split.")
         self.scene = first_scene(capture, settings, self.views, self.frames)
         self.flare = None if settings.mode == "3dgs" else first_flare(capture, self.views, self.frames, settings)
         self.says = (*self.frames.says, *metering.says(self.exposures),
@@ -84,7 +85,8 @@ class Trainer:
         self.extent = capture.extent
         self._given = Given(capture, removed=self.frames.reference == "removed", lights=self.flare is not None)
         self._head_start = head_start(settings.split, len(self.views), settings.iterations)
-        """Iterations in which a scene of mode `split` is fitted alone; then it is asked whether it has been found."""
+        """Iterations in which a scene that is told from flare by parallax is fitted alone; then it is asked whether it
+        has been found."""
         self._scene_is_found = True
         self.optimisers = Optimisers(self.scene, self.flare, settings, self.extent, self.frames.display_white)
         self.strategy = self._strategy()
@@ -117,8 +119,8 @@ class Trainer:
             scene_loss = l1_ssim(shown, clean, weight)
             figures["scene_loss"] = float(scene_loss.detach())
             loss = loss + scene_loss
-        elif settings.mode == "split" and self.scene_is_fitted:
-            scene_loss = self._split_loss(targets, shown, flare, sources)
+        elif settings.by_parallax and self.scene_is_fitted:
+            scene_loss = self._parallax_loss(targets, shown, flare, sources)
             figures["scene_loss"] = float(scene_loss.detach())
             loss = loss + scene_loss
         self.losses[view.name] = sum(figures.values())
@@ -174,8 +176,8 @@ class Trainer:
 
     @torch.no_grad()
     def _look_for_scene(self) -> None:
-        """Mode `split` asks whether the scene has been found when the flare is due."""
-        if self.settings.mode != "split" or not 1 <= self._head_start == self.iteration - 1:
+        """By parallax it is asked whether the scene has been found when the flare is due."""
+        if not self.settings.by_parallax or not 1 <= self._head_start == self.iteration - 1:
             return
 
         def missing(targets: Targets) -> Tensor:
@@ -200,7 +202,7 @@ class Trainer:
 
     def _scene_alone(self, targets: Targets) -> bool:
         """Whether the scene is fitted alone as yet, so that it hides lights by the time their flares are fitted."""
-        if self.settings.mode == "split":
+        if self.settings.by_parallax:
             return self.iteration <= self._head_start
         begun = self.iteration > self.settings.flare.begin * self.settings.iterations
         return self.settings.supervised and self.scene_is_fitted and targets.removed is not None and not begun
@@ -225,7 +227,7 @@ class Trainer:
         over another shot a hole would show. Black behind it, it has to be white by itself. Above white they may tell.
         """
         settings = self.settings
-        clean = targets.frame if settings.mode == "split" else targets.removed if settings.supervised else None
+        clean = targets.frame if settings.by_parallax else targets.removed if settings.supervised else None
         if settings.blend != "add" or self.flare is None or clean is None:
             return None
         discs = torch.from_numpy(clipped_discs(clean.numpy(), targets.camera, self.flare.positions.numpy()))
@@ -246,12 +248,15 @@ class Trainer:
             return (targets.frame - (picture - scene).detach()).clamp(0, self.frames.display_white)
         return None
 
-    def _split_loss(self, targets: Targets, scene: Tensor, flare: Splats | None, sources: Tensor | None) -> Tensor:
+    def _parallax_loss(self, targets: Targets, scene: Tensor, flare: Splats | None, sources: Tensor | None) -> Tensor:
         settings = self.settings
         if self.flare is None or self._scene_alone(targets):
             return from_below(scene, targets.frame, settings.split.excess)
         lights, progress = self.flare.positions.numpy(), self.iteration / settings.iterations
         loss = scene_beside_flare(scene, targets, lights, sources, settings.split, progress)
+        drawn = 1 - settled(progress)
+        if targets.removed is not None and drawn > 0:
+            loss = loss + drawn * l1_ssim(scene, targets.removed, 1 - settings.ssim_share)
         if flare is None or self._scene_is_found:
             return loss
         behind = scene.detach()
@@ -261,7 +266,7 @@ class Trainer:
     def _sh_degree(self) -> int:
         if self.settings.scene.start:
             return MAX_DEGREE  # it was trained before
-        plain = self.settings.mode == "split" and self.iteration <= self.settings.split.plain * self.settings.iterations
+        plain = self.settings.by_parallax and self.iteration <= self.settings.split.plain * self.settings.iterations
         most = self.settings.split.sh_degree if plain else MAX_DEGREE
         return min(most, self.iteration // self.settings.scene.sh_every)
 

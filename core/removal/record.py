@@ -127,6 +127,12 @@ class Record:
         return [name for name, source in sources.items()
                 if name.as_posix() in told and told[name.as_posix()] != content_of(source)]
 
+    def as_made(self, names: Iterable[Path]) -> list[Path]:
+        """Of plates by their names here, those that `remove` made and nobody has worked on since."""
+        made, written = self._read("plates"), self._read("written")
+        return [name for name in names if name.as_posix() in made and (path := self._folder / name).is_file()
+                and written.get(_from(self._folder, path), content_of(path)) == content_of(path)]
+
     def results(self) -> list[Path]:
         """The paths of the plates and flares that it lists, there or not."""
         return [(self._folder / name).resolve() for name in (*self._read("plates"), *self._read("flares").values())]

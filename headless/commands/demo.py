@@ -33,8 +33,8 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, default=ROOT / "build" / "demo", metavar="DIR",
                         help="folder for everything (default build/demo in the repository)")
     parser.add_argument("--capture", type=Path, metavar="CAPTURE",
-                        help="another capture than the sample; what it lacks, lights.json and, with --remove, "
-                             "removed/, is written into it")
+                        help="another capture than the sample; what it lacks, lights.json and removed/, is written "
+                             "into it")
     without = parser.add_mutually_exclusive_group()
     without.add_argument("--split", action="store_true",
                          help="do without flare-free frames: tell scene and flare apart by parallax, as `fit` does "
@@ -65,6 +65,8 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     if words.remove:
         capture = with_removed(capture, progress)
     mode: Mode = "split" if words.split else fit.mode_for(capture, False, progress)
+    if mode == "estimated":
+        capture = with_removed(capture, progress)
     progress.say(f"{source.name}: {len(capture.views)} frames, {len(capture.lights)} lights. "
                  f"{_supervision(capture, mode)}")
     given = {"model": words.model} if words.model else {}
@@ -108,6 +110,8 @@ def _supervision(capture: Capture, mode: Mode) -> str:
     """Where the flare-free frames come from, which the scene is learned from."""
     if mode == "split":
         return "No flare-free frame is looked at."
+    if mode == "estimated":
+        return f"The flare-free frames are estimates, those that `remove` made in {capture.folder / REMOVED}."
     if capture.has_removed:
         return f"The flare-free frames are those in {capture.folder / REMOVED}; no flare is removed here."
     if capture.has_truth:

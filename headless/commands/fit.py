@@ -41,10 +41,11 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--model", choices=get_args(Model),
                         help="the flare's form: the paper's, or ours with rings and offsets")
     parser.add_argument("--mode", choices=get_args(Mode),
-                        help="default: with flare-free frames, which `remove` makes where there are none; split: "
-                             "without, by parallax; unsup: as the paper does without; in-flare: scene supervised by "
-                             "frame less flare; 2d: flare free on the plane; 3dgs: scene alone (if not given: default "
-                             "where the capture has flare-free frames, else split)")
+                        help="default: with flare-free frames that are taken for exact; estimated: with those that "
+                             "`remove` makes, by which the scene is looked for, and parallax; split: by parallax "
+                             "alone; unsup: as the paper does without; in-flare: scene supervised by frame less "
+                             "flare; 2d: flare free on the plane; 3dgs: scene alone (if not given: default where the "
+                             "capture has flare-free frames of its own, else estimated)")
     parser.add_argument("--blend", choices=get_args(Blend),
                         help="over: the flare covers, in display space; add: it adds, in linear light")
     parser.add_argument("--holdout", metavar="FILE|N",
@@ -87,7 +88,8 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     settings = Run.open(out).settings if goes_on else chosen(words, capture, progress)
     if settings.mode != "3dgs":
         capture = with_lights(capture, progress)
-    if settings.supervised and not settings.scene.frozen and not capture.has_truth:
+    exact = settings.supervised and capture.has_truth
+    if settings.looks_at_removed and not settings.scene.frozen and not exact:
         capture = with_removed(capture, progress)
     done = fit(capture, settings, out, progress, resume=words.resume)
     progress.say(f"The run is in {done.folder}: see preview.png there, then `eval` and `bake` it.")
@@ -112,12 +114,16 @@ def chosen(words: argparse.Namespace, capture: Capture, progress: Progress) -> F
 
 
 def mode_for(capture: Capture, frozen: bool, progress: Progress) -> Mode:
-    """What a fit goes by where nobody says: flare-free frames if there are any."""
-    if frozen or capture.has_removed or capture.has_truth:
+    """What a fit goes by where nobody says: flare-free frames if there are any, exact ones before estimates."""
+    from ...core.removal.captured import are_estimates
+
+    if frozen or (capture.has_truth and not capture.has_removed):
         return "default"
-    progress.say(f"{capture.folder} has no flare-free frames (removed/): scene and flare are told apart by parallax, "
-                 "mode split.")
-    return "split"
+    if capture.has_removed and not are_estimates(capture):
+        return "default"
+    progress.say(f"{capture.folder} has no flare-free frames but those that `remove` makes (removed/): scene and flare "
+                 "are told apart by these and by parallax, mode estimated.")
+    return "estimated"
 
 
 def place(words: argparse.Namespace) -> tuple[Path, Path]:

@@ -219,7 +219,8 @@ def test_killed_and_resumed_leaves_nothing_half_written(tmp_path: Path, capture:
 
 
 @pytest.mark.parametrize(("mode", "changes"), [
-    ("split", {}), ("unsup", {}), ("in-flare", {}), ("2d", {}), ("3dgs", {}), ("default", {"flare.detection": False}),
+    ("estimated", {}), ("split", {}), ("unsup", {}), ("in-flare", {}), ("2d", {}), ("3dgs", {}),
+    ("default", {"flare.detection": False}),
     ("default", {"flare.form.light_correction": False}), ("default", {"flare.form.plane_offset": False}),
     ("default", {"scene.strategy": "mcmc", "scene.mcmc.start": 5, "scene.mcmc.every": 5}),
 ])
@@ -249,6 +250,9 @@ def test_scene_and_flare_come_apart_without_a_flare_free_frame(tmp_path: Path, c
     split, empty = found("split")
     unsup, _ = found("unsup")
     assert split > empty + 4 and split > unsup + 1.5, (split, unsup, empty)
+    shutil.copytree(capture.folder / "removed", bare / "removed")
+    estimated, _ = found("estimated")
+    assert estimated > split + 2, (estimated, split)
 
 
 def test_what_frames_agree_on_from_below_is_a_quantile() -> None:

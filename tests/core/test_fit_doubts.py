@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from core.capture import Capture
-from core.errors import Cancelled
+from core.errors import Cancelled, CaptureError
 from core.fit import fit, preset
 from core.fit.doubts import doubts, unlike
 from core.fit.frames import Frames
@@ -80,6 +80,16 @@ def test_mode_split_goes_by_the_frames_alone(capture: Capture, tmp_path: Path) -
     with_them, without = (fit(one, quick(40, mode="split"), tmp_path / name)
                           for name, one in (("with", capture), ("without", Capture.open(bare))))
     assert with_them.fingerprint == without.fingerprint
+
+
+def test_estimates_are_flare_free_frames_that_were_made_not_exact_layers(capture: Capture, tmp_path: Path) -> None:
+    """Which would make a fit of a known scene look better than one of footage."""
+    folder = tmp_path / "known"
+    shutil.copytree(capture.folder, folder, ignore=shutil.ignore_patterns("removed"))
+    known = Capture.open(folder)
+    assert known.has_truth
+    with pytest.raises(CaptureError, match="run remove on it first"):
+        fit(known, quick(40, mode="estimated"), tmp_path / "run")
 
 
 def test_a_frame_of_another_scene_is_named(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from core.choices import Mode
 from core.errors import RunError, SettingsError
 from core.fit.settings import BOUNDS, FitSettings, changed, preset, read_config, write_config
 
@@ -30,11 +31,12 @@ def test_a_run_of_a_version_with_a_setting_more_opens(tmp_path: Path) -> None:
     assert read_config(path) == preset("draft", mode="split")
 
 
-def test_a_split_fit_is_a_fifth_longer_unless_its_length_is_given() -> None:
-    split = preset("draft", mode="split")
-    assert (preset("draft").iterations, split.iterations) == (1500, 1800)
-    assert split == preset("draft", mode="split", iterations=1800)
-    assert preset("draft", mode="split", iterations=400).iterations == 400
+@pytest.mark.parametrize("mode", ["split", "estimated"])
+def test_a_fit_by_parallax_is_a_fifth_longer_unless_its_length_is_given(mode: Mode) -> None:
+    made = preset("draft", mode=mode)
+    assert (preset("draft").iterations, made.iterations) == (1500, 1800)
+    assert made == preset("draft", mode=mode, iterations=1800)
+    assert preset("draft", mode=mode, iterations=400).iterations == 400
 
 
 @pytest.mark.parametrize("name", ["a\nb\r.ply", "a\tb\x00\x1b\x7f.ply", "Straße 写真 \U0001f526.ply"])

@@ -160,12 +160,11 @@ def test_pairs_that_cannot_be_read_do_not_cost_the_others_their_scores(tmp_path:
         assert said in capsys.readouterr().err
 
 
-def test_fit_does_without_flare_free_frames_where_there_are_none(capture: Path, tmp_path: Path,
+def test_fit_does_without_flare_free_frames_where_it_is_asked_to(capture: Path, tmp_path: Path,
                                                                   capsys: pytest.CaptureFixture[str]) -> None:
     bare, run = tmp_path / "bare", tmp_path / "run"
     shutil.copytree(capture, bare, ignore=shutil.ignore_patterns("removed", "truth"))
-    assert cli.main(["fit", str(bare), "--out", str(run), "--iterations", "2"]) == 0
-    assert "no flare-free frames" in capsys.readouterr().err
+    assert cli.main(["fit", str(bare), "--out", str(run), "--iterations", "2", "--mode", "split"]) == 0
     assert not (bare / "removed").exists()
     assert 'mode = "split"' in (run / "config.toml").read_text(encoding="utf-8")
     clean = tmp_path / "clean"
@@ -182,9 +181,10 @@ def test_fit_takes_the_flare_out_where_nobody_did(capture: Path, tmp_path: Path,
                                                   capsys: pytest.CaptureFixture[str]) -> None:
     bare = tmp_path / "bare"
     shutil.copytree(capture, bare, ignore=shutil.ignore_patterns("removed", "truth"))
-    words = ["fit", str(bare), "--out", str(tmp_path / "run"), "--iterations", "2", "--mode", "default"]
+    words = ["fit", str(bare), "--out", str(tmp_path / "run"), "--iterations", "2"]
     assert cli.main(words) == 0
-    assert "has no removed/" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "has no removed/" in said and "mode estimated" in said
     frames = {path.stem: path for path in (bare / "images").iterdir()}
     made = {path.stem: path for path in (bare / "removed").glob("*.png")}
     assert frames.keys() == made.keys()
@@ -192,4 +192,11 @@ def test_fit_takes_the_flare_out_where_nobody_did(capture: Path, tmp_path: Path,
         assert (read_picture(path).pixels <= read_picture(frames[name]).pixels + 1e-6).all()
     shutil.rmtree(tmp_path / "run")
     assert cli.main(words) == 0
-    assert "has no removed/" not in capsys.readouterr().err, "they are kept"
+    said = capsys.readouterr().err
+    assert "has no removed/" not in said and "mode estimated" in said, "they are kept, and known for estimates"
+    assert 'mode = "estimated"' in (tmp_path / "run" / "config.toml").read_text(encoding="utf-8")
+    for path in made.values():
+        write_png(path, read_picture(path).pixels * 0.9)
+    assert cli.main(["fit", str(bare), "--out", str(tmp_path / "worked on"), "--iterations", "2"]) == 0
+    assert 'mode = "default"' in (tmp_path / "worked on" / "config.toml").read_text(encoding="utf-8")
+    assert "mode estimated" not in capsys.readouterr().err, "someone has gone on from them by hand"

@@ -86,7 +86,7 @@ def export(scene: Any, folder: Path) -> int:
         scene.frame_set(before)
     write_cameras(folder, entries)
     state = scene.fit_flare
-    state.capture, state.root, state.mode, state.footage = stored(folder), None, "split", "images"
+    state.capture, state.root, state.mode, state.footage = stored(folder), None, "estimated", "images"
     state.known_lights = ""  # those of an earlier capture are other lights, whatever their names
     return len(entries)
 

@@ -21,6 +21,7 @@ from ..core.bake.frames import numbered
 from ..core.capture import REMOVED, Capture, PointCloud, Twins, View
 from ..core.capture.camera import Camera, quaternion_from_rotation
 from ..core.errors import CaptureError
+from ..core.removal.provenance import has_exact
 from . import cameras, curves
 from .cameras import FLIP
 from .compositor import footage_nodes
@@ -100,7 +101,7 @@ def import_capture(scene: Any, folder: Path | str, settings: ImportSettings | No
     root.fit_flare.is_root = True
     state.capture, state.root, state.footage = stored(folder), root, "images"
     state.known_lights = "\n".join(light.name for light in capture.lights)
-    state.mode = "default" if capture.has_removed or capture.has_truth else "split"
+    state.mode = "default" if has_exact(capture) else "estimated"
     scene.camera = made[0]
     if settings.match_scene:
         notes += [note for note in [show_as_filmed(scene)] if note]

@@ -271,7 +271,7 @@ def cleaned(job: Job) -> None:
     scenes = [scene for scene in _own_scenes()
               if (capture := capture_of(scene)) is not None and _cleaning_folder(capture) == job.folder]
     for scene in scenes:
-        scene.fit_flare.mode = "default"
+        scene.fit_flare.mode = "estimated"
     _remember("Clean Frames", scenes)
 
 

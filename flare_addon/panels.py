@@ -98,7 +98,7 @@ class FITFLARE_PT_fit(_Part, bpy.types.Panel):
         settings.prop(state, "mode")
         settings.prop(state, "width")
         capture = fits.capture_of(scene)
-        if capture is not None and (state.mode == "split" or fits.cleaning_of(capture) is not None):
+        if capture is not None and (state.mode != "default" or fits.cleaning_of(capture) is not None):
             _cleaning(layout, state, capture, stage)
         if stage == "lost":
             lines(layout, f"The run's folder {folder} is gone: start a new fit.", "ERROR")
@@ -135,6 +135,7 @@ def _cleaning(layout: Any, state: Any, capture: Any, stage: str) -> None:
     by_network = stage != "finished" and (not there or job is not None)
     if not there:
         lines(layout, "The fit can take its flare out of the frames." if stage == "finished" else
+              "No frames without flare: the fit begins by making some." if state.mode == "estimated" else
               "No frames without flare: scene and flare are told apart by how they move.", "INFO")
     if by_network:
         given = layout.column()
@@ -144,8 +145,8 @@ def _cleaning(layout: Any, state: Any, capture: Any, stage: str) -> None:
         given.prop(state, "keep_glow")
     if there and state.mode == "split":  # they were made while the .blend was closed
         lines(layout, "There are clean frames: choose them as Supervision to learn from them.", "INFO")
-    by_fit_since = stage == "finished" and job is not None and "--run" not in job.words
-    if not there or by_network or by_fit_since:
+    by_fit = stage == "finished" and (job is None or "--run" not in job.words)
+    if not there or by_network or by_fit:
         layout.operator("fit_flare.clean_frames", text="Make Clean Frames Again" if there else "Make Clean Frames",
                         icon="BRUSH_DATA")
 

@@ -37,10 +37,14 @@ PRESETS: tuple[tuple[Preset, str, str], ...] = (
     ("standard", "Standard", f"Good for most shots: {ITERATIONS['standard']:,} iterations"),
     ("high", "High", f"For final layers: {ITERATIONS['high']:,} iterations"),
 )
-MODES: tuple[tuple[Mode, str, str], ...] = (
-    ("default", "Clean Frames", "The capture has the frames without flare in its folder removed/ (or truth/scene/)"),
-    ("split", "No Clean Frames", "There are no frames without flare: scene and flare are told apart by parallax, "
-     "in a fit that is a fifth longer"),
+MODES: tuple[tuple[Mode, str, str, int], ...] = (  # files hold the numbers
+    ("default", "Clean Frames", "The capture has the frames without flare in its folder removed/ (or truth/scene/), "
+     "and they are taken for exact", 0),
+    ("estimated", "Estimated Clean Frames", "Those that Make Clean Frames makes, or the fit itself before it begins: "
+     "they help to find the scene, and by parallax it is told from what they leave of the flare, in a fit that is a "
+     "fifth longer", 2),
+    ("split", "No Clean Frames", "Without frames without flare: scene and flare are told apart by parallax alone, in "
+     "a fit that is a fifth longer", 1),
 )
 
 
@@ -159,7 +163,8 @@ class FITFLARE_PG_scene(bpy.types.PropertyGroup):
     preset: EnumProperty(  # type: ignore[valid-type]
         name="Quality", description="How long and how fine the fit is", items=PRESETS, default="draft")
     mode: EnumProperty(  # type: ignore[valid-type]
-        name="Supervision", description="Whether there are frames without flare to learn the scene from", items=MODES)
+        name="Supervision", description="What there is of frames without flare, from which the scene is learned",
+        items=MODES)
     width: IntProperty(  # type: ignore[valid-type]
         name="Width", description="Work at this width in pixels at most; 0 takes the frames' own", default=0, min=0,
         max=16384)

@@ -58,30 +58,6 @@ def remove_from(capture: Capture, remover: Remover, progress: Progress) -> Path:
     return target
 
 
-def are_estimates(capture: Capture) -> bool:
-    """Whether some of a capture's clean frames are as `remove` made them; others are taken for exact, be they someone's
-    own or made here and worked on since."""
-    return bool(Record(capture.folder / REMOVED).as_made(_sources(capture)))
-
-
-def check_removed(capture: Capture) -> None:
-    """Raises CaptureError where the capture has clean frames that were made here from others than it has now. Those of
-    which nothing is written down are someone's own."""
-    folder, sources = capture.folder / REMOVED, _sources(capture)
-    if others := Record(folder).made_from_others(sources):
-        raise CaptureError(f"{len(others)} of the {len(sources)} flare-free frames in {folder} were made from other "
-                           f"frames than the capture has now ({others[0].as_posix()} first); remove that folder, and "
-                           "they are made again.")
-
-
-def _sources(capture: Capture) -> dict[Path, Path]:
-    """Of every clean frame, by its name below removed/, the frame that it is of."""
-    folder = (capture.folder / REMOVED).resolve()
-    frames = {capture.removed_path(view).resolve(): view for view in capture.views}
-    return {path.relative_to(folder): capture.frame_path(view) for path, view in frames.items()
-            if path.is_relative_to(folder)}
-
-
 def _names(capture: Capture) -> dict[str, Path]:
     """Of every view's clean picture, below the folder. Raises CaptureError where two would be one, on any file system.
     """

@@ -8,7 +8,7 @@ import contextlib
 import errno
 import hashlib
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -127,11 +127,14 @@ class Record:
         return [name for name, source in sources.items()
                 if name.as_posix() in told and told[name.as_posix()] != content_of(source)]
 
-    def as_made(self, names: Iterable[Path]) -> list[Path]:
-        """Of plates by their names here, those that `remove` made and nobody has worked on since."""
-        made, written = self._read("plates"), self._read("written")
-        return [name for name in names if name.as_posix() in made and (path := self._folder / name).is_file()
-                and written.get(_from(self._folder, path), content_of(path)) == content_of(path)]
+    def as_made(self, names: Iterable[Path]) -> Iterator[Path]:
+        """Of plates by their names here, those that `remove` made and nobody has worked on since, one by one, since
+        each is read for it."""
+        made = self._read("plates")
+        for name in names:
+            path = self._folder / name
+            if name.as_posix() in made and path.is_file() and not self._worked_on([path]):
+                yield name
 
     def results(self) -> list[Path]:
         """The paths of the plates and flares that it lists, there or not."""

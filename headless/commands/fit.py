@@ -115,11 +115,9 @@ def chosen(words: argparse.Namespace, capture: Capture, progress: Progress) -> F
 
 def mode_for(capture: Capture, frozen: bool, progress: Progress) -> Mode:
     """What a fit goes by where nobody says: flare-free frames if there are any, exact ones before estimates."""
-    from ...core.removal.captured import are_estimates
+    from ...core.removal.provenance import has_exact
 
-    if frozen or (capture.has_truth and not capture.has_removed):
-        return "default"
-    if capture.has_removed and not are_estimates(capture):
+    if frozen or has_exact(capture):
         return "default"
     progress.say(f"{capture.folder} has no flare-free frames but those that `remove` makes (removed/): scene and flare "
                  "are told apart by these and by parallax, mode estimated.")

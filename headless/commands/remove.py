@@ -120,8 +120,9 @@ def _remover(words: argparse.Namespace) -> Remover:
 def with_removed(capture: Capture, progress: Progress) -> Capture:
     """The capture with its flare-free frames, which are made and written into its folder if it has none. Raises
     CaptureError where it has some that were made of other frames."""
-    from ...core.removal.captured import check_removed, remove_from
+    from ...core.removal.captured import remove_from
     from ...core.removal.inference import Remover
+    from ...core.removal.provenance import check_removed
 
     if capture.has_removed:
         check_removed(capture)

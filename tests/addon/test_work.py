@@ -85,6 +85,10 @@ def test_clean_frames_that_were_made_again_are_shown(facts: Any) -> None:
     assert facts["clean frames"] == [0, 1]
 
 
+def test_a_fit_goes_by_clean_frames_of_someone_s_own_and_takes_others_for_estimates(facts: Any) -> None:
+    assert facts["goes by"] == ["default", "estimated", "estimated", "estimated"]
+
+
 def test_a_bake_follows_the_cuts_of_the_timeline(facts: Any) -> None:
     names, *off = facts["cut"]
     assert names == ["Camera"] and [far < 1e-4 for far in off] == [False, False, True], off

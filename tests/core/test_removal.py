@@ -32,12 +32,13 @@ from core.pictures import Window, read_exr, read_picture, save_exr, write_exr, w
 from core.progress import Progress
 from core.removal import batch, inference, weights
 from core.removal.batch import plates_of, remove_all
-from core.removal.captured import UNFINISHED, _names, check_removed, remove_from
+from core.removal.captured import UNFINISHED, _names, remove_from
 from core.removal.formation import flare_light
 from core.removal.inference import FlareMap, Remover, Told, carried_up
 from core.removal.mattes import Mattes
 from core.removal.network import LEVELS, SHOWN, RemovalNetwork, seen
 from core.removal.plates import Plate, read_plate, write_plate
+from core.removal.provenance import check_removed, has_exact
 from core.removal.recipe import Recipe, as_dict
 from core.removal.record import RECORD, Record, made_from
 from core.removal.views import told_once
@@ -659,6 +660,21 @@ def test_clean_frames_of_other_frames_are_told(by_the_fit: bool, tmp_path: Path,
         check_removed(Capture.open(capture.folder))
     (removed / "remove.json").unlink()  # someone's own
     check_removed(Capture.open(capture.folder))
+
+
+def test_clean_frames_are_estimates_until_someone_has_worked_on_all(tmp_path: Path, everywhere: Path) -> None:
+    capture = Capture.open(make_capture(tmp_path / "capture", views=4))
+    remove_from(capture, Remover(everywhere, working_size=64), Progress())
+    made = Capture.open(capture.folder)
+    for view in made.views:
+        assert not has_exact(made)
+        path = made.removed_path(view)
+        cv2.imwrite(str(path), cv2.imread(str(path)) // 2)
+    assert has_exact(made)
+    shutil.copy(made.frame_path(made.views[0]), made.removed_path(made.views[0]))
+    assert has_exact(made)
+    (capture.folder / "removed" / "remove.json").unlink()
+    assert has_exact(made), "someone's own"
 
 
 def test_two_fits_that_clean_one_capture_at_once(tmp_path: Path, everywhere: Path) -> None:

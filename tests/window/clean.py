@@ -62,7 +62,7 @@ def steps():
     yield 0.5
     flow.shot("01_no_clean_frames")
     left = yield from clean(capture, matte("left.png", slice(0, 48)))
-    assert scene.fit_flare.mode == "default", "the fit goes by the clean frames now"
+    assert scene.fit_flare.mode == "estimated", "the fit goes by the clean frames now"
     flow.shot("02_cleaned")
     right = yield from clean(capture, matte("right.png", slice(48, 96)))
     flow.shot("03_cleaned_again")

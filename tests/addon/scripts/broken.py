@@ -203,9 +203,9 @@ for name in paths.OURS:
     setattr(state, name, str(folder / unseen))
     said["a name too long for the disk"].append([name, *map(shown, PANELS), *map(polls, asking)])
     setattr(state, name, kept[name])
-state.run, state.mode = str(folder / unseen), "split"
-state.capture = str(folder / unseen)
-said["a name too long for the disk"].append(["all", *map(shown, PANELS), *map(polls, asking)])
+state.run = state.capture = str(folder / unseen)
+for state.mode in ("split", "estimated"):
+    said["a name too long for the disk"].append(["all", *map(shown, PANELS), *map(polls, asking)])
 for name in paths.OURS:
     setattr(state, name, kept[name])
 

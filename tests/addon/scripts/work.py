@@ -2,6 +2,7 @@
 """Inside Blender: an artist's work, operator by operator. Words: the zip, a capture, a .flare of it, a folder."""
 from __future__ import annotations
 
+import json
 import math
 import shutil
 import sys
@@ -145,6 +146,22 @@ seen.pixels.foreach_set(np.ones(64, np.float32))
 seen.save()
 fits.cleaned(SimpleNamespace(folder=moved / "removal", state="done"))
 facts["clean frames"].append(shown.pixels[0])
+
+# ---- what a fit goes by -----------------------------------------------------------------------------
+facts["goes by"] = []
+for which in ("own", "made", "none"):
+    scene, goes = empty(), Path(out) / f"frames {which}"
+    shutil.copytree(capture, goes, ignore=shutil.ignore_patterns("fits", "removal", "truth"))
+    if which == "made":
+        names = [path.name for path in (goes / "removed").iterdir()]
+        (goes / "removed" / "remove.json").write_text(json.dumps({"plates": dict.fromkeys(names, "by a network")}))
+    elif which == "none":
+        shutil.rmtree(goes / "removed")
+    ops.import_capture(directory=str(goes))
+    facts["goes by"].append(scene.fit_flare.mode)
+scene.fit_flare.mode = "default"
+fits.cleaned(SimpleNamespace(folder=goes / "removal", state="done"))
+facts["goes by"].append(scene.fit_flare.mode)
 
 # ---- one undo step ----------------------------------------------------------------------------------
 scene = empty()

@@ -11,8 +11,8 @@ Studies:
   robustness      its study of displaced lights: each moved once by Gaussian noise of sigma, with and without the
                   two corrections delta_l and delta_f
   robustness-ours the same of our form
-  supervision     our form taught by exact flare-free frames, by those that `remove` makes, and by none: split by
-                  parallax, or as the paper does without (unsup)
+  supervision     our form taught by exact flare-free frames, by those that `remove` makes, taken for exact or for
+                  estimates, and by none: split by parallax, or as the paper does without (unsup)
   known           the flare alone, over the exact scene, 900 Gaussians a light: what the representation itself can do
   extrapolation   our form, with a stretch of the path held out instead of every n-th view
   reconstruction  the paper's table 3: 3DGS trained on the frames, on the frames with a bilateral grid for each, and on
@@ -147,7 +147,8 @@ def experiments(length: Length) -> list[Experiment]:
             made += [Experiment(study, f"{corrections}, sigma {sigma:g}", settings, sigma) for sigma in SIGMAS]
     made += of("supervision", {"exact flare-free frames": ours(length), "none: split": ours(length, "split"),
                                "none: unsup": ours(length, "unsup")})
-    made.append(Experiment("supervision", "what remove makes", ours(length), frames="cleaned"))
+    made += [Experiment("supervision", "what remove makes, for exact", ours(length), frames="cleaned"),
+             Experiment("supervision", "what remove makes: estimated", ours(length, "estimated"), frames="cleaned")]
     many = {"flare.count": 900, "flare.density.most": 900}  # of each light, from the beginning to the end
     alone = changed(ours(length), {**many, "flare.occlusion": False})
     made += [Experiment("known", "ours", alone, known_scene=True),
@@ -390,7 +391,7 @@ def main() -> None:
     results: Results = {}
     wanted: Callable[[Experiment], bool] = lambda one: (  # noqa: E731
         (not words.only or one.study in words.only) and (not words.variants or one.name in words.variants))
-    # All of a study are as long as each other, `split` too, which is longer otherwise.
+    # All of a study are as long as each other, those by parallax too, which are longer otherwise.
     length = partial(_seeded, words.seed, words.preset, iterations=words.iterations or ITERATIONS[words.preset])
     made = length()
     seed = f"-seed-{words.seed}" if words.seed else ""

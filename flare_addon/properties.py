@@ -40,7 +40,7 @@ PRESETS: tuple[tuple[Preset, str, str], ...] = (
 MODES: tuple[tuple[Mode, str, str, int], ...] = (  # files hold the numbers
     ("default", "Clean Frames", "The capture has the frames without flare in its folder removed/ (or truth/scene/), "
      "and they are taken for exact", 0),
-    ("estimated", "Estimated Clean Frames", "Those that Make Clean Frames makes, or the fit itself before it begins: "
+    ("estimated", "Estimated Frames", "Those that Make Clean Frames makes, or the fit itself before it begins: "
      "they help to find the scene, and by parallax it is told from what they leave of the flare, in a fit that is a "
      "fifth longer", 2),
     ("split", "No Clean Frames", "Without frames without flare: scene and flare are told apart by parallax alone, in "

@@ -135,8 +135,8 @@ def _cleaning(layout: Any, state: Any, capture: Any, stage: str) -> None:
     by_network = stage != "finished" and (not there or job is not None)
     if not there:
         lines(layout, "The fit can take its flare out of the frames." if stage == "finished" else
-              "No frames without flare: the fit begins by making some." if state.mode == "estimated" else
-              "No frames without flare: scene and flare are told apart by how they move.", "INFO")
+              "No frames without flare: scene and flare are told apart by how they move." if state.mode == "split" else
+              "No frames without flare: the fit begins by making some.", "INFO")
     if by_network:
         given = layout.column()
         given.use_property_split = True

@@ -57,14 +57,16 @@ class Frames:
     """
 
     def __init__(self, capture: Capture, width: int = 0, memory: int = MEMORY, *,
-                 display_white: float = 1.0, alone: bool = False) -> None:
-        """alone: flare-free frames are not looked at, whatever the capture has."""
+                 display_white: float = 1.0, alone: bool = False, truth: bool = True) -> None:
+        """alone: flare-free frames are not looked at, whatever the capture has; truth: exact layers are, where it has
+        no others."""
         self.capture = capture
         self.display_white = display_white
         self._width = width
         self._codes = 65535 / display_white  # 16 bit keeps the smoothness of linear footage at half the size of float
         self.cache = PictureCache(memory)
-        self.reference = ("" if alone else "removed" if capture.has_removed else "truth" if capture.has_truth else "")
+        self.reference = ("" if alone else "removed" if capture.has_removed else
+                          "truth" if truth and capture.has_truth else "")
         self.inside = self._inside()
         """What lies inside the borders; None where there are none."""
 

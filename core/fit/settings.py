@@ -286,8 +286,7 @@ def preset(name: Preset, *, model: Model | None = None, mode: Mode = "default",
     draft, standard, high: our form, shorter schedules with higher rates (README has times and figures)
 
     All are a fifth longer in the modes `estimated` and `split`, unless `iterations` says how long. `model` and `blend`
-    choose another form:
-    the paper's covers in display space, ours adds in linear light and is hidden by the scene.
+    choose another form: the paper's covers in display space, ours adds in linear light and is hidden by the scene.
     """
     if name not in ITERATIONS:
         raise SettingsError(f"There is no preset {name!r}; choose {', '.join(ITERATIONS)}.")

@@ -5,7 +5,7 @@ Frame = encode(scene + flare) leaves open who takes what both could make. Two th
 so no frame is darker than the scene. And what both could make is the flare's: above all the glow about a light, which
 moves with the light as a part of the scene there would. The light's own disc is the scene's. Where the scene is slow to
 find, as plain walls are, what it lacks would become the flare's too, a haze over the frame; so then what both could
-make is the flare's near the lights alone.
+make is the flare's near the lights alone. Flare-free frames that are estimates (mode `estimated`) help to find it.
 """
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from torch import Tensor
 
 from ..capture import Camera
 from ..capture.discs import squared_distances
+from ..gaussians.loss import l1_ssim
 from .frames import Targets
 from .settings import SplitSettings
 
@@ -25,11 +26,6 @@ from .settings import SplitSettings
 def head_start(settings: SplitSettings, views: int, iterations: int) -> int:
     """Iterations, of so many, in which the scene of a fit to so many views is fitted alone."""
     return min(settings.rounds * views, iterations // 3)
-
-
-def settled(progress: float) -> float:
-    """How far, 0..1, a scene counts as found at a point of the fit, 0..1: wholly from its middle on."""
-    return min(2 * progress, 1.0)
 
 
 def scene_beside_flare(scene: Tensor, targets: Targets, lights: ArrayLike, discs: Tensor | None,
@@ -40,7 +36,7 @@ def scene_beside_flare(scene: Tensor, targets: Targets, lights: ArrayLike, discs
     progress: of the fit, 0..1. The more the scene counts as found, the less it is drawn up to brighter frames, and the
     more held down near the lights.
     """
-    share = settled(progress)
+    share = _found_by(progress)
     loss = settings.weight * from_below(scene, targets.frame, settings.excess * (1 - share))
     near = torch.from_numpy(nearness(targets.camera, lights, settings.reach))
     loss = loss + settings.glow * share * (scene * near[..., None]).mean()
@@ -49,12 +45,25 @@ def scene_beside_flare(scene: Tensor, targets: Targets, lights: ArrayLike, discs
     return loss
 
 
+def towards_estimate(scene: Tensor, estimate: Tensor, ssim_share: float, progress: float) -> Tensor:
+    """Loss that draws a scene to an estimated flare-free frame, display values (height, width, 3) both, the less the
+    more it counts as found at this point of the fit, 0..1: parts of the flare that were left in the estimate go then.
+    ssim_share: 1 - lambda, as of the fit's other losses."""
+    drawn = 1 - _found_by(progress)
+    return drawn * l1_ssim(scene, estimate, 1 - ssim_share) if drawn else scene.new_zeros(())
+
+
 def haze(added: Tensor, camera: Camera, lights: ArrayLike, settings: SplitSettings) -> Tensor:
     """Loss of what a flare adds to the display values of a scene that was not found, (height, width, 3), away from
     where lights (n, 3), world, are seen. To leave out what the frame shows costs more than this, so ghosts, which the
     scene cannot take over, stay; what the scene can make as well goes to it."""
     far = torch.from_numpy(1 - nearness(camera, lights, settings.reach))
     return settings.haze * (added * far[..., None]).mean()
+
+
+def _found_by(progress: float) -> float:
+    """How far, 0..1, a scene counts as found at a point of the fit, 0..1: wholly from its middle on."""
+    return min(2 * progress, 1.0)
 
 
 def from_below(scene: Tensor, frame: Tensor, excess: float) -> Tensor:

@@ -39,7 +39,7 @@ from .given import Given
 from .optimisers import Optimisers
 from .rendering import render_flare, render_scene
 from .settings import FitSettings
-from .splitting import from_below, haze, head_start, is_found, scene_beside_flare, settled
+from .splitting import from_below, haze, head_start, is_found, scene_beside_flare, towards_estimate
 
 CLEAR_EVERY = 50
 """Iterations between two looks at how much of the lights the scene leaves (`visibility.clear_shares`)."""
@@ -61,7 +61,7 @@ class Trainer:
         torch.manual_seed(settings.seed)
         self.settings = settings
         self.frames = Frames(capture, settings.width, display_white=settings.display_white,
-                             alone=not settings.looks_at_removed)
+                             alone=not settings.looks_at_removed, truth=settings.supervised)
         if exposures is None:
             exposures = metering.found(capture, self.frames, progress) if settings.exposure == "found" else {}
         self.exposures = exposures
@@ -73,8 +73,7 @@ class Trainer:
         self.losses: dict[str, float] = {}
         """Of each view, by name, when it was last looked at."""
         self.scene_is_fitted = not settings.scene.frozen
-        missing = self.frames.reference != "removed" if settings.mode == "estimated" else not self.frames.reference
-        if settings.looks_at_removed and missing and self.scene_is_fitted:
+        if settings.looks_at_removed and not self.frames.reference and self.scene_is_fitted:
             raise CaptureError(f"{capture.folder} has no flare-free frames (removed/); run remove on it first, "
                                "or fit with --mode split.")
         self.scene = first_scene(capture, settings, self.views, self.frames)
@@ -254,9 +253,8 @@ class Trainer:
             return from_below(scene, targets.frame, settings.split.excess)
         lights, progress = self.flare.positions.numpy(), self.iteration / settings.iterations
         loss = scene_beside_flare(scene, targets, lights, sources, settings.split, progress)
-        drawn = 1 - settled(progress)
-        if targets.removed is not None and drawn > 0:
-            loss = loss + drawn * l1_ssim(scene, targets.removed, 1 - settings.ssim_share)
+        if targets.removed is not None:
+            loss = loss + towards_estimate(scene, targets.removed, settings.ssim_share, progress)
         if flare is None or self._scene_is_found:
             return loss
         behind = scene.detach()

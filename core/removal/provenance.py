@@ -14,7 +14,7 @@ def has_exact(capture: Capture) -> bool:
     where there is no removed/ the layers of a scene that is known. As `remove` makes them they are estimates."""
     if not capture.has_removed:
         return capture.has_truth
-    return not any(True for _ in Record(capture.folder / REMOVED).as_made(_sources(capture)))
+    return not any(Record(capture.folder / REMOVED).as_made(_sources(capture)))
 
 
 def check_removed(capture: Capture) -> None:

@@ -37,11 +37,10 @@ def arguments(parser: argparse.ArgumentParser) -> None:
                              "into it")
     without = parser.add_mutually_exclusive_group()
     without.add_argument("--split", action="store_true",
-                         help="do without flare-free frames: tell scene and flare apart by parallax, as `fit` does "
-                              "where there are none")
+                         help="do without flare-free frames: tell scene and flare apart by parallax alone")
     without.add_argument("--remove", action="store_true",
-                         help="take the flares out of the frames as `remove` does, in place of the sample's exact "
-                              "flare-free frames")
+                         help="take the flares out of the frames as `remove` does, and `fit` where there are no "
+                              "flare-free frames, in place of the sample's exact ones")
     parser.add_argument("--model", choices=get_args(Model), help="the flare's form, as of `fit`")
     parser.add_argument("--iterations", type=int, metavar="N", help="length of the fit (default: the preset's)")
     parser.add_argument("--preset", choices=OUR_PRESETS, default="draft",
@@ -65,12 +64,11 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     if words.remove:
         capture = with_removed(capture, progress)
     mode: Mode = "split" if words.split else fit.mode_for(capture, False, progress)
-    if mode == "estimated":
-        capture = with_removed(capture, progress)
-    progress.say(f"{source.name}: {len(capture.views)} frames, {len(capture.lights)} lights. "
-                 f"{_supervision(capture, mode)}")
     given = {"model": words.model} if words.model else {}
     settings = preset(words.preset, mode=mode, iterations=words.iterations, **given)
+    capture = fit.with_what_teaches(capture, settings, progress)
+    progress.say(f"{source.name}: {len(capture.views)} frames, {len(capture.lights)} lights. "
+                 f"{_supervision(capture, mode)}")
     _check_earlier(out / "run", settings, capture)
     made = fit_capture(capture, settings, out / "run", progress, resume=True)
     result = evaluate.scores_of(made.folder, progress)

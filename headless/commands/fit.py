@@ -88,9 +88,7 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     settings = Run.open(out).settings if goes_on else chosen(words, capture, progress)
     if settings.mode != "3dgs":
         capture = with_lights(capture, progress)
-    exact = settings.supervised and capture.has_truth
-    if settings.looks_at_removed and not settings.scene.frozen and not exact:
-        capture = with_removed(capture, progress)
+    capture = with_what_teaches(capture, settings, progress)
     done = fit(capture, settings, out, progress, resume=words.resume)
     progress.say(f"The run is in {done.folder}: see preview.png there, then `eval` and `bake` it.")
     return {"run": str(done.folder)}
@@ -111,6 +109,13 @@ def chosen(words: argparse.Namespace, capture: Capture, progress: Progress) -> F
     changes["scene.frozen"] = words.freeze_scene or None
     changes = {name: value for name, value in changes.items() if value is not None}
     return changed(settings, {**changes, **dict(map(change, words.changes))})
+
+
+def with_what_teaches(capture: Capture, settings: FitSettings, progress: Progress) -> Capture:
+    """The capture with the flare-free frames that a fit with these settings looks at, made where it has none."""
+    exact = settings.supervised and capture.has_truth
+    needed = settings.looks_at_removed and not settings.scene.frozen and not exact
+    return with_removed(capture, progress) if needed else capture
 
 
 def mode_for(capture: Capture, frozen: bool, progress: Progress) -> Mode:

@@ -143,6 +143,8 @@ def _cleaning(layout: Any, state: Any, capture: Any, stage: str) -> None:
         given.use_property_decorate = False
         given.prop(state, "matte")
         given.prop(state, "keep_glow")
+        if not there and state.mode != "split" and (state.matte or state.keep_glow):
+            lines(layout, "Press Make Clean Frames first: a fit makes them without these.", "INFO")
     if there and state.mode == "split":  # they were made while the .blend was closed
         lines(layout, "There are clean frames: choose them as Supervision to learn from them.", "INFO")
     by_fit = stage == "finished" and (job is None or "--run" not in job.words)

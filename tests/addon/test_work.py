@@ -87,6 +87,7 @@ def test_clean_frames_that_were_made_again_are_shown(facts: Any) -> None:
 
 def test_a_fit_goes_by_clean_frames_of_someone_s_own_and_takes_others_for_estimates(facts: Any) -> None:
     assert facts["goes by"] == ["default", "estimated", "estimated", "estimated"]
+    assert facts["says that a fit knows no matte"] == [False, True]
 
 
 def test_a_bake_follows_the_cuts_of_the_timeline(facts: Any) -> None:

@@ -159,6 +159,11 @@ for which in ("own", "made", "none"):
         shutil.rmtree(goes / "removed")
     ops.import_capture(directory=str(goes))
     facts["goes by"].append(scene.fit_flare.mode)
+part("flare_addon.panels")._cleaning(drawn := MagicMock(), scene.fit_flare, goes, "none")
+scene.fit_flare.keep_glow = True
+part("flare_addon.panels")._cleaning(glow := MagicMock(), scene.fit_flare, goes, "none")
+scene.fit_flare.keep_glow = False
+facts["says that a fit knows no matte"] = ["Press Make Clean" in str(one.mock_calls) for one in (drawn, glow)]
 scene.fit_flare.mode = "default"
 fits.cleaned(SimpleNamespace(folder=goes / "removal", state="done"))
 facts["goes by"].append(scene.fit_flare.mode)

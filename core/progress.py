@@ -22,6 +22,7 @@ import signal
 import sys
 import threading
 import time
+from collections import deque
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, TextIO
@@ -31,6 +32,8 @@ from .errors import DISK_FULL, Cancelled
 STOP_FILE = "FIT_FLARE_STOP"
 """Of the environment: the path of a file which, when it is there, asks a command to stop."""
 STOP_FILE_EVERY_S = 0.3
+PACE_OVER_S = 60.0
+"""Over which the pace of work is measured: a fit slows down as its Gaussians grow more."""
 _NO_LISTENER = (*DISK_FULL, errno.EIO)  # the latter of a terminal that is gone
 
 
@@ -42,19 +45,21 @@ class Progress:
         self._stage = ""
         self._total = 0
         self._done = 0
-        self._began = 0.0
         self._first = 0
+        self._marks: deque[tuple[float, int]] = deque()
+        """Of this stage when how many steps were done, about once a second over the last `PACE_OVER_S`."""
 
     def stage(self, name: str, total: int, done: int = 0) -> None:
         """Begin a stage of `total` steps, of which `done` were made by an earlier run."""
         self._stage, self._total, self._done = name, total, done
-        self._began, self._first = time.monotonic(), done
+        self._first, self._marks = done, deque([(time.monotonic(), done)])
         self._show_stage()
         self.check()
 
     def advance(self, steps: int = 1, **figures: float) -> None:
         """Count steps; `figures` are shown beside them (loss, Gaussians, …)."""
         self._done += steps
+        self._mark()
         self._show_progress(figures)
         self.check()
 
@@ -81,11 +86,21 @@ class Progress:
 
     @property
     def left_s(self) -> float | None:
-        """Seconds left in this stage at the pace so far; None before the first step."""
-        made = self._done - self._first
-        if made <= 0:
+        """Seconds left in this stage at the pace of late; None before the first step."""
+        if not self._marks or self._done <= self._marks[0][1]:
             return None
-        return (time.monotonic() - self._began) / made * max(self._total - self._done, 0)
+        since, before = self._marks[0]
+        return (time.monotonic() - since) / (self._done - before) * max(self._total - self._done, 0)
+
+    def _mark(self) -> None:
+        now, marks = time.monotonic(), self._marks
+        if len(marks) < 2 or now - marks[-1][0] >= 1:
+            marks.append((now, self._done))
+        # In the first step things are compiled and loaded; processes that work side by side end several at once.
+        if len(marks) > 2 and marks[0][1] == self._first and self._done - marks[1][1] >= 3:
+            marks.popleft()
+        while len(marks) > 2 and now - marks[1][0] > PACE_OVER_S:
+            marks.popleft()
 
     def _show_stage(self) -> None:
         pass

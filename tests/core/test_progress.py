@@ -205,9 +205,40 @@ def test_a_file_asks_for_a_stop(of_main_thread: bool, tmp_path: Path, monkeypatc
     assert threading.active_count() == before, "who looked has gone"
 
 
-def test_the_time_left_of_what_goes_on_is_by_the_steps_made_since() -> None:
-    progress = Progress()
+class Clock:
+    """In place of the time module's: it goes on when told."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.now = 1000.0
+        monkeypatch.setattr("core.progress.time.monotonic", lambda: self.now)
+
+    def left_after(self, progress: Progress, seconds: float, steps: int = 1) -> float | None:
+        self.now += seconds
+        progress.advance(steps)
+        return progress.left_s
+
+
+def test_the_time_left_of_what_goes_on_is_by_the_steps_made_since(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock, progress = Clock(monkeypatch), Progress()
     progress.stage("fit", 1000, 900)
-    progress._began -= 50
-    progress.advance(50)
-    assert progress.left_s == pytest.approx(50, rel=0.05)
+    assert progress.left_s is None
+    assert clock.left_after(progress, 50, 50) == pytest.approx(50)
+
+
+def test_the_time_left_forgets_the_first_step_and_an_earlier_pace(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock, progress = Clock(monkeypatch), Progress()
+    progress.stage("fit", 1000)
+    assert clock.left_after(progress, 20) == pytest.approx(20 * 999), "of one step nothing else is known"
+    for _ in range(20):
+        left = clock.left_after(progress, 0.1)
+    assert left == pytest.approx(0.1 * 979), "compiling was twenty seconds"
+    for _ in range(400):
+        left = clock.left_after(progress, 0.3)
+    assert left == pytest.approx(0.3 * 579, rel=0.01), "it goes slower now"
+
+
+def test_processes_that_end_together_are_no_pace(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock, progress = Clock(monkeypatch), Progress()
+    progress.stage("clean", 64)
+    lefts = [clock.left_after(progress, 0.01 if number % 16 else 5) for number in range(32)]
+    assert all(left is not None and left > 5 * (63 - number) / 16 / 2 for number, left in enumerate(lefts))

@@ -29,6 +29,8 @@ from .synthesis.layers import flare, through_aspheres
 from .synthesis.prescription import Prescription
 
 Random = np.random.Generator
+LOOKED_AT = 50
+"""About as many of the user's flares are read before a training, to tell of those that cannot be."""
 MOST_UNREADABLE = 20
 """Of the user's flares drawn one after the other; a folder of nothing else is told of."""
 
@@ -108,7 +110,7 @@ class OwnFlares:
     """Flare layers that the user has, as pictures or video frames, read when they are drawn."""
 
     def __init__(self, folder: Path | str, size: int) -> None:
-        """Raises SettingsError where the folder holds neither pictures nor clips."""
+        """Raises SettingsError where the folder holds neither pictures nor clips, or none that can be read."""
         folder = Path(folder)
         # Beside the folder of its flares, as Flare7K++ has them: another set may have flares of the same names.
         lights = {(path.parent.parent, path.stem): path for path in folder.glob("**/Light_Source/*")
@@ -123,12 +125,25 @@ class OwnFlares:
             self._files.append((path, lights.get((path.parent.parent, path.stem))))
         if not self._files:
             raise SettingsError(f"{folder} holds no flare layers; give pictures or clips of flares on black.")
+        self.left_out: list[str] = []
+        """What is wrong with those that cannot be read, a sentence each, among about `LOOKED_AT` that are looked at."""
+        self._leave_out_unreadable()
+        if not self._files:
+            raise SettingsError(f"None of the flares in {folder} can be read; {self.left_out[0]}")
         compound = {beside for beside, _ in lights}
         self.without_light = [path for path, light in self._files if light is None and path.parent.parent in compound]
         """Those whose folder has the others' lights beside it but not theirs: their lights are taken for flare."""
 
     def __len__(self) -> int:
         return len(self._files)
+
+    def _leave_out_unreadable(self) -> None:
+        for file in self._files[:: max(len(self._files) // LOOKED_AT, 1)]:
+            try:
+                self._read(file, np.random.default_rng(0))
+            except FrameError as problem:
+                self.left_out.append(str(problem))
+                self._files.remove(file)
 
     def draw(self, random: Random) -> Layers:
         """A random layer; the middle of the picture is taken for the principal point. One that cannot be read is passed
@@ -139,16 +154,20 @@ class OwnFlares:
         return self._drawn(random)
 
     def _drawn(self, random: Random) -> Layers:
-        path, light_path = self._files[int(random.integers(len(self._files)))]
-        flare = self._square(_frame_of(path, random))
-        light = np.zeros_like(flare)
-        if light_path is not None:
-            light = np.minimum(self._square(_light_of(light_path)), flare)
+        flare, light = map(self._square, self._read(self._files[int(random.integers(len(self._files)))], random))
+        light = np.minimum(light, flare)
         lights: tuple[tuple[float, float], ...] = ()
         if float(light.max()) > 0.3:
             y, x = np.unravel_index(int(light.sum(-1).argmax()), light.shape[:2])
             lights = (((float(x) + 0.5) / self._size * 2 - 1, (float(y) + 0.5) / self._size * 2 - 1),)
         return Layers(flare - light, np.zeros_like(flare), light * 4, lights)
+
+    @staticmethod
+    def _read(file: tuple[Path, Path | None], random: Random) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Linear light of a flare or a random frame of its clip, and of its light. Raises FrameError."""
+        path, light_path = file
+        flare = _frame_of(path, random)
+        return flare, np.zeros_like(flare) if light_path is None else _light_of(light_path)
 
     def _square(self, pixels: NDArray[np.float32]) -> NDArray[np.float32]:
         """Reduced so that the diagonal is the canvas' side, and set in its middle."""

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ...core.errors import SettingsError
+from ...core.errors import SettingsError, spelled_out
 from ...core.progress import Progress
 from ..command import Command, Step, from_1, refuse_useless
 from .fit import change
@@ -98,6 +98,8 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
         if sentence := told_left_out(left_out):
             progress.say(sentence)
         own = OwnFlares(words.flares, recipe.canvas) if words.flares else None
+        if own and own.left_out:
+            progress.say(f"Left out of your flares: {spelled_out(own.left_out)}")
         if own and own.without_light:
             progress.say(f"{len(own.without_light)} of your {len(own)} flares have no picture of their light in "
                          f"Light_Source, {own.without_light[0].name} first; it is learned as a part of the flare.")

@@ -363,6 +363,12 @@ def test_own_flares_that_cannot_be_read_or_have_no_light(tmp_path: Path) -> None
         path.write_bytes(b"")
     with pytest.raises(FrameError, match=r"\.png"):
         own.draw(np.random.default_rng(0))
+    with pytest.raises(SettingsError, match=r"None of the flares .*1\.png"):
+        OwnFlares(tmp_path, SIZE)
+    write_png(compound / "2.png", picture)
+    beside = OwnFlares(tmp_path, SIZE)
+    assert len(beside) == 1
+    assert all(name in said for name, said in zip(("Reflective_Flare", "1.png"), beside.left_out, strict=True))
 
 
 def test_backgrounds_of_folders(tmp_path: Path) -> None:

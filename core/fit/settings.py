@@ -132,7 +132,8 @@ class SplitSettings:
     the square of what the frames have more than the scene is less than `found` times that of what they have less, the
     flare's light costs `haze` away from the lights: what could be either's is the flare's near them alone.
     Mode `estimated`: from the moment the flare is due to the middle of the fit the scene is drawn to the estimated
-    flare-free frames as well, less and less: what they have left of the flare goes again by parallax.
+    flare-free frames as well, less and less: what they have left of the flare goes again by parallax. Of what they say
+    that the flare adds nothing costs `haze` just below `found`, all at `lost` times and less.
     """
 
     rounds: int = 2
@@ -144,6 +145,7 @@ class SplitSettings:
     plain: float = 0.7
     sky: bool = True
     found: float = 26.0
+    lost: float = 18.0
     haze: float = 0.1
 
 
@@ -261,9 +263,9 @@ BOUNDS: dict[str, Bounds] = {
         "features", "features_rest", "opacity", "scale", "rotation")), _AMOUNT),
     **dict.fromkeys(("scene.rates.position", "scene.rates.position_final"), _POSITIVE),
 
-    "split.rounds": _FROM_0, "split.excess": _SHARE, "split.found": _AMOUNT, "split.haze": _AMOUNT,
-    "split.weight": _AMOUNT, "split.glow": _AMOUNT, "split.reach": Bounds(1e-6, 1e6), "split.plain": _SHARE,
-    "split.sh_degree": Bounds(0, 3),
+    "split.rounds": _FROM_0, "split.excess": _SHARE, "split.found": _AMOUNT, "split.lost": _AMOUNT,
+    "split.haze": _AMOUNT, "split.weight": _AMOUNT, "split.glow": _AMOUNT, "split.reach": Bounds(1e-6, 1e6),
+    "split.plain": _SHARE, "split.sh_degree": Bounds(0, 3),
 }
 """What each number among the settings may be, by its dotted name; some may be None or text instead."""
 

@@ -5,7 +5,8 @@ Frame = encode(scene + flare) leaves open who takes what both could make. Two th
 so no frame is darker than the scene. And what both could make is the flare's: above all the glow about a light, which
 moves with the light as a part of the scene there would. The light's own disc is the scene's. Where the scene is slow to
 find, as plain walls are, what it lacks would become the flare's too, a haze over the frame; so then what both could
-make is the flare's near the lights alone. Flare-free frames that are estimates (mode `estimated`) help to find it.
+make is the flare's near the lights alone. Flare-free frames that are estimates (mode `estimated`) help to find it, and
+tell of flare that is far from them.
 """
 from __future__ import annotations
 
@@ -21,6 +22,9 @@ from ..capture.discs import squared_distances
 from ..gaussians.loss import l1_ssim
 from .frames import Targets
 from .settings import SplitSettings
+
+FOUND_WHOLLY = 1e9
+"""Of a scene than which nothing is darker."""
 
 
 def head_start(settings: SplitSettings, views: int, iterations: int) -> int:
@@ -53,10 +57,18 @@ def towards_estimate(scene: Tensor, estimate: Tensor, ssim_share: float, progres
     return drawn * l1_ssim(scene, estimate, 1 - ssim_share) if drawn else scene.new_zeros(())
 
 
-def haze(added: Tensor, camera: Camera, lights: ArrayLike, settings: SplitSettings) -> Tensor:
+def haze(added: Tensor, told: Tensor | None, found: float, camera: Camera, lights: ArrayLike,
+         settings: SplitSettings) -> Tensor:
     """Loss of what a flare adds to the display values of a scene that was not found, (height, width, 3), away from
     where lights (n, 3), world, are seen. To leave out what the frame shows costs more than this, so ghosts, which the
-    scene cannot take over, stay; what the scene can make as well goes to it."""
+    scene cannot take over, stay; what the scene can make as well goes to it.
+
+    told: the same as an estimated flare-free frame has it, if there is one; found: `times_found`. The nearer the scene
+    is to being found, the more of what is told costs nothing.
+    """
+    if told is not None:
+        believed = (found - settings.lost) / max(settings.found - settings.lost, 1e-9)
+        added = (added - min(max(believed, 0), 1) * told.clamp(min=0)).clamp(min=0)
     far = torch.from_numpy(1 - nearness(camera, lights, settings.reach))
     return settings.haze * (added * far[..., None]).mean()
 
@@ -73,14 +85,14 @@ def from_below(scene: Tensor, frame: Tensor, excess: float) -> Tensor:
     return torch.where(more > 0, more * excess, -more).mean()
 
 
-def is_found(residuals: Iterable[Tensor], times: float) -> bool:
-    """Whether what frames have more than the scene, squared, is so many times what they have less: mostly flare, then.
-    residuals: frame - scene (height, width, 3) of some views, display values."""
+def times_found(residuals: Iterable[Tensor]) -> float:
+    """How many times what frames have less than the scene, squared, they have more, at most `FOUND_WHOLLY`: the more,
+    the more of that is flare. residuals: frame - scene (height, width, 3) of some views, display values."""
     more = less = 0.0
     for residual in residuals:
         more += float(residual.clamp(min=0).square().mean())
         less += float(residual.clamp(max=0).square().mean())
-    return more >= times * less
+    return more / less if more < FOUND_WHOLLY * less else FOUND_WHOLLY
 
 
 def nearness(camera: Camera, lights: ArrayLike, reach: float) -> NDArray[np.float32]:

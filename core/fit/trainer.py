@@ -39,14 +39,22 @@ from .given import Given
 from .optimisers import Optimisers
 from .rendering import render_flare, render_scene
 from .settings import FitSettings
-from .splitting import from_below, haze, head_start, is_found, scene_beside_flare, towards_estimate
+from .splitting import (
+    FOUND_WHOLLY,
+    from_below,
+    haze,
+    head_start,
+    scene_beside_flare,
+    times_found,
+    towards_estimate,
+)
 
 CLEAR_EVERY = 50
 """Iterations between two looks at how much of the lights the scene leaves (`visibility.clear_shares`)."""
 UNTOLD = 0.01
 """Difference of display values between frame and flare-free frame below which nothing is told of a flare."""
 ASKED = 40
-"""About as many views are asked there, and for whether a scene has been found (`splitting.is_found`)."""
+"""About as many views are asked there, and for whether a scene has been found (`splitting.times_found`)."""
 
 
 class Trainer:
@@ -86,7 +94,8 @@ class Trainer:
         self._head_start = head_start(settings.split, len(self.views), settings.iterations)
         """Iterations in which a scene that is told from flare by parallax is fitted alone; then it is asked whether it
         has been found."""
-        self._scene_is_found = True
+        self._found = FOUND_WHOLLY
+        """How far it has (`splitting.times_found`)."""
         self.optimisers = Optimisers(self.scene, self.flare, settings, self.extent, self.frames.display_white)
         self.strategy = self._strategy()
 
@@ -186,7 +195,7 @@ class Trainer:
 
         asked = thinned(self.views, ASKED)
         residuals = (missing(self.frames.targets(view)) for view in asked)
-        self._scene_is_found = is_found(residuals, self.settings.split.found)
+        self._found = times_found(residuals)
 
     def _covered(self, targets: Targets) -> Tensor | None:
         """A loss where the scene hides a light from everywhere that the frame shows, until it lets some of it through.
@@ -255,11 +264,12 @@ class Trainer:
         loss = scene_beside_flare(scene, targets, lights, sources, settings.split, progress)
         if targets.removed is not None:
             loss = loss + towards_estimate(scene, targets.removed, settings.ssim_share, progress)
-        if flare is None or self._scene_is_found:
+        if flare is None or self._found >= settings.split.found:
             return loss
         behind = scene.detach()
         added = composite(behind, flare, settings.blend, self.frames.display_white) - behind
-        return loss + haze(added, targets.camera, lights, settings.split)
+        told = None if targets.removed is None else targets.frame - targets.removed
+        return loss + haze(added, told, self._found, targets.camera, lights, settings.split)
 
     def _sh_degree(self) -> int:
         if self.settings.scene.start:
@@ -309,7 +319,7 @@ class Trainer:
 
     def state(self) -> State:
         """All that a resumed fit needs, as `checkpoint.save` takes it."""
-        state: State = {"iteration": self.iteration, "scene_is_found": self._scene_is_found,
+        state: State = {"iteration": self.iteration, "found": self._found,
                         "losses": [[name, loss] for name, loss in self.losses.items()],
                         "scene": dict(self.scene.state_dict()), "strategy": self.strategy.state_dict(),
                         **self.optimisers.state(), **self._given.note()}
@@ -323,8 +333,8 @@ class Trainer:
         try:
             self._given.check(state)
             self.iteration = int(state["iteration"])
-            found = state.get("scene_is_found", state.get("alone_until") == self._head_start)  # of earlier versions
-            self._scene_is_found = bool(found)
+            of_before = state.get("scene_is_found", state.get("alone_until") == self._head_start)  # earlier versions
+            self._found = float(state.get("found", FOUND_WHOLLY if of_before else 0))
             self.losses = {name: float(loss) for name, loss in state.get("losses", [])}
             _load_parameters(dict(self.scene.named_parameters()), state["scene"])
             if self.flare is not None:

@@ -29,7 +29,7 @@ from core.fit.frames import Frames
 from core.fit.rendering import render_flare
 from core.fit.settings import SplitSettings, changed
 from core.fit.sky import COUNT, with_sky
-from core.fit.splitting import from_below, haze, is_found, nearness, scene_beside_flare
+from core.fit.splitting import FOUND_WHOLLY, from_below, haze, nearness, scene_beside_flare, times_found
 from core.fit.trainer import Trainer
 from core.flare.compositing import composite
 from core.flare.model import OURS, PAPER
@@ -268,10 +268,10 @@ def test_a_scene_is_found_once_what_frames_have_more_is_mostly_flare() -> None:
     errors = torch.randn(4, 20, 30, 3, generator=torch.Generator().manual_seed(0)) * 0.02
     flare = torch.zeros(20, 30, 3)
     flare[5:15, 5:15] = 0.3
-    assert not is_found(errors, times=5)
-    assert is_found(errors + flare, times=5)
-    assert not is_found(errors - flare, times=0.1)
-    assert is_found(iter(()), times=5), "nothing is missing where there is nothing"
+    assert times_found(errors) == pytest.approx(1, abs=0.1)
+    assert times_found(errors + flare) > 5
+    assert times_found(errors - flare) < 0.1
+    assert times_found(iter(())) == times_found([flare]) == FOUND_WHOLLY, "nothing is missing"
 
 
 def test_light_costs_a_flare_away_from_the_lights_where_the_scene_is_not_found(capture: Capture) -> None:
@@ -300,12 +300,24 @@ def test_a_haze_costs_by_its_light_and_by_how_far_it_is_from_the_lights(capture:
     camera, lights = capture.views[0].camera, np.array([light.xyz for light in capture.lights])
     added = torch.full((camera.height, camera.width, 3), 0.1, requires_grad=True)
     settings = SplitSettings(haze=2.0, reach=0.05)
-    loss = haze(added, camera, lights, settings)
+    loss = haze(added, None, 0.0, camera, lights, settings)
     far = torch.from_numpy(1 - nearness(camera, lights, 0.05))
     assert float(loss.detach()) == pytest.approx(2 * 0.1 * float(far.mean()), rel=1e-4)
     loss.backward()
     assert added.grad is not None
     assert torch.allclose(added.grad * added.numel() / 2, far[..., None].expand_as(added), atol=1e-5)
+
+
+@pytest.mark.parametrize(("found", "believed"), [(5.0, 0), (10.0, 0), (15.0, 0.5), (19.9, 0.99), (25.0, 1)])
+def test_of_a_haze_that_an_estimate_tells_of_the_less_costs_the_more_the_scene_is_found(
+        capture: Capture, found: float, believed: float) -> None:
+    camera, lights = capture.views[0].camera, np.array([light.xyz for light in capture.lights])
+    added = torch.full((camera.height, camera.width, 3), 0.1)
+    told = torch.linspace(-0.1, 0.3, added.numel()).reshape(added.shape)
+    settings = SplitSettings(haze=2.0, lost=10.0, found=20.0)
+    far = torch.from_numpy(1 - nearness(camera, lights, settings.reach))
+    expected = 2 * ((0.1 - believed * told.clamp(min=0)).clamp(min=0) * far[..., None]).mean()
+    assert float(haze(added, told, found, camera, lights, settings)) == pytest.approx(float(expected), rel=1e-4)
 
 
 def test_what_could_be_either_is_the_flare_s_but_a_light_s_own_disc(capture: Capture) -> None:
@@ -605,9 +617,9 @@ def test_a_checkpoint_of_a_version_whose_scene_went_on_alone_goes_on(capture: Ca
     settings = changed(quick(120), {"mode": "split", "split.rounds": 1})
     earlier, trainer = (Trainer(capture, settings) for _ in range(2))
     state = earlier.state()
-    del state["scene_is_found"]
+    del state["found"]
     trainer.load_state({**state, "alone_until": len(earlier.views) if found else settings.iterations // 3})
-    assert trainer._scene_is_found == found
+    assert (trainer._found > 0) == found
 
 
 def test_a_checkpoint_brings_back_what_no_optimiser_holds(tmp_path: Path) -> None:
@@ -618,9 +630,9 @@ def test_a_checkpoint_brings_back_what_no_optimiser_holds(tmp_path: Path) -> Non
     assert second.flare is not None
     first.flare.clear.fill_(0.3)
     first.flare.positions += 0.25
-    first._scene_is_found = False
+    first._found = 13.5
     checkpoint.save(tmp_path / "state.safetensors", first.state())
     second.load_state(checkpoint.load(tmp_path / "state.safetensors"))
     assert torch.equal(second.flare.clear, first.flare.clear)
     assert torch.equal(second.flare.positions, first.flare.positions)
-    assert not second._scene_is_found
+    assert second._found == 13.5

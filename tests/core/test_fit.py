@@ -613,13 +613,15 @@ def test_one_view_past_which_the_light_goes_leaves_the_flare_of_the_others_alone
 
 @pytest.mark.parametrize("found", [True, False])
 def test_a_checkpoint_of_a_version_whose_scene_went_on_alone_goes_on(capture: Capture, found: bool) -> None:
-    """It says until when the scene was alone: for longer where it had not been found."""
+    """It says until when the scene was alone, for longer where it had not been found; a later one whether it was."""
     settings = changed(quick(120), {"mode": "split", "split.rounds": 1})
     earlier, trainer = (Trainer(capture, settings) for _ in range(2))
     state = earlier.state()
     del state["found"]
-    trainer.load_state({**state, "alone_until": len(earlier.views) if found else settings.iterations // 3})
-    assert (trainer._found > 0) == found
+    for told in ({"alone_until": len(earlier.views) if found else settings.iterations // 3}, {"scene_is_found": found}):
+        trainer._found = 13.5
+        trainer.load_state({**state, **told})
+        assert trainer._found == (FOUND_WHOLLY if found else 0)
 
 
 def test_a_checkpoint_brings_back_what_no_optimiser_holds(tmp_path: Path) -> None:

@@ -17,6 +17,7 @@ import contextlib
 import errno
 import importlib.util
 import json
+import math
 import os
 import signal
 import sys
@@ -32,7 +33,7 @@ from .errors import DISK_FULL, Cancelled
 STOP_FILE = "FIT_FLARE_STOP"
 """Of the environment: the path of a file which, when it is there, asks a command to stop."""
 STOP_FILE_EVERY_S = 0.3
-PACE_OVER_S = 60.0
+LEAST_PACE_OVER_S, PACE_OVER_S = 1.0, 60.0
 """Over which the pace of work is measured: a fit slows down as its Gaussians grow more."""
 _NO_LISTENER = (*DISK_FULL, errno.EIO)  # the latter of a terminal that is gone
 
@@ -45,14 +46,14 @@ class Progress:
         self._stage = ""
         self._total = 0
         self._done = 0
-        self._first = 0
         self._marks: deque[tuple[float, int]] = deque()
-        """Of this stage when how many steps were done, about once a second over the last `PACE_OVER_S`."""
+        """Of this stage when how many steps were done, from the first on, about once a second over the last
+        `PACE_OVER_S`."""
 
     def stage(self, name: str, total: int, done: int = 0) -> None:
         """Begin a stage of `total` steps, of which `done` were made by an earlier run."""
         self._stage, self._total, self._done = name, total, done
-        self._first, self._marks = done, deque([(time.monotonic(), done)])
+        self._marks.clear()
         self._show_stage()
         self.check()
 
@@ -86,19 +87,21 @@ class Progress:
 
     @property
     def left_s(self) -> float | None:
-        """Seconds left in this stage at the pace of late; None before the first step."""
-        if not self._marks or self._done <= self._marks[0][1]:
+        """Seconds left in this stage at the pace of late; None until a second after the first step, which says little
+        of the others: in it things are compiled and loaded, and processes that work side by side end several at once.
+        """
+        if self._done >= self._total:
+            return 0.0
+        since, before = self._marks[0] if self._marks else (math.inf, 0)
+        passed = time.monotonic() - since
+        if passed < LEAST_PACE_OVER_S or self._done == before:
             return None
-        since, before = self._marks[0]
-        return (time.monotonic() - since) / (self._done - before) * max(self._total - self._done, 0)
+        return passed / (self._done - before) * (self._total - self._done)
 
     def _mark(self) -> None:
         now, marks = time.monotonic(), self._marks
-        if len(marks) < 2 or now - marks[-1][0] >= 1:
+        if not marks or now - marks[-1][0] >= LEAST_PACE_OVER_S:
             marks.append((now, self._done))
-        # In the first step things are compiled and loaded; processes that work side by side end several at once.
-        if len(marks) > 2 and marks[0][1] == self._first and self._done - marks[1][1] >= 3:
-            marks.popleft()
         while len(marks) > 2 and now - marks[1][0] > PACE_OVER_S:
             marks.popleft()
 

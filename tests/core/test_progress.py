@@ -222,23 +222,31 @@ def test_the_time_left_of_what_goes_on_is_by_the_steps_made_since(monkeypatch: p
     clock, progress = Clock(monkeypatch), Progress()
     progress.stage("fit", 1000, 900)
     assert progress.left_s is None
-    assert clock.left_after(progress, 50, 50) == pytest.approx(50)
+    assert clock.left_after(progress, 40) is None, "the first step says little"
+    assert clock.left_after(progress, 50, 50) == pytest.approx(49)
+    assert clock.left_after(progress, 50, 49) == 0
 
 
-def test_the_time_left_forgets_the_first_step_and_an_earlier_pace(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_time_left_is_not_by_the_first_step_and_forgets_an_earlier_pace(monkeypatch: pytest.MonkeyPatch) -> None:
     clock, progress = Clock(monkeypatch), Progress()
     progress.stage("fit", 1000)
-    assert clock.left_after(progress, 20) == pytest.approx(20 * 999), "of one step nothing else is known"
+    assert clock.left_after(progress, 20) is None, "compiling"
+    assert clock.left_after(progress, 0.5) is None
     for _ in range(20):
         left = clock.left_after(progress, 0.1)
-    assert left == pytest.approx(0.1 * 979), "compiling was twenty seconds"
+    assert left == pytest.approx(2.5 / 21 * 978)
     for _ in range(400):
         left = clock.left_after(progress, 0.3)
-    assert left == pytest.approx(0.3 * 579, rel=0.01), "it goes slower now"
+    assert left == pytest.approx(0.3 * 578, rel=0.01), "it goes slower now"
+    progress.stage("eval", 10)
+    assert progress.left_s is None
 
 
 def test_processes_that_end_together_are_no_pace(monkeypatch: pytest.MonkeyPatch) -> None:
     clock, progress = Clock(monkeypatch), Progress()
     progress.stage("clean", 64)
-    lefts = [clock.left_after(progress, 0.01 if number % 16 else 5) for number in range(32)]
-    assert all(left is not None and left > 5 * (63 - number) / 16 / 2 for number, left in enumerate(lefts))
+    lefts = [clock.left_after(progress, 0.01 if number % 16 else 5) for number in range(48)]
+    assert not any(lefts[:16]), "not before others end"
+    for number, left in enumerate(lefts[16:], 17):
+        assert left is not None
+        assert 0.5 < left / (5 * (64 - number) / 16) <= 1.1, (number, left)

@@ -17,7 +17,6 @@ import contextlib
 import errno
 import importlib.util
 import json
-import math
 import os
 import signal
 import sys
@@ -34,7 +33,7 @@ STOP_FILE = "FIT_FLARE_STOP"
 """Of the environment: the path of a file which, when it is there, asks a command to stop."""
 STOP_FILE_EVERY_S = 0.3
 LEAST_PACE_OVER_S, PACE_OVER_S = 1.0, 60.0
-"""Over which the pace of work is measured: a fit slows down as its Gaussians grow more."""
+"""Over which the pace of work is measured, at least and at most: a fit slows down as its Gaussians grow more."""
 _NO_LISTENER = (*DISK_FULL, errno.EIO)  # the latter of a terminal that is gone
 
 
@@ -92,7 +91,9 @@ class Progress:
         """
         if self._done >= self._total:
             return 0.0
-        since, before = self._marks[0] if self._marks else (math.inf, 0)
+        if not self._marks:
+            return None
+        since, before = self._marks[0]
         passed = time.monotonic() - since
         if passed < LEAST_PACE_OVER_S or self._done == before:
             return None

@@ -15,7 +15,8 @@ from ..gaussians.ply import read_ply
 from ..gaussians.scene import SceneGaussians
 from ..lights.snap import Sight, sight, snapped
 from ..pictures import Picture
-from .frames import Frames, thinned
+from ..thinning import thinned
+from .frames import Frames
 from .settings import FitSettings
 from .sky import with_sky
 

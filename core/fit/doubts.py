@@ -11,7 +11,8 @@ import numpy as np
 from ..capture import Capture, View
 from ..flare.model import FlareModel
 from ..pictures import LUMINANCE, holds_floats, linear_from_srgb
-from .frames import Frames, thinned
+from ..thinning import thinned
+from .frames import Frames
 from .settings import FitSettings
 
 FEW = 12

@@ -2,8 +2,8 @@
 """The pictures a fit looks at, at the size and in the encoding in which it does."""
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, TypeVar
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -14,20 +14,13 @@ from ..borders import DARKEST, LEAST, Borders, Inside
 from ..capture import Camera, Capture, View
 from ..errors import CaptureError
 from ..pictures import Picture
+from ..thinning import thinned
 from .cache import MEMORY, PictureCache
 
 ASKED = 12
 """Frames, about, that are asked for their borders."""
 SOFT = 1
 """Lines beside a border that hold some of it at another size."""
-
-
-T = TypeVar("T")
-
-
-def thinned(items: Sequence[T], number: int) -> Sequence[T]:
-    """About so many of them, evenly: fewer than twice as many."""
-    return items[:: max(len(items) // number, 1)]
 
 
 def colours_at(xyz: NDArray[Any], camera: Camera, picture: Tensor) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:

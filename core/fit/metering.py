@@ -19,7 +19,8 @@ from ..capture import Capture, View
 from ..exposures import LEAST
 from ..pictures import LUMINANCE, holds_floats, linear_from_srgb
 from ..progress import Progress
-from .frames import Frames, colours_at, thinned
+from ..thinning import thinned
+from .frames import Frames, colours_at
 from .settings import FitSettings
 
 UNLIKE = 0.25

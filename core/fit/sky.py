@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from ..capture import Capture, View
 from ..capture.colmap import PointCloud
 from ..display import exposed
-from .frames import Frames, colours_at, thinned
+from ..thinning import thinned
+from .frames import Frames, colours_at
 
 COUNT = 2000
 FAR = 3.0

@@ -24,7 +24,7 @@ from .frames import Targets
 from .settings import SplitSettings
 
 FOUND_WHOLLY = 1e9
-"""Of a scene than which nothing is darker."""
+"""`times_found` of a scene that is nowhere brighter than the frames."""
 
 
 def head_start(settings: SplitSettings, views: int, iterations: int) -> int:
@@ -37,10 +37,10 @@ def scene_beside_flare(scene: Tensor, targets: Targets, lights: ArrayLike, discs
     """Loss of a scene (height, width, 3) of display values that is fitted with the flare, besides that of the two
     together. lights: (n, 3), world. discs: (height, width), the lights' own clipped pixels, if they are told.
 
-    progress: of the fit, 0..1. The more the scene counts as found, the less it is drawn up to brighter frames, and the
-    more held down near the lights.
+    progress: of the fit, 0..1. The farther it is, the less the scene is drawn up to brighter frames, and the more held
+    down near the lights.
     """
-    share = _found_by(progress)
+    share = _settled(progress)
     loss = settings.weight * from_below(scene, targets.frame, settings.excess * (1 - share))
     near = torch.from_numpy(nearness(targets.camera, lights, settings.reach))
     loss = loss + settings.glow * share * (scene * near[..., None]).mean()
@@ -51,30 +51,30 @@ def scene_beside_flare(scene: Tensor, targets: Targets, lights: ArrayLike, discs
 
 def towards_estimate(scene: Tensor, estimate: Tensor, ssim_share: float, progress: float) -> Tensor:
     """Loss that draws a scene to an estimated flare-free frame, display values (height, width, 3) both, the less the
-    more it counts as found at this point of the fit, 0..1: parts of the flare that were left in the estimate go then.
-    ssim_share: 1 - lambda, as of the fit's other losses."""
-    drawn = 1 - _found_by(progress)
+    farther the fit is (progress, 0..1): parts of the flare that were left in the estimate go then. ssim_share:
+    1 - lambda, as of the fit's other losses."""
+    drawn = 1 - _settled(progress)
     return drawn * l1_ssim(scene, estimate, 1 - ssim_share) if drawn else scene.new_zeros(())
 
 
-def haze(added: Tensor, told: Tensor | None, found: float, camera: Camera, lights: ArrayLike,
+def haze(added: Tensor, told: Tensor | None, times: float, camera: Camera, lights: ArrayLike,
          settings: SplitSettings) -> Tensor:
     """Loss of what a flare adds to the display values of a scene that was not found, (height, width, 3), away from
     where lights (n, 3), world, are seen. To leave out what the frame shows costs more than this, so ghosts, which the
     scene cannot take over, stay; what the scene can make as well goes to it.
 
-    told: the same as an estimated flare-free frame has it, if there is one; found: `times_found`. The nearer the scene
-    is to being found, the more of what is told costs nothing.
+    told: what the flare adds by an estimated flare-free frame, if there is one; times: `times_found` of the scene. The
+    nearer that is to `settings.found`, the more of what is told costs nothing.
     """
     if told is not None:
-        believed = (found - settings.lost) / max(settings.found - settings.lost, 1e-9)
+        believed = (times - settings.lost) / max(settings.found - settings.lost, 1e-9)
         added = (added - min(max(believed, 0), 1) * told.clamp(min=0)).clamp(min=0)
     far = torch.from_numpy(1 - nearness(camera, lights, settings.reach))
     return settings.haze * (added * far[..., None]).mean()
 
 
-def _found_by(progress: float) -> float:
-    """How far, 0..1, a scene counts as found at a point of the fit, 0..1: wholly from its middle on."""
+def _settled(progress: float) -> float:
+    """How far, 0..1, the scene is left to itself at a point of the fit, 0..1: wholly from its middle on."""
     return min(2 * progress, 1.0)
 
 

@@ -30,11 +30,12 @@ from ..gaussians.loss import l1_ssim
 from ..gaussians.ordering import morton_order
 from ..gaussians.spherical_harmonics import MAX_DEGREE
 from ..progress import Progress
+from ..thinning import thinned
 from . import metering
 from .beginning import first_flare, first_scene
 from .checkpoint import State
 from .doubts import doubts, moved_lights
-from .frames import Frames, Targets, thinned
+from .frames import Frames, Targets
 from .given import Given
 from .optimisers import Optimisers
 from .rendering import render_flare, render_scene
@@ -94,8 +95,8 @@ class Trainer:
         self._head_start = head_start(settings.split, len(self.views), settings.iterations)
         """Iterations in which a scene that is told from flare by parallax is fitted alone; then it is asked whether it
         has been found."""
-        self._found = FOUND_WHOLLY
-        """How far it has (`splitting.times_found`)."""
+        self._times_found = FOUND_WHOLLY
+        """By what is asked then (`splitting.times_found`)."""
         self.optimisers = Optimisers(self.scene, self.flare, settings, self.extent, self.frames.display_white)
         self.strategy = self._strategy()
 
@@ -195,7 +196,7 @@ class Trainer:
 
         asked = thinned(self.views, ASKED)
         residuals = (missing(self.frames.targets(view)) for view in asked)
-        self._found = times_found(residuals)
+        self._times_found = times_found(residuals)
 
     def _covered(self, targets: Targets) -> Tensor | None:
         """A loss where the scene hides a light from everywhere that the frame shows, until it lets some of it through.
@@ -264,12 +265,12 @@ class Trainer:
         loss = scene_beside_flare(scene, targets, lights, sources, settings.split, progress)
         if targets.removed is not None:
             loss = loss + towards_estimate(scene, targets.removed, settings.ssim_share, progress)
-        if flare is None or self._found >= settings.split.found:
+        if flare is None or self._times_found >= settings.split.found:
             return loss
         behind = scene.detach()
         added = composite(behind, flare, settings.blend, self.frames.display_white) - behind
         told = None if targets.removed is None else targets.frame - targets.removed
-        return loss + haze(added, told, self._found, targets.camera, lights, settings.split)
+        return loss + haze(added, told, self._times_found, targets.camera, lights, settings.split)
 
     def _sh_degree(self) -> int:
         if self.settings.scene.start:
@@ -319,7 +320,7 @@ class Trainer:
 
     def state(self) -> State:
         """All that a resumed fit needs, as `checkpoint.save` takes it."""
-        state: State = {"iteration": self.iteration, "found": self._found,
+        state: State = {"iteration": self.iteration, "times_found": self._times_found,
                         "losses": [[name, loss] for name, loss in self.losses.items()],
                         "scene": dict(self.scene.state_dict()), "strategy": self.strategy.state_dict(),
                         **self.optimisers.state(), **self._given.note()}
@@ -333,8 +334,8 @@ class Trainer:
         try:
             self._given.check(state)
             self.iteration = int(state["iteration"])
-            of_before = state.get("scene_is_found", state.get("alone_until") == self._head_start)  # earlier versions
-            self._found = float(state.get("found", FOUND_WHOLLY if of_before else 0))
+            was_found = state.get("scene_is_found", state.get("alone_until") == self._head_start)  # earlier versions
+            self._times_found = float(state.get("times_found", FOUND_WHOLLY if was_found else 0))
             self.losses = {name: float(loss) for name, loss in state.get("losses", [])}
             _load_parameters(dict(self.scene.named_parameters()), state["scene"])
             if self.flare is not None:

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from ..errors import FrameError, SettingsError
 from ..pictures import SUFFIXES, linear_from_srgb, read_picture
+from ..thinning import thinned
 from ..video import VIDEOS, Video, displayed, is_video
 from .pairs import WHITE, Bank, Layers
 from .plates import read_plate
@@ -138,7 +139,7 @@ class OwnFlares:
         return len(self._files)
 
     def _leave_out_unreadable(self) -> None:
-        for file in self._files[:: max(len(self._files) // LOOKED_AT, 1)]:
+        for file in thinned(self._files, LOOKED_AT):
             try:
                 self._read(file, np.random.default_rng(0))
             except FrameError as problem:

@@ -617,11 +617,11 @@ def test_a_checkpoint_of_a_version_whose_scene_went_on_alone_goes_on(capture: Ca
     settings = changed(quick(120), {"mode": "split", "split.rounds": 1})
     earlier, trainer = (Trainer(capture, settings) for _ in range(2))
     state = earlier.state()
-    del state["found"]
+    del state["times_found"]
     for told in ({"alone_until": len(earlier.views) if found else settings.iterations // 3}, {"scene_is_found": found}):
-        trainer._found = 13.5
+        trainer._times_found = 13.5
         trainer.load_state({**state, **told})
-        assert trainer._found == (FOUND_WHOLLY if found else 0)
+        assert trainer._times_found == (FOUND_WHOLLY if found else 0)
 
 
 def test_a_checkpoint_brings_back_what_no_optimiser_holds(tmp_path: Path) -> None:
@@ -632,9 +632,9 @@ def test_a_checkpoint_brings_back_what_no_optimiser_holds(tmp_path: Path) -> Non
     assert second.flare is not None
     first.flare.clear.fill_(0.3)
     first.flare.positions += 0.25
-    first._found = 13.5
+    first._times_found = 13.5
     checkpoint.save(tmp_path / "state.safetensors", first.state())
     second.load_state(checkpoint.load(tmp_path / "state.safetensors"))
     assert torch.equal(second.flare.clear, first.flare.clear)
     assert torch.equal(second.flare.positions, first.flare.positions)
-    assert second._found == 13.5
+    assert second._times_found == 13.5

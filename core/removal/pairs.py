@@ -50,10 +50,10 @@ class Pair:
 
 
 def pair(random: Random, bank: Bank, backgrounds: Backgrounds, width: int, height: int, *,
-         clean: float = 0.08, against_light: float = 0.0, shoulder: float = 0.0) -> Pair:
+         clean: float = 0.08, against_light: float = 0.0, shoulder: float = 0.0, faded: float = 0.0) -> Pair:
     """One frame of that size; a share `clean` of all has no flare. In a share `against_light` the lights are where
     the scene is bright, as a sun is in its sky; in the others anywhere. A share `shoulder` are of cameras whose curves
-    bend towards white."""
+    bend towards white, a share `faded` are graded so that black is grey, or are as logarithmic footage is."""
     gamma = float(random.uniform(*GAMMAS))
     scene = _exposed(random, backgrounds.draw(random, width, height, gamma))
     rest, glare, light = (np.zeros_like(scene) for _ in range(3))
@@ -83,6 +83,9 @@ def pair(random: Random, bank: Bank, backgrounds: Backgrounds, width: int, heigh
     shown = [display(linear, gamma) for linear in formed]
     if random.random() < 0.35:
         shown = _developed(random, shown)
+    if faded > 0 and random.random() < faded:
+        black, white = fade(random)
+        shown = [black + (white - black) * picture for picture in shown]
     frame, clear, gentle = shown
     if bare:
         return Pair(frame, clear, gentle)
@@ -102,19 +105,38 @@ def _exposed(random: Random, scene: Pixels) -> Pixels:
 
 
 def _laid(random: Random, layers: Layers, width: int, height: int) -> NDArray[Any]:
-    """(2, 3) from canvas to frame in pixels: turned, scaled, mirrored and sheared a little, the canvas's middle at the
-    frame's middle in four of five."""
-    size = layers.rest.shape[0]
+    """(2, 3) from canvas to frame in pixels, at random."""
+    return laid(layers.rest.shape[0], width, height, zoom=random.uniform(*ZOOM),
+                turn=random.uniform(0, 2 * math.pi), flip=random.choice([-1.0, 1.0]),
+                longer=math.exp(random.normal(0, SHEAR)), shear=random.normal(0, SHEAR),
+                shift=random.normal(0, OFF_MIDDLE[0] if random.random() < IN_THE_MIDDLE else OFF_MIDDLE[1], 2))
+
+
+ZOOM = (0.85, 1.5)
+"""Of the canvas, from that at which its inner circle goes through the frame's corners."""
+SHEAR = 0.05
+"""Deviation of a canvas's shear, and of the logarithm by which it is longer one way."""
+IN_THE_MIDDLE, OFF_MIDDLE = 0.8, (0.01, 0.25)
+"""Share of the canvases that have their middle at the frame's, and how far those and the others have it from there, in
+halves of the frame's diagonal."""
+
+
+def laid(size: int, width: int, height: int, *, zoom: Any, turn: Any, flip: Any, longer: Any, shear: Any,
+         shift: Any) -> NDArray[Any]:
+    """(..., 2, 3) from a canvas of `size` pixels to a frame in pixels: turned by an angle, scaled, mirrored where
+    `flip` is -1 and sheared, its middle `shift` (..., 2) halves of the diagonal off the frame's. All others (...)."""
     half = math.hypot(width, height) / 2
-    zoom = half / (size / 2) * random.uniform(0.85, 1.5)
-    turn = random.uniform(0, 2 * math.pi)
-    flip = random.choice([-1.0, 1.0])
-    stretch = np.array([[math.exp(random.normal(0, 0.05)), random.normal(0, 0.05)], [0, 1.0]])
-    spin = np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]])
-    linear = zoom * (spin * np.array([flip, 1.0])) @ stretch
-    shift = random.normal(0, 0.01 if random.random() < 0.8 else 0.25, 2) * half
-    offset = np.array([width / 2, height / 2]) + shift - linear @ np.array([size / 2, size / 2])
-    return np.concatenate([linear, offset[:, None]], 1)
+    none, one = np.zeros_like(turn), np.ones_like(turn)
+    stretch = _matrix(longer, shear, none, one)
+    spin = _matrix(np.cos(turn) * flip, -np.sin(turn), np.sin(turn) * flip, np.cos(turn))
+    linear = (half / (size / 2) * np.asarray(zoom))[..., None, None] * spin @ stretch
+    offset = np.array([width / 2, height / 2]) + shift * half - linear @ np.array([size / 2, size / 2])
+    return np.concatenate([linear, offset[..., None]], -1)
+
+
+def _matrix(a: Any, b: Any, c: Any, d: Any) -> NDArray[Any]:
+    """(..., 2, 2): a and b above c and d."""
+    return np.stack([np.stack([a, b], -1), np.stack([c, d], -1)], -2)
 
 
 TRIES = 12
@@ -188,6 +210,13 @@ def _developed(random: Random, shown: Sequence[Pixels]) -> list[Pixels]:
         grey = ((curve[..., 0] + curve[..., 1] + curve[..., 2]) / 3)[..., None]
         result.append(np.clip(lift + (1 - lift) * (grey + saturation * (curve - grey)), 0, 1).astype(np.float32))
     return result
+
+
+def fade(random: Random) -> tuple[Pixels, Pixels]:
+    """Display values (3,) that black and white come to."""
+    black = random.uniform(0.02, 0.2) + random.normal(0, 0.015, 3)
+    white = random.uniform(0.75, 1) + random.normal(0, 0.01, 3)
+    return np.clip(black, 0, 1).astype(np.float32), np.clip(white, 0, 1).astype(np.float32)
 
 
 def _stored(random: Random, frame: Pixels) -> Pixels:

@@ -12,6 +12,9 @@ from ..errors import SettingsError
 from ..typed import field_of
 from .network import LEVELS, MULTIPLE
 
+RETIRED = frozenset({"repeats"})
+"""What recipes of before had besides, and trainings know no more."""
+
 
 @dataclass(frozen=True)
 class Recipe:
@@ -37,7 +40,6 @@ class Recipe:
     widths: tuple[int, ...] = (32, 48, 96, 128, 160)
     blocks: tuple[int, ...] = (0, 1, 4, 8, 6)
     attention: tuple[int, ...] = (3, 2)  # layers of it between the blocks of the two coarsest levels
-    repeats: int = 1               # iterations that have the same pictures, later ones mirrored, in other colours
     canvas: int = 384              # pixels a side of the flares' canvas
     bank: int = 400                # flares kept at a time, 2.7 MB each; a sixteenth are at hand in an iteration
     renew_every: int = 6           # iterations for each new flare
@@ -48,12 +50,13 @@ class Recipe:
     clean: float = 0.12            # of the frames have no flare
     against_light: float = 0.3     # of the frames have their lights where the scene is bright
     shoulder: float = 0.3          # of them are of cameras whose curves bend towards white
+    faded: float = 0.25            # of them are graded so that black is grey
 
     def __post_init__(self) -> None:
-        if min(self.iterations, self.pixels, self.repeats, self.bank, self.renew_every, self.warm) < 1:
-            raise SettingsError("A recipe needs at least one iteration, pixel, use of a picture and flare.")
+        if min(self.iterations, self.pixels, self.bank, self.renew_every, self.warm) < 1:
+            raise SettingsError("A recipe needs at least one iteration, pixel and flare.")
         for name in ("begun", "polish", "local", "coloured", "aspheric", "grey", "own_share", "clean", "against_light",
-                     "shoulder", "average"):
+                     "shoulder", "faded", "average"):
             if not 0 <= getattr(self, name) <= 1:
                 raise SettingsError(f"A recipe's {name} is a share from 0 to 1, not {getattr(self, name)}.")
         if self.seed < 0 or self.decay < 0 or not 32 <= self.canvas <= 8192:
@@ -100,8 +103,8 @@ def as_dict(recipe: Recipe) -> dict[str, Any]:
 
 def from_dict(data: dict[str, Any]) -> Recipe:
     """The inverse of `as_dict`; SettingsError for names that a recipe has not, and values of another kind."""
-    known = {field.name for field in fields(Recipe)}
-    unknown = set(data) - known
+    data = {name: value for name, value in data.items() if name not in RETIRED}
+    unknown = set(data) - {field.name for field in fields(Recipe)}
     if unknown:
         raise SettingsError(f"A recipe has no {', '.join(sorted(unknown))}.")
     values = {}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,8 @@ import torch.nn.functional as F  # noqa: N812 - its name everywhere
 from torch import Tensor
 
 from ..errors import RunError
-from .batches import LOOKS, Batch, Look
+from .batches import Batch
+from .card.recorded import Recorded
 from .learners import ALONE, Learner
 from .network import RemovalNetwork
 from .optimiser import Optimiser, has_bfloat16
@@ -53,6 +55,11 @@ class Trainer:
         self.optimiser = Optimiser(self.network, recipe.decay)
         self.averaged = {name: value.detach().clone() for name, value in self.network.state_dict().items()}
         self.begun_with: dict[str, Tensor] = {}
+        self._recorded = {polishes: Recorded(partial(self._gradients, polishes)) for polishes in (False, True)}
+        self._latest: _OnItsWay | None = None
+        if self.device.type == "cuda":
+            torch.backends.cudnn.benchmark = True  # among few shapes, for as long as a training
+            torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.allow_tf32 = True
 
     def step(self, batch: Batch) -> dict[str, float]:
         """One iteration; its figures."""
@@ -69,6 +76,8 @@ class Trainer:
 
     def _backward(self, batch: Batch) -> dict[str, float]:
         """Set the gradients, and give the figures, of all learners' frames together."""
+        if self.device.type != "cpu":
+            return self._backward_on_card(batch)
         figures = dict.fromkeys(FIGURES, 0.0)
         if batch.share:
             loss, figures = self.loss(batch)
@@ -83,6 +92,21 @@ class Trainer:
             figures = dict(zip(FIGURES, of_all.tolist(), strict=True))
         return figures
 
+    def _backward_on_card(self, batch: Batch) -> dict[str, float]:
+        """As recorded; the figures are those of the iteration before, so that the card is not waited for."""
+        polishes, numbers = self._goal()
+        *gradients, figures = self._recorded[polishes](batch.frame, batch.scene, batch.gentle,
+                                                       numbers.pin_memory().to(self.device, non_blocking=True))
+        for parameter, gradient in zip(self.network.parameters(), gradients, strict=True):
+            parameter.grad = gradient
+        before, self._latest = self._latest, _OnItsWay(figures)
+        return dict(zip(FIGURES, (before or self._latest).arrived(), strict=True))
+
+    def _gradients(self, polishes: bool, frame: Tensor, scene: Tensor, gentle: Tensor, numbers: Tensor) -> list[Tensor]:
+        """Of every parameter, then the figures."""
+        loss, figures = self._loss(polishes, frame, scene, gentle, numbers)
+        return [*torch.autograd.grad(loss, list(self.network.parameters())), figures]
+
     def loss(self, batch: Batch) -> tuple[Tensor, dict[str, float]]:
         """Of each picture the squared error in parts of the flare's own square to a power that rises from a half to
         one: at first strong flares lead, which are learned sooner, in the end faint ones count as much, and what
@@ -90,29 +114,40 @@ class Trainer:
         error in parts of that square, which is the picture's gain in PSNR; what a picture loses counts twice. A
         share of that goal, `local`, is the mean of the same over patches of the picture. At half the weight the same of
         the gentle part."""
-        frame, scene, gentle = (_shown(torch.from_numpy(part).to(self.device), LOOKS[batch.look])
-                                for part in (batch.frame, batch.scene, batch.gentle))
+        polishes, numbers = self._goal()
+        frame, scene, gentle = (part.to(self.device) for part in (batch.frame, batch.scene, batch.gentle))
+        loss, figures = self._loss(polishes, frame, scene, gentle, numbers.to(self.device))
+        return loss, dict(zip(FIGURES, figures.tolist(), strict=True))
+
+    def _goal(self) -> tuple[bool, Tensor]:
+        """Whether a training polishes by now; then the power, the mean square of a faint flare, and that of an error
+        which is not seen."""
+        done = min(self.iteration / self.recipe.iterations, 1.0)
+        faint = FAINT[0] * (FAINT[1] / FAINT[0]) ** max(4 * done - 3, 0.0)
+        unseen = UNSEEN[0] * (UNSEEN[1] / UNSEEN[0]) ** min(done / SEEN_FROM, 1.0)
+        return done >= 1 - self.recipe.polish, torch.tensor([0.5 + 0.5 * done, faint, unseen])
+
+    def _loss(self, polishes: bool, frame: Tensor, scene: Tensor, gentle: Tensor,
+              numbers: Tensor) -> tuple[Tensor, Tensor]:
         with _precision(self.device):
             told = self.network(frame)
         goals = torch.stack([frame - scene, frame - gentle])
         flares = goals.square().mean(2)
         errors = (torch.stack([told.flare, told.gentle]) - goals).square().mean(2)
         before, error = flares.mean((2, 3)), errors.mean((2, 3))
-        done = min(self.iteration / self.recipe.iterations, 1.0)
-        faint = FAINT[0] * (FAINT[1] / FAINT[0]) ** max(4 * done - 3, 0.0)
-        if done < 1 - self.recipe.polish:
-            left = error / (before[0] + faint) ** (0.5 + 0.5 * done)
-        else:
-            unseen = UNSEEN[0] * (UNSEEN[1] / UNSEEN[0]) ** min(done / SEEN_FROM, 1.0)
+        power, faint, unseen = numbers.unbind()
+        if polishes:
             left = _log_left(error, before, unseen)
             if self.recipe.local:
                 in_patches = _log_left(_by_patch(errors), _by_patch(flares), unseen).mean((2, 3))
                 left = torch.lerp(left, in_patches, self.recipe.local)
+        else:
+            left = error / (before[0] + faint) ** power
         loss = left[0].mean() + 0.5 * left[1].mean()
         with torch.no_grad():
             gain = 10 * torch.log10((before[0] + UNSEEN[1]) / (error[0] + UNSEEN[1]))
-            figures = torch.stack([loss, error[0].mean(), before[0].mean(), gain.mean()]).tolist()
-        return loss, dict(zip(FIGURES, figures, strict=True))
+            figures = torch.stack([loss.detach(), error[0].mean(), before[0].mean(), gain.mean()])
+        return loss, figures
 
     @torch.no_grad()
     def check(self, pairs: Mapping[str, Sequence[Pair]]) -> dict[str, float]:
@@ -177,7 +212,21 @@ class Trainer:
         self.optimiser.load_state(state)
 
 
-def _log_left(error: Tensor, before: Tensor, unseen: float) -> Tensor:
+class _OnItsWay:
+    """Numbers that a card sends without being waited for."""
+
+    def __init__(self, numbers: Tensor) -> None:
+        self._there, self._here = torch.cuda.Event(), torch.empty(numbers.shape, pin_memory=True)
+        self._here.copy_(numbers, non_blocking=True)
+        self._there.record()
+
+    def arrived(self) -> list[float]:
+        """When they have."""
+        self._there.synchronize()
+        return [float(number) for number in self._here]
+
+
+def _log_left(error: Tensor, before: Tensor, unseen: Tensor) -> Tensor:
     """The logarithm of squared errors in parts of what they were untouched; what has become worse counts twice."""
     left = torch.log((error + unseen) / (before + unseen))
     return left + left.clamp(min=0)
@@ -189,11 +238,6 @@ def _by_patch(squared: Tensor) -> Tensor:
     return F.avg_pool2d(squared, PATCH, ceil_mode=True)
 
 
-def _shown(pictures: Tensor, look: Look) -> Tensor:
-    """(n, 3, h, w), float32, of pictures (n, h, w, 3)."""
-    planes = pictures[..., look.channels].permute(0, 3, 1, 2).float()
-    return planes.flip(3) if look.mirrored else planes
-
-
 def _precision(on: torch.device) -> Any:
-    return torch.autocast(on.type, dtype=torch.bfloat16) if has_bfloat16(on) else nullcontext()
+    # Weights that were cached in it would not be those of a recorded step's next time.
+    return torch.autocast(on.type, dtype=torch.bfloat16, cache_enabled=False) if has_bfloat16(on) else nullcontext()

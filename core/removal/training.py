@@ -7,6 +7,7 @@ import json
 import math
 import time
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,7 +22,8 @@ from ..progress import Progress
 from . import weights
 from .backgrounds import Backgrounds
 from .bank import OneFlare, OwnFlares
-from .batches import TURNS, Batch, Batches, drawn_ahead
+from .batches import Batch, Batches
+from .card.batches import drawn_on_card
 from .learners import ALONE, Learner, shared
 from .pairs import Pair, pair
 from .recipe import Recipe, as_dict, from_dict
@@ -41,10 +43,8 @@ MOST_LEARNERS = 4
 
 def processes_here() -> int:
     """How many processes a training is best shared among on this machine: learners on a processor; beside a graphics
-    card that learns, those that draw pictures, by whose turns none draws the flares of another."""
-    if device().type == "cpu":
-        return min(cores(), MOST_LEARNERS)
-    return 1 + max(drawing for drawing in range(1, TURNS + 1) if TURNS % drawing == 0 and drawing <= cores())
+    card that learns, those that draw scenes and flares."""
+    return min(cores(), MOST_LEARNERS) if device().type == "cpu" else max(cores(), 3)
 
 
 def checks(backgrounds: Backgrounds, lenses: Sequence[Prescription], count: int = CHECKS) -> dict[str, list[Pair]]:
@@ -79,7 +79,8 @@ def train(recipe: Recipe, folder: Path | str, backgrounds: Backgrounds, lenses: 
     in a network of their widths and with as many blocks as they or the recipe have, whichever are more. `tests`:
     backgrounds and lenses kept out, for the checks in the log; the weights given are those of the best check then.
     Without them, and with flares of the user's own, which the checks have none of, they are the last. `processes`
-    share the work, this one among them: the pictures are the same by any number, the weights but for rounding.
+    share the work, this one among them: on a processor the pictures are the same by any number, the weights but for
+    rounding.
     Raises RunError, SettingsError, and Cancelled when asked to stop (after a checkpoint).
     """
     progress, folder = progress or Progress(), Path(folder)
@@ -92,12 +93,11 @@ def train(recipe: Recipe, folder: Path | str, backgrounds: Backgrounds, lenses: 
             raise RunError(f"{folder} holds a training already; go on with --resume, or choose another folder.")
         beginning = Beginning(recipe, path if path.exists() else start, path.exists(), backgrounds, lenses, own)
         trainer = beginning.trainer(ALONE)  # before others are asked: it may refuse
-        learners, drawing = (processes, 0) if trainer.device.type == "cpu" else (1, processes - 1)
-        with shared(learners, _learn, beginning) as learner:
+        with shared(processes if trainer.device.type == "cpu" else 1, _learn, beginning) as learner:
             trainer.learner = learner
-            batches = drawn_ahead(beginning.batches(trainer), trainer.iteration, trainer.recipe.iterations, drawing)
             held_out = checks(*tests) if tests else {}
-            _run(trainer, batches, folder, held_out, bool(held_out) and own is None, save_every_s, progress)
+            with beginning.batches(trainer, processes - 1) as batches:
+                _run(trainer, batches, folder, held_out, bool(held_out) and own is None, save_every_s, progress)
     return folder / WEIGHTS
 
 
@@ -127,16 +127,24 @@ class Beginning(NamedTuple):
         trainer.load_state(state, iteration)
         return trainer
 
-    def batches(self, trainer: Trainer) -> Batches:
-        """That the trainer's learner sees."""
-        return Batches(trainer.recipe, self.backgrounds, self.lenses, self.own, trainer.learner)
+    @contextmanager
+    def batches(self, trainer: Trainer, drawing: int = 0) -> Iterator[Iterator[Batch]]:
+        """That the trainer's learner sees from its iteration on; on a card out of what `drawing` processes draw."""
+        if trainer.device.type == "cpu":
+            drawn = Batches(trainer.recipe, self.backgrounds, self.lenses, self.own, trainer.learner)
+            yield (drawn[iteration] for iteration in range(trainer.iteration, trainer.recipe.iterations))
+        else:
+            with drawn_on_card(trainer.recipe, trainer.iteration, self.backgrounds, self.lenses, self.own,
+                               trainer.device, max(drawing, 2)) as on_card:
+                yield on_card
 
 
 def _learn(learner: Learner, beginning: Beginning) -> None:
     """What the learners beside the first do."""
     trainer = beginning.trainer(learner)
-    for batch in drawn_ahead(beginning.batches(trainer), trainer.iteration, trainer.recipe.iterations, 0):
-        trainer.step(batch)
+    with beginning.batches(trainer) as batches:
+        for batch in batches:
+            trainer.step(batch)
 
 
 def _run(trainer: Trainer, batches: Iterator[Batch], folder: Path, held_out: Mapping[str, Sequence[Pair]],

@@ -51,8 +51,8 @@ def arguments(parser: argparse.ArgumentParser) -> None:
                         help="for diffusion: weights of LPIPS, which then is a part of the loss")
     parser.add_argument("--threads", type=int, metavar="N", help="processor threads (default: all)")
     parser.add_argument("--processes", type=int, metavar="N",
-                        help="to share the work among; beside a GPU all but one draw pictures (default: one for each "
-                             "processor core up to four, with a GPU up to seventeen)")
+                        help="to share the work among; beside a GPU all but one draw scenes and flares (default: one "
+                             "for each processor core, without a GPU four at most)")
 
 
 def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:

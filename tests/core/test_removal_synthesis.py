@@ -63,6 +63,19 @@ def test_some_pairs_are_of_cameras_with_bent_curves() -> None:
     assert 0 < bent < 0.8 * straight
 
 
+def test_some_pairs_are_graded_so_that_black_is_grey() -> None:
+    """With and without flare alike: what lifts all of a frame as much is none."""
+    some = Backgrounds([np.random.default_rng(0).integers(0, 255, (120, 160, 3), np.uint8)], [])
+    for seed in range(8):
+        made = Single(flare((2, seed), 128, lenses.built_in(), "ghosts"))
+        one = pairs.pair(np.random.default_rng(seed), made, some, 96, 64, clean=1, faded=1)
+        assert 0.01 < one.scene.min() < 0.3 and one.scene.max() <= 1
+        assert np.array_equal(one.frame, one.scene)
+        black, white = pairs.fade(np.random.default_rng(seed))
+        assert black.shape == white.shape == (3,)
+        assert (black >= 0).all() and (black + 0.4 < white).all() and (white <= 1).all()
+
+
 def test_coverage_is_the_share_of_the_frame_that_holds_the_energy() -> None:
     layer = np.zeros((10, 10, 3), np.float32)
     assert formation.coverage(layer) == 0

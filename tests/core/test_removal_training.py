@@ -24,14 +24,14 @@ from core.removal import backgrounds as removal_backgrounds
 from core.removal import evaluation, network, optimiser, training, weights
 from core.removal.backgrounds import Backgrounds
 from core.removal.bank import OwnFlares
-from core.removal.batches import LAG, LOOKS, Batch, Batches, drawn_ahead
+from core.removal.batches import Batch, Batches
 from core.removal.learners import ALONE, Learner, Table, shared
 from core.removal.mapped import Mapped
 from core.removal.network import Attention, RemovalNetwork
 from core.removal.optimiser import Optimiser
 from core.removal.recipe import Recipe, as_dict, from_dict
 from core.removal.synthesis.prescription import built_in
-from core.removal.trainer import Trainer, _shown
+from core.removal.trainer import Trainer
 from core.sheets import GAP, HEAD
 
 torch.set_num_threads(1)  # small tensors, on which threads only wait for each other
@@ -171,45 +171,6 @@ def test_a_learner_that_is_no_more_is_told(tmp_path: Path) -> None:
         training.train(RECIPE, tmp_path, backgrounds(), built_in(), processes=0)
 
 
-def test_pictures_are_the_same_when_others_draw_them() -> None:
-    batches = Batches(RECIPE, backgrounds(), built_in())
-    here, ahead = (list(drawn_ahead(batches, 1, 4, processes)) for processes in (0, 2))
-    assert len(here) == len(ahead) == 3
-    for one, other in zip(here, ahead, strict=True):
-        assert np.array_equal(one.frame.astype(np.float16), other.frame)
-        assert np.array_equal(one.gentle.astype(np.float16), other.gentle)
-
-
-def test_a_drawing_serves_several_iterations() -> None:
-    recipe = replace(RECIPE, repeats=3)
-    batches = Batches(recipe, backgrounds(), built_in())
-    number = {batches[drawing].frame.tobytes(): drawing for drawing in range(40)}
-    assert len(number) == 40, "no two are the same"
-
-    def uses(first: int, end: int) -> list[tuple[int, int]]:
-        return [(number[batch.frame.tobytes()], batch.look) for batch in drawn_ahead(batches, first, end, 0)]
-
-    through = uses(0, 120)
-    for drawing in range(5):
-        assert next(look for used, look in through if used == drawing) == 0, "first as it is"
-    looks = [look for used, look in through if used == 20]
-    assert looks[:2] == [0, 1], "then mirrored"
-    assert len(looks) == 3
-    assert [at for at, (used, _) in enumerate(through) if used == 20] == [60, 60 + 3 * LAG + 1, 60 + 6 * LAG + 2]
-    assert uses(85, 120) == through[85:], "a resumed training sees the same"
-
-
-def test_looks_are_of_all_three_pictures() -> None:
-    pictures = torch.rand(2, 4, 6, 3)
-    assert torch.equal(_shown(pictures, LOOKS[0]), pictures.permute(0, 3, 1, 2))
-    assert torch.equal(_shown(pictures, LOOKS[1]), pictures.permute(0, 3, 1, 2).flip(3))
-    assert len({_shown(pictures, look).numpy().tobytes() for look in LOOKS}) == len(LOOKS) == 12
-    recipe = replace(RECIPE, clean=1.0)
-    batch = Batches(recipe, backgrounds(), built_in())[0]
-    for look in range(12):
-        assert Trainer(recipe).loss(batch._replace(look=look))[1]["untouched"] == 0
-
-
 def test_pictures_that_processes_share_are_mapped(tmp_path: Path) -> None:
     arrays = [np.arange(5, dtype=np.uint8), np.arange(7, dtype=np.float16)[:, None], np.zeros((0, 2), np.float32)]
     mapped = Mapped(tmp_path / "some", arrays)
@@ -274,7 +235,7 @@ def test_what_is_told_of_clean_pictures_counts_for_more_in_the_end() -> None:
     recipe = replace(RECIPE, iterations=100, polish=1.0, clean=1.0)
     trainer = Trainer(recipe)
     batch = Batches(recipe, backgrounds(), built_in())[0]
-    assert np.array_equal(batch.frame, batch.scene)
+    assert torch.equal(batch.frame, batch.scene)
     torch.nn.init.constant_(trainer.network.head.bias, 0.03)
     losses = {}
     for trainer.iteration in (0, 40, 80, 99):
@@ -284,9 +245,9 @@ def test_what_is_told_of_clean_pictures_counts_for_more_in_the_end() -> None:
 
 
 def test_a_local_goal_minds_what_is_told_where_no_flare_is() -> None:
-    scene = np.full((1, 96, 192, 3), 0.25, np.float32)
-    frame = scene.copy()
-    frame[:, :, :96] += 0.5
+    scene = torch.full((1, 3, 96, 192), 0.25)
+    frame = scene.clone()
+    frame[..., :96] += 0.5
     batch = Batch(frame, scene, scene, 1.0)
     losses = {}
     for local in (0.0, 0.5, 1.0):
@@ -368,8 +329,8 @@ def test_stages_of_a_training() -> None:
     early, late = batches[3], batches[70]
     assert early.frame.shape == early.scene.shape == early.gentle.shape
     assert len(early.frame) > len(late.frame) >= 1
-    assert max(early.frame.shape[1:3]) < max(late.frame.shape[1:3])
-    assert np.array_equal(batches[3].frame, early.frame)
+    assert max(early.frame.shape[2:]) < max(late.frame.shape[2:])
+    assert torch.equal(batches[3].frame, early.frame)
 
 
 def test_going_on_from_weights(tmp_path: Path) -> None:
@@ -492,6 +453,7 @@ def test_recipes() -> None:
     assert from_dict(as_dict(recipe)) == recipe
     with pytest.raises(SettingsError, match="has no speed"):
         from_dict({"speed": 1})
+    assert from_dict({**as_dict(recipe), "repeats": 4}) == recipe, "of before"
     with pytest.raises(SettingsError, match="local is a share from 0 to 1, not 2"):
         Recipe(local=2)
     with pytest.raises(SettingsError, match="5 levels"):
@@ -504,7 +466,7 @@ def test_recipes() -> None:
     for stage in ((1.0, 32, 64), (1.0, 96, 64), (1.0, 96)):
         with pytest.raises(SettingsError, match="stages"):
             Recipe(stages=(stage,))  # type: ignore[arg-type]
-    with pytest.raises(SettingsError, match="one iteration, pixel, use of a picture and flare"):
+    with pytest.raises(SettingsError, match="one iteration, pixel and flare"):
         Recipe(pixels=0)
 
 

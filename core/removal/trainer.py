@@ -58,7 +58,7 @@ class Trainer:
         self._recorded = {polishes: Recorded(partial(self._gradients, polishes)) for polishes in (False, True)}
         self._latest: _OnItsWay | None = None
         if self.device.type == "cuda":
-            torch.backends.cudnn.benchmark = True  # among few shapes, for as long as a training
+            torch.backends.cudnn.benchmark, torch.backends.cudnn.benchmark_limit = True, 4  # a minute for five shapes
             torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.allow_tf32 = True
 
     def step(self, batch: Batch) -> dict[str, float]:

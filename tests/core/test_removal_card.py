@@ -194,6 +194,18 @@ def test_processes_draw_what_a_training_learns_from() -> None:
     assert some.layers.shape == (5, 9, CANVAS, CANVAS) and some.there.any() and (some.colour > 0).any()
 
 
+def test_pools_are_as_large_as_a_card_has_room_for() -> None:
+    shapes = pools.shapes_of(replace(RECIPE, stages=((1.0, 256, 480),)), MULTIPLE)
+    assert {(shape.width, shape.height) for shape in shapes} == {(480, 320), (384, 256), (480, 256), (320, 480),
+                                                                 (352, 352)}
+    assert pools.room(80 << 30, shapes, 384) == (pools.SCENES, pools.FLARES)
+    for free in (6 << 30, 24 << 30):
+        scenes, flares = pools.room(free, shapes, 384)
+        assert 0.38 * free < scenes * 6 * 480 * 320 * 0.83 + flares * 18 * 384**2 < 0.42 * free
+        assert scenes > 3 * flares > 1000
+    assert min(pools.room(0, shapes, 384)) >= 1
+
+
 def test_processes_that_end_are_told() -> None:
     room = pools.Pools(pools.shapes_of(RECIPE, MULTIPLE), CANVAS, CPU, scenes=8, flares=2)
     with pytest.raises(RunError, match="draw pictures for the training ended"), \

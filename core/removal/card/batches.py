@@ -15,7 +15,7 @@ from ..network import MULTIPLE
 from ..recipe import Recipe
 from ..synthesis.prescription import Prescription
 from .composition import SECOND, composed, filming, laying
-from .pools import Pools, filled, shapes_of
+from .pools import Pools, filled, room, shapes_of
 
 
 @contextmanager
@@ -24,7 +24,8 @@ def drawn_on_card(recipe: Recipe, first: int, backgrounds: Backgrounds, lenses: 
     """Batches without end, from iteration `first` on; `processes` draw what they are composed of. Unlike those of a
     processor they are no function of the recipe: what is in the pools depends on how fast it was drawn. Raises
     RunError where nothing is drawn."""
-    pools = Pools(shapes_of(recipe, MULTIPLE), recipe.canvas, device)
+    shapes = shapes_of(recipe, MULTIPLE)
+    pools = Pools(shapes, recipe.canvas, device, *room(torch.cuda.mem_get_info(device)[0], shapes, recipe.canvas))
     with filled(pools, recipe, backgrounds, lenses, own, processes):
         yield batches(pools, recipe, np.random.default_rng((recipe.seed, first)))
 

@@ -32,7 +32,9 @@ from .composition import LIGHTS, Flares
 BLOCK = 8
 """Scenes that a process draws and sends at a time."""
 SCENES, FLARES = 16_000, 4_000
-"""Of all shapes together, and flares on the card: some 15 and 11 GB."""
+"""Of all shapes together, and flares on the card, at most: some 13 and 11 GB."""
+POOLS_SHARE = 0.4
+"""Of what is free on a card, for both; the rest is for what the network keeps of an iteration."""
 FIRST_SCENES, FIRST_FLARES = 4 * BLOCK, 200
 """Of each shape, and flares, from which on a training begins."""
 AHEAD = 4
@@ -80,11 +82,18 @@ def shapes_of(recipe: Recipe, multiple: int) -> list[Shape]:
     return found
 
 
+def room(free: int, shapes: Sequence[Shape], canvas: int) -> tuple[int, int]:
+    """How many scenes and flares to hold where so many bytes are free."""
+    scene = 6 * sum(shape.width * shape.height * shape.share for shape in shapes)
+    flare = 18 * canvas**2
+    part = min(free * POOLS_SHARE / (SCENES * scene + FLARES * flare), 1.0)
+    return max(int(SCENES * part), BLOCK), max(int(FLARES * part), 1)
+
+
 class Pools:
     """Half precision, on `device`."""
 
-    def __init__(self, shapes: Sequence[Shape], canvas: int, device: torch.device, scenes: int = SCENES,
-                 flares: int = FLARES) -> None:
+    def __init__(self, shapes: Sequence[Shape], canvas: int, device: torch.device, scenes: int, flares: int) -> None:
         """scenes, flares: how many there is room for."""
         self.shapes, self._device = shapes, device
         blocks = [max(round(scenes * shape.share / BLOCK), 1) for shape in shapes]

@@ -8,10 +8,11 @@ import os
 import signal
 import tempfile
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing.connection import wait
+from multiprocessing.process import BaseProcess
 from multiprocessing.synchronize import Barrier
 from pathlib import Path
 from typing import Any
@@ -148,11 +149,16 @@ def shared(count: int, learn: Callable[..., None], *words: Any) -> Iterator[Lear
             yield Learner(0, count, table)
         finally:
             table.clear()
-            for process in others:
-                if process.pid is not None:  # it was started
-                    process.kill()
-                    process.join()
+            end(others)
             torch.set_num_threads(threads)
+
+
+def end(processes: Iterable[BaseProcess]) -> None:
+    """Those that were started."""
+    for process in processes:
+        if process.pid is not None:
+            process.kill()
+            process.join()
 
 
 def begin_process() -> None:

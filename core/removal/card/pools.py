@@ -23,7 +23,7 @@ from ...errors import RunError
 from ..backgrounds import Backgrounds
 from ..bank import Mixed, OwnFlares, SynthesisBank
 from ..formation import GAMMAS
-from ..learners import begin_process
+from ..learners import begin_process, end
 from ..pairs import Bank
 from ..recipe import Recipe
 from ..synthesis.prescription import Prescription
@@ -181,10 +181,7 @@ def filled(pools: Pools, recipe: Recipe, backgrounds: Backgrounds, lenses: Seque
             yield
         finally:
             ended.set()
-            for process in drawers:
-                if process.pid is not None:  # it was started
-                    process.kill()
-                    process.join()
+            end(drawers)
             filler.join()
             memories.clear()
 

@@ -41,7 +41,7 @@ class SynthesisBank:
     seen for ever.
 
     What a bank holds is a function of the seed and of how far it was renewed: a resumed training sees the same flares.
-    Of its parts one is at hand at a time, so that processes can share its flares out among them. A share `coloured`
+    Of its parts one is at hand at a time, in turn. A share `coloured`
     are of lights of one colour (traffic lights, tail lamps, neon), and a share `aspheric` have the ghosts of moulded
     lenses too, neither of which any class of flares has.
     """

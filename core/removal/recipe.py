@@ -22,7 +22,8 @@ class Recipe:
 
     An iteration is a step on new pictures of one size under flares from the bank. They are of all sizes, small ones
     for most of a training: much of what a flare looks like is learned as well, and sooner, on those. The learning
-    rate rises over the first `warm` iterations and falls as a cosine to nothing at the last.
+    rate rises over the first `warm` iterations and falls as a cosine to nothing at the last. On a graphics card, which
+    has its own pools of flares, `bank` and `renew_every` do not count, and frames are of the last stage's size.
     """
 
     seed: int = 1

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ..errors import RunError
 from .batches import Batch
-from .card.recorded import Recorded
+from .card.recorded import OnItsWay, Recorded
 from .learners import ALONE, Learner
 from .network import RemovalNetwork
 from .optimiser import Optimiser, has_bfloat16
@@ -56,7 +56,7 @@ class Trainer:
         self.averaged = {name: value.detach().clone() for name, value in self.network.state_dict().items()}
         self.begun_with: dict[str, Tensor] = {}
         self._recorded = {polishes: Recorded(partial(self._gradients, polishes)) for polishes in (False, True)}
-        self._latest: _OnItsWay | None = None
+        self._latest: OnItsWay | None = None
         if self.device.type == "cuda":
             torch.backends.cudnn.benchmark, torch.backends.cudnn.benchmark_limit = True, 4  # a minute for five shapes
             torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.allow_tf32 = True
@@ -99,7 +99,7 @@ class Trainer:
                                                        numbers.pin_memory().to(self.device, non_blocking=True))
         for parameter, gradient in zip(self.network.parameters(), gradients, strict=True):
             parameter.grad = gradient
-        before, self._latest = self._latest, _OnItsWay(figures)
+        before, self._latest = self._latest, OnItsWay(figures)
         return dict(zip(FIGURES, (before or self._latest).arrived(), strict=True))
 
     def _gradients(self, polishes: bool, frame: Tensor, scene: Tensor, gentle: Tensor, numbers: Tensor) -> list[Tensor]:
@@ -108,12 +108,7 @@ class Trainer:
         return [*torch.autograd.grad(loss, list(self.network.parameters())), figures]
 
     def loss(self, batch: Batch) -> tuple[Tensor, dict[str, float]]:
-        """Of each picture the squared error in parts of the flare's own square to a power that rises from a half to
-        one: at first strong flares lead, which are learned sooner, in the end faint ones count as much, and what
-        is told where there is none counts for more. Over the last `polish` of a training the logarithm of the
-        error in parts of that square, which is the picture's gain in PSNR; what a picture loses counts twice. A
-        share of that goal, `local`, is the mean of the same over patches of the picture. At half the weight the same of
-        the gentle part."""
+        """As of this iteration (`_loss`), and the figures."""
         polishes, numbers = self._goal()
         frame, scene, gentle = (part.to(self.device) for part in (batch.frame, batch.scene, batch.gentle))
         loss, figures = self._loss(polishes, frame, scene, gentle, numbers.to(self.device))
@@ -129,6 +124,13 @@ class Trainer:
 
     def _loss(self, polishes: bool, frame: Tensor, scene: Tensor, gentle: Tensor,
               numbers: Tensor) -> tuple[Tensor, Tensor]:
+        """Of each picture the squared error in parts of the flare's own square to a power that rises from a half to
+        one: at first strong flares lead, which are learned sooner, in the end faint ones count as much, and what
+        is told where there is none counts for more. Over the last `polish` of a training the logarithm of the
+        error in parts of that square, which is the picture's gain in PSNR; what a picture loses counts twice. A
+        share of that goal, `local`, is the mean of the same over patches of the picture. At half the weight the same of
+        the gentle part. Then the FIGURES. `polishes` and `numbers` are those of `_goal`, given so that a card's record
+        of this serves every iteration."""
         with _precision(self.device):
             told = self.network(frame)
         goals = torch.stack([frame - scene, frame - gentle])
@@ -210,20 +212,6 @@ class Trainer:
             self.begun_with = {name: value.clone() for name, value in self.averaged.items()
                                if name not in grown or any(part in name for part in NOTHING_AT_FIRST)}
         self.optimiser.load_state(state)
-
-
-class _OnItsWay:
-    """Numbers that a card sends without being waited for."""
-
-    def __init__(self, numbers: Tensor) -> None:
-        self._there, self._here = torch.cuda.Event(), torch.empty(numbers.shape, pin_memory=True)
-        self._here.copy_(numbers, non_blocking=True)
-        self._there.record()
-
-    def arrived(self) -> list[float]:
-        """When they have."""
-        self._there.synchronize()
-        return [float(number) for number in self._here]
 
 
 def _log_left(error: Tensor, before: Tensor, unseen: Tensor) -> Tensor:

@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from core.errors import RunError
-from core.removal import pairs, training
+from core.removal import chances, pairs, training
 from core.removal.backgrounds import Backgrounds
 from core.removal.card import composition, jpeg, pools, recorded
 from core.removal.card.batches import batches, drawn_on_card
@@ -55,22 +55,19 @@ def together(some: list[pairs.Layers]) -> composition.Flares:
 def test_flares_are_laid_over_frames_as_one_by_one() -> None:
     """But for the 32nds of a pixel to which OpenCV rounds."""
     some = [made(seed, kind) for seed, kind in enumerate((*layers.CLASSES, *layers.CLASSES))]
-    drawn = []
+    matrices, shining, expected = [], [], []
     for seed, one in enumerate(some):
         random = np.random.default_rng(seed)
-        matrix = pairs._laid(random, one, WIDTH, HEIGHT)
-        expected = pairs._placed(np.random.default_rng(seed), one, matrix, WIDTH, HEIGHT, 0.8)
-        random = np.random.default_rng(seed)
-        blur = random.uniform(0.3, 2.0) if random.random() < 0.25 else 0.0
-        drawn.append((matrix, blur, np.exp(random.normal(0, 0.12, 3)), math.exp(random.normal(0, 0.6)) * 0.8,
-                      random.uniform(0.02, 0.18), expected))
-    matrices, blurs, colours, gains, caps = (np.array([one[k] for one in drawn]) for k in range(5))
+        matrices.append(chances.laid(random, CANVAS, WIDTH, HEIGHT))
+        shining.append(chances.shining(random, 0.8))
+        expected.append(pairs._placed(one, shining[-1], matrices[-1], WIDTH, HEIGHT))
+    blurs, colours, gains, mosts = (np.array(part) for part in zip(*shining, strict=True))
     assert 1 < (blurs > 0).sum() < len(some) - 1
-    how = composition.Laying(matrices, blurs, colours[..., None, None], gains[:, None, None, None],
-                             caps[:, None, None, None]).on(CPU)
+    how = composition.Laying(np.array(matrices), blurs, colours[..., None, None], gains[:, None, None, None],
+                             mosts[:, None, None, None]).on(CPU)
     found = composition._placed(together(some), how, how.matrices, HEIGHT, WIDTH)
-    for row, (*_, expected) in enumerate(drawn):
-        for one, other in zip(found, expected, strict=True):
+    for row, apart in enumerate(expected):
+        for one, other in zip(found, apart, strict=True):
             there = one[row].permute(1, 2, 0).numpy()
             assert np.abs(there - other).mean() < 0.01 * max(float(other.mean()), 0.02), (row, layers.CLASSES[row % 8])
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from core.errors import FrameError, SettingsError
 from core.pictures import write_png
-from core.removal import formation, pairs, variety
+from core.removal import chances, formation, pairs, variety
 from core.removal.backgrounds import Backgrounds, kept_for_test, read_backgrounds, told_left_out
 from core.removal.bank import Mixed, OwnFlares, SynthesisBank
 from core.removal.recipe import Recipe
@@ -71,7 +71,7 @@ def test_some_pairs_are_graded_so_that_black_is_grey() -> None:
         one = pairs.pair(np.random.default_rng(seed), made, some, 96, 64, clean=1, faded=1)
         assert 0.01 < one.scene.min() < 0.3 and one.scene.max() <= 1
         assert np.array_equal(one.frame, one.scene)
-        black, white = pairs.fade(np.random.default_rng(seed))
+        black, white = chances.fade(np.random.default_rng(seed))
         assert black.shape == white.shape == (3,)
         assert (black >= 0).all() and (black + 0.4 < white).all() and (white <= 1).all()
 
@@ -204,7 +204,7 @@ def test_against_the_light_lights_are_where_the_scene_is_bright() -> None:
     anywhere: list[bool] = []
     for seed in range(60):
         random = np.random.default_rng(seed)
-        first = pairs._laid(random, layers, 96, 64)
+        first = chances.laid(random, layers.size, 96, 64)
         matrix, bright = pairs._against_light(random, layers, first, scene)
         for places, laid in ((there, matrix), (anywhere, first)):
             x, y = pairs._on_frame(laid, layers, layers.lights[0])

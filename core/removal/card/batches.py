@@ -8,13 +8,14 @@ from contextlib import contextmanager
 import numpy as np
 import torch
 
+from .. import chances
 from ..backgrounds import Backgrounds
 from ..bank import OwnFlares
 from ..batches import Batch
 from ..network import MULTIPLE
 from ..recipe import Recipe
 from ..synthesis.prescription import Prescription
-from .composition import SECOND, composed, filming, laying
+from .composition import composed, filming, laying
 from .pools import Pools, filled, room, shapes_of
 
 
@@ -37,7 +38,7 @@ def batches(pools: Pools, recipe: Recipe, random: np.random.Generator) -> Iterat
         width, height, count, _ = pools.shapes[number]
         scenes, gammas = pools.scenes(random, number)
         device = scenes.device
-        twice = max(round(SECOND * count), 1)
+        twice = max(round(chances.SECOND * count), 1)
         over = [(pools.flares(random, some),
                  laying(random, some, recipe.canvas, width, height, second=second).on(device))
                 for some, second in ((count, False), (twice, True))]

@@ -8,7 +8,7 @@ thousand pairs.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from typing import Any, NamedTuple, Self
 
@@ -18,15 +18,14 @@ import torch.nn.functional as F  # noqa: N812 - its name everywhere
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..pairs import IN_THE_MIDDLE, OFF_MIDDLE, SHEAR, TRIES, ZOOM, fade, laid
+from .. import chances
+from ..pairs import CLIPS_FROM, CLIPS_OVER, GRAIN, NEAR, READ_NOISE, SHOT_NOISE
 from ..recipe import Recipe
 from . import jpeg
 
 Random = np.random.Generator
 LIGHTS = 3
 """Of a flare, at most."""
-SECOND = 0.15
-"""Share of the frames that have a second flare."""
 BLUR_REACH = 6
 """Pixels to either side, three deviations of the most that a flare is blurred."""
 
@@ -58,7 +57,7 @@ class _Numbers:
 
 @dataclass(frozen=True)
 class Filming(_Numbers):
-    """Of a frame, as `pairs` draws it: scene and camera. (n, 1, 1, 1) where nothing else is said."""
+    """Of a frame, as `chances` has it: scene and camera. (n, 1, 1, 1) where nothing else is said."""
 
     exposure: Any      # (n, 3, 1, 1)
     mirrored: Any
@@ -80,58 +79,47 @@ class Filming(_Numbers):
 
 @dataclass(frozen=True)
 class Laying(_Numbers):
-    """Of a flare over a frame, as `pairs` draws it. (n, 1, 1, 1) where nothing else is said."""
+    """Of a flare over a frame, as `chances` has it. (n, 1, 1, 1) where nothing else is said."""
 
-    matrices: Any      # (n, TRIES, 2, 3) from canvas to frame in pixels
+    matrices: Any      # (n, tries, 2, 3) from canvas to frame in pixels
     blur: Any          # (n,) pixels
     colour: Any        # (n, 3, 1, 1)
     gain: Any
-    cap: Any           # mean light that it has at most
+    most: Any          # mean light that it has
 
 
 def filming(random: Random, count: int, recipe: Recipe) -> Filming:
     """Of `count` frames, float32."""
-    uniform, normal = random.uniform, random.normal
-
     def some(share: float) -> NDArray[np.bool_]:
         return random.random(count) < share
 
-    gain = np.where(some(0.65), uniform(0.5, 1.2, count), np.exp(uniform(math.log(0.03), 0, count)))
-    bare, against, developed = some(recipe.clean), some(recipe.against_light), some(0.35)
-    black, white = np.zeros((count, 3, 1, 1)), np.ones((count, 3, 1, 1))
-    for number in np.nonzero(some(recipe.faded))[0]:
-        black[number, :, 0, 0], white[number, :, 0, 0] = fade(random)
+    def each(draw: Callable[[Random], float]) -> NDArray[Any]:
+        return _by_frame(np.array([draw(random) for _ in range(count)]))
+
+    bare, against = some(recipe.clean), some(recipe.against_light)
+    developed = np.array([chances.development(random) if does else chances.AS_IT_IS
+                          for does in some(chances.DEVELOPED)])
+    unchanged = np.zeros(3), np.ones(3)
+    faded = np.array([chances.fade(random) if does else unchanged for does in some(recipe.faded)])
     channels = np.tile(np.eye(3), (count, 1, 1))
     grey = np.nonzero(some(recipe.grey))[0]
     channels[grey] = np.eye(3)[random.integers(0, 3, len(grey))][:, None]
     return Filming(
-        exposure=(gain[:, None] * np.exp(normal(0, 0.06, (count, 3))))[..., None, None],
+        exposure=np.array([chances.exposure(random) for _ in range(count)])[..., None, None],
         mirrored=_by_frame(some(0.5)), flared=_by_frame(~bare), lit=_by_frame(~bare | some(0.5)),
-        against=against, aim=uniform(0.4, 2, count) * (against & some(0.5)),
-        grain=_by_frame(some(0.5) * random.chisquare(1, count) * 0.3),
-        bend=_by_frame(some(recipe.shoulder) * uniform(0.3, 1, count)),
-        contrast=_by_frame(developed * uniform(0, 0.7, count)),
-        saturation=_by_frame(np.where(developed, uniform(0.8, 1.3, count), 1)),
-        lift=_by_frame((developed & some(0.3)) * uniform(0, 0.04, count)),
-        black=black, white=white, dither=_by_frame(uniform(0.3, 0.7, count)),
-        quality=_by_frame(some(0.4) * random.integers(60, 99, count)),
-        channels=channels)
+        against=against, aim=each(chances.aim).ravel() * against, grain=each(chances.graininess),
+        bend=_by_frame(some(recipe.shoulder)) * each(chances.bend),
+        contrast=_by_frame(developed[:, 0]), saturation=_by_frame(developed[:, 1]), lift=_by_frame(developed[:, 2]),
+        black=faded[:, 0, :, None, None], white=faded[:, 1, :, None, None],
+        dither=each(chances.dither), quality=each(chances.quality), channels=channels)
 
 
 def laying(random: Random, count: int, canvas: int, width: int, height: int, *, second: bool = False) -> Laying:
     """Of `count` flares, the first or the second of their frames, float32."""
-    strength = random.uniform(0.1, 1, count) if second else np.ones(count)
-    tries = (count, TRIES)
-    far = np.where(random.random(tries) < IN_THE_MIDDLE, *OFF_MIDDLE)
-    return Laying(
-        matrices=laid(canvas, width, height, zoom=random.uniform(*ZOOM, tries),
-                      turn=random.uniform(0, 2 * math.pi, tries), flip=random.choice([-1.0, 1.0], tries),
-                      longer=np.exp(random.normal(0, SHEAR, tries)), shear=random.normal(0, SHEAR, tries),
-                      shift=random.normal(0, 1, (*tries, 2)) * far[..., None]),
-        blur=(random.random(count) < 0.25) * random.uniform(0.3, 2.0, count),
-        colour=np.exp(random.normal(0, 0.12, (count, 3)))[..., None, None],
-        gain=_by_frame(np.exp(random.normal(0, 0.6, count)) * strength),
-        cap=_by_frame(random.uniform(0.02, 0.18, count)))
+    shining = [chances.shining(random, chances.second_strength(random) if second else 1.0) for _ in range(count)]
+    blurs, colours, gains, mosts = (np.array(part) for part in zip(*shining, strict=True))
+    return Laying(matrices=chances.laid(random, canvas, width, height, (count, chances.TRIES)), blur=blurs,
+                  colour=colours[..., None, None], gain=_by_frame(gains), most=_by_frame(mosts))
 
 
 def composed(scene: Tensor, gamma: Tensor, filmed: Filming,
@@ -147,7 +135,7 @@ def composed(scene: Tensor, gamma: Tensor, filmed: Filming,
         some = slice(0, len(flares.layers))
         matrix, bright = _chosen(flares, how.matrices, scene[some], filmed.against[some] > 0)
         if number == 0:
-            brought = (filmed.aim / bright.clamp(min=1e-3)).clamp(0.3, 3)
+            brought = (filmed.aim / bright.clamp(min=1e-3)).clamp(*chances.AIMED)
             as_it_is = (filmed.aim == 0) | ~flares.there[:, 0]
             scene = scene * brought.masked_fill(as_it_is, 1)[:, None, None, None]
         r, g, li = _placed(flares, how, matrix, *scene.shape[2:])
@@ -156,7 +144,7 @@ def composed(scene: Tensor, gamma: Tensor, filmed: Filming,
         light[some] = torch.maximum(light[some], li)
     rest, glare = rest * filmed.flared, glare * filmed.flared
     scene = scene + light * filmed.lit
-    grain = (scene.clamp(min=0) * 0.002 + 1e-5).sqrt() * filmed.grain
+    grain = (scene.clamp(min=0) * SHOT_NOISE + READ_NOISE).sqrt() * filmed.grain * GRAIN
     scene = (scene + grain * torch.randn_like(scene)).clamp(min=0)
     formed = torch.stack([_formed(scene, rest + glare, filmed.bend), scene, _formed(scene, glare, filmed.bend)])
     shown = _developed(formed.clamp(0, 1).pow(1 / gamma[:, None, None, None]), filmed)
@@ -224,13 +212,13 @@ def _placed(flares: Flares, how: Laying, matrix: Tensor, height: int, width: int
     rest, glare, light = layers.split(3, 1)
     rest = _blurred(rest, how.blur)
     mean = ((rest[..., ::4, ::4] + glare[..., ::4, ::4]) * how.gain).clamp(max=1).mean((1, 2, 3), keepdim=True)
-    factor = how.colour * how.gain * (how.cap / mean.clamp(min=1e-6)).clamp(max=1)
+    factor = how.colour * how.gain * (how.most / mean.clamp(min=1e-6)).clamp(max=1)
     rest, glare = rest * factor, glare * factor
     at = _on_frame(matrix[:, None], flares.lights, flares.size)
-    reach = 0.35 * math.hypot(width, height) / 2
+    reach = NEAR * math.hypot(width, height) / 2
     away = (_pixels(height, width, matrix) - at[:, :, None, None]).square().sum(-1)
     near = (torch.exp(-away / reach**2) * flares.there[:, :, None, None]).amax(1, keepdim=True)
-    kept = (((rest + glare).amin(1, keepdim=True) * near - 0.5) / 0.4).clamp(0, 1)
+    kept = (((rest + glare).amin(1, keepdim=True) * near - CLIPS_FROM) / CLIPS_OVER).clamp(0, 1)
     kept = kept * kept * (3 - 2 * kept)
     tint = flares.colour[:, :, None, None]
     light = torch.maximum(light, (rest + glare) * kept)

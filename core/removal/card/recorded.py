@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Work on a card that is recorded once for each shape of its input, and then given to it whole: the thousands of small
-pieces that a network's gradients are made of keep a processor longer than they do a card."""
+pieces that a network's gradients are made of keep a processor longer than they do a card. And what comes of it, without
+waiting for it."""
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
@@ -53,3 +54,17 @@ class Recorded:
         with torch.cuda.graph(graph, pool=pool, capture_error_mode="thread_local"):
             results = list(self._work(*given))
         return _Recording(graph, given, results)
+
+
+class OnItsWay:
+    """Numbers that a card sends without being waited for."""
+
+    def __init__(self, numbers: Tensor) -> None:
+        self._there, self._here = torch.cuda.Event(), torch.empty(numbers.shape, pin_memory=True)
+        self._here.copy_(numbers, non_blocking=True)
+        self._there.record()
+
+    def arrived(self) -> list[float]:
+        """When they have."""
+        self._there.synchronize()
+        return [float(number) for number in self._here]

@@ -10,6 +10,7 @@
     python benchmarks/removal.py scenes PHOTOS...            # held-out scenes without flare, as training has them
     python benchmarks/removal.py against PHOTOS... [--lenses LENSES]  # flares whose lights are in a bright sky
     python benchmarks/removal.py coloured PHOTOS... [--lenses LENSES]  # flares of lights of one colour
+    python benchmarks/removal.py graded PHOTOS... [--lenses LENSES]  # what tells flares from grades, and how surely
     python benchmarks/removal.py aspheric PHOTOS...          # ghosts of moulded lenses alone
     python benchmarks/removal.py coverage [--sheet FILE]     # what the synthesis spans, and a sheet of it
 
@@ -23,7 +24,10 @@ eval-removal's; the matte is as an artist would rough it in, wide about all that
 Scenes: as `clean`, of the exposures, colours and grain that training has, some with a light. Against: the same flares
 with their lights where the scene is bright, and anywhere. Coloured: the same flares of lights of one colour (traffic
 lights, neon), and of the white ones that their class has. Aspheric: lights with no other flare than the ghosts of
-telephones' lenses, which no class has.
+telephones' lenses, which no class has. Graded: of frames of all classes and of frames without flare, seven of ten of
+them graded so that black is grey, those in which so much is told that it may be a grade; the weights of
+`core/removal/graded.py` as a logistic regression finds them in pictures that are trained on, and by those in the file
+and by these, of held-out ones, how surely a flare is told from none (area under the curve), and what is left of each.
 """
 from __future__ import annotations
 
@@ -199,6 +203,14 @@ def _unseen(lenses: Path | None) -> Any:
     return held_out(read_lenses(lenses) if lenses else [])
 
 
+def _seen(lenses: Path | None) -> Any:
+    """The lenses of a folder that training takes."""
+    from core.removal.backgrounds import kept_for_test
+    from core.removal.synthesis.prescription import built_in, read_lenses
+
+    return [lens for lens in read_lenses(lenses) if not kept_for_test(lens.name)] if lenses else built_in()
+
+
 AGAINST = ("scatter", "ghosts", "streak", "glare", "mixed")
 """Classes of flares that have a light in the frame."""
 
@@ -228,6 +240,54 @@ def coloured(folders: list[Path], lenses: Path | None = None, weights: Path | No
         colours = [WHITE if white else one_colour(np.random.default_rng(seed)) for seed, _ in seeds]
         _tell_gains(f"{name:13}", [_gain(remover, seed, OneFlare(seed, CANVAS, unseen, kind, colour), backgrounds)
                                    for (seed, kind), colour in zip(seeds, colours, strict=True)])
+
+
+def graded(folders: list[Path], lenses: Path | None = None, weights: Path | None = None, count: int = 600) -> None:
+    """What tells flares from grades."""
+    from core.removal.backgrounds import read_backgrounds
+    from core.removal.graded import AGAIN, FLAT, LIGHT, LIGHTS, NEITHER, worth
+
+    remover = Remover(weights)
+    found = _logistic(*_signs(remover, 1006, count, read_backgrounds(folders, "train", max(SIZE)), _seen(lenses)))
+    print("AGAIN, LIGHT, LIGHTS, FLAT, NEITHER =", ", ".join(f"{value:.3g}" for value in found))
+    signs, flares = _signs(remover, 1007, count // 3, _held_out(folders), _unseen(lenses))
+    now = np.array([AGAIN, LIGHT, LIGHTS, FLAT, NEITHER])
+    for name, by in (("as it is", now), ("by these", found)):
+        odds = signs @ by[:-1] + by[-1]
+        surely = np.mean(odds[flares][:, None] > odds[~flares])
+        kept = np.array([worth(value) for value in odds])
+        print(f"{name}: {surely:.3f} of pairs in order; kept of {flares.sum()} flares {kept[flares].mean():.1%}, of "
+              f"{(~flares).sum()} told where none is {kept[~flares].mean():.1%}")
+
+
+def _signs(remover: Remover, seed: int, count: int, backgrounds: Any, lenses: Any) -> tuple[Any, Any]:
+    """(n, 4) signs of frames in which much is told, half of `count` drawn under flares; (n,) of which that is true."""
+    from core.removal.bank import OneFlare
+    from core.removal.pairs import pair
+    from core.removal.synthesis.layers import CLASSES
+
+    signs, flares = [], []
+    for number in range(count):
+        bare, kind = number % 2 == 0, CLASSES[number // 2 % len(CLASSES)]
+        frame = pair(np.random.default_rng((seed, number)), OneFlare((seed, number), 160, lenses, kind), backgrounds,
+                     *SIZE, clean=float(bare), faded=0.7 if bare else 0.3, shoulder=0.3, against_light=0.35).frame
+        if (found := remover.views(frame).signs) is not None:
+            signs.append(found)
+            flares.append(not bare)
+    return np.array(signs), np.array(flares)
+
+
+def _logistic(signs: Any, flares: Any) -> Any:
+    """Weights (5,) of signs (n, 4) and a constant, of the odds that it is a flare: Newton's method, held to small ones
+    by a ridge of one observation."""
+    middle, spread = signs.mean(0), signs.std(0)
+    a = np.column_stack([(signs - middle) / spread, np.ones(len(signs))])
+    ridge, found = np.diag([1.0] * signs.shape[1] + [0.0]), np.zeros(a.shape[1])
+    for _ in range(30):
+        p = 1 / (1 + np.exp(-a @ found))
+        found -= np.linalg.solve(a.T @ (a * (p * (1 - p))[:, None]) + ridge, a.T @ (p - flares) + ridge @ found)
+    by_sign = found[:-1] / spread
+    return np.append(by_sign, found[-1] - by_sign @ middle)
 
 
 class _Moulded:
@@ -347,7 +407,7 @@ WORDS: dict[str, dict[str, Any]] = {
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     names = parser.add_subparsers(required=True, metavar="BENCHMARK")
-    for benchmark in (speed, one, sample, clean, scenes, matte, against, coloured, aspheric, coverage):
+    for benchmark in (speed, one, sample, clean, scenes, matte, against, coloured, graded, aspheric, coverage):
         words = names.add_parser(benchmark.__name__, help=inspect.getdoc(benchmark))
         words.set_defaults(benchmark=benchmark)
         for name, parameter in inspect.signature(benchmark).parameters.items():

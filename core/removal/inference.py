@@ -26,7 +26,7 @@ from . import formation
 from .formation import GAMMA, flare_light
 from .network import MULTIPLE, RemovalNetwork
 from .plates import Plate, finite
-from .views import Views, believed, doubt_of, told_in_views, trusted
+from .views import Views, believed, doubt_of, told_in_views, trusted, worth_of
 from .weights import IN_THE_BOX, load
 
 WORKING_SIZE = 480
@@ -60,11 +60,12 @@ class FlareMap:
 
 
 class Told(NamedTuple):
-    """Of a plate the display values 0..1 that the network was shown (h, w, 3), and what a flare adds to them as far
-    as its views are believed."""
+    """Of a plate the display values 0..1 that the network was shown (h, w, 3), what a flare adds to them as far as its
+    views are believed, and the part of it, 0..1, that is kept since it may be how the picture is graded."""
 
     display: Pixels
     added: Pixels
+    worth: np.float32 = np.float32(1)
 
 
 class Remover:
@@ -115,7 +116,8 @@ class Remover:
     def told(self, display: Pixels) -> Told:
         """Of what the network is `shown` of a plate by itself."""
         views = self.views(display)
-        return Told(display, believed(views, doubt_of([(views, 1)])))
+        alone = [(views, 1.0)]
+        return Told(display, believed(views, doubt_of(alone)), worth_of(alone))
 
     def views(self, display: Pixels) -> Views:
         """What the network tells of display values 0..1 (h, w, 3), h and w multiples of MULTIPLE."""
@@ -137,7 +139,7 @@ class Remover:
         if not marked:
             # A ramp from nothing to the whole, so that a faint flare has no rim.
             added = added * np.clip((added - LEAST) / LEAST, 0, 1)
-            added = trusted(added, self.sure)
+            added = trusted(added, self.sure) * told.worth
         return np.where(added > 0, flare_light(told.display, added), np.float32(0))
 
     def shown(self, plate: Plate) -> Pixels:

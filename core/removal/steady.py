@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from ..pictures import Pixels
 from . import motion
 from .inference import CLIPPED, Told
-from .views import Views, believed, doubt_of
+from .views import Views, believed, doubt_of, worth_of
 
 FAINT = 0.03
 """What a flare adds to display values where a frame counts half of what it counts where there is none."""
@@ -93,13 +93,14 @@ def of_one_shot(one: Guide, other: Guide) -> np.float32:
 def steadied(here: Sighting, about: Sequence[Neighbour]) -> Told:
     """What was told of `here`, put right by the frames about it."""
     display = here.guide.display
-    doubt = doubt_of([(here.views, 1), *((other.sighting.views, float(other.share)) for other in about)])
+    shot = [(here.views, 1.0), *((other.sighting.views, float(other.share)) for other in about)]
+    doubt, worth = doubt_of(shot), worth_of(shot)
     added = np.minimum(believed(here.views, doubt), display)
     if not about:
-        return Told(display, added)
+        return Told(display, added, worth)
     own = _seen(here, doubt)
     missed = _missed(own, [_found_again(own, other, doubt) for other in about])
-    return Told(display, np.clip(added + _finer(missed, display), 0, display))
+    return Told(display, np.clip(added + _finer(missed, display), 0, display), worth)
 
 
 class _Seen(NamedTuple):

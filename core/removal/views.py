@@ -5,7 +5,8 @@ A flare is one in every view; what is taken for one in some alone seldom is. So 
 down, in two sizes. In the dark each channel is shown alone too, as a grey picture: the glow of a traffic light is
 seldom told in colour, but in the red alone it is that of any lamp. Where what is told so is of one colour, the more of
 the two counts. Of white lights it would not: where one channel is clipped and another is not, their flare would leave
-with another colour than it came with.
+with another colour than it came with. And the frame is shown once more with its black at none, for what is told may be
+how it was graded (`graded`).
 """
 from __future__ import annotations
 
@@ -15,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..pictures import Pixels
+from . import graded
 from .formation import GAMMA, flare_light
 from .formation import display as shown
 from .network import MULTIPLE
@@ -23,7 +25,7 @@ Tell = Callable[[Pixels], Pixels]
 """What a flare adds to display values 0..1 (h, w, 3), h and w multiples of MULTIPLE, by one pass of the network."""
 
 SIZES, QUARTER_TURNS = (1.0, 0.8), (0, 2)
-"""Of the views in colour: parts of the frame's size, quarter turns."""
+"""Of the views in colour: parts of the frame's size, quarter turns. Each counts by its pixels."""
 ALONE_SIZE = 0.8
 """Of the views of a channel alone."""
 APART, ALONE_APART, DOUBT = (0.4, 0.6), (0.12, 0.2), (0.0, 2.5)
@@ -44,23 +46,30 @@ ALONE_SURE = 0.004
 class Views(NamedTuple):
     """What a flare adds to a frame's display values as several views of it tell, each (h, w, 3): in the mean, and how
     far the views are apart from that (standard deviation); what the channels tell alone, and how far, 0..1, that
-    counts where it is more."""
+    counts where it is more; and what tells it from a grade of the picture, where so much is told that it may be one."""
 
     mean: Pixels
     apart: Pixels
     alone: Pixels
     alone_counts: np.float32
+    signs: graded.Signs | None = None
 
 
 def told_in_views(display: Pixels, tell: Tell) -> Views:
     """Of display values 0..1 (h, w, 3), h and w multiples of MULTIPLE."""
-    told = [_in_view(tell, display, size, turns) for size in SIZES for turns in QUARTER_TURNS]
-    mean, apart = np.mean(told, 0), np.std(told, 0)
+    told = np.stack([_in_view(tell, display, size, turns) for size in SIZES for turns in QUARTER_TURNS])
+    pixels = np.repeat(np.square(SIZES), len(QUARTER_TURNS)).astype(np.float32)
+    mean = np.average(told, 0, pixels)
+    views = Views(mean, np.sqrt(np.average(np.square(told - mean), 0, pixels)), np.zeros_like(mean), np.float32(0))
     dark = np.float32(np.interp(np.median(display), DARK, (1, 0)))
-    if dark == 0:
-        return Views(mean, apart, np.zeros_like(mean), dark)
-    alone = np.stack([_told_alone(tell, display, channel) for channel in range(3)], -1)
-    return Views(mean, apart, alone, dark * _is_of_one_colour(flare_light(display, alone)))
+    if dark > 0:
+        alone = np.stack([_told_alone(tell, display, channel) for channel in range(3)], -1)
+        views = views._replace(alone=alone, alone_counts=dark * _is_of_one_colour(flare_light(display, alone)))
+    if graded.may_be(mean) > 0:
+        back = graded.graded_back(display)
+        again = np.mean([_in_view(tell, back, SIZES[0], turns) for turns in QUARTER_TURNS], 0)
+        views = views._replace(signs=graded.signs(display, mean, again))
+    return views
 
 
 def told_once(added: Pixels) -> Views:
@@ -76,6 +85,17 @@ def doubt_of(frames: Sequence[tuple[Views, float]]) -> np.float32:
     apart = sum(share * views.apart.mean() for views, share in frames)
     told = sum(share * np.abs(views.mean).mean() for views, share in frames)
     return _doubt(apart, told, APART)
+
+
+def worth_of(frames: Sequence[tuple[Views, float]]) -> np.float32:
+    """The part of what is told of a frame, 0..1, that is kept as it may be how the picture is graded. Of several
+    frames of a shot, each with a share, by the odds of all of them: a shot is graded as one."""
+    asked = [(views.signs.log_odds, share * graded.may_be(views.mean)) for views, share in frames if views.signs]
+    if not asked:
+        return np.float32(1)
+    odds, shares = np.transpose(asked)
+    counts = shares.sum() / sum(share for _, share in frames)
+    return np.float32(1 - counts * (1 - graded.worth(np.average(odds, weights=shares))))
 
 
 def believed(views: Views, doubt: np.float32) -> Pixels:

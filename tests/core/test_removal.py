@@ -30,7 +30,7 @@ from core.errors import Cancelled, CaptureError, FrameError, RunError, SettingsE
 from core.exif import upright
 from core.pictures import Window, read_exr, read_picture, save_exr, write_exr, write_png
 from core.progress import Progress
-from core.removal import batch, inference, weights
+from core.removal import batch, graded, inference, weights
 from core.removal.batch import plates_of, remove_all
 from core.removal.captured import UNFINISHED, _names, remove_from
 from core.removal.formation import flare_light
@@ -41,7 +41,7 @@ from core.removal.plates import Plate, read_plate, write_plate
 from core.removal.provenance import check_removed, has_exact
 from core.removal.recipe import Recipe, as_dict
 from core.removal.record import RECORD, Record, made_from
-from core.removal.views import told_once
+from core.removal.views import told_once, worth_of
 from tests.core.captures import make_capture
 from tests.core.heard import Heard
 from tests.core.test_exif import exif_segment
@@ -208,11 +208,12 @@ def test_a_frame_upside_down_is_told_the_same(everywhere: Path) -> None:
     np.testing.assert_allclose(told[::-1, ::-1], upright, atol=1e-5)
 
 
-@pytest.mark.parametrize(("in_two", "doubt"), [(0.16, 0.0), (0.4 * 0.44 / 0.56, 0.5), (0.6, 1.0)])
+@pytest.mark.parametrize(("in_two", "doubt"), [(0.16, 0.0), (0.401, 0.5), (0.6, 1.5)])
 def test_a_flare_in_some_views_alone_is_doubted(everywhere: Path, monkeypatch: pytest.MonkeyPatch, in_two: float,
                                                 doubt: float) -> None:
     """Of the four views two tell one in the frame's right half, and all of them one in its left: as long as little is
-    in doubt it stays, then the more is, the more of the deviation goes."""
+    in doubt it stays, then the more is, the more of the deviation goes. Two more are of the frame graded back."""
+    share = 1 / (1 + 0.8**2)  # of its two views, by their pixels
     shown: list[tuple[int, ...]] = []
 
     def told(_: Remover, view: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -226,10 +227,54 @@ def test_a_flare_in_some_views_alone_is_doubted(everywhere: Path, monkeypatch: p
 
     monkeypatch.setattr(Remover, "_told", told)
     added = Remover(everywhere).told(np.full((160, 320, 3), (0.5, 0.6, 0.7), np.float32)).added  # no dark frame
-    assert shown == [(160, 320, 3)] * 2 + [(128, 256, 3)] * 2
+    assert shown == [(160, 320, 3)] * 2 + [(128, 256, 3)] * 2 + [(160, 320, 3)] * 2
     assert added.shape == (160, 320, 3)
     np.testing.assert_allclose(added[:, :158], 0.2, rtol=1e-4)
-    np.testing.assert_allclose(added[:, 162:], in_two / 2 * (1 - doubt), rtol=0.02, atol=1e-6)
+    left = max(share - doubt * np.sqrt(share * (1 - share)), 0)
+    np.testing.assert_allclose(added[:, 162:], in_two * left, rtol=0.02, atol=1e-6)
+
+
+def dusk(veil: float = 0.0, black: float = 0.0) -> NDArray[np.float32]:
+    """(160, 240, 3): a scene with darks of its own, under a veil of light that grows to its right or not, graded so
+    that its black is grey."""
+    coarse = np.random.default_rng(5).random((80, 120, 1)) ** 2 * (0.9, 0.8, 0.7)
+    fine = np.asarray(cv2.resize(coarse, (240, 160), interpolation=cv2.INTER_LINEAR))
+    light = fine**2 + veil * np.linspace(0, 2, 240)[None, :, None]
+    return np.asarray(black + (1 - black) * np.sqrt(np.clip(light, 0, 1)), np.float32)
+
+
+def tells_lifted_darks(_: Remover, view: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Column by column what the darkest places have, as if it were a veil."""
+    darks = cv2.erode(view.min(0, keepdims=True), np.ones((1, 41))) - 0.01
+    return np.broadcast_to(np.maximum(darks, 0), view.shape).astype(np.float32)
+
+
+def test_a_grade_is_no_flare(everywhere: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Remover, "_told", tells_lifted_darks)
+    remover = Remover(everywhere)
+    grade, veil = remover.told(dusk(black=0.04)), remover.told(dusk(veil=0.1))
+    assert grade.added.mean() > 0.03 and remover.flare(grade).max() == 0
+    assert remover.flare(grade, marked=True).max() > 0.01  # whoever marks it has seen a flare
+    assert veil.worth == 1 and remover.flare(veil).mean() > 0.05
+
+
+def test_a_shot_is_graded_as_one(everywhere: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is doubted of a frame is believed in a shot whose other frames have a flare, by their shares."""
+    monkeypatch.setattr(Remover, "_told", tells_lifted_darks)
+    remover = Remover(everywhere)
+    grade, veil = remover.views(dusk(black=0.04)), remover.views(dusk(veil=0.1))
+    faint = told_once(np.full_like(grade.mean, 0.001))
+    assert worth_of([(grade, 1)]) == 0 and worth_of([(faint, 1)]) == 1
+    assert worth_of([(grade, 1), (veil, 1), (veil, 1)]) == 1
+    assert worth_of([(grade, 1), (faint, 1)]) == 0.5  # nothing was asked of the other
+
+
+@pytest.mark.parametrize("display", [np.zeros((96, 96, 3), np.float32), np.ones((96, 96, 3), np.float32),
+                                     np.full((96, 96, 3), 0.3, np.float32)])
+def test_a_picture_of_one_value_is_graded_back_to_finite_ones(display: NDArray[np.float32]) -> None:
+    back = graded.graded_back(display)
+    assert back.dtype == np.float32 and np.isfinite(back).all()
+    assert np.isfinite(graded.signs(display, display * 0.1, back).log_odds)
 
 
 @pytest.mark.parametrize(("frame", "lit", "alone", "counts"), [

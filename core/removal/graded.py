@@ -1,0 +1,71 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Whether what a network tells over a frame is a flare, or how the frame is graded.
+
+Films printed or graded so that black is grey look much as a veil does. They differ: a grade lifts display values, a
+veil adds light. So the frame is graded back, black to black, and the network asked again: of a lifted black it then
+tells nothing, of most flares it tells what it told, since they are not even. An even veil is lost by that as well; it
+is known by being strong, by a light that can be seen, and by flat darks, which a veil has and a grade has not.
+"""
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ..pictures import Pixels
+from .formation import flare_light
+
+FAINT = (0.004, 0.008)
+"""Mean over the frame of what is told, up to which it is no grade, since a grade that anyone sees is told as more, and
+from which on it may be one."""
+BLACK = 0.002
+"""Share of a frame that is darker than its black."""
+DARKS = (0.001, 0.01, 0.1)
+"""Shares of a frame that are darker than the three values by which its darks are known to be flat."""
+SATURATED = 0.99
+"""Display value from which on a channel is."""
+AGAIN, LIGHT, LIGHTS, FLAT, NEITHER = 1.11, 0.581, 7.68, 2.34, 5.39
+"""A logistic regression's weights of the `Signs`, and its constant, as `benchmarks/removal.py graded` finds them."""
+BELIEVED = (-1.25, -0.75)
+"""Log odds of a flare up to which nothing is believed, and from which on all."""
+
+
+class Signs(NamedTuple):
+    """Of a flare, the more the greater: how much of it is told again of a frame graded back, as a logarithm of parts;
+    how strong it is, as a logarithm of its mean light; the share of the frame that is saturated; and how far up the
+    darks come together, in parts of them."""
+
+    again: float
+    light: float
+    lights: float
+    flat: float
+
+    @property
+    def log_odds(self) -> np.float32:
+        return np.float32(AGAIN * self.again + LIGHT * self.light + LIGHTS * self.lights + FLAT * self.flat + NEITHER)
+
+
+def signs(display: Pixels, told: Pixels, again: Pixels) -> Signs:
+    """Of display values 0..1, what is told over them and what is told over them `graded_back`, each (h, w, 3)."""
+    grey = display.mean(-1)
+    darkest, darker, dark = np.quantile(grey, DARKS)
+    return Signs(again=float(np.log(again.mean() / max(told.mean(), 1e-9) + 0.01)),
+                 light=float(np.log(flare_light(display, told).mean() + 0.002)),
+                 lights=float((display >= SATURATED).mean()),
+                 flat=float((darker - darkest) / max(dark - darkest, 0.01)))
+
+
+def graded_back(display: Pixels) -> Pixels:
+    """Display values 0..1 (h, w, 3) with the black of each channel at none."""
+    black = np.quantile(display.reshape(-1, 3), BLACK, axis=0).astype(np.float32)
+    return np.asarray(np.clip((display - black) / np.maximum(1 - black, 0.1), 0, 1), np.float32)
+
+
+def may_be(told: Pixels) -> np.float32:
+    """0..1, whether so much is told that a grade may be it."""
+    return np.float32(np.interp(told.mean(), FAINT, (0, 1)))
+
+
+def worth(log_odds: float) -> np.float32:
+    """The part of what is told that is believed, 0..1."""
+    return np.float32(np.interp(log_odds, BELIEVED, (0, 1)))

@@ -156,7 +156,7 @@ def _cleaning(layout: Any, state: Any, capture: Any, stage: str) -> None:
 def _fitting(layout: Any, job: jobs.Job) -> None:
     draw_progress(layout, job, job.stage.capitalize())
     if job.figures:
-        loss, count = job.figures.get("loss"), job.figures.get("flare_gaussians")
+        loss, count = job.figures.get("loss", job.figures.get("scene_loss")), job.figures.get("flare_gaussians")
         parts = [f"step {job.done} of {job.total}"]
         parts += [f"loss {loss:.4f}"] if loss is not None else []
         parts += [f"{count:,.0f} in the flare"] if count else []

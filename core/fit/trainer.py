@@ -103,7 +103,8 @@ class Trainer:
     # ---- one iteration ----------------------------------------------------------------------------
 
     def step(self) -> dict[str, float]:
-        """One iteration on the next view; the loss and its parts."""
+        """One iteration on the next view; the loss of the composite, which there is none of while a scene is fitted
+        alone, and that of the scene."""
         self.iteration += 1
         settings = self.settings
         view = self._view()
@@ -122,7 +123,7 @@ class Trainer:
         weight = 1 - settings.ssim_share
         loss = (shown.new_zeros(()) if alone else
                 l1_ssim(picture, self._joint_target(targets, picture.detach(), sources), weight))
-        figures = {"loss": float(loss.detach())}
+        figures = {} if alone else {"loss": float(loss.detach())}
         clean = self._scene_target(targets, picture, shown)
         if clean is not None and self.scene_is_fitted:
             scene_loss = l1_ssim(shown, clean, weight)

@@ -611,6 +611,14 @@ def test_one_view_past_which_the_light_goes_leaves_the_flare_of_the_others_alone
     assert trainer.flare.lights[0].query_range.light_high[2] < 2 * max(camera.reach, min(seen))
 
 
+def test_a_scene_that_is_fitted_alone_has_no_loss_of_the_composite(tmp_path: Path) -> None:
+    """None is told, where a nought would pass for a perfect fit."""
+    trainer = Trainer(Capture.open(flared_capture(tmp_path / "c", 5)), quick(120, mode="split"))
+    told = [trainer.step() for _ in range(trainer._head_start + 1)]
+    assert all("loss" not in figures and figures["scene_loss"] > 0 for figures in told[:-1])
+    assert told[-1]["loss"] > 0
+
+
 @pytest.mark.parametrize("found", [True, False])
 def test_a_checkpoint_of_a_version_whose_scene_went_on_alone_goes_on(capture: Capture, found: bool) -> None:
     """It says until when the scene was alone, for longer where it had not been found; a later one whether it was."""

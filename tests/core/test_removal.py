@@ -258,6 +258,25 @@ def test_a_grade_is_no_flare(everywhere: Path, monkeypatch: pytest.MonkeyPatch) 
     assert veil.worth == 1 and remover.flare(veil).mean() > 0.05
 
 
+def test_it_is_said_that_a_veil_may_be_a_grade(everywhere: Path, tmp_path: Path,
+                                               monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Remover, "_told", tells_lifted_darks)
+    for name, shown in (("grade", dusk(black=0.03)), ("veil", dusk(veil=0.1)), ("white", np.ones((160, 240, 3)))):
+        write_codes(tmp_path / name / f"{name}.png", (shown * 255 + 0.5).astype(np.uint8))
+    plates = [tmp_path / name / f"{name}.png" for name in ("grade", "veil")]
+    heard = Heard()
+    remove_all(plates, tmp_path / "clean", Remover(everywhere), heard)
+    assert [said for said in heard.texts if said.startswith("In 1 of them") and "white all over" in said]
+    codes = [cv2.imread(str(path)) for path in (plates[0], tmp_path / "clean" / "grade.png")]
+    np.testing.assert_array_equal(*codes)
+
+    heard = Heard()  # as it is told to be done
+    matte = Mattes(tmp_path / "white" / "white.png")
+    remove_all(plates[:1], tmp_path / "clean", Remover(everywhere), heard, mattes=matte)
+    assert not [said for said in heard.texts if "graded" in said]
+    assert cv2.imread(str(tmp_path / "clean" / "grade.png")).mean() < codes[0].mean() - 1
+
+
 def test_a_shot_is_graded_as_one(everywhere: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What is doubted of a frame is believed in a shot whose other frames have a flare, by their shares."""
     monkeypatch.setattr(Remover, "_told", tells_lifted_darks)

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Whether what a network tells over a frame is a flare, or how the frame is graded.
 
-Films printed or graded so that black is grey look much as a veil does. They differ: a grade lifts display values, a
-veil adds light. So the frame is graded back, black to black, and the network asked again: of a lifted black it then
-tells nothing, of most flares it tells what it told, since they are not even. An even veil is lost by that as well; it
-is known by being strong, by a light that can be seen, and by flat darks, which a veil has and a grade has not.
+Pictures printed or graded so that black is grey look much as veiled ones do. They differ: a grade lifts display
+values, a veil adds light. So the frame is graded back, black to black, and the network asked again: of a lifted black
+it then tells nothing, of most flares, which are not even, what it told before. Of an even veil it tells nothing either;
+so it counts too how strong it is, whether a light is seen, and how flat the darks are, which a veil flattens and a
+grade does not.
 """
 from __future__ import annotations
 
@@ -21,19 +22,20 @@ from which on it may be one."""
 BLACK = 0.002
 """Share of a frame that is darker than its black."""
 DARKS = (0.001, 0.01, 0.1)
-"""Shares of a frame that are darker than the three values by which its darks are known to be flat."""
+"""Shares of a frame that are darker than the three values that its darks are measured by."""
 SATURATED = 0.99
 """Display value from which on a channel is."""
 AGAIN, LIGHT, LIGHTS, FLAT, NEITHER = 1.11, 0.581, 7.68, 2.34, 5.39
-"""A logistic regression's weights of the `Signs`, and its constant, as `benchmarks/removal.py graded` finds them."""
+"""By how much each of the `Signs` raises the log odds of a flare, in their order, and those without any: a logistic
+regression (`benchmarks/removal.py graded`)."""
 BELIEVED = (-1.25, -0.75)
 """Log odds of a flare up to which nothing is believed, and from which on all."""
 
 
 class Signs(NamedTuple):
-    """Of a flare, the more the greater: how much of it is told again of a frame graded back, as a logarithm of parts;
-    how strong it is, as a logarithm of its mean light; the share of the frame that is saturated; and how far up the
-    darks come together, in parts of them."""
+    """Of a flare, the likelier the greater they are: how much of what is told is told again of the frame graded back,
+    as the logarithm of a part; its mean light over the frame, as a logarithm; the share of the frame that is
+    saturated; and how much of the darks' range lies between the two lower of `DARKS`."""
 
     again: float
     light: float
@@ -42,6 +44,7 @@ class Signs(NamedTuple):
 
     @property
     def log_odds(self) -> np.float32:
+        """Of a flare against a grade."""
         return np.float32(AGAIN * self.again + LIGHT * self.light + LIGHTS * self.lights + FLAT * self.flat + NEITHER)
 
 

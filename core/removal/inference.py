@@ -61,7 +61,7 @@ class FlareMap:
 
 class Told(NamedTuple):
     """Of a plate the display values 0..1 that the network was shown (h, w, 3), what a flare adds to them as far as its
-    views are believed, and the part of it, 0..1, that is kept since it may be how the picture is graded."""
+    views are believed, and the part of that, 0..1, which is taken for a flare and not for the picture's grade."""
 
     display: Pixels
     added: Pixels

@@ -88,9 +88,10 @@ def doubt_of(frames: Sequence[tuple[Views, float]]) -> np.float32:
 
 
 def worth_of(frames: Sequence[tuple[Views, float]]) -> np.float32:
-    """The part of what is told of a frame, 0..1, that is kept as it may be how the picture is graded. Of several
+    """The part of what is told of a frame, 0..1, that is taken for a flare and not for the picture's grade. Of several
     frames of a shot, each with a share, by the odds of all of them: a shot is graded as one."""
-    asked = [(views.signs.log_odds, share * graded.may_be(views.mean)) for views, share in frames if views.signs]
+    asked = [(views.signs.log_odds, share * graded.may_be(views.mean)) for views, share in frames
+             if views.signs is not None]
     if not asked:
         return np.float32(1)
     odds, shares = np.transpose(asked)

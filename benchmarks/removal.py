@@ -245,13 +245,13 @@ def coloured(folders: list[Path], lenses: Path | None = None, weights: Path | No
 def graded(folders: list[Path], lenses: Path | None = None, weights: Path | None = None, count: int = 600) -> None:
     """What tells flares from grades."""
     from core.removal.backgrounds import read_backgrounds
-    from core.removal.graded import AGAIN, FLAT, LIGHT, LIGHTS, NEITHER, worth
+    from core.removal.graded import CONSTANT, WEIGHTS, worth
 
     remover = Remover(weights)
     found = _logistic(*_signs(remover, 1006, count, read_backgrounds(folders, "train", max(SIZE)), _seen(lenses)))
-    print("AGAIN, LIGHT, LIGHTS, FLAT, NEITHER =", ", ".join(f"{value:.3g}" for value in found))
+    print("WEIGHTS, CONSTANT =", ", ".join(f"{value:.3g}" for value in found))
     signs, flares = _signs(remover, 1007, count // 3, _held_out(folders), _unseen(lenses))
-    now = np.array([AGAIN, LIGHT, LIGHTS, FLAT, NEITHER])
+    now = np.array([*WEIGHTS, CONSTANT])
     for name, by in (("as it is", now), ("by these", found)):
         odds = signs @ by[:-1] + by[-1]
         surely = np.mean(odds[flares][:, None] > odds[~flares])

@@ -41,9 +41,9 @@ class SynthesisBank:
     seen for ever.
 
     What a bank holds is a function of the seed and of how far it was renewed: a resumed training sees the same flares.
-    Of its parts one is at hand at a time, in turn. A share `coloured`
-    are of lights of one colour (traffic lights, tail lamps, neon), and a share `aspheric` have the ghosts of moulded
-    lenses too, neither of which any class of flares has.
+    Of its parts one is at hand at a time, in turn. A share `coloured` are of lights of one colour (traffic lights, tail
+    lamps, neon), and a share `aspheric` have the ghosts of moulded lenses too, neither of which any class of flares
+    has.
     """
 
     def __init__(self, seed: int, count: int, size: int, lenses: Sequence[Prescription], coloured: float = 0,

@@ -25,7 +25,7 @@ DARKS = (0.001, 0.01, 0.1)
 """Shares of a frame that are darker than the three values that its darks are measured by."""
 SATURATED = 0.99
 """Display value from which on a channel is."""
-AGAIN, LIGHT, LIGHTS, FLAT, NEITHER = 1.11, 0.581, 7.68, 2.34, 5.39
+WEIGHTS, CONSTANT = (1.11, 0.581, 7.68, 2.34), 5.39
 """By how much each of the `Signs` raises the log odds of a flare, in their order, and those without any: a logistic
 regression (`benchmarks/removal.py graded`)."""
 BELIEVED = (-1.25, -0.75)
@@ -45,7 +45,7 @@ class Signs(NamedTuple):
     @property
     def log_odds(self) -> np.float32:
         """Of a flare against a grade."""
-        return np.float32(AGAIN * self.again + LIGHT * self.light + LIGHTS * self.lights + FLAT * self.flat + NEITHER)
+        return np.float32(np.dot(WEIGHTS, self) + CONSTANT)
 
 
 def signs(display: Pixels, told: Pixels, again: Pixels) -> Signs:

@@ -57,7 +57,7 @@ class Views(NamedTuple):
 
 def told_in_views(display: Pixels, tell: Tell) -> Views:
     """Of display values 0..1 (h, w, 3), h and w multiples of MULTIPLE."""
-    told = np.stack([_in_view(tell, display, size, turns) for size in SIZES for turns in QUARTER_TURNS])
+    told = np.concatenate([_turned(tell, display, size) for size in SIZES])
     pixels = np.repeat(np.square(SIZES), len(QUARTER_TURNS)).astype(np.float32)
     mean = np.average(told, 0, pixels)
     views = Views(mean, np.sqrt(np.average(np.square(told - mean), 0, pixels)), np.zeros_like(mean), np.float32(0))
@@ -66,8 +66,7 @@ def told_in_views(display: Pixels, tell: Tell) -> Views:
         alone = np.stack([_told_alone(tell, display, channel) for channel in range(3)], -1)
         views = views._replace(alone=alone, alone_counts=dark * _is_of_one_colour(flare_light(display, alone)))
     if graded.may_be(mean) > 0:
-        back = graded.graded_back(display)
-        again = np.mean([_in_view(tell, back, SIZES[0], turns) for turns in QUARTER_TURNS], 0)
+        again = _turned(tell, graded.graded_back(display), SIZES[0]).mean(0)
         views = views._replace(signs=graded.signs(display, mean, again))
     return views
 
@@ -115,7 +114,7 @@ def trusted(added: Pixels, sure: float) -> Pixels:
 def _told_alone(tell: Tell, display: Pixels, channel: int) -> Pixels:
     """(h, w), of a channel shown as a grey picture."""
     grey = np.repeat(display[..., channel, None], 3, -1)
-    views = [_in_view(tell, grey, ALONE_SIZE, turns).mean(-1) for turns in QUARTER_TURNS]
+    views = _turned(tell, grey, ALONE_SIZE).mean(-1)
     mean, apart = np.mean(views, 0), np.std(views, 0)
     return _less_doubt(mean, apart, _doubt(apart.mean(), np.abs(mean).mean(), ALONE_APART))
 
@@ -133,6 +132,11 @@ def _is_of_one_colour(light: Pixels) -> np.float32:
     """0..1, of light (h, w, 3)."""
     _, second, most = np.sort(light.mean((0, 1)))
     return np.float32(np.interp(second / max(most, 1e-9), ONE_COLOUR, (1, 0)))
+
+
+def _turned(tell: Tell, display: Pixels, size: float) -> Pixels:
+    """(turns, h, w, 3), what is told of views of that part of the frame's size in QUARTER_TURNS."""
+    return np.stack([_in_view(tell, display, size, turns) for turns in QUARTER_TURNS])
 
 
 def _in_view(tell: Tell, display: Pixels, size: float, turns: int) -> Pixels:

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from ..errors import SettingsError
 from ..pictures import Encoding, Pixels, linear_from_srgb
-from . import formation
+from . import formation, lamps
 from .formation import GAMMA, flare_light
 from .network import MULTIPLE, RemovalNetwork
 from .plates import Plate, finite
@@ -140,6 +140,7 @@ class Remover:
             # A ramp from nothing to the whole, so that a faint flare has no rim.
             added = added * np.clip((added - LEAST) / LEAST, 0, 1)
             added = trusted(added, self.sure) * told.worth
+        added = added * (1 - lamps.given_back(told.display, added))[..., None]
         return np.where(added > 0, flare_light(told.display, added), np.float32(0))
 
     def shown(self, plate: Plate) -> Pixels:

@@ -30,7 +30,7 @@ from core.errors import Cancelled, CaptureError, FrameError, RunError, SettingsE
 from core.exif import upright
 from core.pictures import Window, read_exr, read_picture, save_exr, write_exr, write_png
 from core.progress import Progress
-from core.removal import batch, graded, inference, weights
+from core.removal import batch, graded, inference, lamps, weights
 from core.removal.batch import plates_of, remove_all
 from core.removal.captured import UNFINISHED, _names, remove_from
 from core.removal.formation import flare_light
@@ -294,6 +294,43 @@ def test_a_picture_of_one_value_is_graded_back_to_finite_ones(display: NDArray[n
     back = graded.graded_back(display)
     assert back.dtype == np.float32 and np.isfinite(back).all()
     assert np.isfinite(graded.signs(display, display * 0.1, back).log_odds)
+
+
+def street(lamp: int, left: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """(160, 240, 3) each: a dark street with a white lamp `lamp` pixels a side in a glow, and as a flare the glow and
+    of the lamp what leaves it at the display value `left`, a third of that in its rim of a pixel."""
+    display, added = np.full((160, 240, 3), 0.1, np.float32), np.zeros((160, 240, 3), np.float32)
+    first = 60
+    glow, rim = slice(first - 12, first + lamp + 12), slice(first, first + lamp)
+    display[glow, glow], added[glow, glow] = 0.5, 0.35
+    display[rim, rim], added[rim, rim] = 1, 1 - left / 3
+    added[first + 1:first + lamp - 1, first + 1:first + lamp - 1] = 1 - left
+    return display, added
+
+
+def test_a_lamp_stays_as_bright_as_it_was_filmed(everywhere: Path) -> None:
+    """What is left of it says where it is; its glow goes, and of what clips about it the most."""
+    display, added = street(10, left=0.7)
+    clean = display**2 - Remover(everywhere).flare(Told(display, added))
+    np.testing.assert_allclose(clean[62:68, 62:68], 1)
+    np.testing.assert_allclose(clean[50:58, 50:58], 0.15**2, rtol=1e-4)
+    assert 0 < np.sqrt(clean[60, 60:70]).max() < 0.35
+
+
+@pytest.mark.parametrize(("lamp", "left"), [
+    pytest.param(10, 0.2, id="a ghost, gone like what is about it"),
+    pytest.param(44, 0.7, id="as large as a window"),
+    pytest.param(1, 0.7, id="a pixel, which noise is too"),
+])
+def test_what_is_no_lamp_goes_as_told(lamp: int, left: float) -> None:
+    display, added = street(lamp, left)
+    assert lamps.given_back(display, added).max() == 0
+
+
+@pytest.mark.parametrize("value", [0.0, 0.5, 1.0])
+def test_a_picture_of_one_value_has_no_lamps(value: float) -> None:
+    display = np.full((64, 96, 3), value, np.float32)
+    assert not lamps.given_back(display, display * 0.5).any()
 
 
 @pytest.mark.parametrize(("frame", "lit", "alone", "counts"), [

@@ -1,0 +1,66 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The lamps of a scene, which are its own and stay as bright as they were filmed.
+
+A lamp clips, and so does the glow before it; how much of what is clipped is glow nobody can tell. A network that takes
+some of it leaves lamps grey: in photographs of streets at night most of those that are not the brightest. So a small
+place as bright as film gets, which stands out of its surroundings still when the flare is gone, is taken for a lamp,
+and given back what was taken of it, the more the brighter it was left: its middle whole, of its rim little. A bright
+wall under a veil stands out little, a ghost is gone.
+"""
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..pictures import Pixels
+
+BRIGHT = 0.9
+"""Mean of the three display values from which on a place may be a lamp's."""
+RIM = (0.8, 0.95)
+"""The same about it: up to which nothing is given back, and from which on what is the lamp's."""
+LARGE = (0.01, 0.02)
+"""Share of the frame up to which such a place may be a lamp, and from which on it is none."""
+FEW = 3
+"""Pixels of the working size that a lamp has at least."""
+STANDS_OUT = (0.15, 0.3)
+"""How much brighter in display values than its surroundings a place is without the flare, up to which it is no lamp,
+and from which on it is one."""
+NEAR, ABOUT = 3, 7
+"""Pixels a side of the squares that a place is grown by to what counts as its rim, and as its surroundings."""
+ROUND = 4
+"""Power of a pixel's brightness, in parts of the brightest of its lamp, by which it is given back."""
+
+
+def given_back(display: Pixels, added: Pixels) -> Pixels:
+    """The part, 0..1 (h, w), of what a flare is told to add to display values 0..1 (h, w, 3) that is left there, since
+    it is a lamp's."""
+    import cv2
+
+    filmed, left = display.mean(-1), np.maximum(display - added, 0).mean(-1)
+    count, places = cv2.connectedComponents((filmed > BRIGHT).astype(np.uint8))
+    near = _grown(places, NEAR)
+    about = np.where(near > 0, 0, _grown(places, ABOUT))
+    middle = np.where(filmed >= _means(filmed, places, count)[places], places, 0)
+    stands_out = _means(left, middle, count) - _means(left, about, count)
+    pixels = np.bincount(places.ravel(), minlength=count)
+    lamp = np.interp(stands_out, STANDS_OUT, (0, 1)) * np.interp(pixels / filmed.size, LARGE, (1, 0))
+    lamp[(pixels < FEW) | (np.arange(count) == 0)] = 0
+    brightest = np.full(count, 1e-6)
+    np.maximum.at(brightest, middle, left)
+    rim = np.interp(filmed, RIM, (0, 1)) * np.clip(left / brightest[near], 0, 1) ** ROUND
+    return np.asarray(lamp[near] * rim, np.float32)
+
+
+def _grown(places: NDArray[np.int32], side: int) -> NDArray[np.int32]:
+    """Places by their numbers (h, w), 0 where there is none, grown by a square."""
+    import cv2
+
+    return np.asarray(cv2.dilate(places.astype(np.float32), np.ones((side, side), np.uint8)), np.int32)
+
+
+def _means(values: Pixels, places: NDArray[np.int32], count: int) -> NDArray[Any]:
+    """(count,), over each place; 0 where it has no pixel."""
+    totals = np.bincount(places.ravel(), values.ravel(), minlength=count)
+    return totals / np.maximum(np.bincount(places.ravel(), minlength=count), 1)

@@ -28,7 +28,7 @@ SIZES, QUARTER_TURNS = (1.0, 0.8), (0, 2)
 """Of the views in colour: parts of the frame's size, quarter turns. Each counts by its pixels."""
 ALONE_SIZE = 0.8
 """Of the views of a channel alone."""
-APART, ALONE_APART, DOUBT = (0.5, 0.7), (0.12, 0.2), (0.0, 2.5)
+APART, ALONE_APART, DOUBT = (0.4, 0.6), (0.12, 0.2), (0.0, 2.5)
 """By how far the views are apart, as a part of what they tell, and how much of that is then taken off what they tell:
 nothing of what they agree on, as they do on most flares, nearly all of what they do not. Of flares it is a sixth in
 the median, of haze in a scene that is taken for one a quarter to three quarters. Of what a channel tells alone they are

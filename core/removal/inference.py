@@ -6,7 +6,8 @@ is, since a flare lies over the scene and knows nothing of its edges. But where 
 of the flare is to be seen in it, and that part ends where the clipping does: there it is carried up by a guided filter
 (He et al. 2013, in the fast form of He and Sun 2015), flare = a * plate + b, with a and b found at the working size,
 smooth, and applied to the plate's own pixels. What was carried up is taken from the plate in linear light. Where the
-network tells less than a threshold the flare is exactly zero, and the plate's own codes are kept.
+network tells less than a threshold the flare is exactly zero, and the plate's own codes are kept. Lamps stay too
+(`lamps`).
 """
 from __future__ import annotations
 
@@ -131,7 +132,7 @@ class Remover:
         return np.asarray(added.permute(1, 2, 0).numpy())
 
     def flare(self, told: Told, *, marked: bool = False) -> Pixels:
-        """Linear flare (h, w, 3) of what was told; exactly 0 where there is none.
+        """Linear flare (h, w, 3) of what was told, less what is a lamp's; exactly 0 where there is none.
 
         marked: someone has seen a flare there, so that whatever was told is one.
         """

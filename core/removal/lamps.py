@@ -46,7 +46,8 @@ def given_back(display: Pixels, added: Pixels) -> Pixels:
     stands_out = _means(left, middle, count) - _means(left, about, count)
     pixels = np.bincount(places.ravel(), minlength=count)
     lamp = np.interp(stands_out, STANDS_OUT, (0, 1)) * np.interp(pixels / filmed.size, LARGE, (1, 0))
-    lamp[(pixels < FEW) | (np.arange(count) == 0)] = 0
+    lamp[pixels < FEW] = 0
+    lamp[0] = 0  # what is no such place
     brightest = np.full(count, 1e-6)
     np.maximum.at(brightest, middle, left)
     rim = np.interp(filmed, RIM, (0, 1)) * np.clip(left / brightest[near], 0, 1) ** ROUND
@@ -54,7 +55,7 @@ def given_back(display: Pixels, added: Pixels) -> Pixels:
 
 
 def _grown(places: NDArray[np.int32], side: int) -> NDArray[np.int32]:
-    """Places by their numbers (h, w), 0 where there is none, grown by a square."""
+    """Places by their numbers (h, w), 0 where there is none, grown by a square; where two meet, the later counts."""
     import cv2
 
     return np.asarray(cv2.dilate(places.astype(np.float32), np.ones((side, side), np.uint8)), np.int32)

@@ -308,10 +308,11 @@ def street(lamp: int, left: float) -> tuple[NDArray[np.float32], NDArray[np.floa
     return display, added
 
 
-def test_a_lamp_stays_as_bright_as_it_was_filmed(everywhere: Path) -> None:
+@pytest.mark.parametrize("marked", [False, True])
+def test_a_lamp_stays_as_bright_as_it_was_filmed(everywhere: Path, marked: bool) -> None:
     """What is left of it says where it is; its glow goes, and of what clips about it the most."""
     display, added = street(10, left=0.7)
-    clean = display**2 - Remover(everywhere).flare(Told(display, added))
+    clean = display**2 - Remover(everywhere).flare(Told(display, added), marked=marked)
     np.testing.assert_allclose(clean[62:68, 62:68], 1)
     np.testing.assert_allclose(clean[50:58, 50:58], 0.15**2, rtol=1e-4)
     assert 0 < np.sqrt(clean[60, 60:70]).max() < 0.35

@@ -62,11 +62,13 @@ class FlareMap:
 
 class Told(NamedTuple):
     """Of a plate the display values 0..1 that the network was shown (h, w, 3), what a flare adds to them as far as its
-    views are believed, and the part of that, 0..1, which is taken for a flare and not for the picture's grade."""
+    views are believed, the part of that, 0..1, which is taken for a flare and not for the picture's grade, and the part
+    of it, 0..1 (h, w, 3), which is glow round lights."""
 
     display: Pixels
     added: Pixels
-    worth: np.float32 = np.float32(1)
+    worth: np.float32
+    glow: Pixels
 
 
 class Remover:
@@ -118,7 +120,7 @@ class Remover:
         """Of what the network is `shown` of a plate by itself."""
         views = self.views(display)
         alone = [(views, 1.0)]
-        return Told(display, believed(views, doubt_of(alone)), worth_of(alone))
+        return Told(display, believed(views, doubt_of(alone)), worth_of(alone), views.glow)
 
     def views(self, display: Pixels) -> Views:
         """What the network tells of display values 0..1 (h, w, 3), h and w multiples of MULTIPLE."""
@@ -126,22 +128,25 @@ class Remover:
 
     @torch.inference_mode()
     def _told(self, display: Pixels) -> Pixels:
-        """What the network tells of a view."""
+        """What the network tells of a view (`views.Tell`); glow that is kept as it is is no part of it."""
         told = self.network(torch.from_numpy(np.ascontiguousarray(display.transpose(2, 0, 1)))[None])
-        added = (told.gentle if self.keep_glare else told.flare)[0].clamp(min=0)
-        return np.asarray(added.permute(1, 2, 0).numpy())
+        flare, gentle = told.flare[0].clamp(min=0), told.gentle[0].clamp(min=0)
+        both = [gentle, torch.zeros_like(gentle)] if self.keep_glare else [flare, flare - gentle]
+        return np.asarray(torch.cat(both).permute(1, 2, 0).numpy())
 
     def flare(self, told: Told, *, marked: bool = False) -> Pixels:
         """Linear flare (h, w, 3) of what was told, less what is a lamp's; exactly 0 where there is none.
 
-        marked: someone has seen a flare there, so that whatever was told is one.
+        marked: someone has seen a flare there, so that whatever was told is one, and all of its glow.
         """
-        added = told.added
-        if not marked:
+        added, glow = told.added, told.glow
+        if marked:
+            glow = np.zeros_like(glow)
+        else:
             # A ramp from nothing to the whole, so that a faint flare has no rim.
             added = added * np.clip((added - LEAST) / LEAST, 0, 1)
             added = trusted(added, self.sure) * told.worth
-        added = added * (1 - lamps.given_back(told.display, added))[..., None]
+        added = added * (1 - lamps.given_back(told.display, added, glow))
         return np.where(added > 0, flare_light(told.display, added), np.float32(0))
 
     def shown(self, plate: Plate) -> Pixels:

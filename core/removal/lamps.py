@@ -1,11 +1,16 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The lamps of a scene, which are its own and stay as bright as they were filmed.
+"""The lamps of a scene, which are its own and stay as bright as they were filmed, with the glow of a clean lens.
 
 A lamp clips, and so does the glow before it; how much of what is clipped is glow nobody can tell. A network that takes
 some of it leaves lamps grey: in photographs of streets at night most of those that are not the brightest. So a small
 place as bright as film gets, which stands out of its surroundings still when the flare is gone, is taken for a lamp,
 and given back what was taken of it, the more the brighter it was left: its middle whole, of its rim little. A bright
 wall under a veil stands out little, a ghost is gone.
+
+In the dark no lens is so clean that a lamp has no glow in it, and a flare is what comes on top of that. What comes of
+which one picture does not say, and the network, whose flares were synthesised over lamps without any, takes both. So a
+part of what is told as glow stays near a lamp at night. Of streaks, rays and ghosts nothing does, nor by day, when a
+lamp is less brighter than the rest.
 """
 from __future__ import annotations
 
@@ -31,11 +36,20 @@ NEAR, ABOUT = 3, 7
 """Pixels a side of the squares that a place is grown by to what counts as its rim, and as its surroundings."""
 ROUND = 4
 """Power of a pixel's brightness, in parts of the brightest of its lamp, by which it is given back."""
+STAYS, REACH = 0.5, 0.05
+"""Part of the glow that stays beside a lamp, and how far off, in parts of the frame's long side, it has fallen to a
+third (to 1 / e) of that."""
+DARK = (0.2, 0.3)
+"""Median display value without the flare up to which a scene is dark, and from which on no glow stays in it."""
+WHITE = (0.9, 0.97)
+"""Display value of its brightest pixel up to which a lamp keeps no glow, and from which on it does."""
+STEPS = 4
+"""In how many steps a place that may be a lamp counts as one for the glow about it."""
 
 
-def given_back(display: Pixels, added: Pixels) -> Pixels:
-    """The part, 0..1 (h, w), of what a flare is told to add to display values 0..1 (h, w, 3) that is left there, since
-    it is a lamp's."""
+def given_back(display: Pixels, added: Pixels, glow: Pixels) -> Pixels:
+    """The part, 0..1 (h, w, 3), of what a flare is told to add to display values 0..1 (h, w, 3) that is left there,
+    since it is a lamp's. glow: the part of it, 0..1 (h, w, 3), that is glow round lights."""
     import cv2
 
     filmed, left = display.mean(-1), np.maximum(display - added, 0).mean(-1)
@@ -51,7 +65,25 @@ def given_back(display: Pixels, added: Pixels) -> Pixels:
     brightest = np.full(count, 1e-6)
     np.maximum.at(brightest, middle, left)
     rim = np.interp(filmed, RIM, (0, 1)) * np.clip(left / brightest[near], 0, 1) ** ROUND
-    return np.asarray(lamp[near] * rim, np.float32)
+    own = np.asarray(lamp[near] * rim, np.float32)
+    peak = np.zeros(count)
+    np.maximum.at(peak, places, filmed)
+    shines = lamp * np.interp(peak, WHITE, (0, 1))
+    stays = np.float32(STAYS * np.interp(np.median(left), DARK, (1, 0)))
+    return np.asarray(np.maximum(own[..., None], stays * _beside(shines[places])[..., None] * glow))
+
+
+def _beside(shines: NDArray[Any]) -> Pixels:
+    """(h, w), 1 at what shines, 0..1 (h, w), and the less the farther from it."""
+    import cv2
+
+    reach = REACH * max(shines.shape)
+    near = np.zeros(shines.shape, np.float32)
+    for step in range(STEPS):
+        dark = (shines <= (step + 0.5) / STEPS).astype(np.uint8)
+        if not dark.all():
+            near += np.exp(-cv2.distanceTransform(dark, cv2.DIST_L2, cv2.DIST_MASK_5) / np.float32(reach)) / STEPS
+    return near
 
 
 def _grown(places: NDArray[np.int32], side: int) -> NDArray[np.int32]:

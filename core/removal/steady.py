@@ -97,10 +97,11 @@ def steadied(here: Sighting, about: Sequence[Neighbour]) -> Told:
     doubt, worth = doubt_of(shot), worth_of(shot)
     added = np.minimum(believed(here.views, doubt), display)
     if not about:
-        return Told(display, added, worth)
+        return Told(display, added, worth, here.views.glow)
     own = _seen(here, doubt)
     missed = _missed(own, [_found_again(own, other, doubt) for other in about])
-    return Told(display, np.clip(added + _finer(missed, display), 0, display), worth)
+    added = np.clip(added + _finer(missed, display), 0, display)
+    return Told(display, added, worth, here.views.glow)
 
 
 class _Seen(NamedTuple):

@@ -6,7 +6,7 @@ down, in two sizes. In the dark each channel is shown alone too, as a grey pictu
 seldom told in colour, but in the red alone it is that of any lamp. Where what is told so is of one colour, the more of
 the two counts. Of white lights it would not: where one channel is clipped and another is not, their flare would leave
 with another colour than it came with. And the frame is shown once more with its black at none, for what is told may be
-how it was graded (`graded`).
+how it was graded (`graded`). Of what they tell in the mean a part is glow round lights, of which `lamps` leaves some.
 """
 from __future__ import annotations
 
@@ -22,7 +22,8 @@ from .formation import display as shown
 from .network import MULTIPLE
 
 Tell = Callable[[Pixels], Pixels]
-"""What a flare adds to display values 0..1 (h, w, 3), h and w multiples of MULTIPLE, by one pass of the network."""
+"""By one pass of the network, of display values 0..1 (h, w, 3), h and w multiples of MULTIPLE: what a flare adds to
+each, and behind those what of that is glow round lights, (h, w, 6)."""
 
 SIZES, QUARTER_TURNS = (1.0, 0.8), (0, 2)
 """Of the views in colour: parts of the frame's size, quarter turns. Each counts by its pixels."""
@@ -46,12 +47,14 @@ ALONE_SURE = 0.004
 class Views(NamedTuple):
     """What a flare adds to a frame's display values as several views of it tell, each (h, w, 3): in the mean, and how
     far the views are apart from that (standard deviation); what the channels tell alone, and how far, 0..1, that
-    counts where it is more; and what tells it from a grade of the picture, where so much is told that it may be one."""
+    counts where it is more; which part of the mean, 0..1, is glow round lights; and what tells it from a grade of the
+    picture, where so much is told that it may be one."""
 
     mean: Pixels
     apart: Pixels
     alone: Pixels
     alone_counts: np.float32
+    glow: Pixels
     signs: graded.Signs | None = None
 
 
@@ -59,22 +62,24 @@ def told_in_views(display: Pixels, tell: Tell) -> Views:
     """Of display values 0..1 (h, w, 3), h and w multiples of MULTIPLE."""
     told = np.concatenate([_turned(tell, display, size) for size in SIZES])
     pixels = np.repeat(np.square(SIZES), len(QUARTER_TURNS)).astype(np.float32)
+    told, glowing = told[..., :3], np.average(told[..., 3:], 0, pixels)
     mean = np.average(told, 0, pixels)
-    views = Views(mean, np.sqrt(np.average(np.square(told - mean), 0, pixels)), np.zeros_like(mean), np.float32(0))
+    views = told_once(mean)._replace(apart=np.sqrt(np.average(np.square(told - mean), 0, pixels)),
+                                     glow=np.clip(glowing / np.maximum(mean, 1e-9), 0, 1))
     dark = np.float32(np.interp(np.median(display), DARK, (1, 0)))
     if dark > 0:
         alone = np.stack([_told_alone(tell, display, channel) for channel in range(3)], -1)
         views = views._replace(alone=alone, alone_counts=dark * _is_of_one_colour(flare_light(display, alone)))
     if graded.may_be(mean) > 0:
-        again = _turned(tell, graded.graded_back(display), SIZES[0]).mean(0)
+        again = _turned(tell, graded.graded_back(display), SIZES[0])[..., :3].mean(0)
         views = views._replace(signs=graded.signs(display, mean, again))
     return views
 
 
 def told_once(added: Pixels) -> Views:
-    """Of a frame of which there is a single view."""
+    """Of a frame of which there is a single view, in which nothing is glow."""
     none = np.zeros_like(added)
-    return Views(added, none, none, np.float32(0))
+    return Views(added, none, none, np.float32(0), none)
 
 
 def doubt_of(frames: Sequence[tuple[Views, float]]) -> np.float32:
@@ -114,7 +119,7 @@ def trusted(added: Pixels, sure: float) -> Pixels:
 def _told_alone(tell: Tell, display: Pixels, channel: int) -> Pixels:
     """(h, w), of a channel shown as a grey picture."""
     grey = np.repeat(display[..., channel, None], 3, -1)
-    views = _turned(tell, grey, ALONE_SIZE).mean(-1)
+    views = _turned(tell, grey, ALONE_SIZE)[..., :3].mean(-1)
     mean, apart = np.mean(views, 0), np.std(views, 0)
     return _less_doubt(mean, apart, _doubt(apart.mean(), np.abs(mean).mean(), ALONE_APART))
 
@@ -135,7 +140,7 @@ def _is_of_one_colour(light: Pixels) -> np.float32:
 
 
 def _turned(tell: Tell, display: Pixels, size: float) -> Pixels:
-    """(turns, h, w, 3), what is told of views of that part of the frame's size in QUARTER_TURNS."""
+    """(turns, h, w, 6), what is told of views of that part of the frame's size in QUARTER_TURNS."""
     return np.stack([_in_view(tell, display, size, turns) for turns in QUARTER_TURNS])
 
 

@@ -43,6 +43,9 @@ CLIPPED = 0.97
 """Display value from which on a plate is taken for over-exposed."""
 ROWS = 256
 """Rows of the plate that are worked on at a time, which bounds the memory."""
+REVISION = 1
+"""Of what is made of plates with the same weights and settings; one more wherever that comes out otherwise, so that
+plates of before are made again."""
 COLUMNS = 16384
 """Of them at a time where places are looked up, which OpenCV counts in 16 bits."""
 
@@ -170,9 +173,10 @@ class Remover:
 
 
 def described(model: str, weights: Path | str, *settings: Any) -> str:
-    """A short text that changes when plates would come out otherwise: by the weights' content, not their name."""
+    """A short text that changes when plates would come out otherwise: by the weights' content, not their name, and
+    by `REVISION`."""
     digest = hashlib.sha256(Path(weights).read_bytes())
-    digest.update(repr((model, *settings)).encode())
+    digest.update(repr((REVISION, model, *settings)).encode())
     return digest.hexdigest()[:16]
 
 

@@ -208,6 +208,11 @@ def test_a_frame_upside_down_is_told_the_same(everywhere: Path) -> None:
     np.testing.assert_allclose(told[::-1, ::-1], upright, atol=1e-5)
 
 
+def without_glow(added: NDArray[np.float32]) -> NDArray[np.float32]:
+    """As `Remover._told` tells it."""
+    return np.concatenate([added, np.zeros_like(added)], -1)
+
+
 @pytest.mark.parametrize(("in_two", "doubt"), [(0.16, 0.0), (0.401, 0.5), (0.6, 1.5)])
 def test_a_flare_in_some_views_alone_is_doubted(everywhere: Path, monkeypatch: pytest.MonkeyPatch, in_two: float,
                                                 doubt: float) -> None:
@@ -223,7 +228,7 @@ def test_a_flare_in_some_views_alone_is_doubted(everywhere: Path, monkeypatch: p
         if len(shown) < 2:
             added[:, middle:] = in_two
         shown.append(view.shape)
-        return added if upright else added[::-1, ::-1]
+        return without_glow(added if upright else added[::-1, ::-1])
 
     monkeypatch.setattr(Remover, "_told", told)
     added = Remover(everywhere).told(np.full((160, 320, 3), (0.5, 0.6, 0.7), np.float32)).added  # no dark frame
@@ -246,7 +251,7 @@ def dusk(veil: float = 0.0, black: float = 0.0) -> NDArray[np.float32]:
 def tells_lifted_darks(_: Remover, view: NDArray[np.float32]) -> NDArray[np.float32]:
     """Column by column what the darkest places have, as if it were a veil."""
     darks = cv2.erode(view.min(0, keepdims=True), np.ones((1, 41))) - 0.01
-    return np.broadcast_to(np.maximum(darks, 0), view.shape).astype(np.float32)
+    return without_glow(np.broadcast_to(np.maximum(darks, 0), view.shape).astype(np.float32))
 
 
 def test_a_grade_is_no_flare(everywhere: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -312,7 +317,7 @@ def street(lamp: int, left: float) -> tuple[NDArray[np.float32], NDArray[np.floa
 def test_a_lamp_stays_as_bright_as_it_was_filmed(everywhere: Path, marked: bool) -> None:
     """What is left of it says where it is; its glow goes, and of what clips about it the most."""
     display, added = street(10, left=0.7)
-    clean = display**2 - Remover(everywhere).flare(Told(display, added), marked=marked)
+    clean = display**2 - Remover(everywhere).flare(Told(display, added, np.float32(1), 0 * added), marked=marked)
     np.testing.assert_allclose(clean[62:68, 62:68], 1)
     np.testing.assert_allclose(clean[50:58, 50:58], 0.15**2, rtol=1e-4)
     assert 0 < np.sqrt(clean[60, 60:70]).max() < 0.35
@@ -325,13 +330,53 @@ def test_a_lamp_stays_as_bright_as_it_was_filmed(everywhere: Path, marked: bool)
 ])
 def test_what_is_no_lamp_goes_as_told(lamp: int, left: float) -> None:
     display, added = street(lamp, left)
-    assert lamps.given_back(display, added).max() == 0
+    assert lamps.given_back(display, added, np.ones_like(added)).max() == 0
 
 
 @pytest.mark.parametrize("value", [0.0, 0.5, 1.0])
 def test_a_picture_of_one_value_has_no_lamps(value: float) -> None:
     display = np.full((64, 96, 3), value, np.float32)
-    assert not lamps.given_back(display, display * 0.5).any()
+    assert not lamps.given_back(display, display * 0.5, np.ones_like(display)).any()
+
+
+def test_a_part_of_the_glow_stays_beside_a_lamp_at_night() -> None:
+    """The less, the farther off; of what is no glow nothing does."""
+    display, added = street(10, left=0.7)
+    stays = lamps.given_back(display, added, np.float32((1, 0.5, 0)) * np.ones_like(added))
+    for off in (2, 8):
+        expected = lamps.STAYS * np.exp(-off / (lamps.REACH * 240)) * np.array((1, 0.5, 0))
+        np.testing.assert_allclose(stays[65, 60 - off], expected, rtol=0.02)
+
+
+@pytest.mark.parametrize(("about", "part"), [(0.2, 1.0), (0.25, 0.5), (0.3, 0.0)])
+def test_by_day_no_glow_stays(about: float, part: float) -> None:
+    display, added = street(10, left=0.7)
+    display[display < 0.2] = about
+    stays = lamps.given_back(display, added, np.ones_like(added))[65, 58, 0]
+    assert stays == pytest.approx(part * lamps.STAYS * np.exp(-2 / 12), rel=0.02, abs=1e-3)
+
+
+@pytest.mark.parametrize(("white", "part"), [(0.905, 0.0), (0.935, 0.5), (0.98, 1.0)])
+def test_a_lamp_that_is_not_white_keeps_less_of_a_glow(white: float, part: float) -> None:
+    display, added = street(10, left=0.7)
+    stays = lamps.given_back(np.minimum(display, white), added, np.ones_like(added))[65, 58, 0]
+    assert stays == pytest.approx(part * lamps.STAYS * np.exp(-2 / 12), rel=0.05, abs=0.03)
+
+
+def test_of_a_glow_that_is_marked_nothing_stays(everywhere: Path) -> None:
+    display, added = street(10, left=0.7)
+    told = Told(display, added, np.float32(1), np.ones_like(added))
+    seen, marked = (Remover(everywhere).flare(told, marked=marked)[65, 58] for marked in (False, True))
+    np.testing.assert_allclose(marked, 0.5**2 - 0.15**2, rtol=1e-3)
+    assert (seen < 0.8 * marked).all()
+
+
+def test_what_of_a_flare_is_glow_is_what_stays_where_glare_is_kept(everywhere: Path) -> None:
+    """In every view, in the mean over them by what each tells."""
+    display = picture(64, 96, 1, np.float32)
+    told, kept = (Remover(everywhere, keep_glare=keep).told(display) for keep in (False, True))
+    assert 0.01 < told.glow.mean() < 0.99 and kept.glow.max() == 0
+    np.testing.assert_allclose(told.added * (1 - told.glow), kept.added, atol=1e-4)
 
 
 @pytest.mark.parametrize(("frame", "lit", "alone", "counts"), [
@@ -346,7 +391,8 @@ def test_what_a_channel_tells_alone_counts_of_one_colour_in_the_dark(
     """As the glow of a red light does."""
     def told(_: Remover, view: NDArray[np.float32]) -> NDArray[np.float32]:
         is_grey = view[0, 0, 0] == view[0, 0, 1]
-        return np.full_like(view, alone if is_grey and np.isclose(view[0, 0, 0], lit, atol=1e-3).any() else 0.02)
+        lights = is_grey and np.isclose(view[0, 0, 0], lit, atol=1e-3).any()
+        return without_glow(np.full_like(view, alone if lights else 0.02))
 
     monkeypatch.setattr(Remover, "_told", told)
     added = Remover(everywhere).told(np.full((160, 320, 3), frame, np.float32)).added
@@ -873,6 +919,16 @@ def test_a_fit_that_was_second_takes_what_the_first_has_cleaned(tmp_path: Path, 
     assert remove_from(capture, remover, Meanwhile()) == capture.folder / "removed"
     assert not (capture.folder / UNFINISHED).exists()
     assert Capture.open(capture.folder).has_removed
+
+
+def test_plates_of_an_earlier_program_are_made_again(tmp_path: Path, everywhere: Path,
+                                                    monkeypatch: pytest.MonkeyPatch) -> None:
+    source, out = write_codes(tmp_path / "in" / "a.png", picture()), tmp_path / "out"
+    made = []
+    for revision in (inference.REVISION, inference.REVISION, inference.REVISION + 1):
+        monkeypatch.setattr(inference, "REVISION", revision)
+        made.append(remove_all([source], out, Remover(everywhere, working_size=64), Progress())["made"])
+    assert made == [1, 0, 1]
 
 
 def test_a_plate_that_was_begun_is_made(tmp_path: Path, everywhere: Path) -> None:

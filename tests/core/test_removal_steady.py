@@ -141,6 +141,15 @@ def test_a_frame_that_is_seen_by_itself_is_what_was_told() -> None:
     assert np.array_equal(steadied(alone, []).added, alone.views.mean)
 
 
+def test_what_of_a_frame_is_glow_is_as_its_own_views_tell() -> None:
+    frame = told(scene(4), 0.1)
+    glow = np.random.default_rng(0).random((48, 64, 3)).astype(np.float32)
+    frame = frame._replace(views=frame.views._replace(glow=glow))
+    still = motion.flow(frame.guide.grey, frame.guide.grey)
+    for about in ([], [Neighbour(told(scene(4), 0.1), np.float32(1), still, still)]):
+        assert np.array_equal(steadied(frame, about).glow, glow)
+
+
 @pytest.mark.parametrize("shape", [(32, 32), (32, 480), (480, 32)])
 def test_the_smallest_frames_are_followed_too(shape: tuple[int, int]) -> None:
     frame = np.random.default_rng(0).uniform(0.2, 0.8, (*shape, 3)).astype(np.float32)
@@ -151,7 +160,7 @@ def test_the_smallest_frames_are_followed_too(shape: tuple[int, int]) -> None:
 def test_a_flare_is_believed_as_far_as_in_the_frames_of_its_shot() -> None:
     """Its views are apart by as much as they tell, those of the others agree; in another shot that says nothing."""
     even = np.full((48, 64, 3), 0.1, np.float32)
-    doubted = Sighting(guide(scene(6)), Views(even, even, 0 * even, np.float32(0)))
+    doubted = Sighting(guide(scene(6)), Views(even, even, 0 * even, np.float32(0), 0 * even))
     sure = [told(scene(6), even) for _ in range(2)]
     assert steadied(doubted, []).added.max() == 0
     assert in_line(doubted, [told(scene(7), even)]).max() == 0

@@ -14,7 +14,7 @@ lamp is less brighter than the rest.
 """
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,40 +47,53 @@ STEPS = 4
 """In how many steps a place that may be a lamp counts as one for the glow about it."""
 
 
+class _Lamps(NamedTuple):
+    """Bright places by their numbers (h, w), 0 where there is none; and of each, (count,), how far it is a lamp, 0..1,
+    and its brightest pixel, as it was filmed and as the flare leaves it."""
+
+    places: NDArray[np.int32]
+    likely: NDArray[Any]
+    filmed: NDArray[Any]
+    left: NDArray[Any]
+
+
 def given_back(display: Pixels, added: Pixels, glow: Pixels) -> Pixels:
     """The part, 0..1 (h, w, 3), of what a flare is told to add to display values 0..1 (h, w, 3) that is left there,
     since it is a lamp's. glow: the part of it, 0..1 (h, w, 3), that is glow round lights."""
+    filmed, left = display.mean(-1), np.maximum(display - added, 0).mean(-1)
+    lamps = _found(filmed, left)
+    near = _grown(lamps.places, NEAR)
+    rim = np.interp(filmed, RIM, (0, 1)) * np.clip(left / lamps.left[near], 0, 1) ** ROUND
+    own = np.asarray(lamps.likely[near] * rim, np.float32)
+    glowing = lamps.likely * np.interp(lamps.filmed, WHITE, (0, 1))
+    stays = np.float32(STAYS * np.interp(np.median(left), DARK, (1, 0)))
+    return np.asarray(np.maximum(own[..., None], stays * _beside(glowing[lamps.places])[..., None] * glow))
+
+
+def _found(filmed: Pixels, left: Pixels) -> _Lamps:
+    """By brightness (h, w), as it was filmed and as the flare leaves it."""
     import cv2
 
-    filmed, left = display.mean(-1), np.maximum(display - added, 0).mean(-1)
-    count, places = cv2.connectedComponents((filmed > BRIGHT).astype(np.uint8))
-    near = _grown(places, NEAR)
-    about = np.where(near > 0, 0, _grown(places, ABOUT))
+    count, numbers = cv2.connectedComponents((filmed > BRIGHT).astype(np.uint8))
+    places = np.asarray(numbers, np.int32)
+    about = np.where(_grown(places, NEAR) > 0, 0, _grown(places, ABOUT))
     middle = np.where(filmed >= _means(filmed, places, count)[places], places, 0)
     stands_out = _means(left, middle, count) - _means(left, about, count)
     pixels = np.bincount(places.ravel(), minlength=count)
-    lamp = np.interp(stands_out, STANDS_OUT, (0, 1)) * np.interp(pixels / filmed.size, LARGE, (1, 0))
-    lamp[pixels < FEW] = 0
-    lamp[0] = 0  # what is no such place
-    brightest = np.full(count, 1e-6)
-    np.maximum.at(brightest, middle, left)
-    rim = np.interp(filmed, RIM, (0, 1)) * np.clip(left / brightest[near], 0, 1) ** ROUND
-    own = np.asarray(lamp[near] * rim, np.float32)
-    peak = np.zeros(count)
-    np.maximum.at(peak, places, filmed)
-    shines = lamp * np.interp(peak, WHITE, (0, 1))
-    stays = np.float32(STAYS * np.interp(np.median(left), DARK, (1, 0)))
-    return np.asarray(np.maximum(own[..., None], stays * _beside(shines[places])[..., None] * glow))
+    likely = np.interp(stands_out, STANDS_OUT, (0, 1)) * np.interp(pixels / filmed.size, LARGE, (1, 0))
+    likely[pixels < FEW] = 0
+    likely[0] = 0  # what is no such place
+    return _Lamps(places, likely, _most(filmed, middle, count), _most(left, middle, count))
 
 
-def _beside(shines: NDArray[Any]) -> Pixels:
-    """(h, w), 1 at what shines, 0..1 (h, w), and the less the farther from it."""
+def _beside(glowing: NDArray[Any]) -> Pixels:
+    """(h, w), as much as what is glowing, 0..1 (h, w), and the less the farther from it."""
     import cv2
 
-    reach = REACH * max(shines.shape)
-    near = np.zeros(shines.shape, np.float32)
+    reach = REACH * max(glowing.shape)
+    near = np.zeros(glowing.shape, np.float32)
     for step in range(STEPS):
-        dark = (shines <= (step + 0.5) / STEPS).astype(np.uint8)
+        dark = (glowing <= (step + 0.5) / STEPS).astype(np.uint8)
         if not dark.all():
             near += np.exp(-cv2.distanceTransform(dark, cv2.DIST_L2, cv2.DIST_MASK_5) / np.float32(reach)) / STEPS
     return near
@@ -91,6 +104,13 @@ def _grown(places: NDArray[np.int32], side: int) -> NDArray[np.int32]:
     import cv2
 
     return np.asarray(cv2.dilate(places.astype(np.float32), np.ones((side, side), np.uint8)), np.int32)
+
+
+def _most(values: Pixels, places: NDArray[np.int32], count: int) -> NDArray[Any]:
+    """(count,), over each place; next to nothing where it has no pixel."""
+    most = np.full(count, 1e-6)
+    np.maximum.at(most, places, values)
+    return most
 
 
 def _means(values: Pixels, places: NDArray[np.int32], count: int) -> NDArray[Any]:

@@ -5,7 +5,8 @@ A lamp clips, and so does the glow before it; how much of what is clipped is glo
 some of it leaves lamps grey: in photographs of streets at night most of those that are not the brightest. So a small
 place as bright as film gets, which stands out of its surroundings still when the flare is gone, is taken for a lamp,
 and given back what was taken of it, the more the brighter it was left: its middle whole, of its rim little. A bright
-wall under a veil stands out little, a ghost is gone.
+wall under a veil stands out little, a ghost is gone. Of some lamps nothing is left that stands out; but what glow there
+is about a white place comes from a lamp in its middle.
 
 In the dark no lens is so clean that a lamp has no glow in it, and a flare is what comes on top of that. What comes of
 which one picture does not say, and the network, whose flares were synthesised over lamps without any, takes both. So a
@@ -36,6 +37,12 @@ NEAR, ABOUT = 3, 7
 """Pixels a side of the squares that a place is grown by to what counts as its rim, and as its surroundings."""
 ROUND = 4
 """Power of a pixel's brightness, in parts of the brightest of its lamp, by which it is given back."""
+AMID_GLOW = (0.5, 0.8)
+"""Part of what is told about a place that is glow, up to which that says nothing of a lamp, and from which on there is
+one in its middle: what lies half as deep in it as its deepest pixel, or deeper."""
+SHINES = (0.05, 0.15)
+"""How much brighter than its surroundings such a place was filmed, up to which it is no lamp, and from which on it is.
+"""
 STAYS, REACH = 0.5, 0.05
 """Part of the glow that stays beside a lamp, and how far off, in parts of the frame's long side, it has fallen to a
 third (to 1 / e) of that."""
@@ -49,10 +56,11 @@ STEPS = 4
 
 class _Lamps(NamedTuple):
     """Bright places by their numbers (h, w), 0 where there is none; and of each, (count,), how far it is a lamp, 0..1,
-    and its brightest pixel, as it was filmed and as the flare leaves it."""
+    as it stands out and as there is glow about it, and its brightest pixel, as filmed and as the flare leaves it."""
 
     places: NDArray[np.int32]
-    likely: NDArray[Any]
+    stands_out: NDArray[Any]
+    amid_glow: NDArray[Any]
     filmed: NDArray[Any]
     left: NDArray[Any]
 
@@ -61,29 +69,42 @@ def given_back(display: Pixels, added: Pixels, glow: Pixels) -> Pixels:
     """The part, 0..1 (h, w, 3), of what a flare is told to add to display values 0..1 (h, w, 3) that is left there,
     since it is a lamp's. glow: the part of it, 0..1 (h, w, 3), that is glow round lights."""
     filmed, left = display.mean(-1), np.maximum(display - added, 0).mean(-1)
-    lamps = _found(filmed, left)
+    lamps = _found(filmed, left, added.mean(-1), (added * glow).mean(-1))
     near = _grown(lamps.places, NEAR)
-    rim = np.interp(filmed, RIM, (0, 1)) * np.clip(left / lamps.left[near], 0, 1) ** ROUND
-    own = np.asarray(lamps.likely[near] * rim, np.float32)
-    glowing = lamps.likely * np.interp(lamps.filmed, WHITE, (0, 1))
-    stays = np.float32(STAYS * np.interp(np.median(left), DARK, (1, 0)))
-    return np.asarray(np.maximum(own[..., None], stays * _beside(glowing[lamps.places])[..., None] * glow))
+    bright = lamps.stands_out[near] * np.clip(left / lamps.left[near], 0, 1) ** ROUND
+    own = np.interp(filmed, RIM, (0, 1)) * np.maximum(bright, lamps.amid_glow[lamps.places] * _middles(lamps.places))
+    glowing = np.maximum(lamps.stands_out, lamps.amid_glow) * np.interp(lamps.filmed, WHITE, (0, 1))
+    stays = STAYS * np.interp(np.median(left), DARK, (1, 0))
+    return np.asarray(np.maximum(own[..., None], stays * _beside(glowing[lamps.places])[..., None] * glow), np.float32)
 
 
-def _found(filmed: Pixels, left: Pixels) -> _Lamps:
-    """By brightness (h, w), as it was filmed and as the flare leaves it."""
+def _found(filmed: Pixels, left: Pixels, added: Pixels, glow: Pixels) -> _Lamps:
+    """By brightness, as it was filmed and as the flare leaves it, and by what the flare adds and what of that is glow,
+    each (h, w)."""
     import cv2
 
     count, numbers = cv2.connectedComponents((filmed > BRIGHT).astype(np.uint8))
     places = np.asarray(numbers, np.int32)
     about = np.where(_grown(places, NEAR) > 0, 0, _grown(places, ABOUT))
     middle = np.where(filmed >= _means(filmed, places, count)[places], places, 0)
-    stands_out = _means(left, middle, count) - _means(left, about, count)
+    above, above_filmed = (_means(one, middle, count) - _means(one, about, count) for one in (left, filmed))
+    of_glow = _means(glow, about, count) / np.maximum(_means(added, about, count), 1e-6)
     pixels = np.bincount(places.ravel(), minlength=count)
-    likely = np.interp(stands_out, STANDS_OUT, (0, 1)) * np.interp(pixels / filmed.size, LARGE, (1, 0))
-    likely[pixels < FEW] = 0
-    likely[0] = 0  # what is no such place
-    return _Lamps(places, likely, _most(filmed, middle, count), _most(left, middle, count))
+    small = np.interp(pixels / filmed.size, LARGE, (1, 0))
+    small[pixels < FEW] = 0
+    small[0] = 0  # what is no such place
+    return _Lamps(places, small * np.interp(above, STANDS_OUT, (0, 1)),
+                  small * np.interp(of_glow, AMID_GLOW, (0, 1)) * np.interp(above_filmed, SHINES, (0, 1)),
+                  _most(filmed, middle, count), _most(left, middle, count))
+
+
+def _middles(places: NDArray[np.int32]) -> Pixels:
+    """(h, w), 0..1: how deep in its place each pixel lies, in parts of half as deep as the deepest."""
+    import cv2
+
+    deep = cv2.distanceTransform((places > 0).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
+    deepest = _most(np.asarray(deep), places, int(places.max()) + 1)
+    return np.asarray(np.clip(2 * deep / deepest[places], 0, 1), np.float32)
 
 
 def _beside(glowing: NDArray[Any]) -> Pixels:

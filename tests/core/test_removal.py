@@ -323,14 +323,30 @@ def test_a_lamp_stays_as_bright_as_it_was_filmed(everywhere: Path, marked: bool)
     assert 0 < np.sqrt(clean[60, 60:70]).max() < 0.35
 
 
-@pytest.mark.parametrize(("lamp", "left"), [
-    pytest.param(10, 0.2, id="a ghost, gone like what is about it"),
-    pytest.param(44, 0.7, id="as large as a window"),
-    pytest.param(1, 0.7, id="a pixel, which noise is too"),
+@pytest.mark.parametrize(("lamp", "left", "glow"), [
+    pytest.param(10, 0.2, 0.5, id="a ghost, gone like what is about it"),
+    pytest.param(44, 0.7, 1, id="as large as a window"),
+    pytest.param(44, 0.2, 1, id="as large as what a glow clips"),
+    pytest.param(1, 0.7, 1, id="a pixel, which noise is too"),
 ])
-def test_what_is_no_lamp_goes_as_told(lamp: int, left: float) -> None:
+def test_what_is_no_lamp_goes_as_told(lamp: int, left: float, glow: float) -> None:
     display, added = street(lamp, left)
-    assert lamps.given_back(display, added, np.ones_like(added)).max() == 0
+    assert lamps.given_back(display, added, np.full_like(added, glow)).max() == 0
+
+
+@pytest.mark.parametrize(("about", "glow", "part"), [
+    pytest.param(0.5, 1.0, 1.0, id="in a glow"),
+    pytest.param(0.5, 0.65, 0.5, id="half of it a glow"),
+    pytest.param(0.9, 1.0, 0.5, id="hardly brighter than what is about it"),
+])
+def test_in_a_glow_there_is_a_lamp_though_nothing_is_left_of_it(about: float, glow: float, part: float) -> None:
+    """Of its middle all stays, towards its rim less."""
+    display, added = street(10, left=0.15)
+    added[display == 0.5] += about - 0.5
+    display[display == 0.5] = about
+    stays = lamps.given_back(display, added, np.full_like(added, glow))[..., 0]
+    np.testing.assert_allclose(stays[63:67, 63:67], part, rtol=0.02)
+    assert stays[60, 65] < 0.7 * part
 
 
 @pytest.mark.parametrize("value", [0.0, 0.5, 1.0])

@@ -104,7 +104,7 @@ def _middles(places: NDArray[np.int32]) -> Pixels:
 
     deep = cv2.distanceTransform((places > 0).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
     deepest = _most(np.asarray(deep), places, int(places.max()) + 1)
-    return np.asarray(np.clip(2 * deep / deepest[places], 0, 1), np.float32)
+    return np.asarray(np.clip(deep / deepest[places] * 2, 0, 1), np.float32)
 
 
 def _beside(glowing: NDArray[Any]) -> Pixels:

@@ -91,16 +91,17 @@ class Remover:
         self.working_size, self.keep_glare = working_size, keep_glare
         self.described = described("network", weights or IN_THE_BOX, working_size, keep_glare)
 
-    def remove(self, plate: Plate, matte: Pixels | None = None,
-               told: Told | None = None) -> tuple[NDArray[Any], NDArray[np.float16]]:
+    def remove(self, plate: Plate, matte: Pixels | None = None, told: Told | None = None, *,
+               glow_stays: bool = True) -> tuple[NDArray[Any], NDArray[np.float16]]:
         """(codes without flare, in the plate's own type; the flare in linear light (height, width, 3)).
 
         matte: (height, width), 0..1, where someone has marked a flare: that share of it is taken there, and since it
         is known that there is one, so little of it counts too as would be doubted otherwise. told: of the plate, where
-        that is known already (`sequences.Sequences`).
+        that is known already (`sequences.Sequences`). glow_stays: leave lamps at night the glow of a clean lens, where
+        nobody has marked it.
         """
         told = told or self.told(self.shown(plate))
-        found = _carrier(told.display, self.flare(told, marked=matte is not None))
+        found = _carrier(told.display, self.flare(told, marked=matte is not None, glow_stays=glow_stays))
         codes = plate.codes.copy()
         flare = np.zeros(plate.codes.shape, np.float16)
         if not found.empty:
@@ -137,19 +138,18 @@ class Remover:
         both = [gentle, torch.zeros_like(gentle)] if self.keep_glare else [flare, flare - gentle]
         return np.asarray(torch.cat(both).permute(1, 2, 0).numpy())
 
-    def flare(self, told: Told, *, marked: bool = False) -> Pixels:
+    def flare(self, told: Told, *, marked: bool = False, glow_stays: bool = True) -> Pixels:
         """Linear flare (h, w, 3) of what was told, less what is a lamp's; exactly 0 where there is none.
 
         marked: someone has seen a flare there, so that whatever was told is one, and all of its glow.
         """
-        added, glow = told.added, told.glow
-        if marked:
-            glow = np.zeros_like(glow)
-        else:
+        added = told.added
+        if not marked:
             # A ramp from nothing to the whole, so that a faint flare has no rim.
             added = added * np.clip((added - LEAST) / LEAST, 0, 1)
             added = trusted(added, self.sure) * told.worth
-        added = added * (1 - lamps.given_back(told.display, added, glow))
+        stays = glow_stays and not marked
+        added = added * (1 - lamps.given_back(told.display, added, told.glow, glow_stays=stays))
         return np.where(added > 0, flare_light(told.display, added), np.float32(0))
 
     def shown(self, plate: Plate) -> Pixels:

@@ -65,14 +65,17 @@ class _Lamps(NamedTuple):
     left: NDArray[Any]
 
 
-def given_back(display: Pixels, added: Pixels, glow: Pixels) -> Pixels:
+def given_back(display: Pixels, added: Pixels, glow: Pixels, *, glow_stays: bool = True) -> Pixels:
     """The part, 0..1 (h, w, 3), of what a flare is told to add to display values 0..1 (h, w, 3) that is left there,
-    since it is a lamp's. glow: the part of it, 0..1 (h, w, 3), that is glow round lights."""
+    since it is a lamp's. glow: the part of it, 0..1 (h, w, 3), that is glow round lights; glow_stays: and of which some
+    is left beside the lamps."""
     filmed, left = display.mean(-1), np.maximum(display - added, 0).mean(-1)
     lamps = _found(filmed, left, added.mean(-1), (added * glow).mean(-1))
     near = _grown(lamps.places, NEAR)
     bright = lamps.stands_out[near] * np.clip(left / lamps.left[near], 0, 1) ** ROUND
     own = np.interp(filmed, RIM, (0, 1)) * np.maximum(bright, lamps.amid_glow[lamps.places] * _middles(lamps.places))
+    if not glow_stays:
+        return np.asarray(np.broadcast_to(own[..., None], display.shape), np.float32)
     glowing = np.maximum(lamps.stands_out, lamps.amid_glow) * np.interp(lamps.filmed, WHITE, (0, 1))
     stays = STAYS * np.interp(np.median(left), DARK, (1, 0))
     return np.asarray(np.maximum(own[..., None], stays * _beside(glowing[lamps.places])[..., None] * glow), np.float32)

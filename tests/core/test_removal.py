@@ -380,12 +380,31 @@ def test_a_lamp_that_is_not_white_keeps_less_of_a_glow(white: float, part: float
     assert stays == pytest.approx(part * lamps.STAYS * np.exp(-2 / 12), rel=0.05, abs=0.03)
 
 
-def test_of_a_glow_that_is_marked_nothing_stays(everywhere: Path) -> None:
-    display, added = street(10, left=0.7)
-    told = Told(display, added, np.float32(1), np.ones_like(added))
-    seen, marked = (Remover(everywhere).flare(told, marked=marked)[65, 58] for marked in (False, True))
-    np.testing.assert_allclose(marked, 0.5**2 - 0.15**2, rtol=1e-3)
-    assert (seen < 0.8 * marked).all()
+@pytest.mark.parametrize("how", [{"marked": True}, {"glow_stays": False}])
+def test_of_a_glow_that_is_marked_or_a_fits_nothing_stays(everywhere: Path, how: dict[str, bool]) -> None:
+    """Its lamp does."""
+    display, added = street(10, left=0.15)
+    told, remover = Told(display, added, np.float32(1), np.ones_like(added)), Remover(everywhere)
+    whole = remover.flare(told, **how)
+    np.testing.assert_allclose(whole[65, 58], 0.5**2 - 0.15**2, rtol=1e-3)
+    assert (remover.flare(told)[65, 58] < 0.8 * whole[65, 58]).all()
+    assert whole[65, 65].max() == 0
+
+
+def test_clean_frames_of_a_fit_keep_no_glow(tmp_path: Path, everywhere: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    display, added = (one[:, :224] for one in street(10, left=0.7))  # as the network is shown it
+    capture = Capture.open(make_capture(tmp_path / "capture", views=3))
+    shutil.rmtree(capture.folder / "removed", ignore_errors=True)
+    frames = [capture.frame_path(view) for view in capture.views]
+    for frame in frames:
+        cv2.imwrite(str(frame), (display * 255 + 0.5).astype(np.uint8))
+    views = told_once(added)._replace(glow=np.ones_like(added))
+    monkeypatch.setattr(Remover, "views", lambda *_: views)
+    remover = Remover(everywhere, working_size=224)
+    remove_all(frames, tmp_path / "plates", remover, Progress())
+    ours, plates = (cv2.imread(str(folder / frames[0].name)) for folder in
+                    (remove_from(capture, remover, Progress()), tmp_path / "plates"))
+    assert (ours[58, 55:59] < plates[58, 55:59] - 5).all() and (ours[65, 65] == plates[65, 65]).all()
 
 
 def test_what_of_a_flare_is_glow_is_what_stays_where_glare_is_kept(everywhere: Path) -> None:

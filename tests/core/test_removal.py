@@ -178,8 +178,8 @@ def test_where_the_flare_is_zero_the_plate_is_kept_to_the_last_bit(everywhere: P
                                                                    monkeypatch: pytest.MonkeyPatch) -> None:
     remover = Remover(everywhere, working_size=128)
 
-    def corner(told: Told, *, marked: bool) -> NDArray[np.float32]:
-        assert not marked
+    def corner(told: Told, *, marked: bool, glow_stays: bool) -> NDArray[np.float32]:
+        assert glow_stays and not marked
         flare = np.zeros_like(told.display)
         flare[:20, :20] = 0.05
         return flare

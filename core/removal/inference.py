@@ -43,11 +43,11 @@ CLIPPED = 0.97
 """Display value from which on a plate is taken for over-exposed."""
 ROWS = 256
 """Rows of the plate that are worked on at a time, which bounds the memory."""
-REVISION = 1
-"""Of what is made of plates with the same weights and settings; one more wherever that comes out otherwise, so that
-plates of before are made again."""
 COLUMNS = 16384
 """Of them at a time where places are looked up, which OpenCV counts in 16 bits."""
+REVISION = 1
+"""Raised whenever the same plate, weights and settings come out otherwise, so that what an earlier program has made is
+made again."""
 
 
 @dataclass(frozen=True)
@@ -141,15 +141,16 @@ class Remover:
     def flare(self, told: Told, *, marked: bool = False, glow_stays: bool = True) -> Pixels:
         """Linear flare (h, w, 3) of what was told, less what is a lamp's; exactly 0 where there is none.
 
-        marked: someone has seen a flare there, so that whatever was told is one, and all of its glow.
+        marked: someone has seen a flare there, so that whatever was told is one, and all of its glow. glow_stays: as
+        `remove` has it.
         """
         added = told.added
         if not marked:
             # A ramp from nothing to the whole, so that a faint flare has no rim.
             added = added * np.clip((added - LEAST) / LEAST, 0, 1)
             added = trusted(added, self.sure) * told.worth
-        stays = glow_stays and not marked
-        added = added * (1 - lamps.given_back(told.display, added, told.glow, glow_stays=stays))
+        lamps_own = lamps.given_back(told.display, added, told.glow, glow_stays=glow_stays and not marked)
+        added = added * (1 - lamps_own)
         return np.where(added > 0, flare_light(told.display, added), np.float32(0))
 
     def shown(self, plate: Plate) -> Pixels:

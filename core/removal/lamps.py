@@ -11,7 +11,7 @@ is about a white place comes from a lamp in its middle.
 In the dark no lens is so clean that a lamp has no glow in it, and a flare is what comes on top of that. What comes of
 which one picture does not say, and the network, whose flares were synthesised over lamps without any, takes both. So a
 part of what is told as glow stays near a lamp at night. Of streaks, rays and ghosts nothing does, nor by day, when a
-lamp is less brighter than the rest.
+lamp outshines the rest by less.
 """
 from __future__ import annotations
 
@@ -47,7 +47,8 @@ STAYS, REACH = 0.5, 0.05
 """Part of the glow that stays beside a lamp, and how far off, in parts of the frame's long side, it has fallen to a
 third (to 1 / e) of that."""
 DARK = (0.2, 0.3)
-"""Median display value without the flare up to which a scene is dark, and from which on no glow stays in it."""
+"""Median display value up to which a scene is dark, and from which on no glow stays in it; without the flare, which may
+light all of the frame."""
 WHITE = (0.9, 0.97)
 """Display value of its brightest pixel up to which a lamp keeps no glow, and from which on it does."""
 STEPS = 4
@@ -61,8 +62,8 @@ class _Lamps(NamedTuple):
     places: NDArray[np.int32]
     stands_out: NDArray[Any]
     amid_glow: NDArray[Any]
-    filmed: NDArray[Any]
-    left: NDArray[Any]
+    brightest_filmed: NDArray[Any]
+    brightest_left: NDArray[Any]
 
 
 def given_back(display: Pixels, added: Pixels, glow: Pixels, *, glow_stays: bool = True) -> Pixels:
@@ -71,14 +72,31 @@ def given_back(display: Pixels, added: Pixels, glow: Pixels, *, glow_stays: bool
     is left beside the lamps."""
     filmed, left = display.mean(-1), np.maximum(display - added, 0).mean(-1)
     lamps = _found(filmed, left, added.mean(-1), (added * glow).mean(-1))
+    of_glow = _beside(lamps, left)[..., None] * glow if glow_stays else np.zeros_like(glow)
+    return np.asarray(np.maximum(_own(lamps, filmed, left)[..., None], of_glow), np.float32)
+
+
+def _own(lamps: _Lamps, filmed: Pixels, left: Pixels) -> NDArray[Any]:
+    """(h, w), 0..1, of what is taken at a place, the part that is taken of a lamp itself."""
     near = _grown(lamps.places, NEAR)
-    bright = lamps.stands_out[near] * np.clip(left / lamps.left[near], 0, 1) ** ROUND
-    own = np.interp(filmed, RIM, (0, 1)) * np.maximum(bright, lamps.amid_glow[lamps.places] * _middles(lamps.places))
-    if not glow_stays:
-        return np.asarray(np.broadcast_to(own[..., None], display.shape), np.float32)
-    glowing = np.maximum(lamps.stands_out, lamps.amid_glow) * np.interp(lamps.filmed, WHITE, (0, 1))
-    stays = STAYS * np.interp(np.median(left), DARK, (1, 0))
-    return np.asarray(np.maximum(own[..., None], stays * _beside(glowing[lamps.places])[..., None] * glow), np.float32)
+    bright = lamps.stands_out[near] * np.clip(left / lamps.brightest_left[near], 0, 1) ** ROUND
+    middle = lamps.amid_glow[lamps.places] * _middles(lamps.places)
+    return np.asarray(np.interp(filmed, RIM, (0, 1)) * np.maximum(bright, middle))
+
+
+def _beside(lamps: _Lamps, left: Pixels) -> NDArray[Any]:
+    """(h, w), the part of a glow that stays: most at the lamps, and the less the farther from them."""
+    import cv2
+
+    glowing = np.maximum(lamps.stands_out, lamps.amid_glow) * np.interp(lamps.brightest_filmed, WHITE, (0, 1))
+    glowing = glowing[lamps.places]
+    reach = np.float32(REACH * max(glowing.shape))
+    near = np.zeros(glowing.shape, np.float32)
+    for step in range(STEPS):
+        dark = (glowing <= (step + 0.5) / STEPS).astype(np.uint8)
+        if not dark.all():
+            near += np.exp(-cv2.distanceTransform(dark, cv2.DIST_L2, cv2.DIST_MASK_5) / reach) / STEPS
+    return np.asarray(STAYS * np.interp(np.median(left), DARK, (1, 0)) * near)
 
 
 def _found(filmed: Pixels, left: Pixels, added: Pixels, glow: Pixels) -> _Lamps:
@@ -108,19 +126,6 @@ def _middles(places: NDArray[np.int32]) -> Pixels:
     deep = cv2.distanceTransform((places > 0).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
     deepest = _most(np.asarray(deep), places, int(places.max()) + 1)
     return np.asarray(np.clip(deep / deepest[places] * 2, 0, 1), np.float32)
-
-
-def _beside(glowing: NDArray[Any]) -> Pixels:
-    """(h, w), as much as what is glowing, 0..1 (h, w), and the less the farther from it."""
-    import cv2
-
-    reach = REACH * max(glowing.shape)
-    near = np.zeros(glowing.shape, np.float32)
-    for step in range(STEPS):
-        dark = (glowing <= (step + 0.5) / STEPS).astype(np.uint8)
-        if not dark.all():
-            near += np.exp(-cv2.distanceTransform(dark, cv2.DIST_L2, cv2.DIST_MASK_5) / np.float32(reach)) / STEPS
-    return near
 
 
 def _grown(places: NDArray[np.int32], side: int) -> NDArray[np.int32]:

@@ -60,19 +60,18 @@ class Views(NamedTuple):
 
 def told_in_views(display: Pixels, tell: Tell) -> Views:
     """Of display values 0..1 (h, w, 3), h and w multiples of MULTIPLE."""
-    told = np.concatenate([_turned(tell, display, size) for size in SIZES])
+    told, glow = map(np.concatenate, zip(*(_turned(tell, display, size) for size in SIZES), strict=True))
     pixels = np.repeat(np.square(SIZES), len(QUARTER_TURNS)).astype(np.float32)
-    told, glowing = told[..., :3], np.average(told[..., 3:], 0, pixels)
     mean = np.average(told, 0, pixels)
     views = told_once(mean)._replace(apart=np.sqrt(np.average(np.square(told - mean), 0, pixels)),
-                                     glow=np.clip(glowing / np.maximum(mean, 1e-9), 0, 1))
+                                     glow=np.clip(np.average(glow, 0, pixels) / np.maximum(mean, 1e-9), 0, 1))
     dark = np.float32(np.interp(np.median(display), DARK, (1, 0)))
     if dark > 0:
         alone = np.stack([_told_alone(tell, display, channel) for channel in range(3)], -1)
         views = views._replace(alone=alone, alone_counts=dark * _is_of_one_colour(flare_light(display, alone)))
     if graded.may_be(mean) > 0:
-        again = _turned(tell, graded.graded_back(display), SIZES[0])[..., :3].mean(0)
-        views = views._replace(signs=graded.signs(display, mean, again))
+        again, _ = _turned(tell, graded.graded_back(display), SIZES[0])
+        views = views._replace(signs=graded.signs(display, mean, again.mean(0)))
     return views
 
 
@@ -119,7 +118,8 @@ def trusted(added: Pixels, sure: float) -> Pixels:
 def _told_alone(tell: Tell, display: Pixels, channel: int) -> Pixels:
     """(h, w), of a channel shown as a grey picture."""
     grey = np.repeat(display[..., channel, None], 3, -1)
-    views = _turned(tell, grey, ALONE_SIZE)[..., :3].mean(-1)
+    told, _ = _turned(tell, grey, ALONE_SIZE)
+    views = told.mean(-1)
     mean, apart = np.mean(views, 0), np.std(views, 0)
     return _less_doubt(mean, apart, _doubt(apart.mean(), np.abs(mean).mean(), ALONE_APART))
 
@@ -139,13 +139,15 @@ def _is_of_one_colour(light: Pixels) -> np.float32:
     return np.float32(np.interp(second / max(most, 1e-9), ONE_COLOUR, (1, 0)))
 
 
-def _turned(tell: Tell, display: Pixels, size: float) -> Pixels:
-    """(turns, h, w, 6), what is told of views of that part of the frame's size in QUARTER_TURNS."""
-    return np.stack([_in_view(tell, display, size, turns) for turns in QUARTER_TURNS])
+def _turned(tell: Tell, display: Pixels, size: float) -> tuple[Pixels, Pixels]:
+    """What a flare adds, and what of that is glow, as views of that part of the frame's size in QUARTER_TURNS tell:
+    (turns, h, w, 3) each."""
+    told = np.stack([_in_view(tell, display, size, turns) for turns in QUARTER_TURNS])
+    return told[..., :3], told[..., 3:]
 
 
 def _in_view(tell: Tell, display: Pixels, size: float, turns: int) -> Pixels:
-    """What is told of a view, brought back to the frame's size and upright."""
+    """(h, w, 6), what is told of a view, brought back to the frame's size and upright."""
     import cv2
 
     height, width = display.shape[:2]

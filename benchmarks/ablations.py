@@ -255,7 +255,7 @@ def _capture_of(folder: Path, capture: Path, **origins: str) -> Capture:
 def _cleaned(folder: Path, capture: Path, progress: Progress) -> Capture:
     made = _capture_of(folder, capture)
     if not made.has_removed:
-        remove_from(made, Remover(), progress)
+        remove_from(made, Remover(glow="taken"), progress)
     return Capture.open(folder)
 
 

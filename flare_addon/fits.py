@@ -259,8 +259,8 @@ def cleaning(scene: Any, capture: Path) -> list[object]:
         return ["remove", "--run", folder, *moved, "--out", capture / REMOVED]
     given = scene.fit_flare.matte
     matte = ["--matte", absolute(given, scene.library)] if given else []
-    glow = ["--keep-glare"] if scene.fit_flare.keep_glow else []
-    return ["remove", capture / "images", "--out", capture / REMOVED, *matte, *glow]
+    glow = "--keep-glare" if scene.fit_flare.keep_glow else "--all-glare"
+    return ["remove", capture / "images", "--out", capture / REMOVED, *matte, glow]
 
 
 def cleaned(job: Job) -> None:

@@ -41,8 +41,7 @@ def remove_from(capture: Capture, remover: Remover, progress: Progress) -> Path:
             if not record.is_made(name, how, [result]):
                 record.begin(name, frame, how, [result], overwrite=True)
                 plate, told = sequences.read(frame)
-                # To a fit the glow of a clean lens is flare too.
-                write_plate(result, plate, remover.remove(plate, told=told, glow_stays=False)[0])
+                write_plate(result, plate, remover.remove(plate, told=told)[0])
                 record.end([result])
             progress.advance()
         # In this order: what is missing because another has just renamed its folder is in `target` by then.

@@ -198,7 +198,7 @@ class DiffusionRemover(Remover):
 
     def __init__(self, base: Path | str, lora: Path | str, *, working_size: int = WORKING_SIZE) -> None:
         """lora: the file that `DiffusionRemoval.save` wrote. Raises EngineError, RunError."""
-        self.working_size, self.keep_glare = working_size, False
+        self.working_size, self.glow = working_size, "taken"
         self.model = DiffusionRemoval(base, rank_of(lora))
         self.model.load(lora)
         self.model.eval()

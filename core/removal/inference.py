@@ -15,7 +15,7 @@ import hashlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -45,6 +45,9 @@ ROWS = 256
 """Rows of the plate that are worked on at a time, which bounds the memory."""
 COLUMNS = 16384
 """Of them at a time where places are looked up, which OpenCV counts in 16 bits."""
+Glow = Literal["kept", "lamps", "taken"]
+"""What becomes of the glow round lights: it is kept; or it is taken but for what lamps at night have with a clean lens
+too (`lamps`); or all of it is taken, which is what a fit wants, to which it is flare."""
 REVISION = 1
 """Raised whenever the same plate, weights and settings come out otherwise, so that what an earlier program has made is
 made again."""
@@ -83,25 +86,24 @@ class Remover:
     """Changes when plates would come out otherwise."""
 
     def __init__(self, weights: Path | None = None, *, working_size: int = WORKING_SIZE,
-                 keep_glare: bool = False) -> None:
-        """keep_glare: leave the glow round the lights. Raises RunError, SettingsError."""
+                 glow: Glow = "lamps") -> None:
+        """Raises RunError, SettingsError."""
         if not 64 <= working_size <= 8192:
             raise SettingsError(f"A working size of {working_size} pixels is outside 64 to 8192.")
         self.network: RemovalNetwork = load(weights or IN_THE_BOX)
-        self.working_size, self.keep_glare = working_size, keep_glare
-        self.described = described("network", weights or IN_THE_BOX, working_size, keep_glare)
+        self.working_size, self.glow = working_size, glow
+        self.described = described("network", weights or IN_THE_BOX, working_size, glow)
 
-    def remove(self, plate: Plate, matte: Pixels | None = None, told: Told | None = None, *,
-               glow_stays: bool = True) -> tuple[NDArray[Any], NDArray[np.float16]]:
+    def remove(self, plate: Plate, matte: Pixels | None = None, told: Told | None = None
+               ) -> tuple[NDArray[Any], NDArray[np.float16]]:
         """(codes without flare, in the plate's own type; the flare in linear light (height, width, 3)).
 
         matte: (height, width), 0..1, where someone has marked a flare: that share of it is taken there, and since it
         is known that there is one, so little of it counts too as would be doubted otherwise. told: of the plate, where
-        that is known already (`sequences.Sequences`). glow_stays: leave lamps at night the glow of a clean lens, where
-        nobody has marked it.
+        that is known already (`sequences.Sequences`).
         """
         told = told or self.told(self.shown(plate))
-        found = _carrier(told.display, self.flare(told, marked=matte is not None, glow_stays=glow_stays))
+        found = _carrier(told.display, self.flare(told, marked=matte is not None))
         codes = plate.codes.copy()
         flare = np.zeros(plate.codes.shape, np.float16)
         if not found.empty:
@@ -135,21 +137,21 @@ class Remover:
         """What the network tells of a view (`views.Tell`); glow that is kept as it is is no part of it."""
         told = self.network(torch.from_numpy(np.ascontiguousarray(display.transpose(2, 0, 1)))[None])
         flare, gentle = told.flare[0].clamp(min=0), told.gentle[0].clamp(min=0)
-        both = [gentle, torch.zeros_like(gentle)] if self.keep_glare else [flare, flare - gentle]
+        both = [gentle, torch.zeros_like(gentle)] if self.glow == "kept" else [flare, flare - gentle]
         return np.asarray(torch.cat(both).permute(1, 2, 0).numpy())
 
-    def flare(self, told: Told, *, marked: bool = False, glow_stays: bool = True) -> Pixels:
+    def flare(self, told: Told, *, marked: bool = False) -> Pixels:
         """Linear flare (h, w, 3) of what was told, less what is a lamp's; exactly 0 where there is none.
 
-        marked: someone has seen a flare there, so that whatever was told is one, and all of its glow. glow_stays: as
-        `remove` has it.
+        marked: someone has seen a flare there, so that whatever was told is one, and all of its glow.
         """
         added = told.added
         if not marked:
             # A ramp from nothing to the whole, so that a faint flare has no rim.
             added = added * np.clip((added - LEAST) / LEAST, 0, 1)
             added = trusted(added, self.sure) * told.worth
-        lamps_own = lamps.given_back(told.display, added, told.glow, glow_stays=glow_stays and not marked)
+        lamps_own = lamps.given_back(told.display, added, told.glow,
+                                     glow_stays=self.glow == "lamps" and not marked)
         added = added * (1 - lamps_own)
         return np.where(added > 0, flare_light(told.display, added), np.float32(0))
 

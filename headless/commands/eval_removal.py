@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from ...core.errors import FrameError, SettingsError, spelled_out
 from ...core.progress import Progress
+from .. import glare
 from ..command import Command, Step, refuse_useless, seed
 
 if TYPE_CHECKING:
@@ -35,7 +36,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=seed, default=SEED, metavar="N", help=f"of --synthetic (default {SEED})")
     parser.add_argument("--size", type=int, nargs=2, default=SIZE, metavar=("W", "H"),
                         help="of --synthetic's pictures (default {} {})".format(*SIZE))
-    parser.add_argument("--keep-glare", action="store_true", help="leave the glow round the lights")
+    glare.add_options(parser)
     parser.add_argument("--working-size", type=int, metavar="PIXELS", help="as for `remove`")
     parser.add_argument("--weights", type=Path, metavar="FILE", help="as for `remove`")
     parser.add_argument("--lpips", type=Path, metavar="DIR", help="folder with the weights of LPIPS (AlexNet, v0.1)")
@@ -48,7 +49,7 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     from ...core.removal.inference import WORKING_SIZE, Remover
 
     size = WORKING_SIZE if words.working_size is None else words.working_size
-    remover = Remover(words.weights, working_size=size, keep_glare=words.keep_glare)
+    remover = Remover(words.weights, working_size=size, glow=glare.asked(words))
     cases = _cases(words, progress)
     perceptual = None
     if words.lpips:

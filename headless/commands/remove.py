@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from ...core.errors import FrameError, RunError, SettingsError, spelled_out
 from ...core.progress import Progress
-from .. import frames, jobs
+from .. import frames, glare, jobs
 from ..command import Command, Step, refuse_useless
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--matte", type=Path, metavar="PICTURE_OR_DIR",
                         help="where the flares are, white on black: one picture for all plates, or a folder with one "
                              "for each, of its name; nothing is taken elsewhere, and what is faint is taken too")
-    parser.add_argument("--keep-glare", action="store_true", help="leave the glow round the lights")
+    glare.add_options(parser)
     parser.add_argument("--stills", action="store_true",
                         help="clean each plate by itself, in place of in line with those before and after it in its "
                              "folder")
@@ -85,8 +85,8 @@ def _by_run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     from ...core.fit import Run
     from ...core.removal.fitted import remove_fitted
 
-    network = (words.weights, words.working_size, words.keep_glare, words.matte, words.stills, words.base)
-    if words.jobs != 1 or words.model != "network" or any(network):
+    network = (words.weights, words.working_size, words.matte, words.stills, words.base)
+    if words.jobs != 1 or words.model != "network" or glare.is_asked(words) or any(network):
         raise SettingsError("--run takes away the flare that was fitted: of the other options only --out, --frames, "
                             "--flare, --capture and --overwrite go with it.")
     fitted = Run.open(words.run)
@@ -107,13 +107,13 @@ def _remover(words: argparse.Namespace) -> Remover:
     if words.model == "network":
         if words.base is not None:
             raise SettingsError("--base is for --model diffusion; leave it out.")
-        return Remover(words.weights, working_size=size, keep_glare=words.keep_glare)
+        return Remover(words.weights, working_size=size, glow=glare.asked(words))
     from ...core.removal.diffusion import DiffusionRemover, need
 
     need()
-    if words.base is None or words.weights is None or words.keep_glare:
-        raise SettingsError("--model diffusion wants --base and --weights, and knows no --keep-glare: a LoRA is "
-                            "trained for the one or the other.")
+    if words.base is None or words.weights is None or glare.is_asked(words):
+        raise SettingsError("--model diffusion wants --base and --weights, and knows no --keep-glare and no "
+                            "--all-glare: a LoRA is trained for the one or the other.")
     return DiffusionRemover(words.base, words.weights, working_size=size)
 
 
@@ -129,7 +129,7 @@ def with_removed(capture: Capture, progress: Progress) -> Capture:
         return capture
     progress.say(f"{capture.folder} has no removed/: the flares are taken out of its frames, and what comes of that is "
                  "kept there.")
-    remove_from(capture, Remover(), progress)
+    remove_from(capture, Remover(glow="taken"), progress)
     return capture.reopened()
 
 

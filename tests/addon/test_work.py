@@ -58,7 +58,7 @@ def facts(made: tuple[Any, Path]) -> Any:
 def test_frames_are_cleaned_by_the_network_or_by_a_finished_fit(made: tuple[Any, Path]) -> None:
     facts, base = made
     images, removed = str(Path("capture") / "images"), str(Path("capture") / "removed")
-    assert facts["cleaned by the network"] == ["remove", images, "--out", removed]
+    assert facts["cleaned by the network"] == ["remove", images, "--out", removed, "--all-glare"]
     assert facts["cleaned by the fit"] == ["remove", "--run", str(base / "a run"), "--out", removed]
 
 
@@ -66,7 +66,7 @@ def test_frames_are_cleaned_by_a_matte_and_otherwise_again(made: tuple[Any, Path
     facts, base = made
     images, removed = str(Path("capture") / "images"), str(Path("capture") / "removed")
     by_matte = ["remove", images, "--out", removed, "--matte", str(base / "roto")]
-    assert facts["cleaned by a matte"] == by_matte
+    assert facts["cleaned by a matte"] == [*by_matte, "--all-glare"]
     assert facts["cleaned, glow kept"] == [*by_matte, "--keep-glare"]
     first, made, stopped, stopped_otherwise = facts["cleaned again"]
     assert made and stopped_otherwise, "what the engine made is made again, and no two ways are mixed"

@@ -34,7 +34,7 @@ from core.removal import batch, graded, inference, lamps, weights
 from core.removal.batch import plates_of, remove_all
 from core.removal.captured import UNFINISHED, _names, remove_from
 from core.removal.formation import flare_light
-from core.removal.inference import FlareMap, Remover, Told, carried_up
+from core.removal.inference import FlareMap, Glow, Remover, Told, carried_up
 from core.removal.mattes import Mattes
 from core.removal.network import LEVELS, SHOWN, RemovalNetwork, seen
 from core.removal.plates import Plate, read_plate, write_plate
@@ -47,6 +47,11 @@ from tests.core.heard import Heard
 from tests.core.test_exif import exif_segment
 
 TINY = Recipe(widths=(8, 8, 8, 8, 8))
+
+
+def glows(*what: Glow) -> tuple[Glow, ...]:
+    """What becomes of glow, in one way and another."""
+    return what
 
 
 def network_file(path: Path, seed: int = 0, bias: float = 0.0) -> Path:
@@ -178,8 +183,8 @@ def test_where_the_flare_is_zero_the_plate_is_kept_to_the_last_bit(everywhere: P
                                                                    monkeypatch: pytest.MonkeyPatch) -> None:
     remover = Remover(everywhere, working_size=128)
 
-    def corner(told: Told, *, marked: bool, glow_stays: bool) -> NDArray[np.float32]:
-        assert glow_stays and not marked
+    def corner(told: Told, *, marked: bool) -> NDArray[np.float32]:
+        assert not marked
         flare = np.zeros_like(told.display)
         flare[:20, :20] = 0.05
         return flare
@@ -380,18 +385,20 @@ def test_a_lamp_that_is_not_white_keeps_less_of_a_glow(white: float, part: float
     assert stays == pytest.approx(part * lamps.STAYS * np.exp(-2 / 12), rel=0.05, abs=0.03)
 
 
-@pytest.mark.parametrize("how", [{"marked": True}, {"glow_stays": False}])
-def test_of_a_glow_that_is_marked_or_a_fits_nothing_stays(everywhere: Path, how: dict[str, bool]) -> None:
+@pytest.mark.parametrize(("glow", "marked"), [("lamps", True), ("taken", False)])
+def test_of_a_glow_that_is_marked_or_to_be_taken_nothing_stays(everywhere: Path, glow: Glow, marked: bool) -> None:
     """Its lamp does."""
     display, added = street(10, left=0.15)
-    told, remover = Told(display, added, np.float32(1), np.ones_like(added)), Remover(everywhere)
-    whole = remover.flare(told, **how)
+    told = Told(display, added, np.float32(1), np.ones_like(added))
+    whole = Remover(everywhere, glow=glow).flare(told, marked=marked)
     np.testing.assert_allclose(whole[65, 58], 0.5**2 - 0.15**2, rtol=1e-3)
-    assert (remover.flare(told)[65, 58] < 0.8 * whole[65, 58]).all()
+    assert (Remover(everywhere).flare(told)[65, 58] < 0.8 * whole[65, 58]).all()
     assert whole[65, 65].max() == 0
 
 
-def test_clean_frames_of_a_fit_keep_no_glow(tmp_path: Path, everywhere: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_clean_frames_of_a_capture_are_as_their_remover_makes_them(tmp_path: Path, everywhere: Path,
+                                                                    monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those of one that takes all of a glow have none, and are kept by whoever makes them in the same way."""
     display, added = (one[:, :224] for one in street(10, left=0.7))  # as the network is shown it
     capture = Capture.open(make_capture(tmp_path / "capture", views=3))
     shutil.rmtree(capture.folder / "removed", ignore_errors=True)
@@ -400,17 +407,18 @@ def test_clean_frames_of_a_fit_keep_no_glow(tmp_path: Path, everywhere: Path, mo
         cv2.imwrite(str(frame), (display * 255 + 0.5).astype(np.uint8))
     views = told_once(added)._replace(glow=np.ones_like(added))
     monkeypatch.setattr(Remover, "views", lambda *_: views)
-    remover = Remover(everywhere, working_size=224)
-    remove_all(frames, tmp_path / "plates", remover, Progress())
+    whole = Remover(everywhere, working_size=224, glow="taken")
+    remove_all(frames, tmp_path / "plates", Remover(everywhere, working_size=224), Progress())
     ours, plates = (cv2.imread(str(folder / frames[0].name)) for folder in
-                    (remove_from(capture, remover, Progress()), tmp_path / "plates"))
+                    (remove_from(capture, whole, Progress()), tmp_path / "plates"))
     assert (ours[58, 55:59] < plates[58, 55:59] - 5).all() and (ours[65, 65] == plates[65, 65]).all()
+    assert remove_all([capture.folder / "images"], capture.folder / "removed", whole, Progress())["made"] == 0
 
 
 def test_what_of_a_flare_is_glow_is_what_stays_where_glare_is_kept(everywhere: Path) -> None:
     """In every view, in the mean over them by what each tells."""
     display = picture(64, 96, 1, np.float32)
-    told, kept = (Remover(everywhere, keep_glare=keep).told(display) for keep in (False, True))
+    told, kept = (Remover(everywhere, glow=glow).told(display) for glow in glows("lamps", "kept"))
     assert 0.01 < told.glow.mean() < 0.99 and kept.glow.max() == 0
     np.testing.assert_allclose(told.added * (1 - told.glow), kept.added, atol=1e-4)
 
@@ -455,10 +463,10 @@ def test_any_shape(everywhere: Path, shape: tuple[int, int]) -> None:
     assert np.asarray(_remove(Remover(everywhere, working_size=96), codes)).shape == codes.shape
 
 
-def test_keep_glare_takes_no_more(everywhere: Path) -> None:
+def test_where_glow_is_kept_no_more_is_taken(everywhere: Path) -> None:
     codes = picture()
-    gentle, all_of_it = (np.asarray(_remove(Remover(everywhere, working_size=96, keep_glare=keep), codes)).astype(int)
-                         for keep in (True, False))
+    gentle, all_of_it = (np.asarray(_remove(Remover(everywhere, working_size=96, glow=glow), codes)).astype(int)
+                         for glow in glows("kept", "lamps"))
     assert (gentle >= all_of_it - 1).mean() > 0.98
     assert gentle.mean() > all_of_it.mean()
 
@@ -752,7 +760,7 @@ def test_a_plate_is_made_again_when_it_would_come_out_otherwise(tmp_path: Path, 
     first = Remover(everywhere, working_size=64)
     assert [made(first), made(first)] == [2, 0]
     for remover in (Remover(nowhere, working_size=64), Remover(everywhere, working_size=96),
-                    Remover(everywhere, working_size=64, keep_glare=True), first):
+                    *(Remover(everywhere, working_size=64, glow=glow) for glow in glows("kept", "taken")), first):
         assert [made(remover), made(remover)] == [2, 0]
     assert [made(first, "left"), made(first, "left"), made(first, "right"), made(first), made(first, stills=True)] == [
         2, 0, 2, 2, 2]
@@ -802,8 +810,8 @@ def test_a_flare_is_not_written_over_what_is_not_from_here(tmp_path: Path, every
     with pytest.raises(FrameError, match=r"a\.exr is there, and .*remove\.json does not tell of it"):
         remove_all([source], tmp_path / "out", remover, Progress(), flare_folder=render.parent)
     assert render.read_bytes() == work
-    for keep_glare in (False, True):
-        remove_all([source], tmp_path / "out", Remover(everywhere, working_size=64, keep_glare=keep_glare), Progress(),
+    for glow in glows("lamps", "kept"):
+        remove_all([source], tmp_path / "out", Remover(everywhere, working_size=64, glow=glow), Progress(),
                    flare_folder=tmp_path / "flares")
     remove_all([source], tmp_path / "out", remover, Progress(), flare_folder=render.parent, overwrite=True)
     assert render.read_bytes() != work

@@ -172,7 +172,8 @@ def test_fit_does_without_flare_free_frames_where_it_is_asked_to(capture: Path, 
     filmed = sorted(path.name for path in (bare / "images").iterdir())
     assert sorted(path.name for path in clean.iterdir()) == [*filmed[:2], RECORD]
     for words in (["remove", "--out", str(clean)], ["remove", str(bare), "--run", str(run), "--out", str(clean)],
-                  ["remove", "--run", str(run), "--out", str(clean), "--keep-glare"]):
+                  ["remove", "--run", str(run), "--out", str(clean), "--keep-glare"],
+                  ["remove", "--run", str(run), "--out", str(clean), "--all-glare"]):
         assert cli.main(words) == 2
         assert "--run" in capsys.readouterr().err
 
@@ -195,6 +196,9 @@ def test_fit_takes_the_flare_out_where_nobody_did(capture: Path, tmp_path: Path,
     said = capsys.readouterr().err
     assert "has no removed/" not in said and "mode estimated" in said, "they are kept, and known for estimates"
     assert 'mode = "estimated"' in (tmp_path / "run" / "config.toml").read_text(encoding="utf-8")
+    by_hand = ["remove", str(bare / "images"), "--out", str(bare / "removed"), "--all-glare"]
+    assert cli.main(by_hand) == 0
+    assert f"{len(made)} plates were in" in capsys.readouterr().err, "as the panel has them made"
     for path in made.values():
         write_png(path, read_picture(path).pixels * 0.9)
     assert cli.main(["fit", str(bare), "--out", str(tmp_path / "worked on"), "--iterations", "2"]) == 0

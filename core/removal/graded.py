@@ -23,12 +23,15 @@ BLACK = 0.002
 """Share of a frame that is darker than its black."""
 DARKS = (0.001, 0.01, 0.1)
 """Shares of a frame that are darker than the three values that its darks are measured by."""
+NOTHING = 0.02
+"""Part of what is told, of which it makes no odds any more how little it is."""
 SATURATED = 0.99
 """Display value from which on a channel is."""
-WEIGHTS, CONSTANT = (1.11, 0.581, 7.68, 2.34), 5.39
-"""By how much each of the `Signs` raises the log odds of a flare, in their order, and those without any: a logistic
-regression (`benchmarks/removal.py graded`)."""
-BELIEVED = (-1.25, -0.75)
+WEIGHTS, CONSTANT = (1.45, 1.0, 4.0, 1.2), 8.0
+"""By how much each of the `Signs` raises the log odds of a flare, in their order, and those without any. A logistic
+regression (`benchmarks/removal.py graded`) weighs light less, for its grades may be as strong as any veil; those of
+photographs are not, and a strong veil is no grade."""
+BELIEVED = (-0.75, -0.25)
 """Log odds of a flare up to which nothing is believed, and from which on all."""
 
 
@@ -52,7 +55,7 @@ def signs(display: Pixels, told: Pixels, again: Pixels) -> Signs:
     """Of display values 0..1, what is told over them and what is told over them `graded_back`, each (h, w, 3)."""
     grey = display.mean(-1)
     darkest, darker, dark = np.quantile(grey, DARKS)
-    return Signs(again=float(np.log(again.mean() / max(told.mean(), 1e-9) + 0.01)),
+    return Signs(again=float(np.log(again.mean() / max(told.mean(), 1e-9) + NOTHING)),
                  light=float(np.log(flare_light(display, told).mean() + 0.002)),
                  lights=float((display >= SATURATED).mean()),
                  flat=float((darker - darkest) / max(dark - darkest, 0.01)))

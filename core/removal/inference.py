@@ -48,7 +48,7 @@ COLUMNS = 16384
 Glow = Literal["kept", "lamps", "taken"]
 """What becomes of the glow round lights: it is kept; or it is taken but for what lamps at night have with a clean lens
 too (`lamps`); or all of it is taken, which is what a fit wants, to which it is flare."""
-REVISION = 1
+REVISION = 2
 """Raised whenever the same plate, weights and settings come out otherwise, so that what an earlier program has made is
 made again."""
 

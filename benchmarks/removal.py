@@ -177,7 +177,7 @@ def clean(folders: list[Path], weights: Path | None = None) -> None:
           "dB or more")
 
 
-def scenes(folders: list[Path], weights: Path | None = None, count: int = 64) -> None:
+def scenes(folders: list[Path], weights: Path | None = None, count: int = 300) -> None:
     """What happens to held-out scenes without flare."""
     from core.removal.backgrounds import read_backgrounds
     from core.removal.bank import OneFlare

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""--keep-glare and --all-glare: what becomes of the glow round lights."""
+"""--keep-glare and --all-glare: what becomes of the glow round lights (`core.removal.inference.Glow`)."""
 from __future__ import annotations
 
 import argparse
@@ -19,8 +19,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def asked(words: argparse.Namespace) -> Glow:
-    """What is asked for, or what is done else."""
-    return "kept" if words.keep_glare else "taken" if words.all_glare else "lamps"
+    """What is asked for; where nothing is, lamps keep theirs."""
+    return "kept" if words.keep_glare else "taken" if words.all_glare else "kept at lamps"
 
 
 def is_asked(words: argparse.Namespace) -> bool:

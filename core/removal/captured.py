@@ -22,6 +22,8 @@ _LOSSY = frozenset({".jpg", ".jpeg"})
 def remove_from(capture: Capture, remover: Remover, progress: Progress) -> Path:
     """Clean every frame into the capture's removed/, JPEG frames as PNG; what an earlier call has made is kept.
 
+    remover: one that takes all of a glow, where the frames are for a fit.
+
     Raises CaptureError where there is a removed/ already, where the folder cannot be written or two frames would have
     one clean picture, FrameError for a frame that cannot be read, and Cancelled when asked to stop.
     """

@@ -4,8 +4,8 @@
 Pictures printed or graded so that black is grey look much as veiled ones do. They differ: a grade lifts display
 values, a veil adds light. So the frame is graded back, black to black, and the network asked again: of a lifted black
 it then tells nothing, of most flares, which are not even, what it told before. Of an even veil it tells nothing either;
-so it counts too how strong it is, whether a light is seen, and how flat the darks are, which a veil flattens and a
-grade does not.
+so it counts too how strong it is, as hardly a grade is, whether a light is seen, and how flat the darks
+are, which a veil flattens and a grade does not.
 """
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ BLACK = 0.002
 DARKS = (0.001, 0.01, 0.1)
 """Shares of a frame that are darker than the three values that its darks are measured by."""
 NOTHING = 0.02
-"""Part of what is told, of which it makes no odds any more how little it is."""
+"""Part of what is told that has to be told again to count for something."""
 SATURATED = 0.99
 """Display value from which on a channel is."""
 WEIGHTS, CONSTANT = (1.45, 1.0, 4.0, 1.2), 8.0
-"""By how much each of the `Signs` raises the log odds of a flare, in their order, and those without any. A logistic
-regression (`benchmarks/removal.py graded`) weighs light less, for its grades may be as strong as any veil; those of
-photographs are not, and a strong veil is no grade."""
+"""By how much each of the `Signs` raises the log odds of a flare, in their order, and those without any. Near those of
+a logistic regression (`benchmarks/removal.py graded`), but that light weighs more: among the grades that it learns from
+some are as strong as any veil, among photographs none."""
 BELIEVED = (-0.75, -0.25)
 """Log odds of a flare up to which nothing is believed, and from which on all."""
 

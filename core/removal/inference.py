@@ -45,12 +45,12 @@ ROWS = 256
 """Rows of the plate that are worked on at a time, which bounds the memory."""
 COLUMNS = 16384
 """Of them at a time where places are looked up, which OpenCV counts in 16 bits."""
-Glow = Literal["kept", "lamps", "taken"]
-"""What becomes of the glow round lights: it is kept; or it is taken but for what lamps at night have with a clean lens
-too (`lamps`); or all of it is taken, which is what a fit wants, to which it is flare."""
 REVISION = 2
 """Raised whenever the same plate, weights and settings come out otherwise, so that what an earlier program has made is
 made again."""
+Glow = Literal["kept", "kept at lamps", "taken"]
+"""What becomes of the glow round lights: it is kept; or of it what lamps at night have with a clean lens too (`lamps`);
+or all of it is taken, as a fit wants it, to which it is flare."""
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ class Remover:
     """Changes when plates would come out otherwise."""
 
     def __init__(self, weights: Path | None = None, *, working_size: int = WORKING_SIZE,
-                 glow: Glow = "lamps") -> None:
+                 glow: Glow = "kept at lamps") -> None:
         """Raises RunError, SettingsError."""
         if not 64 <= working_size <= 8192:
             raise SettingsError(f"A working size of {working_size} pixels is outside 64 to 8192.")
@@ -150,9 +150,8 @@ class Remover:
             # A ramp from nothing to the whole, so that a faint flare has no rim.
             added = added * np.clip((added - LEAST) / LEAST, 0, 1)
             added = trusted(added, self.sure) * told.worth
-        lamps_own = lamps.given_back(told.display, added, told.glow,
-                                     glow_stays=self.glow == "lamps" and not marked)
-        added = added * (1 - lamps_own)
+        stays = self.glow == "kept at lamps" and not marked
+        added = added * (1 - lamps.given_back(told.display, added, told.glow, glow_stays=stays))
         return np.where(added > 0, flare_light(told.display, added), np.float32(0))
 
     def shown(self, plate: Plate) -> Pixels:

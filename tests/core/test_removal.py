@@ -49,11 +49,6 @@ from tests.core.test_exif import exif_segment
 TINY = Recipe(widths=(8, 8, 8, 8, 8))
 
 
-def glows(*what: Glow) -> tuple[Glow, ...]:
-    """What becomes of glow, in one way and another."""
-    return what
-
-
 def network_file(path: Path, seed: int = 0, bias: float = 0.0) -> Path:
     """A small network of random weights; `bias` makes it see flare everywhere (> 0) or nowhere (< 0)."""
     torch.manual_seed(seed)
@@ -385,7 +380,7 @@ def test_a_lamp_that_is_not_white_keeps_less_of_a_glow(white: float, part: float
     assert stays == pytest.approx(part * lamps.STAYS * np.exp(-2 / 12), rel=0.05, abs=0.03)
 
 
-@pytest.mark.parametrize(("glow", "marked"), [("lamps", True), ("taken", False)])
+@pytest.mark.parametrize(("glow", "marked"), [("kept at lamps", True), ("taken", False)])
 def test_of_a_glow_that_is_marked_or_to_be_taken_nothing_stays(everywhere: Path, glow: Glow, marked: bool) -> None:
     """Its lamp does."""
     display, added = street(10, left=0.15)
@@ -418,7 +413,7 @@ def test_clean_frames_of_a_capture_are_as_their_remover_makes_them(tmp_path: Pat
 def test_what_of_a_flare_is_glow_is_what_stays_where_glare_is_kept(everywhere: Path) -> None:
     """In every view, in the mean over them by what each tells."""
     display = picture(64, 96, 1, np.float32)
-    told, kept = (Remover(everywhere, glow=glow).told(display) for glow in glows("lamps", "kept"))
+    told, kept = (remover.told(display) for remover in (Remover(everywhere), Remover(everywhere, glow="kept")))
     assert 0.01 < told.glow.mean() < 0.99 and kept.glow.max() == 0
     np.testing.assert_allclose(told.added * (1 - told.glow), kept.added, atol=1e-4)
 
@@ -465,8 +460,8 @@ def test_any_shape(everywhere: Path, shape: tuple[int, int]) -> None:
 
 def test_where_glow_is_kept_no_more_is_taken(everywhere: Path) -> None:
     codes = picture()
-    gentle, all_of_it = (np.asarray(_remove(Remover(everywhere, working_size=96, glow=glow), codes)).astype(int)
-                         for glow in glows("kept", "lamps"))
+    gentle, all_of_it = (np.asarray(_remove(remover, codes)).astype(int) for remover in
+                         (Remover(everywhere, working_size=96, glow="kept"), Remover(everywhere, working_size=96)))
     assert (gentle >= all_of_it - 1).mean() > 0.98
     assert gentle.mean() > all_of_it.mean()
 
@@ -760,7 +755,8 @@ def test_a_plate_is_made_again_when_it_would_come_out_otherwise(tmp_path: Path, 
     first = Remover(everywhere, working_size=64)
     assert [made(first), made(first)] == [2, 0]
     for remover in (Remover(nowhere, working_size=64), Remover(everywhere, working_size=96),
-                    *(Remover(everywhere, working_size=64, glow=glow) for glow in glows("kept", "taken")), first):
+                    Remover(everywhere, working_size=64, glow="kept"),
+                    Remover(everywhere, working_size=64, glow="taken"), first):
         assert [made(remover), made(remover)] == [2, 0]
     assert [made(first, "left"), made(first, "left"), made(first, "right"), made(first), made(first, stills=True)] == [
         2, 0, 2, 2, 2]
@@ -810,9 +806,8 @@ def test_a_flare_is_not_written_over_what_is_not_from_here(tmp_path: Path, every
     with pytest.raises(FrameError, match=r"a\.exr is there, and .*remove\.json does not tell of it"):
         remove_all([source], tmp_path / "out", remover, Progress(), flare_folder=render.parent)
     assert render.read_bytes() == work
-    for glow in glows("lamps", "kept"):
-        remove_all([source], tmp_path / "out", Remover(everywhere, working_size=64, glow=glow), Progress(),
-                   flare_folder=tmp_path / "flares")
+    for another in (remover, Remover(everywhere, working_size=64, glow="kept")):
+        remove_all([source], tmp_path / "out", another, Progress(), flare_folder=tmp_path / "flares")
     remove_all([source], tmp_path / "out", remover, Progress(), flare_folder=render.parent, overwrite=True)
     assert render.read_bytes() != work
 

@@ -179,7 +179,7 @@ class Wavering(Remover):
     described = "wavering"
 
     def __init__(self) -> None:
-        self.working_size, self.glow, self.asked = 64, "lamps", 0
+        self.working_size, self.glow, self.asked = 64, "kept at lamps", 0
 
     def shown(self, plate: Plate) -> Pixels:
         display = super().shown(plate)

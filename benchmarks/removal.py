@@ -10,7 +10,7 @@
     python benchmarks/removal.py scenes PHOTOS...            # held-out scenes without flare, as training has them
     python benchmarks/removal.py against PHOTOS... [--lenses LENSES]  # flares whose lights are in a bright sky
     python benchmarks/removal.py coloured PHOTOS... [--lenses LENSES]  # flares of lights of one colour
-    python benchmarks/removal.py graded PHOTOS... [--lenses LENSES]  # what tells flares from grades, and how surely
+    python benchmarks/removal.py odds PHOTOS... [--lenses LENSES]  # what tells flares from scenes, and how surely
     python benchmarks/removal.py aspheric PHOTOS...          # ghosts of moulded lenses alone
     python benchmarks/removal.py coverage [--sheet FILE]     # what the synthesis spans, and a sheet of it
 
@@ -24,10 +24,11 @@ eval-removal's; the matte is as an artist would rough it in, wide about all that
 Scenes: as `clean`, of the exposures, colours and grain that training has, some with a light. Against: the same flares
 with their lights where the scene is bright, and anywhere. Coloured: the same flares of lights of one colour (traffic
 lights, neon), and of the white ones that their class has. Aspheric: lights with no other flare than the ghosts of
-telephones' lenses, which no class has. Graded: of frames of all classes and of frames without flare, seven of ten of
-them graded so that black is grey, those in which so much is told that it may be a grade; the weights of
-`core/removal/graded.py` as a logistic regression finds them in pictures that are trained on, and by those in the file
-and by these, of held-out ones, how surely a flare is told from none (area under the curve), and what is left of each.
+telephones' lenses, which no class has. Odds: of frames of all classes and twice as many without flare, a fourth of
+all graded so that black is grey: the weights of `core/removal/odds.py` as a logistic regression finds them in pictures
+that are trained on, each flare counting by what it is worth to take it, and by those in the file and by these, of
+held-out ones, how surely a flare that is worth it is told from what does a clean picture harm (area under the curve),
+and how much of each is taken.
 """
 from __future__ import annotations
 
@@ -242,50 +243,58 @@ def coloured(folders: list[Path], lenses: Path | None = None, weights: Path | No
                                    for (seed, kind), colour in zip(seeds, colours, strict=True)])
 
 
-def graded(folders: list[Path], lenses: Path | None = None, weights: Path | None = None, count: int = 600) -> None:
-    """What tells flares from grades."""
+def odds(folders: list[Path], lenses: Path | None = None, weights: Path | None = None, count: int = 900) -> None:
+    """What tells flares from scenes and their grades."""
     from core.removal.backgrounds import read_backgrounds
-    from core.removal.graded import CONSTANT, WEIGHTS, worth
+    from core.removal.odds import CONSTANT, WEIGHTS, worth
 
     remover = Remover(weights)
     found = _logistic(*_signs(remover, 1006, count, read_backgrounds(folders, "train", max(SIZE)), _seen(lenses)))
     print("WEIGHTS, CONSTANT =", ", ".join(f"{value:.3g}" for value in found))
-    signs, flares = _signs(remover, 1007, count // 3, _held_out(folders), _unseen(lenses))
-    now = np.array([*WEIGHTS, CONSTANT])
-    for name, by in (("as it is", now), ("by these", found)):
-        odds = signs @ by[:-1] + by[-1]
-        surely = np.mean(odds[flares][:, None] > odds[~flares])
-        kept = np.array([worth(value) for value in odds])
-        print(f"{name}: {surely:.3f} of pairs in order; kept of {flares.sum()} flares {kept[flares].mean():.1%}, of "
-              f"{(~flares).sum()} told where none is {kept[~flares].mean():.1%}")
+    signs, gains = _signs(remover, 1007, count, _held_out(folders), _unseen(lenses))
+    flares = gains > 0
+    for name, by in (("as it is", np.array([*WEIGHTS, CONSTANT])), ("by these", found)):
+        log_odds = signs @ by[:-1] + by[-1]
+        surely = np.mean(log_odds[flares][:, None] > log_odds[~flares])
+        taken = np.array([worth(value) for value in log_odds])
+        print(f"{name}: {surely:.3f} of pairs in order; of {flares.sum()} flares {taken[flares].mean():.1%} are taken, "
+              f"of {(~flares).sum()} that are none {taken[~flares].mean():.1%}; all of the flares are worth "
+              f"{gains[flares].mean():.2f} dB, those {(gains * taken)[flares].mean():.2f} dB")
 
 
 def _signs(remover: Remover, seed: int, count: int, backgrounds: Any, lenses: Any) -> tuple[Any, Any]:
-    """(n, 4) signs of frames in which much is told, half of `count` drawn under flares; (n,) of which that is true."""
+    """(n, 5) signs of frames in which something is told, a third of `count` drawn under flares; (n,) what it is worth
+    to take that, in dB. Of frames without flare those are left out which keep 45 dB, and the others are worth -5."""
     from core.removal.bank import OneFlare
     from core.removal.pairs import pair
     from core.removal.synthesis.layers import CLASSES
 
-    signs, flares = [], []
+    signs, gains = [], []
     for number in range(count):
-        bare, kind = number % 2 == 0, CLASSES[number // 2 % len(CLASSES)]
-        frame = pair(np.random.default_rng((seed, number)), OneFlare((seed, number), 160, lenses, kind), backgrounds,
-                     *SIZE, clean=float(bare), faded=0.7 if bare else 0.3, shoulder=0.3, against_light=0.35).frame
-        if (found := remover.views(frame).signs) is not None:
-            signs.append(found)
-            flares.append(not bare)
-    return np.array(signs), np.array(flares)
+        bare, kind = number % 3 > 0, CLASSES[number // 3 % len(CLASSES)]
+        one = pair(np.random.default_rng((seed, number)), OneFlare((seed, number), 160, lenses, kind), backgrounds,
+                   *SIZE, clean=float(bare), faded=0.25, shoulder=0.3, against_light=0.35)
+        views = remover.views(one.frame)
+        if views.signs is None:
+            continue
+        left = psnr(np.maximum(one.frame - views.mean, 0), one.scene)
+        if not bare or left < 45:
+            signs.append(views.signs)
+            gains.append(-5.0 if bare else left - psnr(one.frame, one.scene))
+    return np.array(signs), np.array(gains)
 
 
-def _logistic(signs: Any, flares: Any) -> Any:
-    """Weights (5,) of signs (n, 4) and a constant, of the odds that it is a flare: Newton's method, held to small ones
-    by a ridge of one observation."""
+def _logistic(signs: Any, gains: Any) -> Any:
+    """Weights (6,) of signs (n, 5) and a constant, of the odds that what is told is worth to be taken, each counting by
+    its gain: Newton's method, held to small ones by a ridge of one observation."""
     middle, spread = signs.mean(0), signs.std(0)
     a = np.column_stack([(signs - middle) / spread, np.ones(len(signs))])
+    counts, flares = np.minimum(np.abs(gains), 15) / 5, gains > 0
     ridge, found = np.diag([1.0] * signs.shape[1] + [0.0]), np.zeros(a.shape[1])
     for _ in range(30):
         p = 1 / (1 + np.exp(-a @ found))
-        found -= np.linalg.solve(a.T @ (a * (p * (1 - p))[:, None]) + ridge, a.T @ (p - flares) + ridge @ found)
+        step = a.T @ (counts * (p - flares)) + ridge @ found
+        found -= np.linalg.solve(a.T @ (a * (counts * p * (1 - p))[:, None]) + ridge, step)
     by_sign = found[:-1] / spread
     return np.append(by_sign, found[-1] - by_sign @ middle)
 
@@ -407,7 +416,7 @@ WORDS: dict[str, dict[str, Any]] = {
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     names = parser.add_subparsers(required=True, metavar="BENCHMARK")
-    for benchmark in (speed, one, sample, clean, scenes, matte, against, coloured, graded, aspheric, coverage):
+    for benchmark in (speed, one, sample, clean, scenes, matte, against, coloured, odds, aspheric, coverage):
         words = names.add_parser(benchmark.__name__, help=inspect.getdoc(benchmark))
         words.set_defaults(benchmark=benchmark)
         for name, parameter in inspect.signature(benchmark).parameters.items():

@@ -112,7 +112,7 @@ def remove_all(inputs: Sequence[Path], folder: Path, remover: Remover, progress:
         plates = [(path, name) for path, name in plates if name in wanted]
     progress.stage("remove", len(plates))
     failed = list(left_out)
-    made, graded, kept = 0, 0, Counter[Kept]()
+    made, doubted, kept = 0, 0, Counter[Kept]()
     for path, name in sorted(plates, key=lambda plate: shot_order(plate[0])):
         try:
             matte = [mattes.path(name)] if mattes else []
@@ -126,7 +126,7 @@ def remove_all(inputs: Sequence[Path], folder: Path, remover: Remover, progress:
                 write_results(results[name], plate, *remover.remove(plate, marked, told))
                 record.end(results[name])
                 made += 1
-                graded += marked is None and bool(told.worth < 0.5)
+                doubted += marked is None and bool(told.worth < 0.5)
         except Exception as problem:
             if not is_of_the_plate(problem):
                 raise
@@ -143,8 +143,8 @@ def remove_all(inputs: Sequence[Path], folder: Path, remover: Remover, progress:
     if failed:
         raise FrameError(f"{len(failed)} of {len(plates) + len(left_out)} plates could not be cleaned: "
                          f"{spelled_out(failed)}")
-    if graded:
-        progress.say(f"In {graded} of them what may be an even veil was left, since they look graded so that black is "
-                     "grey; a matte, white all over, has it taken.")
+    if doubted:
+        progress.say(f"In {doubted} of them what may be a flare was left, since it may as well be the scene or its "
+                     "grade; a matte, white all over, has it taken.")
     progress.say(f"{made + kept.total()} clean plates are in {folder}.")
     return {"plates": str(folder), "made": made, "kept": kept.total()}

@@ -27,7 +27,7 @@ from . import formation, lamps
 from .formation import GAMMA, flare_light
 from .network import MULTIPLE, RemovalNetwork
 from .plates import Plate, finite
-from .views import Views, believed, doubt_of, told_in_views, trusted, worth_of
+from .views import Views, believed, told_in_views, trusted, worth_of
 from .weights import IN_THE_BOX, load
 
 WORKING_SIZE = 480
@@ -45,7 +45,7 @@ ROWS = 256
 """Rows of the plate that are worked on at a time, which bounds the memory."""
 COLUMNS = 16384
 """Of them at a time where places are looked up, which OpenCV counts in 16 bits."""
-REVISION = 2
+REVISION = 3
 """Raised whenever the same plate, weights and settings come out otherwise, so that what an earlier program has made is
 made again."""
 Glow = Literal["kept", "kept at lamps", "taken"]
@@ -67,9 +67,9 @@ class FlareMap:
 
 
 class Told(NamedTuple):
-    """Of a plate the display values 0..1 that the network was shown (h, w, 3), what a flare adds to them as far as its
-    views are believed, the part of that, 0..1, which is taken for a flare and not for the picture's grade, and the part
-    of it, 0..1 (h, w, 3), which is glow round lights."""
+    """Of a plate the display values 0..1 that the network was shown (h, w, 3), what a flare adds to them if there is
+    one, the part of that, 0..1, which is taken for a flare and not for the scene or its grade, and the part of it, 0..1
+    (h, w, 3), which is glow round lights."""
 
     display: Pixels
     added: Pixels
@@ -125,8 +125,7 @@ class Remover:
     def told(self, display: Pixels) -> Told:
         """Of what the network is `shown` of a plate by itself."""
         views = self.views(display)
-        alone = [(views, 1.0)]
-        return Told(display, believed(views, doubt_of(alone)), worth_of(alone), views.glow)
+        return Told(display, believed(views), worth_of([(views, 1.0)]), views.glow)
 
     def views(self, display: Pixels) -> Views:
         """What the network tells of display values 0..1 (h, w, 3), h and w multiples of MULTIPLE."""

@@ -10,8 +10,8 @@ plates do not breathe. Only what is smooth is put right, since a frame's detail 
 about there: where there is no flare, a lamp that comes on changes nothing. What is not found again stays as it was
 told.
 
-How far the network is believed (`views`) is one for the frames about a place in a shot, too: where its views agree on
-most of them, a flare does not go out on the others. Which frames are of one shot, their details say (`of_one_shot`);
+Whether the network is believed (`odds`) is one for the frames about a place in a shot, too: where most of them plainly
+have a flare, it does not go out on the others. Which frames are of one shot, their details say (`of_one_shot`);
 `sequences` finds them among files.
 """
 from __future__ import annotations
@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from ..pictures import Pixels
 from . import motion
 from .inference import CLIPPED, Told
-from .views import Views, believed, doubt_of, worth_of
+from .views import Views, believed, worth_of
 
 FAINT = 0.03
 """What a flare adds to display values where a frame counts half of what it counts where there is none."""
@@ -94,12 +94,12 @@ def steadied(here: Sighting, about: Sequence[Neighbour]) -> Told:
     """What was told of `here`, put right by the frames about it."""
     display = here.guide.display
     shot = [(here.views, 1.0), *((other.sighting.views, float(other.share)) for other in about)]
-    doubt, worth = doubt_of(shot), worth_of(shot)
-    added = np.minimum(believed(here.views, doubt), display)
+    worth = worth_of(shot)
+    added = np.minimum(believed(here.views), display)
     if not about:
         return Told(display, added, worth, here.views.glow)
-    own = _seen(here, doubt)
-    missed = _missed(own, [_found_again(own, other, doubt) for other in about])
+    own = _seen(here)
+    missed = _missed(own, [_found_again(own, other) for other in about])
     added = np.clip(added + _finer(missed, display), 0, display)
     return Told(display, added, worth, here.views.glow)
 
@@ -119,16 +119,16 @@ class _Seen(NamedTuple):
         return self.sure / (1 + np.square(self.told / np.float32(FAINT)))
 
 
-def _seen(frame: Sighting, doubt: np.float32) -> _Seen:
-    added = motion.coarser(believed(frame.views, doubt))
+def _seen(frame: Sighting) -> _Seen:
+    added = motion.coarser(believed(frame.views))
     scene = _blurred(motion.coarser(frame.guide.display) - added, DETAIL)
     told: Pixels = added.max(-1)
     return _Seen(scene, told, np.ones_like(told))
 
 
-def _found_again(own: _Seen, other: Neighbour, doubt: np.float32) -> _Seen:
+def _found_again(own: _Seen, other: Neighbour) -> _Seen:
     """Of a frame what it shows of the places of `own`, laid where those are, as bright as it is there."""
-    scene, told, _ = _seen(other.sighting, doubt)
+    scene, told, _ = _seen(other.sighting)
     laid = motion.brought(np.dstack([scene, told]), other.there)
     found = _Seen(laid[..., :3], laid[..., 3], other.share * motion.followed(other.there, other.back))
     return found._replace(scene=found.scene * _exposure(own, found))

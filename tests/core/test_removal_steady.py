@@ -13,7 +13,8 @@ from core.errors import FrameError
 from core.progress import Progress
 from core.removal import motion
 from core.removal.batch import plates_of, remove_all, with_neighbours
-from core.removal.inference import Remover
+from core.removal.inference import Remover, Told
+from core.removal.odds import Signs
 from core.removal.plates import Plate
 from core.removal.record import RECORD
 from core.removal.sequences import OFFSETS, Sequences, by_number
@@ -34,12 +35,17 @@ def told(display: Pixels, added: Pixels | float) -> Sighting:
     return Sighting(guide(display), told_once(np.broadcast_to(np.float32(added), display.shape)))
 
 
-def in_line(here: Sighting, others: list[Sighting]) -> Pixels:
-    """What a flare adds to `here`, beside those of the others that are of its shot."""
+def in_shot(here: Sighting, others: list[Sighting]) -> Told:
+    """What is told of `here` beside those of the others that are of its shot."""
     a = here.guide
     return steadied(here, [
         Neighbour(other, share, motion.flow(a.grey, other.guide.grey), motion.flow(other.guide.grey, a.grey))
-        for other in others if (share := of_one_shot(a, other.guide)) > 0]).added
+        for other in others if (share := of_one_shot(a, other.guide)) > 0])
+
+
+def in_line(here: Sighting, others: list[Sighting]) -> Pixels:
+    """What a flare adds to it."""
+    return in_shot(here, others).added
 
 
 def wall(seed: int = 0) -> Pixels:
@@ -158,13 +164,14 @@ def test_the_smallest_frames_are_followed_too(shape: tuple[int, int]) -> None:
 
 
 def test_a_flare_is_believed_as_far_as_in_the_frames_of_its_shot() -> None:
-    """Its views are apart by as much as they tell, those of the others agree; in another shot that says nothing."""
+    """Of itself it is taken for the scene, the others plainly are flares; in another shot that says nothing."""
     even = np.full((48, 64, 3), 0.1, np.float32)
-    doubted = Sighting(guide(scene(6)), Views(even, even, 0 * even, np.float32(0), 0 * even))
-    sure = [told(scene(6), even) for _ in range(2)]
-    assert steadied(doubted, []).added.max() == 0
-    assert in_line(doubted, [told(scene(7), even)]).max() == 0
-    np.testing.assert_allclose(in_line(doubted, sure), 0.1, rtol=1e-4)
+    unlikely, plain = (Signs(again=0, light=-3, apart=apart, peak=1, patchy=0.5) for apart in (0, -2))
+    doubted, *sure = [Sighting(guide(scene(6)), told_once(even)._replace(signs=signs))
+                      for signs in (unlikely, plain, plain)]
+    elsewhere = Sighting(guide(scene(7)), sure[0].views)
+    assert in_shot(doubted, []).worth == 0 and in_shot(doubted, [elsewhere]).worth == 0
+    assert in_shot(doubted, sure).worth == 1
 
 
 def test_names_go_by_their_numbers() -> None:

@@ -27,8 +27,8 @@ lights, neon), and of the white ones that their class has. Aspheric: lights with
 telephones' lenses, which no class has. Odds: of frames of all classes and twice as many without flare, a fourth of
 all graded so that black is grey: the weights of `core/removal/odds.py` as a logistic regression finds them in pictures
 that are trained on, each flare counting by what it is worth to take it, and by those in the file and by these, of
-held-out ones, how surely a flare that is worth it is told from what does a clean picture harm (area under the curve),
-and how much of each is taken.
+held-out ones, how surely a flare that is worth it is told from what would harm (area under the curve), and how much of
+each is taken.
 """
 from __future__ import annotations
 
@@ -243,7 +243,7 @@ def coloured(folders: list[Path], lenses: Path | None = None, weights: Path | No
                                    for (seed, kind), colour in zip(seeds, colours, strict=True)])
 
 
-def odds(folders: list[Path], lenses: Path | None = None, weights: Path | None = None, count: int = 900) -> None:
+def odds(folders: list[Path], lenses: Path | None = None, weights: Path | None = None, count: int = 600) -> None:
     """What tells flares from scenes and their grades."""
     from core.removal.backgrounds import read_backgrounds
     from core.removal.odds import CONSTANT, WEIGHTS, worth
@@ -251,7 +251,7 @@ def odds(folders: list[Path], lenses: Path | None = None, weights: Path | None =
     remover = Remover(weights)
     found = _logistic(*_signs(remover, 1006, count, read_backgrounds(folders, "train", max(SIZE)), _seen(lenses)))
     print("WEIGHTS, CONSTANT =", ", ".join(f"{value:.3g}" for value in found))
-    signs, gains = _signs(remover, 1007, count, _held_out(folders), _unseen(lenses))
+    signs, gains = _signs(remover, 1007, count // 2, _held_out(folders), _unseen(lenses))
     flares = gains > 0
     for name, by in (("as it is", np.array([*WEIGHTS, CONSTANT])), ("by these", found)):
         log_odds = signs @ by[:-1] + by[-1]

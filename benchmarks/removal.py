@@ -24,11 +24,10 @@ eval-removal's; the matte is as an artist would rough it in, wide about all that
 Scenes: as `clean`, of the exposures, colours and grain that training has, some with a light. Against: the same flares
 with their lights where the scene is bright, and anywhere. Coloured: the same flares of lights of one colour (traffic
 lights, neon), and of the white ones that their class has. Aspheric: lights with no other flare than the ghosts of
-telephones' lenses, which no class has. Odds: of frames of all classes and twice as many without flare, a fourth of
-all graded so that black is grey: the weights of `core/removal/odds.py` as a logistic regression finds them in pictures
-that are trained on, each flare counting by what it is worth to take it, and by those in the file and by these, of
-held-out ones, how surely a flare that is worth it is told from what would harm (area under the curve), and how much of
-each is taken.
+telephones' lenses, which no class has. Odds: the weights of `core/removal/odds.py` as a logistic regression finds them
+on pictures that are trained on, a third of them under flares of all classes, a fourth graded so that black is grey,
+each flare counting by what it is worth to take it. Then, on held-out ones, by the weights in the file and by these: how
+surely what is worth taking is told from what would harm (area under the curve), and how much of each is taken.
 """
 from __future__ import annotations
 
@@ -257,9 +256,9 @@ def odds(folders: list[Path], lenses: Path | None = None, weights: Path | None =
         log_odds = signs @ by[:-1] + by[-1]
         surely = np.mean(log_odds[flares][:, None] > log_odds[~flares])
         taken = np.array([worth(value) for value in log_odds])
-        print(f"{name}: {surely:.3f} of pairs in order; of {flares.sum()} flares {taken[flares].mean():.1%} are taken, "
-              f"of {(~flares).sum()} that are none {taken[~flares].mean():.1%}; all of the flares are worth "
-              f"{gains[flares].mean():.2f} dB, those {(gains * taken)[flares].mean():.2f} dB")
+        print(f"{name}: {surely:.3f} of pairs in order; taken of {flares.sum()} worth taking "
+              f"{taken[flares].mean():.1%}, of {(~flares).sum()} that harm {taken[~flares].mean():.1%}; the first are "
+              f"worth {gains[flares].mean():.2f} dB, of which {(gains * taken)[flares].mean():.2f} dB are had")
 
 
 def _signs(remover: Remover, seed: int, count: int, backgrounds: Any, lenses: Any) -> tuple[Any, Any]:

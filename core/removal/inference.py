@@ -98,9 +98,9 @@ class Remover:
                ) -> tuple[NDArray[Any], NDArray[np.float16]]:
         """(codes without flare, in the plate's own type; the flare in linear light (height, width, 3)).
 
-        matte: (height, width), 0..1, where someone has marked a flare: that share of it is taken there, and since it
-        is known that there is one, so little of it counts too as would be doubted otherwise. told: of the plate, where
-        that is known already (`sequences.Sequences`).
+        matte: (height, width), 0..1, where someone has marked a flare: that share of it is taken there, of all that is
+        told, since it is known that there is one. told: of the plate, where that is known already
+        (`sequences.Sequences`).
         """
         told = told or self.told(self.shown(plate))
         found = _carrier(told.display, self.flare(told, marked=matte is not None))

@@ -14,16 +14,17 @@ from typing import NamedTuple
 import numpy as np
 
 from ..pictures import Pixels
+from . import motion
 from .formation import flare_light
 
-LEAST = 0.0005
-"""Mean over the frame of what is told, up to which nobody asks whether it is a flare."""
+ASKED = 0.0005
+"""Mean over the frame of what is told, from which on it is asked whether it is a flare; less counts for none."""
 BLACK = 0.002
 """Share of a frame that is darker than its black."""
 NOTHING = 0.02
 """Part of what is told that has to be told again to count for something."""
-AT_ONE = 0.05
-"""Part of what is told by which views may be apart and yet agree."""
+AGREED = 0.05
+"""Part of what is told by which views are apart that agree."""
 PATCH = 8
 """How many patches the long side of a frame has: what is narrower than one is patchy."""
 WEIGHTS, CONSTANT = (0.6, 0.6, -2.0, 0.9, -2.0), 0.5
@@ -56,12 +57,12 @@ def signs(display: Pixels, told: Pixels, apart: Pixels, again: Pixels) -> Signs:
     import cv2
 
     mean = max(float(told.mean()), 1e-9)
-    coarse = cv2.resize(told.mean(-1), None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    coarse = motion.coarser(told.mean(-1))
     patch = max(coarse.shape) // PATCH | 1
     broad = cv2.morphologyEx(coarse, cv2.MORPH_OPEN, np.ones((patch, patch), np.uint8))
     return Signs(again=float(np.log(again.mean() / mean + NOTHING)),
                  light=float(np.log(flare_light(display, told).mean() + 0.002)),
-                 apart=float(np.log(apart.mean() / mean + AT_ONE)),
+                 apart=float(np.log(apart.mean() / mean + AGREED)),
                  peak=float(np.log(max(coarse.max(), 1e-9) / mean)),
                  patchy=1 - float(broad.mean()) / mean)
 

@@ -93,8 +93,7 @@ def of_one_shot(one: Guide, other: Guide) -> np.float32:
 def steadied(here: Sighting, about: Sequence[Neighbour]) -> Told:
     """What was told of `here`, put right by the frames about it."""
     display = here.guide.display
-    shot = [(here.views, 1.0), *((other.sighting.views, float(other.share)) for other in about)]
-    worth = worth_of(shot)
+    worth = worth_of([(here.views, 1.0), *((other.sighting.views, float(other.share)) for other in about)])
     added = np.minimum(believed(here.views), display)
     if not about:
         return Told(display, added, worth, here.views.glow)

@@ -65,7 +65,7 @@ def told_in_views(display: Pixels, tell: Tell) -> Views:
     if dark > 0:
         alone = np.stack([_told_alone(tell, display, channel) for channel in range(3)], -1)
         views = views._replace(alone=alone, alone_counts=dark * _is_of_one_colour(flare_light(display, alone)))
-    if mean.mean() > odds.LEAST:
+    if mean.mean() > odds.ASKED:
         apart = np.sqrt(np.average(np.square(told - mean), 0, pixels))
         again, _ = _turned(tell, odds.graded_back(display), SIZES[0])
         views = views._replace(signs=odds.signs(display, mean, apart, again.mean(0)))

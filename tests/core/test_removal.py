@@ -245,7 +245,7 @@ def test_signs_of_a_flare_are_as_they_are_told() -> None:
     mean, spot = told.mean(), 0.4 * 64 / (160 * 240)
     *logarithms, patchy = odds.signs(np.full_like(told, 0.5), told, 0.2 * told, 0.5 * told)
     np.testing.assert_allclose(np.exp(logarithms), [
-        0.5 + odds.NOTHING, flare_light(np.full_like(told, 0.5), told).mean() + 0.002, 0.2 + odds.AT_ONE, 0.5 / mean],
+        0.5 + odds.NOTHING, flare_light(np.full_like(told, 0.5), told).mean() + 0.002, 0.2 + odds.AGREED, 0.5 / mean],
         rtol=1e-3)
     np.testing.assert_allclose(patchy, spot / mean, rtol=1e-3)
 
@@ -294,7 +294,7 @@ def test_it_is_said_that_a_veil_may_be_a_grade(everywhere: Path, tmp_path: Path,
     assert cv2.imread(str(tmp_path / "clean" / "grade.png")).mean() < codes[0].mean() - 1
 
 
-def test_a_shot_is_graded_as_one(everywhere: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_shot_is_judged_as_one(everywhere: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What is doubted of a frame is believed in a shot whose other frames have a flare, by their shares."""
     monkeypatch.setattr(Remover, "_told", tells_lifted_darks)
     remover = Remover(everywhere)

@@ -27,6 +27,20 @@ def chunks(stream: BinaryIO, wanted: Container[bytes]) -> Iterator[tuple[bytes, 
             yield name, content
 
 
+def is_cut_off(data: memoryview) -> bool:
+    """Whether a chunk says that it goes on beyond the file's end. OpenCV makes room for as much as it says, gigabytes
+    for a damaged length of a small file."""
+    place = len(SIGNATURE)
+    while place < len(data):
+        length, name = int.from_bytes(data[place:place + 4], "big"), data[place + 4:place + 8]
+        place += 12 + length
+        if place > len(data):
+            return True
+        if name == b"IEND":
+            break
+    return False
+
+
 def chunk(name: bytes, content: bytes) -> bytes:
     """As it stands in a file."""
     return len(content).to_bytes(4, "big") + name + content + zlib.crc32(name + content).to_bytes(4, "big")

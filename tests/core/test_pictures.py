@@ -127,6 +127,26 @@ def test_a_header_that_claims_too_much_is_refused_before_memory_is_taken(tmp_pat
         read_picture(tmp_path / "bomb.png")
 
 
+def test_a_chunk_that_claims_too_much_is_refused_before_memory_is_taken(tmp_path: Path,
+                                                                        monkeypatch: pytest.MonkeyPatch) -> None:
+    write_png(tmp_path / "bomb.png", RAMP)
+    data = bytearray((tmp_path / "bomb.png").read_bytes())
+    place = data.index(b"IDAT") - 4
+    data[place:place + 4] = b"\x7f\xff\xff\xff"
+    (tmp_path / "bomb.png").write_bytes(data)
+    monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("given to OpenCV, which makes room for 2 GB"))
+    with pytest.raises(FrameError, match="bomb.png is damaged or truncated"):
+        read_picture(tmp_path / "bomb.png")
+
+
+def test_what_follows_a_png_does_not_matter(tmp_path: Path) -> None:
+    write_png(tmp_path / "a.png", RAMP)
+    whole = read_picture(tmp_path / "a.png").display()
+    with open(tmp_path / "a.png", "ab") as stream:
+        stream.write(b"\xff" * 11)
+    assert np.array_equal(read_picture(tmp_path / "a.png").display(), whole)
+
+
 @pytest.mark.parametrize(("kind", "count", "width"), [
     (11, 1, struct.pack("<f", np.nan)), (11, 1, struct.pack("<f", np.inf)), (12, 0xFFFFFFFF, struct.pack("<I", 8)),
     (3, 2, struct.pack("<HH", 9, 9))], ids=["not a number", "infinite", "more than the file", "two numbers"])

@@ -337,7 +337,7 @@ def _points_txt(path: Path, lines: list[str]) -> Points:
 def _cloud(path: Path, values: Floats, rgb: NDArray[np.uint8]) -> PointCloud:
     if not np.isfinite(values[:, :3]).all() or (np.abs(values[:, :3]) > 1e30).any():
         raise CaptureError(f"{path} has points that are not finite numbers; solve the cameras again.")
-    error = np.where(np.isfinite(values[:, 3]), np.maximum(values[:, 3], 0.0), 0.0)
+    error = np.where(np.isfinite(values[:, 3]), np.clip(values[:, 3], 0.0, 1e30), 0.0)
     return PointCloud(values[:, :3].astype(np.float32), rgb, error.astype(np.float32))
 
 

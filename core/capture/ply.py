@@ -40,12 +40,13 @@ def read_points(path: Path) -> PointCloud:
             table = ply.table(data, vertices.row(ply.ORDERS[header.form]), number, header.start)
     except ValueError as problem:
         raise CaptureError(f"{path} is truncated or damaged; export it again.") from problem
-    xyz = np.stack([table[name].astype(np.float32) for name in "xyz"], axis=1)
+    with np.errstate(over="ignore"):  # told below
+        xyz = np.stack([table[name].astype(np.float32) for name in "xyz"], axis=1)
     if not np.isfinite(xyz).all():
         raise CaptureError(f"{path} has points that are not finite numbers; export it again.")
     rgb = np.full((number, 3), 128, np.uint8)
     if {"red", "green", "blue"} <= set(names):
         colours = np.stack([table[name].astype(np.float64) for name in ("red", "green", "blue")], axis=1)
         unit = 255.0 if dict(layout)["red"].startswith("f") else 1.0
-        rgb = np.clip(colours * unit + 0.5 * (unit > 1), 0, 255).astype(np.uint8)
+        rgb = np.clip(np.nan_to_num(colours) * unit + 0.5 * (unit > 1), 0, 255).astype(np.uint8)
     return PointCloud(xyz, rgb, np.zeros(number, np.float32))

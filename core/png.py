@@ -32,7 +32,7 @@ def is_cut_off(data: memoryview) -> bool:
     for a damaged length of a small file."""
     place = len(SIGNATURE)
     while place < len(data):
-        length, name = int.from_bytes(data[place:place + 4], "big"), data[place + 4:place + 8]
+        length, name = int.from_bytes(data[place:place + 4], "big"), bytes(data[place + 4:place + 8])
         place += 12 + length
         if place > len(data):
             return True

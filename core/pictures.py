@@ -242,11 +242,12 @@ def decoded(path: Path, flags: int) -> NDArray[Any] | None:
     since its own reader cannot open every path that Windows allows."""
     import cv2
 
+    with open(path, "rb") as stream:
+        if png.is_cut_off(stream):
+            return None
     data = np.fromfile(path, np.uint8)
     if data[:4].tobytes() in (b"II*\0", b"MM\0*"):
         data = np.frombuffer(tiff.as_stored(data.tobytes()), np.uint8)
-    if data[:8].tobytes() == png.SIGNATURE and png.is_cut_off(data.data):
-        return None
     try:
         return cv2.imdecode(data, flags) if data.size else None
     except cv2.error:

@@ -24,6 +24,8 @@ from .lens import MODELS, NAMES, Lens
 
 SENSELESS = 1e12
 """From which on a number of a pose or a lens makes no sense, whatever its unit."""
+_LARGEST = 1e30
+"""What float32 still computes with: the farthest a point may lie, and as much as its error counts for."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -335,9 +337,9 @@ def _points_txt(path: Path, lines: list[str]) -> Points:
 
 
 def _cloud(path: Path, values: Floats, rgb: NDArray[np.uint8]) -> PointCloud:
-    if not np.isfinite(values[:, :3]).all() or (np.abs(values[:, :3]) > 1e30).any():
+    if not np.isfinite(values[:, :3]).all() or (np.abs(values[:, :3]) > _LARGEST).any():
         raise CaptureError(f"{path} has points that are not finite numbers; solve the cameras again.")
-    error = np.where(np.isfinite(values[:, 3]), np.clip(values[:, 3], 0.0, 1e30), 0.0)
+    error = np.where(np.isfinite(values[:, 3]), np.clip(values[:, 3], 0.0, _LARGEST), 0.0)
     return PointCloud(values[:, :3].astype(np.float32), rgb, error.astype(np.float32))
 
 

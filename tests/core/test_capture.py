@@ -14,6 +14,7 @@ import psutil
 import pytest
 
 from core.capture import Camera, Capture
+from core.capture.ply import read_points
 from core.errors import CaptureError, FrameError
 from core.pictures import write_exr, write_png
 from tests.core.captures import SIZE, look_at, make_capture, make_transforms, orbit, picture
@@ -31,6 +32,25 @@ def test_text_model(tmp_path: Path) -> None:
     assert capture.points.error[0] == 0.5
     assert not capture.has_removed and not capture.has_truth and not capture.lights
     np.testing.assert_allclose(capture.frame(capture.views[2]).pixels, picture(2)[..., ::-1] / np.float32(255))
+
+
+@pytest.mark.filterwarnings("error")
+def test_an_error_beyond_floats_counts_for_as_much_as_they_hold(tmp_path: Path) -> None:
+    folder = make_capture(tmp_path / "c")
+    points = folder / "sparse/0/points3D.txt"
+    points.write_text("".join(" ".join([*line.split()[:7], "1e200", *line.split()[8:]]) + "\n"
+                              for line in points.read_text().splitlines()))
+    error = Capture.open(folder).points.error
+    assert np.isfinite(error).all() and (error > 1e20).all()
+
+
+@pytest.mark.filterwarnings("error")
+def test_colours_that_are_no_numbers_are_black(tmp_path: Path) -> None:
+    names = ("float x", "float y", "float z", "float red", "float green", "float blue")
+    (tmp_path / "points.ply").write_text("\n".join([
+        "ply", "format ascii 1.0", "element vertex 1", *(f"property {name}" for name in names), "end_header",
+        "0 1 2 nan 1 0.5", ""]))
+    assert read_points(tmp_path / "points.ply").rgb.tolist() == [[0, 255, 128]]
 
 
 def test_binary_model_equals_text(tmp_path: Path) -> None:

@@ -45,7 +45,6 @@ from benchmarks.hidden_lights import hidden_flare
 from benchmarks.known_scene import KnownScene, score
 from core.capture import Camera, Capture, Light
 from core.choices import ITERATIONS, OUR_PRESETS, Preset
-from core.files import write_json
 from core.fit import fit
 from core.fit.frames import Frames
 from core.fit.rendering import render
@@ -53,9 +52,10 @@ from core.fit.run import Run, ViewLayers
 from core.fit.settings import FitSettings, changed, preset
 from core.gaussians.scene import SceneGaussians
 from core.metrics.evaluation import evaluate
-from core.progress import Progress, TerminalProgress
-from core.removal.captured import remove_from
-from core.removal.inference import Remover
+from core.removal.inference.remover import Remover
+from core.removal.jobs.capture import remove_from
+from core.system.files import write_json
+from core.system.progress import Progress, TerminalProgress
 
 DOCUMENT = report.ROOT / "docs" / "ablations.md"
 SAMPLE = report.ROOT / "sample_scenes" / "desk"

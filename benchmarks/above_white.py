@@ -25,8 +25,8 @@ from core.choices import OUR_PRESETS
 from core.errors import CaptureError
 from core.fit import Run, fit, preset
 from core.fit.metering import WHITEST
+from core.images.picture import Picture
 from core.metrics.pictures import relative_l2
-from core.pictures import Picture
 
 COLUMNS = ("flare below white", "flare above", "its peak", "exact peak", "flare's light", "scene above white")
 

@@ -29,9 +29,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from benchmarks.light_composer import Composed, compose
 from core.capture import Capture
 from core.errors import EngineError, FitFlareError
+from core.images.read import read_picture
 from core.lights import Detection, Detector, detector_for, find_lights, union
-from core.pictures import read_picture
-from core.removal.backgrounds import PHOTOS, pictures_of
+from core.removal.training.backgrounds import PHOTOS, pictures_of
 
 THRESHOLDS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
 

@@ -25,9 +25,10 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from benchmarks import report
 from core.capture import Capture, View
 from core.choices import OUR_PRESETS
+from core.colour.srgb import srgb_from_linear
 from core.fit import Run, fit, preset
+from core.images.picture import Picture
 from core.metrics.evaluation import LAYERS, evaluate
-from core.pictures import Picture, srgb_from_linear
 
 COLUMNS = ("mode", "frames", "fitted as", *LAYERS, "found, stops off")
 ROUNDS = 1.5

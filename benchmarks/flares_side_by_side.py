@@ -21,8 +21,8 @@ from core.capture import Capture
 from core.errors import CaptureError
 from core.fit.frames import Frames
 from core.fit.run import Run
+from core.images.write import write_png
 from core.metrics.evaluation import displayed_flare
-from core.pictures import write_png
 
 Pixels = NDArray[np.float32]
 

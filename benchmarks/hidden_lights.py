@@ -10,8 +10,8 @@ import numpy as np
 
 from core.capture import Camera, View
 from core.errors import CaptureError
-from core.files import read_json
 from core.metrics.evaluation import Renderer
+from core.system.files import read_json
 
 SHARES = "truth/visible_share.json"
 """Of a sample capture: for each frame and light the part of the light's disc that no geometry hides, 0..1."""

@@ -9,7 +9,8 @@ import numpy as np
 import torch
 
 from core.capture import View
-from core.display import decode
+from core.colour.srgb import srgb_from_linear
+from core.colour.srgb_torch import decode
 from core.errors import CaptureError
 from core.fit.rendering import render_flare
 from core.fit.trainer import Trainer
@@ -17,7 +18,6 @@ from core.flare.compositing import composite
 from core.gaussians.loss import l1_ssim
 from core.metrics.evaluation import out_of_range
 from core.metrics.pictures import psnr, relative_l2
-from core.pictures import srgb_from_linear
 
 
 class KnownScene(Trainer):

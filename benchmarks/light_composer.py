@@ -13,7 +13,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from core.pictures import Picture, Pixels, linear_from_srgb, srgb_from_linear
+from core.colour.srgb import Pixels, linear_from_srgb, srgb_from_linear
+from core.images.picture import Picture
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,7 +24,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from core.capture import Camera
 from core.capture.camera import quaternion_from_rotation
-from core.files import write_json, write_text
+from core.system.files import write_json, write_text
 
 ROOT = Path(__file__).resolve().parents[1]
 RUN = ROOT / "headless" / "run.py"

@@ -14,8 +14,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from core.conventions.pixel_grid import DILATION
 from core.gaussians import projection, rendering
-from core.sampling import DILATION
 
 _BINDINGS = """
 #include <torch/extension.h>

@@ -32,7 +32,7 @@ from typing import Literal, NamedTuple
 START = time.perf_counter()
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from core.numeric_environment import prepare_for_numpy_and_torch
+from core.system.thread_environment import prepare_for_numpy_and_torch
 
 prepare_for_numpy_and_torch()
 

@@ -24,7 +24,8 @@ eval-removal's; the matte is as an artist would rough it in, wide about all that
 Scenes: as `clean`, of the exposures, colours and grain that training has, some with a light. Against: the same flares
 with their lights where the scene is bright, and anywhere. Coloured: the same flares of lights of one colour (traffic
 lights, neon), and of the white ones that their class has. Aspheric: lights with no other flare than the ghosts of
-telephones' lenses, which no class has. Odds: the weights of `core/removal/odds.py` as a logistic regression finds them
+telephones' lenses, which no class has. Odds: the weights of `core/removal/inference/confidence.py` as a logistic
+regression finds them
 on pictures that are trained on, a third of them under flares of all classes, a fourth graded so that black is grey,
 each flare counting by what it is worth to take it. Then, on held-out ones, by the weights in the file and by these: how
 surely what is worth taking is told from what would harm (area under the curve), and how much of each is taken.
@@ -45,20 +46,21 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
-from core.numeric_environment import prepare_for_numpy_and_torch
+from core.system.thread_environment import prepare_for_numpy_and_torch
 
 prepare_for_numpy_and_torch()
 
 import numpy as np
 
 from benchmarks.resident import held_at_most
+from core.images.plates import read_plate
+from core.images.read import read_picture
+from core.images.write import write_exr, write_png
 from core.metrics.pictures import psnr
-from core.pictures import read_picture, write_exr, write_png
-from core.progress import Progress
-from core.removal.batch import remove_all
-from core.removal.inference import WORKING_SIZE, Remover
-from core.removal.plates import read_plate
-from core.removal.sequences import Sequences
+from core.removal.inference.neighbours import Sequences
+from core.removal.inference.remover import WORKING_SIZE, Remover
+from core.removal.jobs.batch import remove_all
+from core.system.progress import Progress
 
 DESK = ROOT / "sample_scenes" / "desk"
 SHOWN = 3
@@ -159,7 +161,7 @@ def _cleaned(paths: list[Path], folder: Path) -> Iterator[Any]:
 
 def clean(folders: list[Path], weights: Path | None = None) -> None:
     """What happens to pictures without flare."""
-    from core.removal.backgrounds import PHOTOS, pictures_of
+    from core.removal.training.backgrounds import PHOTOS, pictures_of
 
     remover = Remover(weights)
     values, kept = [], 0
@@ -179,10 +181,10 @@ def clean(folders: list[Path], weights: Path | None = None) -> None:
 
 def scenes(folders: list[Path], weights: Path | None = None, count: int = 300) -> None:
     """What happens to held-out scenes without flare."""
-    from core.removal.backgrounds import read_backgrounds
-    from core.removal.bank import OneFlare
-    from core.removal.pairs import pair
     from core.removal.synthesis.prescription import built_in
+    from core.removal.training.backgrounds import read_backgrounds
+    from core.removal.training.flare_bank import OneFlare
+    from core.removal.training.pairs import pair
 
     remover, backgrounds = Remover(weights), read_backgrounds(folders, "test", 480)
     values = []
@@ -205,8 +207,8 @@ def _unseen(lenses: Path | None) -> Any:
 
 def _seen(lenses: Path | None) -> Any:
     """The lenses of a folder that training takes."""
-    from core.removal.backgrounds import kept_for_test
     from core.removal.synthesis.prescription import built_in, read_lenses
+    from core.removal.training.backgrounds import kept_for_test
 
     return [lens for lens in read_lenses(lenses) if not kept_for_test(lens.name)] if lenses else built_in()
 
@@ -217,8 +219,8 @@ AGAINST = ("scatter", "ghosts", "streak", "glare", "mixed")
 
 def against(folders: list[Path], lenses: Path | None = None, weights: Path | None = None, count: int = 20) -> None:
     """What removal gains where lights stand in a bright part of the scene, and where they stand anywhere."""
-    from core.removal.bank import OneFlare
     from core.removal.evaluation import CANVAS
+    from core.removal.training.flare_bank import OneFlare
 
     remover, backgrounds, unseen = Remover(weights), _held_out(folders), _unseen(lenses)
     seeds = [((1003, index, number), kind) for index, kind in enumerate(AGAINST) for number in range(count)]
@@ -229,10 +231,10 @@ def against(folders: list[Path], lenses: Path | None = None, weights: Path | Non
 
 def coloured(folders: list[Path], lenses: Path | None = None, weights: Path | None = None, count: int = 20) -> None:
     """What removal gains of flares whose lights have one colour, and of the same of white lights."""
-    from core.removal.bank import OneFlare, one_colour
     from core.removal.evaluation import CANVAS
-    from core.removal.pairs import WHITE
-    from core.removal.synthesis.layers import CLASSES
+    from core.removal.synthesis.flare import CLASSES
+    from core.removal.training.flare_bank import OneFlare, one_colour
+    from core.removal.training.pairs import WHITE
 
     remover, backgrounds, unseen = Remover(weights), _held_out(folders), _unseen(lenses)
     seeds = [((1004, index, number), kind) for index, kind in enumerate(CLASSES) for number in range(count)]
@@ -244,8 +246,8 @@ def coloured(folders: list[Path], lenses: Path | None = None, weights: Path | No
 
 def odds(folders: list[Path], lenses: Path | None = None, weights: Path | None = None, count: int = 600) -> None:
     """What tells flares from scenes and their grades."""
-    from core.removal.backgrounds import read_backgrounds
-    from core.removal.odds import CONSTANT, WEIGHTS, worth
+    from core.removal.inference.confidence import CONSTANT, WEIGHTS, worth
+    from core.removal.training.backgrounds import read_backgrounds
 
     remover = Remover(weights)
     found = _logistic(*_signs(remover, 1006, count, read_backgrounds(folders, "train", max(SIZE)), _seen(lenses)))
@@ -264,9 +266,9 @@ def odds(folders: list[Path], lenses: Path | None = None, weights: Path | None =
 def _signs(remover: Remover, seed: int, count: int, backgrounds: Any, lenses: Any) -> tuple[Any, Any]:
     """(n, 5) signs of frames in which something is told, a third of `count` drawn under flares; (n,) what it is worth
     to take that, in dB. Of frames without flare those are left out which keep 45 dB, and the others are worth -5."""
-    from core.removal.bank import OneFlare
-    from core.removal.pairs import pair
-    from core.removal.synthesis.layers import CLASSES
+    from core.removal.synthesis.flare import CLASSES
+    from core.removal.training.flare_bank import OneFlare
+    from core.removal.training.pairs import pair
 
     signs, gains = [], []
     for number in range(count):
@@ -307,10 +309,10 @@ class _Moulded:
     def draw(self, random: np.random.Generator) -> Any:
         """Another light and lens at every call."""
         from core.removal.evaluation import CANVAS
-        from core.removal.pairs import Layers
         from core.removal.synthesis.aspheric import ghosts as ghosts_of
-        from core.removal.synthesis.layers import flare
+        from core.removal.synthesis.flare import flare
         from core.removal.synthesis.prescription import built_in
+        from core.removal.training.pairs import Layers
 
         seed = (*self._seed, int(random.integers(1 << 30)))
         made = flare(seed, CANVAS, built_in(), "scatter")
@@ -331,14 +333,14 @@ SIZE = (480, 320)
 
 def _held_out(folders: list[Path]) -> Any:
     """The photographs that training leaves out."""
-    from core.removal.backgrounds import read_backgrounds
+    from core.removal.training.backgrounds import read_backgrounds
 
     return read_backgrounds(folders, "test", max(SIZE))
 
 
 def _gain(remover: Remover, seed: tuple[int, ...], bank: Any, backgrounds: Any, against_light: float = 0.0) -> float:
     """Of the picture of a seed under a flare of the bank, a share of those with their lights against the light."""
-    from core.removal.pairs import pair
+    from core.removal.training.pairs import pair
 
     one = pair(np.random.default_rng(seed), bank, backgrounds, *SIZE, clean=0, against_light=against_light)
     return psnr(remover.clean_display(one.frame), one.scene) - psnr(one.frame, one.scene)
@@ -351,8 +353,8 @@ def _tell_gains(name: str, gains: Any) -> None:
 
 def matte(folders: list[Path], lenses: Path | None = None, weights: Path | None = None, count: int = 20) -> None:
     """What removal gains with a rough matte of the flare, and without."""
+    from core.images.plates import Plate
     from core.removal.evaluation import synthetic
-    from core.removal.plates import Plate
 
     remover, gains = Remover(weights), []
     for case in synthetic(1001, count, _held_out(folders), _unseen(lenses), SIZE):
@@ -377,8 +379,8 @@ def _roughed_in(frame: Any, truth: Any) -> Any:
 
 def coverage(sheet: Path | None = None, count: int = 400) -> None:
     """A histogram of the coverage of synthesised flares, as text, and a sheet of pictures."""
-    from core.removal.formation import coverage as covered
-    from core.removal.synthesis.layers import CLASSES, flare, through_aspheres
+    from core.removal.model.image_formation import coverage as covered
+    from core.removal.synthesis.flare import CLASSES, flare, through_aspheres
     from core.removal.synthesis.prescription import built_in
 
     lenses = built_in()

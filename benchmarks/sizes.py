@@ -22,10 +22,10 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from benchmarks import report
 from core.capture import Capture, View
 from core.choices import OUR_PRESETS
+from core.colour.srgb import srgb_from_linear
 from core.errors import CaptureError
 from core.fit import Run, fit, preset
 from core.metrics.pictures import psnr
-from core.pictures import srgb_from_linear
 
 TIMES = (0.25, 0.5, 0.75, 1.0, 1.5, 2.0)
 COLUMNS = ("size", "", "scene, dB", "composite", "linear flare", "its light")

@@ -28,14 +28,15 @@ from numpy.typing import NDArray
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from core.capture import Camera, Capture
+from core.colour.srgb import srgb_from_linear
+from core.conventions.run_files import FLARE
 from core.errors import CaptureError
-from core.files import read_json, write_json
 from core.fit.run import Run
+from core.images.write import write_png
 from core.look import Look, ViewOfLight, read
 from core.look.shot import PlacedLight, Shot, ShotFrame
 from core.metrics.evaluation import displayed_flare
-from core.pictures import srgb_from_linear, write_png
-from core.run_files import FLARE
+from core.system.files import read_json, write_json
 from core.transfer.target import Target, of_capture, of_shot
 from core.transfer.transfer import Transfer, TransferSettings
 from sample_scenes.description import looking_at

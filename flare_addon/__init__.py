@@ -19,7 +19,8 @@ from __future__ import annotations
 
 import bpy
 
-from . import fits, jobs, looks, operators, overlay, panels, paths, points, preferences, properties, wires
+from . import fits, jobs, looks, operators, overlay, panels, paths, points, preferences, properties
+from .compositor import drivers
 
 _MODULES = (properties, preferences, operators, panels, points, overlay, paths)
 
@@ -32,14 +33,14 @@ def _loaded(_path: str) -> None:
     points.forget()
     overlay.problem = ""
     for scene in bpy.data.scenes:
-        wires.go_by_numbers(scene)
+        drivers.go_by_numbers(scene)
 
 
 @bpy.app.handlers.persistent
 def _before_a_save(_path: str) -> None:
     """What a Blender without this extension needs to render the file goes into it."""
     for scene in bpy.data.scenes:
-        wires.keep_standing(scene)
+        drivers.keep_standing(scene)
 
 
 def register() -> None:

@@ -10,8 +10,8 @@ from pathlib import Path
 import bpy
 
 from ..core.errors import EngineError, FitFlareError
-from ..core.files import remove_folder, write_text
-from ..core.processes import environment, python_at
+from ..core.system.files import remove_folder, write_text
+from ..core.system.processes import environment, python_at
 from . import jobs
 from .jobs import Job
 

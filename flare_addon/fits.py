@@ -8,13 +8,13 @@ from typing import Any
 
 import bpy
 
-from ..core import exposures
 from ..core.capture import REMOVED
+from ..core.conventions import exposures
+from ..core.conventions.run_files import CONFIG, FLARE, SMALL_PREVIEW
 from ..core.errors import CaptureError, FitFlareError, RunError
 from ..core.look import Look, read
-from ..core.run_files import CONFIG, FLARE, SMALL_PREVIEW
 from . import engine, jobs, lights, looks
-from .capture_import import expose
+from .capture.importer import expose
 from .images import read_again
 from .jobs import Job
 from .paths import absolute, is_file, is_folder, stored

@@ -2,7 +2,7 @@
 """Work of the engine, watched from Blender: a process of its own whose events land in a file.
 
     FOLDER/job.json       what was started, in which words, on which machine, and the process's number
-    FOLDER/events.jsonl   its events, one JSON object a line (core/progress.py)
+    FOLDER/events.jsonl   its events, one JSON object a line (core/system/progress.py)
     FOLDER/engine.log     what else it said
     FOLDER/stop           there when it has been asked to stop
 
@@ -28,11 +28,11 @@ from typing import Any, Literal
 
 import bpy
 
-from ..core import processes
 from ..core.errors import DISK_FULL, EngineError, FitFlareError, RunError, refusal
-from ..core.files import remove_file, write_json
-from ..core.processes import STOPPED, WINDOWS, own_group
-from ..core.progress import STOP_FILE
+from ..core.system import processes
+from ..core.system.files import remove_file, write_json
+from ..core.system.processes import STOPPED, WINDOWS, own_group
+from ..core.system.progress import STOP_FILE
 from .paths import is_file, is_folder
 
 State = Literal["running", "done", "failed", "stopped"]

@@ -11,11 +11,11 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.colour.srgb import linear_from_srgb, srgb_from_linear
 from ..core.errors import FitFlareError, FlareFileError
-from ..core.files import atomic_path, plain_name
 from ..core.look import Look, draw, read
 from ..core.look.look import ViewOfLight, annotated
-from ..core.pictures import linear_from_srgb, srgb_from_linear
+from ..core.system.files import atomic_path, plain_name
 from . import preferences
 
 SIDE = 192  # pixels of a thumbnail

@@ -13,9 +13,9 @@ from numpy.typing import ArrayLike
 
 from ..core.capture import LIGHTS, read_lights
 from ..core.errors import CaptureError
-from ..core.files import named_by, read_json, rounded, write_json
+from ..core.system.files import named_by, read_json, rounded, write_json
 from . import cameras
-from .capture_import import add_light
+from .capture.importer import add_light
 from .objects import depsgraph_of, matrix_of, view_layer_of
 from .paths import absolute
 

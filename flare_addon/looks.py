@@ -12,7 +12,8 @@ from ..core.errors import CaptureError, FlareFileError
 from ..core.look import Edit, Look, LookEdits, PlaneGaussians, read
 from ..core.look.look import Query
 from ..core.look.shot import PlacedLight, evaluate
-from . import cameras, curves, occlusion, wires
+from . import cameras, fcurves, occlusion
+from .compositor import drivers
 from .lights import name_of, of_scene, place_of, stands
 from .objects import depsgraph_of, matrix_of
 from .paths import absolute, stored
@@ -84,10 +85,10 @@ def use(scene: Any, path: Path | str) -> Look:
 def remove(scene: Any, number: int) -> None:
     """Take a flare out of the scene. Those after it keep their animation, and their wires to the compositor; its own
     layer is left there as it was baked."""
-    gains = wires.wired(scene)
-    curves.take_out(scene.fit_flare.lights, "fit_flare.lights", number)
+    gains = drivers.wired(scene)
+    fcurves.take_out(scene.fit_flare.lights, "fit_flare.lights", number)
     if gains:
-        wires.wire(scene, {layer: one - (one > number) for layer, one in gains.items() if one != number})
+        drivers.wire(scene, {layer: one - (one > number) for layer, one in gains.items() if one != number})
 
 
 def _is_of(look: Look, state: Any, objects: dict[str, Any], depsgraph: Any) -> bool:
@@ -129,7 +130,7 @@ def _elements(item: Any, light: Any) -> None:
     wanted = {element.name: element.kind for element in light.elements}
     for index in reversed(range(len(item.elements))):
         if item.elements[index].name not in wanted:
-            curves.take_out(item.elements, f"{item.path_from_id()}.elements", index)
+            fcurves.take_out(item.elements, f"{item.path_from_id()}.elements", index)
     there = {element.name for element in item.elements}
     for name, kind in wanted.items():
         if name not in there:

@@ -8,7 +8,7 @@ from typing import Any, Literal
 import bpy
 
 from ..core.errors import CaptureError
-from . import curves
+from . import fcurves
 
 _PLACING = ("location", "rotation_", "scale", "delta_")  # what begins the names of properties that place an object
 
@@ -33,7 +33,7 @@ def _is_moved(thing: Any) -> bool:
     """Whether keys or drivers move an object: a lamp that blinks by them stands still."""
     data = thing.animation_data
     return data is not None and (bool(data.nla_tracks) or any(
-        curve.data_path.startswith(_PLACING) for some in (*curves.of(thing), data.drivers) for curve in some))
+        curve.data_path.startswith(_PLACING) for some in (*fcurves.of(thing), data.drivers) for curve in some))
 
 
 def _is_off(thing: Any, layer: Any) -> bool:

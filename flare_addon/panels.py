@@ -10,9 +10,10 @@ from typing import Any
 import bpy
 
 from ..core.capture import REMOVED
+from ..core.conventions.run_files import FLARE
 from ..core.errors import FitFlareError
-from ..core.run_files import FLARE
-from . import engine, fits, flare_node, jobs, library, lights, looks, overlay, shots, wires
+from . import engine, fits, jobs, library, lights, looks, overlay, shots
+from .compositor import drivers, flare_node
 from .layouts import draw_progress, lines
 from .paths import is_folder
 
@@ -339,10 +340,10 @@ class FITFLARE_PT_bake(_Part, bpy.types.Panel):
         box.operator("fit_flare.set_up_baked", icon="NODE_COMPOSITING")
         if node is not None and node.node_tree is not None:
             sliders = [node.inputs[name] for name in ("Intensity", "Tint") if name in node.inputs]  # not renamed ones
-            drivers = wires.drivers(scene)
-            if not wires.complete(scene):
+            slider_drivers = drivers.drivers(scene)
+            if not drivers.complete(scene):
                 lines(box, "Some sliders of the panel Look act on it no longer: set it up again.", "ERROR")
-            elif drivers or any(socket.is_linked for socket in sliders if socket.name == "Intensity"):
+            elif slider_drivers or any(socket.is_linked for socket in sliders if socket.name == "Intensity"):
                 lines(box, "Set up: the sliders of the panel Look act on it.", "CHECKMARK")
             else:
                 column = box.column()

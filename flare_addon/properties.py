@@ -23,7 +23,7 @@ from bpy.props import (
 )
 
 from ..core.choices import ITERATIONS, Mode, Preset
-from ..core.exposures import LEAST
+from ..core.conventions.exposures import LEAST
 from ..core.look import Edit
 
 # From 4.5 on a path that may be relative to the .blend has to say so; before, the word is unknown.
@@ -59,7 +59,7 @@ def redraw(_self: Any = None, _context: Any = None) -> None:
 
 def _footage(self: Any, _context: Any) -> None:
     """Show the frames as filmed or without flare behind the cameras."""
-    from .capture_import import show_footage
+    from .capture.importer import show_footage
 
     show_footage(self.id_data, self.footage)
 

@@ -12,13 +12,13 @@ from uuid import uuid4
 import bpy
 
 from ..core.bake import bake as bakes
-from ..core.bake.frames import layers_file
 from ..core.bake.layers import layer_names
+from ..core.conventions.frame_numbers import layers_file
+from ..core.conventions.run_files import FLARE, SCENE
 from ..core.errors import CaptureError, FrameError, RunError, SettingsError
-from ..core.files import digest_of, remove_file, write_json
 from ..core.look import Edit, LookEdits
 from ..core.look.shot import Shot, ShotFrame
-from ..core.run_files import FLARE, SCENE
+from ..core.system.files import digest_of, remove_file, write_json
 from . import cameras, engine, fits, jobs, library, looks
 from .images import read_again
 from .jobs import Job

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from ..core.errors import Cancelled, EngineError, FitFlareError, SettingsError
-from ..core.processes import MISUSED, STOPPED, own_group
+from ..core.system.processes import MISUSED, STOPPED, own_group
 
 PATIENCE_S = 60.0  # for a stopped process to write what it must
 POLL_S = 0.2

@@ -17,8 +17,8 @@ from collections.abc import Iterator, Sequence
 from typing import Any, NoReturn, TextIO
 
 from ..core.errors import Cancelled, EngineError, FitFlareError, SettingsError, is_out_of_memory, refusal
-from ..core.processes import DONE, FAILED, MISUSED, STOPPED, WINDOWS
-from ..core.progress import JsonProgress, OpenJdProgress, Progress, TerminalProgress, flush_or_drop, stoppable
+from ..core.system.processes import DONE, FAILED, MISUSED, STOPPED, WINDOWS
+from ..core.system.progress import JsonProgress, OpenJdProgress, Progress, TerminalProgress, flush_or_drop, stoppable
 from . import hand_off
 from .command import AfterAStop, Command, Step
 from .commands import COMMANDS

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from ..core.errors import SettingsError
-from ..core.progress import Progress
+from ..core.system.progress import Progress
 from ..core.typed import MOST_SEED
 
 Side = Literal["engine", "blender"]

@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 
-from ..core.bake.frames import Frame, absent, chosen
-from ..core.progress import Progress
+from ..core.conventions.frame_numbers import Frame, absent, chosen
+from ..core.system.progress import Progress
 
 
 def add_option(parser: argparse.ArgumentParser,

@@ -20,8 +20,8 @@ from types import FrameType
 from typing import Any
 
 from ..core.errors import Cancelled, EngineError
-from ..core.processes import DONE, WINDOWS, environment, python_at
-from ..core.progress import Progress, is_hangup, stop_signals
+from ..core.system.processes import DONE, WINDOWS, environment, python_at
+from ..core.system.progress import Progress, is_hangup, stop_signals
 from .child import Child, joint_failure
 from .command import Side
 

@@ -13,8 +13,8 @@ import sys
 from collections import deque
 from collections.abc import Sequence
 
-from ..core.processes import DONE, cores, environment
-from ..core.progress import STOP_FILE, Progress
+from ..core.system.processes import DONE, cores, environment
+from ..core.system.progress import STOP_FILE, Progress
 from . import hand_off
 from .child import Child, Event, Inbox, joint_failure, next_event
 from .command import from_1

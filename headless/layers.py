@@ -8,9 +8,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..core.bake.frames import Frame
+from ..core.conventions.frame_numbers import Frame
 from ..core.errors import SettingsError
-from ..core.progress import Progress
+from ..core.system.progress import Progress
 
 if TYPE_CHECKING:
     from ..core.bake.bake import BakeSettings

@@ -3,7 +3,7 @@
 
 The add-on runs it with Blender's own Python; it needs nothing but the standard library. The packages are those of
 the group "engine" in pyproject.toml, at the versions of constraints.txt. Events go to standard output, one JSON
-object a line (core/progress.py). A folder that a stopped set-up left is made anew.
+object a line (core/system/progress.py). A folder that a stopped set-up left is made anew.
 """
 from __future__ import annotations
 
@@ -80,8 +80,8 @@ def run(command: list[str]) -> str:
 
 @contextlib.contextmanager
 def _ended_by_file(process: subprocess.Popen[str]) -> Iterator[None]:
-    """The process ends when the file that FIT_FLARE_STOP names is there (core/progress.py), and KeyboardInterrupt is
-    raised: on Windows the panel has no signal for it."""
+    """End the process when the file that FIT_FLARE_STOP names is there (core/system/progress.py), and raise
+    KeyboardInterrupt: on Windows the panel has no signal for it."""
     named, ended = os.environ.get("FIT_FLARE_STOP"), threading.Event()
     if not named:
         yield
@@ -130,7 +130,7 @@ def base() -> str | None:
 
 def cleared(folder: Path) -> bool:
     """Whether the folder is gone: as a whole, since nothing of an old engine may be left in a new one. It stays where
-    Windows has a file of it in use for long. (core/files.py has the like, which may not be imported here.)"""
+    Windows has a file of it in use for long. (core/system/files.py has the like, which may not be imported here.)"""
     for left in folder.parent.glob(f"{glob.escape(folder.name)}.old-*"):  # what was in use when it was removed
         shutil.rmtree(left, ignore_errors=True)
     old = folder.with_name(f"{folder.name}.old-{os.getpid()}")

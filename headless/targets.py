@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..core.errors import CaptureError, RunError, SettingsError
-from ..core.pictures import SUFFIXES, no_picture, pictures_in
+from ..core.images.listing import SUFFIXES, pictures_in
+from ..core.images.unsupported import unsupported_file
 
 if TYPE_CHECKING:
     from ..core.capture.camera import Floats
@@ -43,13 +44,13 @@ def shot_path(words: argparse.Namespace) -> Path:
 
 def _kind(target: Path) -> str:
     """Of OPTIONS. FrameError for a file of no kind of those."""
-    from ..core.run_files import CONFIG
+    from ..core.conventions.run_files import CONFIG
 
     suffix = target.suffix.lower()
     if suffix in SUFFIXES:
         return "picture"
     if target.is_file() and suffix not in OPTIONS:
-        raise no_picture(target)
+        raise unsupported_file(target)
     return suffix if suffix in OPTIONS else "run" if (target / CONFIG).is_file() else "capture"
 
 
@@ -64,8 +65,8 @@ def check_options(words: argparse.Namespace, kind: str) -> None:
 def source(words: argparse.Namespace) -> tuple[Path, list[Floats] | None]:
     """The .flare, and the poses of its training views where they can be had."""
     from ..core.capture import Capture
+    from ..core.conventions.run_files import FLARE
     from ..core.fit.run import Run
-    from ..core.run_files import FLARE
 
     capture, holdout = words.capture, None
     flare = words.flare
@@ -83,14 +84,14 @@ def source(words: argparse.Namespace) -> tuple[Path, list[Floats] | None]:
 
 def target_of(words: argparse.Namespace, flare: Path, training: list[Floats] | None = None) -> Target:
     """The target, by what --to names. training: poses, for a .flare that does not tell."""
-    from ..core.bake.frames import Frame, chosen
     from ..core.capture import Capture
+    from ..core.conventions.frame_numbers import Frame, chosen
+    from ..core.conventions.run_files import SCENE
     from ..core.fit.run import Run
     from ..core.lights.detection import Detector
     from ..core.lights.exposure import Exposure
     from ..core.look import read
     from ..core.look.shot import Shot
-    from ..core.run_files import SCENE
     from ..core.transfer.query import seen_by
     from ..core.transfer.sources import parsed
     from ..core.transfer.target import of_capture, of_pictures, of_shot

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from typing import NoReturn
 
 from core.errors import FitFlareError, refusal
-from core.progress import Progress, TerminalProgress, stoppable
+from core.system.progress import Progress, TerminalProgress, stoppable
 
 
 def run(work: Callable[[Progress], None]) -> int:

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from core.files import atomic_path
-from core.pictures import srgb_from_linear
+from core.colour.srgb import srgb_from_linear
+from core.system.files import atomic_path
 
 Pixels = NDArray[np.float32]
 

@@ -22,11 +22,13 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from core.capture import LIGHTS, Capture
 from core.capture.colmap import Observed, write_model
 from core.capture.lens import Lens
-from core.files import write_json
+from core.colour.srgb import linear_from_srgb, srgb_from_linear
 from core.fit import metering
 from core.fit.frames import Frames
-from core.pictures import linear_from_srgb, read_picture, srgb_from_linear, write_png
-from core.progress import Progress
+from core.images.read import read_picture
+from core.images.write import write_png
+from core.system.files import write_json
+from core.system.progress import Progress
 from sample_scenes.command import run
 from sample_scenes.flares import LOOKS, Look, render_flare
 from sample_scenes.layers import FLARE_LEVEL, write_layer

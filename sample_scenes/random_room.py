@@ -12,8 +12,9 @@ from typing import Any
 import bpy
 import numpy as np
 
+from core.colour.srgb import Pixels
 from core.errors import FrameError
-from core.pictures import Pixels, read_exr
+from core.images.exr import read_exr
 
 from . import shots, stage
 from .command import silent

@@ -17,9 +17,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from core.capture import LIGHTS
 from core.errors import CaptureError
-from core.files import read_json, write_json
-from core.pictures import read_picture
-from core.progress import Progress
+from core.images.read import read_picture
+from core.system.files import read_json, write_json
+from core.system.progress import Progress
 from sample_scenes.command import leave, run, silent
 from sample_scenes.description import SceneDescription, camera_positions
 from sample_scenes.flares import LOOKS, render_flare

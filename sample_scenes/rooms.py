@@ -19,10 +19,11 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from core.colour.srgb import Pixels
 from core.errors import SettingsError
-from core.pictures import Pixels, write_png
-from core.progress import Progress
-from core.removal.backgrounds import MAPS, PHOTOS, pictures_of
+from core.images.write import write_png
+from core.removal.training.backgrounds import MAPS, PHOTOS, pictures_of
+from core.system.progress import Progress
 from sample_scenes.command import leave, run
 from sample_scenes.random_room import Room
 

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from core.files import atomic_path
-from core.pictures import read_picture
+from core.images.read import read_picture
+from core.system.files import atomic_path
 
 
 def empty_flare(frame: NDArray[np.float32], scene: NDArray[np.float32]) -> float:

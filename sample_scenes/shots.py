@@ -12,7 +12,7 @@ import numpy as np
 from mathutils import Matrix, Vector
 from numpy.typing import NDArray
 
-from core.pictures import read_picture
+from core.images.read import read_picture
 
 from .description import Array, LightSource, Pinhole
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from core.progress import Progress
+from core.system.progress import Progress
 
 from .description import Pinhole, SceneDescription
 from .layers import FRAME_SUFFIX

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from core.numeric_environment import prepare_for_numpy_and_torch
+from core.system.thread_environment import prepare_for_numpy_and_torch
 
 prepare_for_numpy_and_torch()
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as shells start what runs in the background

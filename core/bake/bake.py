@@ -16,14 +16,14 @@ from typing import Any, Protocol
 
 from ..capture.camera import Camera
 from ..colour import ColourSpace, colour_space
+from ..conventions.frame_numbers import Frame
 from ..errors import FrameError, RunError
-from ..files import inside, locked, read_json, remove_file, write_json
+from ..images.exr import exr_is_cut_off, window_of
 from ..look import KeyedEdits, LookEdits
-from ..pictures import exr_is_cut_off, window_of
-from ..progress import Progress
+from ..system.files import inside, locked, read_json, remove_file, write_json
+from ..system.progress import Progress
 from ..typed import value_of
 from .exr import read_description, write_layers
-from .frames import Frame
 from .layers import FrameLayers, Rendering, layer_names, layers_of
 
 RECORD = "bake.json"

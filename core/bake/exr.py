@@ -14,8 +14,10 @@ from pathlib import Path
 from typing import Any
 
 from ..colour import REC_709, Chromaticities
+from ..colour.srgb import Pixels
 from ..errors import FrameError
-from ..pictures import Pixels, exr_header, read_exr, window_of, write_exr
+from ..images.exr import read_exr, read_exr_header, window_of
+from ..images.write import write_exr
 from .layers import FrameLayers, layer_names
 
 ATTRIBUTE = "fitFlare"
@@ -44,7 +46,7 @@ def write_layers(path: Path | str, layers: FrameLayers, *, half: bool = True,
 
 def read_description(path: Path | str) -> dict[str, Any]:
     """What `write_layers` noted in the header. Raises FrameError where the file is not one of ours."""
-    text = exr_header(path).get(ATTRIBUTE)
+    text = read_exr_header(path).get(ATTRIBUTE)
     try:
         description = json.loads(text) if text else None
     except (TypeError, ValueError, RecursionError) as problem:

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..errors import FrameError
-from ..pictures import channel_names, exr_is_cut_off, exr_pixel_aspect, picture_size
+from ..images.exr import channel_names, exr_is_cut_off, exr_pixel_aspect
+from ..images.size import picture_size
 
 _NUMBERED = re.compile(r"(.*?)(\d+)\.exr", re.IGNORECASE)
 

@@ -20,8 +20,9 @@ from typing import Any, Protocol
 import numpy as np
 
 from ..colour import ColourSpace
+from ..colour.srgb import Pixels
 from ..errors import SettingsError
-from ..pictures import Pixels, Window
+from ..images.window import DataWindow
 
 FARTHEST = 1e10
 """Depth where there is nothing, as Blender writes it."""
@@ -54,7 +55,7 @@ class FrameLayers:
     scene: Pixels
     flares: Mapping[str, Pixels]
     depth: Pixels
-    window: Window | None = None
+    window: DataWindow | None = None
 
     @property
     def flare(self) -> Pixels:

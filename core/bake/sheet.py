@@ -7,8 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ..pictures import Picture, write_png
-from ..sheets import labelled, side_by_side
+from ..images.contact_sheet import labelled, side_by_side
+from ..images.picture import Picture
+from ..images.write import write_png
 from .layers import FrameLayers
 
 TITLES = ("frame", "composite", "scene", "flare")

@@ -16,15 +16,15 @@ from typing import Any
 import numpy as np
 
 from ..capture.camera import Camera
+from ..conventions.frame_numbers import Frame, layers_file
 from ..fit.rendering import render_scene, splat_look
 from ..fit.run import Run, ViewLayers
 from ..flare.compositing import layers as linear_layers
 from ..flare.visibility import share_seen
 from ..look import LookEdits, read
 from ..look.shot import PlacedLight, Shot, ShotFrame, evaluate
-from ..progress import Progress
+from ..system.progress import Progress
 from .bake import BakeSettings, bake_frames
-from .frames import Frame, layers_file
 from .layers import FrameLayers
 
 

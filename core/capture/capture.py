@@ -26,9 +26,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import CaptureError, FrameError
-from ..files import inside, read_json
-from ..pictures import SUFFIXES, Picture, are_one_shape, no_picture, picture_size, pictures_below, read_picture
-from ..video import is_video
+from ..images.listing import SUFFIXES, pictures_below
+from ..images.picture import Picture, are_one_shape
+from ..images.read import read_picture
+from ..images.size import picture_size
+from ..images.unsupported import unsupported_file
+from ..images.video import is_video
+from ..system.files import inside, read_json
 from .camera import Camera, Floats
 from .colmap import PointCloud, Posed, find_model, read_model
 from .lens import PINHOLES, Lens, straightened
@@ -396,7 +400,7 @@ def _checked_size(path: Path, lens: Lens) -> tuple[int, int]:
         raise FrameError(f"{path} is {size[0]} x {size[1]} pixels and its camera {lens.width} x {lens.height}, "
                          "which is another shape; use the frames that were solved.")
     if path.suffix.lower() not in SUFFIXES:
-        raise no_picture(path)
+        raise unsupported_file(path)
     return size
 
 

@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import CaptureError
-from ..files import WRITTEN_BY_HAND, atomic_path
-from ..pictures import LARGEST
+from ..images.size import MAX_PIXELS
+from ..system.files import WRITTEN_BY_HAND, atomic_path
 from .camera import Floats, quaternion_from_rotation, rotation_from_quaternion
 from .lens import MODELS, NAMES, Lens
 
@@ -142,7 +142,7 @@ def write_model(folder: Path, frames: Sequence[Observed], cloud: PointCloud) -> 
 
 def check_lens(lens: Lens, where: str) -> Lens:
     """`lens`, or CaptureError where its numbers cannot be a camera's."""
-    if lens.width <= 0 or lens.height <= 0 or lens.width * lens.height > LARGEST:
+    if lens.width <= 0 or lens.height <= 0 or lens.width * lens.height > MAX_PIXELS:
         raise CaptureError(f"{where} a size of {lens.width} x {lens.height} pixels makes no sense; solve the cameras "
                            "again.")
     if not all(map(math.isfinite, lens.params)):

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import CaptureError
-from ..pictures import Picture
+from ..images.picture import Picture
 from .camera import Camera, Floats
 
 # COLMAP's number for each model, and its parameters in COLMAP's order.

@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 
 from ..errors import CaptureError
-from ..files import inside, read_json
-from ..pictures import SUFFIXES, picture_size
+from ..images.listing import SUFFIXES
+from ..images.size import picture_size
+from ..system.files import inside, read_json
 from .camera import Floats, is_rotation
 from .colmap import SENSELESS, PointCloud, Posed, check_lens, find_model, read_model
 from .lens import Lens

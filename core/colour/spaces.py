@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import SettingsError
-from ..pictures import Pixels, linear_from_srgb, srgb_from_linear
+from .srgb import Pixels, linear_from_srgb, srgb_from_linear
 
 Chromaticities = tuple[float, float, float, float, float, float, float, float]
 """x and y of red, green, blue and white, as OpenEXR's attribute has them."""

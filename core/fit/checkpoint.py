@@ -14,8 +14,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .. import tensors as on_disk
 from ..errors import RunError
+from ..system import tensor_files as on_disk
 
 VERSION = 1
 _MANY_ROWS = 100_000

@@ -10,10 +10,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..borders import DARKEST, LEAST, Borders, Inside
 from ..capture import Camera, Capture, View
 from ..errors import CaptureError
-from ..pictures import Picture
+from ..images.borders import DARKEST, LEAST, Borders, Inside
+from ..images.picture import Picture
 from ..thinning import thinned
 from .cache import MEMORY, PictureCache
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..capture import LIGHTS, Capture, View
 from ..errors import RunError
-from ..files import content_of
+from ..system.files import content_of
 
 SAME_PLACE = 1e-5
 """Share of the extent within which a light that was given is where it was."""

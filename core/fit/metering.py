@@ -16,9 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..capture import Capture, View
-from ..exposures import LEAST
-from ..pictures import LUMINANCE, holds_floats, linear_from_srgb
-from ..progress import Progress
+from ..colour.srgb import LUMINANCE, linear_from_srgb
+from ..conventions.exposures import LEAST
+from ..images.read import holds_floats
+from ..system.progress import Progress
 from ..thinning import thinned
 from .frames import Frames, colours_at
 from .settings import FitSettings

@@ -9,8 +9,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ..display import encode
-from ..pictures import Picture, write_png
+from ..colour.srgb_torch import encode
+from ..images.picture import Picture
+from ..images.write import write_png
 from .rendering import RenderedView
 
 GAP = 4

@@ -10,7 +10,8 @@ from torch import Tensor
 
 from ..capture import Camera
 from ..choices import Blend, Kernels
-from ..display import decode, encode, exposed
+from ..colour.srgb_torch import decode, encode, exposed
+from ..conventions.pixel_grid import Sampling
 from ..flare.compositing import Layers, joined, layers, splat_flare
 from ..flare.model import FlareModel
 from ..flare.placement import PlaneGaussians
@@ -19,7 +20,6 @@ from ..gaussians import Rendering, Splats
 from ..gaussians.scene import SceneGaussians
 from ..look import Look, LookEdits
 from ..look import PlaneGaussians as LookGaussians
-from ..sampling import Sampling
 
 LEAST_ALPHA = 1e-6  # by which a depth is divided: where nothing is it stays 0
 

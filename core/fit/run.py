@@ -17,18 +17,18 @@ from pathlib import Path
 
 import numpy as np
 
-from .. import exposures
 from ..capture import Camera, Capture
+from ..colour.srgb import Pixels
+from ..conventions import exposures
+from ..conventions.run_files import CAPTURE, CONFIG, FLARE, SCENE
 from ..errors import RunError
-from ..files import digest_of, remove_file, write_json, write_text
 from ..flare import file as flare_file
 from ..flare.file import FlareFile
 from ..gaussians.ply import read_ply
 from ..gaussians.scene import SceneGaussians
 from ..look import Look, LookEdits
 from ..look import read as read_look
-from ..pictures import Pixels
-from ..run_files import CAPTURE, CONFIG, FLARE, SCENE
+from ..system.files import digest_of, remove_file, write_json, write_text
 from ..typed import is_utf8
 from .rendering import RenderedView, render
 from .settings import FitSettings, read_config, write_config

@@ -18,14 +18,14 @@ from typing import Any, Literal
 import numpy as np
 
 from ..choices import BY_PARALLAX, ITERATIONS, LONGER_BY_PARALLAX, Blend, Kernels, Mode, Model, Preset
+from ..colour.srgb import srgb_from_linear
 from ..errors import RunError, SettingsError
-from ..files import WRITTEN_BY_HAND, write_text
 from ..flare.density import DensitySettings
 from ..flare.model import OURS, PAPER
 from ..flare.visibility import VisibilitySettings
 from ..gaussians.densification import ClassicSettings, McmcSettings
 from ..look.look import FORM_BOUNDS, MOST_GAUSSIANS, FlareForm
-from ..pictures import srgb_from_linear
+from ..system.files import WRITTEN_BY_HAND, write_text
 from ..typed import MOST_SEED, WHOLE_DIGITS, Bounds, field_of, table_of
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..capture import Capture, View
 from ..capture.colmap import PointCloud
-from ..display import exposed
+from ..colour.srgb_torch import exposed
 from ..thinning import thinned
 from .frames import Frames, colours_at
 

@@ -19,7 +19,7 @@ from torch.nn import Parameter
 
 from ..capture import Capture, View
 from ..capture.discs import clipped_discs
-from ..display import clipped
+from ..colour.srgb_torch import clipped
 from ..errors import CaptureError, RunError
 from ..flare.compositing import composite
 from ..flare.density import clone_and_prune
@@ -29,18 +29,15 @@ from ..gaussians.densification import Classic, Mcmc, Strategy
 from ..gaussians.loss import l1_ssim
 from ..gaussians.ordering import morton_order
 from ..gaussians.spherical_harmonics import MAX_DEGREE
-from ..progress import Progress
+from ..system.progress import Progress
 from ..thinning import thinned
 from . import metering
-from .beginning import first_flare, first_scene
 from .checkpoint import State
-from .doubts import doubts, moved_lights
 from .frames import Frames, Targets
 from .given import Given
+from .initialise import first_flare, first_scene
 from .optimisers import Optimisers
-from .rendering import render_flare, render_scene
-from .settings import FitSettings
-from .splitting import (
+from .parallax_losses import (
     FOUND_WHOLLY,
     from_below,
     haze,
@@ -49,6 +46,9 @@ from .splitting import (
     times_found,
     towards_estimate,
 )
+from .rendering import render_flare, render_scene
+from .settings import FitSettings
+from .warnings import doubts, moved_lights
 
 CLEAR_EVERY = 50
 """Iterations between two looks at how much of the lights the scene leaves (`visibility.clear_shares`)."""

@@ -19,11 +19,11 @@ import torch
 from torch import Tensor
 
 from ..choices import Blend, Kernels
-from ..display import decode, decoded_with_slope, encoded_with_slope
-from ..exposures import brightness
+from ..colour.srgb_torch import decode, decoded_with_slope, encoded_with_slope
+from ..conventions.exposures import brightness
+from ..conventions.pixel_grid import Sampling
 from ..gaussians import Splats, over, splat
 from ..gaussians.rasterizer import Resolution
-from ..sampling import Sampling
 from . import placement
 from .placement import PlaneGaussians
 

@@ -16,11 +16,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .. import tensors as on_disk
 from ..choices import Blend
+from ..conventions.pixel_grid import Sampling
 from ..errors import FlareFileError
 from ..look.look import KEY, VERSION, FlareForm, TrainedCamera, checked
-from ..sampling import Sampling
+from ..system import tensor_files as on_disk
 from .deformation import QueryRange
 from .encoding import TABLE
 from .model import FlareModel, LightFlare

@@ -14,10 +14,10 @@ from typing import NamedTuple, cast
 import torch
 from torch import Tensor, nn
 
-from ..files import rounded
 from ..gaussians.spherical_harmonics import colours
 from ..look.look import FlareForm
 from ..look.plane import PLANE_DEPTH
+from ..system.files import rounded
 from . import placement
 from .deformation import DeformationNetwork, QueryRange
 from .placement import PlaneGaussians

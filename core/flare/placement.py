@@ -14,9 +14,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from ..conventions.pixel_grid import Sampling, dilation
 from ..gaussians.rendering import STRENGTH2_MIN
 from ..look.plane import ARC_SOFT, PLANE_DEPTH
-from ..sampling import Sampling, dilation
 
 
 class PlaneGaussians(NamedTuple):

@@ -18,9 +18,9 @@ import torch
 from numpy.typing import NDArray
 
 from .. import ply
+from ..conventions.pixel_grid import Sampling
 from ..errors import FlareFileError
-from ..files import atomic_path
-from ..sampling import Sampling
+from ..system.files import atomic_path
 from .compressed import is_compressed, read_compressed
 from .rendering import NEAR
 from .scene import COEFFICIENTS, SceneGaussians

@@ -7,8 +7,8 @@ from typing import Literal
 from torch import Tensor
 
 from ..choices import Blend, Kernels
+from ..conventions.pixel_grid import DILATION
 from ..errors import SettingsError
-from ..sampling import DILATION
 from .kernels import choose
 from .mixed import splat_mixed
 from .rendering import NEAR, Rendering, Splats, levelled

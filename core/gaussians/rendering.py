@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from ..choices import Blend
-from ..splatting import ALPHA_MIN as ALPHA_MIN
-from ..splatting import OPACITY_MAX as OPACITY_MAX
-from ..splatting import PROFILE_MIN as PROFILE_MIN
+from ..conventions.splatting import ALPHA_MIN as ALPHA_MIN
+from ..conventions.splatting import OPACITY_MAX as OPACITY_MAX
+from ..conventions.splatting import PROFILE_MIN as PROFILE_MIN
 
 TRANSMITTANCE_MIN = 1e-4
 """A pixel is finished once its transmittance has fallen below this: later Gaussians do not count."""

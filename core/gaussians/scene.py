@@ -8,8 +8,8 @@ from torch import Tensor, nn
 
 from ..capture import Camera, PointCloud
 from ..choices import Kernels
+from ..conventions.pixel_grid import Sampling, dilation
 from ..errors import SettingsError
-from ..sampling import Sampling, dilation
 from . import spherical_harmonics
 from .ordering import nearest_distances
 from .rasterizer import rasterization

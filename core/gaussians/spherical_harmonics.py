@@ -9,8 +9,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from ..conventions.splatting import C0, C1, C2, C3
 from ..errors import SettingsError
-from ..splatting import C0, C1, C2, C3
 
 MAX_DEGREE = 3
 

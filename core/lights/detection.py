@@ -9,7 +9,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ..pictures import Picture
+from ..images.picture import Picture
 
 Mask = NDArray[np.bool_]
 

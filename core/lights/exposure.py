@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..pictures import Picture
+from ..images.picture import Picture
 from .detection import Detection, measured
 
 THIN = 0.55    # of the thickest part's radius; thinner parts are cut off

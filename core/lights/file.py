@@ -22,7 +22,7 @@ from ..capture import read_lights
 from ..capture.camera import Camera
 from ..capture.capture import is_place
 from ..errors import CaptureError
-from ..files import named_by, read_json, rounded, write_json
+from ..system.files import named_by, read_json, rounded, write_json
 from .gather import FoundLight
 
 NEAR = 0.02  # of the frame's diagonal: projections nearer than this are one light

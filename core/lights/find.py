@@ -12,8 +12,8 @@ from numpy.typing import ArrayLike
 
 from ..capture import LIGHTS, Capture
 from ..errors import SettingsError
-from ..files import write_json
-from ..progress import Progress
+from ..system.files import write_json
+from ..system.progress import Progress
 from .detection import Detection, Detector
 from .file import write_lights
 from .gather import FAR, FoundLight, GatherSettings, gather

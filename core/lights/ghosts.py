@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..capture.camera import Camera
-from ..pictures import Picture
-from ..progress import Progress
+from ..images.picture import Picture
+from ..system.progress import Progress
 from .detection import Detection
 from .gather import FoundLight, GatherSettings, gather
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import EngineError
-from ..pictures import Picture
+from ..images.picture import Picture
 from .detection import Detection, Mask, measured
 
 BOXES, MASKS = "IDEA-Research/grounding-dino-base", "facebook/sam2.1-hiera-small"

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..capture import Capture
-from ..files import remove_file
-from ..pictures import write_png
+from ..images.write import write_png
+from ..system.files import remove_file
 from .detection import Detection
 from .gather import FoundLight
 

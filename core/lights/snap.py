@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..capture.camera import Camera, Floats
 from ..capture.discs import WHITE
-from ..pictures import linear_from_srgb
+from ..colour.srgb import linear_from_srgb
 
 WINDOWS = (0.12, 0.08, 0.05, 0.03, 0.02, 0.013)
 """Deviations of the windows, of the frame's width: from as far as a light may be off. Peaks nearby are tried first, so

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FlareFileError
-from ..files import atomic_path
+from ..system.files import atomic_path
 
 Arrays = dict[str, NDArray[Any]]
 

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..choices import Blend
-from ..sampling import Sampling
-from ..splatting import ALPHA_MIN, PROFILE_MIN
-from ..splatting import OPACITY_MAX as OPACITY_MAX
+from ..conventions.pixel_grid import Sampling
+from ..conventions.splatting import ALPHA_MIN, PROFILE_MIN
+from ..conventions.splatting import OPACITY_MAX as OPACITY_MAX
 from .plane import Floats, PlaneGaussians, arc_level, joined, pixels, strengths, ways
 
 

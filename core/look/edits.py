@@ -29,8 +29,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..choices import Blend
+from ..colour.srgb import LUMINANCE, linear_from_srgb, srgb_from_linear
 from ..errors import SettingsError
-from ..pictures import LUMINANCE, linear_from_srgb, srgb_from_linear
 from .elements import Element
 from .plane import Floats, PlaneGaussians, joined
 

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import SettingsError
-from ..files import WRITTEN_BY_HAND, read_json, write_json
+from ..system.files import WRITTEN_BY_HAND, read_json, write_json
 from .edits import LookEdits
 
 

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..choices import Blend
+from ..conventions.pixel_grid import Sampling
 from ..errors import FlareFileError
-from ..sampling import Sampling
 from ..typed import Bounds, table_of
 from . import container, elements
 from .edits import LookEdits, edited

@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..choices import Blend
-from ..exposures import brightness
-from ..pictures import LUMINANCE
-from ..sampling import Sampling, dilation
-from ..splatting import C0, C1, C2, C3
+from ..colour.srgb import LUMINANCE
+from ..conventions.exposures import brightness
+from ..conventions.pixel_grid import Sampling, dilation
+from ..conventions.splatting import C0, C1, C2, C3
 
 Floats = NDArray[np.float32]
 

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from ..capture.camera import Camera
 from ..errors import SettingsError
-from ..files import plain_name, read_json, write_json
+from ..system.files import plain_name, read_json, write_json
 from .edits import LookEdits
 from .look import Look, Query, ViewOfLight, asked
 from .plane import PlaneGaussians

@@ -17,10 +17,11 @@ from typing import Any, Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ..borders import Inside
 from ..capture import Camera, Capture, View
-from ..pictures import Picture, srgb_from_linear
-from ..progress import Progress
+from ..colour.srgb import srgb_from_linear
+from ..images.borders import Inside
+from ..images.picture import Picture
+from ..system.progress import Progress
 from .pictures import Perceptual, flip, psnr, relative_l2, ssim
 
 Array = NDArray[np.float32]

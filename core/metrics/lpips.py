@@ -15,8 +15,8 @@ import torch
 import torch.nn.functional as F  # noqa: N812 - its name everywhere
 from torch import Tensor
 
+from ..colour.srgb import Pixels
 from ..errors import SettingsError
-from ..pictures import Pixels
 
 _LAYERS = ((0, 4, 2, False), (3, 1, 2, True), (6, 1, 1, True), (8, 1, 1, False), (10, 1, 1, False))
 """Index in AlexNet's features, stride, padding, whether a 3x3 maximum of stride 2 comes first."""

@@ -19,14 +19,17 @@ from typing import Any
 
 import numpy as np
 
+from ..colour.srgb import Pixels
 from ..errors import FrameError, SettingsError
+from ..images.contact_sheet import labelled, side_by_side
+from ..images.listing import pictures_in
+from ..images.picture import are_one_shape
+from ..images.read import read_picture
 from ..metrics.evaluation import cell
 from ..metrics.pictures import Perceptual, flip, psnr, ssim
-from ..pictures import Pixels, are_one_shape, pictures_in, read_picture
-from ..progress import Progress
-from ..sheets import labelled, side_by_side
-from .backgrounds import Backgrounds, kept_for_test
+from ..system.progress import Progress
 from .synthesis.prescription import Prescription, built_in
+from .training.backgrounds import Backgrounds, kept_for_test
 
 INPUTS = ("input", "flare", "blend")
 TRUTHS = ("gt", "target", "clean", "scene")
@@ -215,9 +218,9 @@ def synthetic(seed: int, count: int, backgrounds: Backgrounds, lenses: Sequence[
               size: tuple[int, int]) -> list[Case]:
     """`count` cases of every class of flare, a function of the seed: the test set that needs no data but clean
     pictures. Frames are 8 bit codes."""
-    from .bank import OneFlare
-    from .pairs import pair
-    from .synthesis.layers import CLASSES
+    from .synthesis.flare import CLASSES
+    from .training.flare_bank import OneFlare
+    from .training.pairs import pair
 
     def reader(index: int, number: int) -> Callable[[], tuple[Pixels, Pixels, None]]:
         def read() -> tuple[Pixels, Pixels, None]:

@@ -13,14 +13,14 @@ from numpy.typing import NDArray
 
 from ..capture.camera import Camera, quaternion_from_rotation
 from ..choices import Blend
-from ..files import write_json
+from ..conventions.pixel_grid import DILATION, Sampling, dilation
+from ..conventions.splatting import OPACITY_MAX
 from ..gaussians.ply import write_ply
 from ..gaussians.scene import COEFFICIENTS, SceneGaussians
 from ..gaussians.spherical_harmonics import dc_from_colour
 from ..look import Element, LightLook, Look, LookEdits, PlaneGaussians, ViewOfLight
 from ..look.plane import PLANE_DEPTH, joined
-from ..sampling import DILATION, Sampling, dilation
-from ..splatting import OPACITY_MAX
+from ..system.files import write_json
 
 PRESET_VERSION = 1
 _APART = 1e-5  # share of the depth between one Gaussian and the next, so that a sort by depth keeps their order

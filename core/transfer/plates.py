@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..colour import ColourSpace, colour_space
-from ..pictures import Pixels
-from ..removal.plates import Plate, read_plate, write_plate
+from ..colour.srgb import Pixels
+from ..images.plates import Plate, read_plate, write_plate
 
 AUTO = "auto"
 

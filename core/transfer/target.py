@@ -14,17 +14,20 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..bake.frames import Frame, layers_file, numbered, plates_by_number
 from ..capture import Camera, Capture, Light, View, read_lights
 from ..colour import ColourSpace
+from ..conventions.frame_numbers import Frame, layers_file, numbered, plates_by_number
 from ..errors import CaptureError, SettingsError
-from ..files import content_of
 from ..gaussians.ply import read_ply
 from ..gaussians.scene import SceneGaussians
+from ..images.exr import window_of
+from ..images.listing import pictures_in
+from ..images.picture import Picture, are_one_shape
+from ..images.read import read_picture
 from ..lights.detection import Detector
 from ..look import Look
 from ..look.shot import PlacedLight, Shot, ShotFrame
-from ..pictures import Picture, are_one_shape, pictures_in, read_picture, window_of
+from ..system.files import content_of
 from .query import Seen
 from .sources import assigned
 

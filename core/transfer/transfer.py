@@ -18,23 +18,25 @@ import torch
 from numpy.typing import ArrayLike
 
 from ..bake.bake import BakeSettings, bake_frames
-from ..bake.frames import Frame
 from ..bake.layers import FrameLayers
 from ..capture import Camera
 from ..choices import Follows
 from ..colour import ColourSpace, colour_space
-from ..display import decode, encode
+from ..colour.srgb import Pixels
+from ..colour.srgb_torch import decode, encode
+from ..conventions.frame_numbers import Frame
 from ..errors import SettingsError
-from ..files import check_apart
 from ..fit.rendering import render_scene, splat_look
 from ..fit.run import ViewLayers
 from ..flare.compositing import layers as linear_layers
 from ..flare.visibility import VisibilitySettings, share_seen
 from ..gaussians import Splats
+from ..images.exr import window_of
+from ..images.picture import Picture
 from ..look import LookEdits, ViewOfLight, read
 from ..look.shot import PlacedLight
-from ..pictures import Picture, Pixels, window_of
-from ..progress import Progress
+from ..system.files import check_apart
+from ..system.progress import Progress
 from . import query as queries
 from .plates import AUTO, ColouredPlate
 from .target import Target, TargetFrame, background

@@ -9,7 +9,8 @@ import bpy
 
 from ...core.bake.folder import LayerFolder
 from ...core.errors import CaptureError
-from .. import compositor, compositor_warnings, engine, flare_node, jobs, rendering, shots, wires
+from .. import engine, jobs, render_settings, shots
+from ..compositor import drivers, flare_node, setup, warnings
 from ..paths import absolute, is_folder
 from ..reports import NO_CAMERA, NO_FLARE, Action, reported
 
@@ -75,11 +76,11 @@ def set_up(operator: Any, scene: Any, folder: str, *, keep_image: bool, plate: b
     """Nodes for the layers in a folder, over the baked scene, what the compositor shows now (`keep_image`) or the
     footage behind the camera (`plate`); `match` gives the scene their frames and size. Raises FrameError."""
     layers = LayerFolder.open(shots.folder_of_camera(absolute(folder), scene.camera))
-    compositor.set_up(scene, layers, keep_image=keep_image, plate=compositor.plate_of(scene) if plate else None)
+    setup.set_up(scene, layers, keep_image=keep_image, plate=setup.plate_of(scene) if plate else None)
     if match:
-        rendering.match_scene(scene, layers, layers.size())
+        render_settings.match_scene(scene, layers, layers.size())
     live = "; Intensity and Tint of the panel act on it" if wire(scene, layers) else ""
-    for told in compositor_warnings.warnings(scene, layers, bool(live)):
+    for told in warnings.warnings(scene, layers, bool(live)):
         operator.report({"WARNING"}, told)
     operator.report({"INFO"}, f"{len(layers.files)} frames of layers set up{live}")
 
@@ -129,7 +130,7 @@ def wire(scene: Any, layers: LayerFolder) -> bool:
     gains = shots.live_layers(scene.fit_flare, layers.folder)
     if gains is None:
         return False
-    wires.wire(scene, gains)
+    drivers.wire(scene, gains)
     return True
 
 
@@ -147,7 +148,7 @@ class FITFLARE_OT_remove_compositor(Action, bpy.types.Operator):
         return ""
 
     def act(self, context: bpy.types.Context) -> None:
-        compositor.remove(context.scene)
+        setup.remove(context.scene)
 
 
 class FITFLARE_OT_set_up_baked(Action, bpy.types.Operator):

@@ -6,8 +6,9 @@ from pathlib import Path
 
 import bpy
 
-from .. import capture_export, fits
-from ..capture_import import ImportSettings, import_capture
+from .. import fits
+from ..capture import exporter
+from ..capture.importer import ImportSettings, import_capture
 from ..reports import NO_CAMERA, Action
 
 
@@ -90,7 +91,7 @@ class FITFLARE_OT_capture_from_camera(Action, bpy.types.Operator):
     def why_not(cls, context: bpy.types.Context) -> str:
         if context.scene.camera is None:
             return NO_CAMERA
-        if capture_export.footage_of(context.scene.camera) is None:
+        if exporter.footage_of(context.scene.camera) is None:
             return "The camera has no background image sequence or movie clip to take the frames from"
         return ""
 
@@ -99,7 +100,7 @@ class FITFLARE_OT_capture_from_camera(Action, bpy.types.Operator):
         return {"RUNNING_MODAL"}
 
     def act(self, context: bpy.types.Context) -> None:
-        count = capture_export.export(context.scene, Path(bpy.path.abspath(self.directory)))
+        count = exporter.export(context.scene, Path(bpy.path.abspath(self.directory)))
         fits.leave_another(context.scene)
         self.report({"INFO"}, f"{count} frames are now a capture in {self.directory}")
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import bpy
 
-from ...core.run_files import LOG, PREVIEW
+from ...core.conventions.run_files import LOG, PREVIEW
 from .. import engine, fits, jobs, shots
 from ..paths import is_file, is_folder
 from ..reports import NO_CAPTURE, Action

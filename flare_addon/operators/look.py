@@ -8,7 +8,8 @@ from typing import Any
 import bpy
 
 from ...core.errors import FitFlareError
-from .. import looks, wires
+from .. import looks
+from ..compositor import drivers
 from ..properties import EDIT_NAMES
 from ..reports import NO_FLARE, Action
 
@@ -93,7 +94,7 @@ class FITFLARE_OT_remove_flare(Action, bpy.types.Operator):
     def execute(self, context: bpy.types.Context) -> set[str]:
         state = context.scene.fit_flare
         name = state.lights[state.light].name
-        if state.light in wires.wired(context.scene).values():
+        if state.light in drivers.wired(context.scene).values():
             self.report({"WARNING"}, f"The layer of {name} stays in the compositor as it was baked; bake again to have "
                         "it go")
         looks.remove(context.scene, state.light)

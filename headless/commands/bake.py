@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from ...core.errors import RunError, SettingsError
-from ...core.progress import Progress
+from ...core.system.progress import Progress
 from .. import frames, jobs, layers, targets
 from ..command import Command, Step
 from . import transfer
@@ -37,7 +37,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     from ...core.bake.bake import bake
-    from ...core.bake.frames import numbered
+    from ...core.conventions.frame_numbers import numbered
     from ...core.fit.run import Run
 
     if words.run.suffix.lower() == ".json":
@@ -97,8 +97,8 @@ def _as_transfer(words: argparse.Namespace) -> argparse.Namespace:
 
 def run_shot(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     """A shot's layers; its edits are in the file."""
-    from ...core.bake.frames import Frame
     from ...core.bake.shot import bake_shot
+    from ...core.conventions.frame_numbers import Frame
     from ...core.look.shot import Shot
 
     if words.edits or words.keyed:

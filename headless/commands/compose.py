@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from ...core.errors import SettingsError
-from ...core.files import patiently
 from ...core.look import LookEdits
-from ...core.progress import Progress
+from ...core.system.files import patiently
+from ...core.system.progress import Progress
 from .. import frames
 from ..command import Command, Step
 
@@ -39,8 +39,9 @@ def frames_of(folder: Path, out: Path, progress: Progress, *, wanted: str | None
     import bpy
 
     from ...core.bake.folder import LayerFolder
-    from ...core.bake.frames import Frame
-    from ...flare_addon import cameras, compositor, rendering
+    from ...core.conventions.frame_numbers import Frame
+    from ...flare_addon import cameras, render_settings
+    from ...flare_addon.compositor import setup
 
     if out.resolve() == folder.resolve():
         raise SettingsError(f"{out} holds the layers; choose another folder for the frames.")
@@ -53,19 +54,19 @@ def frames_of(folder: Path, out: Path, progress: Progress, *, wanted: str | None
 
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
     scene = bpy.context.scene
-    node = compositor.set_up(scene, layers)
-    rendering.match_scene(scene, layers, layers.size())
+    node = setup.set_up(scene, layers)
+    render_settings.match_scene(scene, layers, layers.size())
     render = scene.render
     render.pixel_aspect_x, render.pixel_aspect_y = cameras.pixel_aspect(1, layers.pixel_aspect())
-    for note in (rendering.plain_view(scene), compositor.misread(scene)):
+    for note in (render_settings.plain_view(scene), setup.misread(scene)):
         if note:
             progress.say(note)
     node.inputs["Intensity"].default_value = intensity
     node.inputs["Tint"].default_value = (*colour, 1.0)
     _keep(out.resolve() / BLEND, progress)
-    rendering.save_beside(out.resolve() / BLEND)
+    render_settings.save_beside(out.resolve() / BLEND)
     progress.stage("compose", len(numbers))
-    rendering.render_frames(scene, numbers, lambda number, suffix: out.resolve() / f"frame.{number:04d}{suffix}",
+    render_settings.render_frames(scene, numbers, lambda number, suffix: out.resolve() / f"frame.{number:04d}{suffix}",
                              lambda _number: progress.advance())
     return {"frames": str(out), "blend": str(out / BLEND), "blender": bpy.app.version_string}
 

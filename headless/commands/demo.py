@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any, get_args
 from ...core.capture import LIGHTS, REMOVED
 from ...core.choices import OUR_PRESETS, Mode, Model
 from ...core.errors import CaptureError, RunError
-from ...core.files import atomic_folder
-from ...core.progress import Progress
+from ...core.system.files import atomic_folder
+from ...core.system.progress import Progress
 from ..command import Command, Step
 from . import compose, evaluate, fit
 from .lights import with_lights
@@ -50,8 +50,8 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     """Fit, score, bake, and the contact sheet."""
     from ...core.bake.bake import bake
-    from ...core.bake.frames import numbered
     from ...core.capture import Capture
+    from ...core.conventions.frame_numbers import numbered
     from ...core.fit import fit as fit_capture
     from ...core.fit import preset
 
@@ -93,8 +93,8 @@ def _copy_of_sample(out: Path, remove: bool) -> Path:
 
 def _check_earlier(folder: Path, settings: FitSettings, capture: Capture) -> None:
     """An earlier run is gone on with, so it must be the one that is asked for now."""
+    from ...core.conventions.run_files import CONFIG
     from ...core.fit.run import Run
-    from ...core.run_files import CONFIG
 
     if (folder / CONFIG).exists():
         earlier = Run.open(folder)

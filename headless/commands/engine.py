@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ...core.errors import EngineError
-from ...core.progress import Progress
+from ...core.system.progress import Progress
 from ..command import Command, Step
 
 ROOT = Path(__file__).resolve().parents[2]

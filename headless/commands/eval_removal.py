@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ...core.errors import FrameError, SettingsError, spelled_out
-from ...core.progress import Progress
-from .. import glare
+from ...core.system.progress import Progress
+from .. import glow
 from ..command import Command, Step, refuse_useless, seed
 
 if TYPE_CHECKING:
@@ -36,20 +36,20 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=seed, default=SEED, metavar="N", help=f"of --synthetic (default {SEED})")
     parser.add_argument("--size", type=int, nargs=2, default=SIZE, metavar=("W", "H"),
                         help="of --synthetic's pictures (default {} {})".format(*SIZE))
-    glare.add_options(parser)
+    glow.add_options(parser)
     parser.add_argument("--working-size", type=int, metavar="PIXELS", help="as for `remove`")
     parser.add_argument("--weights", type=Path, metavar="FILE", help="as for `remove`")
     parser.add_argument("--lpips", type=Path, metavar="DIR", help="folder with the weights of LPIPS (AlexNet, v0.1)")
 
 
 def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
-    from ...core.files import write_json
-    from ...core.pictures import write_png
+    from ...core.images.write import write_png
     from ...core.removal import evaluation
-    from ...core.removal.inference import WORKING_SIZE, Remover
+    from ...core.removal.inference.remover import WORKING_SIZE, Remover
+    from ...core.system.files import write_json
 
     size = WORKING_SIZE if words.working_size is None else words.working_size
-    remover = Remover(words.weights, working_size=size, glow=glare.asked(words))
+    remover = Remover(words.weights, working_size=size, glow=glow.asked(words))
     cases = _cases(words, progress)
     perceptual = None
     if words.lpips:
@@ -71,8 +71,8 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
 
 def _cases(words: argparse.Namespace, progress: Progress) -> list[Case]:
     from ...core.removal import evaluation
-    from ...core.removal.backgrounds import read_backgrounds, told_left_out
     from ...core.removal.synthesis.prescription import read_lenses
+    from ...core.removal.training.backgrounds import read_backgrounds, told_left_out
 
     if (words.pairs is None) == (words.synthetic is None):
         raise SettingsError("Give either a folder of pairs, or --synthetic with --backgrounds.")

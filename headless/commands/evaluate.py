@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from ...core.errors import RunError
-from ...core.progress import Progress
+from ...core.system.progress import Progress
 from ..command import Command, Step
 
 VIEWS = ("held-out", "train", "all")
@@ -28,11 +28,11 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
 def scores_of(folder: Path, progress: Progress, *, which: str = "held-out",
               capture_folder: Path | None = None, lpips_folder: Path | None = None) -> dict[str, Any]:
     """Score a run's views, write its eval.json, show the table."""
-    from ...core.files import write_json
+    from ...core.conventions.run_files import EVALUATION
     from ...core.fit.frames import Frames
     from ...core.fit.run import Run
     from ...core.metrics.evaluation import evaluate, table, worse_than_none
-    from ...core.run_files import EVALUATION
+    from ...core.system.files import write_json
 
     perceptual = None
     if lpips_folder is not None:

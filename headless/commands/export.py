@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from ...core.errors import RunError, SettingsError
-from ...core.files import check_apart
-from ...core.progress import Progress
+from ...core.system.files import check_apart
+from ...core.system.progress import Progress
 from .. import frames
 from ..command import Command, Step
 
@@ -29,11 +29,11 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
-    from ...core.bake.frames import numbered
     from ...core.capture import Capture
+    from ...core.conventions.frame_numbers import numbered
+    from ...core.conventions.run_files import FLARE
     from ...core.fit.run import Run
     from ...core.look import LookEdits, ViewOfLight, read
-    from ...core.run_files import FLARE
     from ...core.transfer.export import write_flare_ply, write_preset
 
     folder = words.capture

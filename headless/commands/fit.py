@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any, get_args
 
 from ...core.choices import Blend, Mode, Model, Preset
 from ...core.errors import SettingsError
-from ...core.files import WRITTEN_BY_HAND
-from ...core.progress import Progress
+from ...core.system.files import WRITTEN_BY_HAND
+from ...core.system.progress import Progress
 from ...core.typed import WHOLE_DIGITS
 from .. import jobs
 from ..command import Command, Step, from_1, refuse_useless, seed
@@ -65,8 +65,8 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     from ...core.capture import Capture
+    from ...core.conventions.run_files import CONFIG
     from ...core.fit import Run, fit
-    from ...core.run_files import CONFIG
 
     if words.listed is not None and words.capture is not None:
         raise SettingsError("fit takes a capture, or a list of them with --list: the one or the other.")
@@ -120,7 +120,7 @@ def with_what_teaches(capture: Capture, settings: FitSettings, progress: Progres
 
 def mode_for(capture: Capture, frozen: bool, progress: Progress) -> Mode:
     """What a fit goes by where nobody says: flare-free frames if there are any, exact ones before estimates."""
-    from ...core.removal.provenance import has_exact
+    from ...core.removal.jobs.provenance import has_exact
 
     if frozen or has_exact(capture):
         return "default"

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from ...core.capture import LIGHTS
 from ...core.errors import CaptureError, SettingsError
-from ...core.progress import Progress
+from ...core.system.progress import Progress
 from ..command import Command, Step, seed
 
 if TYPE_CHECKING:

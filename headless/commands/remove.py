@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ...core.errors import FrameError, RunError, SettingsError, spelled_out
-from ...core.progress import Progress
-from .. import frames, glare, jobs
+from ...core.system.progress import Progress
+from .. import frames, glow, jobs
 from ..command import Command, Step, refuse_useless
 
 if TYPE_CHECKING:
     from ...core.capture import Capture
-    from ...core.removal.inference import Remover
+    from ...core.removal.inference.remover import Remover
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -32,7 +32,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--matte", type=Path, metavar="PICTURE_OR_DIR",
                         help="where the flares are, white on black: one picture for all plates, or a folder with one "
                              "for each, of its name; nothing is taken elsewhere, and what is faint is taken too")
-    glare.add_options(parser)
+    glow.add_options(parser)
     parser.add_argument("--stills", action="store_true",
                         help="clean each plate by itself, in place of in line with those before and after it in its "
                              "folder")
@@ -50,10 +50,10 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
-    from ...core.bake.frames import numbered
-    from ...core.removal.batch import plates_of, remove_all
-    from ...core.removal.footage import with_frames
-    from ...core.removal.mattes import Mattes
+    from ...core.conventions.frame_numbers import numbered
+    from ...core.removal.jobs.batch import plates_of, remove_all
+    from ...core.removal.jobs.mattes import Mattes
+    from ...core.removal.jobs.video_frames import with_frames
 
     if (words.run is None) == (not words.plates):
         raise SettingsError("remove needs plates, or a fitted run with --run: the one or the other.")
@@ -81,12 +81,12 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
 
 
 def _by_run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
-    from ...core.bake.frames import numbered
+    from ...core.conventions.frame_numbers import numbered
     from ...core.fit import Run
-    from ...core.removal.fitted import remove_fitted
+    from ...core.removal.jobs.fitted import remove_fitted
 
     network = (words.weights, words.working_size, words.matte, words.stills, words.base)
-    if words.jobs != 1 or words.model != "network" or glare.is_asked(words) or any(network):
+    if words.jobs != 1 or words.model != "network" or glow.is_asked(words) or any(network):
         raise SettingsError("--run takes away the flare that was fitted: of the other options only --out, --frames, "
                             "--flare, --capture and --overwrite go with it.")
     fitted = Run.open(words.run)
@@ -101,17 +101,17 @@ def _by_run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
 
 
 def _remover(words: argparse.Namespace) -> Remover:
-    from ...core.removal.inference import WORKING_SIZE, Remover
+    from ...core.removal.inference.remover import WORKING_SIZE, Remover
 
     size = WORKING_SIZE if words.working_size is None else words.working_size
     if words.model == "network":
         if words.base is not None:
             raise SettingsError("--base is for --model diffusion; leave it out.")
-        return Remover(words.weights, working_size=size, glow=glare.asked(words))
-    from ...core.removal.diffusion import DiffusionRemover, need
+        return Remover(words.weights, working_size=size, glow=glow.asked(words))
+    from ...core.removal.inference.diffusion import DiffusionRemover, need
 
     need()
-    if words.base is None or words.weights is None or glare.is_asked(words):
+    if words.base is None or words.weights is None or glow.is_asked(words):
         raise SettingsError("--model diffusion wants --base and --weights, and knows no --keep-glare and no "
                             "--all-glare: a LoRA is trained for the one or the other.")
     return DiffusionRemover(words.base, words.weights, working_size=size)
@@ -120,9 +120,9 @@ def _remover(words: argparse.Namespace) -> Remover:
 def with_removed(capture: Capture, progress: Progress) -> Capture:
     """The capture with its flare-free frames, which are made and written into its folder if it has none. Raises
     CaptureError where it has some that were made of other frames."""
-    from ...core.removal.captured import remove_from
-    from ...core.removal.inference import Remover
-    from ...core.removal.provenance import check_removed
+    from ...core.removal.inference.remover import Remover
+    from ...core.removal.jobs.capture import remove_from
+    from ...core.removal.jobs.provenance import check_removed
 
     if capture.has_removed:
         check_removed(capture)

@@ -8,7 +8,7 @@ from typing import Any, get_args
 
 from ...core.choices import Matching
 from ...core.errors import CaptureError, SettingsError
-from ...core.progress import Progress
+from ...core.system.progress import Progress
 from ..command import Command, Step, refuse_useless, seed
 
 OF_A_SOLVE = {"frames": 0, "matching": "auto", "lens": "RADIAL", "work_size": 1000, "size": 0, "no_mask": False,
@@ -64,11 +64,11 @@ def is_blend(words: argparse.Namespace) -> bool:
 
 def of_blend(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     """Blender's part: the animated camera of a .blend as a capture."""
-    from ...core.bake.frames import plates_by_number
     from ...core.capture.colmap import find_model
     from ...core.capture.transforms import FILE as TRANSFORMS
-    from ...core.pictures import pictures_in
-    from ...flare_addon.blend_shot import capture_of, opened
+    from ...core.conventions.frame_numbers import plates_by_number
+    from ...core.images.listing import pictures_in
+    from ...flare_addon.capture.blend_shot import capture_of, opened
 
     refuse_useless(words, OF_A_SOLVE, "frames or a video that have to be solved")
     if words.plates is None or not words.plates.is_dir():

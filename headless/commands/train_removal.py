@@ -8,16 +8,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ...core.errors import SettingsError, spelled_out
-from ...core.progress import Progress
+from ...core.system.progress import Progress
 from ..command import Command, Step, from_1, refuse_useless
 from .fit import change
 
 if TYPE_CHECKING:
-    from ...core.pictures import Pixels
-    from ...core.removal.backgrounds import Backgrounds
-    from ...core.removal.bank import OwnFlares
-    from ...core.removal.recipe import Recipe
+    from ...core.colour.srgb import Pixels
+    from ...core.removal.model.recipe import Recipe
     from ...core.removal.synthesis.prescription import Prescription
+    from ...core.removal.training.backgrounds import Backgrounds
+    from ...core.removal.training.flare_bank import OwnFlares
 
 MOST_LENSES = 180
 
@@ -58,13 +58,13 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     import torch
 
-    from ...core.removal import recipe as recipes
-    from ...core.removal import weights
-    from ...core.removal.backgrounds import kept_for_test, mapped_backgrounds, read_backgrounds, told_left_out
-    from ...core.removal.bank import OwnFlares
     from ...core.removal.evaluation import held_out
+    from ...core.removal.model import recipe as recipes
+    from ...core.removal.model import weights
     from ...core.removal.synthesis.prescription import built_in, read_lenses
-    from ...core.removal.training import recipe_in, train
+    from ...core.removal.training.backgrounds import kept_for_test, mapped_backgrounds, read_backgrounds, told_left_out
+    from ...core.removal.training.flare_bank import OwnFlares
+    from ...core.removal.training.run import recipe_in, train
 
     if words.model == "network":
         refuse_useless(words, {"base": None, "keep_glare": False, "lpips": None}, "--model diffusion")
@@ -117,8 +117,8 @@ def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
 def _diffusion(words: argparse.Namespace, recipe: Recipe, backgrounds: Backgrounds,
                lenses: Sequence[Prescription], own: OwnFlares | None, progress: Progress) -> dict[str, Any]:
     from ...core.metrics.lpips import Lpips
-    from ...core.removal import diffusion
-    from ...core.removal.batches import Batches
+    from ...core.removal.inference import diffusion
+    from ...core.removal.training.batches import Batches
 
     diffusion.need()
     if words.base is None:

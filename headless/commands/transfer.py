@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, get_args
 
 from ...core.choices import Follows
 from ...core.errors import SettingsError
-from ...core.progress import Progress
+from ...core.system.progress import Progress
 from .. import frames, jobs, layers, targets
 from ..command import Command, Step, from_1
 
@@ -71,10 +71,10 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 def look_at_blend(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     """Blender's part: the .blend's camera, lights and what hides them, written down for the engine."""
-    from ...core.bake.frames import Frame, chosen
+    from ...core.conventions.frame_numbers import Frame, chosen
+    from ...core.conventions.run_files import FLARE
     from ...core.look import read
-    from ...core.run_files import FLARE
-    from ...flare_addon.blend_shot import opened, shot_of
+    from ...flare_addon.capture.blend_shot import opened, shot_of
 
     if len(words.to) > 1:
         raise SettingsError("One .blend at a time can be the target.")

@@ -14,7 +14,10 @@ from blenders import Blender
 from core.bake.exr import read_layers, write_layers
 from core.bake.layers import FrameLayers, matte
 from core.colour import colour_space
-from core.pictures import read_exr, read_picture, srgb_from_linear, write_exr
+from core.colour.srgb import srgb_from_linear
+from core.images.exr import read_exr
+from core.images.read import read_picture
+from core.images.write import write_exr
 
 SCRIPTS = Path(__file__).parent / "scripts"
 NUMBERS = (0, 3, 4, 1000)  # a sequence may begin at 0 and have gaps

@@ -12,7 +12,7 @@ from test_work import a_flare
 
 from core.bake.exr import write_layers
 from core.bake.layers import FrameLayers
-from core.files import write_json
+from core.system.files import write_json
 
 SCRIPT = Path(__file__).parent / "scripts" / "flares.py"
 SCENE, PLATE, LAMP, KEY, RIM = 0.125, 0.5, 0.25, 0.5, 1.0

@@ -12,7 +12,7 @@ from test_work import a_flare
 
 from core.bake.exr import write_layers
 from core.bake.layers import FrameLayers
-from core.pictures import read_exr
+from core.images.exr import read_exr
 from tests.core.flared import HEIGHT, WIDTH, flared_capture
 
 SCRIPT = Path(__file__).parent / "scripts" / "studio.py"

@@ -12,8 +12,8 @@ from test_work import a_flare
 
 from core.bake.exr import write_layers
 from core.bake.layers import FrameLayers
-from core.files import write_json
-from core.pictures import read_picture
+from core.images.read import read_picture
+from core.system.files import write_json
 
 SCRIPTS = Path(__file__).parent / "scripts"
 SCENE, FLARE = np.full((8, 16, 3), 0.125, np.float32), np.full((8, 16, 3), 0.25, np.float32)

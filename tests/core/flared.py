@@ -13,9 +13,10 @@ import torch
 from numpy.typing import NDArray
 
 from core.capture import Camera
-from core.files import write_json, write_text
+from core.colour.srgb import linear_from_srgb, srgb_from_linear
 from core.gaussians import rasterization
-from core.pictures import linear_from_srgb, srgb_from_linear, write_exr, write_png
+from core.images.write import write_exr, write_png
+from core.system.files import write_json, write_text
 
 WIDTH, HEIGHT = 64, 40
 LIGHT = np.array([0.3, -0.6, 1.5])

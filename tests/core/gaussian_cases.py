@@ -16,12 +16,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from core.conventions.pixel_grid import DILATION
 from core.gaussians import rasterization, splat
 from core.gaussians import reference as r
 from core.gaussians.projection import camera_position, frustum_limits, project
 from core.gaussians.rendering import ALPHA_MIN, NEAR, PROFILE_MIN, TRANSMITTANCE_MIN, levelled
 from core.gaussians.spherical_harmonics import basis
-from core.sampling import DILATION
 
 HAIR = 1e-4
 FORWARD = 1e-5

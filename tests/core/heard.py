@@ -2,7 +2,7 @@
 """A progress that remembers what it was told to say."""
 from __future__ import annotations
 
-from core.progress import Progress
+from core.system.progress import Progress
 
 
 class Heard(Progress):

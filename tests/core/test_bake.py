@@ -13,16 +13,17 @@ import pytest
 from core.bake import bake as baking
 from core.bake.bake import RECORD, BakeSettings, bake, read_record
 from core.bake.exr import read_description, read_layers, write_layers
-from core.bake.frames import absent, chosen, numbered, plates_by_number
 from core.bake.layers import FARTHEST, FrameLayers, layer_names, layers_of
 from core.capture.camera import Camera
 from core.colour import REC_709, colour_space
+from core.conventions.frame_numbers import absent, chosen, numbered, plates_by_number
 from core.errors import Cancelled, FrameError, RunError, SettingsError
-from core.files import write_json
 from core.fit.run import ViewLayers
+from core.images.exr import exr_space, read_exr, read_exr_header
+from core.images.write import write_exr
 from core.look import KeyedEdits, LookEdits
-from core.pictures import exr_header, exr_space, read_exr, write_exr
-from core.progress import Progress
+from core.system.files import write_json
+from core.system.progress import Progress
 
 HALF = 2.0 ** -11  # the relative rounding error of 16 bit floats
 
@@ -223,10 +224,10 @@ def test_layers_of_squeezed_frames_say_so(tmp_path: Path) -> None:
     make a pixel oblong."""
     cameras = {name: replace(camera(60), fx=fx) for name, fx in zip(VIEWS, (30.0, 60.0, 60.3), strict=True)}
     bake(FakeRenderer(), FRAMES, cameras, tmp_path)
-    told = [exr_header(tmp_path / frame.file)["pixelAspectRatio"] for frame in FRAMES]
+    told = [read_exr_header(tmp_path / frame.file)["pixelAspectRatio"] for frame in FRAMES]
     assert told == [2.0, 1.0, 1.0]
     bake(FakeRenderer(), FRAMES[:1], cameras, tmp_path / "square", BakeSettings(24, 8))
-    assert exr_header(tmp_path / "square" / FRAMES[0].file)["pixelAspectRatio"] == 1.0, "as they are rendered"
+    assert read_exr_header(tmp_path / "square" / FRAMES[0].file)["pixelAspectRatio"] == 1.0, "as they are rendered"
 
 
 def test_edits_by_frame_reach_the_renderer_or_the_layers(tmp_path: Path) -> None:

@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from core.borders import LEAST, Borders, Inside, inside_borders
 from core.capture import Capture
+from core.colour.srgb import linear_from_srgb
 from core.fit import fit
 from core.fit.frames import SOFT, Frames
+from core.images.borders import LEAST, Borders, Inside, inside_borders
+from core.images.plates import Plate
 from core.metrics.evaluation import evaluate
-from core.pictures import linear_from_srgb
-from core.removal.inference import Remover
-from core.removal.plates import Plate
+from core.removal.inference.remover import Remover
 from tests.core.captures import picture
 from tests.core.flared import HEIGHT, WIDTH, flared_capture
 from tests.core.heard import Heard

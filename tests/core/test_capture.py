@@ -16,7 +16,7 @@ import pytest
 from core.capture import Camera, Capture
 from core.capture.ply import read_points
 from core.errors import CaptureError, FrameError
-from core.pictures import write_exr, write_png
+from core.images.write import write_exr, write_png
 from tests.core.captures import SIZE, look_at, make_capture, make_transforms, orbit, picture
 
 

@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 import pytest
 
-from core import tiff
-from core.exif import as_stored, read_exif, upright
+from core.images.formats import tiff
+from core.images.formats.exif import as_stored, read_exif, upright
 
 
 def exif_segment(order: str, orientation: int, focal: int) -> bytes:

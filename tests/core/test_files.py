@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from core.errors import CaptureError, SettingsError, refusal
-from core.files import (
+from core.system.files import (
     atomic_folder,
     atomic_path,
     check_apart,
@@ -99,7 +99,7 @@ def test_a_file_that_windows_holds_for_a_moment_is_waited_for(tmp_path: Path, mo
     with pytest.raises(PermissionError):
         patiently(forbidden)
     assert len(asked) == 1, "what stays forbidden is told at once"
-    monkeypatch.setattr("core.files._PATIENCE_S", 0.1)
+    monkeypatch.setattr("core.system.files._PATIENCE_S", 0.1)
     refusals[:] = [refused_by_windows() for _ in range(100)]
     with pytest.raises(PermissionError):
         write_text(tmp_path / "a.txt", "newer")
@@ -178,7 +178,7 @@ def test_names_of_devices(name: str, expected: str) -> None:
 
 def test_what_windows_takes_for_a_device_is_no_file_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for windows in (False, True):
-        monkeypatch.setattr("core.files.WINDOWS", windows)
+        monkeypatch.setattr("core.system.files.WINDOWS", windows)
         for name in ("images/nul.png", "con/0001.png"):
             with pytest.raises(CaptureError, match="device") if windows else contextlib.nullcontext():
                 assert inside(tmp_path, name, CaptureError) == tmp_path / name
@@ -269,7 +269,7 @@ def test_a_folder_is_there_whole_or_not_at_all(tmp_path: Path) -> None:
 def test_what_a_killed_process_left_of_a_file_can_be_removed(tmp_path: Path) -> None:
     """And what a living one is writing cannot: on a farm a task may be given again while its worker still lives."""
     target = tmp_path / "layers.0001.exr"
-    writes = ("import sys, time\nfrom core.files import atomic_path\n"
+    writes = ("import sys, time\nfrom core.system.files import atomic_path\n"
               "with atomic_path(sys.argv[1]):\n    print('begun', flush=True)\n    time.sleep(60)")
     other = subprocess.Popen([sys.executable, "-c", writes, str(target)], cwd=ROOT, stdout=subprocess.PIPE)
     assert other.stdout is not None and other.stdout.readline() == b"begun\n"
@@ -287,7 +287,7 @@ def test_what_a_killed_process_left_of_a_file_can_be_removed(tmp_path: Path) -> 
 
 def test_what_a_killed_process_left_of_a_file_goes_when_that_is_written_again(tmp_path: Path) -> None:
     """Whatever writes it, and nothing of another file's."""
-    dies = "import os, sys\nfrom core.files import atomic_path\nwith atomic_path(sys.argv[1]):\n    os._exit(9)"
+    dies = "import os, sys\nfrom core.system.files import atomic_path\nwith atomic_path(sys.argv[1]):\n    os._exit(9)"
     for name in ("eval.json", "report.json"):
         assert subprocess.run([sys.executable, "-c", dies, str(tmp_path / name)], cwd=ROOT, check=False).returncode == 9
     assert len(list(tmp_path.iterdir())) == 2
@@ -298,7 +298,7 @@ def test_what_a_killed_process_left_of_a_file_goes_when_that_is_written_again(tm
 
 def test_what_a_killed_process_left_of_a_folder_goes_when_that_is_made_again(tmp_path: Path) -> None:
     """And what a living one makes stays."""
-    makes = ("import os, sys\nfrom core.files import atomic_folder\n"
+    makes = ("import os, sys\nfrom core.system.files import atomic_folder\n"
              "with atomic_folder(sys.argv[1]) as folder:\n    (folder / 'a').touch()\n    ")
     words = [sys.executable, "-c", f"{makes}os._exit(9)", str(tmp_path / "frames")]
     assert subprocess.run(words, cwd=ROOT, check=False).returncode == 9
@@ -427,7 +427,7 @@ def test_where_nothing_may_be_written_the_file_itself_is_named(tmp_path: Path, m
     def refuse(**_: object) -> None:
         raise PermissionError(errno.EACCES, "Permission denied", str(tmp_path / ".partial-eval.json-1"))
 
-    monkeypatch.setattr("core.files.tempfile.mkstemp", refuse)
+    monkeypatch.setattr("core.system.files.tempfile.mkstemp", refuse)
     with pytest.raises(PermissionError) as problem, atomic_path(tmp_path / "eval.json"):
         pytest.fail("there is nothing to write to")
     assert problem.value.filename == str(tmp_path / "eval.json")
@@ -437,8 +437,8 @@ def test_a_folder_that_may_not_be_written_is_told_in_the_end(tmp_path: Path, mon
     def refuse(*_: object) -> int:
         raise PermissionError(errno.EACCES, "Permission denied", str(tmp_path / ".lock"))
 
-    monkeypatch.setattr("core.files._REFUSALS", 3)
-    monkeypatch.setattr("core.files.os.open", refuse)
+    monkeypatch.setattr("core.system.files._REFUSALS", 3)
+    monkeypatch.setattr("core.system.files.os.open", refuse)
     with pytest.raises(PermissionError), locked(tmp_path / ".lock"):
         pass
 

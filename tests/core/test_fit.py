@@ -22,24 +22,25 @@ import pytest
 import torch
 
 from core.capture import Capture, Light
+from core.conventions.run_files import CHECKPOINT, FLARE, SCENE
 from core.errors import Cancelled, CaptureError, FlareFileError, RunError, SettingsError
 from core.fit import FitSettings, Run, checkpoint, fit, preset
-from core.fit.beginning import NEAREST_PART, nearest_depth
 from core.fit.frames import Frames
+from core.fit.initialise import NEAREST_PART, nearest_depth
+from core.fit.parallax_losses import FOUND_WHOLLY, from_below, haze, nearness, scene_beside_flare, times_found
 from core.fit.rendering import render_flare
 from core.fit.settings import SplitSettings, changed
 from core.fit.sky import COUNT, with_sky
-from core.fit.splitting import FOUND_WHOLLY, from_below, haze, nearness, scene_beside_flare, times_found
 from core.fit.trainer import Trainer
 from core.flare.compositing import composite
 from core.flare.model import OURS, PAPER
 from core.gaussians.rendering import NEAR
-from core.holding import held
+from core.images.read import read_picture
+from core.images.write import write_png
 from core.look import LookEdits, draw
 from core.look.look import FORM_BOUNDS
-from core.pictures import read_picture, write_png
-from core.progress import Progress
-from core.run_files import CHECKPOINT, FLARE, SCENE
+from core.system.folder_lock import held
+from core.system.progress import Progress
 from tests.core.flared import flared_capture
 from tests.core.heard import Heard
 

@@ -14,7 +14,7 @@ import torch
 from core.capture import Capture, View
 from core.fit.cache import DISK_LEFT, PictureCache
 from core.fit.frames import Frames
-from core.pictures import Picture
+from core.images.picture import Picture
 from tests.core.captures import make_capture
 
 

@@ -12,10 +12,10 @@ import pytest
 from core.capture import Capture
 from core.errors import Cancelled, CaptureError
 from core.fit import fit, preset
-from core.fit.doubts import doubts, unlike
 from core.fit.frames import Frames
+from core.fit.warnings import doubts, unlike
+from core.images.write import write_png
 from core.metrics.evaluation import worse_than_none
-from core.pictures import write_png
 from tests.core.flared import HEIGHT, WIDTH, flared_capture
 from tests.core.heard import Heard
 from tests.core.test_fit import StopAt, quick

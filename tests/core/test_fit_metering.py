@@ -16,14 +16,15 @@ import torch
 from numpy.typing import NDArray
 
 from core.capture import Camera, Capture
-from core.display import clipped, decode, encode, exposed
+from core.colour.srgb import linear_from_srgb, srgb_from_linear
+from core.colour.srgb_torch import clipped, decode, encode, exposed
 from core.errors import Cancelled, RunError
-from core.files import write_text
 from core.fit import Run, fit, metering
 from core.fit.frames import Frames
 from core.fit.sky import with_sky
 from core.fit.trainer import Trainer
-from core.pictures import linear_from_srgb, srgb_from_linear, write_png
+from core.images.write import write_png
+from core.system.files import write_text
 from tests.core.flared import cameras, flared_capture
 from tests.core.heard import Heard
 from tests.core.test_fit import StopAt, quick

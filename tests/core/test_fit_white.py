@@ -13,7 +13,9 @@ from numpy.typing import NDArray
 
 from core.bake.shot import ShotRenderer
 from core.capture import Capture, View
-from core.display import decode, encode
+from core.colour.srgb import srgb_from_linear
+from core.colour.srgb_torch import decode, encode
+from core.conventions.run_files import FLARE
 from core.errors import SettingsError
 from core.fit import FitSettings, Run, fit, preset
 from core.fit.frames import Frames, Targets
@@ -23,9 +25,10 @@ from core.fit.sky import with_sky
 from core.fit.trainer import Trainer
 from core.flare.compositing import composite, layers
 from core.gaussians import Splats
+from core.images.picture import Picture
+from core.images.read import holds_floats
+from core.images.write import write_png
 from core.look.shot import Shot, ShotFrame
-from core.pictures import Picture, holds_floats, srgb_from_linear, write_png
-from core.run_files import FLARE
 from tests.core.flared import flared_capture, write_light
 from tests.core.heard import Heard
 

@@ -14,7 +14,8 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from core.capture import Camera
-from core.display import decode, encode
+from core.colour.srgb_torch import decode, encode
+from core.conventions.pixel_grid import Sampling
 from core.errors import FlareFileError
 from core.flare import file as flare_file
 from core.flare import placement
@@ -30,7 +31,6 @@ from core.gaussians.rendering import arc_strengths
 from core.look import TrainedCamera
 from core.look.look import FlareForm
 from core.look.plane import PLANE_DEPTH
-from core.sampling import Sampling
 from tests.core.flared import cameras
 
 RANGE = QueryRange((-1.0, -1.0, -5.0), (1.0, 1.0, -3.0), (0.5, 0.5, 0.7))

@@ -12,12 +12,15 @@ ROOT = Path(__file__).resolve().parents[2]
 OURS = "fit_flare."  # as tests and tools name the root package
 
 # What Blender's own Python, which has numpy and nothing else of ours, must be able to import.
-LIGHT = ("core.errors", "core.choices", "core.files", "core.progress", "core.pictures", "core.capture",
-         "core.bake.bake", "core.metrics.evaluation", "core.look")
+LIGHT = ("core.errors", "core.choices", "core.system.files", "core.system.progress", "core.conventions.splatting",
+         "core.conventions.run_files", "core.images.read", "core.images.write", "core.capture", "core.bake.bake",
+         "core.metrics.evaluation", "core.look")
 
 # From the lowest; what is not named is the ground floor, below all.
-ROOMS = ("core.capture", "core.metrics", "core.gaussians", "core.look", "core.lights", "core.flare", "core.removal",
-         "core.fit", "core.bake", "core.transfer", "flare_addon", "headless")
+ROOMS = ("core.system", "core.conventions", "core.colour", "core.images", "core.capture", "core.metrics",
+         "core.gaussians", "core.look", "core.lights", "core.flare", "core.removal.model", "core.removal.synthesis",
+         "core.removal.inference", "core.removal.training", "core.removal.jobs", "core.removal", "core.fit",
+         "core.bake", "core.transfer", "flare_addon", "headless")
 
 # Kernel sets that refuse to be imported on a machine without their device.
 OPTIONAL = ("core.gaussians.cuda", "core.gaussians.warp_kernels")

@@ -13,7 +13,9 @@ import pytest
 from numpy.typing import NDArray
 
 from core.capture import Camera, Capture
+from core.colour.srgb import srgb_from_linear
 from core.errors import Cancelled, CaptureError, EngineError, SettingsError
+from core.images.picture import Picture
 from core.lights import Detection, Exposure, GatherSettings, detector_for, find_lights, gather, record, union
 from core.lights.exposure import COSTLY
 from core.lights.file import check_replaceable, write_lights
@@ -21,8 +23,7 @@ from core.lights.find import _from_one_view
 from core.lights.gather import MANY, PAIRS, FoundLight, _at_least, without_ghosts
 from core.lights.ghosts import find_blobs, gather_ghosts
 from core.lights.lifted import lift
-from core.pictures import Picture, srgb_from_linear
-from core.progress import Progress
+from core.system.progress import Progress
 from tests.core.captures import make_capture, orbit, picture
 
 SIZE = (320, 240)

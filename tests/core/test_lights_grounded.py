@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from core.images.picture import Picture
 from core.lights.grounded import Grounded, refined, smallest
-from core.pictures import Picture
 
 
 def frame(*boxes: tuple[int, int, int, int], values: tuple[int, ...]) -> tuple[np.ndarray, list, np.ndarray]:

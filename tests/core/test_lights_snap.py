@@ -9,8 +9,8 @@ import pytest
 from numpy.typing import NDArray
 
 from core.capture import Camera
+from core.colour.srgb import linear_from_srgb, srgb_from_linear
 from core.lights.snap import Sight, sight, snapped
-from core.pictures import linear_from_srgb, srgb_from_linear
 from tests.core.flared import HEIGHT, WIDTH, cameras
 
 LAMP, SPOT = np.array([0.3, -0.6, 1.5]), np.array([-0.9, 0.3, 2.0])

@@ -13,6 +13,7 @@ import pytest
 import torch
 
 from core.bake import shot as shot_bakes
+from core.colour.srgb import linear_from_srgb, srgb_from_linear
 from core.errors import FlareFileError, SettingsError
 from core.flare import file as flare_file
 from core.flare.compositing import splat_flare
@@ -34,7 +35,6 @@ from core.look.container import read_tensors, rewritten
 from core.look.edits import edited
 from core.look.look import FORM_BOUNDS, FlareForm, asked
 from core.look.shot import PlacedLight, Shot, ShotFrame, evaluate
-from core.pictures import linear_from_srgb, srgb_from_linear
 from tests.core.flared import cameras
 from tests.core.test_flare import pose, some_flare
 

@@ -9,10 +9,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from core.colour.srgb import srgb_from_linear
 from core.errors import SettingsError
+from core.images.picture import Picture
 from core.metrics.evaluation import clipped, out_of_range, score_view, summary, table, worse_than_none
 from core.metrics.pictures import flip, has_flip, psnr, relative_l2, ssim
-from core.pictures import Picture, srgb_from_linear
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from core.numeric_environment import VARIABLES
+from core.system.thread_environment import VARIABLES
 
 ROOT = Path(__file__).resolve().parents[2]
 OTHERS = {name: value for name, value in os.environ.items() if name not in VARIABLES}
@@ -24,7 +24,7 @@ def variables_after(script: str, given: dict[str, str]) -> dict[str, str | None]
 
 
 def test_it_is_prepared_before_both_and_what_the_user_has_set_stays() -> None:
-    script = ("import sys; from core.numeric_environment import prepare_for_numpy_and_torch\n"
+    script = ("import sys; from core.system.thread_environment import prepare_for_numpy_and_torch\n"
               "prepare_for_numpy_and_torch(); assert not {'numpy', 'torch'} & set(sys.modules)")
     assert variables_after(script, {"OMP_WAIT_POLICY": "ACTIVE"}) == {**VARIABLES, "OMP_WAIT_POLICY": "ACTIVE"}
 

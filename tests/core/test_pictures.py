@@ -15,25 +15,18 @@ import numpy as np
 import OpenEXR
 import pytest
 
-from core import pictures, tiff
 from core.capture import Capture
 from core.colour import colour_space
+from core.colour.srgb import linear_from_srgb, srgb_from_linear
 from core.errors import CaptureError, FrameError
-from core.pictures import (
-    Picture,
-    channel_names,
-    exr_is_cut_off,
-    linear_from_srgb,
-    picture_size,
-    read_exr,
-    read_picture,
-    save_exr,
-    srgb_from_linear,
-    window_of,
-    write_exr,
-    write_png,
-)
-from core.removal.plates import read_plate
+from core.images import exr, read, size, write
+from core.images.exr import channel_names, exr_is_cut_off, read_exr, window_of
+from core.images.formats import tiff
+from core.images.picture import Picture
+from core.images.plates import read_plate
+from core.images.read import read_picture
+from core.images.size import picture_size
+from core.images.write import save_exr, write_exr, write_png
 
 RAMP = np.random.default_rng(0).uniform(0, 1, (7, 9, 3)).astype(np.float32)
 
@@ -212,7 +205,7 @@ def test_a_full_disk_is_told_as_one(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     def full(_target: Path, _turn: object = None) -> Iterator[Path]:
         yield Path("/dev/full")
 
-    monkeypatch.setattr(pictures, "atomic_path", full)
+    monkeypatch.setattr(write, "atomic_path", full)
     for sides in ((200, 300), (2, 2)):  # the smaller is refused no sooner than at its closing
         with pytest.raises(OSError) as told:
             write_exr(tmp_path / "a.exr", {"R": np.random.default_rng(0).random(sides).astype(np.float32)})
@@ -230,9 +223,9 @@ def test_a_tiff_that_would_be_read_as_something_else_is_refused(tag: int, value:
     codes = (RAMP * 65535).astype(np.uint16)
     data = cv2.imencode(".tif", codes if tag == tiff.PLANES else codes[..., 0])[1].tobytes()
     (tmp_path / "a.tif").write_bytes(tiff.with_tags(data, {tag: tiff.short(value)}))
-    for read in (read_picture, read_plate):
+    for reader in (read_picture, read_plate):
         with pytest.raises(FrameError, match=rf"a\.tif has .*{told}"):
-            read(tmp_path / "a.tif")
+            reader(tmp_path / "a.tif")
 
 
 def test_of_an_exr_only_the_picture_counts(tmp_path: Path) -> None:
@@ -283,16 +276,16 @@ def test_an_exr_is_what_its_frame_shows(low: tuple[int, int], high: tuple[int, i
     stored = np.random.default_rng(0).random((height, width)).astype(np.float32)
     windows = {name: (np.array(first, np.int32), np.array(last, np.int32))
                for name, first, last in (("dataWindow", low, high), ("displayWindow", (0, 0), (19, 11)))}
-    pictures.write_exr(tmp_path / "a.exr", dict.fromkeys("RGB", stored), half=False, header=windows)
-    assert pictures.picture_size(tmp_path / "a.exr") == (20, 12)
-    found = pictures.read_picture(tmp_path / "a.exr").pixels
+    write.write_exr(tmp_path / "a.exr", dict.fromkeys("RGB", stored), half=False, header=windows)
+    assert size.picture_size(tmp_path / "a.exr") == (20, 12)
+    found = read.read_picture(tmp_path / "a.exr").pixels
     expected = np.zeros((12, 20), np.float32)
     for y in range(12):
         for x in range(20):
             if low[0] <= x <= high[0] and low[1] <= y <= high[1]:
                 expected[y, x] = stored[y - low[1], x - low[0]]
     np.testing.assert_array_equal(found[..., 0], expected)
-    window = pictures.window_of(tmp_path / "a.exr")
+    window = exr.window_of(tmp_path / "a.exr")
     assert (window.size, window.origin, window.is_frame) == ((width, height), low, False)
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from core import processes
+from core.system import processes
 
 
 @pytest.fixture(params=["this system's way", "by ps"])

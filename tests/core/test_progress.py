@@ -16,7 +16,15 @@ from pathlib import Path
 import pytest
 
 from core.errors import Cancelled
-from core.progress import STOP_FILE, JsonProgress, OpenJdProgress, Progress, TerminalProgress, flush_or_drop, stoppable
+from core.system.progress import (
+    STOP_FILE,
+    JsonProgress,
+    OpenJdProgress,
+    Progress,
+    TerminalProgress,
+    flush_or_drop,
+    stoppable,
+)
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -109,7 +117,7 @@ ON_A_TERMINAL = """
 import fcntl, sys, termios, time
 from pathlib import Path
 from core.errors import Cancelled
-from core.progress import TerminalProgress, flush_or_drop, stoppable
+from core.system.progress import TerminalProgress, flush_or_drop, stoppable
 
 fcntl.ioctl(0, termios.TIOCSCTTY, 0)
 progress = TerminalProgress()
@@ -179,7 +187,7 @@ def test_openjd_lines_are_a_farm_s() -> None:
 @pytest.mark.parametrize("of_main_thread", [True, False])
 def test_a_file_asks_for_a_stop(of_main_thread: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(STOP_FILE, str(tmp_path / "stop"))
-    monkeypatch.setattr("core.progress.STOP_FILE_EVERY_S", 0.01)
+    monkeypatch.setattr("core.system.progress.STOP_FILE_EVERY_S", 0.01)
     stopped: list[str] = []
 
     def work() -> None:
@@ -210,7 +218,7 @@ class Clock:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.now = 1000.0
-        monkeypatch.setattr("core.progress.time.monotonic", lambda: self.now)
+        monkeypatch.setattr("core.system.progress.time.monotonic", lambda: self.now)
 
     def left_after(self, progress: Progress, seconds: float, steps: int = 1) -> float | None:
         self.now += seconds

@@ -23,25 +23,31 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from core import jpeg, png, tiff
 from core.capture import Capture
 from core.colour.spaces import AP1
 from core.errors import Cancelled, CaptureError, FrameError, RunError, SettingsError
-from core.exif import upright
-from core.pictures import Window, read_exr, read_picture, save_exr, write_exr, write_png
-from core.progress import Progress
-from core.removal import batch, inference, lamps, odds, weights
-from core.removal.batch import plates_of, remove_all
-from core.removal.captured import UNFINISHED, _names, remove_from
-from core.removal.formation import flare_light
-from core.removal.inference import FlareMap, Glow, Remover, Told, carried_up
-from core.removal.mattes import Mattes
-from core.removal.network import LEVELS, SHOWN, RemovalNetwork, seen
-from core.removal.plates import Plate, read_plate, write_plate
-from core.removal.provenance import check_removed, has_exact
-from core.removal.recipe import Recipe, as_dict
-from core.removal.record import RECORD, Record, made_from
-from core.removal.views import told_once, worth_of
+from core.images.exr import read_exr
+from core.images.formats import jpeg, png, tiff
+from core.images.formats.exif import upright
+from core.images.plates import Plate, read_plate, write_plate
+from core.images.read import read_picture
+from core.images.window import DataWindow
+from core.images.write import save_exr, write_exr, write_png
+from core.removal.inference import confidence, light_sources
+from core.removal.inference import remover as remover_module
+from core.removal.inference.remover import FlareMap, Glow, Remover, Told, carried_up
+from core.removal.inference.test_time_views import told_once, worth_of
+from core.removal.jobs import batch
+from core.removal.jobs.batch import plates_of, remove_all
+from core.removal.jobs.capture import UNFINISHED, _names, remove_from
+from core.removal.jobs.manifest import RECORD, Record, made_from
+from core.removal.jobs.mattes import Mattes
+from core.removal.jobs.provenance import check_removed, has_exact
+from core.removal.model import weights
+from core.removal.model.image_formation import flare_light
+from core.removal.model.network import LEVELS, SHOWN, RemovalNetwork, seen
+from core.removal.model.recipe import Recipe, as_dict
+from core.system.progress import Progress
 from tests.core.captures import make_capture
 from tests.core.heard import Heard
 from tests.core.test_exif import exif_segment
@@ -243,9 +249,10 @@ def test_signs_of_a_flare_are_as_they_are_told() -> None:
     told = np.full((160, 240, 3), 0.1, np.float32)
     told[70:78, 100:108] += 0.4
     mean, spot = told.mean(), 0.4 * 64 / (160 * 240)
-    *logarithms, patchy = odds.signs(np.full_like(told, 0.5), told, 0.2 * told, 0.5 * told)
+    *logarithms, patchy = confidence.signs(np.full_like(told, 0.5), told, 0.2 * told, 0.5 * told)
     np.testing.assert_allclose(np.exp(logarithms), [
-        0.5 + odds.NOTHING, flare_light(np.full_like(told, 0.5), told).mean() + 0.002, 0.2 + odds.AGREED, 0.5 / mean],
+        0.5 + confidence.NOTHING, flare_light(np.full_like(told, 0.5), told).mean() + 0.002,
+        0.2 + confidence.AGREED, 0.5 / mean],
         rtol=1e-3)
     np.testing.assert_allclose(patchy, spot / mean, rtol=1e-3)
 
@@ -308,10 +315,10 @@ def test_a_shot_is_judged_as_one(everywhere: Path, monkeypatch: pytest.MonkeyPat
 @pytest.mark.parametrize("display", [np.zeros((96, 96, 3), np.float32), np.ones((96, 96, 3), np.float32),
                                      np.full((96, 96, 3), 0.3, np.float32)])
 def test_a_picture_of_one_value_is_graded_back_to_finite_ones(display: NDArray[np.float32]) -> None:
-    back = odds.graded_back(display)
+    back = confidence.graded_back(display)
     assert back.dtype == np.float32 and np.isfinite(back).all()
-    assert np.isfinite(odds.signs(display, display * 0.1, 0 * display, back).log_odds)
-    assert np.isfinite(odds.signs(display, 0 * display, 0 * display, 0 * back).log_odds)
+    assert np.isfinite(confidence.signs(display, display * 0.1, 0 * display, back).log_odds)
+    assert np.isfinite(confidence.signs(display, 0 * display, 0 * display, 0 * back).log_odds)
 
 
 def street(lamp: int, left: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -344,7 +351,7 @@ def test_a_lamp_stays_as_bright_as_it_was_filmed(everywhere: Path, marked: bool)
 ])
 def test_what_is_no_lamp_goes_as_told(lamp: int, left: float, glow: float) -> None:
     display, added = street(lamp, left)
-    assert lamps.given_back(display, added, np.full_like(added, glow)).max() == 0
+    assert light_sources.given_back(display, added, np.full_like(added, glow)).max() == 0
 
 
 @pytest.mark.parametrize(("about", "glow", "part"), [
@@ -357,7 +364,7 @@ def test_in_a_glow_there_is_a_lamp_though_nothing_is_left_of_it(about: float, gl
     display, added = street(10, left=0.15)
     added[display == 0.5] += about - 0.5
     display[display == 0.5] = about
-    stays = lamps.given_back(display, added, np.full_like(added, glow))[..., 0]
+    stays = light_sources.given_back(display, added, np.full_like(added, glow))[..., 0]
     np.testing.assert_allclose(stays[63:67, 63:67], part, rtol=0.02)
     assert stays[60, 65] < 0.7 * part
 
@@ -366,15 +373,15 @@ def test_in_a_glow_there_is_a_lamp_though_nothing_is_left_of_it(about: float, gl
 def test_a_picture_of_one_value_has_no_lamps(value: float) -> None:
     display = np.full((64, 96, 3), value, np.float32)
     with np.errstate(all="raise"):
-        assert not lamps.given_back(display, display * 0.5, np.ones_like(display)).any()
+        assert not light_sources.given_back(display, display * 0.5, np.ones_like(display)).any()
 
 
 def test_a_part_of_the_glow_stays_beside_a_lamp_at_night() -> None:
     """The less, the farther off; of what is no glow nothing does."""
     display, added = street(10, left=0.7)
-    stays = lamps.given_back(display, added, np.float32((1, 0.5, 0)) * np.ones_like(added))
+    stays = light_sources.given_back(display, added, np.float32((1, 0.5, 0)) * np.ones_like(added))
     for off in (2, 8):
-        expected = lamps.STAYS * np.exp(-off / (lamps.REACH * 240)) * np.array((1, 0.5, 0))
+        expected = light_sources.STAYS * np.exp(-off / (light_sources.REACH * 240)) * np.array((1, 0.5, 0))
         np.testing.assert_allclose(stays[65, 60 - off], expected, rtol=0.02)
 
 
@@ -382,15 +389,15 @@ def test_a_part_of_the_glow_stays_beside_a_lamp_at_night() -> None:
 def test_by_day_no_glow_stays(about: float, part: float) -> None:
     display, added = street(10, left=0.7)
     display[display < 0.2] = about
-    stays = lamps.given_back(display, added, np.ones_like(added))[65, 58, 0]
-    assert stays == pytest.approx(part * lamps.STAYS * np.exp(-2 / 12), rel=0.02, abs=1e-3)
+    stays = light_sources.given_back(display, added, np.ones_like(added))[65, 58, 0]
+    assert stays == pytest.approx(part * light_sources.STAYS * np.exp(-2 / 12), rel=0.02, abs=1e-3)
 
 
 @pytest.mark.parametrize(("white", "part"), [(0.905, 0.0), (0.935, 0.5), (0.98, 1.0)])
 def test_a_lamp_that_is_not_white_keeps_less_of_a_glow(white: float, part: float) -> None:
     display, added = street(10, left=0.7)
-    stays = lamps.given_back(np.minimum(display, white), added, np.ones_like(added))[65, 58, 0]
-    assert stays == pytest.approx(part * lamps.STAYS * np.exp(-2 / 12), rel=0.05, abs=0.03)
+    stays = light_sources.given_back(np.minimum(display, white), added, np.ones_like(added))[65, 58, 0]
+    assert stays == pytest.approx(part * light_sources.STAYS * np.exp(-2 / 12), rel=0.05, abs=0.03)
 
 
 @pytest.mark.parametrize(("glow", "marked"), [("kept at lamps", True), ("taken", False)])
@@ -459,7 +466,7 @@ def test_rows_are_worked_on_apart_without_a_seam(monkeypatch: pytest.MonkeyPatch
     whole, parts = np.zeros(codes.shape, np.float32), np.zeros(codes.shape, np.float32)
     for rows, light in carried_up(found, codes, "srgb", 255):
         whole[rows] = light
-    monkeypatch.setattr(inference, "ROWS", 7)
+    monkeypatch.setattr(remover_module, "ROWS", 7)
     for rows, light in carried_up(found, codes, "srgb", 255):
         parts[rows] = light
     np.testing.assert_allclose(parts, whole, atol=2e-4)
@@ -743,7 +750,7 @@ def test_a_grey_matte_takes_a_part(everywhere: Path) -> None:
 
 
 def test_what_is_faint_is_taken_where_it_is_marked(tmp_path: Path) -> None:
-    faint = Remover(network_file(tmp_path / "faint.safetensors", bias=0.9 * inference.LEAST), working_size=64)
+    faint = Remover(network_file(tmp_path / "faint.safetensors", bias=0.9 * remover_module.LEAST), working_size=64)
     codes = np.full((60, 90, 3), 46_000, np.uint16)
     assert np.array_equal(_remove(faint, codes), codes)
     assert (faint.remove(plate_of(codes), np.ones((60, 90), np.float32))[0] < codes).mean() > 0.3
@@ -977,8 +984,8 @@ def test_plates_of_an_earlier_program_are_made_again(tmp_path: Path, everywhere:
                                                     monkeypatch: pytest.MonkeyPatch) -> None:
     source, out = write_codes(tmp_path / "in" / "a.png", picture()), tmp_path / "out"
     made = []
-    for revision in (inference.REVISION, inference.REVISION, inference.REVISION + 1):
-        monkeypatch.setattr(inference, "REVISION", revision)
+    for revision in (remover_module.REVISION, remover_module.REVISION, remover_module.REVISION + 1):
+        monkeypatch.setattr(remover_module, "REVISION", revision)
         made.append(remove_all([source], out, Remover(everywhere, working_size=64), Progress())["made"])
     assert made == [1, 0, 1]
 
@@ -1009,8 +1016,8 @@ def test_a_plate_that_a_kill_left_without_its_content_written_down_is_kept_once_
     assert clean.read_bytes() == work
 
 
-def whole(width: int, height: int) -> Window:
-    return Window((width, height), (0, 0), (width, height))
+def whole(width: int, height: int) -> DataWindow:
+    return DataWindow((width, height), (0, 0), (width, height))
 
 
 def test_a_matte_lies_where_its_file_and_the_plate_s_say(tmp_path: Path) -> None:
@@ -1022,7 +1029,7 @@ def test_a_matte_lies_where_its_file_and_the_plate_s_say(tmp_path: Path) -> None
     write_exr(tmp_path / "cropped.exr", {"Y": painted[20:30, 50:70]}, header=header)
     write_exr(tmp_path / "whole.exr", {"Y": painted})
     write_exr(tmp_path / "half.exr", {"Y": painted[::2, ::2]})
-    overscan = Window((110, 72), (-10, -6), (90, 60))
+    overscan = DataWindow((110, 72), (-10, -6), (90, 60))
     for name, off in (("cropped.exr", 0), ("whole.exr", 0), ("half.exr", 1)):
         for window in (whole(90, 60), overscan):
             found = Mattes(tmp_path / name).read(Path("a.exr"), window)
@@ -1320,8 +1327,8 @@ def test_a_folder_that_may_not_be_written_ends_the_batch(tmp_path: Path, nowhere
         tried.append(path)
         raise OSError(number, os.strerror(number), path)
 
-    monkeypatch.setattr("core.files._REFUSALS", 0)
-    monkeypatch.setattr("core.files.os.open", refuse)
+    monkeypatch.setattr("core.system.files._REFUSALS", 0)
+    monkeypatch.setattr("core.system.files.os.open", refuse)
     with pytest.raises(FrameError, match=r"^[^ ]*out cannot be written to \([^)]*\); choose another folder"):
         remove_all([tmp_path / "in"], tmp_path / "out", Remover(nowhere, working_size=64), Progress())
     assert len(tried) == 1

@@ -13,16 +13,16 @@ import pytest
 import torch
 
 from core.errors import RunError
-from core.removal import chances, pairs, training
-from core.removal.backgrounds import Backgrounds
-from core.removal.card import composition, jpeg, pools, recorded
-from core.removal.card.batches import batches, drawn_on_card
-from core.removal.formation import under_shoulder
-from core.removal.network import MULTIPLE
-from core.removal.recipe import Recipe
-from core.removal.synthesis import layers
+from core.removal.model.image_formation import under_shoulder
+from core.removal.model.network import MULTIPLE
+from core.removal.model.recipe import Recipe
+from core.removal.synthesis import flare
 from core.removal.synthesis.prescription import built_in
-from core.removal.trainer import Trainer
+from core.removal.training import pairs, random_cameras, run
+from core.removal.training.backgrounds import Backgrounds
+from core.removal.training.gpu import composition, cuda_graphs, jpeg, pools
+from core.removal.training.gpu.batches import batches, drawn_on_card
+from core.removal.training.trainer import Trainer
 
 CPU = torch.device("cpu")
 CANVAS, WIDTH, HEIGHT = 96, 96, 64
@@ -36,7 +36,7 @@ def flat() -> Backgrounds:
 
 
 def made(seed: int, kind: str | None = None) -> pairs.Layers:
-    one = layers.flare(seed, CANVAS, built_in(), kind)
+    one = flare.flare(seed, CANVAS, built_in(), kind)
     return pairs.Layers(one.rest, one.glare, one.light, one.lights, np.array([1, 0.5, 0.25], np.float32))
 
 
@@ -54,12 +54,12 @@ def together(some: list[pairs.Layers]) -> composition.Flares:
 
 def test_flares_are_laid_over_frames_as_one_by_one() -> None:
     """But for the 32nds of a pixel to which OpenCV rounds."""
-    some = [made(seed, kind) for seed, kind in enumerate((*layers.CLASSES, *layers.CLASSES))]
+    some = [made(seed, kind) for seed, kind in enumerate((*flare.CLASSES, *flare.CLASSES))]
     matrices, shining, expected = [], [], []
     for seed, one in enumerate(some):
         random = np.random.default_rng(seed)
-        matrices.append(chances.laid(random, CANVAS, WIDTH, HEIGHT))
-        shining.append(chances.shining(random, 0.8))
+        matrices.append(random_cameras.laid(random, CANVAS, WIDTH, HEIGHT))
+        shining.append(random_cameras.shining(random, 0.8))
         expected.append(pairs._placed(one, shining[-1], matrices[-1], WIDTH, HEIGHT))
     blurs, colours, gains, mosts = (np.array(part) for part in zip(*shining, strict=True))
     assert 1 < (blurs > 0).sum() < len(some) - 1
@@ -69,7 +69,7 @@ def test_flares_are_laid_over_frames_as_one_by_one() -> None:
     for row, apart in enumerate(expected):
         for one, other in zip(found, apart, strict=True):
             there = one[row].permute(1, 2, 0).numpy()
-            assert np.abs(there - other).mean() < 0.01 * max(float(other.mean()), 0.02), (row, layers.CLASSES[row % 8])
+            assert np.abs(there - other).mean() < 0.01 * max(float(other.mean()), 0.02), (row, flare.CLASSES[row % 8])
 
 
 @pytest.mark.parametrize("quality", [60, 75, 90])
@@ -218,7 +218,7 @@ def test_on_a_processor_nothing_is_recorded() -> None:
         calls.append(one)
         return [one * 2]
 
-    twice = recorded.Recorded(work)
+    twice = cuda_graphs.Recorded(work)
     assert torch.equal(twice(torch.ones(2))[0], torch.full((2,), 2.0))
     assert torch.equal(twice(torch.zeros(2))[0], torch.zeros(2))
     assert len(calls) == 2
@@ -227,7 +227,7 @@ def test_on_a_processor_nothing_is_recorded() -> None:
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no NVIDIA GPU")
 def test_a_training_on_a_card(tmp_path: Path) -> None:
     card = torch.device("cuda")
-    twice = recorded.Recorded(lambda one: [one * 2, one.sum()])
+    twice = cuda_graphs.Recorded(lambda one: [one * 2, one.sum()])
     for side in (3, 5, 3):
         given = torch.rand(side, side, device=card)
         doubled, whole = twice(given)
@@ -239,4 +239,4 @@ def test_a_training_on_a_card(tmp_path: Path) -> None:
         loss, figures = plain.loss(batch)
         loss.backward()
         assert trainer.step(batch)["loss"] == pytest.approx(figures["loss"], rel=0.02), "of the step before"
-    assert training.train(RECIPE, tmp_path, flat(), built_in(), processes=3).is_file()
+    assert run.train(RECIPE, tmp_path, flat(), built_in(), processes=3).is_file()

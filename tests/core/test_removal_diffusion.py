@@ -11,8 +11,8 @@ import pytest
 import torch
 
 from core.errors import EngineError, RunError
-from core.progress import Progress
-from core.removal import diffusion
+from core.removal.inference.remover import diffusion
+from core.system.progress import Progress
 
 HERE = all(importlib.util.find_spec(name) for name in ("diffusers", "transformers", "peft"))
 needs = pytest.mark.skipif(not HERE, reason="diffusers, transformers or peft is not installed")

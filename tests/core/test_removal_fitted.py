@@ -14,12 +14,15 @@ import pytest
 from core.capture import Camera, Capture
 from core.capture.discs import clipped_discs
 from core.colour import ColourSpace, colour_space
+from core.colour.srgb import LUMINANCE, linear_from_srgb, srgb_from_linear
 from core.errors import CaptureError, FrameError, SettingsError
-from core.pictures import LUMINANCE, linear_from_srgb, read_exr, read_picture, srgb_from_linear, write_exr, write_png
-from core.progress import Progress
-from core.removal.fitted import _parts, remove_fitted, without
-from core.removal.plates import Plate, read_plate
-from core.removal.record import RECORD
+from core.images.exr import read_exr
+from core.images.plates import Plate, read_plate
+from core.images.read import read_picture
+from core.images.write import write_exr, write_png
+from core.removal.jobs.fitted import _parts, remove_fitted, without
+from core.removal.jobs.manifest import RECORD
+from core.system.progress import Progress
 from tests.core.flared import LIGHT, flare, flared_capture
 from tests.core.heard import Heard
 

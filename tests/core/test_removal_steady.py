@@ -10,16 +10,15 @@ import pytest
 from numpy.typing import NDArray
 
 from core.errors import FrameError
-from core.progress import Progress
-from core.removal import motion
-from core.removal.batch import plates_of, remove_all, with_neighbours
-from core.removal.inference import Remover, Told
-from core.removal.odds import Signs
-from core.removal.plates import Plate
-from core.removal.record import RECORD
-from core.removal.sequences import OFFSETS, Sequences, by_number
-from core.removal.steady import Neighbour, Sighting, guide, of_one_shot, steadied
-from core.removal.views import Views, told_once
+from core.images.plates import Plate
+from core.removal.inference.confidence import Signs
+from core.removal.inference.neighbours import OFFSETS, Sequences, by_number
+from core.removal.inference.remover import Remover, Told, optical_flow
+from core.removal.inference.temporal import Neighbour, Sighting, guide, of_one_shot, steadied
+from core.removal.inference.test_time_views import Views, told_once
+from core.removal.jobs.batch import plates_of, remove_all, with_neighbours
+from core.removal.jobs.manifest import RECORD
+from core.system.progress import Progress
 
 Pixels = NDArray[np.float32]
 
@@ -39,7 +38,8 @@ def in_shot(here: Sighting, others: list[Sighting]) -> Told:
     """What is told of `here` beside those of the others that are of its shot."""
     a = here.guide
     return steadied(here, [
-        Neighbour(other, share, motion.flow(a.grey, other.guide.grey), motion.flow(other.guide.grey, a.grey))
+        Neighbour(other, share, optical_flow.flow(a.grey, other.guide.grey),
+                  optical_flow.flow(other.guide.grey, a.grey))
         for other in others if (share := of_one_shot(a, other.guide)) > 0])
 
 
@@ -151,7 +151,7 @@ def test_what_of_a_frame_is_glow_is_as_its_own_views_tell() -> None:
     frame = told(scene(4), 0.1)
     glow = np.random.default_rng(0).random((48, 64, 3)).astype(np.float32)
     frame = frame._replace(views=frame.views._replace(glow=glow))
-    still = motion.flow(frame.guide.grey, frame.guide.grey)
+    still = optical_flow.flow(frame.guide.grey, frame.guide.grey)
     for about in ([], [Neighbour(told(scene(4), 0.1), np.float32(1), still, still)]):
         assert np.array_equal(steadied(frame, about).glow, glow)
 

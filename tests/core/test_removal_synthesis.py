@@ -11,15 +11,16 @@ import pytest
 from numpy.typing import NDArray
 
 from core.errors import FrameError, SettingsError
-from core.pictures import write_png
-from core.removal import chances, formation, pairs, variety
-from core.removal.backgrounds import Backgrounds, kept_for_test, read_backgrounds, told_left_out
-from core.removal.bank import Mixed, OwnFlares, SynthesisBank
-from core.removal.recipe import Recipe
+from core.images.write import write_png
+from core.removal.model import image_formation
+from core.removal.model.recipe import Recipe
 from core.removal.synthesis import aspheric, shapes
 from core.removal.synthesis import prescription as lenses
 from core.removal.synthesis.canvas import grid
-from core.removal.synthesis.layers import CLASSES, Flare, flare
+from core.removal.synthesis.flare import CLASSES, Flare, flare
+from core.removal.training import background_augmentation, pairs, random_cameras
+from core.removal.training.backgrounds import Backgrounds, kept_for_test, read_backgrounds, told_left_out
+from core.removal.training.flare_bank import Mixed, OwnFlares, SynthesisBank
 
 ROOT = Path(__file__).resolve().parents[2]
 SIZE = 96
@@ -34,9 +35,9 @@ stop  2.0  1.0  0     10  0
 
 def test_flare_adds_in_light() -> None:
     scene, glow = (np.full((2, 2, 3), value, np.float32) for value in (0.5, 0.4))
-    assert formation.display(scene**2 + glow**2, 2.0) == pytest.approx(np.sqrt(0.25 + 0.16), abs=1e-6)
-    assert formation.display(scene**2.2 + 1, 2.2) == pytest.approx(1.0)
-    assert formation.display(scene**1.8, 1.8) == pytest.approx(0.5, abs=1e-6)
+    assert image_formation.display(scene**2 + glow**2, 2.0) == pytest.approx(np.sqrt(0.25 + 0.16), abs=1e-6)
+    assert image_formation.display(scene**2.2 + 1, 2.2) == pytest.approx(1.0)
+    assert image_formation.display(scene**1.8, 1.8) == pytest.approx(0.5, abs=1e-6)
 
 
 def test_a_flare_adds_less_to_what_a_bent_curve_shows_brighter() -> None:
@@ -45,9 +46,9 @@ def test_a_flare_adds_less_to_what_a_bent_curve_shows_brighter() -> None:
     for shoulder in (0.3, 0.7, 1.0):
         light = -np.log(1 - shoulder * scene) / shoulder
         expected = (1 - np.exp(-shoulder * (light + glow))) / shoulder
-        assert formation.under_shoulder(scene, glow, shoulder) == pytest.approx(expected, abs=1e-5)
-    assert formation.under_shoulder(scene, glow * 0, 0.5) == pytest.approx(scene)
-    assert formation.under_shoulder(scene, glow, 1e-3) == pytest.approx(scene + glow, abs=0.01), "hardly bent"
+        assert image_formation.under_shoulder(scene, glow, shoulder) == pytest.approx(expected, abs=1e-5)
+    assert image_formation.under_shoulder(scene, glow * 0, 0.5) == pytest.approx(scene)
+    assert image_formation.under_shoulder(scene, glow, 1e-3) == pytest.approx(scene + glow, abs=0.01), "hardly bent"
 
 
 def test_some_pairs_are_of_cameras_with_bent_curves() -> None:
@@ -71,17 +72,17 @@ def test_some_pairs_are_graded_so_that_black_is_grey() -> None:
         one = pairs.pair(np.random.default_rng(seed), made, some, 96, 64, clean=1, faded=1)
         assert 0.01 < one.scene.min() < 0.3 and one.scene.max() <= 1
         assert np.array_equal(one.frame, one.scene)
-        black, white = chances.fade(np.random.default_rng(seed))
+        black, white = random_cameras.fade(np.random.default_rng(seed))
         assert black.shape == white.shape == (3,)
         assert (black >= 0).all() and (black + 0.4 < white).all() and (white <= 1).all()
 
 
 def test_coverage_is_the_share_of_the_frame_that_holds_the_energy() -> None:
     layer = np.zeros((10, 10, 3), np.float32)
-    assert formation.coverage(layer) == 0
+    assert image_formation.coverage(layer) == 0
     layer[0, 0] = 1
-    assert formation.coverage(layer) == 0.01
-    assert formation.coverage(np.ones((10, 10, 3), np.float32)) == 0.9
+    assert image_formation.coverage(layer) == 0.01
+    assert image_formation.coverage(np.ones((10, 10, 3), np.float32)) == 0.9
 
 
 def test_a_lens_is_read_and_has_its_focal_length() -> None:
@@ -152,7 +153,7 @@ def test_a_smear_is_beams_from_the_light() -> None:
 
 
 def test_flares_span_small_to_full_frame() -> None:
-    covered = [formation.coverage(flare((11, k), SIZE, lenses.built_in()).whole) for k in range(60)]
+    covered = [image_formation.coverage(flare((11, k), SIZE, lenses.built_in()).whole) for k in range(60)]
     assert min(covered) < 0.02
     assert max(covered) > 0.7
 
@@ -204,7 +205,7 @@ def test_against_the_light_lights_are_where_the_scene_is_bright() -> None:
     anywhere: list[bool] = []
     for seed in range(60):
         random = np.random.default_rng(seed)
-        first = chances.laid(random, layers.size, 96, 64)
+        first = random_cameras.laid(random, layers.size, 96, 64)
         matrix, bright = pairs._against_light(random, layers, first, scene)
         for places, laid in ((there, matrix), (anywhere, first)):
             x, y = pairs._on_frame(laid, layers, layers.lights[0])
@@ -410,25 +411,25 @@ def test_few_backgrounds_look_like_many() -> None:
     ramp = np.broadcast_to(np.linspace(20, 240, 160)[None, :, None] * np.array([1, 0.5, 0.25]), (120, 160, 3))
     plain, varied = (Backgrounds([ramp.astype(np.uint8)], [], varied) for varied in (False, True))
 
-    def drawn(some: Backgrounds) -> list[formation.Pixels]:
+    def drawn(some: Backgrounds) -> list[image_formation.Pixels]:
         scenes = [some.draw(np.random.default_rng(seed), 48, 32, 2.0) for seed in range(100)]
         assert all(scene.shape == (32, 48, 3) and scene.dtype == np.float32 for scene in scenes)
         assert all(np.isfinite(scene).all() and scene.min() >= 0 for scene in scenes)
         return scenes
 
-    def sideways(scene: formation.Pixels) -> bool:
+    def sideways(scene: image_formation.Pixels) -> bool:
         return bool(np.ptp(scene[..., 0], 0).mean() > np.ptp(scene[..., 0], 1).mean())
 
-    def tinted(scene: formation.Pixels) -> bool:
+    def tinted(scene: image_formation.Pixels) -> bool:
         red, green = (float(scene[..., channel].mean()) for channel in (0, 1))
         return abs(red / 4 - green) > 0.2 * green
 
-    def askew(scene: formation.Pixels) -> bool:
+    def askew(scene: image_formation.Pixels) -> bool:
         """Gets brighter downwards too, but less so."""
         down, across = (np.median(np.abs(np.diff(scene.sum(-1), axis=axis))) for axis in (0, 1))
         return bool(across / 20 < down < across)
 
-    def cut(scene: formation.Pixels) -> bool:
+    def cut(scene: image_formation.Pixels) -> bool:
         """Has edges both ways."""
         return all(np.abs(np.diff(scene[..., 1], axis=axis)).max() > 0.02 for axis in (0, 1))
 
@@ -453,7 +454,7 @@ def test_haze_lies_behind_what_is_near() -> None:
     scene[50:, 20:70] = 0.01 * random.random((30, 50, 3))  # someone in front of it, against the light
     hidden = []
     for seed in range(30):
-        hazy = variety._hazy(np.random.default_rng(seed), scene)
+        hazy = background_augmentation._hazy(np.random.default_rng(seed), scene)
         near, far = hazy[54:, 24:66], hazy[:30]
         assert np.abs(near - scene[54:, 24:66]).max() < 0.01, "no veil over it"
         hidden.append(1 - float(np.abs(np.diff(far, axis=1)).mean() / np.abs(np.diff(scene[:30], axis=1)).mean()))
@@ -463,7 +464,7 @@ def test_haze_lies_behind_what_is_near() -> None:
 def test_a_light_out_of_focus_is_a_disc_or_a_polygon_of_as_much_light() -> None:
     light = np.zeros((80, 120, 3), np.float32)
     light[40, 60] = 900.0
-    shapes = [variety._out_of_focus(np.random.default_rng(seed), light) for seed in range(60)]
+    shapes = [background_augmentation._out_of_focus(np.random.default_rng(seed), light) for seed in range(60)]
     for shape in shapes:
         lit = shape[..., 0] > 0.01 * shape.max()
         rows, columns = np.nonzero(lit)

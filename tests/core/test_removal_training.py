@@ -15,24 +15,27 @@ import numpy as np
 import pytest
 import torch
 
+from core.colour.srgb import Pixels
 from core.errors import Cancelled, EngineError, FrameError, RunError, SettingsError
-from core.holding import held
+from core.images.contact_sheet import GAP, HEAD
+from core.images.write import write_png
 from core.metrics.lpips import Lpips
-from core.pictures import Pixels, write_png
-from core.progress import Progress
-from core.removal import backgrounds as removal_backgrounds
-from core.removal import evaluation, network, optimiser, training, weights
-from core.removal.backgrounds import Backgrounds
-from core.removal.bank import OwnFlares
-from core.removal.batches import Batch, Batches
-from core.removal.learners import ALONE, Learner, Table, shared
-from core.removal.mapped import Mapped
-from core.removal.network import Attention, RemovalNetwork
-from core.removal.optimiser import Optimiser
-from core.removal.recipe import Recipe, as_dict, from_dict
+from core.removal import evaluation
+from core.removal.model import network, weights
+from core.removal.model.network import Attention, RemovalNetwork
+from core.removal.model.recipe import Recipe, as_dict, from_dict
 from core.removal.synthesis.prescription import built_in
-from core.removal.trainer import Trainer
-from core.sheets import GAP, HEAD
+from core.removal.training import backgrounds as removal_backgrounds
+from core.removal.training import optimiser, run
+from core.removal.training.backgrounds import Backgrounds
+from core.removal.training.batches import Batch, Batches
+from core.removal.training.flare_bank import OwnFlares
+from core.removal.training.optimiser import Optimiser
+from core.removal.training.shared_arrays import Mapped
+from core.removal.training.trainer import Trainer
+from core.removal.training.workers import ALONE, Learner, Table, shared
+from core.system.folder_lock import held
+from core.system.progress import Progress
 
 torch.set_num_threads(1)  # small tensors, on which threads only wait for each other
 
@@ -65,15 +68,15 @@ class StopAfter(Progress):
 
 
 def test_a_training_that_was_stopped_goes_on_as_if_it_was_not(tmp_path: Path) -> None:
-    whole = training.train(RECIPE, tmp_path / "whole", backgrounds(), built_in(), processes=1)
+    whole = run.train(RECIPE, tmp_path / "whole", backgrounds(), built_in(), processes=1)
     with pytest.raises(Cancelled):
-        training.train(RECIPE, tmp_path / "parts", backgrounds(), built_in(), processes=1,
+        run.train(RECIPE, tmp_path / "parts", backgrounds(), built_in(), processes=1,
                        progress=StopAfter(2))
     with pytest.raises(RunError, match="--resume"):
-        training.train(RECIPE, tmp_path / "parts", backgrounds(), built_in())
+        run.train(RECIPE, tmp_path / "parts", backgrounds(), built_in())
     with held(tmp_path / "parts"), pytest.raises(RunError, match="Another process"):
-        training.train(RECIPE, tmp_path / "parts", backgrounds(), built_in(), resume=True)
-    parts = training.train(RECIPE, tmp_path / "parts", backgrounds(), built_in(), resume=True, processes=2)
+        run.train(RECIPE, tmp_path / "parts", backgrounds(), built_in(), resume=True)
+    parts = run.train(RECIPE, tmp_path / "parts", backgrounds(), built_in(), resume=True, processes=2)
     a, b = weights.read(whole)[0], weights.read(parts)[0]
     assert a.keys() == b.keys()
     for name in a:
@@ -98,9 +101,9 @@ def test_the_step_after_a_stop_is_the_one_that_would_have_come() -> None:
 
 
 def test_learners_share_the_frames_of_one(tmp_path: Path) -> None:
-    alone = training.train(RECIPE, tmp_path / "alone", backgrounds(), built_in(), processes=1)
-    by_three = training.train(RECIPE, tmp_path / "three", backgrounds(), built_in(), processes=3)
-    logs = [json.loads((path.parent / training.LOG).read_text(encoding="utf-8")) for path in (alone, by_three)]
+    alone = run.train(RECIPE, tmp_path / "alone", backgrounds(), built_in(), processes=1)
+    by_three = run.train(RECIPE, tmp_path / "three", backgrounds(), built_in(), processes=3)
+    logs = [json.loads((path.parent / run.LOG).read_text(encoding="utf-8")) for path in (alone, by_three)]
     assert logs[0]["untouched"] == pytest.approx(logs[1]["untouched"], rel=1e-4), "the pictures are the same"
     a, b = weights.read(alone)[0], weights.read(by_three)[0]
     for name in a:
@@ -168,7 +171,7 @@ def test_a_learner_that_is_no_more_is_told(tmp_path: Path) -> None:
     with shared(1, ends) as learner:
         assert learner == ALONE
     with pytest.raises(SettingsError, match="at least one process"):
-        training.train(RECIPE, tmp_path, backgrounds(), built_in(), processes=0)
+        run.train(RECIPE, tmp_path, backgrounds(), built_in(), processes=0)
 
 
 def test_pictures_that_processes_share_are_mapped(tmp_path: Path) -> None:
@@ -334,16 +337,16 @@ def test_stages_of_a_training() -> None:
 
 
 def test_going_on_from_weights(tmp_path: Path) -> None:
-    first = training.train(RECIPE, tmp_path / "first", backgrounds(), built_in(), processes=1)
-    second = training.train(RECIPE, tmp_path / "second", backgrounds(), built_in(), start=first, processes=1)
+    first = run.train(RECIPE, tmp_path / "first", backgrounds(), built_in(), processes=1)
+    second = run.train(RECIPE, tmp_path / "second", backgrounds(), built_in(), start=first, processes=1)
     assert weights.read(second)[1]["iteration"] == "4"
     other = Recipe(**{**RECIPE.__dict__, "widths": (16, 8, 8, 8, 8)})
-    third = training.train(other, tmp_path / "third", backgrounds(), built_in(), start=first, processes=1)
+    third = run.train(other, tmp_path / "third", backgrounds(), built_in(), start=first, processes=1)
     assert widths_of(third) == RECIPE.widths, "the network is that of the weights"
     tensors, _ = weights.read(first)
     weights.write(tmp_path / "foreign.safetensors", tensors, {"recipe": "{}"})
     with pytest.raises(RunError, match="holds no weights"):
-        training.train(RECIPE, tmp_path / "fourth", backgrounds(), built_in(), start=tmp_path / "foreign.safetensors")
+        run.train(RECIPE, tmp_path / "fourth", backgrounds(), built_in(), start=tmp_path / "foreign.safetensors")
 
 
 def test_attention_is_torch_s_own(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -361,28 +364,28 @@ def test_attention_is_torch_s_own(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_network_grows_by_blocks_that_do_nothing_yet(tmp_path: Path) -> None:
     small = replace(RECIPE, blocks=(0, 1, 1, 1, 1), attention=(0, 0))
     large = replace(RECIPE, blocks=(1, 0, 2, 1, 3), attention=(0, 1))
-    first = training.train(small, tmp_path / "first", backgrounds(), built_in(), processes=1)
-    grown = training.Beginning(large, first, False, backgrounds(), built_in(), None).trainer(ALONE)
+    first = run.train(small, tmp_path / "first", backgrounds(), built_in(), processes=1)
+    grown = run.Beginning(large, first, False, backgrounds(), built_in(), None).trainer(ALONE)
     assert [len(enter) for enter in grown.network.enter] == [1, 1, 2, 1, 3]  # type: ignore[arg-type]
     frame = torch.rand(1, 3, 64, 64)
     with torch.no_grad():
         before, after = weights.load(first)(frame), grown.network(frame)
     assert before.flare.std() > 0
     torch.testing.assert_close(after.flare, before.flare, rtol=1e-3, atol=1e-6)  # a fused layout adds up otherwise
-    grown_to = training.train(large, tmp_path / "second", backgrounds(), built_in(), start=first, processes=1)
+    grown_to = run.train(large, tmp_path / "second", backgrounds(), built_in(), start=first, processes=1)
     form = weights.form(grown_to, weights.read(grown_to)[1])
     assert form == (small.widths, (1, 1, 2, 1, 3), (0, 1))
     longer = replace(large, iterations=5, blocks=(4, 4, 4, 4, 4), attention=(2, 2))
-    training.train(longer, tmp_path / "second", backgrounds(), built_in(), resume=True, processes=1)
+    run.train(longer, tmp_path / "second", backgrounds(), built_in(), resume=True, processes=1)
     assert weights.form(grown_to, weights.read(grown_to)[1]) == form, "none grows on the way"
     of_before = {name: value for name, value in as_dict(small).items() if name != "attention"}
     assert weights.form(first, {"recipe": json.dumps(of_before)}).attention == (0, 0)
 
 
 def test_the_log_has_figures_and_checks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(training, "checks", partial(training.checks, count=8))
-    training.train(RECIPE, tmp_path, backgrounds(), built_in(), tests=(backgrounds(), built_in()), processes=1)
-    (line,) = [json.loads(text) for text in (tmp_path / training.LOG).read_text(encoding="utf-8").splitlines()]
+    monkeypatch.setattr(run, "checks", partial(run.checks, count=8))
+    run.train(RECIPE, tmp_path, backgrounds(), built_in(), tests=(backgrounds(), built_in()), processes=1)
+    (line,) = [json.loads(text) for text in (tmp_path / run.LOG).read_text(encoding="utf-8").splitlines()]
     assert line["iteration"] == 4
     assert "gain_db" in line
     drawn = [Batches(RECIPE, backgrounds(), built_in())[at] for at in range(4)]
@@ -392,36 +395,36 @@ def test_the_log_has_figures_and_checks(tmp_path: Path, monkeypatch: pytest.Monk
 
 def test_the_log_of_a_training_that_was_killed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What it told after its last checkpoint is told anew, once."""
-    monkeypatch.setattr(training, "CHECK_EVERY", 1)
+    monkeypatch.setattr(run, "CHECK_EVERY", 1)
     with pytest.raises(Cancelled):
-        training.train(RECIPE, tmp_path, backgrounds(), built_in(), processes=1, progress=StopAfter(2))
-    log = tmp_path / training.LOG
+        run.train(RECIPE, tmp_path, backgrounds(), built_in(), processes=1, progress=StopAfter(2))
+    log = tmp_path / run.LOG
     log.write_text(log.read_text(encoding="utf-8") + '{"iteration": 3, "loss": 7.0}\n{"iterat', encoding="utf-8")
-    training.train(RECIPE, tmp_path, backgrounds(), built_in(), resume=True, processes=1)
+    run.train(RECIPE, tmp_path, backgrounds(), built_in(), resume=True, processes=1)
     lines = [json.loads(text) for text in log.read_text(encoding="utf-8").splitlines()]
     assert [line["iteration"] for line in lines] == [1, 2, 3, 4] and lines[2]["loss"] != 7.0
 
 
 def test_the_weights_of_the_best_check_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     gains = {1: 1.0, 2: 2.5, 3: 2.0, 4: 2.5, 5: 3.0, 6: 0.0}
-    monkeypatch.setattr(training, "checks", lambda *_: {"streak": []})
-    monkeypatch.setattr(training, "CHECK_EVERY", 1)
+    monkeypatch.setattr(run, "checks", lambda *_: {"streak": []})
+    monkeypatch.setattr(run, "CHECK_EVERY", 1)
     monkeypatch.setattr(Trainer, "check", lambda trainer, _: {"mean": gains[trainer.iteration]})
-    train = partial(training.train, RECIPE, backgrounds=backgrounds(), lenses=built_in(), processes=1)
+    train = partial(run.train, RECIPE, backgrounds=backgrounds(), lenses=built_in(), processes=1)
     tests = backgrounds(), built_in()
 
     def kept(folder: str) -> str:
-        return weights.read(tmp_path / folder / training.WEIGHTS)[1]["iteration"]
+        return weights.read(tmp_path / folder / run.WEIGHTS)[1]["iteration"]
 
     train(tmp_path / "whole", tests=tests)
     assert kept("whole") == "2"
     with pytest.raises(Cancelled):
         train(tmp_path / "parts", tests=tests, progress=StopAfter(3))
-    assert weights.read(tmp_path / "parts" / training.CHECKPOINT)[1]["iteration"] == "3"
+    assert weights.read(tmp_path / "parts" / run.CHECKPOINT)[1]["iteration"] == "3"
     train(tmp_path / "parts", tests=tests, resume=True)
     assert kept("parts") == "2", "what a part before had found is still the best"
     longer = replace(RECIPE, iterations=6)
-    training.train(longer, tmp_path / "parts", backgrounds(), built_in(), tests=tests, resume=True, processes=1)
+    run.train(longer, tmp_path / "parts", backgrounds(), built_in(), tests=tests, resume=True, processes=1)
     assert kept("parts") == "5"
     train(tmp_path / "untested")
     assert kept("untested") == "4"
@@ -439,8 +442,8 @@ def test_a_training_that_comes_to_no_number_stops(tmp_path: Path, monkeypatch: p
 
     monkeypatch.setattr(Trainer, "step", broken)
     with pytest.raises(RunError, match=r"Iteration 3 .* no number.*learning_rate"):
-        training.train(RECIPE, tmp_path, backgrounds(), built_in(), processes=1, save_every_s=0)
-    state, about = weights.read(tmp_path / training.CHECKPOINT)
+        run.train(RECIPE, tmp_path, backgrounds(), built_in(), processes=1, save_every_s=0)
+    state, about = weights.read(tmp_path / run.CHECKPOINT)
     assert about["iteration"] == "2", "what was saved last is whole"
     assert all(torch.isfinite(value).all() for value in state.values())
 
@@ -598,14 +601,14 @@ def test_lpips_with_weights_of_the_user(tmp_path: Path) -> None:
 
 
 def test_a_share_of_the_weights_begun_with_is_kept(tmp_path: Path) -> None:
-    first = training.train(RECIPE, tmp_path / "first", backgrounds(), built_in(), processes=1)
+    first = run.train(RECIPE, tmp_path / "first", backgrounds(), built_in(), processes=1)
     kept = {}
     for share in (0.0, 0.5, 1.0):
         folder, recipe = tmp_path / str(share), replace(RECIPE, begun=share, seed=2)
         with pytest.raises(Cancelled):
-            training.train(recipe, folder, backgrounds(), built_in(), start=first, processes=1, progress=StopAfter(2))
-        training.train(recipe, folder, backgrounds(), built_in(), start=first, processes=1, resume=True)
-        kept[share] = weights.read(folder / training.WEIGHTS)[0]
+            run.train(recipe, folder, backgrounds(), built_in(), start=first, processes=1, progress=StopAfter(2))
+        run.train(recipe, folder, backgrounds(), built_in(), start=first, processes=1, resume=True)
+        kept[share] = weights.read(folder / run.WEIGHTS)[0]
     begun = weights.read(first)[0]
     assert any(not torch.equal(kept[0.0][name], value) for name, value in begun.items())
     for name, value in begun.items():
@@ -618,8 +621,8 @@ def test_what_has_grown_is_kept_by_the_same_share(tmp_path: Path) -> None:
     """Of a network that grew, the weights begun with are those of the smaller one, which tells the same."""
     small, large = replace(RECIPE, blocks=(0, 1, 1, 2, 2), attention=(0, 0)), replace(RECIPE, blocks=(0, 1, 2, 2, 2),
                                                                                       attention=(1, 1), begun=1.0)
-    first = training.train(small, tmp_path / "first", backgrounds(), built_in(), processes=1)
-    grown = training.train(large, tmp_path / "grown", backgrounds(), built_in(), start=first, processes=1)
+    first = run.train(small, tmp_path / "first", backgrounds(), built_in(), processes=1)
+    grown = run.train(large, tmp_path / "grown", backgrounds(), built_in(), start=first, processes=1)
     name = "between.0.0.asked.weight"
     assert weights.read(grown)[0][name].any()
     frame = torch.rand(1, 3, 64, 64)

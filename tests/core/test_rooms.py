@@ -10,8 +10,9 @@ import cv2
 import numpy as np
 import pytest
 
-from core.pictures import read_picture, write_png
-from core.removal.backgrounds import kept_for_test
+from core.images.read import read_picture
+from core.images.write import write_png
+from core.removal.training.backgrounds import kept_for_test
 
 ROOT = Path(__file__).parents[2]
 SMALL = """

@@ -15,9 +15,10 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from core.capture import Capture
+from core.colour.srgb import srgb_from_linear
 from core.errors import SettingsError
-from core.pictures import read_picture, srgb_from_linear
-from core.progress import Progress
+from core.images.read import read_picture
+from core.system.progress import Progress
 from sample_scenes.description import Pinhole, looking_at
 from sample_scenes.flares import LOOKS, Look, render_flare
 from sample_scenes.flares.aperture import Aperture

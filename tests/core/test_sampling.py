@@ -14,7 +14,9 @@ import torch
 
 from core.bake.shot import ShotRenderer
 from core.capture import Camera, Capture
-from core.display import decode, encode
+from core.colour.srgb_torch import decode, encode
+from core.conventions.pixel_grid import DILATION, MOST_PIXELS, PIXEL, Sampling, dilation
+from core.conventions.run_files import FLARE, SCENE
 from core.errors import FlareFileError
 from core.fit import Run, fit
 from core.fit.rendering import render_scene
@@ -28,8 +30,6 @@ from core.look import PlaneGaussians as LookGaussians
 from core.look import draw, pixels, read
 from core.look.container import read_tensors, rewritten
 from core.look.shot import PlacedLight, Shot, ShotFrame
-from core.run_files import FLARE, SCENE
-from core.sampling import DILATION, MOST_PIXELS, PIXEL, Sampling, dilation
 from tests.core.flared import HEIGHT, LIGHT, WIDTH, cameras, flared_capture
 from tests.core.test_fit import quick
 

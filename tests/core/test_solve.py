@@ -27,11 +27,15 @@ from core.capture.solve.mapping import Model, Solved, SolvedFrame
 from core.capture.solve.pairs import choose_matching, choose_pairs
 from core.capture.solve.stills import Still, choose, gather, usable
 from core.capture.solve.world import up_direction
+from core.colour.srgb import linear_from_srgb
 from core.errors import Cancelled, CaptureError, FrameError, RunError, SettingsError
-from core.files import atomic_path
-from core.holding import held
-from core.pictures import Picture, linear_from_srgb, picture_size, read_picture, stored_pixels, write_exr
-from core.progress import Progress
+from core.images.picture import Picture
+from core.images.read import read_picture, stored_pixels
+from core.images.size import picture_size
+from core.images.write import write_exr
+from core.system.files import atomic_path
+from core.system.folder_lock import held
+from core.system.progress import Progress
 from tests.core.captures import look_at, make_capture, orbit
 from tests.core.heard import Heard
 from tests.core.test_video import with_pixels

@@ -17,16 +17,18 @@ from core.bake.bake import RECORD, BakeSettings, read_record
 from core.bake.exr import read_layers
 from core.capture import Camera, Capture
 from core.colour import colour_space
+from core.colour.srgb import linear_from_srgb, srgb_from_linear
 from core.errors import RunError, SettingsError
-from core.files import write_json
 from core.flare import file as flare_file
 from core.flare.file import FlareFile
 from core.gaussians import SceneGaussians
 from core.gaussians.ply import write_ply
+from core.images.exr import read_exr, window_of
+from core.images.plates import Plate
+from core.images.write import write_exr, write_png
 from core.look import KeyedEdits, Look, TrainedCamera, ViewOfLight, read
 from core.look.shot import PlacedLight, Shot, ShotFrame
-from core.pictures import linear_from_srgb, read_exr, srgb_from_linear, window_of, write_exr, write_png
-from core.removal.plates import Plate
+from core.system.files import write_json
 from core.transfer import query as queries
 from core.transfer.plates import ColouredPlate
 from core.transfer.sources import assigned, parsed
@@ -338,7 +340,7 @@ def test_an_acescg_plate_keeps_its_values_outside_the_flare(flare: Path, look: L
     transfer = Transfer(flare, plate_target(tmp_path / "plate.0001.exr", look))
     transfer.bake(tmp_path / "out", settings=BakeSettings(space="acescg"))
     made = read_exr(tmp_path / "out" / "layers.0001.exr")
-    framed = read_exr(tmp_path / "out" / "frames" / "plate.0001.exr")
+    crop_to_display_window = read_exr(tmp_path / "out" / "frames" / "plate.0001.exr")
     light = np.stack([made[f"flare.{channel}"] for channel in "RGB"], -1)
     outside = ~(light != 0).any(-1)
     assert 0.2 < outside.mean() < 0.99
@@ -346,7 +348,7 @@ def test_an_acescg_plate_keeps_its_values_outside_the_flare(flare: Path, look: L
         stored = values[..., index].astype(np.float32)
         np.testing.assert_array_equal(made[f"scene.{channel}"], stored)
         np.testing.assert_array_equal(made[channel][outside], stored[outside])
-        np.testing.assert_array_equal(framed[channel][outside], stored[outside])
+        np.testing.assert_array_equal(crop_to_display_window[channel][outside], stored[outside])
         assert (made[channel] != stored)[~outside].mean() > 0.3
     for path in (tmp_path / "out" / "layers.0001.exr", tmp_path / "out" / "frames" / "plate.0001.exr"):
         with OpenEXR.File(str(path), header_only=True) as file:

@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 import torch
 
-from core.exposures import brightness
+from core.conventions.exposures import brightness
+from core.conventions.pixel_grid import Sampling
 from core.flare.model import OURS, PAPER
 from core.gaussians import rasterization
 from core.gaussians.ply import read_ply
 from core.gaussians.projection import rotation_matrices
 from core.gaussians.rendering import ALPHA_MIN
 from core.look import LookEdits, PlaneGaussians, ViewOfLight, draw, read
-from core.sampling import Sampling
 from core.transfer.export import _part, flare_scene, preset, write_flare_ply, write_preset
 from tests.core.flared import cameras
 from tests.core.test_look import saved

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from core.colour.srgb import linear_from_srgb
 from core.errors import Cancelled, FrameError, SettingsError
-from core.pictures import linear_from_srgb
-from core.progress import Progress
-from core.removal import bank
-from core.removal.bank import OwnFlares
-from core.removal.footage import frames_of, with_frames
-from core.video import Video
+from core.images.video import Video
+from core.removal.jobs.video_frames import frames_of, with_frames
+from core.removal.training import flare_bank
+from core.removal.training.flare_bank import OwnFlares
+from core.system.progress import Progress
 from tests.core.heard import Heard
 
 PATCHES = np.array([(200, 60, 40), (40, 180, 60), (50, 70, 210), (128, 128, 128), (230, 200, 40), (240, 240, 240)])
@@ -133,7 +133,7 @@ def test_a_clip_that_claims_more_frames_than_it_has_trains(tmp_path: Path, monke
     path = tmp_path / "clips" / "flare.mp4"
     path.parent.mkdir()
     patches(path, 360, (0.299, 0.114))
-    monkeypatch.setattr(bank, "Video", Longer)
+    monkeypatch.setattr(flare_bank, "Video", Longer)
     assert OwnFlares(path.parent, 256).draw(np.random.default_rng(0)).rest.max() > 0.1
 
 
@@ -171,7 +171,7 @@ def test_the_frames_of_a_video_are_taken_out_once(tmp_path: Path, monkeypatch: p
     with Video(clip) as again:
         assert np.array_equal(first, next(iter(again)))
     with monkeypatch.context() as patch:
-        patch.setattr("core.removal.footage._take_out", lambda *_: pytest.fail("they are there"))
+        patch.setattr("core.removal.jobs.video_frames._take_out", lambda *_: pytest.fail("they are there"))
         assert frames_of(clip, out, Progress()) == frames
     patches(clip, 96, (0.299, 0.114))
     with pytest.raises(SettingsError, match=r"another video of that name"):
@@ -181,7 +181,7 @@ def test_the_frames_of_a_video_are_taken_out_once(tmp_path: Path, monkeypatch: p
 def test_what_another_task_has_taken_out_meanwhile_is_taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     clip, out = patches(tmp_path / "clip.mp4", 64, (0.299, 0.114)), tmp_path / "out"
     there = frames_of(clip, tmp_path / "other", Progress())
-    monkeypatch.setattr("core.removal.footage._take_out", lambda *_: there.rename(out / there.name))
+    monkeypatch.setattr("core.removal.jobs.video_frames._take_out", lambda *_: there.rename(out / there.name))
     assert len(list(frames_of(clip, out, Progress()).glob("*.png"))) == 3
 
 

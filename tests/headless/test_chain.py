@@ -25,8 +25,10 @@ import pytest
 from core.bake.exr import read_layers, write_layers
 from core.bake.layers import layers_of
 from core.capture import Capture
+from core.colour.srgb import srgb_from_linear
 from core.fit.run import Run
-from core.pictures import picture_size, read_picture, srgb_from_linear
+from core.images.read import read_picture
+from core.images.size import picture_size
 
 ROOT = Path(__file__).resolve().parents[2]
 RUN = ROOT / "headless" / "run.py"

@@ -19,7 +19,7 @@ import torch
 from fit_flare.core.capture import Capture
 from fit_flare.core.capture.colmap import PointCloud
 from fit_flare.core.errors import Cancelled, CaptureError, FitFlareError, SettingsError
-from fit_flare.core.progress import Progress
+from fit_flare.core.system.progress import Progress
 from fit_flare.headless import cli, layers
 from fit_flare.headless.command import AfterAStop, Command, Step
 from fit_flare.headless.commands import COMMANDS, compose, fit, lights, remove
@@ -83,7 +83,7 @@ def test_lights_and_clean_frames_that_are_made_leave_the_room_for_pictures_as_it
     """A fit keeps few pictures decoded here, since it has its own."""
     capture = Capture.open(make_capture(tmp_path / "c"), cache_bytes=100_000)
     monkeypatch.setattr(lights, "_find", lambda *_: (tmp_path / "c" / "lights.json").write_text('{"lights": []}'))
-    monkeypatch.setattr("fit_flare.core.removal.inference.Remover", lambda **_: None)
+    monkeypatch.setattr("fit_flare.core.removal.inference.remover.Remover", lambda **_: None)
     monkeypatch.setattr("fit_flare.core.removal.captured.remove_from", lambda *_: None)
     for made in (lights.with_lights(capture, Progress()), remove.with_removed(capture, Progress())):
         assert made is not capture

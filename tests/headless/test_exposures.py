@@ -13,10 +13,12 @@ from fit_flare.headless import cli
 
 from core.bake.exr import read_layers
 from core.capture import Capture
+from core.colour.srgb import linear_from_srgb, srgb_from_linear
 from core.fit import Run, fit, preset
 from core.fit.settings import changed
 from core.gaussians.ply import read_ply
-from core.pictures import linear_from_srgb, read_picture, srgb_from_linear, write_png
+from core.images.read import read_picture
+from core.images.write import write_png
 
 TIMES = 1.6
 

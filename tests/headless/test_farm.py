@@ -25,8 +25,8 @@ from core.fit import fit, preset
 from core.fit.settings import changed
 from core.look import read
 from core.look.shot import PlacedLight, Shot, ShotFrame
-from core.removal.record import RECORD
-from core.removal.weights import IN_THE_BOX
+from core.removal.jobs.manifest import RECORD
+from core.removal.model.weights import IN_THE_BOX
 
 ROOT = Path(__file__).resolve().parents[2]
 RUN = ROOT / "headless" / "run.py"

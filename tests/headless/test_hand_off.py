@@ -14,8 +14,8 @@ from typing import Any
 
 import pytest
 from fit_flare.core.errors import Cancelled, EngineError, FitFlareError, SettingsError
-from fit_flare.core.processes import environment
-from fit_flare.core.progress import Progress, stoppable
+from fit_flare.core.system.processes import environment
+from fit_flare.core.system.progress import Progress, stoppable
 from fit_flare.headless import hand_off
 from fit_flare.headless.child import Child, Inbox, next_event
 

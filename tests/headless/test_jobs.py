@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 from fit_flare.core.errors import Cancelled, EngineError, FitFlareError, SettingsError
-from fit_flare.core.progress import Progress
+from fit_flare.core.system.progress import Progress
 from fit_flare.headless import hand_off, jobs
 
 PROCESS = """

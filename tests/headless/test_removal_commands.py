@@ -11,9 +11,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from fit_flare.core.pictures import read_picture, write_png
-from fit_flare.core.removal.record import RECORD
-from fit_flare.core.removal.training import recipe_in
+from fit_flare.core.images.read import read_picture
+from fit_flare.core.images.write import write_png
+from fit_flare.core.removal.jobs.manifest import RECORD
+from fit_flare.core.removal.training.run import recipe_in
 from fit_flare.headless import cli
 
 RUN = Path(__file__).resolve().parents[2] / "headless" / "run.py"

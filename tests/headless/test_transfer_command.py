@@ -22,9 +22,10 @@ from core.fit.settings import changed
 from core.flare.file import FlareFile
 from core.flare.file import save as save_flare
 from core.gaussians.ply import read_ply
+from core.images.read import read_picture
+from core.images.write import write_png
 from core.look import TrainedCamera, read
 from core.look.shot import Shot
-from core.pictures import read_picture, write_png
 from tests.core.captures import make_transforms
 from tests.core.test_flare import some_flare
 

@@ -21,11 +21,11 @@ from typing import Any, get_args
 
 from ...choices import Matching
 from ...errors import CaptureError, SettingsError
-from ...files import read_json, remove_file, remove_partial, write_json
-from ...holding import held
-from ...pictures import pictures_in
-from ...progress import Progress
-from ...video import is_video
+from ...images.listing import pictures_in
+from ...images.video import is_video
+from ...system.files import read_json, remove_file, remove_partial, write_json
+from ...system.folder_lock import held
+from ...system.progress import Progress
 from ..capture import LIGHTS, REMOVED
 from ..lens import MODELS
 

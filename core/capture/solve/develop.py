@@ -8,9 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from ...files import atomic_path, patiently
-from ...pictures import holds_floats, holds_halves, stored_pixels, window_of, write_exr, write_png
-from ...progress import Progress
+from ...images.exr import window_of
+from ...images.read import holds_floats, holds_halves, stored_pixels
+from ...images.write import write_exr, write_png
+from ...system.files import atomic_path, patiently
+from ...system.progress import Progress
 from ..camera import Camera
 from ..colmap import Observed, PointCloud, write_model
 from ..lens import Lens, straightened

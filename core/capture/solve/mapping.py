@@ -19,9 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import CaptureError, EngineError
-from ...files import read_json, write_json, write_text
-from ...pictures import decoded, picture_size
-from ...progress import Progress
+from ...images.read import decoded
+from ...images.size import picture_size
+from ...system.files import read_json, write_json, write_text
+from ...system.progress import Progress
 from ..camera import Floats
 from ..colmap import read_model
 from ..lens import MODELS, Lens

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ...pictures import write_png
+from ...images.write import write_png
 from ..camera import Floats
 from .mapping import Solved
 from .stills import Still

@@ -14,12 +14,18 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ...colour.srgb import Pixels
 from ...errors import CaptureError, FrameError
-from ...exif import read_exif, upright
-from ...files import read_json, write_json
-from ...pictures import Picture, Pixels, picture_size, pictures_in, read_picture, window_of, write_png
-from ...progress import Progress
-from ...video import Video, displayed, is_video, told_short
+from ...images.exr import window_of
+from ...images.formats.exif import read_exif, upright
+from ...images.listing import pictures_in
+from ...images.picture import Picture
+from ...images.read import read_picture
+from ...images.size import picture_size
+from ...images.video import Video, displayed, is_video, told_short
+from ...images.write import write_png
+from ...system.files import read_json, write_json
+from ...system.progress import Progress
 
 RECORD = "stills.json"
 COMBED, SOME = 1.1, 0.25

@@ -14,10 +14,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...splatting import C0 as _C0
-from ...splatting import C1 as _C1
-from ...splatting import C2 as _C2
-from ...splatting import C3 as _C3
+from ...conventions.splatting import C0 as _C0
+from ...conventions.splatting import C1 as _C1
+from ...conventions.splatting import C2 as _C2
+from ...conventions.splatting import C3 as _C3
 from .compilation import inlined
 from .vector import LANES, fma, load, load_rows, opaque, splat, store, store_rows, stream_rows, transpose
 

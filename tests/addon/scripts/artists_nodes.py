@@ -23,7 +23,8 @@ spec.loader.exec_module(run)
 run.load()
 
 from fit_flare.core.bake.folder import LayerFolder  # noqa: E402
-from fit_flare.flare_addon import compositor, flare_node, rendering  # noqa: E402
+from fit_flare.flare_addon import render_settings  # noqa: E402
+from fit_flare.flare_addon.compositor import flare_node, setup  # noqa: E402
 from fit_flare.flare_addon.panels import FITFLARE_PT_bake  # noqa: E402
 
 GROUPS = bpy.app.version >= (5, 0, 0)
@@ -36,8 +37,8 @@ facts: dict[str, object] = {}
 def empty() -> bpy.types.Scene:
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
     scene = bpy.context.scene
-    rendering.match_scene(scene, layers, layers.size())
-    rendering.plain_view(scene)
+    render_settings.match_scene(scene, layers, layers.size())
+    render_settings.plain_view(scene)
     scene.camera = bpy.data.objects.new("Camera", bpy.data.cameras.new("Camera"))
     scene.collection.objects.link(scene.camera)
     return scene
@@ -58,7 +59,7 @@ def grade(tree: bpy.types.NodeTree, name: str = "Grade") -> bpy.types.Node:
     node = tree.nodes.new("CompositorNodeExposure")
     node.name = name
     node.inputs["Exposure"].default_value = 1
-    end = compositor._output(tree)
+    end = setup._output(tree)
     tree.links.new(end.links[0].from_socket, node.inputs[0])
     tree.links.new(node.outputs[0], end)
     return node
@@ -69,7 +70,7 @@ def shown(scene: bpy.types.Scene) -> float | None:
     tree = flare_node.tree_of(scene)
     if tree is None or not all(link.is_valid for link in tree.links):
         return None
-    rendering.render_frames(scene, [layers.first], lambda _number, suffix: out / f"shown{suffix}")
+    render_settings.render_frames(scene, [layers.first], lambda _number, suffix: out / f"shown{suffix}")
     image = bpy.data.images.load(str(out / "shown.exr"))
     value = float(image.pixels[0])
     bpy.data.images.remove(image)
@@ -83,7 +84,7 @@ def names(scene: bpy.types.Scene) -> list[str]:
 
 # ---- taken away from a composite that an artist has built round it ----------------------------------
 scene = empty()
-compositor.set_up(scene, layers)
+setup.set_up(scene, layers)
 tree = flare_node.tree_of(scene)
 fed = tree.nodes.new("CompositorNodeRGB")
 fed.name = "Sky"
@@ -91,63 +92,63 @@ fed.outputs[0].default_value = (0.5, 0.5, 0.5, 1)
 tree.links.new(fed.outputs[0], flare_node.find_node(scene).inputs["Scene"])
 grade(tree)
 facts["with our own tree"] = shown(scene)
-compositor.remove(scene)
+setup.remove(scene)
 facts["our own tree, removed"] = [shown(scene), names(scene)]
 
 # A render that the artist's nodes go on from stays.
 scene = empty()
-compositor.set_up(scene, layers, keep_image=True)
+setup.set_up(scene, layers, keep_image=True)
 grade(flare_node.tree_of(scene))
-compositor.remove(scene)
+setup.remove(scene)
 tree = flare_node.tree_of(scene)
 facts["render goes on"] = tree is not None and tree.nodes["Grade"].inputs[0].is_linked
 
 # Nodes of ours that were deleted by hand, and a composite made since.
 scene = empty()
-compositor.set_up(scene, layers, keep_image=True)
+setup.set_up(scene, layers, keep_image=True)
 if GROUPS:
     bpy.data.node_groups.remove(flare_node.tree_of(scene))
 plate(scene)
-compositor.set_up(scene, layers, keep_image=True)
-compositor.remove(scene)
+setup.set_up(scene, layers, keep_image=True)
+setup.remove(scene)
 facts["made since"] = [shown(scene), names(scene)]
 
 # Our group alone deleted by hand: what was there before it is still known.
 scene = empty()
 tree, _ = plate(scene)
-compositor.set_up(scene, layers)
+setup.set_up(scene, layers)
 tree.nodes.remove(flare_node.find_node(scene))
-compositor.set_up(scene, layers)
-compositor.remove(scene)
+setup.set_up(scene, layers)
+setup.remove(scene)
 facts["set up again"] = [shown(scene), names(scene)]
 
 # ---- nodes behind the flare -------------------------------------------------------------------------
 for over, keep in (("present", True), ("scene", False)):
     scene = empty()
     tree, _ = plate(scene)
-    compositor.set_up(scene, layers, keep_image=keep)
+    setup.set_up(scene, layers, keep_image=keep)
     grade(tree)
     before = shown(scene)
-    compositor.set_up(scene, layers, keep_image=keep)
+    setup.set_up(scene, layers, keep_image=keep)
     facts[f"graded, {over}"] = [before, shown(scene)]
-    compositor.remove(scene)
+    setup.remove(scene)
     facts[f"graded, {over}, removed"] = [shown(scene), names(scene)]
 
 # A file in which that has made a cycle is put right.
 scene = empty()
 tree, colour = plate(scene)
-node = compositor.set_up(scene, layers, keep_image=True)
+node = setup.set_up(scene, layers, keep_image=True)
 after = grade(tree)
-tree.links.new(node.outputs["Image"], compositor._output(tree))
+tree.links.new(node.outputs["Image"], setup._output(tree))
 tree.links.new(after.outputs[0], node.inputs["Scene"])
 facts["a cycle"] = shown(scene)
-compositor.set_up(scene, layers, keep_image=True)
+setup.set_up(scene, layers, keep_image=True)
 facts["no cycle"] = shown(scene)
 
 # ---- over the baked scene, and back -----------------------------------------------------------------
 scene = empty()
 tree, _ = plate(scene)
-node = compositor.set_up(scene, layers, keep_image=True)
+node = setup.set_up(scene, layers, keep_image=True)
 before = node.inputs["Scene"].links[0].from_socket
 stop = tree.nodes.new("CompositorNodeExposure")
 stop.name, stop.inputs["Exposure"].default_value = "Stop", 1
@@ -155,10 +156,10 @@ tree.links.new(before, stop.inputs[0])
 tree.links.new(stop.outputs[0], node.inputs["Scene"])
 facts["over"] = [shown(scene)]
 for keep in (False, True):
-    compositor.set_up(scene, layers, keep_image=keep)
+    setup.set_up(scene, layers, keep_image=keep)
     facts["over"].append(shown(scene))
-compositor.set_up(scene, layers)
-compositor.remove(scene)
+setup.set_up(scene, layers)
+setup.remove(scene)
 facts["over"].append(shown(scene))
 
 # ---- two outputs, of which the second counts --------------------------------------------------------
@@ -172,17 +173,17 @@ else:
     tree.nodes.active = second  # as a click does, which makes it the one that counts, too
 facts["two outputs"] = []
 for _ in range(2):
-    compositor.set_up(scene, layers, keep_image=True)
+    setup.set_up(scene, layers, keep_image=True)
     facts["two outputs"] += [shown(scene), [node.inputs[0].links[0].from_node.name for node in tree.nodes
                                             if node.bl_idname == END]]
     tree.nodes.active = colour  # 4.x goes by the second none the less, and tells nobody
-compositor.remove(scene)
+setup.remove(scene)
 facts["two outputs"].append(shown(scene))
 
 # ---- a slider of the group that has another name ----------------------------------------------------
 scene = empty()
 plate(scene)
-node = compositor.set_up(scene, layers, keep_image=True)
+node = setup.set_up(scene, layers, keep_image=True)
 for item in node.node_tree.interface.items_tree:
     if item.name in ("Intensity", "Scene"):
         item.name = f"My {item.name}"
@@ -192,7 +193,7 @@ FITFLARE_PT_bake._compositor(None, layout, SimpleNamespace(
                        {"node_tree": scene.node_tree, "use_nodes": True})))
 facts["renamed in the panel"] = [call.kwargs["text"] for call in layout.mock_calls if call[0].endswith(".prop")
                                  and "text" in call.kwargs]
-compositor.remove(scene)
+setup.remove(scene)
 facts["renamed sockets"] = [shown(scene), names(scene)]
 
 # ---- a compositor that is linked from another file (up to 4.5 it is its scene's) --------------------
@@ -204,12 +205,12 @@ if GROUPS:
     with bpy.data.libraries.load(str(out / "studio.blend"), link=True) as (there, linked):
         linked.node_groups = there.node_groups
     scene.compositing_node_group = linked.node_groups[0]
-compositor.set_up(scene, layers, keep_image=True)
+setup.set_up(scene, layers, keep_image=True)
 bpy.ops.wm.save_as_mainfile(filepath=str(out / "shot.blend"))
 bpy.ops.wm.open_mainfile(filepath=str(out / "shot.blend"))
 scene = bpy.context.scene
 facts["linked"] = [shown(scene), "Plate" in names(scene)]
-compositor.remove(scene)
+setup.remove(scene)
 facts["linked, removed"] = [shown(scene), names(scene)]
 
 print(json.dumps(facts))

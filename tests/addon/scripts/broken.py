@@ -310,7 +310,7 @@ def dump() -> list[object]:
     return [sorted(item.name for item in bpy.data.objects), state.flare, [item.name for item in state.lights],
             state.master.intensity, now.render.resolution_x, state.capture, len(state.lights),
             sorted(item.name for item in now.objects if item.fit_flare.is_light),
-            part("flare_addon.flare_node").find_node(now) is not None]
+            part("flare_addon.compositor.flare_node").find_node(now) is not None]
 
 
 def slide() -> set[str]:

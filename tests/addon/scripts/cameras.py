@@ -52,12 +52,12 @@ for fx, fy in ((70.0, 50.0), (50.0, 70.0)):
 
 # What a scene has one of.
 Camera = part("core.capture").Camera
-facts["unlike"] = [list(part("flare_addon.capture_import").unlike_the_first(
+facts["unlike"] = [list(part("flare_addon.capture.importer").unlike_the_first(
     [Camera(64, 40, 70.0, 70.0, 32, 20, np.eye(4)), Camera(64, height, 70.0, fy, 32, 20, np.eye(4))]))
     for height, fy in ((40, 70.1), (44, 70.0), (40, 71.4))]
 
 # What was up in the capture is up in Blender.
-axes = part("flare_addon.capture_import").UP
+axes = part("flare_addon.capture.importer").UP
 facts["up"] = {name: list(np.array(Euler(axes[name]).to_matrix()) @ up)
                for name, up in (("Z", (0, 0, 1)), ("-Y", (0, -1, 0)), ("Y", (0, 1, 0)))}
 
@@ -67,7 +67,7 @@ facts["custom"] = list(shots.frames_of(SimpleNamespace(fit_flare=custom)))
 sequence = SimpleNamespace(source="SEQUENCE", library=None, filepath="/s/plate.1001.exr")
 behind = SimpleNamespace(source="IMAGE", image=sequence,
                          image_user=SimpleNamespace(frame_start=1, frame_offset=1004))
-filmed = part("flare_addon.capture_export").footage_of(
+filmed = part("flare_addon.capture.exporter").footage_of(
     SimpleNamespace(type="CAMERA", data=SimpleNamespace(background_images=[behind])))
 facts["footage"] = filmed.path(3).name
 

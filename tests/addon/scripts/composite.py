@@ -19,8 +19,9 @@ run.load()
 
 from fit_flare.core.bake.folder import LayerFolder  # noqa: E402
 from fit_flare.core.errors import FrameError  # noqa: E402
-from fit_flare.core.progress import Progress  # noqa: E402
-from fit_flare.flare_addon import compositor, flare_node, rendering  # noqa: E402
+from fit_flare.core.system.progress import Progress  # noqa: E402
+from fit_flare.flare_addon import render_settings  # noqa: E402
+from fit_flare.flare_addon.compositor import flare_node, setup  # noqa: E402
 from fit_flare.headless.commands import compose  # noqa: E402
 
 INTENSITY, TINT = 1.7, (1.0, 0.5, 0.25, 1.0)
@@ -33,13 +34,13 @@ def empty() -> bpy.types.Scene:
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
     scene = bpy.context.scene
     scene.frame_set(layers.last + 1)
-    rendering.match_scene(scene, layers, layers.size())
-    rendering.plain_view(scene)
+    render_settings.match_scene(scene, layers, layers.size())
+    render_settings.plain_view(scene)
     return scene
 
 
 def render(scene: bpy.types.Scene, name: str, frames: list[int]) -> None:
-    rendering.render_frames(scene, frames, lambda number, suffix: out / name / f"{number}{suffix}")
+    render_settings.render_frames(scene, frames, lambda number, suffix: out / name / f"{number}{suffix}")
 
 
 facts: dict[str, object] = {"version": bpy.app.version_string}
@@ -47,7 +48,7 @@ facts: dict[str, object] = {"version": bpy.app.version_string}
 # The graph as it comes, rendered and saved.
 scene = empty()
 facts["stands at"] = scene.frame_current
-node = compositor.set_up(scene, layers)
+node = setup.set_up(scene, layers)
 facts["inputs"] = [socket.name for socket in node.inputs]
 facts["outputs"] = [socket.name for socket in node.outputs]
 render(scene, "plain", sorted(layers.files))
@@ -56,26 +57,26 @@ render(scene, "plain", sorted(layers.files))
 node.inputs["Intensity"].default_value = INTENSITY
 node.inputs["Tint"].default_value = TINT
 render(scene, "changed", sorted(layers.files))
-rendering.save_beside(out / "scene" / "compositor.blend")
+render_settings.save_beside(out / "scene" / "compositor.blend")
 
 # Set up again: nothing doubles, the sliders stay.
 count = len(flare_node.tree_of(scene).nodes), len(bpy.data.node_groups)
-again = compositor.set_up(scene, layers)
+again = setup.set_up(scene, layers)
 facts["doubled"] = [count, (len(flare_node.tree_of(scene).nodes), len(bpy.data.node_groups))]
 facts["sliders"] = [again.inputs["Intensity"].default_value, list(again.inputs["Tint"].default_value)]
 
 # The flare alone.
-flare_node.tree_of(scene).links.new(again.outputs["Flare"], compositor._output(flare_node.tree_of(scene)))
+flare_node.tree_of(scene).links.new(again.outputs["Flare"], setup._output(flare_node.tree_of(scene)))
 render(scene, "flare", sorted(layers.files)[:1])
 
 # Over what is there: a plain colour in place of the baked scene, twice.
 scene = empty()
-tree = compositor._new_tree(scene, keep_image=False)
+tree = setup._new_tree(scene, keep_image=False)
 plate = tree.nodes.new("CompositorNodeRGB")
 plate.outputs[0].default_value = (0.25, 0.5, 0.75, 1.0)
-tree.links.new(plate.outputs[0], compositor._output(tree))
+tree.links.new(plate.outputs[0], setup._output(tree))
 for _ in range(2):
-    compositor.set_up(scene, layers, keep_image=True)
+    setup.set_up(scene, layers, keep_image=True)
 facts["plate stays"] = plate.name in tree.nodes
 render(scene, "over", sorted(layers.files)[:1])
 
@@ -84,16 +85,16 @@ for percentage in (50, 200):
     scene.render.resolution_percentage = percentage
     render(scene, f"over at {percentage}", sorted(layers.files)[:1])
 scene = empty()
-compositor.set_up(scene, layers)
+setup.set_up(scene, layers)
 scene.render.resolution_percentage = 50
 render(scene, "plain at 50", sorted(layers.files)[:1])
 
 # Pointed at layers of fewer lights, and at a picture without layers, which is refused.
 scene = empty()
-compositor.set_up(scene, layers)
-node = compositor.set_up(scene, LayerFolder.open(fewer))
+setup.set_up(scene, layers)
+node = setup.set_up(scene, LayerFolder.open(fewer))
 try:
-    compositor.set_up(scene, LayerFolder.open(none))
+    setup.set_up(scene, LayerFolder.open(none))
 except FrameError as problem:
     facts["no layers"] = str(problem)
 facts["fewer"] = [socket.name for socket in node.inputs if socket.is_linked]
@@ -102,20 +103,20 @@ render(scene, "fewer", [layers.first])
 # Two scenes of one tree: what is set up and removed in the second leaves the first as it is.
 if flare_node.GROUPS_ARE_TREES:
     scene = empty()
-    compositor.set_up(scene, layers)
+    setup.set_up(scene, layers)
     second = bpy.data.scenes.new("Second")
     second.compositing_node_group = scene.compositing_node_group
-    compositor.set_up(second, LayerFolder.open(fewer))
-    shown = flare_node.tree_of(scene).nodes[compositor.LAYERS].image.filepath
-    compositor.remove(second)
+    setup.set_up(second, LayerFolder.open(fewer))
+    shown = flare_node.tree_of(scene).nodes[setup.LAYERS].image.filepath
+    setup.remove(second)
     third = bpy.data.scenes.new("Third")
     third.compositing_node_group = scene.compositing_node_group
-    compositor.remove(third)
+    setup.remove(third)
     fourth = bpy.data.scenes.new("Fourth")
     fourth.compositing_node_group = scene.compositing_node_group
     trees = len(bpy.data.node_groups)
     try:
-        compositor.set_up(fourth, LayerFolder.open(none))
+        setup.set_up(fourth, LayerFolder.open(none))
     except FrameError:
         facts["refused of one tree"] = [fourth.compositing_node_group == scene.compositing_node_group,
                                         len(bpy.data.node_groups) - trees]
@@ -126,18 +127,18 @@ if flare_node.GROUPS_ARE_TREES:
 # Wide pixels stay; a region that is cut out is refused, and leaves nothing.
 scene = empty()
 scene.render.pixel_aspect_x = 2
-rendering.match_scene(scene, layers, layers.size())
+render_settings.match_scene(scene, layers, layers.size())
 facts["pixel aspect"] = scene.render.pixel_aspect_x
 scene.render.use_border = scene.render.use_crop_to_border = True
 try:
-    compositor.set_up(scene, layers)
+    setup.set_up(scene, layers)
 except FrameError as problem:
     facts["cropped"] = [str(problem), flare_node.find_node(scene) is None]
 
 # The command, of layers of wide pixels in ACEScg.
 compose.frames_of(aces, out / "aces", Progress())
 scene = bpy.context.scene
-facts["aces"] = [compositor.misread(scene), scene.render.pixel_aspect_x, scene.render.pixel_aspect_y]
+facts["aces"] = [setup.misread(scene), scene.render.pixel_aspect_x, scene.render.pixel_aspect_y]
 
 # A disk that fills up, which Blender does not tell of: files may not grow beyond a limit.
 if sys.platform == "linux":
@@ -146,11 +147,11 @@ if sys.platform == "linux":
 
     signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     scene = empty()
-    compositor.set_up(scene, layers)
+    setup.set_up(scene, layers)
     full, before = out / "full", resource.getrlimit(resource.RLIMIT_FSIZE)
     refused = []
     for write in (lambda: render(scene, "full", sorted(layers.files)[:1]),
-                  lambda: rendering.save_beside(full / "compositor.blend")):
+                  lambda: render_settings.save_beside(full / "compositor.blend")):
         resource.setrlimit(resource.RLIMIT_FSIZE, (1000, before[1]))
         try:
             write()

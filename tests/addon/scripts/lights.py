@@ -123,7 +123,7 @@ for name in ("On", "Off", "Excluded"):
     group.objects.link(bpy.data.objects.new(f"Lamp {name}", bpy.data.lights.new(name, "POINT")))
 bpy.data.collections["Off"].hide_render = True
 bpy.context.view_layer.layer_collection.children["Excluded"].exclude = True
-facts["lamps"] = [thing.name for thing in part("flare_addon.blend_shot")._lights(scene, ())]
+facts["lamps"] = [thing.name for thing in part("flare_addon.capture.blend_shot")._lights(scene, ())]
 
 # ---- an empty as the camera, and another file -------------------------------------------------------
 ops.open_flare(filepath=str(flare))

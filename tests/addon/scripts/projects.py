@@ -17,7 +17,7 @@ install(package)
 sys.path.remove(str(Path(__file__).parent))
 ops = bpy.ops.fit_flare
 paths = part("flare_addon.paths")
-export, loaded = part("flare_addon.capture_export"), part("core.capture").Capture
+export, loaded = part("flare_addon.capture.exporter"), part("core.capture").Capture
 facts: dict[str, object] = {}
 pictures = sorted((capture / "images").iterdir())[:6]
 

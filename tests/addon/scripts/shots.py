@@ -18,7 +18,7 @@ install(package)
 sys.path.remove(str(Path(__file__).parent))
 ops = bpy.ops.fit_flare
 shots, looks = (part(f"flare_addon.{name}") for name in ("shots", "looks"))
-write_json = part("core.files").write_json
+write_json = part("core.system.files").write_json
 facts: dict[str, object] = {}
 
 
@@ -77,7 +77,7 @@ def refused(*_words: object) -> None:
 # ---- a newer plate, from where pictures are linked and from where they have to be copied ------------
 facts["newer plates"] = []
 plate = sorted((second / "images").iterdir())[0]
-frame_of = part("flare_addon.capture_export").entry_of
+frame_of = part("flare_addon.capture.exporter").entry_of
 for name in ("linked", "copied"):
     if name == "copied":
         os.link = refused
@@ -169,12 +169,12 @@ with bpy.context.temp_override(scene=linked):
 scene = empty()
 ops.import_capture(directory=str(second))
 other = bpy.data.scenes.new("Other")
-part("flare_addon.capture_import").import_capture(other, second)
+part("flare_addon.capture.importer").import_capture(other, second)
 backs = [one.camera.data.background_images[0] for one in (scene, other)]
 tree = artists_tree(scene)
 own, under = (tree.nodes.new("CompositorNodeImage") for _ in range(2))
 own.image = under.image = backs[0].image
-under.name = part("flare_addon.compositor").PLATE
+under.name = part("flare_addon.compositor.setup").PLATE
 facts["shared footage"] = []
 for which, one in (("removed", scene), ("removed", other), ("images", scene), ("images", other)):
     one.fit_flare.footage = which

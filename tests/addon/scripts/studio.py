@@ -14,7 +14,7 @@ package, capture, flare, layers, out = sys.argv[1:6]
 install(package)
 sys.path.remove(str(Path(__file__).parent))
 ops = bpy.ops.fit_flare
-compositor, rendering = part("flare_addon.compositor"), part("flare_addon.rendering")
+compositor, rendering = part("flare_addon.compositor.setup"), part("flare_addon.render_settings")
 facts: dict[str, object] = {}
 
 scene = empty()

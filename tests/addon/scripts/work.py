@@ -51,7 +51,7 @@ for kind, up, scale in (("animated", "Z", 1.0), ("each", "-Y", 2.5)):
     to_world = np.array(root.matrix_world)
     cloud = original.points.xyz.astype(np.float64)
     worst = 0.0
-    frames = part("core.bake.frames").numbered(view.name for view in original.views)
+    frames = part("core.conventions.frame_numbers").numbered(view.name for view in original.views)
     for frame in frames:
         view = original.view(frame.view)
         scene.frame_set(frame.number)
@@ -60,7 +60,7 @@ for kind, up, scale in (("animated", "Z", 1.0), ("each", "-Y", 2.5)):
         found = blenders_own(scene, camera, cloud @ to_world[:3, :3].T + to_world[:3, 3])
         worst = max(worst, float(np.abs(expected - found)[depth > 0.3].max()))
     facts[f"pixels off, {kind}"] = worst
-    fitted = part("flare_addon.capture_import")
+    fitted = part("flare_addon.capture.importer")
     fitted.expose(root, {view.name: 0.5 + number for number, view in enumerate(original.views)})
     found = []
     for frame in frames:
@@ -452,7 +452,7 @@ facts["export lens off"] = float(np.abs(again.views[0].camera.intrinsics - origi
 facts["export points"] = len(again.points)
 
 facts["exported again"] = list(ops.capture_from_camera(directory=str(exported)))
-core_files = part("core.files")
+core_files = part("core.system.files")
 theirs = core_files.read_json(exported / "transforms.json", RuntimeError)
 del theirs["made_by"]
 others = {"of nerfstudio": Path(out) / "nerfstudio", "of COLMAP": Path(out) / "colmap"}
@@ -471,7 +471,7 @@ image = bpy.data.images.new("plain", 8, 8, float_buffer=True)
 image.filepath_raw, image.file_format = str(Path(out) / "plain" / "a.0001.exr"), "OPEN_EXR"
 image.save()
 bpy.data.images.remove(image)
-flare_node = part("flare_addon.flare_node")
+flare_node = part("flare_addon.compositor.flare_node")
 facts["no layers"] = [refusal(lambda: ops.set_up_compositor(directory=str(Path(out) / "plain"))),
                       flare_node.tree_of(scene) is None, [image.name for image in bpy.data.images]]
 

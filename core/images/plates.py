@@ -1,0 +1,287 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Plates: pictures as a shop has them, read and written without loss of depth, channels or colour tags.
+
+A plate keeps its file's own numbers (8 or 16 bit codes, half or full floats), its alpha, an EXR's other
+channels and header, and the colour profile and tags of other files, so that what removal does not touch comes out as
+it went in, to the last bit. A plate that it does not touch at all is copied.
+"""
+from __future__ import annotations
+
+import io
+import shutil
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..colour import ColourSpace, colour_space, space_of_chromaticities
+from ..colour.srgb import LUMINANCE, srgb_from_linear
+from ..errors import FrameError, is_out_of_memory
+from ..system.files import atomic_path
+from .borders import Inside, inside_borders
+from .exr import exr_parts, missing_rgb
+from .formats import jpeg, png, tiff
+from .listing import SUFFIXES
+from .picture import Encoding
+from .read import stored_pixels
+from .size import picture_size
+from .unsupported import unsupported_file
+from .write import save_exr, write_exr
+
+_KEPT_CHUNKS = (b"iCCP", b"gAMA", b"cHRM", b"sRGB", b"pHYs", png.EXIF, b"cICP", b"tEXt", b"zTXt", b"iTXt")
+_KEPT_SEGMENTS = ((jpeg.APP1, b"Exif"), (jpeg.APP1, b"http"), (jpeg.APP2, b"ICC_"))
+"""XMP goes by the address of its name space."""
+_KEPT_TAGS = (tiff.ORIENTATION, tiff.EXTRA_SAMPLES, tiff.X_RESOLUTION, tiff.Y_RESOLUTION, tiff.RESOLUTION_UNIT,
+              tiff.XMP, tiff.COLOUR_PROFILE)
+_PLACING = ("chromaticities", "dataWindow", "displayWindow", "pixelAspectRatio")
+_JPEG_QUALITY = 97
+_JPEGS, _TIFFS = (".jpg", ".jpeg"), (".tif", ".tiff")
+_DEPTHS: dict[str, tuple[type, ...]] = {".png": (np.uint8, np.uint16), **dict.fromkeys(_JPEGS, (np.uint8,))}
+"""Of pixels in files that cannot hold all that a plate may have; others OpenCV would bring to 8 bit without a word."""
+
+
+@dataclass
+class Plate:
+    """codes: (height, width, 3), the file's own type, R G B; a grey file has three equal channels.
+
+    `encoding` says what they mean: "srgb" for integer codes, "linear" for floats. `rest` is what belongs to
+    the file and is written again untouched.
+    """
+
+    path: Path
+    codes: NDArray[Any]
+    encoding: Encoding
+    grey: bool = False
+    alpha: NDArray[Any] | None = None
+    rest: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def top(self) -> float:
+        """The code that means 1."""
+        return float(np.iinfo(self.codes.dtype).max) if self.codes.dtype.kind == "u" else 1.0
+
+    @property
+    def values(self) -> NDArray[np.float32]:
+        """(height, width, 3) in its own space, codes as 0..1."""
+        return self.codes.astype(np.float32) / np.float32(self.top)
+
+    def shown(self, light: NDArray[np.float32]) -> NDArray[np.float32]:
+        """What of linear light (height, width, 3) such a plate shows: all of it, or its luminance where it is grey."""
+        return np.repeat(light @ LUMINANCE.astype(np.float32)[:, None], 3, -1) if self.grey else light
+
+    @cached_property
+    def inside(self) -> Inside:
+        """What lies inside its black borders."""
+        if self.encoding == "srgb":
+            return inside_borders(self.codes, lambda line: line / self.top)
+        return inside_borders(self.codes, lambda line: srgb_from_linear(
+            np.clip(np.nan_to_num(line.astype(np.float32), nan=1.0), 0, 1)))
+
+    @property
+    def straight_alpha(self) -> NDArray[np.float32] | None:
+        """(height, width), 0..1: alpha that integer codes are not multiplied with yet; None where there is no such."""
+        if self.alpha is None or self.encoding != "srgb" or tiff.is_premultiplied(self.path):
+            return None
+        return self.alpha.astype(np.float32) / np.float32(self.top)
+
+    @property
+    def space(self) -> ColourSpace:
+        """What the codes are: sRGB where they are integers; linear, in an EXR's own primaries where it names some.
+
+        Raises SettingsError where those span no space."""
+        if self.encoding == "srgb":
+            return colour_space("srgb")
+        told = self.placing.get("chromaticities")
+        return space_of_chromaticities(tuple(told)) if told is not None else colour_space("linear")
+
+    @property
+    def placing(self) -> dict[str, Any]:
+        """What the header of another EXR has to say to lie where this one does, in its colours."""
+        header = self.rest.get("header", {})
+        return {name: header[name] for name in _PLACING if name in header}
+
+
+def is_of_the_plate(problem: Exception) -> bool:
+    """Whether a plate is what is wrong, so that others may do: it is damaged, the system refuses it, or it is too large
+    for the memory. All else is a defect."""
+    return isinstance(problem, FrameError | OSError) or is_out_of_memory(problem)
+
+
+def finite(codes: NDArray[Any]) -> NDArray[np.float32]:
+    """Linear light of float codes; what is no number counts as black, what is infinite as the most that halfs hold."""
+    return np.nan_to_num(codes.astype(np.float32), nan=0.0, posinf=65504.0, neginf=0.0)
+
+
+def read_plate(path: Path | str) -> Plate:
+    """Read PNG, JPEG, TIFF or EXR as it is stored. Floats that are not finite are kept.
+
+    Raises FrameError where the file is missing, damaged, of another kind, or has no colour.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise FrameError(f"{path} is missing{': it is a link that leads nowhere' if path.is_symlink() else ''}.")
+    if path.suffix.lower() not in SUFFIXES:
+        raise unsupported_file(path)
+    picture_size(path)
+    return _read_exr(path) if path.suffix.lower() == ".exr" else _read_codes(path)
+
+
+def _read_codes(path: Path) -> Plate:
+    with open(path, "rb") as stream:
+        pages = tiff.page_count(stream)
+    if pages > 1:
+        raise FrameError(f"{path} has {pages} pages; export the plate as a file of its own.")
+    stored = stored_pixels(path)
+    if stored.dtype not in (np.uint8, np.uint16, np.float32):
+        raise FrameError(f"{path} holds {stored.dtype} pixels; save it as 8 or 16 bit or as 32 bit float.")
+    if _is_animated(path):
+        raise FrameError(f"{path} is an animated PNG; export its frames as files of their own.")
+    grey, alpha = stored.ndim == 2 or _is_grey_with_alpha(path), None
+    if stored.ndim == 2:
+        codes, alpha = np.repeat(stored[..., None], 3, axis=2), _transparency(path, stored)
+    else:
+        alpha = stored[..., 3].copy() if stored.shape[2] == 4 else None
+        codes = np.ascontiguousarray(stored[..., 2::-1])
+    return Plate(path, codes, "linear" if stored.dtype == np.float32 else "srgb", grey, alpha)
+
+
+def _is_grey_with_alpha(path: Path) -> bool:
+    """A PNG of colour type 4 (PNG specification, 11.2.1), which OpenCV reads as colour."""
+    with open(path, "rb") as stream:
+        header = stream.read(26)
+    return header[:4] == b"\x89PNG" and header[25:] == b"\x04"
+
+
+def _is_animated(path: Path) -> bool:
+    """A PNG of several frames (PNG specification, third edition, 11.3.6.1), of which OpenCV reads the first alone."""
+    with open(path, "rb") as stream:
+        return any(int.from_bytes(content[:4], "big") > 1 for _, content in png.chunks(stream, (b"acTL",)))
+
+
+def _transparency(path: Path, stored: NDArray[Any]) -> NDArray[Any] | None:
+    """Alpha (height, width) of a grey PNG of which one code is transparent (PNG specification, 11.3.2.1), which OpenCV
+    reads without; None where none is."""
+    with open(path, "rb") as stream:
+        depth = stream.read(25)[24:]
+        key = next((content for _, content in png.chunks(stream, (b"tRNS",)) if len(content) == 2), None)
+    if key is None:
+        return None
+    top = np.iinfo(stored.dtype).max
+    code = int.from_bytes(key, "big") * top // (2 ** depth[0] - 1)  # depths below 8 bits are spread over all codes
+    return np.where(stored == code, 0, top).astype(stored.dtype)
+
+
+def _read_exr(path: Path) -> Plate:
+    parts = exr_parts(path)
+    header, channels = parts[0]
+    if len(parts) > 1:
+        raise FrameError(f"{path} has {len(parts)} parts; export the plate as a file of its own.")
+    names = ["R", "G", "B"] if all(name in channels for name in "RGB") else ["Y"] if "Y" in channels else []
+    if not names:
+        raise missing_rgb(path, channels)
+    if any(channels[name].dtype not in (np.float16, np.float32) for name in names):
+        raise FrameError(f"{path} has colour channels that are no floats; export it as half or float.")
+    if len({channel.shape for channel in channels.values()}) > 1:
+        raise FrameError(f"{path} has channels of several sizes (luminance and chroma, say); export it as R, G, B.")
+    codes = np.stack([np.asarray(channels[name]) for name in (names if len(names) == 3 else names * 3)], -1)
+    return Plate(path, codes, "linear", len(names) == 1, None, {"header": header, "channels": channels})
+
+
+def write_plate(path: Path | str, plate: Plate, codes: NDArray[Any]) -> None:
+    """Write `codes` in the kind and depth of `plate`, with all that belongs to it, to a path of its suffix."""
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix == plate.path.suffix.lower() and np.array_equal(codes, plate.codes, equal_nan=True):
+        with atomic_path(path) as temporary:
+            shutil.copyfile(plate.path, temporary)
+        return
+    if "channels" in plate.rest:
+        _write_exr(path, plate, codes)
+        return
+    if codes.dtype not in _DEPTHS.get(suffix, (codes.dtype,)) or (suffix in _JPEGS and plate.alpha is not None):
+        raise FrameError(f"{plate.path} holds what no {suffix[1:].upper()} can hold ({codes.dtype} pixels"
+                         f"{', alpha' if plate.alpha is not None else ''}): it has the suffix of another kind of file; "
+                         "rename it to what it is.")
+    import cv2
+
+    stored: NDArray[Any] = codes[..., 0] if plate.grey and plate.alpha is None else codes[..., ::-1]
+    if plate.alpha is not None:
+        stored = np.concatenate([stored, plate.alpha[..., None]], -1)
+    done, data = cv2.imencode(suffix, np.ascontiguousarray(stored), _encoding(suffix, codes.dtype))
+    if not done:
+        raise FrameError(f"{path} could not be encoded as {suffix[1:].upper()}.")
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(_tagged(data.tobytes(), suffix, plate))
+
+
+def _encoding(suffix: str, kind: np.dtype[Any]) -> list[int]:
+    """What OpenCV is to encode by, pixels of this kind."""
+    import cv2
+
+    if suffix in _JPEGS:
+        return [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY, cv2.IMWRITE_JPEG_SAMPLING_FACTOR,
+                cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
+    if suffix in _TIFFS and kind.kind == "f":  # which it would make LogLuv of, with 16 bits for three floats
+        return [cv2.IMWRITE_TIFF_COMPRESSION, cv2.IMWRITE_TIFF_COMPRESSION_NONE]
+    return []
+
+
+def write_flare(path: Path | str, plate: Plate, flare: NDArray[Any]) -> None:
+    """Write what was taken from a plate, light (height, width, 3) in its colours, as an EXR that lies where it does."""
+    write_exr(path, {name: flare[..., k] for k, name in enumerate("RGB")}, header=plate.placing)
+
+
+def write_results(results: Sequence[Path], plate: Plate, codes: NDArray[Any], flare: NDArray[Any]) -> None:
+    """Write the clean plate, and the flare where the results have a path for it too."""
+    write_plate(results[0], plate, codes)
+    for result in results[1:]:
+        write_flare(result, plate, flare)
+
+
+def _tagged(encoded: bytes, suffix: str, plate: Plate) -> bytes:
+    """With what the plate's file says about how it is to be shown, where both are of one kind."""
+    source = plate.path.suffix.lower()
+    if suffix in _JPEGS and source in _JPEGS:
+        return encoded[:2] + b"".join(_jpeg_tags(plate.path)) + encoded[2:]
+    if suffix == source == ".png":
+        data = plate.path.read_bytes()
+        was_grey, is_grey = (not header[25] & 2 for header in (data, encoded))
+        left_out = (b"iCCP",) if was_grey != is_grey else ()
+        kept = b"".join(png.chunk(name, content) for name, content in png.chunks(io.BytesIO(data), _KEPT_CHUNKS)
+                        if name not in left_out)
+        return encoded[:33] + kept + encoded[33:]  # behind the header chunk
+    if suffix in _TIFFS and source in _TIFFS:
+        tags = tiff.read_tags(io.BytesIO(plate.path.read_bytes()), _KEPT_TAGS)
+        if plate.alpha is None:
+            tags.pop(tiff.EXTRA_SAMPLES, None)
+        return tiff.with_tags(encoded, tags)
+    return encoded
+
+
+def _write_exr(path: Path, plate: Plate, codes: NDArray[Any]) -> None:
+    import OpenEXR
+
+    channels = dict(plate.rest["channels"])
+    for index, name in enumerate(["Y"] if plate.grey else ["R", "G", "B"]):
+        channels[name] = np.ascontiguousarray(codes[..., index], channels[name].dtype)  # each of its own depth
+    header = {name: value for name, value in plate.rest["header"].items() if name not in ("channels", "chunkCount")}
+    header["type"] = OpenEXR.scanlineimage
+    header.pop("tiles", None)
+    if header.get("lineOrder") == OpenEXR.RANDOM_Y:  # as renderers write tiles, in the order that they are done
+        header["lineOrder"] = OpenEXR.INCREASING_Y
+    if header.get("compression") in (OpenEXR.B44_COMPRESSION, OpenEXR.B44A_COMPRESSION, OpenEXR.DWAA_COMPRESSION,
+                                     OpenEXR.DWAB_COMPRESSION):  # lose some at each writing
+        header["compression"] = OpenEXR.ZIP_COMPRESSION
+    save_exr(path, header, channels)
+
+
+def _jpeg_tags(path: Path) -> Iterator[bytes]:
+    """The source's EXIF, XMP and colour profile segments: how it is to be shown, and whose it is."""
+    with open(path, "rb") as stream:
+        for marker, content in jpeg.segments(stream):
+            if (marker, content[:4]) in _KEPT_SEGMENTS:
+                yield jpeg.segment(marker, content)

@@ -1,0 +1,59 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Reads the size of a picture from its header alone, without a library, so that Blender's own Python can."""
+from __future__ import annotations
+
+from pathlib import Path
+from typing import BinaryIO
+
+from ..errors import FrameError
+from .formats import exr_header, jpeg, png, tiff
+
+MAX_PIXELS = 500_000_000  # pixels; a header that claims more is damaged or hostile
+
+
+def picture_size(path: Path | str) -> tuple[int, int]:
+    """(width, height) from the header alone; an EXR's are those of the frame, its displayWindow. Raises FrameError
+    where the header is no picture's."""
+    path = Path(path)
+    if not path.is_file():
+        raise FrameError(f"{path} is missing.")
+    try:
+        with open(path, "rb") as stream:
+            if stream.read(4) in tiff.BIG:
+                raise FrameError(f"{path} is a BigTIFF; save it as a plain TIFF, of less than 4 GB.")
+            stream.seek(0)
+            size = _size_from_header(stream)
+    except OSError as problem:
+        raise FrameError(f"{path} cannot be read: {problem.strerror or problem}.") from problem
+    return checked_size(path, size)
+
+
+def checked_size(path: Path, size: tuple[int, int] | None) -> tuple[int, int]:
+    if size is None or min(size) <= 0:
+        raise FrameError(f"{path} is not a picture, or its header is damaged; export it again.")
+    if size[0] * size[1] > MAX_PIXELS:
+        raise FrameError(f"{path} claims {size[0]} x {size[1]} pixels, more than this program opens.")
+    return size
+
+
+def _size_from_header(stream: BinaryIO) -> tuple[int, int] | None:
+    head = stream.read(24)
+    if head[:8] == png.SIGNATURE and len(head) == 24:
+        return int.from_bytes(head[16:20], "big"), int.from_bytes(head[20:24], "big")
+    if head[:2] == b"\xff\xd8":
+        header = jpeg.frame_header(stream)
+        return (header.width, header.height) if header else None
+    if head[:4] in (b"II*\0", b"MM\0*"):
+        sides = tiff.whole_numbers(tiff.read_tags(stream, (tiff.WIDTH, tiff.HEIGHT)))
+        return (sides[tiff.WIDTH], sides[tiff.HEIGHT]) if len(sides) == 2 else None
+    if head[:4] == exr_header.MAGIC:
+        return _exr_size(stream)
+    return None
+
+
+def _exr_size(stream: BinaryIO) -> tuple[int, int] | None:
+    """Of the frame; a dataWindow of more pixels than may be opened counts in its place."""
+    sizes = exr_header.windows(stream)
+    stored = sizes.get("dataWindow")
+    whole = stored is not None and min(stored) > 0 and stored[0] * stored[1] <= MAX_PIXELS
+    return sizes.get("displayWindow", stored) if whole else stored

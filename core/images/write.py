@@ -1,0 +1,68 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Writes picture files: PNG by OpenCV, EXR by OpenEXR; each is whole or absent."""
+from __future__ import annotations
+
+import errno
+import os
+from collections.abc import Mapping
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import FrameError
+from ..system.files import atomic_path
+from ..typed import is_utf8
+from .exr import exr_is_cut_off
+
+
+def write_exr(path: Path | str, channels: Mapping[str, NDArray[Any]], *, half: bool = True,
+              header: Mapping[str, Any] | None = None, turn: AbstractContextManager[None] | None = None) -> None:
+    """Write one part, scanlines, ZIP; each channel (height, width). Full names as given ("scene.R"). turn: see
+    `atomic_path`.
+
+    `half` stores 16 bit floats; channels that end in ".Z" stay 32 bit, since depth needs the range.
+    """
+    import OpenEXR
+
+    def stored(name: str, pixels: NDArray[Any]) -> NDArray[Any]:
+        if half and not name.endswith(".Z") and name != "Z":
+            return np.ascontiguousarray(np.clip(pixels, -65504, 65504), np.float16)
+        return np.ascontiguousarray(pixels, np.float32)
+
+    attributes = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **(header or {})}
+    save_exr(path, attributes, {name: stored(name, pixels) for name, pixels in channels.items()}, turn)
+
+
+def save_exr(path: Path | str, header: Mapping[str, Any], channels: Mapping[str, NDArray[Any]],
+             turn: AbstractContextManager[None] | None = None) -> None:
+    """Write one part as it is given. turn: see `atomic_path`. Raises OSError where the system refuses, a full disk
+    among that; FrameError for a path that the library cannot be told."""
+    import OpenEXR
+
+    if not is_utf8(str(path)):
+        raise FrameError(f"The path {str(path)!r} is not UTF-8, and no EXR can be written there; rename its folder.")
+    with atomic_path(path, turn) as temporary, OpenEXR.File(dict(header), dict(channels)) as file:
+        try:
+            file.write(str(temporary))
+        except RuntimeError as problem:  # how the library hands on what the system refused, by its words alone
+            full = os.strerror(errno.ENOSPC) in str(problem)
+            raise OSError(errno.ENOSPC if full else errno.EIO, str(problem), str(path)) from problem
+        if not temporary.stat().st_size or exr_is_cut_off(temporary):  # what is refused at its closing, it keeps quiet
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+
+
+def write_png(path: Path | str, display: NDArray[Any], bits: Literal[8, 16] = 8) -> None:
+    """Write display values 0..1, (height, width, 3) or (height, width), as PNG."""
+    import cv2
+
+    top = (1 << bits) - 1
+    pixels = np.clip(np.nan_to_num(display), 0.0, 1.0) * top + 0.5
+    stored: NDArray[Any] = pixels.astype(np.uint8 if bits == 8 else np.uint16)
+    done, data = cv2.imencode(".png", stored[..., ::-1] if stored.ndim == 3 else stored)
+    if not done:
+        raise FrameError(f"{path} could not be encoded as PNG.")
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(data.tobytes())

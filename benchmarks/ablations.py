@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Takes the model's choices away one by one, on captures whose layers are known, and writes docs/ablations.md.
+"""Remove one choice of the model at a time on captures with exact layers and write docs/results/ablations.md.
 
     python benchmarks/ablations.py                                  everything, on the sample; a night on two cores
     python benchmarks/ablations.py --captures A B --width 240       other captures, at another size
@@ -57,7 +57,7 @@ from core.removal.jobs.capture import remove_from
 from core.system.files import write_json
 from core.system.progress import Progress, TerminalProgress
 
-DOCUMENT = report.ROOT / "docs" / "ablations.md"
+DOCUMENT = report.RESULTS / "ablations.md"
 SAMPLE = report.ROOT / "sample_scenes" / "desk"
 SIGMAS = (0.0, 0.1, 0.5, 1.0)
 SCORES = "scores.json"
@@ -359,8 +359,7 @@ def _commit() -> str:
 def write(results: Results, section: str, length: str, document: Path) -> str:
     """The tables, with what they were made of, into a section of the document; returns them."""
     commits = {one["commit"]: None for rows in results.values() for row in rows.values() for one in row.values()}
-    head = (f"Fitted at commit {', '.join(commits)}; times are of a machine with other work on it. "
-            f"{report.conditions()}")
+    head = f"Fitted at commit {', '.join(commits)}; times include other load on the machine. {report.conditions()}"
     text = f"## Figures: {length[0].lower()}{length[1:]}\n\n{head}\n\n{tables(results)}"
     for study in ("form", "known", "extrapolation"):
         if study in results and len(shared(results[study])) > 1:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Times the kernel sets side by side on the workload of `workload.py`, and writes docs/engine.md.
+"""Time the kernel sets on the workload of `workload.py` and write docs/results/rasterizer.md.
 
     python benchmarks/raster.py                 all of it, some minutes on two cores
     python benchmarks/raster.py --quick         fewer rounds
@@ -49,7 +49,7 @@ from core.gaussians import Adam, SceneGaussians, kernels, l1_ssim, over, rasteri
 from core.gaussians.spherical_harmonics import colours
 
 Engine = Callable[..., Tensor]
-DOCUMENT = report.ROOT / "docs" / "engine.md"
+DOCUMENT = report.RESULTS / "rasterizer.md"
 
 
 class Job(NamedTuple):
@@ -443,7 +443,7 @@ def process_section(sets: list[str]) -> str:
 
 
 INSTRUCTIONS = {
-    "as the machine is": {},
+    "native": {},
     "AVX2": {"NUMBA_CPU_NAME": "haswell", "NUMBA_CPU_FEATURES": "+avx2,+fma,+bmi,+bmi2,+popcnt,+f16c,+lzcnt"},
     "SSE4.2": {"NUMBA_CPU_NAME": "nehalem", "NUMBA_CPU_FEATURES": "+sse4.2,+popcnt"},
 }
@@ -517,7 +517,7 @@ def main() -> None:
         "iteration": lambda: iteration_section(arguments.kernels, counts, rounds),
         "stages": lambda: stage_section(counts, rounds),
         "flares": lambda: flare_section(arguments.kernels, rounds),
-        "curve": lambda: curve_section(engines, rounds, arguments.device, arguments.out.parent / "engine-curve.png"),
+        "curve": lambda: curve_section(engines, rounds, arguments.device, arguments.out.parent / "raster-curve.png"),
         "process": lambda: process_section(arguments.kernels),
         "peer": lambda: peer_section(arguments.opensplat, rounds),
         "gpu": lambda: gpu_section(rounds),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Frames per second of a fitted scene with its flares, each stage apart, and writes docs/engine.md.
+"""Time the stages of rendering a fitted scene with its flares and write docs/results/rasterizer.md.
 
     python benchmarks/render.py               a synthetic scene of the paper's size
     python benchmarks/render.py --run FOLDER  the scene and flares of a run; its first light, again, for more lights
@@ -148,7 +148,7 @@ def main() -> None:
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     parser.add_argument("--kernels", default="auto", choices=["auto", *kernels.MODULES])
     parser.add_argument("--rounds", type=int, default=5)
-    parser.add_argument("--out", type=Path, default=report.ROOT / "docs" / "engine.md")
+    parser.add_argument("--out", type=Path, default=report.RESULTS / "rasterizer.md")
     arguments = parser.parse_args()
     if arguments.run:
         fitted = of_run(arguments.run)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Tables in docs/engine.md, each between markers of its own, and a description of the machine."""
+"""Write tables into the documents of docs/results, each between its own markers, and describe the machine."""
 from __future__ import annotations
 
 import os
@@ -11,6 +11,8 @@ from pathlib import Path
 import torch
 
 ROOT = Path(__file__).resolve().parents[1]
+RESULTS = ROOT / "docs" / "results"
+"""Documents that hold measured tables and their pictures."""
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -42,21 +44,21 @@ def processor() -> str:
 
 
 def conditions() -> str:
-    """One line: machine, versions, and whether anything else was running."""
+    """Describe machine, versions and other load in one line."""
     import numba
 
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else 0.0
-    idle = "idle" if load < 0.5 else f"with other work (load {load:.1f}), so that ratios say more than times"
+    state = "idle" if load < 0.5 else f"under other load ({load:.1f})"
     return (
         f"{processor()}; {platform.system()} {platform.machine()}, Python {platform.python_version()}, "
-        f"torch {torch.__version__.split('+')[0]}, numba {numba.__version__}; machine {idle} at the start."
+        f"torch {torch.__version__.split('+')[0]}, numba {numba.__version__}; machine {state} at the start."
     )
 
 
 def write_section(path: Path, name: str, text: str) -> None:
-    """Replaces what stands between the markers of this name, or appends it."""
+    """Replace the text between the markers of this name, or append both to the document."""
     begin, end = f"<!-- {name}: begin -->", f"<!-- {name}: end -->"
-    old = path.read_text(encoding="utf-8") if path.exists() else "# The engine, measured\n"
+    old = path.read_text(encoding="utf-8") if path.exists() else "# Results\n"
     section = f"{begin}\n{text.strip()}\n{end}"
     if begin in old and end in old:
         before, rest = old.split(begin, 1)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""How much of a light the camera sees past the scene (ours; docs/ablations.md: occlusion).
+"""How much of a light the camera sees past the scene (ours; docs/decisions/visibility.md).
 
 A small camera at the view's position looks straight at the light, in the frame or not, and rasterises the
 scene Gaussians that lie before it; what transmittance is left over a soft disk is the visible share. It is

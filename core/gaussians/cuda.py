@@ -2,8 +2,8 @@
 """The kernels for NVIDIA GPUs: projection, colours and lists in torch, tiles by Warp, which needs neither a CUDA
 toolkit nor a compiler (`pip install warp-lang`).
 
-On a GPU they pass the comparison with the definition; where time goes there is in docs/engine.md: for small pictures
-into the calls that torch makes, so that those of the processor are faster.
+On a GPU they pass the comparison with the definition. Small pictures spend their time in torch's calls, so the CPU
+kernels are faster there (docs/results/rasterizer.md).
 """
 from __future__ import annotations
 

@@ -32,7 +32,7 @@ def load(name: str) -> Any:
     assert spec.loader is not None
     run = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(run)
-    return importlib.import_module(f"{run.load()}.{name}")
+    return importlib.import_module(f"{run.register_package()}.{name}")
 
 
 def make_capture(folder: Path, cameras: int = CAMERAS) -> Path:
@@ -122,7 +122,7 @@ def main() -> None:
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
     load("flare_addon").register()
     importing, looks, overlay, cameras, jobs = (load(f"flare_addon.{name}") for name in (
-        "capture_import", "looks", "overlay", "cameras", "jobs"))
+        "capture.importer", "looks", "overlay", "cameras", "jobs"))
     rows = [f"Blender {bpy.app.version_string}, {os.cpu_count()} cores"]
     with tempfile.TemporaryDirectory() as base:
         folder = Path(base)
@@ -152,7 +152,7 @@ def main() -> None:
         look = looks.look_of(scene)
 
         def frame() -> None:
-            found = overlay.joined(list(looks.seen(scene, depsgraph, scene.camera).values()))
+            found = overlay.concatenate(list(looks.seen(scene, depsgraph, scene.camera).values()))
             overlay.levels(found, window, look)
 
         frame()

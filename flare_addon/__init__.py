@@ -1,19 +1,19 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Blender's side of Fit Flare. Each module registers its own classes; the last registered goes first.
+"""The Blender extension. `register` registers every module's classes; `unregister` removes them in reverse.
 
-    properties.py       what a .blend remembers           preferences.py   engine and library
-    capture_import.py   captures in                       capture_export.py   Blender's cameras as captures
-    cameras.py          Blender's cameras and the core's  lights.py        light objects
-    engine.py, jobs.py  the process with torch            fits.py          fits
-    looks.py            .flare, flares                    occlusion.py     what of a light is seen
-    overlay.py, points.py   what is drawn in the viewport
-    shots.py            what is baked                     compositor.py    layers back together
-    flare_node.py       what puts layers together         wires.py         the panel's sliders on it
-    library.py          flares for other shots            paths.py         files of a .blend that moves
-    objects.py          where objects stand               curves.py        animation of what is moved
-    rendering.py        frames and .blends out            reports.py       what buttons tell
-    blend_shot.py       a .blend for the commands         layouts.py       what panels are laid out of
-    operators/, panels.py   buttons and panels
+    properties.py       the properties that a .blend stores      user_settings.py   values of the preferences
+    preferences.py      panel of the preferences                 panels.py          the sidebar
+    operators/          the buttons                              reports.py         refusals and errors of buttons
+    layouts.py          labels and progress bars                 engine.py          finding and installing the engine
+    jobs.py             processes of the engine                  fits.py            fits, light search, clean frames
+    capture/            captures into and out of Blender         cameras.py         Blender's cameras and the core's
+    lights.py           light objects                            objects.py         matrices of objects
+    looks.py            the look of a scene, its flares          occlusion.py       visibility of lights
+    overlay.py          the flare in the viewport                points.py          the point cloud in the viewport
+    shots.py            bakes                                    compositor/        the layers in the compositor
+    library.py          the library of flares                    paths.py           paths of a .blend that moves
+    fcurves.py          animation of list items                  render_settings.py   rendering and saving
+    images.py           pictures loaded from disk
 """
 from __future__ import annotations
 
@@ -26,35 +26,36 @@ _MODULES = (properties, preferences, operators, panels, points, overlay, paths)
 
 
 @bpy.app.handlers.persistent
-def _loaded(_path: str) -> None:
-    """Another file: nothing that was read for the last one stays, and what it has of an earlier version is brought
-    up to this one."""
-    looks.forget()
-    points.forget()
-    overlay.problem = ""
+def _after_load(_path: str) -> None:
+    """After a file is loaded: clear the caches of the previous one, and migrate data of earlier versions."""
+    looks.clear_cache()
+    points.clear_cache()
+    overlay.last_error = ""
     for scene in bpy.data.scenes:
-        drivers.go_by_numbers(scene)
+        drivers.migrate_to_indices(scene)
 
 
 @bpy.app.handlers.persistent
-def _before_a_save(_path: str) -> None:
-    """What a Blender without this extension needs to render the file goes into it."""
+def _before_save(_path: str) -> None:
+    """Before a save: store what a Blender without this extension needs to render the file."""
     for scene in bpy.data.scenes:
-        drivers.keep_standing(scene)
+        drivers.store_fallbacks(scene)
 
 
 def register() -> None:
+    """Register all classes and handlers."""
     for module in _MODULES:
         module.register()
-    bpy.app.handlers.load_post.append(_loaded)
-    bpy.app.handlers.save_pre.append(_before_a_save)
+    bpy.app.handlers.load_post.append(_after_load)
+    bpy.app.handlers.save_pre.append(_before_save)
 
 
 def unregister() -> None:
-    bpy.app.handlers.load_post.remove(_loaded)
-    bpy.app.handlers.save_pre.remove(_before_a_save)
+    """Remove all classes, handlers and timers."""
+    bpy.app.handlers.load_post.remove(_after_load)
+    bpy.app.handlers.save_pre.remove(_before_save)
     jobs.unregister()
     fits.unregister()
-    looks.forget()
+    looks.clear_cache()
     for module in reversed(_MODULES):
         module.unregister()

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Where the engine is, and how its commands are started: a Python with torch, never Blender's own process."""
+"""Finds, installs and tests the engine, the Python with torch, and starts its commands in a process of their own.
+
+`fits` and `shots` start their work through `run`; the preferences set the engine up, test and remove it.
+"""
 from __future__ import annotations
 
 import os
@@ -11,20 +14,21 @@ import bpy
 
 from ..core.errors import EngineError, FitFlareError
 from ..core.system.files import remove_folder, write_text
-from ..core.system.processes import environment, python_at
+from ..core.system.processes import child_environment, find_python
 from . import jobs
 from .jobs import Job
+from .user_settings import engine_path
 
 ROOT = Path(__file__).resolve().parents[1]
-RUN = ROOT / "headless" / "run.py"
-PACKAGE = (__package__ or "").rpartition(".")[0]  # "bl_ext.user_default.fit_flare", by which Blender knows it
-FOLDER = "engine"
-VARIABLE = "FIT_FLARE_ENGINE"
-TESTED = "python.txt"  # which Python the last test was of
+RUN_SCRIPT = ROOT / "headless" / "run.py"
+PACKAGE = (__package__ or "").rpartition(".")[0]  # such as "bl_ext.user_default.fit_flare"
+ENGINE_FOLDER = "engine"
+ENGINE_VARIABLE = "FIT_FLARE_ENGINE"
+TESTED_FILE = "python.txt"  # holds the path of the Python that was tested last
 
 
 def user_folder(name: str, create: bool = False) -> Path:
-    """A folder of the extension's own, in Blender's user folder."""
+    """Return a folder of the extension in Blender's user folder."""
     try:
         return Path(bpy.utils.extension_path_user(PACKAGE, path=name, create=create))
     except (ValueError, AttributeError):  # loaded from source, not installed as an extension
@@ -34,127 +38,127 @@ def user_folder(name: str, create: bool = False) -> Path:
         return folder
 
 
-def home() -> Path:
-    """Where a click sets the engine up. On Windows not in Blender's user folder: its path is so long that those of
-    torch's files would have more than the 260 characters that are allowed."""
+def set_up_folder() -> Path:
+    """Return the folder of the engine that Set Up Engine installs.
+
+    On Windows it is not in Blender's user folder, whose long path would push torch's files over the limit of 260
+    characters.
+    """
     local = os.environ.get("LOCALAPPDATA")
     if os.name != "nt" or not local:
-        return user_folder(FOLDER)
+        return user_folder(ENGINE_FOLDER)
     return Path(local, "fit_flare", "{}.{}".format(*bpy.app.version))
 
 
 def virtual_environment() -> Path:
-    """What a click sets up; it need not be there."""
-    return home() / "python"
+    """Return the virtual environment that Set Up Engine makes; it may not exist yet."""
+    return set_up_folder() / "python"
 
 
-def named() -> tuple[str, str]:
-    """What names an engine, and which: the variable FIT_FLARE_ENGINE, or else the preferences; of none ("", "")."""
-    from .preferences import engine_path
-
-    for who, place in ((VARIABLE, os.environ.get(VARIABLE, "")), ("the preferences", engine_path())):
-        if place:
-            return who, place
+def configured_engine() -> tuple[str, str]:
+    """Return the source and the path of a configured engine: FIT_FLARE_ENGINE, else the preferences, else ("", "")."""
+    for source, path in ((ENGINE_VARIABLE, os.environ.get(ENGINE_VARIABLE, "")), ("the preferences", engine_path())):
+        if path:
+            return source, path
     return "", ""
 
 
-def find() -> Path | None:
-    """The engine's Python: the one that is named, else the one that was set up by a click, or .venv in the extension's
-    source, in the order of the commands (headless/hand_off.py). None where there is none.
+def find_engine() -> Path | None:
+    """Return the engine's Python: the configured one, else the installed one, else .venv in the extension's source.
 
-    A look at the disk, cheap enough for a panel. The commands start what they find, to see whether it has torch, and so
-    may take a .venv in the folder above, too, which is anybody's.
+    None where there is none. The order is that of headless/hand_off.py. This only looks at the disk, so a panel can
+    call it; the commands also test for torch, and therefore may search .venv in the folder above as well.
     """
-    _, place = named()
-    if place:
-        return python_at(Path(place).expanduser())
+    _, path = configured_engine()
+    if path:
+        return find_python(Path(path).expanduser())
     for folder in (virtual_environment(), ROOT / ".venv"):
-        python = python_at(folder)
+        python = find_python(folder)
         if python is not None:
             return python
     return None
 
 
-def missing() -> str:
-    """Why there is none, and what to do, without a full stop; "" where there is one."""
-    if find() is not None:
+def missing_reason() -> str:
+    """Return why there is no engine and what to do, without a full stop; "" where there is one."""
+    if find_engine() is not None:
         return ""
-    who, place = named()
-    if place:
-        return f"The engine named by {who} is not there: {place}. Name a Python that has torch, or none"
-    return "No engine is set up. Open the preferences of Fit Flare and set one up, or name a Python that has it"
+    source, path = configured_engine()
+    if path:
+        return f"The engine named by {source} is missing: {path}. Name a Python that has torch, or leave it empty"
+    return "No engine is set up. Open the preferences of Fit Flare and set one up, or name a Python that has torch"
 
 
-def command(*words: object) -> list[str]:
-    """A command of run.py as the engine runs it. Raises EngineError where no engine is set up."""
-    python = find()
+def command(*args: object) -> list[str]:
+    """Return the command line of a run.py command in the engine. Raises EngineError where there is no engine."""
+    python = find_engine()
     if python is None:
-        raise EngineError(f"{missing()}.")
-    return [str(python), str(RUN), *map(str, words), "--progress", "json"]
+        raise EngineError(f"{missing_reason()}.")
+    return [str(python), str(RUN_SCRIPT), *map(str, args), "--progress", "json"]
 
 
-def run(kind: str, folder: Path, words: Sequence[object]) -> Job:
+def run(kind: str, folder: Path, args: Sequence[object]) -> Job:
     """Start a command of run.py whose events go to `folder`; see `jobs.start`."""
-    return jobs.start(kind, folder, command(*words), environment(), words=words)
+    return jobs.start(kind, folder, command(*args), child_environment(), args=args)
 
 
-# ---- its state ------------------------------------------------------------------------------------
+# ---- test, set-up and removal ------------------------------------------------------------------------------------
 
 
 def test() -> Job:
-    """Ask the engine what it is; the answer is the job's result (version, python, torch, device)."""
+    """Start the command `engine`; the job's result has version, python, torch and device."""
     folder = user_folder("test", create=True)
-    write_text(folder / TESTED, str(find()))
+    write_text(folder / TESTED_FILE, str(find_engine()))
     return run("test", folder, ["engine"])
 
 
-def tested() -> Job | None:
-    """The last test, if it was of the engine that is there now."""
-    folder, python = user_folder("test"), find()
+def last_test() -> Job | None:
+    """Return the last test, if it tested the engine that is used now."""
+    folder, python = user_folder("test"), find_engine()
     try:
-        same = python is not None and (folder / TESTED).read_text(encoding="utf-8") == str(python)
+        same = python is not None and (folder / TESTED_FILE).read_text(encoding="utf-8") == str(python)
     except (OSError, ValueError):
         return None
     return jobs.find(folder) if same else None
 
 
 def set_up() -> Job:
-    """Make a virtual environment in the extension's own folder and install the engine into it.
+    """Install the engine into a virtual environment in `set_up_folder`.
 
-    Raises EngineError where Blender's online access is not granted, or what is left of an engine cannot be removed.
+    Raises EngineError where Blender's online access is off, or where a damaged earlier engine cannot be removed.
     """
     if not bpy.app.online_access:
         raise EngineError("Blender's online access is off; allow it in Preferences > System > Network, then set up.")
-    if was_set_up() and not (virtual_environment() / "pyvenv.cfg").is_file():  # half of it was removed
-        _clear(virtual_environment())
+    if is_set_up() and not (virtual_environment() / "pyvenv.cfg").is_file():  # damaged
+        _remove_environment(virtual_environment())
     script = ROOT / "headless" / "set_up.py"
-    words = [sys.executable, *bpy.app.python_args, str(script), str(virtual_environment())]
-    return jobs.start("set up", home(), words, environment())
+    command_line = [sys.executable, *bpy.app.python_args, str(script), str(virtual_environment())]
+    return jobs.start("set up", set_up_folder(), command_line, child_environment())
 
 
-def was_set_up() -> bool:
-    """Whether there is one that a click has set up."""
+def is_set_up() -> bool:
+    """Return whether Set Up Engine has installed an engine."""
     return virtual_environment().is_dir()
 
 
-def setting_up() -> Job | None:
-    """The set-up that runs or ran."""
-    return jobs.find(home())
+def set_up_job() -> Job | None:
+    """Return the job of the current or last set-up; None without one."""
+    return jobs.find(set_up_folder())
 
 
 def remove() -> None:
-    """Remove the engine that a click set up. Raises FitFlareError while it works, EngineError where a file of it is in
-    use otherwise."""
+    """Remove the installed engine. Raises FitFlareError while a job runs, EngineError where a file is in use."""
     if any(job.running for job in jobs.running()):
-        raise FitFlareError("The engine is at work; wait for it or cancel it before removing it.")
-    folder = home()
-    _clear(folder)
-    jobs.forget(folder)
+        raise FitFlareError("The engine is running; wait for it, or cancel it before you remove it.")
+    folder = set_up_folder()
+    _remove_environment(folder)
+    jobs.stop_watching(folder)
 
 
-def _clear(folder: Path) -> None:
+def _remove_environment(folder: Path) -> None:
+    """Remove the folder of an engine. Raises EngineError where a file of it is in use."""
     try:
         remove_folder(folder)
     except OSError as problem:
         raise EngineError(f"The engine in {folder} is in use or cannot be removed ({problem.strerror or problem}); "
-                          "close other Blenders and programs that work with it, and try again.") from problem
+                          "close other Blenders and programs that use it, and try again.") from problem

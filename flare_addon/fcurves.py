@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""F-curves and drivers, whose paths go by number, where what is numbered is moved."""
+"""Keeps F-curves and drivers on the items of a collection property whose indices change."""
 from __future__ import annotations
 
 import re
@@ -9,8 +9,8 @@ from typing import Any
 import bpy
 
 
-def of(block: Any) -> list[Any]:
-    """The collections of F-curves that animate a data block."""
+def fcurves_of(block: Any) -> list[Any]:
+    """Return the collections of F-curves that animate a data block."""
     data = block.animation_data
     if data is None or data.action is None:
         return []
@@ -20,22 +20,24 @@ def of(block: Any) -> list[Any]:
             if bag.slot_handle == data.action_slot_handle]
 
 
-def renumber(block: Any, path: str, moved: Callable[[int], int | None]) -> None:
-    """Have what animates and drives the items of the collection at `path` follow them: `moved` gives an item's new
-    number by its old one, None for one that is gone."""
-    numbered = re.compile(re.escape(path) + r"\[(\d+)\](.*)")
+def renumber(block: Any, path: str, new_index: Callable[[int], int | None]) -> None:
+    """Update the indices in the paths of F-curves and drivers on the items of the collection at `path`.
+
+    new_index: the new index of an item by its old one, None for an item that was removed; its curves are removed too.
+    """
+    pattern = re.compile(re.escape(path) + r"\[(\d+)\](.*)")
     drivers = [block.animation_data.drivers] if block.animation_data is not None else []
-    for curves in (*of(block), *drivers):
+    for curves in (*fcurves_of(block), *drivers):
         for curve in list(curves):
-            if match := numbered.fullmatch(curve.data_path):
-                number = moved(int(match[1]))
-                if number is None:
+            if match := pattern.fullmatch(curve.data_path):
+                index = new_index(int(match[1]))
+                if index is None:
                     curves.remove(curve)
                 else:
-                    curve.data_path = f"{path}[{number}]{match[2]}"
+                    curve.data_path = f"{path}[{index}]{match[2]}"
 
 
-def take_out(collection: Any, path: str, number: int) -> None:
-    """Remove an item of a collection property, at `path` of its data block; those after it move up."""
-    collection.remove(number)
-    renumber(collection.id_data, path, lambda one: None if one == number else one - (one > number))
+def remove_item(collection: Any, path: str, index: int) -> None:
+    """Remove an item of the collection property at `path` of its data block, with the animation of that item."""
+    collection.remove(index)
+    renumber(collection.id_data, path, lambda old: None if old == index else old - (old > index))

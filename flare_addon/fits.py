@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Fits: started, found again, and what they leave taken into the scene."""
+"""Fits, light searches and clean frames: starts the jobs of a scene and brings their results into it."""
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import bpy
 
@@ -14,44 +14,47 @@ from ..core.conventions.run_files import CONFIG, FLARE, SMALL_PREVIEW
 from ..core.errors import CaptureError, FitFlareError, RunError
 from ..core.look import Look, read
 from . import engine, jobs, lights, looks
-from .capture.importer import expose
-from .images import read_again
+from .capture.importer import set_exposures
+from .images import reload_images
 from .jobs import Job
-from .paths import absolute, is_file, is_folder, stored
+from .paths import absolute, blend_relative, is_file, is_folder
 from .reports import NO_CAPTURE
 
+FitState = Literal["none", "running", "resumable", "finished", "lost"]
+"""resumable: stopped or failed before its end. lost: the folder of the run does not exist any more."""
 
-def folder_of(scene: Any) -> Path | None:
-    """The run's folder; None where none is chosen."""
+
+def run_folder(scene: Any) -> Path | None:
+    """Return the folder of the scene's run; None where none is set."""
     return absolute(scene.fit_flare.run, scene.library) if scene.fit_flare.run else None
 
 
-def capture_of(scene: Any) -> Path | None:
-    """The capture's folder; None where none is chosen."""
+def capture_folder(scene: Any) -> Path | None:
+    """Return the folder of the scene's capture; None where none is set."""
     return absolute(scene.fit_flare.capture, scene.library) if scene.fit_flare.capture else None
 
 
 def has_clean_frames(scene: Any) -> bool:
-    """Whether the imported capture has frames without flare, to be shown behind its cameras."""
-    folder = capture_of(scene)
+    """Return whether the imported capture has clean frames to show behind its cameras."""
+    folder = capture_folder(scene)
     return scene.fit_flare.root is not None and folder is not None and is_folder(folder / REMOVED)
 
 
-def job_of(scene: Any) -> Job | None:
-    """The fit that runs or ran in the scene's run folder."""
-    return jobs.find(folder_of(scene))
+def fit_job(scene: Any) -> Job | None:
+    """Return the job of the scene's current or last fit; None without one."""
+    return jobs.find(run_folder(scene))
 
 
-def jobs_of(scene: Any) -> list[Job | None]:
-    """The scene's fit, search for lights and cleaning, where there is or was one."""
-    capture = capture_of(scene)
-    of_capture = [] if capture is None else [jobs.find(capture / "lights"), cleaning_of(capture)]
-    return [job_of(scene), *of_capture]
+def engine_jobs(scene: Any) -> list[Job | None]:
+    """Return the jobs of the scene's fit, light search and clean frames; None for each without one."""
+    capture = capture_folder(scene)
+    of_capture = [] if capture is None else [jobs.find(capture / "lights"), cleaning_job(capture)]
+    return [fit_job(scene), *of_capture]
 
 
-def state_of(scene: Any) -> str:
-    """"none", "running", "resumable" (broken off), "finished" or "lost" (its folder is gone)."""
-    folder = folder_of(scene)
+def fit_state(scene: Any) -> FitState:
+    """Return the state of the scene's fit."""
+    folder = run_folder(scene)
     if folder is None:
         return "none"
     job = jobs.find(folder)
@@ -65,24 +68,24 @@ def state_of(scene: Any) -> str:
 
 
 def why_not(scene: Any) -> str:
-    """What keeps a fit from being started, and what to do; "" where nothing does. No full stop: for tooltips."""
-    capture = capture_of(scene)
+    """Return why a fit cannot start and what to do, without a full stop; "" where it can."""
+    capture = capture_folder(scene)
     if capture is None:
         return NO_CAPTURE
     if not is_folder(capture):
-        return f"The capture {capture} is not there any more; choose where it is now"
-    if not lights.of_scene(scene):
+        return f"The capture {capture} does not exist any more; choose its present folder"
+    if not lights.scene_lights(scene):
         return "Add a light first, or find the lights in the frames"
-    if missing := engine.missing():
+    if missing := engine.missing_reason():
         return missing
-    if state_of(scene) == "running":
+    if fit_state(scene) == "running":
         return "A fit is running"
     return ""
 
 
-def new_folder(scene: Any) -> Path:
-    """A free folder for a run: beside the .blend where it is saved, else in the capture's own fits/."""
-    capture = capture_of(scene)
+def new_run_folder(scene: Any) -> Path:
+    """Return a free folder for a run: beside a saved .blend, else in fits/ of the capture. Raises CaptureError."""
+    capture = capture_folder(scene)
     if capture is None:
         raise CaptureError("There is no capture yet; import one first.")
     base = Path(bpy.data.filepath).parent / "fits" if bpy.data.filepath else capture / "fits"
@@ -93,156 +96,159 @@ def new_folder(scene: Any) -> Path:
 
 
 def start(scene: Any) -> Job:
-    """Begin a fit in a new folder, with the lights as they are in the scene.
+    """Start a fit in a new folder, with the present lights of the scene.
 
-    Raises EngineError without an engine, CaptureError without a capture or lights, RunError for the folder.
+    Raises EngineError without an engine, CaptureError without a capture or lights, RunError for an unusable folder.
     """
-    capture = capture_of(scene)
+    capture = capture_folder(scene)
     if capture is None or not is_folder(capture):
-        raise CaptureError(f"The capture {capture} is not there any more; import it from where it is now."
+        raise CaptureError(f"The capture {capture} does not exist any more; import it from its present folder."
                            if capture else "There is no capture yet; import one first.")
-    engine.command()  # says so before anything is written
-    lights.write(scene, capture)
-    folder, before = new_folder(scene), scene.fit_flare.run
-    scene.fit_flare.run = stored(folder)
-    folder = folder_of(scene) or folder  # by the name that it will be asked for
+    engine.command()  # raises before anything is written
+    lights.write_to_capture(scene, capture)
+    folder, before = new_run_folder(scene), scene.fit_flare.run
+    scene.fit_flare.run = blend_relative(folder)
+    folder = run_folder(scene) or folder  # as the stored path resolves
     try:
-        return _run(scene, capture, folder)
+        return _run_fit(scene, capture, folder)
     except FitFlareError:
-        if not is_file(folder / CONFIG):  # refused before it began: an earlier fit is still what there is
+        if not is_file(folder / CONFIG):  # refused before it started: keep the earlier fit
             scene.fit_flare.run = before
         raise
 
 
 def resume(scene: Any) -> Job:
-    """Go on with the run of the scene. Raises as `start` does."""
-    capture, folder = capture_of(scene), folder_of(scene)
+    """Resume the run of the scene. Raises as `start` does."""
+    capture, folder = capture_folder(scene), run_folder(scene)
     if folder is None or not is_file(folder / CONFIG):
-        raise RunError(f"There is no fit to go on with in {folder}; start a new one.")
-    begun = _begun_with(folder)
-    if begun is None or _has_moved(folder, capture):
-        begun = capture
-    if begun is None or not is_folder(begun):
-        raise CaptureError(f"The capture {begun} that this fit was begun with is not there; put it back, or start a "
-                           "new fit.")
-    return _run(scene, begun, folder)
+        raise RunError(f"There is no fit to resume in {folder}; start a new one.")
+    fitted = _capture_of_run(folder)
+    if fitted is None or _capture_has_moved(folder, capture):
+        fitted = capture
+    if fitted is None or not is_folder(fitted):
+        raise CaptureError(f"The capture {fitted} of this fit does not exist; put it back, or start a new fit.")
+    return _run_fit(scene, fitted, folder)
 
 
-def _run(scene: Any, capture: Path, folder: Path) -> Job:
+def _run_fit(scene: Any, capture: Path, folder: Path) -> Job:
+    """Start the command `fit` with the scene's settings."""
     state = scene.fit_flare
-    words: list[object] = ["fit", capture.resolve(), "--out", folder, "--resume", "--preset", state.preset, "--mode",
-                           state.mode, "--holdout", 0]
+    args: list[object] = ["fit", capture.resolve(), "--out", folder, "--resume", "--preset", state.preset, "--mode",
+                          state.mode, "--holdout", 0]
     if state.width:
-        words += ["--size", state.width]
-    return engine.run("fit", folder, words)
+        args += ["--size", state.width]
+    return engine.run("fit", folder, args)
 
 
-def show(scene: Any, folder: Path) -> Look:
-    """The flare of a run in the scene, its lights where the fit has put them, its cameras exposed as their frames were.
-    Raises FlareFileError, CaptureError, RunError."""
+def show_result(scene: Any, folder: Path) -> Look:
+    """Show the flare of a run in the scene, with the lights and exposures of the fit; return its look.
+
+    Raises FlareFileError, CaptureError and RunError.
+    """
     path = folder / FLARE
-    # Before the look is used, which asks where the lights are.
-    lights.follow(scene, {light.name: light.xyz for light in read(path).lights}, capture_of(scene))
-    look = looks.use(scene, path)
+    # Before show_look, which compares the positions of the lights.
+    lights.move_to_fit(scene, {light.name: light.xyz for light in read(path).lights}, capture_folder(scene))
+    look = looks.show_look(scene, path)
     expose_cameras(scene, folder)
     return look
 
 
 def expose_cameras(scene: Any, folder: Path | None) -> None:
-    """The imported cameras, as the run in a folder found the frames that they are; nothing where it is a run of another
-    capture. Raises RunError."""
-    capture = capture_of(scene)
+    """Set the exposure of the imported cameras from a run, unless it is a run of another capture. Raises RunError."""
+    capture = capture_folder(scene)
     if folder is None or capture is None or scene.fit_flare.root is None:
         return
-    if _begun_with(folder) is not None and _may_be_of(folder, capture):
-        expose(scene.fit_flare.root, exposures.read(folder))
+    if _capture_of_run(folder) is not None and _may_belong_to(folder, capture):
+        set_exposures(scene.fit_flare.root, exposures.read(folder))
 
 
-def leave_another(scene: Any) -> None:
-    """Let go of a run of another capture than the scene's present one; it goes on, and its folder stays."""
-    folder, capture = folder_of(scene), capture_of(scene)
-    if folder is not None and capture is not None and not _may_be_of(folder, capture):
+def clear_other_run(scene: Any) -> None:
+    """Clear the scene's run where it is one of another capture; its job and its folder are left alone."""
+    folder, capture = run_folder(scene), capture_folder(scene)
+    if folder is not None and capture is not None and not _may_belong_to(folder, capture):
         scene.fit_flare.run = ""
 
 
-def _may_be_of(folder: Path, capture: Path) -> bool:
-    """Whether a run is of a capture. One whose own is gone may be of one that has its name: that may have been moved;
-    one that does not say may be of any."""
-    begun = _begun_with(folder)
-    if begun is None:
+def _may_belong_to(folder: Path, capture: Path) -> bool:
+    """Return whether a run may be of this capture.
+
+    Where the run's capture is missing, one of the same name counts, since it may have been moved. A run that does not
+    store its capture may belong to any.
+    """
+    fitted = _capture_of_run(folder)
+    if fitted is None:
         return True
-    return begun.samefile(capture) if is_folder(begun) and is_folder(capture) else begun.name == capture.name
+    return fitted.samefile(capture) if is_folder(fitted) and is_folder(capture) else fitted.name == capture.name
 
 
-def _has_moved(folder: Path, capture: Path | None) -> bool:
-    """Whether the capture of a run is gone from where it was, and may be the one that is given now."""
-    begun = _begun_with(folder)
-    return (begun is not None and not is_folder(begun) and capture is not None and is_folder(capture)
-            and _may_be_of(folder, capture))
+def _capture_has_moved(folder: Path, capture: Path | None) -> bool:
+    """Return whether the capture of a run is missing from its folder and `capture` may be it."""
+    fitted = _capture_of_run(folder)
+    return (fitted is not None and not is_folder(fitted) and capture is not None and is_folder(capture)
+            and _may_belong_to(folder, capture))
 
 
-def _begun_with(folder: Path) -> Path | None:
-    """The capture of a run; None where its folder does not say."""
+def _capture_of_run(folder: Path) -> Path | None:
+    """Return the capture of a run; None where its folder does not store it."""
     try:
         return Path((folder / "capture.txt").read_text(encoding="utf-8").removesuffix("\n"))
     except (OSError, UnicodeDecodeError):
         return None
 
 
-def finished(job: Job) -> None:
-    """Show the flare of a fit that ended well, in every scene that has this run."""
+def on_fit_finished(job: Job) -> None:
+    """Show the flare of a successful fit in every scene with this run."""
     if job.state != "done":
         return
-    scenes = [scene for scene in _own_scenes() if folder_of(scene) == job.folder]
+    scenes = [scene for scene in _local_scenes() if run_folder(scene) == job.folder]
     for scene in scenes:
         try:
-            show(scene, job.folder)
+            show_result(scene, job.folder)
         except FitFlareError as problem:
             job.error = str(problem)
-    _remember("Fit", scenes)
+    _push_undo("Fit", scenes)
 
 
-def _own_scenes() -> list[Any]:
-    """The scenes of this .blend, without those that are linked from another and cannot be changed here."""
+def _local_scenes() -> list[Any]:
+    """Return the scenes of this .blend, without linked ones, which cannot be changed."""
     return [scene for scene in bpy.data.scenes if scene.library is None]
 
 
-def _remember(what: str, scenes: Sequence[Any]) -> None:
-    """An undo step for what a timer changed in scenes, so that undoing what came later does not take it away too."""
+def _push_undo(label: str, scenes: Sequence[Any]) -> None:
+    """Add an undo step for a change by a timer, so that undoing a later change does not undo this one too."""
     manager = bpy.context.window_manager
     if bpy.app.background or not manager.windows or not scenes:
         return
     with bpy.context.temp_override(window=manager.windows[0]):
-        bpy.ops.ed.undo_push(message=f"Fit Flare: {what}")
+        bpy.ops.ed.undo_push(message=f"Fit Flare: {label}")
 
 
 def find_lights(scene: Any) -> Job:
-    """Have the engine look for lights in the frames; those of the scene stay. Raises EngineError, CaptureError."""
-    capture = capture_of(scene)
+    """Start a search for lights in the frames; lights of the scene stay. Raises EngineError and CaptureError."""
+    capture = capture_folder(scene)
     if capture is None or not is_folder(capture):
         raise CaptureError("There is no capture yet; import one first.")
-    if lights.of_scene(scene):
-        lights.write(scene, capture)
-    lights.remember(scene)
+    if lights.scene_lights(scene):
+        lights.write_to_capture(scene, capture)
+    lights.remember_names(scene)
     return engine.run("lights", capture / "lights", ["lights", capture, "--keep"])
 
 
-def clean(scene: Any) -> Job:
-    """Have the engine take the flares out of the frames, into the capture's removed/. Raises EngineError,
-    CaptureError."""
-    capture = capture_of(scene)
+def clean_frames(scene: Any) -> Job:
+    """Start the removal of flares from the frames into the capture's removed/. Raises EngineError and CaptureError."""
+    capture = capture_folder(scene)
     if capture is None or not is_folder(capture / "images"):
         raise CaptureError("There is no capture with a folder images/ yet; import one first.")
-    words = cleaning(scene, capture)
-    made = cleaning_of(capture)
-    # What the engine itself has made is made again; what it was stopped at is gone on with, if it is still the same.
-    if made is not None and (made.state == "done" or made.words != list(map(str, words))):
-        words = [*words, "--overwrite"]
-    return engine.run("clean", _cleaning_folder(capture), words)
+    args = cleaning_args(scene, capture)
+    earlier = cleaning_job(capture)
+    # A finished job is replaced; one that was stopped is resumed if its arguments are the same.
+    if earlier is not None and (earlier.state == "done" or earlier.args != list(map(str, args))):
+        args = [*args, "--overwrite"]
+    return engine.run("clean", _cleaning_folder(capture), args)
 
 
-def cleaning_of(capture: Path) -> Job | None:
-    """The cleaning of a capture's frames that runs or ran."""
+def cleaning_job(capture: Path) -> Job | None:
+    """Return the current or last job that makes the clean frames of a capture; None without one."""
     return jobs.find(_cleaning_folder(capture))
 
 
@@ -250,60 +256,60 @@ def _cleaning_folder(capture: Path) -> Path:
     return capture / "removal"
 
 
-def cleaning(scene: Any, capture: Path) -> list[object]:
-    """The engine's words for it: a finished fit knows the flare of all frames, a network sees a few at a time, and by
-    a matte where there is one."""
-    folder = folder_of(scene)
-    if folder is not None and state_of(scene) == "finished" and _may_be_of(folder, capture):
-        moved = ["--capture", capture] if _has_moved(folder, capture) else []
-        return ["remove", "--run", folder, *moved, "--out", capture / REMOVED]
-    given = scene.fit_flare.matte
-    matte = ["--matte", absolute(given, scene.library)] if given else []
-    glow = "--keep-glare" if scene.fit_flare.keep_glow else "--all-glare"
+def cleaning_args(scene: Any, capture: Path) -> list[object]:
+    """Return the arguments of the command `remove`: with the run where the fit is finished, else with the network and
+    the matte."""
+    folder = run_folder(scene)
+    if folder is not None and fit_state(scene) == "finished" and _may_belong_to(folder, capture):
+        moved_capture = ["--capture", capture] if _capture_has_moved(folder, capture) else []
+        return ["remove", "--run", folder, *moved_capture, "--out", capture / REMOVED]
+    path = scene.fit_flare.matte
+    matte = ["--matte", absolute(path, scene.library)] if path else []
+    glow = "--keep-glow" if scene.fit_flare.keep_glow else "--all-glow"
     return ["remove", capture / "images", "--out", capture / REMOVED, *matte, glow]
 
 
-def cleaned(job: Job) -> None:
-    """Fits of the scenes with this capture go by the clean frames from now on; those that are shown are read again."""
-    read_again(job.folder.parent / REMOVED)
+def on_cleaning_finished(job: Job) -> None:
+    """Reload clean frames that are shown; after success, fits of the scenes with this capture use them as estimates."""
+    reload_images(job.folder.parent / REMOVED)
     if job.state != "done":
         return
-    scenes = [scene for scene in _own_scenes()
-              if (capture := capture_of(scene)) is not None and _cleaning_folder(capture) == job.folder]
+    scenes = [scene for scene in _local_scenes()
+              if (capture := capture_folder(scene)) is not None and _cleaning_folder(capture) == job.folder]
     for scene in scenes:
         scene.fit_flare.mode = "estimated"
-    _remember("Clean Frames", scenes)
+    _push_undo("Clean Frames", scenes)
 
 
-def lights_found(job: Job) -> None:
-    """Bring found lights into every scene with this capture."""
+def on_lights_found(job: Job) -> None:
+    """Add the lights that were found to every scene with this capture."""
     if job.state != "done":
         return
-    scenes = [scene for scene in _own_scenes()
-              if (capture := capture_of(scene)) is not None and capture / "lights" == job.folder]
+    scenes = [scene for scene in _local_scenes()
+              if (capture := capture_folder(scene)) is not None and capture / "lights" == job.folder]
     for scene in scenes:
         try:
-            lights.bring_in(scene, job.folder.parent)
+            lights.import_new(scene, job.folder.parent)
         except FitFlareError as problem:
             job.error = str(problem)
-    _remember("Lights", scenes)
+    _push_undo("Lights", scenes)
 
 
-jobs.FINISHERS.update({"fit": finished, "lights": lights_found, "clean": cleaned})
+jobs.ON_FINISHED.update({"fit": on_fit_finished, "lights": on_lights_found, "clean": on_cleaning_finished})
 
 
 # ---- the preview ----------------------------------------------------------------------------------
 
 _previews: Any = None
-_shown: dict[str, float] = {}
+_preview_times: dict[str, float] = {}
 
 
 def preview_icon(folder: Path) -> int:
-    """An icon of the run's newest preview picture; 0 where there is none yet."""
+    """Return the icon id of the run's newest preview; 0 where there is none yet."""
     global _previews
     path = folder / SMALL_PREVIEW
     try:
-        changed = path.stat().st_mtime
+        modified = path.stat().st_mtime
     except OSError:
         return 0
     if _previews is None:
@@ -311,19 +317,20 @@ def preview_icon(folder: Path) -> int:
 
         _previews = previews.new()
     key = str(path)
-    if _shown.get(key) != changed:
+    if _preview_times.get(key) != modified:
         if key in _previews:
             del _previews[key]
         _previews.load(key, key, "IMAGE")
-        _shown[key] = changed
+        _preview_times[key] = modified
     return int(_previews[key].icon_id)
 
 
 def unregister() -> None:
+    """Free the preview icons."""
     global _previews
     if _previews is not None:
         from bpy.utils import previews
 
         previews.remove(_previews)
         _previews = None
-    _shown.clear()
+    _preview_times.clear()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Pictures that a .blend has from disk."""
+"""Loads and reloads pictures as Blender images."""
 from __future__ import annotations
 
 from pathlib import Path
@@ -7,22 +7,24 @@ from typing import Any, Literal
 
 import bpy
 
-from .paths import absolute, stored
+from .paths import absolute, blend_relative
 
 
-def loaded(path: Path, source: Literal["FILE", "SEQUENCE"] = "FILE") -> Any:
-    """The picture, or the sequence that begins with it: the image that is here for it, unless that one is the other of
-    the two. By a path that goes with a .blend into another place."""
+def load_image(path: Path, source: Literal["FILE", "SEQUENCE"] = "FILE") -> Any:
+    """Return the image of a picture, or of the sequence that begins with it, under a path relative to the .blend.
+
+    An image that the .blend has already is reused, unless it is a still and a sequence is needed, or the reverse.
+    """
     image = bpy.data.images.load(str(path), check_existing=True)
     if image.users and image.source != source:
         image = bpy.data.images.load(str(path))
     if not image.users:
-        image.source, image.filepath = source, stored(path)
+        image.source, image.filepath = source, blend_relative(path)
     return image
 
 
-def read_again(folder: Path) -> None:
-    """Read pictures below a folder from disk again, where Blender has them: it would show those of before."""
+def reload_images(folder: Path) -> None:
+    """Reload the images below a folder from disk, since Blender keeps the old pixels."""
     folder = folder.resolve()
     for image in bpy.data.images:
         if image.source in ("FILE", "SEQUENCE") and image.filepath and \

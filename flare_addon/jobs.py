@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Work of the engine, watched from Blender: a process of its own whose events land in a file.
+"""Jobs: commands of the engine in processes of their own, which Blender follows by a file of events.
 
-    FOLDER/job.json       what was started, in which words, on which machine, and the process's number
-    FOLDER/events.jsonl   its events, one JSON object a line (core/system/progress.py)
-    FOLDER/engine.log     what else it said
-    FOLDER/stop           there when it has been asked to stop
+    FOLDER/job.json       kind, arguments, machine and process number of the job
+    FOLDER/events.jsonl   its events, one JSON object per line (core/system/progress.py)
+    FOLDER/engine.log     its other output
+    FOLDER/stop           exists once the job was asked to stop
 
-A file, not a pipe: the process needs nobody to read it, so Blender can be saved, closed and opened again
-meanwhile, and finds the work by its folder. A timer looks at what is new in the file, a few kilobytes at a
-time, so the window never waits. Without a window the same calls wait for the end. Of work on another machine, in a
-folder that both see, the events alone tell whether it goes on.
+`engine.run` starts a job; `fits` and `shots` register in `ON_FINISHED` what happens in the scenes at its end. The
+events go to a file, not a pipe, so that Blender can be closed and opened again during a job, and finds it by its
+folder. A timer reads new events in small pieces, so the window never waits. Without a window the same calls wait for
+the end. Whether a job on another machine is running, in a folder that both can access, is known from its events alone.
 """
 from __future__ import annotations
 
@@ -28,58 +28,61 @@ from typing import Any, Literal
 
 import bpy
 
-from ..core.errors import DISK_FULL, EngineError, FitFlareError, RunError, refusal
+from ..core.errors import DISK_FULL, EngineError, FitFlareError, RunError, os_error_message
 from ..core.system import processes
 from ..core.system.files import remove_file, write_json
-from ..core.system.processes import STOPPED, WINDOWS, own_group
+from ..core.system.processes import STOPPED, WINDOWS, new_process_group
 from ..core.system.progress import STOP_FILE
 from .paths import is_file, is_folder
 
 State = Literal["running", "done", "failed", "stopped"]
 
 RECORD, EVENTS, LOG, STOP = "job.json", "events.jsonl", "engine.log", "stop"
-HOST = processes.machine()
-EVERY_S = 0.2
+HOST = processes.machine_id()
+POLL_INTERVAL_S = 0.2
 NICENESS = 5
-TAB = "Fit Flare"  # of the sidebar
-AT_ONCE = 1 << 16  # bytes of events read at a time
-SILENT_S = 3600.0  # another machine's engine that has told nothing for so long has died
-FULL = 1 << 16  # a disk with fewer bytes free is full
+SIDEBAR_TAB = "Fit Flare"
+READ_CHUNK = 1 << 16  # bytes of events
+SILENCE_LIMIT_S = 3600.0  # a job on another machine without events for so long counts as failed
+MIN_FREE_BYTES = 1 << 16  # a disk with less free space counts as full
 
-FINISHERS: dict[str, Callable[[Job], None]] = {}
-"""By kind of work: what is to be done in the scenes when it has ended."""
+ON_FINISHED: dict[str, Callable[[Job], None]] = {}
+"""The function to call when a job has ended, by kind of job."""
 
 _jobs: dict[str, Job] = {}
 
 
 class Job:
-    """One command of the engine. done, total: steps of `stage`; left_s: seconds left, None where unknown. log_from:
-    bytes of the log that commands before it have written. host: its machine, which people call `host_name`.
-    started: when, in seconds since the epoch, by which one of an earlier Blender is known."""
+    """One command of the engine.
+
+    done, total: steps of `stage`. eta_s: remaining seconds, None where unknown. log_offset: size of the log before the
+    command, bytes. host: id of its machine, `host_name` its name for people. started: seconds since the epoch, which
+    tells the process from a later one of the same number.
+    """
 
     def __init__(self, kind: str, folder: Path, pid: int, process: subprocess.Popen[bytes] | None,
-                 words: Sequence[str] = (), host: str = HOST, log_from: int = 0, host_name: str = "",
+                 args: Sequence[str] = (), host: str = HOST, log_offset: int = 0, host_name: str = "",
                  started: float = 0.0) -> None:
-        self.kind, self.folder, self.pid, self.host, self.log_from = kind, folder, pid, host, log_from
+        self.kind, self.folder, self.pid, self.host, self.log_offset = kind, folder, pid, host, log_offset
         self.started = started
         self.host_name = host_name or host
-        self.words = [word for word in words if word != "--overwrite"]
+        self.args = [arg for arg in args if arg != "--overwrite"]
         self.state: State = "running"
-        self.stage, self.done, self.total, self.left_s = "starting", 0, 0, None
+        self.stage, self.done, self.total, self.eta_s = "starting", 0, 0, None
         self.figures: dict[str, float] = {}
-        self.said: list[str] = []
+        self.messages: list[str] = []
         self.result: dict[str, Any] = {}
         self.error = ""
-        self._process, self._watched, self._has_result = process, process is not None, False
-        self._at, self._rest = 0, b""
+        self._process, self._was_seen_running, self._has_result = process, process is not None, False
+        self._offset, self._partial_line = 0, b""
 
     @property
     def running(self) -> bool:
         return self.state == "running"
 
     @property
-    def share(self) -> float:
-        """How much of the stage is done, 0..1."""
+    def fraction_done(self) -> float:
+        """The part of the stage that is done, 0..1."""
         return min(self.done / self.total, 1.0) if self.total else 0.0
 
     @property
@@ -87,87 +90,89 @@ class Job:
         return self.folder / LOG
 
     def poll(self) -> bool:
-        """Take in what is new; whether anything was."""
+        """Read new events; return whether there were any, or the job has ended."""
         if not self.running:
             return False
-        before = self._at
-        alive = self._alive()  # asked first: what was written before the end is then read below
+        before = self._offset
+        alive = self._is_alive()  # before reading, so that the last events are read below
         self._read()
         if alive:
-            self._watched = True
-            return self._at > before
+            self._was_seen_running = True
+            return self._offset > before
         while self._read():
             pass
-        self._end()
-        if self._watched and self.kind in FINISHERS:  # what ended before this session was taken in then
-            FINISHERS[self.kind](self)
+        self._finish()
+        if self._was_seen_running and self.kind in ON_FINISHED:  # else an earlier session handled the end
+            ON_FINISHED[self.kind](self)
         return True
 
     def stop(self) -> None:
-        """Ask it to stop; it keeps what it has, and ends by itself.
+        """Ask the process to stop; it saves its state and ends by itself.
 
-        By a file, since on Windows a signal reaches only who shares a console; elsewhere by a signal too, which is
-        heard in start-up, and of which a second one ends what does not answer. The number may be another process's, as
-        it is on another machine, and then the file is all.
+        This is done by a file, since on Windows a signal reaches processes of the same console only. On other systems
+        a signal is sent too: it also works during start-up, and a second one ends a process that does not react. On
+        another machine, or where the process number was reused, there is no signal.
         """
-        if not self.running or not self._alive():
+        if not self.running or not self._is_alive():
             return
         self.stage = "stopping"
         with contextlib.suppress(OSError):
             (self.folder / STOP).touch()
-        if not WINDOWS and self.host == HOST and (self._process or processes.is_same(self.pid, self.started)):
+        if not WINDOWS and self.host == HOST and (self._process or processes.is_same_process(self.pid, self.started)):
             with contextlib.suppress(OSError):
                 os.kill(self.pid, signal.SIGINT)
 
     def _read(self) -> bool:
+        """Read and handle one piece of new events; return whether there was any."""
         try:
             with open(self.folder / EVENTS, "rb") as stream:
-                stream.seek(self._at)
-                data = stream.read(AT_ONCE)
-        except OSError:  # the folder was removed, or is not there yet
+                stream.seek(self._offset)
+                data = stream.read(READ_CHUNK)
+        except OSError:  # the folder was removed, or does not exist yet
             return False
-        self._at += len(data)
-        *lines, self._rest = (self._rest + data).split(b"\n")
+        self._offset += len(data)
+        *lines, self._partial_line = (self._partial_line + data).split(b"\n")
         for line in lines:
-            self._take(line)
+            self._handle_event(line)
         return bool(data)
 
-    def _take(self, line: bytes) -> None:
+    def _handle_event(self, line: bytes) -> None:
+        """Update the state from one line of events; other lines are ignored."""
         try:
             event = json.loads(line)
             kind = event["type"]
         except (ValueError, KeyError, TypeError):
             return
         if kind == "stage":
-            self.stage, self.done, self.total, self.left_s = event["name"], event["done"], event["total"], None
+            self.stage, self.done, self.total, self.eta_s = event["name"], event["done"], event["total"], None
         elif kind == "progress":
-            self.done, self.total, self.left_s = event["done"], event["total"], event["left_s"]
+            self.done, self.total, self.eta_s = event["done"], event["total"], event.get("eta_s", event.get("left_s"))
             self.figures = event["figures"]
         elif kind == "say":
-            self.said.append(str(event["text"]))
+            self.messages.append(str(event["text"]))
         elif kind == "result":
             self.result.update(event["data"])
             self._has_result = True
         elif kind == "error":
             self.error = str(event["text"])
 
-    def _alive(self) -> bool:
+    def _is_alive(self) -> bool:
         if self._process is not None:
             return self._process.poll() is None
         if self.host != HOST:
             while self._read():
                 pass
-            return not (self._has_result or self.error or self._silent())
-        return self.pid > 0 and processes.runs(self.pid)
+            return not (self._has_result or self.error or self._is_silent())
+        return self.pid > 0 and processes.is_running(self.pid)
 
-    def _silent(self) -> bool:
+    def _is_silent(self) -> bool:
         try:
-            return time.time() - (self.folder / EVENTS).stat().st_mtime > SILENT_S
+            return time.time() - (self.folder / EVENTS).stat().st_mtime > SILENCE_LIMIT_S
         except OSError:
             return True
 
-    def _end(self) -> None:
-        """The process is gone."""
+    def _finish(self) -> None:
+        """Set the final state after the process has ended, from its events, its exit status and its folder."""
         status = self._process.returncode if self._process is not None else None
         if self._has_result:
             self.state = "done"
@@ -177,22 +182,23 @@ class Job:
             self.state = "failed"
         elif self.host != HOST and is_folder(self.folder):
             self.state = "failed"
-            self.error = (f"The engine on {self.host_name} has told nothing for an hour; see there whether it works in "
-                          f"{self.folder}.")
+            self.error = (f"The engine on {self.host_name} has reported nothing for an hour; check there whether it "
+                          f"still runs in {self.folder}.")
         elif not is_folder(self.folder):
-            self.state, self.error = "failed", f"The folder {self.folder} was removed while the engine worked in it."
-        elif _is_full(self.folder):  # then its last words found no room either
+            self.state, self.error = "failed", f"The folder {self.folder} was removed while the engine used it."
+        elif _is_full(self.folder):  # the error event could not be written either
             self.state = "failed"
             self.error = f"The disk of {self.folder} is full; make room and start it again, what is finished is kept."
-        elif is_file(self.folder / STOP):  # before it listened
-            self.state, self.error = "stopped", "Stopped as asked before it began."
+        elif is_file(self.folder / STOP):  # before the process watched the file
+            self.state, self.error = "stopped", "Stopped before it began."
         else:
             self.state = "failed"
-            self.error = f"The engine ended without a result{self._last_words()}; {LOG} in {self.folder} has it all."
+            self.error = f"The engine ended without a result{self._last_log_line()}; see {LOG} in {self.folder}."
 
-    def _last_words(self) -> str:
+    def _last_log_line(self) -> str:
+        """Return the last line of the job's log in brackets and quotes; "" without one."""
         try:
-            text = self.log.read_bytes()[self.log_from:].decode("utf-8", errors="replace")
+            text = self.log.read_bytes()[self.log_offset:].decode("utf-8", errors="replace")
         except OSError:
             return ""
         lines = [line.strip() for line in text.splitlines() if line.strip()]
@@ -200,49 +206,50 @@ class Job:
 
 
 def _is_full(folder: Path) -> bool:
+    """Return whether the disk of a folder is full."""
     try:
-        return shutil.disk_usage(folder).free < FULL
+        return shutil.disk_usage(folder).free < MIN_FREE_BYTES
     except OSError:
         return False
 
 
-# ---- starting and finding -------------------------------------------------------------------------
+# ---- starting and finding jobs ------------------------------------------------------------------------
 
 
 def start(kind: str, folder: Path, command: Sequence[str], environment: Mapping[str, str] | None = None, *,
-          words: Sequence[object] = ()) -> Job:
-    """Start a command whose events go to `folder`, and watch it. words: those of it that say what is made.
+          args: Sequence[object] = ()) -> Job:
+    """Start a command whose events go to `folder`, and follow it.
 
-    Without a window this returns when it has ended. Raises EngineError where it cannot be started, RunError
-    where the folder cannot be written or has work running in it.
+    args: the arguments that identify the job. Without a window this returns when the job has ended. Raises EngineError
+    where the command cannot be started, RunError where the folder cannot be written or a job runs in it.
     """
     before = find(folder)
     if before is not None and before.running:
-        raise RunError(f"The engine works in {folder} already; wait for it or cancel it first.")
-    apart = own_group()
+        raise RunError(f"The engine already works in {folder}; wait for it, or cancel it first.")
+    group = new_process_group()
     if WINDOWS:
-        apart["creationflags"] |= getattr(subprocess, "BELOW_NORMAL_PRIORITY_CLASS", 0)
+        group["creationflags"] |= getattr(subprocess, "BELOW_NORMAL_PRIORITY_CLASS", 0)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         remove_file(folder / STOP)
         with open(folder / EVENTS, "wb") as events, open(folder / LOG, "ab") as log:
-            log_from = log.tell()
-            process = _launched(command, stdin=subprocess.DEVNULL, stdout=events, stderr=log,
+            log_offset = log.tell()
+            process = _launch(command, stdin=subprocess.DEVNULL, stdout=events, stderr=log,
                                 env={**(os.environ if environment is None else environment),
-                                     STOP_FILE: str((folder / STOP).absolute())}, **apart)
-        _yield_to_the_window(process.pid)
+                                     STOP_FILE: str((folder / STOP).absolute())}, **group)
+        _lower_priority(process.pid)
         try:
             write_json(folder / RECORD, {"kind": kind, "host": HOST, "host_name": platform.node(), "pid": process.pid,
-                                          "started": time.time(), "words": [str(word) for word in words],
-                                          "log_from": log_from})
+                                          "started": time.time(), "args": [str(arg) for arg in args],
+                                          "log_from": log_offset})
         except OSError:
-            process.kill()  # nobody would find it again
+            process.kill()  # it could not be found again
             raise
     except OSError as problem:
         if problem.errno in DISK_FULL:
-            raise RunError(refusal(problem)) from problem
+            raise RunError(os_error_message(problem)) from problem
         raise RunError(f"{folder} cannot be used ({problem.strerror or problem}); choose another folder.") from problem
-    job = Job(kind, folder, process.pid, process, [str(word) for word in words], log_from=log_from)
+    job = Job(kind, folder, process.pid, process, [str(arg) for arg in args], log_offset=log_offset)
     _jobs[_key(folder)] = job
     if bpy.app.background:
         _wait(job)
@@ -251,24 +258,24 @@ def start(kind: str, folder: Path, command: Sequence[str], environment: Mapping[
     return job
 
 
-def _launched(command: Sequence[str], **how: Any) -> subprocess.Popen[bytes]:
-    """Raises EngineError where the system does not start it."""
+def _launch(command: Sequence[str], **options: Any) -> subprocess.Popen[bytes]:
+    """Start a process. Raises EngineError where the system cannot start it."""
     try:
-        return subprocess.Popen(list(command), **how)
+        return subprocess.Popen(list(command), **options)
     except OSError as problem:
         raise EngineError(f"{command[0]} cannot be started ({problem.strerror or problem}); set up the engine in the "
                           "preferences.") from problem
 
 
-def _yield_to_the_window(pid: int) -> None:
-    """The engine takes every core, and Blender's window comes first where they are wanted."""
+def _lower_priority(pid: int) -> None:
+    """Lower the priority of the engine, which uses every core, so that Blender's window stays responsive."""
     if not WINDOWS:
         with contextlib.suppress(OSError):
             os.setpriority(os.PRIO_PROCESS, pid, NICENESS)
 
 
 def find(folder: Path | str | None) -> Job | None:
-    """The work in a folder: watched already, or left running by an earlier Blender; None where there is none."""
+    """Return the job in a folder, also one that an earlier Blender started; None where there is none."""
     if not folder:
         return None
     folder = Path(folder)
@@ -277,11 +284,12 @@ def find(folder: Path | str | None) -> Job | None:
         return known
     try:
         record = json.loads((folder / RECORD).read_text(encoding="utf-8"))
-        pid, host = int(record["pid"]), str(record.get("host", HOST))  # an early version wrote none,
-        host = HOST if host == platform.node() else host  # and the next a Mac's name
+        pid, host = int(record["pid"]), str(record.get("host", HOST))  # an early version stored none,
+        host = HOST if host == platform.node() else host  # and the next the name of a Mac
         started = float(record["started"])
-        here = host == HOST and processes.is_same(pid, started)
-        job = Job(str(record["kind"]), folder, pid if here else 0, None, list(map(str, record.get("words", ()))), host,
+        is_running = host == HOST and processes.is_same_process(pid, started)
+        job = Job(str(record["kind"]), folder, pid if is_running else 0, None,
+                  list(map(str, record.get("args", record.get("words", ())))), host,
                   int(record.get("log_from", 0)), str(record.get("host_name", "")), started)
     except (OSError, ValueError, KeyError, TypeError):
         return None
@@ -292,13 +300,13 @@ def find(folder: Path | str | None) -> Job | None:
     return job
 
 
-def forget(folder: Path | str) -> None:
-    """Stop watching a folder; what runs there goes on."""
+def stop_watching(folder: Path | str) -> None:
+    """Forget the job in a folder; its process continues."""
     _jobs.pop(_key(Path(folder)), None)
 
 
 def running() -> list[Job]:
-    """All work that goes on now."""
+    """Return all running jobs."""
     return [job for job in _jobs.values() if job.running]
 
 
@@ -307,6 +315,7 @@ def _key(folder: Path) -> str:
 
 
 def _wait(job: Job) -> None:
+    """Wait for the end of a job. Raises FitFlareError where it failed."""
     while job.running:
         job.poll()
         time.sleep(0.05)
@@ -315,39 +324,44 @@ def _wait(job: Job) -> None:
 
 
 def _watch() -> None:
+    """Start the timer that polls the jobs."""
     if not bpy.app.background and not bpy.app.timers.is_registered(_tick):
-        bpy.app.timers.register(_tick, first_interval=EVERY_S, persistent=True)
+        bpy.app.timers.register(_tick, first_interval=POLL_INTERVAL_S, persistent=True)
 
 
 def _tick() -> float | None:
-    news = [_polled(job) for job in running()]
+    news = [_poll_safely(job) for job in running()]
     if any(news):
         _redraw_bars()
-    return EVERY_S if running() else None
+    return POLL_INTERVAL_S if running() else None
 
 
-def _polled(job: Job) -> bool:
-    """Whether anything is new of it. What nobody foresaw ends the watching of no other work: the panel tells that it
-    was, and the console what."""
+def _poll_safely(job: Job) -> bool:
+    """Poll a job; return whether there is anything new. An unexpected exception is shown in the panel and the console.
+
+    It does not stop the polling of other jobs.
+    """
     try:
         return job.poll()
     except Exception as problem:
         traceback.print_exc()
-        job.error = (f"What the engine left in {job.folder} cannot be shown ({' '.join(str(problem).split())}); report "
-                     "it with what the console says.")
+        job.error = (f"The result of the engine in {job.folder} cannot be shown ({' '.join(str(problem).split())}); "
+                     "report it with what the console says.")
         job.state = "failed" if job.running else job.state
         return True
 
 
 def _redraw_bars() -> None:
-    """Have what shows progress drawn again: the sidebars with our tab and the preferences. Not the 3D views, which are
-    dear to draw; where the work changes what they show, its properties say so."""
+    """Redraw what shows progress: the sidebars with our tab, and the preferences.
+
+    The 3D views are left out, since they are expensive to draw; properties that change them redraw them.
+    """
     for area in (area for window in bpy.context.window_manager.windows for area in window.screen.areas):
         if area.type == "PREFERENCES":
             area.tag_redraw()
         elif area.type == "VIEW_3D":
             for region in area.regions:
-                if region.type == "UI" and region.active_panel_category == TAB:
+                if region.type == "UI" and region.active_panel_category == SIDEBAR_TAB:
                     region.tag_redraw()
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What panels and preferences are laid out of: sentences, and bars of work that goes on."""
+"""Layout elements of panels and preferences: wrapped sentences and progress bars."""
 from __future__ import annotations
 
 from typing import Any
@@ -10,26 +10,26 @@ from . import jobs
 
 
 def draw_progress(layout: Any, job: jobs.Job, text: str) -> None:
-    """A bar with what is done and the time left, and Cancel."""
+    """Draw a progress bar with the remaining time, and a button that cancels the job."""
     row = layout.row(align=True)
-    row.progress(factor=job.share, text=f"{text}: {job.share:.0%}{_time_left(job)}")
+    row.progress(factor=job.fraction_done, text=f"{text}: {job.fraction_done:.0%}{_time_left(job)}")
     row.operator("fit_flare.cancel", text="", icon="X").folder = str(job.folder)
-    if job.said:
-        lines(layout, job.said[-1])
+    if job.messages:
+        label_lines(layout, job.messages[-1])
 
 
 def _time_left(job: jobs.Job) -> str:
-    """", 3 min left"; nothing where it is not known."""
+    """Format the remaining time as ", 3 min left"; "" where it is unknown."""
     if job.stage == "stopping":
         return ", stopping …"
-    if not job.left_s:
+    if not job.eta_s:
         return ""
-    left = job.left_s
+    left = job.eta_s
     return f", {left / 60:.0f} min left" if left >= 90 else f", {left:.0f} s left"
 
 
-def lines(layout: Any, text: str, icon: str = "NONE", width: int = 44) -> None:
-    """A sentence broken into labels, since a label is cut off at the panel's edge."""
+def label_lines(layout: Any, text: str, icon: str = "NONE", width: int = 44) -> None:
+    """Draw a sentence as several labels, since Blender cuts a label off at the edge of the panel."""
     region = bpy.context.region
     if region is not None and region.width > 1:
         scale = bpy.context.preferences.system.ui_scale
@@ -39,7 +39,7 @@ def lines(layout: Any, text: str, icon: str = "NONE", width: int = 44) -> None:
     words, line, first = text.split(), "", True
     for word in [*words, ""]:
         if not word or len(line) + len(word) + 1 > width:
-            while len(line) > width + 4:  # a path without blanks
+            while len(line) > width + 4:  # a path without spaces
                 column.label(text=line[:width], icon=icon if first else "BLANK1" if icon != "NONE" else "NONE")
                 line, first = line[width:], False
             if line:

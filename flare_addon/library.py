@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The library: a folder of .flare files, each with a thumbnail beside it, shown as previews."""
+"""The library: a folder of .flare files with thumbnails, which the panel Transfer shows as previews."""
 from __future__ import annotations
 
 import struct
@@ -14,29 +14,31 @@ from numpy.typing import NDArray
 from ..core.colour.srgb import linear_from_srgb, srgb_from_linear
 from ..core.errors import FitFlareError, FlareFileError
 from ..core.look import Look, draw, read
-from ..core.look.look import ViewOfLight, annotated
-from ..core.system.files import atomic_path, plain_name
-from . import preferences
+from ..core.look.look import ViewOfLight, write_annotated
+from ..core.system.files import atomic_path, avoid_device_name
+from .user_settings import library_path
 
-SIDE = 192  # pixels of a thumbnail
+THUMBNAIL_SIZE = 192  # pixels of a thumbnail
 
 _previews: Any = None
 _items: list[tuple[str, str, str, int, int]] = []
-_seen: tuple[tuple[str, float], ...] | None = None
-_chosen = 0  # the number of an item
+_stamps: tuple[tuple[str, float], ...] | None = None
+_chosen = 0  # number of the chosen item
 
 
 def folder(create: bool = False) -> Path:
-    """The library's folder: the preferences' own, or one in Blender's user folder; not one of the extension's, which
-    Blender deletes when the extension is uninstalled."""
-    path = Path(preferences.library_path() or bpy.utils.user_resource("DATAFILES", path="fit_flare/library"))
+    """Return the folder of the library: the one of the preferences, else one in Blender's user folder.
+
+    It is not in the folder of the extension, which Blender deletes when the extension is uninstalled.
+    """
+    path = Path(library_path() or bpy.utils.user_resource("DATAFILES", path="fit_flare/library"))
     if create:
         path.mkdir(parents=True, exist_ok=True)
     return path
 
 
 def files() -> list[Path]:
-    """The .flare files there, by name."""
+    """Return the .flare files of the library, sorted by name."""
     try:
         return sorted(path for path in folder().glob("*.flare") if not path.name.startswith("."))
     except OSError:
@@ -44,34 +46,36 @@ def files() -> list[Path]:
 
 
 def save(look: Look, name: str, notes: str, licence: str) -> Path:
-    """Put a look into the library. Raises FlareFileError where the name is taken or cannot be a file's."""
+    """Save a look to the library; return its file. Raises FlareFileError where the name is taken or not valid."""
     safe = "".join(letter for letter in name if letter.isalnum() or letter in " -_()").strip()
     if not safe:
-        raise FlareFileError(f"{name!r} cannot be a file's name; use letters and digits.")
-    path = folder(create=True) / f"{plain_name(safe)}.flare"
+        raise FlareFileError(f"{name!r} is not a valid file name; use letters and digits.")
+    path = folder(create=True) / f"{avoid_device_name(safe)}.flare"
     if path.exists():
         raise FlareFileError(f"The library has {safe!r} already; choose another name.")
-    annotated(look.path, path, notes=notes, licence=licence)
+    write_annotated(look.path, path, notes=notes, licence=licence)
     write_png(path.with_suffix(".png"), thumbnail(look))
     return path
 
 
 def thumbnail(look: Look) -> NDArray[np.float32]:
-    """(SIDE, SIDE, 3) display values: each light's flare as the middle of its training saw it, light upper left."""
-    k = np.array([[1.1 * SIDE, 0, SIDE / 2], [0, 1.1 * SIDE, SIDE / 2], [0, 0, 1]])
-    total = np.zeros((SIDE, SIDE, 3), np.float32)
+    """Return display values (THUMBNAIL_SIZE, THUMBNAIL_SIZE, 3): all flares for the middle of their training cameras,
+    with the light at the upper left."""
+    k = np.array([[1.1 * THUMBNAIL_SIZE, 0, THUMBNAIL_SIZE / 2], [0, 1.1 * THUMBNAIL_SIZE, THUMBNAIL_SIZE / 2], [0, 0,
+                                                                                                                 1]])
+    total = np.zeros((THUMBNAIL_SIZE, THUMBNAIL_SIZE, 3), np.float32)
     for light in look.lights:
         middle = (light.query_range.camera_low + light.query_range.camera_high) / 2
-        _, place = light.query_range.clipped(middle, np.array([-0.24, -0.2], np.float32))
+        _, place = light.query_range.clip(middle, np.array([-0.24, -0.2], np.float32))
         found = light.evaluate(ViewOfLight(middle, np.eye(3, dtype=np.float32), place, 1.0))
         if found is not None:
-            shown = draw([found], k, SIDE, SIDE, look.blend, look.sampling)
+            shown = draw([found], k, THUMBNAIL_SIZE, THUMBNAIL_SIZE, look.blend, look.pixel_grid)
             total += shown if look.blend == "add" else linear_from_srgb(shown)
     return np.clip(srgb_from_linear(np.maximum(total, 0)), 0, 1)
 
 
 def write_png(path: Path, display: NDArray[np.float32]) -> None:
-    """An 8 bit PNG of display values, without a library for it (Blender's Python has none)."""
+    """Write display values (h, w, 3) as an 8 bit PNG; Blender's Python has no library for it."""
     height, width = display.shape[:2]
     rows = (np.clip(display, 0, 1) * 255 + 0.5).astype(np.uint8).reshape(height, -1)
     raw = np.concatenate([np.zeros((height, 1), np.uint8), rows], 1).tobytes()
@@ -86,15 +90,15 @@ def write_png(path: Path, display: NDArray[np.float32]) -> None:
 
 
 def items(_self: Any = None, _context: Any = None) -> list[tuple[str, str, str, int, int]]:
-    """The library for a preview enum: file, name, notes, icon, number. Read again when a file changed."""
-    global _previews, _items, _seen
+    """Return the items of the preview menu: file, name, notes, icon, number. They are cached until a file changes."""
+    global _previews, _items, _stamps
     stamps = []
     for path in files():
         try:
             stamps.append((str(path), path.stat().st_mtime))
         except OSError:
             continue
-    if tuple(stamps) == _seen:
+    if tuple(stamps) == _stamps:
         return _items
     if _previews is None:
         from bpy.utils import previews
@@ -103,7 +107,7 @@ def items(_self: Any = None, _context: Any = None) -> list[tuple[str, str, str, 
     _previews.clear()
     found = []
     for name, _ in stamps:
-        number = zlib.crc32(name.encode("utf-8", "surrogateescape")) & 0x7FFFFFFF  # the same beside any others
+        number = zlib.crc32(name.encode("utf-8", "surrogateescape")) & 0x7FFFFFFF  # does not depend on the other files
         path = Path(name)
         try:
             look = read(path)
@@ -114,18 +118,18 @@ def items(_self: Any = None, _context: Any = None) -> list[tuple[str, str, str, 
         except (FitFlareError, OSError) as problem:
             icon, notes = 0, str(problem)
         found.append((name, path.stem, notes, icon, number))
-    _items, _seen = found or [("", "Empty", "Save a flare into the library first", 0, 0)], tuple(stamps)
+    _items, _stamps = found or [("", "Empty", "Save a flare to the library first", 0, 0)], tuple(stamps)
     return _items
 
 
 def chosen(_self: Any = None) -> int:
-    """The number of the chosen item; the first's where none was chosen yet, or what was is no longer there."""
+    """Return the number of the chosen item; that of the first where none is chosen or the chosen one was deleted."""
     numbers = [item[-1] for item in items()]
     return _chosen if _chosen in numbers else numbers[0]
 
 
 def choose(_self: Any, number: int) -> None:
-    """Choose an item by its number."""
+    """Choose the item with this number."""
     global _chosen
     _chosen = number
 
@@ -136,7 +140,7 @@ def register() -> None:
 
 
 def unregister() -> None:
-    global _previews, _seen
+    global _previews, _stamps
     del bpy.types.WindowManager.fit_flare_library
     if _previews is not None:
         from bpy.utils import previews
@@ -144,4 +148,4 @@ def unregister() -> None:
         previews.remove(_previews)
         _previews = None
     _items.clear()
-    _seen = None
+    _stamps = None

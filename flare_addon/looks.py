@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The look of a scene: its .flare, which object each flare comes from, what it shows in a camera."""
+"""The look of a scene: its .flare, the flares with their light objects and edits, and their evaluation for a camera."""
 from __future__ import annotations
 
 from pathlib import Path
@@ -9,34 +9,33 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.errors import CaptureError, FlareFileError
-from ..core.look import Edit, Look, LookEdits, PlaneGaussians, read
+from ..core.look import Edit, Look, LookEdits, PlacedLight, PlaneGaussians, read
 from ..core.look.look import Query
-from ..core.look.shot import PlacedLight, evaluate
 from . import cameras, fcurves, occlusion
 from .compositor import drivers
-from .lights import name_of, of_scene, place_of, stands
-from .objects import depsgraph_of, matrix_of
-from .paths import absolute, stored
+from .lights import capture_position, light_name, light_position, scene_lights
+from .objects import depsgraph_of, world_matrix
+from .paths import absolute, blend_relative
 from .properties import edit_of
 
 _cache: dict[str, tuple[tuple[float, int], Look | str]] = {}
 
 
 def path_of(scene: Any) -> Path | None:
-    """The .flare of the scene; None where none is chosen."""
+    """Return the .flare of the scene; None where none is set."""
     return absolute(scene.fit_flare.flare, scene.library) if scene.fit_flare.flare else None
 
 
 def look_of(scene: Any) -> Look:
-    """The scene's look, read again when the file changes. Raises FlareFileError."""
+    """Return the look of the scene, cached until its file changes. Raises FlareFileError."""
     path = path_of(scene)
     if path is None:
-        raise FlareFileError("No flare is chosen; fit one, or open a .flare.")
+        raise FlareFileError("No flare is set; fit one, or open a .flare.")
     try:
         status = path.stat()
         stamp = (status.st_mtime, status.st_size)
     except OSError as problem:
-        raise FlareFileError(f"{path} is missing; choose a .flare file that a fit has written.") from problem
+        raise FlareFileError(f"{path} is missing; choose a .flare file that a fit wrote.") from problem
     known = _cache.get(str(path))
     if known is None or known[0] != stamp:
         try:
@@ -50,25 +49,25 @@ def look_of(scene: Any) -> Look:
 
 
 def is_placed(item: Any, scene: Any) -> bool:
-    """Whether a flare has a light in the scene; an object that was deleted there is still the flare's."""
+    """Return whether the light object of a flare is in the scene; a deleted object stays assigned to the flare."""
     return item.target is not None and scene.objects.get(item.target.name) == item.target
 
 
-def use(scene: Any, path: Path | str) -> Look:
-    """Show a .flare in the scene: one flare for each of its lights, at the light object of that name.
+def show_look(scene: Any, path: Path | str) -> Look:
+    """Show a .flare in the scene: one flare for each of its lights, at the light object of the same name.
 
-    Edits of flares that stay are kept. Raises FlareFileError.
+    Flares that were there keep their edits. Returns the look. Raises FlareFileError.
     """
     path = Path(path)
     look = read(path)
     state = scene.fit_flare
     before = state.flare
-    state.flare = stored(path)
-    objects = {name_of(item): item for item in of_scene(scene)}
+    state.flare = blend_relative(path)
+    objects = {light_name(item): item for item in scene_lights(scene)}
     if before != state.flare:
         for index in reversed(range(len(state.lights))):
             if state.lights[index].source not in look.names:
-                remove(scene, index)
+                remove_flare(scene, index)
     for light in look.lights:
         item = next((one for one in state.lights if one.source == light.name), None)
         if item is None:
@@ -76,24 +75,29 @@ def use(scene: Any, path: Path | str) -> Look:
             item.name = item.source = light.name
         if item.target is None and light.name in objects:
             item.target = objects[light.name]
-        _elements(item, light)
+        _sync_elements(item, light)
     state.light = min(state.light, max(len(state.lights) - 1, 0))
-    state.native = _is_of(look, state, objects, depsgraph_of(scene))
+    state.native = _was_learned_here(look, state, objects, depsgraph_of(scene))
     return look
 
 
-def remove(scene: Any, number: int) -> None:
-    """Take a flare out of the scene. Those after it keep their animation, and their wires to the compositor; its own
-    layer is left there as it was baked."""
-    gains = drivers.wired(scene)
-    fcurves.take_out(scene.fit_flare.lights, "fit_flare.lights", number)
+def remove_flare(scene: Any, number: int) -> None:
+    """Remove a flare from the scene.
+
+    The flares after it keep their animation and their drivers in the compositor. The layer of the removed flare stays
+    in the compositor as it was baked.
+    """
+    gains = drivers.connected_flares(scene)
+    fcurves.remove_item(scene.fit_flare.lights, "fit_flare.lights", number)
     if gains:
-        drivers.wire(scene, {layer: one - (one > number) for layer, one in gains.items() if one != number})
+        drivers.connect(scene, {layer: one - (one > number) for layer, one in gains.items() if one != number})
 
 
-def _is_of(look: Look, state: Any, objects: dict[str, Any], depsgraph: Any) -> bool:
-    """Whether the look was learned in the scene's capture: its lights are where they were then. The world of a capture
-    that was made of Blender's own camera, which has no root, is Blender's."""
+def _was_learned_here(look: Look, state: Any, objects: dict[str, Any], depsgraph: Any) -> bool:
+    """Return whether the look was learned from the scene's capture, by the positions of the lights.
+
+    A capture that was made from Blender's own camera has no root; its world is Blender's.
+    """
     root = state.root
     shared = [light for light in look.lights if light.name in objects]
     if not (root is not None or state.capture) or not shared:
@@ -101,14 +105,14 @@ def _is_of(look: Look, state: Any, objects: dict[str, Any], depsgraph: Any) -> b
     extent = max(float(np.linalg.norm(light.query_range.camera_high - light.query_range.camera_low))
                  for light in shared)
     try:
-        return all(np.linalg.norm(place_of(objects[light.name], root, depsgraph) - light.xyz) < 0.05 * extent
+        return all(np.linalg.norm(capture_position(objects[light.name], root, depsgraph) - light.xyz) < 0.05 * extent
                    for light in shared)
-    except CaptureError:  # nobody knows where one is
+    except CaptureError:  # the position of one is unknown
         return False
 
 
-def add_instance(scene: Any, target: Any, source: str) -> Any:
-    """One more flare: the look of the .flare's light `source`, coming from `target`. Raises FlareFileError."""
+def add_flare(scene: Any, target: Any, source: str) -> Any:
+    """Add a flare at the object `target`, with the look of the .flare's light `source`. Raises FlareFileError."""
     look = look_of(scene)
     light = next((one for one in look.lights if one.name == source), None)
     if light is None:
@@ -120,17 +124,17 @@ def add_instance(scene: Any, target: Any, source: str) -> Any:
         name, number = f"{target.name} {number}", number + 1
     item = state.lights.add()
     item.name, item.source, item.target = name, source, target
-    _elements(item, light)
+    _sync_elements(item, light)
     state.light = len(state.lights) - 1
     return item
 
 
-def _elements(item: Any, light: Any) -> None:
-    """Give a flare the elements of its look, keeping the sliders of those that stay."""
+def _sync_elements(item: Any, light: Any) -> None:
+    """Update the elements of a flare to those of its look; elements that stay keep their sliders."""
     wanted = {element.name: element.kind for element in light.elements}
     for index in reversed(range(len(item.elements))):
         if item.elements[index].name not in wanted:
-            fcurves.take_out(item.elements, f"{item.path_from_id()}.elements", index)
+            fcurves.remove_item(item.elements, f"{item.path_from_id()}.elements", index)
     there = {element.name for element in item.elements}
     for name, kind in wanted.items():
         if name not in there:
@@ -139,7 +143,7 @@ def _elements(item: Any, light: Any) -> None:
 
 
 def edits_of(state: Any) -> LookEdits:
-    """All sliders of a scene."""
+    """Return the edits that all sliders of a scene make."""
     neutral = Edit()
     lights = {item.name: edit for item in state.lights if (edit := edit_of(item)) != neutral}
     elements = {(item.name, element.name): edit for item in state.lights for element in item.elements
@@ -147,43 +151,45 @@ def edits_of(state: Any) -> LookEdits:
     return LookEdits(edit_of(state.master), lights, elements)
 
 
-def twice(state: Any) -> str:
-    """A name that two flares of the scene have, "" where all differ: edits and layers go by it."""
+def duplicate_name(state: Any) -> str:
+    """Return a name that two flares of the scene have; "" where all differ, as edits and layers require."""
     names = [item.name for item in state.lights]
     return next((name for name in names if names.count(name) > 1), "")
 
 
 def query_of(state: Any) -> Query:
-    """What appearance follows: the view itself in the capture's own scene, else the middle of what was trained."""
+    """Return the view that the look is evaluated for: the camera's in its own capture, else a training view."""
     return "target" if state.native else "source"
 
 
-def placed(scene: Any, depsgraph: Any, camera: Any) -> tuple[NDArray[np.float64], list[PlacedLight]]:
-    """world_to_camera (4, 4) of a camera object and the lights with their visible shares, in the coordinates
-    that the look is asked in: the capture's, or Blender's where there is no capture. Raises CaptureError."""
+def place_lights(scene: Any, depsgraph: Any, camera: Any) -> tuple[NDArray[np.float64], list[PlacedLight]]:
+    """Return world_to_camera (4, 4) of a camera object, and the lights with their visibility.
+
+    The coordinates are the capture's, or Blender's without a capture. Raises CaptureError.
+    """
     state = scene.fit_flare
     matrix = camera.evaluated_get(depsgraph).matrix_world
-    into = cameras.to_capture(state.root, depsgraph)
+    to_capture = cameras.world_to_capture(state.root, depsgraph)
     lights = []
     for item in state.lights:
         if not is_placed(item, scene):
             continue
-        where = stands(item.target, matrix_of(item.target, depsgraph), matrix.translation)
-        share = occlusion.visible_share(scene, depsgraph, matrix.translation, item) if state.occlusion else 1.0
-        xyz = (into @ np.array([*where, 1.0]))[:3]
-        lights.append(PlacedLight(item.name, item.source, xyz, share))
+        where = light_position(item.target, world_matrix(item.target, depsgraph), matrix.translation)
+        visibility = occlusion.visibility(scene, depsgraph, matrix.translation, item) if state.occlusion else 1.0
+        xyz = (to_capture @ np.array([*where, 1.0]))[:3]
+        lights.append(PlacedLight(item.name, item.source, xyz, visibility))
     return cameras.pose_in_capture(matrix, state.root, depsgraph), lights
 
 
-def seen(scene: Any, depsgraph: Any, camera: Any) -> dict[str, PlaneGaussians]:
-    """What every flare of the scene shows in a camera at the present frame. Raises FlareFileError, CaptureError."""
+def evaluate_flares(scene: Any, depsgraph: Any, camera: Any) -> dict[str, PlaneGaussians]:
+    """Evaluate every flare of the scene for a camera at the current frame. Raises FlareFileError and CaptureError."""
     look = look_of(scene)
-    pose, lights = placed(scene, depsgraph, camera)
-    found = evaluate(look, pose, lights, edits_of(scene.fit_flare), query_of(scene.fit_flare))
+    pose, lights = place_lights(scene, depsgraph, camera)
+    found = look.evaluate_lights(pose, lights, edits_of(scene.fit_flare), query_of(scene.fit_flare))
     exposure = camera.evaluated_get(depsgraph).fit_flare.exposure
-    return {name: one.exposed(exposure, look.blend) for name, one in found.items()}
+    return {name: one.with_exposure(exposure, look.blend) for name, one in found.items()}
 
 
-def forget() -> None:
-    """Let go of all files that were read."""
+def clear_cache() -> None:
+    """Forget all files that were read."""
     _cache.clear()

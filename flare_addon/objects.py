@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Where objects of a scene stand, those too that the viewport is without, and which collections are shown."""
+"""World matrices of objects, also of ones that are disabled in the viewport, and the enabled collections of a layer."""
 from __future__ import annotations
 
 from collections.abc import Iterator
@@ -10,55 +10,60 @@ import bpy
 from ..core.errors import CaptureError
 from . import fcurves
 
-_PLACING = ("location", "rotation_", "scale", "delta_")  # what begins the names of properties that place an object
+_TRANSFORM_PREFIXES = ("location", "rotation_", "scale",
+                       "delta_")  # what begins the names of properties that place an object
 
 
-def matrix_of(thing: Any, depsgraph: Any) -> Any:
-    """matrix_world of an object as it stands now, also of one that is switched off in the viewport or in an excluded
-    collection, which Blender does not keep up with; of another scene's as it was when that was looked at last. Raises
-    CaptureError where one of this scene is switched off and moved by more than its parents."""
-    if not _is_off(thing, depsgraph.view_layer):
-        return thing.evaluated_get(depsgraph).matrix_world
-    if _is_moved(thing) or thing.constraints or thing.parent_type != "OBJECT":
-        if thing.name not in depsgraph.scene.objects:
-            return thing.matrix_world.copy()
-        raise CaptureError(f"{thing.name!r} is switched off in the viewport, or in an excluded collection, so that "
-                           "Blender does not move it; switch it on there, and hide it by its eye instead.")
-    if thing.parent is None:
-        return thing.matrix_basis.copy()
-    return matrix_of(thing.parent, depsgraph) @ thing.matrix_parent_inverse @ thing.matrix_basis
+def world_matrix(obj: Any, depsgraph: Any) -> Any:
+    """Return the current matrix_world of an object, also of a disabled one, which Blender does not update.
+
+    Disabled means off in the viewport or in an excluded collection. For an object of another scene this is the matrix
+    of that scene's last update. Raises CaptureError for a disabled object of this scene that animation, constraints or
+    a parent other than an object move.
+    """
+    if not _is_disabled(obj, depsgraph.view_layer):
+        return obj.evaluated_get(depsgraph).matrix_world
+    if _is_animated(obj) or obj.constraints or obj.parent_type != "OBJECT":
+        if obj.name not in depsgraph.scene.objects:
+            return obj.matrix_world.copy()
+        raise CaptureError(f"{obj.name!r} is disabled in the viewport, or in an excluded collection, so Blender does "
+                           "not move it; enable it there, and hide it with its eye icon instead.")
+    if obj.parent is None:
+        return obj.matrix_basis.copy()
+    return world_matrix(obj.parent, depsgraph) @ obj.matrix_parent_inverse @ obj.matrix_basis
 
 
-def _is_moved(thing: Any) -> bool:
-    """Whether keys or drivers move an object: a lamp that blinks by them stands still."""
-    data = thing.animation_data
+def _is_animated(obj: Any) -> bool:
+    """Return whether keys or drivers move an object; animated brightness does not count."""
+    data = obj.animation_data
     return data is not None and (bool(data.nla_tracks) or any(
-        curve.data_path.startswith(_PLACING) for some in (*fcurves.of(thing), data.drivers) for curve in some))
+        curve.data_path.startswith(_TRANSFORM_PREFIXES) for group in (*fcurves.fcurves_of(obj),
+                                                                      data.drivers) for curve in group))
 
 
-def _is_off(thing: Any, layer: Any) -> bool:
-    """Whether the viewport is without an object; one that is hidden by an eye alone is not meant."""
-    if thing.visible_get(view_layer=layer):
+def _is_disabled(obj: Any, layer: Any) -> bool:
+    """Return whether an object is disabled in the viewport; one hidden by its eye icon alone is not."""
+    if obj.visible_get(view_layer=layer):
         return False
-    return thing.hide_viewport or not any(
-        thing.name in some.objects for some in collections_shown(layer.layer_collection, "hide_viewport"))
+    return obj.hide_viewport or not any(
+        obj.name in group.objects for group in enabled_collections(layer.layer_collection, "hide_viewport"))
 
 
-def collections_shown(layer: Any, hidden: Literal["hide_viewport", "hide_render"]) -> Iterator[Any]:
-    """The collections of a layer collection, itself first, but for those that are switched off and what is in them."""
+def enabled_collections(layer: Any, hidden: Literal["hide_viewport", "hide_render"]) -> Iterator[Any]:
+    """Yield the enabled collections of a layer collection, itself first."""
     if not layer.exclude and not getattr(layer.collection, hidden):
         yield layer.collection
         for child in layer.children:
-            yield from collections_shown(child, hidden)
+            yield from enabled_collections(child, hidden)
 
 
 def view_layer_of(scene: Any) -> Any:
-    """The view layer in which a scene's objects are looked at."""
+    """Return the view layer in which the objects of a scene are evaluated."""
     return bpy.context.view_layer if bpy.context.scene == scene else scene.view_layers[0]
 
 
 def depsgraph_of(scene: Any) -> Any:
-    """Where the objects of a scene stand now, of one too that no window shows."""
+    """Return the updated dependency graph of a scene, also of one that no window shows."""
     layer = view_layer_of(scene)
     layer.update()
     return layer.depsgraph

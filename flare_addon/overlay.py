@@ -1,13 +1,12 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The flare over the camera view, drawn by the GPU from what numpy evaluates.
+"""Draws the flare over the camera view: numpy evaluates the look, the GPU draws its Gaussians.
 
-Each Gaussian is a quad. Where light adds, what is soft is drawn small: a Gaussian goes to the coarsest of five
-pictures (full size to 1/16) in which its narrow side is still four texels, so cost is bounded whatever the
-size of a glare. What covers is drawn back to front at full size, over black, as it is baked. The pictures are
-half float and linear; a last pass adds them to the viewport's overlay, which Blender blends in display-linear
-light, so light adds as it does in the baked layers.
+Each Gaussian is a quad. With the blend "add" it is drawn into the coarsest of five buffers (full size to 1/16) in which
+its narrow side still has four texels, so the cost does not grow with the size of a glow. With "over" all are drawn back
+to front at full size over black, as they are baked. The buffers are half float and linear. A last pass adds them to the
+viewport's overlay, which Blender blends in display-linear light, so light adds as in the baked layers.
 
-Only what the region shows of the frame is drawn, at the region's own pixels, so zoom costs nothing.
+Only the visible part of the frame is drawn, at the pixels of the region, so zooming in costs nothing.
 """
 from __future__ import annotations
 
@@ -20,17 +19,17 @@ from numpy.typing import NDArray
 
 from ..core.errors import FitFlareError
 from ..core.look import Look, PlaneGaussians, pixels
-from ..core.look.drawing import OPACITY_MAX, reach
-from ..core.look.plane import arc_level, joined, ways
+from ..core.look.drawing import OPACITY_MAX, extent
+from ..core.look.plane import arc_log_peak, concatenate, pixel_arcs
 from . import cameras, looks
 
 LEVELS = (1, 2, 4, 8, 16)
-TEXELS = 4.0  # deviations of a Gaussian's narrow side at the level it is drawn in
+MIN_TEXELS = 4.0  # standard deviation of the narrow side of a Gaussian, in the level that it is drawn in
 
 Floats = NDArray[np.float32]
 
-problem = ""
-"""What kept the overlay from being drawn last time, for the panel; "" where nothing did."""
+last_error = ""
+"""Why the last drawing failed, for the panel; "" after a success."""
 
 _handle: Any = None
 _shaders: dict[str, Any] = {}
@@ -38,8 +37,8 @@ _offscreens: dict[tuple[int, int, int], Any] = {}
 
 
 @dataclass(frozen=True)
-class Frame:
-    """Where the camera's frame lies in a region, in region pixels from its lower left corner."""
+class CameraFrame:
+    """The rectangle of the camera's frame in a region, in pixels from the lower left corner of the region."""
 
     left: float
     bottom: float
@@ -48,9 +47,9 @@ class Frame:
 
 
 @dataclass(frozen=True)
-class Window:
-    """The part of a frame that is drawn: its corner and size in region pixels, and the intrinsics (3, 3) of its
-    pixels, row 0 on top."""
+class DrawnRegion:
+    """The part of a frame that is drawn: lower left corner and size in region pixels, and the intrinsics (3, 3) of its
+    pixels, with row 0 on top."""
 
     x: int
     y: int
@@ -59,10 +58,10 @@ class Window:
     intrinsics: NDArray[np.float64]
 
 
-def window_of(frame: Frame, region: tuple[int, int], camera: Any) -> Window | None:
-    """What a region of (width, height) pixels shows of a frame; None where it shows nothing.
+def drawn_region(frame: CameraFrame, region: tuple[int, int], camera: Any) -> DrawnRegion | None:
+    """Return the part of a frame that a region of (width, height) pixels shows; None where it shows nothing.
 
-    camera: the core's camera of the render. The frame is the render's picture, so its pixels are scaled ones.
+    camera: the core's camera of the render, whose intrinsics are scaled to the frame.
     """
     left, bottom = max(int(np.floor(frame.left)), 0), max(int(np.floor(frame.bottom)), 0)
     right = min(int(np.ceil(frame.left + frame.width)), region[0])
@@ -73,11 +72,11 @@ def window_of(frame: Frame, region: tuple[int, int], camera: Any) -> Window | No
     above = frame.bottom + frame.height - top  # from the frame's upper edge down to the window's
     k = np.array([[camera.fx * x, 0, camera.cx * x + frame.left - left],
                   [0, camera.fy * y, camera.cy * y - above], [0, 0, 1.0]])
-    return Window(left, bottom, right - left, top - bottom, k)
+    return DrawnRegion(left, bottom, right - left, top - bottom, k)
 
 
-def frame_in(context: Any, scene: Any, camera: Any) -> Frame | None:
-    """The camera's frame in the region of a 3D view that looks through it."""
+def camera_frame(context: Any, scene: Any, camera: Any) -> CameraFrame | None:
+    """Return the camera's frame in the region of a 3D view that looks through it; None where it is behind the view."""
     from bpy_extras.view3d_utils import location_3d_to_region_2d
 
     corners = [location_3d_to_region_2d(context.region, context.region_data, camera.matrix_world.normalized() @ corner)
@@ -85,7 +84,7 @@ def frame_in(context: Any, scene: Any, camera: Any) -> Frame | None:
     if any(corner is None for corner in corners):
         return None
     across, up = [corner.x for corner in corners], [corner.y for corner in corners]
-    return Frame(min(across), min(up), max(across) - min(across), max(up) - min(up))
+    return CameraFrame(min(across), min(up), max(across) - min(across), max(up) - min(up))
 
 
 # ---- quads ----------------------------------------------------------------------------------------
@@ -93,9 +92,11 @@ def frame_in(context: Any, scene: Any, camera: Any) -> Frame | None:
 
 @dataclass(frozen=True)
 class Quads:
-    """Vertices of n quads: place (4n, 2) in the window's pixels, local (4n, 2) in Mahalanobis radii, light
-    (4n, 3) at the peak, ring (4n, 3) r0, w and opacity, arc (4n, 3) in the unit of local and its level, and the
-    triangles (2n, 3)."""
+    """Vertices of n quads.
+
+    place (4n, 2): pixels of the drawn region. local (4n, 2): Mahalanobis coordinates. light (4n, 3): at the peak.
+    ring (4n, 3): r0, w and opacity. arc (4n, 3): in the unit of local, and its level. triangles (2n, 3): vertices.
+    """
 
     place: Floats
     local: Floats
@@ -109,8 +110,10 @@ _CORNERS = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], np.float32)
 
 
 def quads(centres: Floats, covariances: Floats, radii: Floats, light: Floats, ring: Floats, arcs: Floats) -> Quads:
-    """Quads round ellipses: centres (n, 2), covariances (n, 3) px², radii (n,) Mahalanobis, light (n, 3), ring
-    (n, 3), arcs (n, 2) px; in their order."""
+    """Return a quad about each ellipse, in their order.
+
+    centres (n, 2) px, covariances (n, 3) px², radii (n,) Mahalanobis, light (n, 3), ring (n, 3), arcs (n, 2) px.
+    """
     xx, xy, yy = covariances.T
     half, root = (xx + yy) / 2, np.sqrt(((xx - yy) / 2) ** 2 + xy * xy)
     long, short = np.sqrt(np.maximum(half + root, 0)), np.sqrt(np.maximum(half - root, 0))
@@ -121,8 +124,8 @@ def quads(centres: Floats, covariances: Floats, radii: Floats, light: Floats, ri
     place = (centres[:, None] + local[..., :1] * (long[:, None] * axis)[:, None]
              + local[..., 1:] * (short[:, None] * side)[:, None])
     axes = np.stack([axis / np.maximum(long, 1e-6)[:, None], side / np.maximum(short, 1e-6)[:, None]], 1)
-    own = np.einsum("nax,nx->na", axes, arcs)
-    arc = np.concatenate([own, arc_level(np.hypot(*own.T), ring[:, :2])[:, None]], -1)
+    members = np.einsum("nax,nx->na", axes, arcs)
+    arc = np.concatenate([members, arc_log_peak(np.hypot(*members.T), ring[:, :2])[:, None]], -1)
     count = len(centres)
     index = 4 * np.arange(count, dtype=np.uint32)[:, None, None]
     triangles = (index + np.array([[0, 1, 2], [0, 2, 3]], np.uint32)).reshape(-1, 3)
@@ -132,18 +135,18 @@ def quads(centres: Floats, covariances: Floats, radii: Floats, light: Floats, ri
                  np.ascontiguousarray(triangles, np.uint32))
 
 
-def level_of(covariances: Floats, rings: Floats | None) -> NDArray[np.int64]:
-    """(n,) number of the level in LEVELS that each Gaussian is drawn in, by its narrow side in pixels."""
+def level_indices(covariances: Floats, rings: Floats | None) -> NDArray[np.int64]:
+    """Return the index in LEVELS (n,) that each Gaussian is drawn in, by its narrow side in pixels."""
     xx, xy, yy = covariances.T
     half, root = (xx + yy) / 2, np.sqrt(((xx - yy) / 2) ** 2 + xy * xy)
     narrow = np.sqrt(np.maximum(half - root, 0))
     if rings is not None:
         narrow = narrow * np.minimum(rings[:, 1], 1)
-    return np.clip(np.searchsorted(np.array(LEVELS), narrow / TEXELS, side="right") - 1, 0, len(LEVELS) - 1)
+    return np.clip(np.searchsorted(np.array(LEVELS), narrow / MIN_TEXELS, side="right") - 1, 0, len(LEVELS) - 1)
 
 
-def inside(centres: Floats, covariances: Floats, radii: Floats, width: int, height: int) -> NDArray[np.bool_]:
-    """(n,) which ellipses touch the picture and are ellipses at all."""
+def touch_region(centres: Floats, covariances: Floats, radii: Floats, width: int, height: int) -> NDArray[np.bool_]:
+    """Return which ellipses (n,) touch the picture; degenerate ones do not."""
     xx, xy, yy = covariances.T
     reach_x, reach_y = radii * np.sqrt(np.maximum(xx, 0)), radii * np.sqrt(np.maximum(yy, 0))
     x, y = centres.T
@@ -152,30 +155,30 @@ def inside(centres: Floats, covariances: Floats, radii: Floats, width: int, heig
                           & (xx * yy - xy * xy > 0) & (radii > 0) & np.isfinite(x + y))
 
 
-def levels(gaussians: PlaneGaussians, window: Window, look: Look) -> dict[int, Quads]:
-    """Quads of a look's Gaussians by level (a divisor of the size), those of the level in its own pixels; in drawing
-    order."""
+def quads_by_level(gaussians: PlaneGaussians, window: DrawnRegion, look: Look) -> dict[int, Quads]:
+    """Return the quads of Gaussians by level (the divisor of the size), in pixels of the level and drawing order."""
     blend = look.blend
-    centres, covariances = pixels(gaussians, window.intrinsics, look.sampling)
-    radii, arcs = reach(gaussians, blend), ways(gaussians, window.intrinsics)
-    rows = np.flatnonzero(inside(centres, covariances, radii, window.width, window.height))
+    centres, covariances = pixels(gaussians, window.intrinsics, look.pixel_grid)
+    radii, arcs = extent(gaussians, blend), pixel_arcs(gaussians, window.intrinsics)
+    rows = np.flatnonzero(touch_region(centres, covariances, radii, window.width, window.height))
     opacities = gaussians.opacities if blend == "add" else np.minimum(gaussians.opacities, OPACITY_MAX)
     rings = gaussians.rings
     if rings is None:
         rings = np.tile(np.array([0, 1], np.float32), (len(gaussians), 1))
     light, ring = gaussians.colours * opacities[:, None], np.concatenate([rings, opacities[:, None]], -1)
-    if blend == "over":  # the first lies in front, so it is drawn last
+    if blend == "over":  # the first is in front, so it is drawn last
         rows = rows[::-1]
         chosen = np.zeros(len(gaussians), np.int64)
     else:
-        chosen = level_of(covariances, gaussians.rings)
-    made: dict[int, Quads] = {}
+        chosen = level_indices(covariances, gaussians.rings)
+    by_level: dict[int, Quads] = {}
     for number, divisor in enumerate(LEVELS):
-        own = rows[chosen[rows] == number]
-        if len(own):
-            made[divisor] = quads(centres[own] / divisor, covariances[own] / divisor**2, radii[own], light[own],
-                                  ring[own], arcs[own] / divisor)
-    return made
+        members = rows[chosen[rows] == number]
+        if len(members):
+            by_level[divisor] = quads(centres[members] / divisor, covariances[members] / divisor**2, radii[members],
+                                      light[members],
+                                  ring[members], arcs[members] / divisor)
+    return by_level
 
 
 # ---- the GPU --------------------------------------------------------------------------------------
@@ -238,8 +241,8 @@ def _sum_shader() -> Any:
                        "  at = corner;\n"
                        "  gl_Position = vec4(mix(box.xy, box.zw, corner) * 2.0 - 1.0, 0.0, 1.0);\n"
                        "}\n")
-    # Texels are filtered here, so that it does not depend on how a texture was made. A level rounds its size
-    # up, so its rows are counted from the top, where the picture begins.
+    # Texels are filtered here, so that the result does not depend on the settings of a texture. The size of a level is
+    # rounded up, so its rows are counted from the top, where the picture begins.
     picked = "".join(f"  sum += pick(level{number}, extent / {divisor}.0);\n" for number, divisor in enumerate(LEVELS))
     info.fragment_source("vec3 pick(sampler2D picture, vec2 covered) {\n"
                          "  ivec2 size = textureSize(picture, 0);\n"
@@ -277,45 +280,47 @@ def _offscreen(divisor: int, width: int, height: int) -> Any:
     return _offscreens[key]
 
 
-def _batch(made: Quads) -> Any:
+def _batch(vertices: Quads) -> Any:
     import gpu
 
     form = gpu.types.GPUVertFormat()
     for name, size in (("place", 2), ("local", 2), ("light", 3), ("ring", 3), ("arc", 3)):
         form.attr_add(id=name, comp_type="F32", len=size, fetch_mode="FLOAT")
-    buffer = gpu.types.GPUVertBuf(form, len(made.place))
+    buffer = gpu.types.GPUVertBuf(form, len(vertices.place))
     for name in ("place", "local", "light", "ring", "arc"):
-        buffer.attr_fill(name, np.ascontiguousarray(getattr(made, name)))
-    triangles = gpu.types.GPUIndexBuf(type="TRIS", seq=made.triangles)
+        buffer.attr_fill(name, np.ascontiguousarray(getattr(vertices, name)))
+    triangles = gpu.types.GPUIndexBuf(type="TRIS", seq=vertices.triangles)
     return gpu.types.GPUBatch(type="TRIS", buf=buffer, elem=triangles)
 
 
-def render(gaussians: PlaneGaussians | None, window: Window, look: Look) -> list[Any]:
-    """Draw Gaussians of a look into the offscreens; returns one for each level, the full size first. Needs a GPU
-    context."""
+def render(gaussians: PlaneGaussians | None, window: DrawnRegion, look: Look) -> list[Any]:
+    """Draw Gaussians of a look into the offscreen buffers; return the buffer of each level, full size first.
+
+    Needs a GPU context.
+    """
     import gpu
 
-    made = {} if gaussians is None else levels(gaussians, window, look)
+    by_level = {} if gaussians is None else quads_by_level(gaussians, window, look)
     drawn = []
     for divisor in LEVELS:
         offscreen = _offscreen(divisor, window.width, window.height)
         with offscreen.bind():
             gpu.state.active_framebuffer_get().clear(color=(0.0, 0.0, 0.0, 0.0))
-            if divisor in made:
+            if divisor in by_level:
                 gpu.state.blend_set("ADDITIVE" if look.blend == "add" else "ALPHA_PREMULT")
                 gpu.state.depth_test_set("NONE")
                 shader = _shader("gaussian")
                 shader.bind()
                 shader.uniform_float("covers", 0.0 if look.blend == "add" else 1.0)
-                # The level's own pixels: its last ones may reach past the window's edge.
+                # The size of the level, whose last pixels may reach past the edge of the region.
                 shader.uniform_float("size", (offscreen.width, offscreen.height))
-                _batch(made[divisor]).draw(shader)
+                _batch(by_level[divisor]).draw(shader)
         drawn.append(offscreen)
     return drawn
 
 
-def add(drawn: list[Any], box: tuple[float, float, float, float], blend: str, window: Window) -> None:
-    """Add rendered levels to the framebuffer that is bound, into box (left, bottom, right, top; 0..1 of it)."""
+def composite(drawn: list[Any], box: tuple[float, float, float, float], blend: str, window: DrawnRegion) -> None:
+    """Add rendered levels to the bound framebuffer, inside box (left, bottom, right, top; 0..1 of its size)."""
     import gpu
     from gpu_extras.batch import batch_for_shader
 
@@ -334,68 +339,68 @@ def add(drawn: list[Any], box: tuple[float, float, float, float], blend: str, wi
 
 
 def _draw() -> None:
-    global problem
+    global last_error
     context = bpy.context
     scene, space = context.scene, context.space_data
     if scene is None or context.region_data is None or context.region_data.view_perspective != "CAMERA":
         return
     state = scene.fit_flare
     camera = space.camera if space.use_local_camera and space.camera else scene.camera
-    wanted = state.show and state.flare and space.overlay.show_overlays
-    if not wanted or camera is None or camera.type != "CAMERA":
+    is_shown = state.show and state.flare and space.overlay.show_overlays
+    if not is_shown or camera is None or camera.type != "CAMERA":
         return
     try:
-        draw_in(context, scene, camera)
-        problem = ""
-    except FitFlareError as what:
-        problem = str(what)
+        draw_region(context, scene, camera)
+        last_error = ""
+    except FitFlareError as error:
+        last_error = str(error)
 
 
-def draw_in(context: Any, scene: Any, camera: Any) -> None:
-    """Draw the scene's flares over the region's camera view. Raises FitFlareError."""
+def draw_region(context: Any, scene: Any, camera: Any) -> None:
+    """Draw the flares of the scene over the camera view of the region. Raises FitFlareError."""
     import gpu
 
     depsgraph = context.view_layer.depsgraph
     evaluated = camera.evaluated_get(depsgraph)
     core = cameras.core_camera(evaluated.data, evaluated.matrix_world, scene.render)
-    frame = frame_in(context, scene, evaluated)
+    frame = camera_frame(context, scene, evaluated)
     region = context.region.width, context.region.height
-    window = window_of(frame, region, core) if frame is not None else None
+    window = drawn_region(frame, region, core) if frame is not None else None
     if window is None:
         return
     look = looks.look_of(scene)
-    gaussians = joined(list(looks.seen(scene, depsgraph, camera).values()))
+    gaussians = concatenate(list(looks.evaluate_flares(scene, depsgraph, camera).values()))
     if gaussians is None:
         return
     drawn = render(gaussians, window, look)
     viewport = gpu.state.viewport_get()
-    add(drawn, (window.x / region[0], window.y / region[1], (window.x + window.width) / region[0],
+    composite(drawn, (window.x / region[0], window.y / region[1], (window.x + window.width) / region[0],
                 (window.y + window.height) / region[1]), look.blend, window)
     gpu.state.viewport_set(*viewport)
 
 
-def picture(scene: Any, depsgraph: Any, camera: Any, width: int, height: int) -> Floats:
-    """The overlay as numbers: (height, width, 3) scene-linear, row 0 on top. Needs a GPU context."""
+def render_picture(scene: Any, depsgraph: Any, camera: Any, width: int, height: int) -> Floats:
+    """Render the overlay to pixels (height, width, 3), scene-linear, row 0 on top. Needs a GPU context."""
     import gpu
 
     evaluated = camera.evaluated_get(depsgraph)
     core = cameras.core_camera(evaluated.data, evaluated.matrix_world, scene.render)
-    window = window_of(Frame(0, 0, width, height), (width, height), core)
+    window = drawn_region(CameraFrame(0, 0, width, height), (width, height), core)
     assert window is not None
     look = looks.look_of(scene)
-    gaussians = joined(list(looks.seen(scene, depsgraph, camera).values()))
+    gaussians = concatenate(list(looks.evaluate_flares(scene, depsgraph, camera).values()))
     drawn = render(gaussians, window, look)
     target = gpu.types.GPUOffScreen(width, height, format="RGBA32F")
     try:
         with target.bind():
             buffer = gpu.state.active_framebuffer_get()
             buffer.clear(color=(0.0, 0.0, 0.0, 0.0))
-            add(drawn, (0, 0, 1, 1), look.blend, window)
-            pixels_ = buffer.read_color(0, 0, width, height, 4, 0, "FLOAT")
+            composite(drawn, (0, 0, 1, 1), look.blend, window)
+            rgba = buffer.read_color(0, 0, width, height, 4, 0, "FLOAT")
     finally:
         target.free()
-    pixels_.dimensions = width * height * 4
-    return np.array(pixels_, np.float32).reshape(height, width, 4)[::-1, :, :3]
+    rgba.dimensions = width * height * 4
+    return np.array(rgba, np.float32).reshape(height, width, 4)[::-1, :, :3]
 
 
 def register() -> None:
@@ -405,7 +410,7 @@ def register() -> None:
 
 
 def unregister() -> None:
-    global _handle, problem
+    global _handle, last_error
     if _handle is not None:
         bpy.types.SpaceView3D.draw_handler_remove(_handle, "WINDOW")
         _handle = None
@@ -413,4 +418,4 @@ def unregister() -> None:
         offscreen.free()
     _offscreens.clear()
     _shaders.clear()
-    problem = ""
+    last_error = ""

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The sidebar's "Fit Flare" tab, in the order of the work: Capture, Lights, Fit, Look, Bake, Transfer.
+"""The tab "Fit Flare" of the sidebar, in the order of the work: Capture, Lights, Fit, Look, Bake, Transfer.
 
-Each part says what is missing and offers the next step.
+Each panel shows what is missing and offers the next step; the buttons are in `operators`.
 """
 from __future__ import annotations
 
@@ -14,28 +14,38 @@ from ..core.conventions.run_files import FLARE
 from ..core.errors import FitFlareError
 from . import engine, fits, jobs, library, lights, looks, overlay, shots
 from .compositor import drivers, flare_node
-from .layouts import draw_progress, lines
+from .layouts import draw_progress, label_lines
 from .paths import is_folder
 
 
-class _Part:
+class _SidebarPanel:
+    """Mixin that puts a panel into the tab of the sidebar."""
+
     bl_space_type = "VIEW_3D"
     bl_region_type = "UI"
-    bl_category = "Fit Flare"
+    bl_category = jobs.SIDEBAR_TAB
 
 
-class FITFLARE_PT_capture(_Part, bpy.types.Panel):
+def _settings_column(layout: Any) -> Any:
+    """Return a column for properties that are not animated."""
+    column = layout.column()
+    column.use_property_split = True
+    column.use_property_decorate = False
+    return column
+
+
+class FITFLARE_PT_capture(_SidebarPanel, bpy.types.Panel):
     bl_label = "Capture"
     bl_idname = "FITFLARE_PT_capture"
 
     def draw(self, context: bpy.types.Context) -> None:
         layout, state = self.layout, context.scene.fit_flare
-        folder = fits.capture_of(context.scene)
+        folder = fits.capture_folder(context.scene)
         if folder is None:
-            lines(layout, "Footage with a camera solve: a folder with images/ and sparse/0/ (COLMAP) or "
+            label_lines(layout, "Footage with a camera solve: a folder with images/ and sparse/0/ (COLMAP) or "
                           "transforms.json.", "INFO")
         elif not is_folder(folder):
-            lines(layout, f"The capture {folder} is not there any more: choose where it is now.", "ERROR")
+            label_lines(layout, f"The capture {folder} does not exist any more: choose its present folder.", "ERROR")
         row = layout.row()
         row.scale_y = 1.3
         row.operator("fit_flare.import_capture", icon="IMPORT")
@@ -47,28 +57,28 @@ class FITFLARE_PT_capture(_Part, bpy.types.Panel):
         column.operator("fit_flare.capture_from_camera", icon="CAMERA_DATA")
 
 
-class FITFLARE_PT_lights(_Part, bpy.types.Panel):
+class FITFLARE_PT_lights(_SidebarPanel, bpy.types.Panel):
     bl_label = "Lights"
     bl_idname = "FITFLARE_PT_lights"
 
     def draw(self, context: bpy.types.Context) -> None:
         layout, scene = self.layout, context.scene
-        found = lights.of_scene(scene)
+        found = lights.scene_lights(scene)
         if not found:
-            lines(layout, "No lights yet. The fit learns a flare for each light source of the footage.", "INFO")
+            label_lines(layout, "No lights yet. The fit learns a flare for each light in the footage.", "INFO")
         column = layout.column(align=True)
         for light in found:
             row = column.row(align=True)
             row.prop(light.fit_flare, "light", text="", icon="LIGHT_POINT")
             row.operator("fit_flare.remove_light", text="", icon="X").object = light.name
-        folder = fits.capture_of(scene)
+        folder = fits.capture_folder(scene)
         job = jobs.find(folder / "lights") if folder is not None else None
         if job is not None and job.running:
-            draw_progress(layout, job, "Looking for lights")
+            draw_progress(layout, job, "Searching for lights")
         elif job is not None and job.error:
-            lines(layout, job.error, "ERROR")
-        elif folder is not None and (names := lights.unknown(scene, folder)):
-            lines(layout, f"Found, and not in the scene yet: {', '.join(names)}.", "INFO")
+            label_lines(layout, job.error, "ERROR")
+        elif folder is not None and (names := lights.new_names(scene, folder)):
+            label_lines(layout, f"Found, but not in the scene yet: {', '.join(names)}.", "INFO")
             layout.operator("fit_flare.use_lights", icon="IMPORT")
         column = layout.column(align=True)
         column.operator("fit_flare.find_lights", icon="VIEWZOOM")
@@ -77,137 +87,139 @@ class FITFLARE_PT_lights(_Part, bpy.types.Panel):
         row.operator("fit_flare.lights_from_selected", icon="RESTRICT_SELECT_OFF")
 
 
-class FITFLARE_PT_fit(_Part, bpy.types.Panel):
+class FITFLARE_PT_fit(_SidebarPanel, bpy.types.Panel):
     bl_label = "Fit"
     bl_idname = "FITFLARE_PT_fit"
 
     def draw(self, context: bpy.types.Context) -> None:
         layout, scene = self.layout, context.scene
-        state, stage, folder = scene.fit_flare, fits.state_of(scene), fits.folder_of(scene)
+        state, stage, folder = scene.fit_flare, fits.fit_state(scene), fits.run_folder(scene)
         job = jobs.find(folder)
-        for other in shots.unnamed():
-            draw_progress(layout, other, f"{other.folder.name}, of no scene")
-        if engine.find() is None:
-            draw_engine(layout)
+        for other in shots.orphaned_jobs():
+            draw_progress(layout, other, f"{other.folder.name} (used by no scene)")
+        if engine.find_engine() is None:
+            draw_missing_engine(layout)
         if stage == "running" and job is not None:
-            _fitting(layout, job)
+            _draw_running_fit(layout, job)
             return
-        settings = layout.column()
-        settings.use_property_split = True
-        settings.use_property_decorate = False
+        settings = _settings_column(layout)
         settings.prop(state, "preset")
         settings.prop(state, "mode")
         settings.prop(state, "width")
-        capture = fits.capture_of(scene)
-        if capture is not None and (state.mode != "default" or fits.cleaning_of(capture) is not None):
-            _cleaning(layout, state, capture, stage)
+        capture = fits.capture_folder(scene)
+        if capture is not None and (state.mode != "default" or fits.cleaning_job(capture) is not None):
+            _draw_clean_frames(layout, state, capture, stage)
         if stage == "lost":
-            lines(layout, f"The run's folder {folder} is gone: start a new fit.", "ERROR")
+            label_lines(layout, f"The folder of the run {folder} does not exist any more: start a new fit.", "ERROR")
         elif stage == "resumable":
             if job is not None and job.state == "failed":
-                lines(layout, job.error, "ERROR")
+                label_lines(layout, job.error, "ERROR")
             else:
-                lines(layout, "The fit was stopped and can go on where it was.", "INFO")
+                label_lines(layout, "The fit was stopped and can be resumed.", "INFO")
             layout.operator("fit_flare.resume", icon="PLAY")
         elif stage == "finished":
-            _finished(layout, scene, job)
+            _draw_finished_fit(layout, scene, job)
         elif job is not None and job.state in ("failed", "stopped"):
-            lines(layout, job.error, "ERROR" if job.state == "failed" else "INFO")
+            label_lines(layout, job.error, "ERROR" if job.state == "failed" else "INFO")
         why = fits.why_not(scene)
-        if why and engine.find() is not None:
-            lines(layout, f"{why}.", "INFO")
+        if why and engine.find_engine() is not None:
+            label_lines(layout, f"{why}.", "INFO")
         row = layout.row()
         row.scale_y = 1.3
         row.operator("fit_flare.fit", text="Fit" if stage in ("none", "lost") else "New Fit", icon="RENDER_ANIMATION")
         if folder is not None and is_folder(folder):
-            _reading(layout, folder)
+            _draw_log_buttons(layout, folder)
 
 
-def _cleaning(layout: Any, state: Any, capture: Any, stage: str) -> None:
-    """The frames without flare: made, being made, or to be made; those of a network can be made again, otherwise or by
-    the fit that was made since."""
-    job = fits.cleaning_of(capture)
+def _draw_clean_frames(layout: Any, state: Any, capture: Any, stage: str) -> None:
+    """Draw the state of the clean frames, their options, and the button that makes them.
+
+    Clean frames of the network can be made again with other options, or with the fit once it is finished.
+    """
+    job = fits.cleaning_job(capture)
     if job is not None and job.running:
         draw_progress(layout, job, "Clean frames")
         return
     if job is not None and job.error:
-        lines(layout, job.error, "INFO" if job.state == "stopped" else "ERROR")
-    there = is_folder(capture / REMOVED) and (job is None or job.state == "done")
-    by_network = stage != "finished" and (not there or job is not None)
-    if not there:
-        lines(layout, "The fit can take its flare out of the frames." if stage == "finished" else
-              "No frames without flare: scene and flare are told apart by how they move." if state.mode == "split" else
-              "No frames without flare: the fit begins by making some.", "INFO")
+        label_lines(layout, job.error, "INFO" if job.state == "stopped" else "ERROR")
+    exists = is_folder(capture / REMOVED) and (job is None or job.state == "done")
+    by_network = stage != "finished" and (not exists or job is not None)
+    if not exists:
+        label_lines(layout, "The fit can remove its flare from the frames." if stage == "finished" else
+                    "No clean frames: the fit separates scene and flare by parallax." if state.mode == "split" else
+                    "No clean frames yet: the fit starts by making them.", "INFO")
     if by_network:
-        given = layout.column()
-        given.use_property_split = True
-        given.use_property_decorate = False
-        given.prop(state, "matte")
-        given.prop(state, "keep_glow")
-        if not there and state.mode != "split" and (state.matte or state.keep_glow):
-            lines(layout, "Press Make Clean Frames first: a fit makes them without these.", "INFO")
-    if there and state.mode == "split":  # they were made while the .blend was closed
-        lines(layout, "There are clean frames: choose them as Supervision to learn from them.", "INFO")
-    by_fit = stage == "finished" and (job is None or "--run" not in job.words)
-    if not there or by_network or by_fit:
-        layout.operator("fit_flare.clean_frames", text="Make Clean Frames Again" if there else "Make Clean Frames",
+        options = _settings_column(layout)
+        options.prop(state, "matte")
+        options.prop(state, "keep_glow")
+        if not exists and state.mode != "split" and (state.matte or state.keep_glow):
+            label_lines(layout, "Press Make Clean Frames first: a fit makes them without these options.", "INFO")
+    if exists and state.mode == "split":  # they were made while the .blend was closed
+        label_lines(layout, "There are clean frames: choose them under Supervision to use them.", "INFO")
+    by_fit = stage == "finished" and (job is None or "--run" not in job.args)
+    if not exists or by_network or by_fit:
+        layout.operator("fit_flare.clean_frames", text="Make Clean Frames Again" if exists else "Make Clean Frames",
                         icon="BRUSH_DATA")
 
 
-def _fitting(layout: Any, job: jobs.Job) -> None:
+def _draw_running_fit(layout: Any, job: jobs.Job) -> None:
+    """Draw progress, figures and preview of a fit."""
     draw_progress(layout, job, job.stage.capitalize())
     if job.figures:
         loss, count = job.figures.get("loss", job.figures.get("scene_loss")), job.figures.get("flare_gaussians")
         parts = [f"step {job.done} of {job.total}"]
         parts += [f"loss {loss:.4f}"] if loss is not None else []
-        parts += [f"{count:,.0f} in the flare"] if count else []
-        lines(layout, ", ".join(parts))
+        parts += [f"{count:,.0f} flare Gaussians"] if count else []
+        label_lines(layout, ", ".join(parts))
     icon = fits.preview_icon(job.folder)
     if icon:
-        _picture(layout, icon)
+        _draw_preview(layout, icon)
     else:
-        lines(layout, "A preview comes after an eighth of the way. Blender can be used, saved and closed meanwhile.")
-    _reading(layout, job.folder)
+        label_lines(layout, "The first preview appears after an eighth of the fit. You can use, save and close Blender "
+                            "meanwhile.")
+    _draw_log_buttons(layout, job.folder)
 
 
-def _picture(layout: Any, icon: int) -> None:
-    """A preview, composite above flare, as wide as the panel."""
+def _draw_preview(layout: Any, icon: int) -> None:
+    """Draw a preview (composite above flare) as wide as the panel."""
     region, scale = bpy.context.region, bpy.context.preferences.system.ui_scale
     width = region.width / scale if region is not None else 260
     layout.template_icon(icon_value=icon, scale=max(min((width - 60) / 20, 16), 6))
 
 
-def _finished(layout: Any, scene: Any, job: jobs.Job | None) -> None:
-    folder = fits.folder_of(scene)
+def _draw_finished_fit(layout: Any, scene: Any, job: jobs.Job | None) -> None:
+    """Draw the preview of a finished fit, and whether its flare is shown."""
+    folder = fits.run_folder(scene)
     assert folder is not None
     icon = fits.preview_icon(folder)
     if icon:
-        _picture(layout, icon)
+        _draw_preview(layout, icon)
     used = looks.path_of(scene)
     if job is not None and job.error:
-        lines(layout, job.error, "ERROR")
+        label_lines(layout, job.error, "ERROR")
     if used is None or used != folder / FLARE:
-        lines(layout, "The fit is finished.", "CHECKMARK")
+        label_lines(layout, "The fit is finished.", "CHECKMARK")
         layout.operator("fit_flare.use_result", icon="LIGHT_SUN")
     else:
-        lines(layout, "The fit is finished; its flare is shown in the camera view.", "CHECKMARK")
+        label_lines(layout, "The fit is finished; its flare is shown in the camera view.", "CHECKMARK")
 
 
-def _reading(layout: Any, folder: Any) -> None:
+def _draw_log_buttons(layout: Any, folder: Any) -> None:
+    """Draw the buttons that show preview, log and folder of a run."""
     row = layout.row(align=True)
     row.operator("fit_flare.show_preview", icon="IMAGE_DATA", text="Preview")
     row.operator("fit_flare.show_log", icon="TEXT", text="Log").folder = str(folder)
     row.operator("fit_flare.open_folder", icon="FILE_FOLDER", text="").folder = str(folder)
 
 
-def draw_engine(layout: Any) -> None:
-    """That there is no engine, and the way to one."""
+def draw_missing_engine(layout: Any) -> None:
+    """Draw why there is no engine, and a button that opens the preferences."""
     box = layout.box()
-    lines(box, f"{engine.missing()}.", "ERROR")
+    label_lines(box, f"{engine.missing_reason()}.", "ERROR")
     box.operator("preferences.addon_show", text="Open Preferences", icon="PREFERENCES").module = engine.PACKAGE
 
 
-class FITFLARE_PT_look(_Part, bpy.types.Panel):
+class FITFLARE_PT_look(_SidebarPanel, bpy.types.Panel):
     bl_label = "Look"
     bl_idname = "FITFLARE_PT_look"
 
@@ -218,27 +230,28 @@ class FITFLARE_PT_look(_Part, bpy.types.Panel):
         layout, scene = self.layout, context.scene
         state = scene.fit_flare
         if not state.flare:
-            lines(layout, "No flare yet: fit one above, or open a .flare.", "INFO")
+            label_lines(layout, "No flare yet: fit one above, or open a .flare.", "INFO")
             layout.operator("fit_flare.open_flare", icon="FILE_FOLDER")
             return
         try:
             looks.look_of(scene)
         except FitFlareError as problem:
-            lines(layout, str(problem), "ERROR")
+            label_lines(layout, str(problem), "ERROR")
             layout.operator("fit_flare.open_flare", icon="FILE_FOLDER")
             return
-        if overlay.problem:
-            lines(layout, overlay.problem, "ERROR")
+        if overlay.last_error:
+            label_lines(layout, overlay.last_error, "ERROR")
         if scene.camera is None:
-            lines(layout, "The scene has no camera to see the flare from.", "ERROR")
-        elif not _through_camera(context):
+            label_lines(layout, "The scene has no camera; add one to see the flare.", "ERROR")
+        elif not _looks_through_camera(context):
             layout.operator("view3d.view_camera", text="Look through the Camera", icon="VIEW_CAMERA")
         elif state.show and state.native and state.footage == "images" and fits.has_clean_frames(scene):
-            lines(layout, "The frames behind the camera have their own flare, and this one is over it: choose Without "
-                          "Flare under Capture to see one alone.", "INFO")
-        if looks.twice(state):
-            lines(layout, f"Two flares have the name {looks.twice(state)}: rename one.", "ERROR")
-        _sliders(layout, state.master)
+            label_lines(layout, "The frames behind the camera contain their own flare, and this one is drawn over it: "
+                                "choose "
+                          "Clean under Capture to see this one alone.", "INFO")
+        if looks.duplicate_name(state):
+            label_lines(layout, f"Two flares have the name {looks.duplicate_name(state)}: rename one.", "ERROR")
+        _draw_sliders(layout, state.master)
         if scene.camera is not None:
             column = layout.column()
             column.use_property_split = True
@@ -251,35 +264,38 @@ class FITFLARE_PT_look(_Part, bpy.types.Panel):
         column.operator("fit_flare.add_flare", text="", icon="ADD")
         column.operator("fit_flare.remove_flare", text="", icon="REMOVE")
         if 0 <= state.light < len(state.lights):
-            _light(layout, scene, state.lights[state.light])
+            _draw_flare(layout, scene, state.lights[state.light])
         row = layout.row(align=True)
         row.operator("fit_flare.reset_look", icon="LOOP_BACK")
         row.operator("fit_flare.open_flare", text="Open", icon="FILE_FOLDER")
 
 
-def _through_camera(context: bpy.types.Context) -> bool:
+def _looks_through_camera(context: bpy.types.Context) -> bool:
+    """Return whether the 3D view of the panel shows the camera's view."""
     space = context.space_data
     return space is None or space.type != "VIEW_3D" or space.region_3d.view_perspective == "CAMERA"
 
 
-def _sliders(layout: Any, sliders: Any, streak: bool = True) -> None:
+def _draw_sliders(layout: Any, sliders: Any, streak: bool = True) -> None:
+    """Draw the sliders of an edit; streak: also Streak Length."""
     column = layout.column()
     column.use_property_split = True
     for name in ("intensity", "scale", "spread", "rotation", "tint", "saturation", *(("streak",) if streak else ())):
         column.prop(sliders, name, slider=name in ("intensity", "scale", "spread", "saturation", "streak"))
 
 
-def _light(layout: Any, scene: Any, item: Any) -> None:
+def _draw_flare(layout: Any, scene: Any, item: Any) -> None:
+    """Draw the settings and elements of one flare."""
     box = layout.box()
     column = box.column()
     column.use_property_split = True
     column.prop(item, "target")
     if item.target is None:
-        lines(box, f"Choose the object that {item.name} comes from.", "ERROR")
+        label_lines(box, f"Choose the light object of {item.name}.", "ERROR")
     elif not looks.is_placed(item, scene):
-        lines(box, f"{item.target.name} is not in this scene: choose another object.", "ERROR")
-    lines(box, f"Look: {item.source}")
-    _sliders(box, item)
+        label_lines(box, f"{item.target.name} is not in this scene: choose another object.", "ERROR")
+    label_lines(box, f"Look: {item.source}")
+    _draw_sliders(box, item)
     column = box.column()
     column.use_property_split = True
     column.prop(item, "radius")
@@ -291,10 +307,10 @@ def _light(layout: Any, scene: Any, item: Any) -> None:
     if item.show_elements:
         box.template_list("FITFLARE_UL_elements", "", item, "elements", item, "element", rows=4)
         if 0 <= item.element < len(item.elements):
-            _sliders(box, item.elements[item.element], item.elements[item.element].kind == "streak")
+            _draw_sliders(box, item.elements[item.element], item.elements[item.element].kind == "streak")
 
 
-class FITFLARE_PT_bake(_Part, bpy.types.Panel):
+class FITFLARE_PT_bake(_SidebarPanel, bpy.types.Panel):
     bl_label = "Bake"
     bl_idname = "FITFLARE_PT_bake"
 
@@ -302,15 +318,13 @@ class FITFLARE_PT_bake(_Part, bpy.types.Panel):
         layout, scene = self.layout, context.scene
         state = scene.fit_flare
         if not state.flare:
-            lines(layout, "Nothing to bake yet: fit or open a flare first.", "INFO")
+            label_lines(layout, "Nothing to bake yet: fit or open a flare first.", "INFO")
         job = jobs.find(shots.layers_folder(scene)) if state.layers else None
         if job is not None and job.running:
             draw_progress(layout, job, "Bake")
-            _baked_log(layout, job)
+            _draw_bake_log(layout, job)
         else:
-            column = layout.column()
-            column.use_property_split = True
-            column.use_property_decorate = False
+            column = _settings_column(layout)
             column.prop(state, "bake_range")
             if state.bake_range == "custom":
                 column.prop(state, "bake_first")
@@ -319,32 +333,32 @@ class FITFLARE_PT_bake(_Part, bpy.types.Panel):
             column.prop(state, "bake_live")
             column.prop(state, "bake_scene")
             if job is not None and job.error:
-                lines(layout, job.error, "INFO" if job.state == "stopped" else "ERROR")
+                label_lines(layout, job.error, "INFO" if job.state == "stopped" else "ERROR")
             elif job is not None and job.state == "done":
-                lines(layout, f"{job.result.get('frames', 0)} frames of layers are baked.", "CHECKMARK")
+                label_lines(layout, f"Layers of {job.result.get('frames', 0)} frames are baked.", "CHECKMARK")
             row = layout.row(align=True)
             row.scale_y = 1.3
             row.operator("fit_flare.bake", icon="RENDER_ANIMATION").selected = False
             row.operator("fit_flare.bake", text="", icon="OUTLINER_OB_CAMERA").selected = True
             if job is not None:
-                _baked_log(layout, job)
-        self._compositor(layout, scene)
+                _draw_bake_log(layout, job)
+        self._draw_compositor(layout, scene)
 
-    def _compositor(self, layout: Any, scene: Any) -> None:
+    def _draw_compositor(self, layout: Any, scene: Any) -> None:
+        """Draw the set-up of the compositor, and its sliders where the panel Look does not drive them."""
         state, node = scene.fit_flare, flare_node.find_node(scene)
         box = layout.box().column()
-        column = box.column()
-        column.use_property_split = True
-        column.use_property_decorate = False
+        column = _settings_column(box)
         column.prop(state, "over")
         box.operator("fit_flare.set_up_baked", icon="NODE_COMPOSITING")
         if node is not None and node.node_tree is not None:
-            sliders = [node.inputs[name] for name in ("Intensity", "Tint") if name in node.inputs]  # not renamed ones
-            slider_drivers = drivers.drivers(scene)
-            if not drivers.complete(scene):
-                lines(box, "Some sliders of the panel Look act on it no longer: set it up again.", "ERROR")
+            sliders = [node.inputs[name] for name in ("Intensity",
+                                                      "Tint") if name in node.inputs]  # an artist may have renamed them
+            slider_drivers = drivers.node_drivers(scene)
+            if not drivers.is_complete(scene):
+                label_lines(box, "Some sliders of the panel Look do not act on it any more: set it up again.", "ERROR")
             elif slider_drivers or any(socket.is_linked for socket in sliders if socket.name == "Intensity"):
-                lines(box, "Set up: the sliders of the panel Look act on it.", "CHECKMARK")
+                label_lines(box, "Set up: the sliders of the panel Look act on it.", "CHECKMARK")
             else:
                 column = box.column()
                 column.use_property_split = True
@@ -355,13 +369,14 @@ class FITFLARE_PT_bake(_Part, bpy.types.Panel):
             box.operator("fit_flare.set_up_compositor", text="Other Layers …", icon="FILE_FOLDER")
 
 
-def _baked_log(layout: Any, job: jobs.Job) -> None:
+def _draw_bake_log(layout: Any, job: jobs.Job) -> None:
+    """Draw the buttons that show log and folder of a bake."""
     row = layout.row(align=True)
     row.operator("fit_flare.show_log", icon="TEXT", text="Log").folder = str(job.folder)
     row.operator("fit_flare.open_folder", icon="FILE_FOLDER", text="Folder").folder = str(job.folder)
 
 
-class FITFLARE_PT_transfer(_Part, bpy.types.Panel):
+class FITFLARE_PT_transfer(_SidebarPanel, bpy.types.Panel):
     bl_label = "Transfer"
     bl_idname = "FITFLARE_PT_transfer"
 
@@ -370,16 +385,18 @@ class FITFLARE_PT_transfer(_Part, bpy.types.Panel):
         if library.files():
             layout.template_icon_view(context.window_manager, "fit_flare_library", show_labels=True, scale=6.0,
                                       scale_popup=5.0)
-            lines(layout, "Select the objects that are to flare, then apply.")
+            label_lines(layout, "Select the objects that get the flare, then apply.")
             layout.operator("fit_flare.apply_flare", icon="LIGHT_SUN")
         else:
-            lines(layout, "The library is empty. Save a flare, then apply it to other cameras and lights.", "INFO")
+            label_lines(layout, "The library is empty. Save a flare, then apply it to other cameras and lights.",
+                        "INFO")
         column = layout.column(align=True)
         column.operator("fit_flare.save_flare", icon="FILE_TICK")
         column.operator("fit_flare.shot_from_picture", icon="IMAGE_DATA")
         column.operator("fit_flare.pick_light", icon="EYEDROPPER")
         if state.flare and not state.native and any(item.target for item in state.lights):
-            lines(layout, "A flare of another shot: it keeps the look of the middle of its own footage.", "INFO")
+            label_lines(layout, "This flare is from another capture: its look is that of one training view and does "
+                                "not follow the camera.", "INFO")
 
 
 _CLASSES = (FITFLARE_PT_capture, FITFLARE_PT_lights, FITFLARE_PT_fit, FITFLARE_PT_look, FITFLARE_PT_bake,

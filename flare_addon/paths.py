@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Paths as a .blend keeps them, and as the disk knows them."""
+"""Converts between the paths that a .blend stores and paths on disk, and keeps them valid when a .blend moves."""
 from __future__ import annotations
 
 import os
@@ -8,34 +8,35 @@ from typing import Any
 
 import bpy
 
-OURS = ("capture", "matte", "run", "flare", "layers")
-"""Of a scene, the properties that hold one."""
+PATH_PROPERTIES = ("capture", "matte", "run", "flare", "layers")
+"""The properties of a scene that hold a path."""
 
-_before: dict[tuple[str, str], str] = {}
-"""By scene and property what they were before the save that goes on now."""
+_paths_before_save: dict[tuple[str, str], str] = {}
+"""The paths before the current save, by scene and property."""
 
 
-def stored(path: Path) -> str:
-    """A path as a .blend keeps it: relative to the file where it can be."""
-    # Not resolved: a drive of the network would lose its letter.
+def blend_relative(path: Path) -> str:
+    """Return a path as a .blend stores it: relative to the file where possible."""
+    # Not resolved, since a network drive would lose its letter.
     return _relative(Path(os.path.normpath(path.absolute())), bpy.data.filepath)
 
 
 def absolute(text: str, library: Any = None) -> Path:
-    """Of such a path the place on disk, without `..`: below a linked folder that would lead elsewhere, and the same
-    place would have several names. library: of what is linked from another .blend, which its paths start from."""
+    """Return the path on disk of a stored path, without "..", which below a linked folder would lead elsewhere.
+
+    library: the library of a linked data block, whose paths are relative to that .blend.
+    """
     text = text.replace("\\", "/") if text.startswith("//") else text
     return Path(os.path.normpath(bpy.path.abspath(text, library=library)))
 
 
 def is_folder(path: Path) -> bool:
-    """Whether a folder is there to be looked at: a name that is too long for the disk, or no leave to look, is no error
-    of the panel that asks."""
+    """Return whether a folder exists and can be accessed; an invalid name or a missing permission counts as no."""
     return os.path.isdir(path)  # noqa: PTH112 - pathlib's raises then
 
 
 def is_file(path: Path) -> bool:
-    """Whether a file is there to be looked at, as `is_folder`."""
+    """Return whether a file exists and can be accessed, as `is_folder` does."""
     return os.path.isfile(path)  # noqa: PTH113
 
 
@@ -49,49 +50,48 @@ def _relative(path: Path, blend: str) -> str:
         return os.fspath(path)
 
 
-# ---- a .blend saved elsewhere: what Blender does for its own paths ----------------------------------
+# ---- a .blend saved in another folder: what Blender does for its own paths ----------------------------------
 
 
 @bpy.app.handlers.persistent
 def _remap(blend: str, *_: object) -> None:
-    """Before a save: relative paths from where the file goes; of a file that is saved for the first time all become
-    relative."""
-    _before.clear()
+    """Before a save: make relative paths relative to the new file; on the first save make all paths relative."""
+    _paths_before_save.clear()
     first = not bpy.data.filepath
     if not blend or (not first and Path(blend).parent == Path(bpy.data.filepath).parent):
         return
     for scene in (scene for scene in bpy.data.scenes if scene.library is None):
-        for name in OURS:
+        for name in PATH_PROPERTIES:
             text = getattr(scene.fit_flare, name)
             if text and text.startswith("//") != first:
-                _before[scene.name, name] = text
+                _paths_before_save[scene.name, name] = text
                 setattr(scene.fit_flare, name, _relative(absolute(text), blend))
 
 
 @bpy.app.handlers.persistent
-def _put_back(blend: str, *_: object) -> None:
-    """After a save: as they were, where it was a copy or failed and the file here is still the other one."""
+def _restore(blend: str, *_: object) -> None:
+    """After a save of a copy, or a failed save: restore the paths, since the open file is still the earlier one."""
     if not blend or Path(blend).parent != Path(bpy.data.filepath).parent:
-        for (scene, name), text in _before.items():
+        for (scene, name), text in _paths_before_save.items():
             setattr(bpy.data.scenes[scene].fit_flare, name, text)
-    _before.clear()
+    _paths_before_save.clear()
 
 
 @bpy.app.handlers.persistent
-def _take_along(context: Any, *_: object) -> None:
-    """After scenes of another .blend were appended: their paths, which are told from there."""
+def _remap_appended(context: Any, *_: object) -> None:
+    """After scenes of another .blend were appended: make their paths relative to this file."""
     for item in context.import_items:
         if item.id_type != "SCENE" or item.id is None or item.id.library is not None or item.source_library is None:
             continue
-        for name in OURS:
+        for name in PATH_PROPERTIES:
             text = getattr(item.id.fit_flare, name)
             if text.startswith("//"):
-                setattr(item.id.fit_flare, name, stored(absolute(text, item.source_library)))
+                setattr(item.id.fit_flare, name, blend_relative(absolute(text, item.source_library)))
 
 
-_HANDLERS = [("save_pre", _remap), ("save_post", _put_back), ("save_post_fail", _put_back)]
+_HANDLERS = [("save_pre", _remap), ("save_post", _restore), ("save_post_fail", _restore)]
 if hasattr(bpy.app.handlers, "blend_import_post"):  # from 4.3 on
-    _HANDLERS.append(("blend_import_post", _take_along))
+    _HANDLERS.append(("blend_import_post", _remap_appended))
 
 
 def register() -> None:

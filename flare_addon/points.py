@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The point cloud's colours in the viewport: Blender draws loose vertices as black dots."""
+"""Draws the point cloud of a capture in its colours; Blender itself draws loose vertices as black dots."""
 from __future__ import annotations
 
 from typing import Any
@@ -8,7 +8,7 @@ import bpy
 import numpy as np
 
 ATTRIBUTE = "Col"
-MOST = 400_000  # vertices that are drawn; of more, every second or third
+MAX_VERTICES = 400_000  # that are drawn; larger clouds are thinned to every second, third, ... vertex
 
 _batches: dict[tuple[str, int], Any] = {}
 _handle: Any = None
@@ -25,7 +25,7 @@ def _batch(mesh: Any) -> Any:
         places, colours = np.empty(3 * count, np.float32), np.empty(4 * count, np.float32)
         mesh.vertices.foreach_get("co", places)
         mesh.color_attributes[ATTRIBUTE].data.foreach_get("color", colours)
-        step = max(-(-count // MOST), 1)
+        step = max(-(-count // MAX_VERTICES), 1)
         shader = _shader()
         _batches[key] = shader, batch_for_shader(shader, "POINTS", {
             "pos": np.ascontiguousarray(places.reshape(-1, 3)[::step]),
@@ -44,7 +44,7 @@ def _draw() -> None:
 
     context = bpy.context
     if context.region_data is None or context.region_data.view_perspective == "CAMERA":
-        return  # the footage is to be seen there
+        return  # it would cover the footage
     if not context.space_data.overlay.show_overlays:
         return
     for item in context.visible_objects:
@@ -61,8 +61,8 @@ def _draw() -> None:
         gpu.state.depth_test_set("NONE")
 
 
-def forget() -> None:
-    """Let go of the clouds that were drawn."""
+def clear_cache() -> None:
+    """Free the batches of the clouds that were drawn."""
     _batches.clear()
 
 
@@ -77,4 +77,4 @@ def unregister() -> None:
     if _handle is not None:
         bpy.types.SpaceView3D.draw_handler_remove(_handle, "WINDOW")
         _handle = None
-    forget()
+    clear_cache()

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What the user sets once: the engine, and the library of flares."""
+"""The preferences: the engine and the library of flares, with the buttons that install, test and remove the engine.
+
+`user_settings` reads the values.
+"""
 from __future__ import annotations
 
 import sys
@@ -8,10 +11,10 @@ from typing import Any
 import bpy
 
 from . import engine, jobs
-from .layouts import draw_progress, lines
-from .reports import Action
+from .layouts import draw_progress, label_lines
+from .reports import GuardedOperator
 
-DOWNLOAD = f"about {'3 GB, most of it CUDA,' if sys.platform == 'linux' else '1 GB'} to download once"
+DOWNLOAD_SIZE = f"about {'3 GB, most of it CUDA,' if sys.platform == 'linux' else '1 GB'} to download once"
 
 
 class FITFLARE_AP_preferences(bpy.types.AddonPreferences):
@@ -19,14 +22,16 @@ class FITFLARE_AP_preferences(bpy.types.AddonPreferences):
 
     engine: bpy.props.StringProperty(  # type: ignore[valid-type]
         name="Engine",
-        description="The Python that has torch, or the folder of its virtual environment. Empty: the one that Set Up "
-        "Engine has made",
+        description="The Python with torch, or the folder of its virtual environment. Empty: the engine that Set Up "
+                    "Engine "
+        "installed",
         subtype="FILE_PATH",
     )
     library: bpy.props.StringProperty(  # type: ignore[valid-type]
         name="Flare Library",
-        description="Folder of .flare files to choose from. Empty: fit_flare/library among Blender's user files, which "
-        "stays when the extension is uninstalled",
+        description="Folder of the .flare files in the library. Empty: fit_flare/library in Blender's user folder, "
+                    "which "
+        "is kept when the extension is uninstalled",
         subtype="DIR_PATH",
     )
 
@@ -40,24 +45,25 @@ class FITFLARE_AP_preferences(bpy.types.AddonPreferences):
 
 
 def _draw_engine(layout: Any) -> None:
+    """Draw the state of the engine, of its set-up and of its test, and their buttons."""
     box = layout.box().column()
-    python, test, making = engine.find(), engine.tested(), engine.setting_up()
-    if making is not None and making.running:
-        draw_progress(box, making, "Setting up the engine")
-        _log_of(box, making)
+    python, test, set_up = engine.find_engine(), engine.last_test(), engine.set_up_job()
+    if set_up is not None and set_up.running:
+        draw_progress(box, set_up, "Setting up the engine")
+        _draw_log_button(box, set_up)
         return
     if python is None:
-        _, named = engine.named()
-        box.label(text="The engine that is named is not there" if named else "No engine yet", icon="ERROR")
-        lines(box, f"{engine.missing()}." if named else
-              f"Set it up here ({DOWNLOAD}), or name a Python above that has torch.")
+        _, configured = engine.configured_engine()
+        box.label(text="The configured engine is missing" if configured else "No engine yet", icon="ERROR")
+        label_lines(box, f"{engine.missing_reason()}." if configured else
+                    f"Set it up here ({DOWNLOAD_SIZE}), or name a Python with torch above.")
         if not bpy.app.online_access:
-            lines(box, "Set Up Engine needs online access: allow it in System > Network.", "INTERNET_OFFLINE")
+            label_lines(box, "Set Up Engine needs online access: allow it in System > Network.", "INTERNET_OFFLINE")
     else:
         box.label(text=f"Engine: {python}", icon="CHECKMARK")
-    if making is not None and making.state in ("failed", "stopped"):
-        lines(box, making.error, "ERROR")
-        _log_of(box, making)
+    if set_up is not None and set_up.state in ("failed", "stopped"):
+        label_lines(box, set_up.error, "ERROR")
+        _draw_log_button(box, set_up)
     if test is not None and test.running:
         box.label(text="Testing …", icon="SORTTIME")
     elif test is not None and test.state == "done":
@@ -65,41 +71,22 @@ def _draw_engine(layout: Any) -> None:
         box.label(text=f"Fit Flare {result.get('version')}, torch {result.get('torch')}, {result.get('device')}",
                   icon="INFO")
     elif test is not None and test.error:
-        lines(box, test.error, "ERROR")
+        label_lines(box, test.error, "ERROR")
     row = box.row()
     row.operator("fit_flare.test_engine", icon="PLAY")
     row.operator("fit_flare.set_up_engine", icon="IMPORT")
     row.operator("fit_flare.remove_engine", icon="TRASH")
 
 
-def _log_of(layout: Any, job: jobs.Job) -> None:
+def _draw_log_button(layout: Any, job: jobs.Job) -> None:
+    """Draw the button that shows the log of a job."""
     row = layout.row()
     row.alignment = "LEFT"
     row.operator("fit_flare.show_log", icon="TEXT", text="Log").folder = str(job.folder)
 
 
-def own() -> Any:
-    """The preferences; None where the extension is not enabled (loaded from source)."""
-    for name, addon in bpy.context.preferences.addons.items():
-        if name.rpartition(".")[2] == "fit_flare" and addon.preferences is not None:
-            return addon.preferences
-    return None
-
-
-def engine_path() -> str:
-    """The engine set in the preferences; "" where none is, or the extension is not enabled."""
-    preferences = own()
-    return bpy.path.abspath(preferences.engine) if preferences is not None and preferences.engine else ""
-
-
-def library_path() -> str:
-    """The library's folder as set; "" where none is."""
-    preferences = own()
-    return bpy.path.abspath(preferences.library) if preferences is not None and preferences.library else ""
-
-
-class FITFLARE_OT_test_engine(Action, bpy.types.Operator):
-    """Start the engine and ask for its version and device"""
+class FITFLARE_OT_test_engine(GuardedOperator, bpy.types.Operator):
+    """Start the engine and show its version and device"""
 
     bl_idname = "fit_flare.test_engine"
     bl_label = "Test"
@@ -107,16 +94,16 @@ class FITFLARE_OT_test_engine(Action, bpy.types.Operator):
 
     @classmethod
     def why_not(cls, _context: bpy.types.Context) -> str:
-        if engine.find() is None:
-            return "No engine is set up or named"
+        if engine.find_engine() is None:
+            return "No engine is set up or configured"
         return ""
 
     def act(self, _context: bpy.types.Context) -> None:
         engine.test()
 
 
-class FITFLARE_OT_set_up_engine(Action, bpy.types.Operator):
-    """Install the engine (torch and its libraries, 1 GB to download, 3 on Linux) into the extension's own folder"""
+class FITFLARE_OT_set_up_engine(GuardedOperator, bpy.types.Operator):
+    """Install the engine (torch and its libraries; downloads 1 GB, on Linux 3 GB) into a folder of the extension"""
 
     bl_idname = "fit_flare.set_up_engine"
     bl_label = "Set Up Engine"
@@ -126,24 +113,24 @@ class FITFLARE_OT_set_up_engine(Action, bpy.types.Operator):
     def why_not(cls, _context: bpy.types.Context) -> str:
         if not bpy.app.online_access:
             return "Allow Online Access in Preferences > System > Network first"
-        making = engine.setting_up()
-        if making is not None and making.running:
+        job = engine.set_up_job()
+        if job is not None and job.running:
             return "The engine is being set up"
-        return "The engine is at work; wait for it, or cancel it" if jobs.running() else ""
+        return "The engine is running; wait for it, or cancel it" if jobs.running() else ""
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
-        if not engine.was_set_up():
+        if not engine.is_set_up():
             return self.execute(context)
         return context.window_manager.invoke_confirm(
-            self, event, title="Set the engine up again?", message="The one that is there is removed first",
+            self, event, title="Set the engine up again?", message="The installed engine is removed first",
             confirm_text="Set Up Again")
 
     def act(self, _context: bpy.types.Context) -> None:
         engine.set_up()
 
 
-class FITFLARE_OT_remove_engine(Action, bpy.types.Operator):
-    """Delete the engine that Set Up Engine has installed, and free its disk space"""
+class FITFLARE_OT_remove_engine(GuardedOperator, bpy.types.Operator):
+    """Delete the engine that Set Up Engine installed, and free its disk space"""
 
     bl_idname = "fit_flare.remove_engine"
     bl_label = "Remove"
@@ -151,8 +138,8 @@ class FITFLARE_OT_remove_engine(Action, bpy.types.Operator):
 
     @classmethod
     def why_not(cls, _context: bpy.types.Context) -> str:
-        if not engine.was_set_up():
-            return "No engine was set up here; one that is named by its path is not touched"
+        if not engine.is_set_up():
+            return "No engine was installed here; an engine that is set by its path is not deleted"
         return ""
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:

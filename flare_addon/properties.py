@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What a .blend remembers of Fit Flare: the capture, the run, the look with its edits, the bake.
+"""The properties that a .blend stores: the capture, the run, the look with its edits, the bake.
 
-All of it hangs on the scene (`scene.fit_flare`) and on light objects (`object.fit_flare`), so two scenes
-keep two looks, and every number can be animated and driven (`fit_flare.lights[0].intensity`).
+They belong to the scene (`scene.fit_flare`) and to objects (`object.fit_flare`), so each scene has a look of its own,
+and every number can be animated and driven (`fit_flare.lights[0].intensity`).
 """
 from __future__ import annotations
 
@@ -23,33 +23,33 @@ from bpy.props import (
 )
 
 from ..core.choices import ITERATIONS, Mode, Preset
-from ..core.conventions.exposures import LEAST
+from ..core.conventions.exposures import MIN_EXPOSURE
 from ..core.look import Edit
 
-# From 4.5 on a path that may be relative to the .blend has to say so; before, the word is unknown.
-PATH = {"PATH_SUPPORTS_BLEND_RELATIVE"} if bpy.app.version >= (4, 5, 0) else set()
+# From 4.5 on this option permits paths relative to the .blend; earlier versions do not know it.
+PATH_OPTIONS = {"PATH_SUPPORTS_BLEND_RELATIVE"} if bpy.app.version >= (4, 5, 0) else set()
 
 OVERRIDABLE = {"LIBRARY_OVERRIDABLE"}
-"""For what a .blend may say of an object that is linked into it: without, it would be forgotten when it is saved."""
+"""Option for properties of linked objects, whose values would otherwise not be saved."""
 
 PRESETS: tuple[tuple[Preset, str, str], ...] = (
-    ("draft", "Draft", f"A first look in minutes: {ITERATIONS['draft']:,} iterations"),
+    ("draft", "Draft", f"A first result in minutes: {ITERATIONS['draft']:,} iterations"),
     ("standard", "Standard", f"Good for most shots: {ITERATIONS['standard']:,} iterations"),
     ("high", "High", f"For final layers: {ITERATIONS['high']:,} iterations"),
 )
-MODES: tuple[tuple[Mode, str, str, int], ...] = (  # files hold the numbers
-    ("default", "Clean Frames", "The capture has the frames without flare in its folder removed/ (or truth/scene/), "
-     "and they are taken for exact", 0),
-    ("estimated", "Estimated Frames", "Those that Make Clean Frames makes, or the fit itself before it begins: "
-     "they help to find the scene, and by parallax it is told from what they leave of the flare, in a fit that is a "
-     "fifth longer", 2),
-    ("split", "No Clean Frames", "Without frames without flare: scene and flare are told apart by parallax alone, in "
-     "a fit that is a fifth longer", 1),
+MODES: tuple[tuple[Mode, str, str, int], ...] = (  # a .blend stores the numbers
+    ("default", "Exact Clean Frames", "Use the clean frames in the capture's folder removed/ (or truth/scene/) and "
+                                      "take "
+     "them as exact", 0),
+    ("estimated", "Estimated Clean Frames", "Use clean frames that Make Clean Frames estimates, or the fit itself "
+                                            "before "
+     "it starts. The rest of the flare in them is separated by parallax. The fit takes a fifth longer", 2),
+    ("split", "No Clean Frames", "Separate scene and flare by parallax alone. The fit takes a fifth longer", 1),
 )
 
 
-def redraw(_self: Any = None, _context: Any = None) -> None:
-    """Have every 3D viewport drawn again: the overlay shows what was changed."""
+def redraw_viewports(_self: Any = None, _context: Any = None) -> None:
+    """Redraw every 3D view, since a change affects the overlay."""
     manager = getattr(bpy.context, "window_manager", None)
     for window in manager.windows if manager else ():
         for area in window.screen.areas:
@@ -57,8 +57,8 @@ def redraw(_self: Any = None, _context: Any = None) -> None:
                 area.tag_redraw()
 
 
-def _footage(self: Any, _context: Any) -> None:
-    """Show the frames as filmed or without flare behind the cameras."""
+def _update_footage(self: Any, _context: Any) -> None:
+    """Show the frames as filmed, or the clean frames, behind the cameras."""
     from .capture.importer import show_footage
 
     show_footage(self.id_data, self.footage)
@@ -68,37 +68,42 @@ class Edits:
     """The sliders of a look, for all lights, one light, or one element (core.look.Edit)."""
 
     intensity: FloatProperty(  # type: ignore[valid-type]
-        name="Intensity", description="How bright: a factor on the linear light", default=1.0, min=0.0, soft_max=4.0,
-        max=1000.0, update=redraw)
+        name="Intensity", description="Brightness: a factor on the linear light", default=1.0, min=0.0, soft_max=4.0,
+        max=1000.0, update=redraw_viewports)
     scale: FloatProperty(  # type: ignore[valid-type]
-        name="Scale", description="Size of each ghost, glare and streak about its own centre", default=1.0, min=0.0,
-        soft_max=4.0, max=100.0, update=redraw)
+        name="Scale", description="Size of each ghost, glow and streak about its own centre", default=1.0, min=0.0,
+        soft_max=4.0, max=100.0, update=redraw_viewports)
     spread: FloatProperty(  # type: ignore[valid-type]
-        name="Spread", description="Distance of the ghosts from the light, along the line through the picture's centre",
-        default=1.0, min=0.0, soft_max=3.0, max=100.0, update=redraw)
+        name="Spread", description="Distance of the ghosts from the light, along the line through the centre of the "
+                                   "picture",
+        default=1.0, min=0.0, soft_max=3.0, max=100.0, update=redraw_viewports)
     rotation: FloatProperty(  # type: ignore[valid-type]
-        name="Rotation", description="Turns each ghost, glare and streak about its own centre", default=0.0,
-        subtype="ANGLE", update=redraw)
+        name="Rotation", description="Angle by which each ghost, glow and streak is turned about its own centre",
+        default=0.0,
+        subtype="ANGLE", update=redraw_viewports)
     tint: FloatVectorProperty(  # type: ignore[valid-type]
-        name="Tint", description="Colour on the flare; white leaves it as it was filmed", default=(1.0, 1.0, 1.0),
-        size=3, subtype="COLOR", min=0.0, soft_max=1.0, max=100.0, update=redraw)
+        name="Tint", description="Colour that multiplies the flare; white leaves it as filmed", default=(1.0, 1.0, 1.0),
+        size=3, subtype="COLOR", min=0.0, soft_max=1.0, max=100.0, update=redraw_viewports)
     saturation: FloatProperty(  # type: ignore[valid-type]
-        name="Saturation", description="0 is grey, 1 as it was filmed", default=1.0, min=0.0, soft_max=2.0, max=10.0,
-        update=redraw)
+        name="Saturation", description="Colour saturation of the flare: 0 is grey, 1 as filmed", default=1.0, min=0.0,
+        soft_max=2.0, max=10.0,
+        update=redraw_viewports)
     streak: FloatProperty(  # type: ignore[valid-type]
-        name="Streak Length", description="Stretches the streaks along themselves", default=1.0, min=0.0, soft_max=4.0,
-        max=100.0, update=redraw)
+        name="Streak Length", description="Length of the streaks along their direction", default=1.0, min=0.0,
+        soft_max=4.0,
+        max=100.0, update=redraw_viewports)
     mute: BoolProperty(  # type: ignore[valid-type]
-        name="Mute", description="Leave this out", default=False, update=redraw)
+        name="Mute", description="Do not show this one", default=False, update=redraw_viewports)
     solo: BoolProperty(  # type: ignore[valid-type]
-        name="Solo", description="Leave out all the others", default=False, update=redraw)
+        name="Solo", description="Show only this one, with others that are solo", default=False,
+        update=redraw_viewports)
 
 
 EDIT_NAMES = tuple(entry.name for entry in dataclasses.fields(Edit))
 
 
 def edit_of(sliders: Any) -> Edit:
-    """The edit that sliders (an `Edits` group) stand for."""
+    """Return the edit that a group of sliders makes."""
     red, green, blue = sliders.tint
     return Edit(intensity=sliders.intensity, tint=(red, green, blue), saturation=sliders.saturation,
                 scale=sliders.scale, spread=sliders.spread, rotation=math.degrees(sliders.rotation),
@@ -106,122 +111,135 @@ def edit_of(sliders: Any) -> Edit:
 
 
 class FITFLARE_PG_master(Edits, bpy.types.PropertyGroup):
-    """Sliders of all lights together."""
+    """The sliders of all lights together."""
 
 
 class FITFLARE_PG_element(Edits, bpy.types.PropertyGroup):
-    """Sliders of one element; `name` is the element's in the .flare."""
+    """The sliders of one element; `name` is the name of the element in the .flare."""
 
     kind: StringProperty()  # type: ignore[valid-type]
 
 
 class FITFLARE_PG_light(Edits, bpy.types.PropertyGroup):
-    """One flare in the scene: which light of the .flare it shows, and where. `name` is its layer's."""
+    """One flare in the scene: the light of the .flare whose look it has, and its light object.
+
+    `name` names its layer.
+    """
 
     source: StringProperty(  # type: ignore[valid-type]
-        name="Look", description="The light of the .flare whose look this is")
+        name="Look", description="The light of the .flare whose look this flare has")
     target: PointerProperty(  # type: ignore[valid-type]
-        name="Light", description="The object that the flare comes from: move it and the flare follows",
-        type=bpy.types.Object, update=redraw)
-    identity: StringProperty()  # type: ignore[valid-type]  # by which its baked layers know it under any name
+        name="Light", description="The light object of this flare; the flare follows it",
+        type=bpy.types.Object, update=redraw_viewports)
+    identity: StringProperty()  # type: ignore[valid-type]  # stays when the flare is renamed; the baked layers store it
     elements: CollectionProperty(type=FITFLARE_PG_element)  # type: ignore[valid-type]
     element: IntProperty(name="Element", description="The element whose sliders are shown", default=0)  # type: ignore[valid-type]
     show_elements: BoolProperty(  # type: ignore[valid-type]
         name="Elements", description="Show the sliders of single ghosts, streaks and rings", default=False)
     radius: FloatProperty(  # type: ignore[valid-type]
-        name="Light Size", description="Radius of the light for occlusion, in scene units; 0 takes 2% of its distance. "
-        "The larger, the softer the flare fades behind things", default=0.0, min=0.0, subtype="DISTANCE", update=redraw)
+        name="Light Size", description="Radius of the light for occlusion, in scene units; 0 uses 2% of its distance. "
+        "With a larger radius the flare fades more softly behind objects", default=0.0, min=0.0, subtype="DISTANCE",
+        update=redraw_viewports)
 
 
 class FITFLARE_PG_scene(bpy.types.PropertyGroup):
-    """Everything of one scene."""
+    """The properties of a scene."""
 
     capture: StringProperty(  # type: ignore[valid-type]
         name="Capture", description="Folder with images/, a camera solve and lights.json", subtype="DIR_PATH",
-        options=PATH)
+        options=PATH_OPTIONS)
     root: PointerProperty(  # type: ignore[valid-type]
-        name="Root", description="The empty that carries the imported capture: move, turn or scale it as you like",
-        type=bpy.types.Object, update=redraw)
+        name="Root", description="The parent object of the imported capture; move, rotate or scale it to place the "
+                                 "capture",
+        type=bpy.types.Object, update=redraw_viewports)
 
     known_lights: StringProperty()  # type: ignore[valid-type]
     footage: EnumProperty(  # type: ignore[valid-type]
         name="Footage", description="Which frames are shown behind the cameras",
         items=(("images", "As Filmed", "The frames with their own flare"),
-               ("removed", "Without Flare", "The frames of removed/, to see the flare over a clean plate")),
-        update=_footage)
+               ("removed", "Clean", "The clean frames of removed/, to see the flare without the one in the footage")),
+        update=_update_footage)
 
     matte: StringProperty(  # type: ignore[valid-type]
-        name="Matte", description="Where the flares are, white on black, roughly painted: a picture for all frames, or "
-        "a folder with one for each, of its name. Faint flares are taken too then, and nothing elsewhere. Empty has "
-        "them found", subtype="FILE_PATH", options=PATH)
+        name="Matte", description="Where the flares are, roughly painted in white on black: one picture for all "
+                                  "frames, or a "
+        "folder with one of the same name for each. Inside, faint flares are removed too; outside, nothing is. Empty: "
+        "the network finds the flares", subtype="FILE_PATH", options=PATH_OPTIONS)
     keep_glow: BoolProperty(  # type: ignore[valid-type]
-        name="Keep Glow", description="Leave the glow round the lights in the clean frames: it stays with the scene, "
-        "and the flare is learned without it", default=False)
+        name="Keep Glow", description="Keep the glow about the lights in the clean frames: it stays in the scene, and "
+                                      "the "
+        "flare is learned without it", default=False)
     run: StringProperty(  # type: ignore[valid-type]
         name="Run", description="Folder of the fit: settings, checkpoint, preview and result", subtype="DIR_PATH",
-        options=PATH)
+        options=PATH_OPTIONS)
     preset: EnumProperty(  # type: ignore[valid-type]
-        name="Quality", description="How long and how fine the fit is", items=PRESETS, default="draft")
+        name="Preset", description="Length and size of the fit", items=PRESETS, default="draft")
     mode: EnumProperty(  # type: ignore[valid-type]
-        name="Supervision", description="What there is of frames without flare, from which the scene is learned",
+        name="Supervision", description="Which clean frames supervise the scene in the fit",
         items=MODES)
     width: IntProperty(  # type: ignore[valid-type]
-        name="Width", description="Work at this width in pixels at most; 0 takes the frames' own", default=0, min=0,
+        name="Width", description="Width in pixels to fit at, at most; 0 uses the width of the frames", default=0,
+        min=0,
         max=16384)
 
     flare: StringProperty(  # type: ignore[valid-type]
-        name="Flare", description="The .flare file that is shown", subtype="FILE_PATH",
-        options=PATH, update=redraw)
+        name="Flare", description="The .flare file that the scene shows", subtype="FILE_PATH",
+        options=PATH_OPTIONS, update=redraw_viewports)
     native: BoolProperty(  # type: ignore[valid-type]
-        name="Of This Capture", description="The flare was learned from the imported capture, so its appearance "
-        "follows the camera; in another scene it keeps its middle look", default=False, update=redraw)
+        name="Of This Capture", description="The flare was learned from the imported capture, so its look follows the "
+                                            "camera; in "
+        "another scene it keeps the look of one training view", default=False, update=redraw_viewports)
     lights: CollectionProperty(type=FITFLARE_PG_light)  # type: ignore[valid-type]
     light: IntProperty(name="Light", description="The light whose sliders are shown", default=0)  # type: ignore[valid-type]
     master: PointerProperty(type=FITFLARE_PG_master)  # type: ignore[valid-type]
     show: BoolProperty(  # type: ignore[valid-type]
-        name="Show in Viewport", description="Draw the flare over the camera view", default=True, update=redraw)
+        name="Show in Viewport", description="Draw the flare over the camera view", default=True,
+        update=redraw_viewports)
     occlusion: BoolProperty(  # type: ignore[valid-type]
-        name="Hide behind Objects", description="Fade the flare where an object stands between camera and light",
-        default=True, update=redraw)
+        name="Hide behind Objects", description="Fade the flare where an object is between camera and light",
+        default=True, update=redraw_viewports)
 
     layers: StringProperty(  # type: ignore[valid-type]
         name="Layers", description="Folder for the EXR layers", subtype="DIR_PATH",
-        options=PATH)
+        options=PATH_OPTIONS)
     bake_range: EnumProperty(  # type: ignore[valid-type]
         name="Frames", description="Which frames are baked",
-        items=(("scene", "Scene Range", "All frames of the scene"), ("current", "Current", "This frame alone"),
-               ("custom", "Custom", "From one frame to another")))
+        items=(("scene", "Scene Range", "All frames of the scene"), ("current", "Current", "The current frame alone"),
+               ("custom", "Custom", "From a first to a last frame")))
     bake_first: IntProperty(name="First", description="First frame to bake", default=1)  # type: ignore[valid-type]
     bake_last: IntProperty(name="Last", description="Last frame to bake", default=1)  # type: ignore[valid-type]
     bake_scene: BoolProperty(  # type: ignore[valid-type]
-        name="Fitted Scene Too", description="Render the scene that the fit learned as a layer; else there are layers "
-        "of the flare alone", default=False)
+        name="Fitted Scene Too", description="Also render the scene of the fit as a layer; without it there are layers "
+                                             "of the "
+        "flare alone", default=False)
     bake_live: BoolProperty(  # type: ignore[valid-type]
-        name="Keep Colours Live", description="Leave Intensity, Tint, Mute and Solo of whole lights out of the layers: "
-        "the compositor applies them, so they can be changed without baking again", default=True)
+        name="Keep Colours Live", description="Do not bake Intensity, Tint, Mute and Solo of lights into the layers; "
+                                              "the "
+        "compositor applies them, so you can change them without baking again", default=True)
     over: EnumProperty(  # type: ignore[valid-type]
-        name="Over", description="What the flare is laid over in the compositor",
-        items=(("present", "Present Image", "What the compositor shows now, or the render"),
-               ("plate", "Footage", "The capture's frames"),
+        name="Over", description="What the compositor puts the flare over",
+        items=(("present", "Present Image", "The present output of the compositor, or the render"),
+               ("plate", "Footage", "The frames behind the camera"),
                ("scene", "Baked Scene", "The fitted scene in the layers")))
 
 
 class FITFLARE_PG_object(bpy.types.PropertyGroup):
-    """Of a light object, or a camera's."""
+    """The properties of a light object or a camera."""
 
     is_light: BoolProperty(  # type: ignore[valid-type]
         name="Light of the Capture", description="The fit learns a flare for this object", default=False,
         override=OVERRIDABLE)
     light: StringProperty(  # type: ignore[valid-type]
-        name="Light Name", description="Name of the light in lights.json and the .flare", override=OVERRIDABLE)
+        name="Light Name", description="Name of the light in lights.json and in the .flare", override=OVERRIDABLE)
     is_points: BoolProperty()  # type: ignore[valid-type]
     is_root: BoolProperty()  # type: ignore[valid-type]
     is_made: BoolProperty()  # type: ignore[valid-type]
-    view: StringProperty(name="Frame", description="Name of the frame of the capture that this camera is")  # type: ignore[valid-type]
+    view: StringProperty(name="Frame", description="Name of the capture's frame that this camera belongs to")  # type: ignore[valid-type]
     exposure: FloatProperty(  # type: ignore[valid-type]
-        name="Exposure", description="Light on this camera's frame, in parts of a usual one's: its flare is as much "
-        "brighter. A fit sets and animates it for a capture whose exposure changes", default=1.0, min=LEAST,
-        max=1 / LEAST, soft_min=0.1, soft_max=10.0, update=redraw, override=OVERRIDABLE)
+        name="Exposure", description="Exposure of this camera relative to the median frame: a factor on its flare. A "
+                                     "fit "
+        "sets and animates it for a capture whose exposure changes", default=1.0, min=MIN_EXPOSURE,
+        max=1 / MIN_EXPOSURE, soft_min=0.1, soft_max=10.0, update=redraw_viewports, override=OVERRIDABLE)
 
 
 _CLASSES = (FITFLARE_PG_master, FITFLARE_PG_element, FITFLARE_PG_light, FITFLARE_PG_scene, FITFLARE_PG_object)

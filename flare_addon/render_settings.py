@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Frames out of a scene: its size, range and view as the footage has them, and files that are whole or absent."""
+"""Render settings that match the footage, and atomic writing of rendered frames and .blend files."""
 from __future__ import annotations
 
 import contextlib
@@ -12,49 +12,53 @@ import bpy
 
 from ..core.bake.folder import LayerFolder
 from ..core.errors import FrameError
-from ..core.images.exr import exr_is_cut_off
+from ..core.images.exr import is_exr_truncated
 from ..core.system.files import atomic_path
-from .paths import absolute, stored
+from .paths import absolute, blend_relative
 
 PLAIN_VIEWS = ("Standard", "Un-tone-mapped")  # of Blender's own colour configuration, and of ACES'
 
 
 def match_scene(scene: Any, layers: LayerFolder, size: tuple[int, int]) -> None:
-    """Give the scene the layers' frames and size (width, height), and stand on one of those frames. Its pixels keep
-    their aspect: the camera goes by that."""
+    """Set frame range and size (width, height) of the scene to the layers', and go to one of their frames.
+
+    The pixel aspect is kept, since the camera depends on it.
+    """
     scene.frame_start, scene.frame_end = layers.first, layers.last
-    if not layers.first <= scene.frame_current <= layers.last:  # where there is nothing to see
+    if not layers.first <= scene.frame_current <= layers.last:  # a frame without layers
         scene.frame_set(layers.first)
     render = scene.render
     render.resolution_x, render.resolution_y = size
     render.resolution_percentage = 100
 
 
-def plain_view(scene: Any) -> str:
-    """Show pictures with no look and no dithering, as the footage was. Returns what `show_as_filmed` does."""
+def set_plain_view(scene: Any) -> str:
+    """Switch look and dithering off, and show pictures as filmed. Returns what `show_as_filmed` does."""
     scene.render.dither_intensity = 0.0
     return show_as_filmed(scene)
 
 
 def show_as_filmed(scene: Any) -> str:
-    """Show pictures as they are on the screen that they were made for; Blender's own view is AgX. Returns a sentence
-    where the colour configuration has no view for it, "" where it has."""
+    """Choose the view transform that shows pictures unchanged, in place of Blender's default AgX.
+
+    Returns a sentence where the colour configuration has no such view, "" where it has.
+    """
     view = scene.view_settings
     view.look, view.exposure, view.gamma = "None", 0.0, 1.0
     for name in PLAIN_VIEWS:
         with contextlib.suppress(TypeError):  # the configuration has none of that name
             view.view_transform = name
             return ""
-    return (f"The colour configuration has no view {' or '.join(PLAIN_VIEWS)}, which shows footage as it is; it is "
+    return (f"The colour configuration has no view {' or '.join(PLAIN_VIEWS)}, which shows footage unchanged; it is "
             f"shown by {view.view_transform}: choose another in the scene's colour management.")
 
 
 def render_frames(scene: Any, frames: Iterable[int], path_of: Callable[[int, str], Path],
                   done: Callable[[int], None] = lambda _frame: None) -> None:
-    """Render frames through the compositor: a half-float EXR and an 8 bit PNG each, written atomically.
+    """Render frames through the compositor, each to a half-float EXR and an 8 bit PNG, written atomically.
 
-    path_of: from a frame's number and a suffix (".exr", ".png") to the file. The EXR is scene-linear, the
-    PNG as the scene's view shows it (see `plain_view`). done: called after each frame.
+    path_of: the file for a frame's number and a suffix (".exr", ".png"). The EXR is scene-linear, the PNG is as the
+    scene's view transform shows it (see `set_plain_view`). done: called after each frame. Raises FrameError.
     """
     if hasattr(scene.render, "compositor_device"):
         scene.render.compositor_device = "CPU"
@@ -67,26 +71,27 @@ def render_frames(scene: Any, frames: Iterable[int], path_of: Callable[[int, str
                 try:
                     _render_result().save_render(str(temporary), scene=scene)
                 except RuntimeError as problem:
-                    raise _unwritten(temporary) from problem
-                if not _is_whole(temporary):
-                    raise _unwritten(temporary)
+                    raise _incomplete_file(temporary) from problem
+                if not _is_complete(temporary):
+                    raise _incomplete_file(temporary)
         done(frame)
 
 
-_ENDS = {".png": b"IEND", ".blend": b"ENDB"}
+_END_MARKS = {".png": b"IEND", ".blend": b"ENDB"}
 _LAST_BLOCK = 32
-"""Bytes at most of a file's last block, which begins with its name or has it before a checksum."""
+"""Largest size in bytes of the last block of a file; the block has the mark at its start or before a checksum."""
 
 
-def _is_whole(path: Path) -> bool:
-    """Of a file that Blender has written: it does not say so when a disk fills up meanwhile."""
+def _is_complete(path: Path) -> bool:
+    """Return whether a file that Blender wrote is complete; Blender does not report a disk that became full."""
     if path.suffix == ".exr":
-        return path.stat().st_size > 0 and not exr_is_cut_off(path)
-    return _ENDS[path.suffix] in path.read_bytes()[-_LAST_BLOCK:]
+        return path.stat().st_size > 0 and not is_exr_truncated(path)
+    return _END_MARKS[path.suffix] in path.read_bytes()[-_LAST_BLOCK:]
 
 
-def _unwritten(path: Path) -> FrameError:
-    return FrameError(f"Blender could not write a whole file to {path.parent}; make room there, or choose another "
+def _incomplete_file(path: Path) -> FrameError:
+    """Return the error for a file that Blender could not write."""
+    return FrameError(f"Blender could not write a complete file to {path.parent}; make room there, or choose another "
                       "folder.")
 
 
@@ -104,22 +109,22 @@ def _set_format(settings: Any, suffix: str) -> None:
         settings.exr_codec = "ZIP"
 
 
-def save_beside(path: Path) -> None:
-    """Save the file, with paths relative to it wherever they can be."""
+def save_blend(path: Path) -> None:
+    """Save the .blend at `path` atomically, with relative paths where possible. Raises FrameError."""
     preferences = bpy.context.preferences.filepaths
     versions = preferences.save_version
-    preferences.save_version = 0  # no .blend1 of a file that is made anew
+    preferences.save_version = 0  # no .blend1 backup of the temporary file
     try:
         with atomic_path(path) as temporary:
             try:
                 bpy.ops.wm.save_as_mainfile(filepath=os.fspath(temporary))
                 for image in bpy.data.images:
                     if image.source == "SEQUENCE":
-                        image.filepath = stored(absolute(image.filepath))
+                        image.filepath = blend_relative(absolute(image.filepath))
                 bpy.ops.wm.save_as_mainfile(filepath=os.fspath(temporary), compress=False)
             except RuntimeError as problem:
-                raise _unwritten(temporary) from problem
-            if not _is_whole(temporary):
-                raise _unwritten(temporary)
+                raise _incomplete_file(temporary) from problem
+            if not _is_complete(temporary):
+                raise _incomplete_file(temporary)
     finally:
         preferences.save_version = versions

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What buttons tell people: why they cannot be pressed, and what went wrong, in a sentence, never a traceback."""
+"""Reports of operators: why a button is disabled, and what went wrong, as one sentence instead of a traceback."""
 from __future__ import annotations
 
 import contextlib
@@ -7,19 +7,19 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
-from ..core.errors import FitFlareError, refusal
+from ..core.errors import FitFlareError, os_error_message
 
 
 @dataclass
 class Outcome:
-    """What an operator returns: FINISHED, or CANCELLED once something went wrong."""
+    """The return value of an operator: FINISHED, or CANCELLED after an error."""
 
     status: set[str] = field(default_factory=lambda: {"FINISHED"})
 
 
 @contextlib.contextmanager
-def reported(operator: Any) -> Iterator[Outcome]:
-    """Run a block; what goes wrong in a way meant for the user becomes the operator's error report."""
+def report_errors(operator: Any) -> Iterator[Outcome]:
+    """Run a block; a FitFlareError or OSError becomes the operator's error report."""
     outcome = Outcome()
     try:
         yield outcome
@@ -27,40 +27,40 @@ def reported(operator: Any) -> Iterator[Outcome]:
         operator.report({"ERROR"}, str(problem))
         outcome.status = {"CANCELLED"}
     except OSError as problem:
-        operator.report({"ERROR"}, refusal(problem))
+        operator.report({"ERROR"}, os_error_message(problem))
         outcome.status = {"CANCELLED"}
 
 
-class Action:
-    """For an operator to inherit beside bpy.types.Operator: `why_not` greys its button out, `act` does the work."""
+class GuardedOperator:
+    """Mixin for operators: `why_not` disables the button, `act` does the work, and errors of it are reported."""
 
     changes_scene: ClassVar[bool] = True
-    """Whether it needs a scene that can be changed, which a linked one cannot."""
+    """Whether the operator changes the scene, which is not possible for a linked one."""
 
     @classmethod
     def why_not(cls, _context: Any) -> str:
-        """Why it cannot run now, as its tooltip says it; "" where it can."""
+        """Return why the operator cannot run now, for the tooltip; "" where it can."""
         return ""
 
     @classmethod
     def poll(cls, context: Any) -> bool:
-        """Blender's question whether the button can be pressed."""
+        """Return to Blender whether the button is enabled."""
         why = LINKED if cls.changes_scene and context.scene.library is not None else cls.why_not(context)
         if why:
             cls.poll_message_set(why)  # type: ignore[attr-defined]  # Operator's
         return not why
 
     def act(self, _context: Any) -> None:
-        """The work; what goes wrong is raised."""
+        """Do the work. Raises FitFlareError and OSError."""
 
     def execute(self, context: Any) -> set[str]:
-        """Blender's call: the work, and a report of what went wrong."""
-        with reported(self) as outcome:
+        """Do the work when Blender calls the operator, and report errors."""
+        with report_errors(self) as outcome:
             self.act(context)
         return outcome.status
 
 
-LINKED = "The scene is linked from another file, and nothing in it can be changed here: append it, or open that file"
+LINKED = "The scene is linked from another file and cannot be changed here: append it, or open that file"
 NO_FLARE = "Fit or open a flare first"
 NO_CAMERA = "The scene has no camera"
 NO_CAPTURE = "Import a capture first"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The scene's cameras, lights and sliders, frame by frame, written down for the engine to bake."""
+"""Bakes: writes the cameras, lights and sliders of a scene frame by frame as a shot, which the engine bakes."""
 from __future__ import annotations
 
 import json
@@ -18,19 +18,19 @@ from ..core.conventions.run_files import FLARE, SCENE
 from ..core.errors import CaptureError, FrameError, RunError, SettingsError
 from ..core.look import Edit, LookEdits
 from ..core.look.shot import Shot, ShotFrame
-from ..core.system.files import digest_of, remove_file, write_json
+from ..core.system.files import hash_files, remove_file, write_json
 from . import cameras, engine, fits, jobs, library, looks
-from .images import read_again
+from .images import reload_images
 from .jobs import Job
 from .objects import view_layer_of
-from .paths import absolute, stored
+from .paths import absolute, blend_relative
 
-SHOT = "shot.json"
-LIVE = "live.json"  # lights whose colour was left to the compositor
+SHOT_FILE = "shot.json"
+LIVE_FILE = "live.json"  # the lights whose intensity and tint the compositor applies
 
 
-def frames_of(scene: Any) -> list[int]:
-    """The frames to bake, as the panel asks."""
+def frames_to_bake(scene: Any) -> list[int]:
+    """Return the frames to bake, as set in the panel."""
     state = scene.fit_flare
     if state.bake_range == "current":
         return [scene.frame_current]
@@ -39,63 +39,64 @@ def frames_of(scene: Any) -> list[int]:
     return list(range(scene.frame_start, scene.frame_end + 1))
 
 
-def of_scene(scene: Any, chosen: Sequence[Any], frames: Sequence[int], flare: Path, run: Path | None,
+def scene_shot(scene: Any, camera_objects: Sequence[Any], frames: Sequence[int], flare: Path, run: Path | None,
              done: Callable[[int], None] = lambda _frame: None) -> Shot:
-    """The shot of these camera objects at these frames; of none the scene's own, which markers on the timeline may
-    change from frame to frame, under the name of the first. The scene's current frame is put back.
+    """Return the shot of these camera objects at these frames; the scene's current frame is restored.
 
-    Raises CaptureError for a camera that is no perspective camera, and for a light that is switched off in the viewport
-    and moved there; FlareFileError for a bad .flare, SettingsError for frames below 0, which files have no numbers for.
+    Without camera objects it is the scene's camera, which markers on the timeline may change, under the name of the
+    first one. Raises CaptureError for a camera that is not a perspective camera and for a disabled light that is
+    animated, FlareFileError for a bad .flare, SettingsError for negative frames, which layers cannot be named after.
     """
     if min(frames, default=0) < 0:
-        raise SettingsError(f"Layers of the frame {min(frames)} have no name; begin the frames to bake at 0 or later.")
+        raise SettingsError(f"Frame {min(frames)} cannot be baked, since layers have no negative numbers; start at "
+                            "frame 0 or later.")
     view_layer = view_layer_of(scene)
     before, subframe = scene.frame_current, scene.frame_subframe
-    made: list[ShotFrame] = []
+    shot_frames: list[ShotFrame] = []
     try:
         for frame in frames:
             scene.frame_set(frame)
             depsgraph = view_layer.depsgraph
-            made += [frame_of(scene, depsgraph, camera, frame) for camera in chosen]
-            if not chosen:
-                one = frame_of(scene, depsgraph, scene.camera, frame)
-                made.append(replace(one, name=made[0].name if made else one.name))
+            shot_frames += [shot_frame(scene, depsgraph, camera, frame) for camera in camera_objects]
+            if not camera_objects:
+                one = shot_frame(scene, depsgraph, scene.camera, frame)
+                shot_frames.append(replace(one, name=shot_frames[0].name if shot_frames else one.name))
             done(frame)
     finally:
         scene.frame_set(before, subframe=subframe)
-    return Shot(flare, tuple(made), looks.query_of(scene.fit_flare), run, scene.fit_flare.bake_live)
+    return Shot(flare, tuple(shot_frames), looks.query_of(scene.fit_flare), run, scene.fit_flare.bake_live)
 
 
-def frame_of(scene: Any, depsgraph: Any, camera: Any, frame: int) -> ShotFrame:
-    """One camera as it stands now."""
+def shot_frame(scene: Any, depsgraph: Any, camera: Any, frame: int) -> ShotFrame:
+    """Return the frame of a shot for one camera at the current frame of the scene."""
     evaluated = camera.evaluated_get(depsgraph)
-    pose, lights = looks.placed(scene, depsgraph, camera)
+    pose, lights = looks.place_lights(scene, depsgraph, camera)
     core = cameras.core_camera(evaluated.data, evaluated.matrix_world, scene.render)
     edits = looks.edits_of(scene.fit_flare)
     if scene.fit_flare.bake_live:
-        edits = without_live(edits)
-    words = _of_lights(edits, {light.name for light in lights}).words()
+        edits = without_live_edits(edits)
+    edit_texts = _for_lights(edits, {light.name for light in lights}).texts()
     seen_by = replace(core, world_to_camera=pose, exposure=evaluated.fit_flare.exposure)
-    return ShotFrame(frame, camera.name, seen_by, tuple(lights), tuple(words))
+    return ShotFrame(frame, camera.name, seen_by, tuple(lights), tuple(edit_texts))
 
 
-def without_live(edits: LookEdits) -> LookEdits:
-    """The edits less what the compositor applies: intensity, tint, mute and solo of all lights and of each."""
-    def kept(edit: Edit) -> Edit:
+def without_live_edits(edits: LookEdits) -> LookEdits:
+    """Return the edits without those that the compositor applies: intensity, tint, mute and solo of lights."""
+    def without_live(edit: Edit) -> Edit:
         return replace(edit, intensity=1.0, tint=(1.0, 1.0, 1.0), mute=False, solo=False)
 
-    return LookEdits(kept(edits.master), {name: kept(edit) for name, edit in edits.lights.items()}, edits.elements)
+    return LookEdits(without_live(edits.master), {name: without_live(edit) for name, edit in edits.lights.items()},
+                     edits.elements)
 
 
-def _of_lights(edits: LookEdits, names: set[str]) -> LookEdits:
-    """The edits of these lights: one that is not in the shot has nothing to be edited."""
+def _for_lights(edits: LookEdits, names: set[str]) -> LookEdits:
+    """Return the edits of these lights only, since a shot accepts no edits of other lights."""
     return LookEdits(edits.master, {name: edit for name, edit in edits.lights.items() if name in names},
                      {pair: edit for pair, edit in edits.elements.items() if pair[0] in names})
 
 
-def live_of(state: Any, names: Sequence[str]) -> dict[str, list[str]]:
-    """What is written of flares whose colour is left to the compositor: the names of their layers, and what they are
-    known by when they have others."""
+def live_record(state: Any, names: Sequence[str]) -> dict[str, list[str]]:
+    """Return the contents of LIVE_FILE: the names of the baked lights, and ids that stay when a flare is renamed."""
     identities = {}
     for item in state.lights:
         item.identity = item.identity or uuid4().hex
@@ -104,58 +105,70 @@ def live_of(state: Any, names: Sequence[str]) -> dict[str, list[str]]:
 
 
 def live_layers(state: Any, folder: Path) -> dict[str, int] | None:
-    """Of layers whose colour was left to the compositor, the number of the flare in the scene that each is of; those of
-    flares that are gone are left out. None where the folder, or the one that has it, says nothing of the kind."""
-    folder = next((one for one in (folder, folder.parent) if (one / LIVE).is_file()), folder)
+    """Return the index of the scene's flare for each layer that was baked without intensity and tint.
+
+    Layers of removed flares are left out. None where neither the folder nor its parent has a LIVE_FILE.
+    """
+    folder = next((one for one in (folder, folder.parent) if (one / LIVE_FILE).is_file()), folder)
     try:
-        live = json.loads((folder / LIVE).read_text(encoding="utf-8"))
+        live = json.loads((folder / LIVE_FILE).read_text(encoding="utf-8"))
         baked = layer_names(live["lights"])
         identities = dict(zip(live["lights"], live.get("identities", live["lights"]), strict=True))
     except (OSError, ValueError, KeyError, TypeError):
         return None
-    names, known = ({getattr(item, of): number for number, item in enumerate(state.lights)}
-                    for of in ("name", "identity"))
-    found = {layer: known.get(identities[name], names.get(name)) for name, layer in baked.items()}
-    return {layer: number for layer, number in found.items() if number is not None}
+    by_name, by_identity = ({getattr(item, key): index for index, item in enumerate(state.lights)}
+                            for key in ("name", "identity"))
+    indices = {layer: by_identity.get(identities[name], by_name.get(name)) for name, layer in baked.items()}
+    return {layer: index for layer, index in indices.items() if index is not None}
 
 
-def layers_folder(scene: Any, create: bool = False) -> Path:
-    """The folder of the layers: as chosen, or beside the .blend or the flare."""
+def layers_folder(scene: Any) -> Path:
+    """Return the folder of the scene's layers; an empty path where none is set."""
     state = scene.fit_flare
-    if not state.layers and create:
+    return absolute(state.layers, scene.library) if state.layers else Path()
+
+
+def choose_layers_folder(scene: Any) -> Path:
+    """Set the folder of the scene's layers where none is set: a new one beside the .blend, else beside the flare.
+
+    Returns the folder. Raises RunError without a flare, and where it would be in the library.
+    """
+    state = scene.fit_flare
+    if not state.layers:
         path = looks.path_of(scene)
         if path is None:
             raise RunError("There is no flare to bake; fit one, or open a .flare.")
         base = Path(bpy.data.filepath).parent if bpy.data.filepath else path.parent
         if base.resolve() == library.folder().resolve():
-            raise RunError("Layers do not go into the library of flares; save the .blend first, or choose a folder for "
-                           "Layers.")
+            raise RunError("Layers cannot be written to the library of flares; save the .blend first, or choose a "
+                           "folder for Layers.")
         folder, number = base / "layers", 1
         while folder.exists():
             number += 1
             folder = base / f"layers_{number}"
-        state.layers = stored(folder)
-    return absolute(state.layers, scene.library) if state.layers else Path()
+        state.layers = blend_relative(folder)
+    return layers_folder(scene)
 
 
-def folder_of_camera(layers: Path, camera: Any) -> Path:
-    """Where a camera's layers are, in a folder into which the scene's own or chosen ones were baked. Raises FrameError
-    where there are only others' layers."""
+def camera_folder(layers: Path, camera: Any) -> Path:
+    """Return the folder of a camera's layers, inside the folder of a bake or that folder itself.
+
+    Raises FrameError where there are layers of other cameras only.
+    """
     try:
-        last = Shot.read(layers / SHOT).folders
+        last = Shot.read(layers / SHOT_FILE).folders
     except SettingsError:
         return layers
-    folders = {**_folders_of_all_bakes(layers), **last}
+    folders = {**_baked_folders(layers), **last}
     name = camera.name if camera is not None else ""
     if name not in folders and "" not in last.values() and not any(layers.glob("*.exr")):
         raise FrameError(f"{layers} has no layers of the camera {name!r}, only of {', '.join(map(repr, folders))}; "
-                         "bake it too, or make one of those the scene's camera. One that was renamed needs its name "
-                         "back.")
+                         "bake it too, or make one of those the scene's camera. A renamed camera needs its old name.")
     return layers / folders.get(name, "")
 
 
-def _folders_of_all_bakes(layers: Path) -> dict[str, str]:
-    """Of each camera whose layers a folder has, those of bakes before the last too, the folder in it."""
+def _baked_folders(layers: Path) -> dict[str, str]:
+    """Return the subfolder of each camera in a folder of layers, also of cameras of earlier bakes."""
     try:
         entries = bakes.read_record(layers)["frames"]
     except RunError:
@@ -164,83 +177,88 @@ def _folders_of_all_bakes(layers: Path) -> dict[str, str]:
             if "/" in entry["view"]}
 
 
-def replaced(scene: Any, chosen: Sequence[Any]) -> list[int]:
-    """Numbers of the frames whose layers a bake would take out of the folder: they were baked from another flare, of
-    other lights or colours, and are not asked for now. Raises FitFlareError of every kind."""
-    folder, frames = layers_folder(scene), frames_of(scene)
+def frames_to_replace(scene: Any, camera_objects: Sequence[Any]) -> list[int]:
+    """Return the numbers of the frames whose layers a bake would delete.
+
+    They were baked from another flare, or with other lights or colours, and are not among the frames to bake. Raises
+    FitFlareError.
+    """
+    folder, frames = layers_folder(scene), frames_to_bake(scene)
     if not scene.fit_flare.layers or not (folder / bakes.RECORD).exists():
         return []
-    shot = _shot(scene, chosen, frames[:1])  # has the lights and cameras of all
+    shot = _panel_shot(scene, camera_objects, frames[:1])  # one frame has all lights and cameras
     files = {layers_file(inner, frame) for inner in shot.folders.values() for frame in frames}
 
     def fingerprint() -> str:
         run = shot.run
-        return shot.fingerprint("" if run is None else digest_of(run / name for name in (SCENE, FLARE)))
+        return shot.fingerprint("" if run is None else hash_files(run / name for name in (SCENE, FLARE)))
 
     return bakes.replaced(folder, fingerprint, shot.lights, files)
 
 
-def losing(folder: Path, frames: Sequence[int]) -> str:
-    """That a bake would take these frames out of the folder of the layers, and what to do."""
+def replacement_warning(folder: Path, frames: Sequence[int]) -> str:
+    """Return the warning that a bake would delete the layers of these frames."""
     which = f"frame {frames[0]}" if len(frames) == 1 else f"{len(frames)} frames from {frames[0]} to {frames[-1]}"
-    return (f"{folder} has layers of {which} that were baked from another flare or with other lights or colours, and "
-            "that would go: bake them too, or choose another folder for Layers.")
+    return (f"{folder} has layers of {which} that were baked from another flare or with other lights or colours. They "
+            "would be deleted: bake them too, or choose another folder for Layers.")
 
 
-def _shot(scene: Any, chosen: Sequence[Any], frames: Sequence[int]) -> Shot:
-    """What the panel asks for, at these frames."""
-    shot = of_scene(scene, chosen, frames, looks.look_of(scene).path.resolve(), _run(scene))
-    return replace(shot, apart=bool(chosen))
+def _panel_shot(scene: Any, camera_objects: Sequence[Any], frames: Sequence[int]) -> Shot:
+    """Return the shot that the panel is set to bake, at these frames."""
+    shot = scene_shot(scene, camera_objects, frames, looks.look_of(scene).path.resolve(), _run_to_bake(scene))
+    return replace(shot, own_folder=bool(camera_objects))
 
 
-def _run(scene: Any) -> Path | None:
-    """The run whose scene is baked too; None where it is not wanted. Raises RunError where there is none."""
+def _run_to_bake(scene: Any) -> Path | None:
+    """Return the run whose scene is baked as well; None where this is off. Raises RunError where there is no run."""
     if not scene.fit_flare.bake_scene:
         return None
-    run = fits.folder_of(scene)
+    run = fits.run_folder(scene)
     if run is None or not (run / SCENE).is_file():
         raise RunError("There is no fitted scene to bake; switch Fitted Scene Too off, or finish a fit.")
     return run.resolve()
 
 
-def jobs_of(scene: Any) -> list[Job]:
-    """The work of the engine that goes on for a scene: its fit, search for lights, cleaning and bake."""
+def running_jobs(scene: Any) -> list[Job]:
+    """Return the running jobs of a scene: fit, light search, clean frames and bake."""
     layers = jobs.find(layers_folder(scene)) if scene.fit_flare.layers else None
-    return [job for job in (*fits.jobs_of(scene), layers) if job is not None and job.running]
+    return [job for job in (*fits.engine_jobs(scene), layers) if job is not None and job.running]
 
 
-def unnamed() -> list[Job]:
-    """Fits and bakes that go on and that no scene names: undoing what followed the start of one forgets it."""
-    found = [job for job in jobs.running() if job.kind in ("fit", "bake")]
-    named = [job for scene in bpy.data.scenes for job in jobs_of(scene)] if found else []
-    return [job for job in found if job not in named]
+def orphaned_jobs() -> list[Job]:
+    """Return running fits and bakes that no scene refers to, as after an undo that reset the scene's folder."""
+    candidates = [job for job in jobs.running() if job.kind in ("fit", "bake")]
+    known = [job for scene in bpy.data.scenes for job in running_jobs(scene)] if candidates else []
+    return [job for job in candidates if job not in known]
 
 
-def bake(scene: Any, chosen: Sequence[Any], *, others_may_go: bool = False) -> Job:
-    """Bake layers of these cameras through the engine, or of the scene's own. others_may_go: frames of the folder that
-    were baked otherwise and are not asked for. Raises FitFlareError of every kind."""
-    if not chosen and scene.camera is None:
+def bake(scene: Any, camera_objects: Sequence[Any], *, replace_others: bool = False) -> Job:
+    """Start a bake of these cameras, or of the scene's camera.
+
+    replace_others: delete layers that `frames_to_replace` returns; without it they are an error. Raises FitFlareError.
+    """
+    if not camera_objects and scene.camera is None:
         raise CaptureError("The scene has no camera to bake from; add one, or import a capture.")
     engine.command()
     state = scene.fit_flare
     if not any(looks.is_placed(item, scene) for item in state.lights):
-        raise RunError("No flare has a light to come from; choose an object for each in the panel Look.")
-    if looks.twice(state):
-        raise RunError(f"Two flares have the name {looks.twice(state)!r}; rename one in the panel Look.")
-    if not others_may_go and (lost := replaced(scene, chosen)):
-        raise RunError(losing(layers_folder(scene), lost))
-    shot, folder = _shot(scene, chosen, frames_of(scene)), layers_folder(scene, create=True)
-    shot.write(folder / SHOT)
+        raise RunError("No flare has a light object; choose one for each in the panel Look.")
+    if looks.duplicate_name(state):
+        raise RunError(f"Two flares have the name {looks.duplicate_name(state)!r}; rename one in the panel Look.")
+    if not replace_others and (replaced := frames_to_replace(scene, camera_objects)):
+        raise RunError(replacement_warning(layers_folder(scene), replaced))
+    shot, folder = _panel_shot(scene, camera_objects, frames_to_bake(scene)), choose_layers_folder(scene)
+    shot.write(folder / SHOT_FILE)
     if state.bake_live:
-        write_json(folder / LIVE, live_of(state, shot.lights))
+        write_json(folder / LIVE_FILE, live_record(state, shot.lights))
     else:
-        remove_file(folder / LIVE)
-    return engine.run("bake", folder, ["bake", folder / SHOT, "--out", folder, "--overwrite"])
+        remove_file(folder / LIVE_FILE)
+    return engine.run("bake", folder, ["bake", folder / SHOT_FILE, "--out", folder, "--overwrite"])
 
 
-def baked(job: Job) -> None:
-    """Show the layers that were baked."""
-    read_again(job.folder)
+def on_bake_finished(job: Job) -> None:
+    """Reload the baked layers that Blender shows."""
+    reload_images(job.folder)
 
 
-jobs.FINISHERS["bake"] = baked
+jobs.ON_FINISHED["bake"] = on_bake_finished

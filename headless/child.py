@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A command of ours in a process of its own, started with `--progress json`: its events, its stop, and what became of
-it. Whoever starts several hears them all in one inbox."""
+"""One of our commands as a child process, started with `--progress json`: its events, its stop and its outcome.
+
+`hand_off` starts one child for a step, `jobs` several; these share one event queue.
+"""
 from __future__ import annotations
 
 import contextlib
@@ -17,96 +19,99 @@ from pathlib import Path
 from typing import Any
 
 from ..core.errors import Cancelled, EngineError, FitFlareError, SettingsError
-from ..core.system.processes import MISUSED, STOPPED, own_group
+from ..core.system.processes import STOPPED, USAGE_ERROR, new_process_group
 
-PATIENCE_S = 60.0  # for a stopped process to write what it must
+KILL_AFTER_S = 60.0  # from an interrupt, for the process to write its state
 POLL_S = 0.2
-LAST_WORDS = 40  # lines
+LOG_TAIL_LINES = 40
 
 Event = dict[str, Any]
-Inbox = queue.Queue[tuple["Child", Event | None]]
-"""What children tell, in the order that it comes; None when one has told all."""
+EventQueue = queue.Queue[tuple["Child", Event | None]]
+"""Events of children in the order of their arrival; None marks the last one of a child."""
 
 
 class Child:
-    """told: the sentence of its error, "" while it has none. last_words: of a child that has ended, what else it wrote.
-    """
+    """A child process. error_text: the message of its error event, "" while there is none. log_tail: the last lines
+    that it wrote to standard error, once it has ended."""
 
-    def __init__(self, command: Sequence[str], environment: Mapping[str, str], inbox: Inbox | None = None) -> None:
-        """Start it. Raises EngineError where the system does not."""
-        self.name, self.told, self.last_words = Path(command[0]).name, "", ""
-        self._inbox: Inbox = queue.Queue() if inbox is None else inbox
-        self._noise = tempfile.TemporaryFile()  # noqa: SIM115 - closed when the process has ended
+    def __init__(self, command: Sequence[str], environment: Mapping[str, str],
+                 event_queue: EventQueue | None = None) -> None:
+        """Start the process. Raises EngineError where the system cannot start it."""
+        self.name, self.error_text, self.log_tail = Path(command[0]).name, "", ""
+        self._event_queue: EventQueue = queue.Queue() if event_queue is None else event_queue
+        self._stderr = tempfile.TemporaryFile()  # noqa: SIM115 - closed when the process has ended
         try:
             self._process = subprocess.Popen(list(command), stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
-                                             stderr=self._noise, env=environment, encoding="utf-8", errors="replace",
-                                             **own_group())
+                                             stderr=self._stderr, env=environment, encoding="utf-8", errors="replace",
+                                             **new_process_group())
         except OSError as problem:
-            self._noise.close()
+            self._stderr.close()
             raise EngineError(f"{command[0]} cannot be started ({problem.strerror or problem}).") from problem
-        threading.Thread(target=self._listen, daemon=True).start()
+        threading.Thread(target=self._read_events, daemon=True).start()
 
     @property
     def status(self) -> int | None:
-        """None while it runs."""
+        """The exit status; None while the process runs."""
         return self._process.poll()
 
     def events(self) -> Iterator[Event]:
-        """What it tells, to its end; of one that has an inbox of its own."""
+        """Yield the events until the process ends; only for a child with an event queue of its own."""
         while True:
-            heard = next_event(self._inbox)
-            if heard is not None:
-                if heard[1] is None:
+            item = next_event(self._event_queue)
+            if item is not None:
+                if item[1] is None:
                     return
-                yield heard[1]
+                yield item[1]
 
     def interrupt(self) -> None:
-        """Ask it to stop. A second time ends it at once."""
+        """Ask the process to stop; the second call ends it at once."""
         with contextlib.suppress(OSError):
             self._process.send_signal(getattr(signal, "CTRL_BREAK_EVENT", signal.SIGINT))
 
-    def end(self) -> None:
-        """Wait for it, and kill it where that takes too long."""
-        until = time.monotonic() + PATIENCE_S
+    def wait_or_kill(self) -> None:
+        """Wait for the process to end, and kill it after `KILL_AFTER_S`."""
+        deadline = time.monotonic() + KILL_AFTER_S
         while self.status is None:
-            if time.monotonic() > until:
+            if time.monotonic() > deadline:
                 self._process.kill()
             with contextlib.suppress(subprocess.TimeoutExpired):
                 self._process.wait(POLL_S)
-        if not self._noise.closed:
-            self._noise.seek(0)
-            lines = self._noise.read().decode("utf-8", "replace").splitlines(keepends=True)
-            self.last_words = "".join(lines[-LAST_WORDS:])
-            self._noise.close()
+        if not self._stderr.closed:
+            self._stderr.seek(0)
+            lines = self._stderr.read().decode("utf-8", "replace").splitlines(keepends=True)
+            self.log_tail = "".join(lines[-LOG_TAIL_LINES:])
+            self._stderr.close()
 
-    def failure(self) -> FitFlareError:
-        """Its sentence, as the error that its status says."""
-        return {STOPPED: Cancelled, MISUSED: SettingsError}.get(self.status or 0, FitFlareError)(self.told)
+    def to_error(self) -> FitFlareError:
+        """Return the error that its exit status stands for, with its message."""
+        return {STOPPED: Cancelled, USAGE_ERROR: SettingsError}.get(self.status or 0, FitFlareError)(self.error_text)
 
-    def _listen(self) -> None:
-        """In a thread, since on Windows Ctrl-C does not interrupt who reads from a pipe."""
+    def _read_events(self) -> None:
+        """Queue the events, in a thread, since on Windows Ctrl-C does not interrupt reading from a pipe."""
         assert self._process.stdout is not None
         with self._process.stdout as lines:
             for line in lines:
-                event = _event(line)
+                event = _parse_event(line)
                 if event.get("type") == "error":
-                    self.told = str(event.get("text", ""))
+                    self.error_text = str(event.get("text", ""))
                 if event:
-                    self._inbox.put((self, event))
-        self._inbox.put((self, None))
+                    self._event_queue.put((self, event))
+        self._event_queue.put((self, None))
 
 
-def next_event(inbox: Inbox) -> tuple[Child, Event | None] | None:
-    """What one of the children tells next; None where all are silent for a moment: on Windows a stop is heard between
-    two waits alone."""
+def next_event(event_queue: EventQueue) -> tuple[Child, Event | None] | None:
+    """Return the next child and event; None after `POLL_S` without any.
+
+    The wait is bounded because Windows delivers Ctrl-C only between two waits.
+    """
     try:
-        return inbox.get(timeout=POLL_S)
+        return event_queue.get(timeout=POLL_S)
     except queue.Empty:
         return None
 
 
-def _event(line: str) -> Event:
-    """The event that a line holds; {} for the other things that programs print."""
+def _parse_event(line: str) -> Event:
+    """Parse one line of output as an event; return {} for any other text."""
     if not line.startswith("{"):
         return {}
     try:
@@ -116,19 +121,22 @@ def _event(line: str) -> Event:
     return event if isinstance(event, dict) else {}
 
 
-def joint_failure(failed: Sequence[Child], count: int, step: str) -> FitFlareError:
-    """One error for those of `count` processes of a step that have ended and failed, with the sentence of each; of the
-    kind that they have in common. EngineError where one gave no reason; its last words are shown."""
-    problems = [child.failure() for child in failed if child.told]
-    told = list(dict.fromkeys(map(str, problems)))
-    if silent := [child for child in failed if not child.told]:
-        said = silent[0].last_words
-        sys.stderr.write(said)
+def combined_error(failed: Sequence[Child], count: int, step: str) -> FitFlareError:
+    """Return one error for the processes that failed, out of `count` of a step, with the message of each.
+
+    Its type is the one that all have in common. It is an EngineError where a process ended without a message; the end
+    of that process's log goes to standard error.
+    """
+    problems = [child.to_error() for child in failed if child.error_text]
+    messages = list(dict.fromkeys(map(str, problems)))
+    if silent := [child for child in failed if not child.error_text]:
+        log_tail = silent[0].log_tail
+        sys.stderr.write(log_tail)
         who = f"{len(silent)} of {count} processes of {step}" if count > 1 else f"{silent[0].name}, for {step},"
         statuses = ", ".join(str(child.status) for child in silent)
-        wrote = "what one wrote last stands above" if count > 1 else "its last words stand above"
-        told.append(f"{who} ended without a reason, status {statuses}; "
-                    f"{wrote if said else 'memory may have been short'}.")
-        return EngineError(" ".join(told))
+        where = "the end of one log is above" if count > 1 else "the end of its log is above"
+        messages.append(f"{who} ended without a message, status {statuses}; "
+                    f"{where if log_tail else 'memory may have been short'}.")
+        return EngineError(" ".join(messages))
     kinds = {type(problem) for problem in problems}
-    return (kinds.pop() if len(kinds) == 1 else FitFlareError)(" ".join(told))
+    return (kinds.pop() if len(kinds) == 1 else FitFlareError)(" ".join(messages))

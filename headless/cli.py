@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The command line: reads the words, runs the command's steps where they belong, ends with one sentence.
+"""The command line: parses the arguments, runs each step of the command in the process that it needs, reports the end.
 
-Status: 0 done; 1 it could not be done, and one sentence says why; 2 the words made no sense; 130 stopped.
+`headless/run.py` calls `main`. A step that needs the other side (torch or Blender) goes to `hand_off`.
+Exit status: 0 done; 1 failed, the last line says why; 2 invalid arguments; 130 stopped.
 """
 from __future__ import annotations
 
@@ -16,33 +17,45 @@ import traceback
 from collections.abc import Iterator, Sequence
 from typing import Any, NoReturn, TextIO
 
-from ..core.errors import Cancelled, EngineError, FitFlareError, SettingsError, is_out_of_memory, refusal
-from ..core.system.processes import DONE, FAILED, MISUSED, STOPPED, WINDOWS
-from ..core.system.progress import JsonProgress, OpenJdProgress, Progress, TerminalProgress, flush_or_drop, stoppable
+from ..core.errors import Cancelled, EngineError, FitFlareError, SettingsError, is_out_of_memory, os_error_message
+from ..core.system.processes import DONE, FAILED, STOPPED, USAGE_ERROR, WINDOWS
+from ..core.system.progress import (
+    JsonProgress,
+    OpenJdProgress,
+    Progress,
+    TerminalProgress,
+    flush_or_drop,
+    stop_on_request,
+)
 from . import hand_off
-from .command import AfterAStop, Command, Step
+from .command import Command, ResumeRule, Step
 from .commands import COMMANDS
 
-_HINTS: dict[AfterAStop, str] = {
-    "goes on": "Give the command again to go on.",
-    "goes on with --resume": "Give the command again with --resume to go on.",
-    "starts over": "Given again, it starts over.",
+_RESUME_HINTS: dict[ResumeRule, str] = {
+    "resumes": "Run the command again to resume.",
+    "resumes with --resume": "Run the command again with --resume to resume.",
+    "starts over": "Run again, the command starts over.",
 }
 
+OPTION_ALIASES = {"--keep-glare": "--keep-glow", "--all-glare": "--all-glow", "--most-lenses": "--max-lenses"}
+"""The current name of each renamed option. The old names still work in this version and print the current one."""
+
 _DESCRIPTION = """\
-Takes lens flares out of footage, learns them, and gives them back as layers.
+Removes lens flares from footage, learns them, and renders them as layers.
 
   python headless/run.py COMMAND …
   blender -b -P headless/run.py -- COMMAND …"""
 
 _EPILOGUE = """\
-Status at the end: 0 done; 1 it could not be done, the last line says why; 2 the words made no sense; 130 stopped.
-`COMMAND --help` tells more."""
+Exit status: 0 done; 1 failed, the last line says why; 2 invalid arguments; 130 stopped.
+`COMMAND --help` describes a command."""
 
 
 class _Parser(argparse.ArgumentParser):
-    """Options by their whole names alone: a part of one may be two options' in the next version, and is none to those
-    who read words before this does."""
+    """Accepts options by their full names only; raises SettingsError for invalid arguments.
+
+    An abbreviation may become ambiguous in the next version, and code that reads argv before the parser misses it.
+    """
 
     def __init__(self, **settings: Any) -> None:
         super().__init__(**settings, allow_abbrev=False)
@@ -51,68 +64,85 @@ class _Parser(argparse.ArgumentParser):
         raise SettingsError(f"{message[0].upper()}{message[1:]} (see {self.prog} --help).")
 
 
-def parser() -> argparse.ArgumentParser:
-    """The parser of all commands, their options and the options that all share."""
+def build_parser() -> argparse.ArgumentParser:
+    """Return the parser of all commands, with their options and the options that all commands share."""
     shared = _Parser(add_help=False)
-    options = shared.add_argument_group("how it runs")
+    options = shared.add_argument_group("general")
     options.add_argument("--progress", choices=("terminal", "json", "openjd"), default="terminal",
-                         help="json: one JSON object a line on standard output, for programs that watch; openjd: "
-                              "lines of the Open Job Description, for farms")
+                         help="how progress is written (default terminal). json: one JSON object per line on "
+                              "standard output, for other programs. openjd: lines of the Open Job Description, for "
+                              "render farms")
     options.add_argument("--engine", metavar="PYTHON",
-                         help="the Python with torch, or the folder of its virtual environment (else this one where "
-                              "it has torch, FIT_FLARE_ENGINE, from Blender the add-on's preferences and what its Set "
-                              "Up Engine has made, .venv in the repository)")
+                         help="the Python with torch, or the folder of its virtual environment (default, in this "
+                              "order: this Python if it has torch, FIT_FLARE_ENGINE, in Blender the add-on's "
+                              "preferences and the engine that Set Up Engine installed, .venv in the repository)")
     options.add_argument("--blender", metavar="PROGRAM",
-                         help="the Blender for the steps that need one (else FIT_FLARE_BLENDER, the bpy package of "
-                              "this Python, `blender` on the PATH, the system's usual places)")
+                         help="the Blender for steps that need one (default, in this order: FIT_FLARE_BLENDER, the bpy "
+                              "package of this Python, `blender` on the PATH, the system's usual places)")
     options.add_argument("--step", help=argparse.SUPPRESS)
-    whole = _Parser(prog="run.py", description=_DESCRIPTION, epilog=f"{_after_a_stop()}\n{_EPILOGUE}",
+    parser_ = _Parser(prog="run.py", description=_DESCRIPTION, epilog=f"{_resume_summary()}\n{_EPILOGUE}",
                     formatter_class=argparse.RawDescriptionHelpFormatter)
-    commands = whole.add_subparsers(dest="command", metavar="COMMAND", required=True)
+    commands = parser_.add_subparsers(dest="command", metavar="COMMAND", required=True)
     for command in COMMANDS.values():
-        one = commands.add_parser(command.name, parents=[shared], help=command.summary,
+        subparser = commands.add_parser(command.name, parents=[shared], help=command.summary,
                                   description=f"{command.summary}\n\n{command.description}",
                                   formatter_class=argparse.RawDescriptionHelpFormatter)
-        command.arguments(one)
-    return whole
+        command.arguments(subparser)
+    return parser_
 
 
-def _after_a_stop() -> str:
-    """What commands do that are given again after Ctrl-C."""
-    ways = {way: [name for name, command in COMMANDS.items() if command.after_a_stop == way] for way in _HINTS}
-    text = "; ".join(f"{', '.join(names)} {way.replace('goes', 'go')}" for way, names in ways.items()
-                     if names and way != "starts over")
-    return textwrap.fill(f"Stopped (Ctrl-C) and given again, {text}; the others start over.", 110)
+def _resume_summary() -> str:
+    """Return the sentence of the help that says which commands resume after Ctrl-C."""
+    by_rule = {rule: [name for name, command in COMMANDS.items() if command.resume_rule == rule]
+               for rule in _RESUME_HINTS}
+    text = "; ".join(f"{', '.join(names)} {rule.replace('resumes', 'resume')}" for rule, names in by_rule.items()
+                     if names and rule != "starts over")
+    return textwrap.fill(f"Stopped with Ctrl-C and run again, {text}. The others start over.", 110)
 
 
-def main(words: Sequence[str]) -> int:
-    """Run the command that `words` ask for; returns the status the process should end with.
+def main(argv: Sequence[str]) -> int:
+    """Run the command that `argv` names; return the exit status of the process.
 
-    An option with nothing behind its "=" counts as not given: the templates of farms cannot leave one out.
+    An option with nothing behind its "=" is ignored, since job templates of farms cannot leave an option out.
     """
-    words = [word for word in words if not (word.startswith("--") and word.find("=") == len(word) - 1)]
+    argv = [arg for arg in argv if not (arg.startswith("--") and arg.find("=") == len(arg) - 1)]
     try:
-        if words:
-            with _progress(words) as progress:
-                status = _status(words, progress)
+        if argv:
+            argv, renamed = _current_options(argv)
+            with _open_progress(argv) as progress:
+                for old, new in renamed.items():
+                    progress.say(f"{old} is now {new}; the old name still works in this version.")
+                status = _exit_status(argv, progress)
         else:
-            parser().print_help(sys.stderr)
-            status = MISUSED
+            build_parser().print_help(sys.stderr)
+            status = USAGE_ERROR
         flush_or_drop(sys.stdout)
         flush_or_drop(sys.stderr)
         return status
-    except OSError:  # whoever listened has gone
+    except OSError:  # the reader of our output has gone
         return FAILED
 
 
-def _status(words: Sequence[str], progress: Progress) -> int:
-    arguments = argparse.Namespace(words=list(words))
+def _current_options(argv: Sequence[str]) -> tuple[list[str], dict[str, str]]:
+    """Return `argv` with renamed options by their current names, and the old names that were used with the new ones."""
+    end = argv.index("--") if "--" in argv else len(argv)
+    current, renamed = list(argv), {}
+    for index, arg in enumerate(argv[:end]):
+        name, equals, value = arg.partition("=")
+        if name in OPTION_ALIASES:
+            renamed[name] = OPTION_ALIASES[name]
+            current[index] = OPTION_ALIASES[name] + equals + value
+    return current, renamed
+
+
+def _exit_status(argv: Sequence[str], progress: Progress) -> int:
+    arguments = argparse.Namespace(argv=list(argv))
     try:
-        if "" in words:
-            raise SettingsError("One of the words is empty; leave it out, or name what it is to be.")
-        arguments = parser().parse_args(words, arguments)
-        with stoppable(progress):
-            result = _run(COMMANDS[arguments.command], arguments, words, progress)
+        if "" in argv:
+            raise SettingsError("One of the arguments is empty; leave it out, or give it a value.")
+        arguments = build_parser().parse_args(argv, arguments)
+        with stop_on_request(progress):
+            result = _run_steps(COMMANDS[arguments.command], arguments, argv, progress)
         progress.close()
         progress.result(**result)
         return DONE
@@ -120,10 +150,10 @@ def _status(words: Sequence[str], progress: Progress) -> int:
         return int(end.code or 0)
     except SettingsError as problem:
         progress.error(str(problem))
-        return MISUSED
+        return USAGE_ERROR
     except (Cancelled, KeyboardInterrupt) as stop:
         command = COMMANDS.get(getattr(arguments, "command", ""))
-        hint = f" {_HINTS[command.after_a_stop]}" if command and isinstance(progress, TerminalProgress) else ""
+        hint = f" {_RESUME_HINTS[command.resume_rule]}" if command and isinstance(progress, TerminalProgress) else ""
         progress.error(f"{str(stop) or 'Stopped.'}{hint}")
         return STOPPED
     except FitFlareError as problem:
@@ -132,35 +162,38 @@ def _status(words: Sequence[str], progress: Progress) -> int:
     except BrokenPipeError:
         raise
     except OSError as problem:
-        progress.error(refusal(problem))
+        progress.error(os_error_message(problem))
         return FAILED
     except Exception as problem:
         looped = problem.__context__
         if isinstance(problem, RuntimeError) and isinstance(looped, OSError) and looped.errno == errno.ELOOP:
-            progress.error(refusal(looped))  # as pathlib tells it before Python 3.13
+            progress.error(os_error_message(looped))  # how pathlib reports it before Python 3.13
             return FAILED
         if is_out_of_memory(problem):
-            progress.error(f"It does not fit into the memory of this machine; {_memory_spared(arguments)}.")
+            progress.error(f"This machine has not enough memory for it; {_memory_advice(arguments)}.")
             return FAILED
         traceback.print_exc()
         progress.error(f"A defect of Fit Flare, please report it: {type(problem).__name__}: {problem}.")
         return FAILED
 
 
-def _memory_spared(arguments: argparse.Namespace) -> str:
-    """What takes less memory, of what this command has."""
-    ways = [way for option, way in (("size", "a smaller --size"), ("jobs", "fewer --jobs"),
+def _memory_advice(arguments: argparse.Namespace) -> str:
+    """Return the advice for a command that ran out of memory, from the options that it has."""
+    advice = [text for option, text in (("size", "a smaller --size"), ("jobs", "fewer --jobs"),
                                     ("processes", "fewer --processes")) if hasattr(arguments, option)]
-    return f"use {', or '.join(ways)}" if ways else "end other programs, or take a larger machine"
+    return f"use {', or '.join(advice)}" if advice else "close other programs, or use a machine with more memory"
 
 
 @contextlib.contextmanager
-def _progress(words: Sequence[str]) -> Iterator[Progress]:
-    """By --progress alone, read before the rest so that misuse is told in the same manner."""
-    told = " ".join(words).replace("--progress=", "--progress ").split("--progress ")[1:]
-    kind = told[-1].split(" ")[0] if told else ""
-    if kind != "json" or "--help" in words:
-        if kind == "openjd" and isinstance(sys.stdout, io.TextIOWrapper):  # read as UTF-8 by farms on every system
+def _open_progress(argv: Sequence[str]) -> Iterator[Progress]:
+    """Open the progress output that --progress names, before the other arguments are parsed.
+
+    So invalid arguments are reported in the same format.
+    """
+    values = " ".join(argv).replace("--progress=", "--progress ").split("--progress ")[1:]
+    kind = values[-1].split(" ")[0] if values else ""
+    if kind != "json" or "--help" in argv:
+        if kind == "openjd" and isinstance(sys.stdout, io.TextIOWrapper):  # farms read UTF-8 on every system
             sys.stdout.reconfigure(encoding="utf-8", errors="replace")
         progress: Progress = OpenJdProgress() if kind == "openjd" else TerminalProgress()
         try:
@@ -168,14 +201,14 @@ def _progress(words: Sequence[str]) -> Iterator[Progress]:
         finally:
             progress.close()
         return
-    # Blender and libraries print as they like: standard output is for events alone, the rest goes to errors.
-    with _pointed_at(2) as events, contextlib.redirect_stdout(sys.stderr):
+    # Blender and libraries print to standard output, which is for events alone: their text goes to standard error.
+    with _redirect_stdout(2) as events, contextlib.redirect_stdout(sys.stderr):
         yield JsonProgress(events)
 
 
 @contextlib.contextmanager
-def _pointed_at(target: int) -> Iterator[TextIO]:
-    """Point standard output at another file descriptor for a while; gives a stream to where it was."""
+def _redirect_stdout(target: int) -> Iterator[TextIO]:
+    """Point standard output at another file descriptor within the block; yield a stream to the original one."""
     sys.stdout.flush()
     before = os.dup(1)
     os.dup2(target, 1)
@@ -190,19 +223,19 @@ def _pointed_at(target: int) -> Iterator[TextIO]:
 
 
 @contextlib.contextmanager
-def _quiet() -> Iterator[None]:
-    """Silence standard output, where Blender writes many lines a frame."""
+def _silence_stdout() -> Iterator[None]:
+    """Discard standard output within the block, since Blender writes many lines per frame."""
     nowhere = os.open(os.devnull, os.O_WRONLY)
     try:
-        with _pointed_at(nowhere):
+        with _redirect_stdout(nowhere):
             yield
     finally:
         os.close(nowhere)
 
 
 @contextlib.contextmanager
-def _torch_loaded() -> Iterator[None]:
-    """Raises EngineError where torch is there and does not load: on Windows that is an OSError, as of a disk."""
+def _report_torch_load_errors() -> Iterator[None]:
+    """Raise EngineError in place of the OSError by which Windows reports that torch cannot be loaded."""
     try:
         yield
     except OSError as problem:
@@ -211,37 +244,40 @@ def _torch_loaded() -> Iterator[None]:
             raise
         cure = "install the Microsoft Visual C++ Redistributable (vc_redist.x64) or " if WINDOWS else ""
         raise EngineError(f"torch of {sys.executable} cannot be loaded ({problem.strerror or problem}); {cure}"
-                          "set the engine up anew.") from problem
+                          "set the engine up again.") from problem
 
 
-def _run(command: Command, arguments: argparse.Namespace, words: Sequence[str], progress: Progress) -> dict[str, Any]:
+def _run_steps(command: Command, arguments: argparse.Namespace, argv: Sequence[str],
+               progress: Progress) -> dict[str, Any]:
+    """Run the steps of a command that these arguments need; return their results together."""
     result: dict[str, Any] = {}
     for step in command.steps:
-        if arguments.step in (None, step.name) and step.wanted(arguments):
-            result.update(_run_step(step, arguments, words, progress))
+        if arguments.step in (None, step.name) and step.is_needed(arguments):
+            result.update(_run_step(step, arguments, argv, progress))
     return result
 
 
-def _run_step(step: Step, arguments: argparse.Namespace, words: Sequence[str], progress: Progress) -> dict[str, Any]:
+def _run_step(step: Step, arguments: argparse.Namespace, argv: Sequence[str], progress: Progress) -> dict[str, Any]:
+    """Run a step here, or in a child process where this one lacks its side; return its result."""
     if arguments.step and step.side == "blender" and "bpy" not in sys.modules:
         try:
-            __import__("bpy")  # this process was started for it, in a Python that has Blender as a module
+            __import__("bpy")  # this process was started for the step, in a Python that has Blender as a module
         except ImportError as problem:
-            raise EngineError(f"Blender's module cannot be loaded here ({problem}). On Linux it wants libraries of "
-                              "X11, on a server too: install what is named (see README.md), or name a Blender with "
-                              "--blender.") from problem
+            raise EngineError(f"Blender's module cannot be loaded here ({problem}). On Linux it needs libraries of "
+                              "X11, on a server too: install the one that is missing (see README.md), or name a "
+                              "Blender with --blender.") from problem
     elsewhere = step.side == "engine" and arguments.engine is not None and not arguments.step
-    if hand_off.here() == step.side and not elsewhere:
-        with _quiet() if step.side == "blender" else _torch_loaded():
+    if hand_off.current_side() == step.side and not elsewhere:
+        with _silence_stdout() if step.side == "blender" else _report_torch_load_errors():
             return step.run(arguments, progress)
     if arguments.step:
         raise EngineError(f"The step {step.name} was handed to {sys.executable}, which has no {step.side} either.")
     try:
-        there = (hand_off.engine_command(arguments.engine) if step.side == "engine"
-                 else hand_off.blender_command(arguments.blender))
+        command = (hand_off.engine_command(arguments.engine) if step.side == "engine"
+                   else hand_off.blender_command(arguments.blender))
     except EngineError as problem:
         if not step.optional:
             raise
-        progress.say(f"Left out: {step.name}. {problem}")
+        progress.say(f"Skipped: {step.name}. {problem}")
         return {}
-    return hand_off.run_there(there, words, step.name, progress)
+    return hand_off.run_in_child(command, argv, step.name, progress)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What a command is: its words on the command line, and its steps with the side each one runs on.
+"""What a command consists of: its arguments on the command line, and its steps with the side that each one runs on.
 
-A step of the "engine" side needs torch, one of the "blender" side needs bpy, and no process ever has
-both: see `hand_off`. Steps hand results on through files; what a step returns (paths and figures,
-JSON-able) becomes part of the command's result.
+A step of the "engine" side needs torch, one of the "blender" side needs bpy, and no process ever has both (see
+`hand_off`). Steps pass data on through files. What a step returns (paths and figures, serialisable as JSON) becomes
+part of the command's result. The modules in `commands` build a `Command` each; `cli` runs them.
 """
 from __future__ import annotations
 
@@ -14,55 +14,57 @@ from typing import Any, Literal
 
 from ..core.errors import SettingsError
 from ..core.system.progress import Progress
-from ..core.typed import MOST_SEED
+from ..core.typed import MAX_SEED
 
 Side = Literal["engine", "blender"]
-AfterAStop = Literal["starts over", "goes on", "goes on with --resume"]
-Run = Callable[[argparse.Namespace, Progress], dict[str, Any]]
+ResumeRule = Literal["starts over", "resumes", "resumes with --resume"]
+StepFunction = Callable[[argparse.Namespace, Progress], dict[str, Any]]
 
 
-def seed(text: str) -> int:
-    """Of all randomness: a whole number that every library takes."""
-    if not text.isdecimal() or int(text) > MOST_SEED:
-        raise argparse.ArgumentTypeError(f"a seed is a whole number from 0 to {MOST_SEED}, not {text!r}")
+def parse_seed(text: str) -> int:
+    """Parse a random seed: a whole number that every library accepts. Raises ArgumentTypeError."""
+    if not text.isdecimal() or int(text) > MAX_SEED:
+        raise argparse.ArgumentTypeError(f"a seed is a whole number from 0 to {MAX_SEED}, not {text!r}")
     return int(text)
 
 
-def from_1(option: str, value: int) -> None:
-    """Raises SettingsError for an option's number below 1."""
+def check_at_least_one(option: str, value: int) -> None:
+    """Raise SettingsError where the number of an option is below 1."""
     if value < 1:
-        raise SettingsError(f"{option} {value} makes no sense; give a number from 1.")
+        raise SettingsError(f"{option} {value} is out of range; give a whole number of 1 or more.")
 
 
-def refuse_useless(words: argparse.Namespace, defaults: Mapping[str, Any], goes_with: str) -> None:
-    """Raises SettingsError for an option that was given and does nothing: who gives it believes that it does.
+def reject_unused_options(args: argparse.Namespace, defaults: Mapping[str, Any], goes_with: str) -> None:
+    """Raise SettingsError for an option that would have no effect with these arguments.
 
-    defaults: of such options by their names in `words`, where they are as if not given. goes_with: what they are for.
+    defaults: the default values of such options, by their names in `args`. goes_with: the option or input that they
+    need.
     """
-    for name, usual in defaults.items():
-        if getattr(words, name) != usual:
-            raise SettingsError(f"--{name.replace('_', '-')} goes with {goes_with}; leave it out.")
+    for name, default in defaults.items():
+        if getattr(args, name) != default:
+            raise SettingsError(f"--{name.replace('_', '-')} is only for {goes_with}; leave it out.")
 
 
 @dataclass(frozen=True)
 class Step:
-    """optional: left out, with a sentence, on a machine that lacks its side. wanted: whether these words ask for it."""
+    """One step of a command. optional: skipped, with a message, on a machine that lacks its side. is_needed: whether
+    these arguments require the step."""
 
     name: str
     side: Side
-    run: Run
+    run: StepFunction
     optional: bool = False
-    wanted: Callable[[argparse.Namespace], bool] = lambda _words: True
+    is_needed: Callable[[argparse.Namespace], bool] = lambda _args: True
 
 
 @dataclass(frozen=True)
 class Command:
-    """summary: one line of the list of commands. description: the head of its own help. after_a_stop: what it does
-    when it is given again after it was stopped."""
+    """One command. summary: its line in the list of commands. description: the text of its own help. arguments: adds
+    its options to a parser. resume_rule: what it does when it is run again after a stop."""
 
     name: str
     summary: str
     description: str
     arguments: Callable[[argparse.ArgumentParser], None]
     steps: tuple[Step, ...]
-    after_a_stop: AfterAStop = "starts over"
+    resume_rule: ResumeRule = "starts over"

@@ -1,25 +1,27 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""--frames: which of the frames that there are a command does, and what it tells of them."""
+"""--frames: selects the frames that a command processes."""
 from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
 
-from ..core.conventions.frame_numbers import Frame, absent, chosen
+from ..core.conventions.frame_numbers import NumberedFrame, missing_numbers, select_frames
 from ..core.system.progress import Progress
 
 
 def add_option(parser: argparse.ArgumentParser,
-               what: str = "frame numbers, such as 1-20,31 or 1-99:2; all where not given") -> None:
-    """--frames."""
-    parser.add_argument("--frames", metavar="A-B", help=what)
+               description: str = "frame numbers, such as 1-20,31 or 1-99:2 (default: all)") -> None:
+    """Add --frames, with this description."""
+    parser.add_argument("--frames", metavar="A-B", help=description)
 
 
-def asked(known: Sequence[Frame], text: str | None, progress: Progress) -> list[Frame]:
-    """The frames of `known` that --frames asks for; what it asks for besides is told. Raises SettingsError where none
-    of them is there."""
-    frames = chosen(known, text)
-    if missing := absent(known, text):
+def select(known: Sequence[NumberedFrame], text: str | None, progress: Progress) -> list[NumberedFrame]:
+    """Return the frames of `known` that --frames selects, and report the selected numbers that do not exist.
+
+    Raises SettingsError where none of them exists.
+    """
+    frames = select_frames(known, text)
+    if missing := missing_numbers(known, text):
         numbers = [frame.number for frame in known]
-        progress.say(f"The frames {missing} are not there: they are {min(numbers)} to {max(numbers)}.")
+        progress.say(f"The frames {missing} do not exist; there are {min(numbers)} to {max(numbers)}.")
     return frames

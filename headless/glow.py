@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""--keep-glare and --all-glare: what becomes of the glow round lights (`core.removal.inference.remover.Glow`)."""
+"""--keep-glow and --all-glow: whether the glow about lights is removed (`core.removal.inference.remover.Glow`)."""
 from __future__ import annotations
 
 import argparse
@@ -10,19 +10,19 @@ if TYPE_CHECKING:
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Of the two, one at most."""
-    either = parser.add_mutually_exclusive_group()
-    either.add_argument("--keep-glare", action="store_true", help="leave the glow round the lights")
-    either.add_argument("--all-glare", action="store_true",
-                        help="take all of it, as a fit wants it; without this lamps at night keep a part, as a clean "
-                             "lens has it")
+    """Add the two options, which exclude each other."""
+    group = parser.add_mutually_exclusive_group()
+    group.add_argument("--keep-glow", action="store_true", help="keep the glow about the lights")
+    group.add_argument("--all-glow", action="store_true",
+                       help="remove all glow, as a fit needs it (default: lamps at night keep a part of theirs, as a "
+                            "clean lens would show it)")
 
 
-def asked(words: argparse.Namespace) -> Glow:
-    """What is asked for; where nothing is, lamps keep theirs."""
-    return "kept" if words.keep_glare else "taken" if words.all_glare else "kept at lamps"
+def glow_mode(args: argparse.Namespace) -> Glow:
+    """Return the remover's setting; lamps keep a part of their glow without either option."""
+    return "kept" if args.keep_glow else "taken" if args.all_glow else "kept at lamps"
 
 
-def is_asked(words: argparse.Namespace) -> bool:
-    """Whether one of the two was given."""
-    return bool(words.keep_glare or words.all_glare)
+def is_set(args: argparse.Namespace) -> bool:
+    """Return whether one of the two options was given."""
+    return bool(args.keep_glow or args.all_glow)

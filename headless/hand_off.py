@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""One process hands a step to another: the engine's to a Python with torch, Blender's to a Blender.
+"""Runs a step in another process: an engine step in a Python with torch, a Blender step in a Blender.
 
-torch never enters a process that has bpy. The other process is this same program with `--step NAME
---progress json`; its events become this process's own, a stop is passed on, and it is never left behind.
+torch never enters a process that has bpy. The child is this same program with `--step NAME --progress json`. Its events
+are forwarded as this process's own, stop signals are forwarded to it, and it always ends before this process does.
 """
 from __future__ import annotations
 
@@ -20,60 +20,63 @@ from types import FrameType
 from typing import Any
 
 from ..core.errors import Cancelled, EngineError
-from ..core.system.processes import DONE, WINDOWS, environment, python_at
+from ..core.system.processes import DONE, WINDOWS, child_environment, find_python
 from ..core.system.progress import Progress, is_hangup, stop_signals
-from .child import Child, joint_failure
+from .child import Child, combined_error
 from .command import Side
 
 ROOT = Path(__file__).resolve().parents[1]
-RUN = ROOT / "headless" / "run.py"
+RUN_SCRIPT = ROOT / "headless" / "run.py"
 
 
-def here() -> Side | None:
-    """The side this process can be; None where it has neither bpy loaded nor torch installed."""
+def current_side() -> Side | None:
+    """Return the side of this process: "blender" with bpy loaded, "engine" with torch installed, else None."""
     if "bpy" in sys.modules:
         return "blender"
     return "engine" if importlib.util.find_spec("torch") else None
 
 
-# ---- who ------------------------------------------------------------------------------------------
+# ---- finding the engine and Blender ---------------------------------------------------------------
 
 
-def engine_command(named: str | None) -> list[str]:
-    """How to start run.py in a Python with torch.
+def engine_command(path: str | None) -> list[str]:
+    """Return the command line that starts run.py in a Python with torch.
 
-    Looked for in this order: `named` (--engine), FIT_FLARE_ENGINE, the add-on's preferences, what its Set Up Engine
-    has made, `.venv` in the repository or beside it. One that is named has to work; EngineError where none does.
+    Searched in this order: `path` (--engine), FIT_FLARE_ENGINE, the add-on's preferences, the engine that its Set Up
+    Engine installed, `.venv` in the repository or beside it. Raises EngineError where a named one has no torch, and
+    where none is found.
     """
-    for where, place in (("--engine", named), ("FIT_FLARE_ENGINE", os.environ.get("FIT_FLARE_ENGINE")),
+    for source, place in (("--engine", path), ("FIT_FLARE_ENGINE", os.environ.get("FIT_FLARE_ENGINE")),
                          ("the add-on's preferences", _engine_in_preferences())):
         if place:
-            python = python_at(Path(place).expanduser())
+            python = find_python(Path(place).expanduser())
             if python is None or not _has_torch(python):
-                raise EngineError(f"The engine that {where} names, {place}, is not a Python with torch; "
+                raise EngineError(f"The engine that {source} names, {place}, is not a Python with torch; "
                                   "install the engine there or name another.")
-            return [str(python), str(RUN)]
-    for folder in (*_set_up_by_the_addon(), ROOT / ".venv", ROOT.parent / ".venv"):
-        python = python_at(folder)
+            return [str(python), str(RUN_SCRIPT)]
+    for folder in (*_addon_environments(), ROOT / ".venv", ROOT.parent / ".venv"):
+        python = find_python(folder)
         if python is not None and _has_torch(python):
-            return [str(python), str(RUN)]
+            return [str(python), str(RUN_SCRIPT)]
     if not (ROOT / "Makefile").exists():  # the extension, as Blender installs it
         raise EngineError("This step needs a Python with torch, and none was found: press Set Up Engine in the "
                           "add-on's preferences, or name one with --engine or FIT_FLARE_ENGINE.")
     raise EngineError(f"This step needs a Python with torch, and none was found: run `make setup` in {ROOT}, or "
-                      "`python -m pip install --group engine -c constraints.txt` there with a Python of yours, or name "
+                      "`python -m pip install --group engine -c constraints.txt` there with your own Python, or name "
                       "one with --engine or FIT_FLARE_ENGINE.")
 
 
 def _engine_in_preferences() -> str:
+    """Return the engine that the add-on's preferences name; "" outside Blender."""
     if "bpy" not in sys.modules:
         return ""
-    from ..flare_addon.preferences import engine_path
+    from ..flare_addon.user_settings import engine_path
 
     return engine_path()
 
 
-def _set_up_by_the_addon() -> list[Path]:
+def _addon_environments() -> list[Path]:
+    """Return the environment that the add-on's Set Up Engine installs; none outside Blender."""
     if "bpy" not in sys.modules:
         return []
     from ..flare_addon import engine
@@ -84,46 +87,46 @@ def _set_up_by_the_addon() -> list[Path]:
 def _has_torch(python: Path) -> bool:
     code = "import importlib.util, sys; sys.exit(importlib.util.find_spec('torch') is None)"
     try:
-        return subprocess.run([str(python), "-c", code], env=environment(), capture_output=True,
+        return subprocess.run([str(python), "-c", code], env=child_environment(), capture_output=True,
                               timeout=60, check=False).returncode == 0
     except (OSError, subprocess.TimeoutExpired):
         return False
 
 
-def blender_command(named: str | None) -> list[str]:
-    """How to start run.py in a Blender.
+def blender_command(program: str | None) -> list[str]:
+    """Return the command line that starts run.py in a Blender.
 
-    Looked for in this order: `named` (--blender) and FIT_FLARE_BLENDER, each a program or a whole command
-    line; Blender as a module of this Python; `blender` on the PATH; the system's usual places.
-    EngineError where there is none.
+    Searched in this order: `program` (--blender) and FIT_FLARE_BLENDER, each a program or a whole command line; Blender
+    as a module of this Python; `blender` on the PATH; the system's usual places. Raises EngineError where a named one
+    is not a program, and where none is found.
     """
-    script = ["-b", "--factory-startup", "-P", str(RUN), "--"]
-    for where, text in (("--blender", named), ("FIT_FLARE_BLENDER", os.environ.get("FIT_FLARE_BLENDER"))):
+    script = ["-b", "--factory-startup", "-P", str(RUN_SCRIPT), "--"]
+    for source, text in (("--blender", program), ("FIT_FLARE_BLENDER", os.environ.get("FIT_FLARE_BLENDER"))):
         if text:
-            words = _command_line(text)
-            if not words or not shutil.which(words[0]):
-                raise EngineError(f"The Blender that {where} names, {text}, is not a program; name another.")
-            return [*words, *script]
+            command = _split_command_line(text)
+            if not command or not shutil.which(command[0]):
+                raise EngineError(f"The Blender that {source} names, {text}, is not a program; name another.")
+            return [*command, *script]
     if importlib.util.find_spec("bpy"):
-        return [sys.executable, str(RUN)]
-    for program in (shutil.which("blender"), *_usual_places()):
-        if program and Path(program).is_file():
-            return [program, *script]
+        return [sys.executable, str(RUN_SCRIPT)]
+    for path in (shutil.which("blender"), *_default_locations()):
+        if path and Path(path).is_file():
+            return [path, *script]
     raise EngineError("This step needs Blender, and none was found: name one with --blender or FIT_FLARE_BLENDER, "
                       "or install the bpy package beside the engine.")
 
 
-def _command_line(text: str) -> list[str]:
-    """The words of a program's path or of a command line; in the latter a path with spaces is quoted."""
+def _split_command_line(text: str) -> list[str]:
+    """Split a command line, in which paths with spaces are quoted; the path of one program stays whole."""
     if Path(text.strip('"')).is_file():
         return [text.strip('"')]
     try:
-        return [word.strip('"') if WINDOWS else word for word in shlex.split(text, posix=not WINDOWS)]
-    except ValueError:  # a quotation mark without its other one
+        return [part.strip('"') if WINDOWS else part for part in shlex.split(text, posix=not WINDOWS)]
+    except ValueError:  # an unclosed quotation mark
         return []
 
 
-def _usual_places() -> Iterator[str]:
+def _default_locations() -> Iterator[str]:
     if sys.platform == "darwin":
         yield "/Applications/Blender.app/Contents/MacOS/Blender"
     elif WINDOWS:
@@ -131,43 +134,43 @@ def _usual_places() -> Iterator[str]:
         yield from (str(path) for path in sorted(folder.glob("Blender */blender.exe"), reverse=True))
 
 
-# ---- how ------------------------------------------------------------------------------------------
+# ---- running a step in a child --------------------------------------------------------------------
 
 
-def with_options(words: Sequence[str], *added: str) -> list[str]:
-    """The command's words with options more, before the "--" after which there are none."""
-    end = words.index("--") if "--" in words else len(words)
-    return [*words[:end], *added, *words[end:]]
+def add_options(argv: Sequence[str], *added: str) -> list[str]:
+    """Return `argv` with more options, before the "--" that ends the options."""
+    end = argv.index("--") if "--" in argv else len(argv)
+    return [*argv[:end], *added, *argv[end:]]
 
 
-def run_there(command: Sequence[str], words: Sequence[str], step: str, progress: Progress) -> dict[str, Any]:
-    """Run one step of the command `words` in another process and return its result.
+def run_in_child(command: Sequence[str], argv: Sequence[str], step: str, progress: Progress) -> dict[str, Any]:
+    """Run one step of the command line `argv` in a child process; return the step's result.
 
-    Raises Cancelled when that process was stopped, SettingsError and FitFlareError with its own sentence when it
-    failed, and EngineError where it cannot be started or ends without a reason.
+    Raises Cancelled where the child was stopped, SettingsError or FitFlareError with its message where it failed, and
+    EngineError where it cannot be started or ends without a message.
     """
-    child = Child([*command, *with_options(words, "--step", step, "--progress", "json")], environment())
+    child = Child([*command, *add_options(argv, "--step", step, "--progress", "json")], child_environment())
     try:
-        with _stops_passed_on(child):
-            result = _relayed(child, progress)
-    except BaseException:  # this process is leaving early
+        with _forward_signals(child):
+            result = _relay_events(child, progress)
+    except BaseException:  # this process ends early
         child.interrupt()
         raise
     finally:
-        child.end()
+        child.wait_or_kill()
     progress.check()
     if child.status != DONE:
-        raise joint_failure([child], 1, step)
+        raise combined_error([child], 1, step)
     return result
 
 
-def _relayed(child: Child, progress: Progress) -> dict[str, Any]:
-    """The child's result, with its other events made this process's own."""
+def _relay_events(child: Child, progress: Progress) -> dict[str, Any]:
+    """Forward the child's events to `progress`; return the data of its result event."""
     result: dict[str, Any] = {}
     done = 0
     for event in child.events():
         kind = event.get("type")
-        with contextlib.suppress(Cancelled):  # the child has been told too, and is heard to its end
+        with contextlib.suppress(Cancelled):  # the child stops as well; its events are read to the end
             if kind == "stage":
                 done = event["done"]
                 progress.stage(event["name"], event["total"], done)
@@ -182,24 +185,24 @@ def _relayed(child: Child, progress: Progress) -> dict[str, Any]:
 
 
 @contextlib.contextmanager
-def _stops_passed_on(child: Child) -> Iterator[None]:
-    """Signals that ask this process to stop reach the child too; it has a process group of its own."""
+def _forward_signals(child: Child) -> Iterator[None]:
+    """Forward stop signals of this process to the child within the block; the child has its own process group."""
     before = {number: signal.getsignal(number) for number in stop_signals()}
-    told: list[int] = []
+    received: list[int] = []
 
-    def pass_on(number: int, frame: FrameType | None) -> None:
+    def forward(number: int, frame: FrameType | None) -> None:
         # A second stop ends the child at once, and a lost terminal's signal often comes with another.
-        if not told or not is_hangup(number):
+        if not received or not is_hangup(number):
             child.interrupt()
-        told.append(number)
+        received.append(number)
         handler = before[number]
         if callable(handler):
             handler(number, frame)
 
     try:
         for number in before:
-            signal.signal(number, pass_on)
-    except ValueError:  # not the main thread, which alone may do this
+            signal.signal(number, forward)
+    except ValueError:  # only the main thread may set handlers
         yield
         return
     try:

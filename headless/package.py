@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Builds the extension as Blender installs it: `python headless/package.py [DIR]` writes DIR/fit_flare-VERSION.zip.
+"""Builds the Blender extension: `python headless/package.py [DIR]` writes DIR/fit_flare-VERSION.zip.
 
-Blender's own packer checks the manifest and packs the tree; it comes with the bpy package, and Blender
-itself has it as `blender --command extension build`.
+Blender's own packer checks the manifest and packs the tree. It comes with the bpy package, and in Blender it is
+`blender --command extension build`.
 """
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 
 
-def packer() -> list[str]:
-    """How to start Blender's packer; [] where there is none."""
+def find_packer() -> list[str]:
+    """Return the command that starts Blender's packer; [] where there is none."""
     spec = importlib.util.find_spec("bpy")
     for folder in (spec.submodule_search_locations if spec else None) or ():
         for script in Path(folder).glob("*/scripts/addons_core/bl_pkg/cli/blender_ext.py"):
@@ -25,13 +25,14 @@ def packer() -> list[str]:
     return [blender, "--command", "extension"] if blender else []
 
 
-def main(words: list[str]) -> int:
-    command = packer()
+def main(argv: list[str]) -> int:
+    """Build the extension into the folder argv[0], or build/; return the exit status."""
+    command = find_packer()
     if not command:
         print("error: Blender's packer is needed: install the bpy package, or put blender on the PATH.",
               file=sys.stderr)
         return 1
-    out = Path(words[0]) if words else ROOT / "build"
+    out = Path(argv[0]) if argv else ROOT / "build"
     out.mkdir(parents=True, exist_ok=True)
     return subprocess.run([*command, "build", "--source-dir", str(ROOT), "--output-dir", str(out)],
                           check=False).returncode

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The door for scripts and farms.
+"""Entry point of the command line, for scripts and render farms.
 
     python headless/run.py COMMAND …
     blender -b -P headless/run.py -- COMMAND …
 
-Both do the same; `COMMAND --help` says what. The file finds its own tree, whatever the working folder,
-and puts nothing on sys.path.
+Both run the same commands; `COMMAND --help` describes each. The file finds its own tree from any working folder and
+adds nothing to sys.path. It registers the package and calls `headless/cli.py`.
 """
 from __future__ import annotations
 
@@ -22,8 +22,11 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = "fit_flare"
 
 
-def load() -> str:
-    """Make this tree importable as a package and return its name: an enabled extension's own, or PACKAGE."""
+def register_package() -> str:
+    """Make this tree importable as a package; return its name.
+
+    The name is that of the enabled Blender extension where this tree is one, else PACKAGE.
+    """
     for name, module in list(sys.modules.items()):
         file = getattr(module, "__file__", None)
         if name.rpartition(".")[2] == PACKAGE and file and Path(file).resolve() == ROOT / "__init__.py":
@@ -38,15 +41,15 @@ def load() -> str:
     return PACKAGE
 
 
-def words() -> list[str]:
-    """The command's own words; Blender passes on what stands after the first --."""
+def command_argv() -> list[str]:
+    """Return the arguments of the command; in Blender those are the ones after the first "--"."""
     if "bpy" in sys.modules:
         return sys.argv[sys.argv.index("--") + 1:] if "--" in sys.argv else []
     return sys.argv[1:]
 
 
 def open_streams() -> None:
-    """What a daemon or a scheduler has closed leads nowhere, and what a terminal cannot show is shown as "?"."""
+    """Reopen standard streams that a daemon or scheduler has closed; print characters that a terminal lacks as "?"."""
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         try:
             os.fstat(number)
@@ -59,26 +62,28 @@ def open_streams() -> None:
             stream.reconfigure(errors="replace")
 
 
-def hand_over(package: str, words: list[str]) -> int:
-    """In a Python without numpy, which even reading the words takes: the engine's goes on in place of this one, and its
-    status is ours."""
+def exec_engine(package: str, argv: list[str]) -> int:
+    """Replace this process, whose Python has no numpy, by the engine's Python with the same arguments.
+
+    Parsing the arguments already needs numpy. Returns the exit status where the process could not be replaced.
+    """
     errors = importlib.import_module(f"{package}.core.errors")
-    named = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
-    named.add_argument("--engine")
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
+    parser.add_argument("--engine")
     try:
-        engine = named.parse_known_args(words)[0].engine
+        engine = parser.parse_known_args(argv)[0].engine
         command = importlib.import_module(f"{package}.headless.hand_off").engine_command(engine)
     except (errors.FitFlareError, argparse.ArgumentError) as problem:
         print(f"error: {problem}", file=sys.stderr)
         return 1 if isinstance(problem, errors.FitFlareError) else 2
     if os.name != "nt":
-        os.execv(command[0], [*command, *words])
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the other hears it too
-    return subprocess.call([*command, *words])
+        os.execv(command[0], [*command, *argv])
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the child receives it as well
+    return subprocess.call([*command, *argv])
 
 
-def leave(status: int) -> None:
-    """End the process. Blender as a Python module may hang at interpreter exit (seen with 4.5)."""
+def exit_process(status: int) -> None:
+    """Flush the streams and exit. Blender as a Python module may hang at interpreter exit (seen with 4.5)."""
     sys.stdout.flush()
     sys.stderr.flush()
     bpy = sys.modules.get("bpy")
@@ -87,12 +92,12 @@ def leave(status: int) -> None:
     sys.exit(status)
 
 
-if __name__ == "__mp_main__":  # a process that one of ours has spawned, which looks up our modules by name
-    load()
+if __name__ == "__mp_main__":  # a process spawned by multiprocessing, which imports our modules by name
+    register_package()
 if __name__ == "__main__":
     open_streams()
-    package = load()
+    package = register_package()
     if importlib.util.find_spec("numpy") is None:
-        leave(hand_over(package, words()))
-    importlib.import_module(f"{package}.core.numeric_environment").prepare_for_numpy_and_torch()
-    leave(importlib.import_module(f"{package}.headless.cli").main(words()))
+        exit_process(exec_engine(package, command_argv()))
+    importlib.import_module(f"{package}.core.system.thread_environment").set_thread_environment()
+    exit_process(importlib.import_module(f"{package}.headless.cli").main(command_argv()))

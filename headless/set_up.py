@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Installs the engine: `python headless/set_up.py FOLDER` makes a virtual environment there and fills it.
 
-The add-on runs it with Blender's own Python; it needs nothing but the standard library. The packages are those of
-the group "engine" in pyproject.toml, at the versions of constraints.txt. Events go to standard output, one JSON
-object a line (core/system/progress.py). A folder that a stopped set-up left is made anew.
+The add-on runs it with Blender's own Python, so it uses the standard library alone. The packages are the group
+"engine" of pyproject.toml, at the versions in constraints.txt. Events go to standard output, one JSON object per line
+(core/system/progress.py). An environment in FOLDER, also one that a stopped set-up left, is replaced.
 """
 from __future__ import annotations
 
@@ -25,47 +25,52 @@ from typing import NamedTuple
 
 ROOT = Path(__file__).resolve().parents[1]
 WINDOWS = os.name == "nt"
-OLDEST_MACOS = 14  # that the wheels of torch and pycolmap in constraints.txt are made for
-ATTEMPTS = 20  # a tenth of a second apart
-TEST = "import cv2, numpy, torch, numba, OpenEXR, pycolmap"  # OpenCV before COLMAP, as in core/capture/solve
+MIN_MACOS = 14  # required by the wheels of torch and pycolmap in constraints.txt
+RENAME_ATTEMPTS = 20  # 0.1 s apart
+IMPORT_TEST = "import cv2, numpy, torch, numba, OpenEXR, pycolmap"  # OpenCV before COLMAP, as in core/capture/solve
 
 
 class Step(NamedTuple):
-    """begins: what is told of it. fails: what is told where it does not end well, with why."""
+    """One command of the set-up. message: reported at its start. failure: reported where it fails; {why} in it is
+    replaced by the reason."""
 
-    begins: str
+    message: str
     command: list[str]
-    fails: str
+    failure: str
 
 
-def say(**event: object) -> None:
+def emit(**event: object) -> None:
+    """Write one event to standard output."""
     print(json.dumps(event), flush=True)
 
 
-def packages() -> list[str]:
-    """Names of the engine's packages."""
+def engine_packages() -> list[str]:
+    """Return the names of the engine's packages."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
     return list(project["dependency-groups"]["engine"])
 
 
-def python_in(folder: Path) -> Path:
+def environment_python(folder: Path) -> Path:
+    """Return the interpreter of the virtual environment in `folder`."""
     return folder / ("Scripts/python.exe" if WINDOWS else "bin/python")
 
 
-def run(command: list[str]) -> str:
-    """Run a command whose words go to the log, what it loads to the events too; "" where it ended well, else what it
-    said was wrong."""
+def run_logged(command: list[str]) -> str:
+    """Run a command; return "" on success, else the reason of the failure.
+
+    Its output goes to the log, and the lines that name a download also to the events.
+    """
     last, unreached = "", False
     with subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
                           text=True, errors="replace") as process:
         assert process.stdout is not None
         try:
-            with _ended_by_file(process):
+            with _killed_by_stop_file(process):
                 for line in process.stdout:
                     print(line, end="", file=sys.stderr, flush=True)
                     if line.strip().startswith(("Downloading ", "Installing collected")):
-                        say(type="say", text=line.strip()[:120])  # torch takes minutes
-                    unreached |= "Retrying (" in line  # what pip makes of that in the end speaks of versions
+                        emit(type="say", text=line.strip()[:120])  # torch takes minutes
+                    unreached |= "Retrying (" in line  # pip's last line then speaks of versions
                     if not last.startswith("ERROR:"):
                         last = line.strip() or last
         except BaseException:
@@ -79,22 +84,22 @@ def run(command: list[str]) -> str:
 
 
 @contextlib.contextmanager
-def _ended_by_file(process: subprocess.Popen[str]) -> Iterator[None]:
-    """End the process when the file that FIT_FLARE_STOP names is there (core/system/progress.py), and raise
-    KeyboardInterrupt: on Windows the panel has no signal for it."""
-    named, ended = os.environ.get("FIT_FLARE_STOP"), threading.Event()
-    if not named:
+def _killed_by_stop_file(process: subprocess.Popen[str]) -> Iterator[None]:
+    """Kill the process when the file that FIT_FLARE_STOP names appears (core/system/progress.py); raise
+    KeyboardInterrupt then. On Windows the panel cannot send a signal."""
+    stop_file, ended = os.environ.get("FIT_FLARE_STOP"), threading.Event()
+    if not stop_file:
         yield
         return
-    file = Path(named)
+    file = Path(stop_file)
 
-    def look() -> None:
+    def watch() -> None:
         while not ended.wait(0.3):
             if file.exists():
                 process.kill()
                 return
 
-    watcher = threading.Thread(target=look, daemon=True)
+    watcher = threading.Thread(target=watch, daemon=True)
     watcher.start()
     try:
         yield
@@ -105,63 +110,68 @@ def _ended_by_file(process: subprocess.Popen[str]) -> Iterator[None]:
         raise KeyboardInterrupt
 
 
-def unsuitable() -> str:
-    """Why torch cannot be had for this machine, as a sentence; "" where it can."""
+def unsupported_reason() -> str:
+    """Return why torch has no build for this machine, as a sentence; "" where it has one."""
     if sys.platform != "darwin":
         return ""
     if platform.machine() != "arm64":
-        return "The engine needs torch, which is made no more for Macs with Intel processors; use another computer."
+        return "The engine needs torch, which no longer supports Macs with Intel processors; use another computer."
     version = platform.mac_ver()[0]
-    if version and int(version.partition(".")[0]) < OLDEST_MACOS:
-        return f"The engine needs macOS {OLDEST_MACOS} or later, and this is {version}; update the system."
+    if version and int(version.partition(".")[0]) < MIN_MACOS:
+        return f"The engine needs macOS {MIN_MACOS} or later, and this is {version}; update the system."
     return ""
 
 
-def base() -> str | None:
-    """The Python to make the environment with: this one, else one on the PATH, that has what `venv` needs; a Blender of
-    a Linux distribution often comes without. None where there is none."""
-    ask = "import ensurepip, sys, venv; sys.exit(sys.version_info < (3, 11))"
-    places = [sys.executable, *(shutil.which(f"python3.{minor}") for minor in (13, 12, 11)), shutil.which("python3")]
-    for python in filter(None, places):
-        if subprocess.run([python, "-I", "-c", ask], capture_output=True, check=False).returncode == 0:
+def find_base_python() -> str | None:
+    """Return the Python that makes the environment: this one, else one on the PATH that has `ensurepip`; None without.
+
+    The Blender of a Linux distribution often lacks it.
+    """
+    check = "import ensurepip, sys, venv; sys.exit(sys.version_info < (3, 11))"
+    candidates = [sys.executable, *(shutil.which(f"python3.{minor}") for minor in (13, 12, 11)),
+                  shutil.which("python3")]
+    for python in filter(None, candidates):
+        if subprocess.run([python, "-I", "-c", check], capture_output=True, check=False).returncode == 0:
             return python
     return None
 
 
-def cleared(folder: Path) -> bool:
-    """Whether the folder is gone: as a whole, since nothing of an old engine may be left in a new one. It stays where
-    Windows has a file of it in use for long. (core/system/files.py has the like, which may not be imported here.)"""
-    for left in folder.parent.glob(f"{glob.escape(folder.name)}.old-*"):  # what was in use when it was removed
-        shutil.rmtree(left, ignore_errors=True)
+def remove_environment(folder: Path) -> bool:
+    """Remove the folder as a whole; return whether it is gone. It stays where Windows keeps a file of it in use.
+
+    core/system/files.py has a similar function, which cannot be imported here.
+    """
+    for stale in folder.parent.glob(f"{glob.escape(folder.name)}.old-*"):  # was in use at an earlier removal
+        shutil.rmtree(stale, ignore_errors=True)
     old = folder.with_name(f"{folder.name}.old-{os.getpid()}")
-    for _ in range(ATTEMPTS):
+    for _ in range(RENAME_ATTEMPTS):
         if not folder.exists():
             break
         try:
             folder.rename(old)
-        except OSError:  # a process of it that has just ended is held for a moment
+        except OSError:  # Windows holds the files of a process that has just ended
             time.sleep(0.1)
     shutil.rmtree(old, ignore_errors=True)
     return not folder.exists()
 
 
-def discard(folder: Path) -> None:
-    """As far as that goes: a half of an engine would count as one."""
-    if not cleared(folder):
+def discard_environment(folder: Path) -> None:
+    """Remove the folder, or as much of it as possible: a partial engine would be taken for a complete one."""
+    if not remove_environment(folder):
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def placing(maker: str, folder: Path) -> Step:
-    """A virtual environment, made by the Python `maker`."""
-    return Step("Making a place for the engine", [maker, "-m", "venv", str(folder)],
+def venv_step(base: str, folder: Path) -> Step:
+    """Return the step that makes a virtual environment with the Python `base`."""
+    return Step("Making the virtual environment", [base, "-m", "venv", str(folder)],
                 "The virtual environment for the engine could not be made ({why}); look at the log, check the free "
                 "disk space, and set up again.")
 
 
-def installing(folder: Path, package: str) -> Step:
-    """Of a package by its name, or by its wheel's file."""
-    pip = [str(python_in(folder)), "-m", "pip", "install", "--disable-pip-version-check", "--no-input",
-           "--only-binary", ":all:"]  # building one takes a compiler, which an artist has not
+def install_step(folder: Path, package: str) -> Step:
+    """Return the step that installs a package, named by its name or the file of its wheel."""
+    pip = [str(environment_python(folder)), "-m", "pip", "install", "--disable-pip-version-check", "--no-input",
+           "--only-binary", ":all:"]  # building one needs a compiler
     constraints = ROOT / "constraints.txt"
     if constraints.is_file():
         pip += ["-c", str(constraints)]
@@ -170,60 +180,62 @@ def installing(folder: Path, package: str) -> Step:
                 "space, and set up again.")
 
 
-def testing(folder: Path) -> Step:
-    """Everything is there: does it load?"""
+def test_step(folder: Path) -> Step:
+    """Return the step that imports every package of the engine."""
     cure = "install the Microsoft Visual C++ Redistributable (vc_redist.x64)" if WINDOWS else "look at the log"
-    return Step("Testing the engine", [str(python_in(folder)), "-c", TEST],
-                f"The engine was installed, and cannot be loaded ({{why}}); {cure}, and set up again.")
+    return Step("Testing the engine", [str(environment_python(folder)), "-c", IMPORT_TEST],
+                f"The engine was installed but cannot be loaded ({{why}}); {cure}, and set up again.")
 
 
-def main(words: list[str]) -> int:
-    if not words:
+def main(argv: list[str]) -> int:
+    """Set the engine up in the folder argv[0], with the packages of the rest or all; return the exit status."""
+    if not argv:
         print(__doc__, file=sys.stderr)
         return 2
-    folder, wanted = Path(words[0]), words[1:] or packages()
-    if not words[1:] and unsuitable():
-        say(type="error", text=unsuitable())
+    folder, names = Path(argv[0]), argv[1:] or engine_packages()
+    if not argv[1:] and unsupported_reason():
+        emit(type="error", text=unsupported_reason())
         return 1
-    maker = base()
-    if maker is None:
-        say(type="error", text=f"{sys.executable} has no ensurepip to make an environment with (Debian keeps it in "
+    base = find_base_python()
+    if base is None:
+        emit(type="error", text=f"{sys.executable} has no ensurepip to make an environment with (Debian keeps it in "
                                "python3-venv); install it, or name a Python that has torch in the field Engine.")
         return 1
     if folder.exists() and not (folder / "pyvenv.cfg").is_file() and (not folder.is_dir() or any(folder.iterdir())):
-        say(type="error", text=f"{folder} is there and is no virtual environment; name another folder, or remove it.")
+        emit(type="error",
+             text=f"{folder} exists and is not a virtual environment; choose another folder, or remove it.")
         return 1
-    steps = [placing(maker, folder), *(installing(folder, name) for name in wanted)]
-    if not words[1:]:
-        steps.append(testing(folder))
-    say(type="stage", name="set up", total=len(steps), done=0)
-    if not cleared(folder):
-        say(type="error", text=f"The engine in {folder} is in use; close other Blenders and programs that work with "
-                               "it, and set up again.")
+    steps = [venv_step(base, folder), *(install_step(folder, name) for name in names)]
+    if not argv[1:]:
+        steps.append(test_step(folder))
+    emit(type="stage", name="set up", total=len(steps), done=0)
+    if not remove_environment(folder):
+        emit(type="error", text=f"The engine in {folder} is in use; close other Blenders and programs that use it, "
+                               "and set up again.")
         return 1
     for number, step in enumerate(steps):
-        say(type="say", text=step.begins)
+        emit(type="say", text=step.message)
         try:
-            why = run(step.command)
+            why = run_logged(step.command)
         except KeyboardInterrupt:
-            discard(folder)
+            discard_environment(folder)
             raise
         if why:
-            discard(folder)
-            say(type="error", text=step.fails.replace("{why}", why))
+            discard_environment(folder)
+            emit(type="error", text=step.failure.replace("{why}", why))
             return 1
-        say(type="progress", stage="set up", done=number + 1, total=len(steps), left_s=None, figures={})
-    say(type="result", data={"engine": str(python_in(folder))})
+        emit(type="progress", stage="set up", done=number + 1, total=len(steps), eta_s=None, figures={})
+    emit(type="result", data={"engine": str(environment_python(folder))})
     return 0
 
 
 if __name__ == "__main__":
-    # Where Blender was started in the background of a script it ignores SIGINT, and what it starts would too.
+    # A Blender that a script started in the background ignores SIGINT, and its child processes inherit that.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     if hasattr(signal, "SIGBREAK"):
         signal.signal(signal.SIGBREAK, signal.default_int_handler)
     try:
         sys.exit(main(sys.argv[1:]))
     except KeyboardInterrupt:
-        say(type="error", text="Stopped during set up as asked; set up again to go on.")
+        emit(type="error", text="Stopped during the set-up; set up again to start over.")
         sys.exit(130)

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What a flare goes on to, and where it comes from: the words of `transfer`, and of `bake` for a .flare, as a target of
-`core.transfer`."""
+"""The flare and the target of a transfer, from the arguments of `transfer`, and of `bake` for a .flare.
+
+Hands a `core.transfer` target to the commands, which render it.
+"""
 from __future__ import annotations
 
 import argparse
@@ -17,130 +19,132 @@ from ..core.images.unsupported import unsupported_file
 if TYPE_CHECKING:
     from ..core.capture.camera import Floats
     from ..core.look.look import LightLook
-    from ..core.transfer.query import Seen
+    from ..core.transfer.query import TrainingViews
     from ..core.transfer.target import Target
 
-OPTIONS = {"picture": ("light", "focal", "centre"), ".blend": ("lights", "scene", "plates", "radius"),
+TARGET_OPTIONS = {"picture": ("light", "focal", "centre"), ".blend": ("lights", "scene", "plates", "radius"),
            ".json": ("scene", "plates"), ".ply": ("lights", "cameras"), "run": ("lights", "scene", "cameras"),
            "capture": ("lights", "scene")}
-"""By kind of target those that it has a use for, of all that are for some alone."""
+"""The options that apply to a kind of target only, by that kind."""
 
 
-def is_blend(words: argparse.Namespace) -> bool:
-    """Whether Blender has to be asked."""
-    return bool(words.to[0].suffix.lower() == ".blend")
+def is_blend(args: argparse.Namespace) -> bool:
+    """Return whether the target is a .blend, whose cameras and lights Blender has to read."""
+    return bool(args.to[0].suffix.lower() == ".blend")
 
 
-def shot_path(words: argparse.Namespace) -> Path:
-    """Where Blender's part leaves the shot; chunks of one shot each have their own."""
-    if words.shot:
-        return Path(words.shot)
-    part = words.frames or ""
-    if not re.fullmatch(r"[\d,-]{0,60}", part):  # no file has such a name everywhere
+def shot_path(args: argparse.Namespace) -> Path:
+    """Return the file that the Blender step writes the shot to; each range of frames has its own."""
+    if args.shot:
+        return Path(args.shot)
+    part = args.frames or ""
+    if not re.fullmatch(r"[\d,-]{0,60}", part):  # not a valid file name on every system
         part = hashlib.sha256(part.encode()).hexdigest()[:8]
     part = f".{part.replace(',', '_')}" if part else ""
-    return Path(words.out) / f"shot{part}.json"
+    return Path(args.out) / f"shot{part}.json"
 
 
-def _kind(target: Path) -> str:
-    """Of OPTIONS. FrameError for a file of no kind of those."""
+def _target_kind(target: Path) -> str:
+    """Return the kind of a target, a key of TARGET_OPTIONS. Raises FrameError for an unsupported file."""
     from ..core.conventions.run_files import CONFIG
 
     suffix = target.suffix.lower()
     if suffix in SUFFIXES:
         return "picture"
-    if target.is_file() and suffix not in OPTIONS:
+    if target.is_file() and suffix not in TARGET_OPTIONS:
         raise unsupported_file(target)
-    return suffix if suffix in OPTIONS else "run" if (target / CONFIG).is_file() else "capture"
+    return suffix if suffix in TARGET_OPTIONS else "run" if (target / CONFIG).is_file() else "capture"
 
 
-def check_options(words: argparse.Namespace, kind: str) -> None:
-    """Raises SettingsError for an option that the kind of target has no use for: who gives it believes that it does
-    something."""
-    for name in dict.fromkeys(name for names in OPTIONS.values() for name in names):
-        if getattr(words, name) and name not in OPTIONS[kind]:
-            raise SettingsError(f"--{name} is not for a {kind} as the target; leave it out.")
+def check_options(args: argparse.Namespace, kind: str) -> None:
+    """Raise SettingsError for an option that has no effect on this kind of target."""
+    for name in dict.fromkeys(name for names in TARGET_OPTIONS.values() for name in names):
+        if getattr(args, name) and name not in TARGET_OPTIONS[kind]:
+            raise SettingsError(f"--{name} does not apply to a {kind} as the target; leave it out.")
 
 
-def source(words: argparse.Namespace) -> tuple[Path, list[Floats] | None]:
-    """The .flare, and the poses of its training views where they can be had."""
+def find_flare(args: argparse.Namespace) -> tuple[Path, list[Floats] | None]:
+    """Return the .flare, and the poses (4, 4) of its training views, None where they are unknown."""
     from ..core.capture import Capture
     from ..core.conventions.run_files import FLARE
     from ..core.fit.run import Run
 
-    capture, holdout = words.capture, None
-    flare = words.flare
+    capture, holdout = args.capture, None
+    flare = args.flare
     if flare.is_dir():
-        made = Run.open(flare)
+        run_ = Run.open(flare)
         if not (flare / FLARE).is_file():
-            raise RunError(made.without_flare)
-        flare, holdout = flare / FLARE, made.settings.holdout
-        capture = capture or (made.capture_folder if made.capture_folder.is_dir() else None)
+            raise RunError(run_.without_flare)
+        flare, holdout = flare / FLARE, run_.settings.holdout
+        capture = capture or (run_.capture_folder if run_.capture_folder.is_dir() else None)
     if capture is None:
         return flare, None
     views, _ = Capture.open(capture, need_frames=False).split(holdout)
     return flare, [view.camera.world_to_camera for view in views]
 
 
-def target_of(words: argparse.Namespace, flare: Path, training: list[Floats] | None = None) -> Target:
-    """The target, by what --to names. training: poses, for a .flare that does not tell."""
+def open_target(args: argparse.Namespace, flare: Path, training: list[Floats] | None = None) -> Target:
+    """Open the target that --to names. training: poses of training views, for a .flare that does not store its own.
+
+    Raises SettingsError, CaptureError, FrameError and RunError.
+    """
     from ..core.capture import Capture
-    from ..core.conventions.frame_numbers import Frame, chosen
+    from ..core.conventions.frame_numbers import NumberedFrame, select_frames
     from ..core.conventions.run_files import SCENE
     from ..core.fit.run import Run
     from ..core.lights.detection import Detector
-    from ..core.lights.exposure import Exposure
+    from ..core.lights.exposure import ExposureDetector
     from ..core.look import read
     from ..core.look.shot import Shot
-    from ..core.transfer.query import seen_by
-    from ..core.transfer.sources import parsed
-    from ..core.transfer.target import of_capture, of_pictures, of_shot
+    from ..core.transfer.query import training_views
+    from ..core.transfer.sources import parse_assignments
+    from ..core.transfer.target import capture_target, picture_target, shot_target
 
-    look, to, wanted = read(flare), words.to, parsed(words.use)
+    look, to, sources = read(flare), args.to, parse_assignments(args.use)
     if len(to) > 1 and not all(path.suffix.lower() in SUFFIXES for path in to):
         raise SettingsError("Several targets at once have to be pictures.")
     if missing := next((path for path in to if not path.exists()), None):
-        raise CaptureError(f"{missing} is missing; name what the flare goes on to: pictures, a capture, a run, a "
-                           ".blend, a PLY or a shot.")
-    if len(to) == 1 and _kind(to[0]) == "capture" and _is_of_plates(to[0]):
+        raise CaptureError(f"{missing} is missing; name a target for the flare: pictures, a capture, a run, a .blend, "
+                           "a PLY or a shot.")
+    if len(to) == 1 and _target_kind(to[0]) == "capture" and _is_plate_folder(to[0]):
         to = pictures_in(to[0])
-    kind = _kind(to[0])
-    check_options(words, kind)
+    kind = _target_kind(to[0])
+    check_options(args, kind)
     if kind == "picture":
-        seen = seen_by(flare, look.lights, training)
-        distances = {light.name: _usual_distance(light, seen.get(light.name)) for light in look.lights}
-        detector: Detector | None = None if words.light else Exposure()
-        return of_pictures(to, look, _points(words.light), wanted, distances, detector=detector, focal=words.focal,
-                           centre=_point(words.centre) if words.centre else None, seen=seen)
+        seen = training_views(flare, look.lights, training)
+        distances = {light.name: _median_distance(light, seen.get(light.name)) for light in look.lights}
+        detector: Detector | None = None if args.light else ExposureDetector()
+        return picture_target(to, look, _parse_lights(args.light), sources, distances, detector=detector,
+                              focal=args.focal, centre=_parse_point(args.centre) if args.centre else None, seen=seen)
     if kind in (".blend", ".json"):
-        path = shot_path(words) if kind == ".blend" else to[0]
+        path = shot_path(args) if kind == ".blend" else to[0]
         shot = Shot.read(path)
-        numbers = [Frame("", number, "") for number in sorted({one.frame for one in shot.frames})]
-        return of_shot(shot, look, wanted, plates=words.plates, scene=words.scene,
-                       wanted_frames={frame.number for frame in chosen(numbers, words.frames)})
-    lights = Path(words.lights) if words.lights else None
+        numbers = [NumberedFrame("", number, "") for number in sorted({one.frame for one in shot.frames})]
+        return shot_target(shot, look, sources, plates=args.plates, scene=args.scene,
+                       wanted_frames={frame.number for frame in select_frames(numbers, args.frames)})
+    lights = Path(args.lights) if args.lights else None
     if kind == ".ply":
-        if words.cameras is None:
+        if args.cameras is None:
             raise SettingsError(f"{to[0]} is a scene without cameras; name a capture that has them with --cameras.")
-        return of_capture(Capture.open(words.cameras, need_frames=False), look, wanted, lights=lights, scene=to[0],
+        return capture_target(Capture.open(args.cameras, need_frames=False), look, sources, lights=lights, scene=to[0],
                           shown=True)
     if kind == "run":
-        capture = (Capture.open(words.cameras, need_frames=False) if words.cameras else
+        capture = (Capture.open(args.cameras, need_frames=False) if args.cameras else
                    Run.open(to[0]).capture(need_frames=False))
-        return of_capture(capture, look, wanted, lights=lights, scene=words.scene or to[0] / SCENE, shown=True)
+        return capture_target(capture, look, sources, lights=lights, scene=args.scene or to[0] / SCENE, shown=True)
     if to[0].is_dir() and not any(to[0].iterdir()):
-        raise CaptureError(f"{to[0]} is empty: neither pictures nor a capture; name what the flare goes on to.")
-    return of_capture(Capture.open(to[0]), look, wanted, lights=lights, scene=words.scene)
+        raise CaptureError(f"{to[0]} is empty: neither pictures nor a capture; name a target for the flare.")
+    return capture_target(Capture.open(to[0]), look, sources, lights=lights, scene=args.scene)
 
 
-def _is_of_plates(folder: Path) -> bool:
-    """Whether it is a folder that holds pictures themselves, not a capture."""
+def _is_plate_folder(folder: Path) -> bool:
+    """Return whether a folder holds pictures themselves and is not a capture."""
     capture = any((folder / name).exists() for name in ("images", "sparse", "colmap", "transforms.json"))
     return folder.is_dir() and not capture and bool(pictures_in(folder))
 
 
-def _usual_distance(light: LightLook, seen: Seen | None) -> float:
-    """From which training saw a light, in the middle."""
+def _median_distance(light: LightLook, seen: TrainingViews | None) -> float:
+    """Return the median distance of the training cameras to a light; the middle of its range where that is unknown."""
     import numpy as np
 
     if seen is not None:
@@ -149,23 +153,24 @@ def _usual_distance(light: LightLook, seen: Seen | None) -> float:
     return float(np.linalg.norm((reach.camera_low + reach.camera_high) / 2 - light.xyz)) or 1.0
 
 
-def _points(words: list[str]) -> dict[str, tuple[float, float]]:
-    """"[name=]x,y" by name."""
-    found: dict[str, tuple[float, float]] = {}
-    for number, word in enumerate(words, 1):
-        given, equals, place = word.rpartition("=")
-        name = given.strip() if equals else f"light{number}"
-        if name in found:
+def _parse_lights(texts: list[str]) -> dict[str, tuple[float, float]]:
+    """Parse each "[name=]x,y"; return the pixels by name. Raises SettingsError."""
+    places: dict[str, tuple[float, float]] = {}
+    for number, text in enumerate(texts, 1):
+        prefix, equals, place = text.rpartition("=")
+        name = prefix.strip() if equals else f"light{number}"
+        if name in places:
             raise SettingsError(f"--light names {name!r} twice; give each light a name of its own.")
-        found[name] = _point(place)
-    return found
+        places[name] = _parse_point(place)
+    return places
 
 
-def _point(text: str) -> tuple[float, float]:
+def _parse_point(text: str) -> tuple[float, float]:
+    """Parse "x,y" in pixels. Raises SettingsError."""
     try:
         x, y = (float(part) for part in text.split(","))
         if not (math.isfinite(x) and math.isfinite(y)):
             raise ValueError(text)
     except ValueError:
-        raise SettingsError(f"{text!r} is not a place in pixels such as 640,360.") from None
+        raise SettingsError(f"{text!r} is not a position in pixels such as 640,360.") from None
     return x, y

@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Processes: the cores that this one may use, what another is started with, by what status ours end, on which machine
-they run, and whether one that was written down still runs, known by its number and by when it began, since systems give
-the numbers of ended ones out again."""
+"""Processes: usable cores, environment and options of child processes, exit statuses, and whether a process still runs.
+
+A process that was written down is identified by its id and its start time, since systems use the ids of ended processes
+again. The command line, the add-on's jobs and `files.py` use this module.
+"""
 from __future__ import annotations
 
 import contextlib
@@ -17,112 +19,119 @@ from pathlib import Path
 from typing import Any
 
 WINDOWS = os.name == "nt"
-DONE, FAILED, MISUSED, STOPPED = 0, 1, 2, 130
-"""Statuses of our commands: done; it could not be; the words made no sense; it was asked to stop, and did."""
+DONE, FAILED, USAGE_ERROR, STOPPED = 0, 1, 2, 130
+"""Exit statuses of the commands: success; failure; invalid arguments; stopped on request."""
 PROC = Path("/proc")
-SLACK_S = 5.0
-"""By which the clocks of the two may differ."""
+CLOCK_TOLERANCE_S = 5.0
+"""Allowed difference between the recorded start time and the system's."""
 DAY_S = 86400
 CENTURY_S = 36525 * DAY_S
-"""No process is as old."""
+"""Upper bound for the age of a process."""
 
 
-def python_at(place: Path) -> Path | None:
-    """The interpreter that `place` is, or that the virtual environment in it has; on Windows conda has it at the top of
-    the environment. None, too, where the Python that the environment was made from is gone."""
+def find_python(place: Path) -> Path | None:
+    """Return the interpreter at `place`: the file itself, or that of the virtual environment or (Windows) conda
+    environment.
+
+    None as well where the Python that the environment was made from is gone.
+    """
     for path in (place, place / "Scripts" / "python.exe", place / "bin" / "python", place / "python.exe"):
-        if os.path.isfile(path) and not (WINDOWS and _lacks_its_base(path)):  # noqa: PTH113 - pathlib's may raise
+        if os.path.isfile(path) and not (WINDOWS and _is_base_missing(path)):  # noqa: PTH113 - pathlib's may raise
             return path.absolute()  # not resolved: a virtual environment's python is a link
     return None
 
 
-def _lacks_its_base(python: Path) -> bool:
-    """Whether a virtual environment's python.exe, on Windows no link but a program that starts another, has lost that:
-    the Blender that it was made by, say, has been replaced by a newer one."""
+def _is_base_missing(python: Path) -> bool:
+    """True if a virtual environment's python.exe, which on Windows starts another program, has lost that program.
+
+    For instance because the Blender that made the environment has been replaced by a newer one.
+    """
     try:
-        told = (python.parent.parent / "pyvenv.cfg").read_text(encoding="utf-8", errors="replace")
+        config = (python.parent.parent / "pyvenv.cfg").read_text(encoding="utf-8", errors="replace")
     except OSError:  # it is its own base
         return False
-    home = re.search(r"^home\s*=\s*(.+?)\s*$", told, re.MULTILINE)
+    home = re.search(r"^home\s*=\s*(.+?)\s*$", config, re.MULTILINE)
     return home is not None and not Path(home[1], "python.exe").is_file()
 
 
-def environment() -> dict[str, str]:
-    """This environment, less what would lead another Python to the modules of this one."""
+def child_environment() -> dict[str, str]:
+    """Return this process's environment without the variables that lead another Python to its modules."""
     return {name: value for name, value in os.environ.items() if name not in ("PYTHONHOME", "PYTHONPATH")}
 
 
-def own_group() -> dict[str, Any]:
-    """Options of Popen that keep a terminal's Ctrl-C from a child, so that it is stopped by its parent alone."""
+def new_process_group() -> dict[str, Any]:
+    """Return options of Popen that keep a terminal's Ctrl-C from a child, so that only its parent stops it."""
     if WINDOWS:
         return {"creationflags": getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0)}
     return {"start_new_session": True}
 
 
 @lru_cache(maxsize=1)
-def machine() -> str:
-    """What tells this machine from others that see the same folders, today and later: its name. A Mac's changes with
-    the network, so there it is a name that was made up once and is kept for the user; elsewhere a user's folder may be
-    the same on many machines."""
+def machine_id() -> str:
+    """Return a lasting name of this machine, different from others that see the same folders.
+
+    The host name of a Mac changes with the network, so there it is a random name, stored for the user; elsewhere a
+    user's folder may be the same on many machines.
+    """
     if sys.platform == "darwin":
         with contextlib.suppress(OSError, RuntimeError, ValueError):  # of a user without a home, too
-            return _made_up(Path.home() / "Library" / "Application Support" / "fit_flare" / "machine")
+            return _stored_id(Path.home() / "Library" / "Application Support" / "fit_flare" / "machine")
     return platform.node()
 
 
-def _made_up(file: Path) -> str:
-    """The name that the file holds; one is made up where there is none."""
+def _stored_id(file: Path) -> str:
+    """Return the name that the file holds; write a random one where there is none."""
     if not file.exists():
         file.parent.mkdir(parents=True, exist_ok=True)
-        fresh = file.with_name(f"{file.name}.{uuid.uuid4()}")
+        temporary = file.with_name(f"{file.name}.{uuid.uuid4()}")
         try:
-            fresh.write_text(str(uuid.uuid4()), encoding="utf-8")
+            temporary.write_text(str(uuid.uuid4()), encoding="utf-8")
             with contextlib.suppress(FileExistsError):  # another process was first
-                os.link(fresh, file)
+                os.link(temporary, file)
         finally:
-            fresh.unlink(missing_ok=True)
+            temporary.unlink(missing_ok=True)
     return file.read_text(encoding="utf-8")
 
 
-def cores() -> int:
-    """Those that this process may use: a farm or a container often gives it a few of many."""
+def available_cores() -> int:
+    """Number of cores that this process may use: a farm or a container often grants a few of many."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def is_same(pid: int, started: float) -> bool:
-    """Whether the process that was begun and written down at `started`, seconds since the epoch, still runs.
+def is_same_process(pid: int, started: float) -> bool:
+    """True if the process that was recorded with start time `started`, seconds since the epoch, still runs.
 
-    One that began later has come by its number; so has one that began earlier, where what was written down is of
-    another machine or of the time before it was started anew.
+    A process with another start time has the id by coincidence: it began later, or the record is of another machine or
+    of the time before this one was restarted.
     """
-    began = _began(pid)
-    return began is not None and abs(began - started) <= SLACK_S
+    began = _start_time(pid)
+    return began is not None and abs(began - started) <= CLOCK_TOLERANCE_S
 
 
-def runs(pid: int) -> bool:
-    """Whether there is a process of that number."""
+def is_running(pid: int) -> bool:
+    """True if a process of that id exists."""
     if WINDOWS or PROC.is_dir():
-        return _began(pid) is not None
+        return _start_time(pid) is not None
     try:
         os.kill(pid, 0)
-    except PermissionError:  # it is somebody else's
+    except PermissionError:  # another user's
         return True
     except OSError:
         return False
     return True
 
 
-def _began(pid: int) -> float | None:
-    """Seconds since the epoch; None where no such process runs."""
+def _start_time(pid: int) -> float | None:
+    """Start time of a process, seconds since the epoch; None where no such process runs."""
     try:
         if WINDOWS:
-            return _told_by_windows(pid)
-        return _told_by_proc(pid) if PROC.is_dir() else _told_by_ps(pid)
+            return _start_time_windows(pid)
+        return _start_time_proc(pid) if PROC.is_dir() else _start_time_ps(pid)
     except (OSError, ValueError, IndexError):
         return None
 
 
-def _told_by_windows(pid: int) -> float | None:
+def _start_time_windows(pid: int) -> float | None:
     import ctypes
 
     kernel = ctypes.windll.kernel32  # type: ignore[attr-defined,unused-ignore]
@@ -139,19 +148,21 @@ def _told_by_windows(pid: int) -> float | None:
     return times[0].value / 1e7 - 11_644_473_600  # tenths of microseconds since 1601
 
 
-def _told_by_proc(pid: int) -> float | None:
+def _start_time_proc(pid: int) -> float | None:
     after_name = (PROC / str(pid) / "stat").read_text(encoding="utf-8", errors="replace").rpartition(")")[2].split()
-    if after_name[0] in "ZX":  # it has ended, and nobody has asked how
+    if after_name[0] in "ZX":  # ended, and its parent has not read its status
         return None
     booted = re.search(r"^btime (\d+)", (PROC / "stat").read_text(encoding="utf-8"), re.MULTILINE)
     return int(booted[1]) + int(after_name[19]) / os.sysconf("SC_CLK_TCK") if booted else None
 
 
-def _told_by_ps(pid: int) -> float | None:
-    """By its age: [[days-]hours:]minutes:seconds. Of one that has just begun procps tells 441077234 days now and
-    then."""
-    told = subprocess.run(["ps", "-o", "etime=", "-p", str(pid)], capture_output=True, text=True, check=False)
-    days, _, clock = told.stdout.strip().rpartition("-")
+def _start_time_ps(pid: int) -> float | None:
+    """Start time by the age that ps prints, [[days-]hours:]minutes:seconds.
+
+    Of a process that has just begun procps now and then prints 441077234 days.
+    """
+    listing = subprocess.run(["ps", "-o", "etime=", "-p", str(pid)], capture_output=True, text=True, check=False)
+    days, _, clock = listing.stdout.strip().rpartition("-")
     if not clock:
         return None
     age = 0

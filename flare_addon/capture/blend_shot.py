@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A .blend as a shot: its camera, its lights or named objects, and what its objects hide of them, frame by frame;
-and its animated camera as a capture.
+"""Reads a .blend for the commands: as a shot (camera, lights and their visibility by frame), or as a capture.
 
-For the commands, which find no look set up in the scene; the panel's own ways are `shots` and `capture_export`.
+`transfer` and `bake` use the shot, `solve` the capture. The scene needs no look; for the panel, `shots` and `exporter`
+do the same from a scene that has one.
 """
 from __future__ import annotations
 
@@ -16,17 +16,18 @@ import numpy as np
 
 from ...core.capture import LIGHTS
 from ...core.errors import CaptureError
-from ...core.look.shot import PlacedLight, Shot, ShotFrame
+from ...core.look import PlacedLight
+from ...core.look.shot import Shot, ShotFrame
 from ...core.system.files import write_json
 from .. import cameras, lights, occlusion
-from ..objects import collections_shown, matrix_of
+from ..objects import enabled_collections, world_matrix
 from . import exporter
 
-KINDS = ("POINT", "SPOT", "AREA", "SUN")
+LAMP_TYPES = ("POINT", "SPOT", "AREA", "SUN")
 
 
-def opened(path: Path) -> Any:
-    """The active scene of a .blend, which is opened without its scripts. Raises CaptureError."""
+def open_blend(path: Path) -> Any:
+    """Open a .blend without running its scripts; return its active scene. Raises CaptureError."""
     if not path.is_file():
         raise CaptureError(f"{path} is missing; name a .blend.")
     try:
@@ -37,86 +38,89 @@ def opened(path: Path) -> Any:
     return bpy.context.scene
 
 
-def shot_of(scene: Any, flare: Path, names: Sequence[str], frames: Sequence[int], *, radius: float = 0.0,
+def read_shot(scene: Any, flare: Path, names: Sequence[str], frames: Sequence[int], *, radius: float = 0.0,
             done: Callable[[], None] = lambda: None) -> Shot:
-    """The scene's active camera at these frames. names: of objects that are lights; none: the scene's lamps. Markers
-    may change the camera; it is one shot all the same, and bears the scene's name.
+    """Return the shot of the scene's active camera at these frames, in the coordinates of Blender's world.
 
-    radius: of the lights' discs for the soft edge of shadows, world units; 0: a share of the distance. The shot's
-    coordinates are Blender's world. Raises CaptureError for a scene without a camera, light, or named object.
+    Markers may change the camera; the shot has the name of the scene. names: objects that are lights; without any, the
+    scene's lamps. radius: radius of the lights' discs for soft occlusion, world units; 0 for a part of the distance.
+    Raises CaptureError for a scene without a camera, a light or a named object.
     """
-    things = _lights(scene, names)
-    if not things:
+    light_objects = _find_lights(scene, names)
+    if not light_objects:
         raise CaptureError(f"The scene {scene.name!r} has no lights; name objects with --lights.")
-    made = []
+    shot_frames = []
     for frame in frames:
         scene.frame_set(frame)
         depsgraph = bpy.context.evaluated_depsgraph_get()
-        camera = _camera_of(scene).evaluated_get(depsgraph)
+        camera = _active_camera(scene).evaluated_get(depsgraph)
         core = cameras.core_camera(camera.data, camera.matrix_world, scene.render)
         eye = camera.matrix_world.translation
-        placed = tuple(_placed(scene, depsgraph, thing, eye, radius) for thing in things)
-        made.append(ShotFrame(frame, scene.name, core, placed))
+        placed = tuple(_place_light(scene, depsgraph, obj, eye, radius) for obj in light_objects)
+        shot_frames.append(ShotFrame(frame, scene.name, core, placed))
         done()
-    return Shot(flare, tuple(made))
+    return Shot(flare, tuple(shot_frames))
 
 
-def _camera_of(scene: Any) -> Any:
-    """The active camera. Raises CaptureError where there is none, or an object that is none."""
+def _active_camera(scene: Any) -> Any:
+    """Return the active camera of the scene. Raises CaptureError where there is none."""
     if scene.camera is None or scene.camera.type != "CAMERA":
         raise CaptureError(f"The scene {scene.name!r} has no active camera; set one.")
     return scene.camera
 
 
-def _lights(scene: Any, names: Sequence[str]) -> list[Any]:
-    """The objects of these names; of none the lamps that are rendered. Raises CaptureError for a name without one."""
+def _find_lights(scene: Any, names: Sequence[str]) -> list[Any]:
+    """Return the objects with these names, or all rendered lamps without names.
+
+    Raises CaptureError for a wrong name.
+    """
     if names:
         missing = [name for name in names if name not in scene.objects]
         if missing:
-            raise CaptureError(f"The scene {scene.name!r} has no object {missing[0]!r}; name lights as it does.")
+            raise CaptureError(f"The scene {scene.name!r} has no object {missing[0]!r}; use the names of its objects.")
         return [scene.objects[name] for name in names]
-    rendered = {thing.name for layer in scene.view_layers
-                for shown in collections_shown(layer.layer_collection, "hide_render") for thing in shown.objects}
-    return [thing for thing in scene.objects if thing.type == "LIGHT" and thing.data.type in KINDS
-            and not thing.hide_render and thing.name in rendered]
+    rendered = {obj.name for layer in scene.view_layers
+                for shown in enabled_collections(layer.layer_collection, "hide_render") for obj in shown.objects}
+    return [obj for obj in scene.objects if obj.type == "LIGHT" and obj.data.type in LAMP_TYPES
+            and not obj.hide_render and obj.name in rendered]
 
 
-def _placed(scene: Any, depsgraph: Any, thing: Any, eye: Any, radius: float) -> PlacedLight:
-    where = _position(depsgraph, thing, eye)
-    item = SimpleNamespace(target=thing, radius=radius or _radius(thing))
-    share = occlusion.visible_share(scene, depsgraph, eye, item)
-    return PlacedLight(thing.name, thing.name, where, float(share))
+def _place_light(scene: Any, depsgraph: Any, obj: Any, eye: Any, radius: float) -> PlacedLight:
+    where = _light_position(depsgraph, obj, eye)
+    item = SimpleNamespace(target=obj, radius=radius or _lamp_radius(obj))
+    visibility = occlusion.visibility(scene, depsgraph, eye, item)
+    return PlacedLight(obj.name, obj.name, where, float(visibility))
 
 
-def _position(depsgraph: Any, thing: Any, eye: Any) -> cameras.Floats:
-    """(3,) in the world. Raises CaptureError where it is no number, as a driver may have it."""
-    where = np.array(lights.stands(thing, matrix_of(thing, depsgraph), eye), np.float64)
+def _light_position(depsgraph: Any, obj: Any, eye: Any) -> cameras.Floats:
+    """Return the position (3,) of a light in the world. Raises CaptureError where it is not finite."""
+    where = np.array(lights.light_position(obj, world_matrix(obj, depsgraph), eye), np.float64)
     if not np.isfinite(where).all():
-        raise CaptureError(f"The place of the light {thing.name!r} is not finite at frame "
-                           f"{depsgraph.scene.frame_current}; mend its transform, and the drivers and parents that "
+        raise CaptureError(f"The position of the light {obj.name!r} is not finite at frame "
+                           f"{depsgraph.scene.frame_current}; correct its transform, and the drivers and parents that "
                            "move it.")
     return where
 
 
-def _radius(thing: Any) -> float:
-    """Of a lamp that has one; 0 where it is a point, a sun or a mesh."""
-    sized = thing.type == "LIGHT" and thing.data.type != "SUN"
-    return float(getattr(thing.data, "shadow_soft_size", 0.0)) if sized else 0.0
+def _lamp_radius(obj: Any) -> float:
+    """Return the radius of a lamp; 0 for a sun and for other objects."""
+    sized = obj.type == "LIGHT" and obj.data.type != "SUN"
+    return float(getattr(obj.data, "shadow_soft_size", 0.0)) if sized else 0.0
 
 
-def capture_of(scene: Any, plates: Mapping[int, Path], folder: Path, names: Sequence[str],
+def write_capture(scene: Any, plates: Mapping[int, Path], folder: Path, names: Sequence[str],
                done: Callable[[], None] = lambda: None) -> int:
-    """Write a capture of the scene's camera: transforms.json, images/, points.ply, and lights.json where there are
-    lights (`names`, or the scene's lamps); how many frames it has.
+    """Write a capture of the scene's camera; return its number of frames.
 
-    plates: the picture of each frame. Raises CaptureError where the scene lacks a camera, and what `write_frames` does.
+    lights.json is written where there are lights (`names`, or the scene's lamps). plates: the picture of each frame.
+    Raises CaptureError where the scene has no camera, and as `exporter.write_frames` does.
     """
-    _camera_of(scene)
-    things = _lights(scene, names)
+    _active_camera(scene)
+    light_objects = _find_lights(scene, names)
     entries = exporter.write_frames(scene, None, plates, folder, done)
-    if things:
+    if light_objects:
         eye, depsgraph = scene.camera.matrix_world.translation, bpy.context.evaluated_depsgraph_get()
         write_json(folder / LIGHTS, {"lights": [
-            {"name": thing.name, "xyz": _position(depsgraph, thing, eye).tolist()} for thing in things]})
+            {"name": obj.name, "xyz": _light_position(depsgraph, obj, eye).tolist()} for obj in light_objects]})
     exporter.write_cameras(folder, entries)
     return len(entries)

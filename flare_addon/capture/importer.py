@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A capture as a collection: cameras with their frames behind them, the point cloud, the lights.
+"""Imports a capture as a collection: cameras with their frames as background, the point cloud, the lights.
 
-Everything is parented to one empty that carries up axis and scale, so keys and positions are the capture's
-own numbers, and turning or scaling the empty turns and scales all.
+All objects are children of one empty, the root, which holds up axis and scale. Keys and positions below it are in the
+capture's coordinates, and the root places the capture in the scene.
 """
 from __future__ import annotations
 
@@ -17,37 +17,38 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core.capture import REMOVED, Capture, PointCloud, Twins, View
+from ...core.capture import REMOVED, Capture, PictureIndex, PointCloud, View
 from ...core.capture.camera import Camera, quaternion_from_rotation
-from ...core.conventions.frame_numbers import numbered
+from ...core.conventions.frame_numbers import number_views
 from ...core.errors import CaptureError
-from ...core.removal.jobs.provenance import has_exact
+from ...core.removal.jobs.provenance import has_exact_clean_frames
 from .. import cameras, fcurves
-from ..cameras import FLIP
+from ..cameras import FLIP_YZ
 from ..compositor.setup import footage_nodes
-from ..images import loaded
-from ..paths import absolute, stored
+from ..images import load_image
+from ..paths import absolute, blend_relative
 from ..render_settings import show_as_filmed
 
 SENSOR = 36.0  # mm
-UP = {"Z": (0.0, 0.0, 0.0), "-Y": (-math.pi / 2, 0.0, 0.0), "Y": (math.pi / 2, 0.0, 0.0)}
-"""Rotation of the root by the axis that is up in the capture."""
+UP_ROTATIONS = {"Z": (0.0, 0.0, 0.0), "-Y": (-math.pi / 2, 0.0, 0.0), "Y": (math.pi / 2, 0.0, 0.0)}
+"""Rotation of the root by the up axis of the capture."""
 
-EXPOSURE = "fit_flare.exposure"
-"""RNA path on a camera object."""
+EXPOSURE_PATH = "fit_flare.exposure"
+"""RNA path of the exposure on a camera object."""
 
-SAME_PIXELS = 2e-3
-"""Of the ratio of focal lengths, what cameras may differ by that are solved apart: a pixel at the edge of 1000."""
+PIXEL_ASPECT_TOLERANCE = 2e-3
+"""Largest relative difference of fx / fy between cameras with the same pixel aspect: one pixel in 1000."""
 
-Placement = Literal["animated", "each"]
+CameraLayout = Literal["animated", "each"]
 _NUMBER = re.compile(r"(\d+)(?=\D*$)")
 
 
 @dataclass(frozen=True)
 class ImportSettings:
-    """cameras: one animated camera (for each folder of frames), or one for each frame. up: "Z", "Y" or "-Y"."""
+    """Settings of an import. cameras: one animated camera for each folder of frames, or one for each frame. up: the up
+    axis of the capture, "Z", "Y" or "-Y"."""
 
-    cameras: Placement = "animated"
+    cameras: CameraLayout = "animated"
     up: str = "Z"
     scale: float = 1.0
     frames: bool = True
@@ -57,7 +58,7 @@ class ImportSettings:
 
 @dataclass(frozen=True)
 class Imported:
-    """What an import made. notes: sentences on what could not be done as asked."""
+    """The objects that an import made. notes: warnings."""
 
     root: Any
     cameras: tuple[Any, ...]
@@ -66,7 +67,7 @@ class Imported:
 
 
 def find_capture(path: Path | str) -> Path:
-    """The capture's folder, from itself or anything in it: a COLMAP model's file or folder, images/, lights.json.
+    """Return the folder of a capture from a path to it or to anything in it, such as images/ or lights.json.
 
     Raises CaptureError where there is none.
     """
@@ -75,12 +76,12 @@ def find_capture(path: Path | str) -> Path:
     for folder in (start, *start.parents[:3]):
         if (folder / "images").is_dir() or (folder / "transforms.json").is_file():
             return folder
-    raise CaptureError(f"{path} is not in a capture: no folder images/ beside sparse/0/, and no transforms.json; "
-                       "choose the capture's folder.")
+    raise CaptureError(f"{path} is not in a capture: there is neither a folder images/ beside sparse/0/ nor a "
+                       "transforms.json; choose the folder of a capture.")
 
 
 def import_capture(scene: Any, folder: Path | str, settings: ImportSettings | None = None) -> Imported:
-    """Read the capture in `folder` and build it in `scene`. Raises CaptureError or FrameError."""
+    """Import the capture in `folder` into `scene`. Raises CaptureError and FrameError."""
     settings = settings or ImportSettings()
     folder = find_capture(folder)
     capture = Capture.open(folder, need_frames=settings.frames)
@@ -88,20 +89,20 @@ def import_capture(scene: Any, folder: Path | str, settings: ImportSettings | No
     extent = capture.extent
     collection = bpy.data.collections.new(folder.resolve().name)
     scene.collection.children.link(collection)
-    root = _object(collection, f"{collection.name} Root", None, None)
+    root = _add_object(collection, f"{collection.name} Root", None, None)
     root.empty_display_type, root.empty_display_size = "ARROWS", 0.2 * extent
-    root.rotation_euler, root.scale = UP[settings.up], (settings.scale,) * 3
-    made = _cameras(collection, root, capture, extent, settings, scene, notes)
+    root.rotation_euler, root.scale = UP_ROTATIONS[settings.up], (settings.scale,) * 3
+    made = _add_cameras(collection, root, capture, extent, settings, scene, notes)
     if settings.points and len(capture.points):
-        _points(collection, root, capture.points)
+        _add_points(collection, root, capture.points)
     lights = tuple(add_light(collection, root, light.name, light.xyz, 0.02 * extent) for light in capture.lights)
     state = scene.fit_flare
     if state.root is not None:
-        state.root.fit_flare.is_root = True  # the version before did not say so
+        state.root.fit_flare.is_root = True  # earlier versions did not store it
     root.fit_flare.is_root = True
-    state.capture, state.root, state.footage = stored(folder), root, "images"
+    state.capture, state.root, state.footage = blend_relative(folder), root, "images"
     state.known_lights = "\n".join(light.name for light in capture.lights)
-    state.mode = "default" if has_exact(capture) else "estimated"
+    state.mode = "default" if has_exact_clean_frames(capture) else "estimated"
     scene.camera = made[0]
     if settings.match_scene:
         notes += [note for note in [show_as_filmed(scene)] if note]
@@ -113,8 +114,8 @@ def import_capture(scene: Any, folder: Path | str, settings: ImportSettings | No
 
 
 def add_light(collection: Any, root: Any, name: str, xyz: Any, size: float) -> Any:
-    """An empty that stands for a light of the capture, at `xyz` in the root's coordinates."""
-    light = _object(collection, name, None, root)
+    """Add an empty for a light of the capture, at `xyz` in the coordinates of the root; return it."""
+    light = _add_object(collection, name, None, root)
     light.empty_display_type, light.empty_display_size = "SPHERE", size
     light.location = [float(value) for value in xyz]
     light.show_name = True
@@ -125,9 +126,10 @@ def add_light(collection: Any, root: Any, name: str, xyz: Any, size: float) -> A
 # ---- cameras --------------------------------------------------------------------------------------
 
 
-def _cameras(collection: Any, root: Any, capture: Capture, extent: float, settings: ImportSettings, scene: Any,
-             notes: list[str]) -> tuple[Any, ...]:
-    frames = numbered(view.name for view in capture.views)
+def _add_cameras(collection: Any, root: Any, capture: Capture, extent: float, settings: ImportSettings, scene: Any,
+                 notes: list[str]) -> tuple[Any, ...]:
+    """Add the cameras, with animation and frames as the settings say; append warnings to `notes`."""
+    frames = number_views(view.name for view in capture.views)
     number = {frame.view: frame.number for frame in frames}
     folders: dict[str, list[View]] = {}
     for frame in frames:
@@ -141,86 +143,88 @@ def _cameras(collection: Any, root: Any, capture: Capture, extent: float, settin
         render.pixel_aspect_x, render.pixel_aspect_y = aspect
         scene.frame_start, scene.frame_end = min(number.values()), max(number.values())
         scene.frame_set(scene.frame_start)
-    notes += unlike_the_first([view.camera for view in capture.views])
+    notes += camera_differences([view.camera for view in capture.views])
     made: list[Any] = []
     for folder, views in folders.items():
         label = "Camera" if folder == "." else f"Camera {folder}"
         if settings.cameras == "animated":
-            camera = _camera(collection, root, label, views[0], aspect, 0.15 * extent)
+            camera = _add_camera(collection, root, label, views[0], aspect, 0.15 * extent)
             camera.fit_flare.view = folder
             _animate(camera, views, [number[view.name] for view in views], aspect)
-            if settings.frames and not _footage(camera, capture, views, [number[view.name] for view in views]):
+            if settings.frames and not _show_sequence(camera, capture, views, [number[view.name] for view in views]):
                 notes.append(f"The frames of {label} have no common numbering, so only the first is shown behind it; "
                              "import with one camera for each frame to see all.")
             made.append(camera)
         else:
             for view in views:
-                camera = _camera(collection, root, Path(view.name).stem, view, aspect, 0.08 * extent)
+                camera = _add_camera(collection, root, Path(view.name).stem, view, aspect, 0.08 * extent)
                 camera.fit_flare.view = view.name
                 if settings.frames:
-                    _backdrop(camera, loaded(capture.frame_path(view)))
+                    _add_background(camera, load_image(capture.frame_path(view)))
                 made.append(camera)
     return tuple(made)
 
 
-def unlike_the_first(those: Sequence[Camera]) -> Iterator[str]:
-    """Sentences on what a scene has one of, where the cameras of a capture differ in it."""
-    if len({camera.size for camera in those}) > 1:
-        yield "The frames differ in size, and a scene has one: it is that of the first frame."
-    shape = those[0].fx / those[0].fy
-    off = max(abs(camera.fx / camera.fy / shape - 1) for camera in those)
-    if off > SAME_PIXELS:
-        yield ("The pixels of the frames differ in shape, and a scene has one: it is that of the first frame, and "
-               f"others are up to {off:.1%} too wide or too high behind their cameras.")
+def camera_differences(all_cameras: Sequence[Camera]) -> Iterator[str]:
+    """Yield warnings where the cameras of a capture differ in what a scene has only once."""
+    if len({camera.size for camera in all_cameras}) > 1:
+        yield "The frames differ in size; the scene has the size of the first frame."
+    aspect = all_cameras[0].fx / all_cameras[0].fy
+    difference = max(abs(camera.fx / camera.fy / aspect - 1) for camera in all_cameras)
+    if difference > PIXEL_ASPECT_TOLERANCE:
+        yield ("The frames differ in pixel aspect; the scene has that of the first frame, and others are up to "
+               f"{difference:.1%} too wide or too high behind their cameras.")
 
 
-def _camera(collection: Any, root: Any, name: str, view: View, aspect: tuple[float, float], size: float) -> Any:
+def _add_camera(collection: Any, root: Any, name: str, view: View, aspect: tuple[float, float], size: float) -> Any:
     data = bpy.data.cameras.new(name)
     data.sensor_fit, data.sensor_width = "HORIZONTAL", SENSOR
     data.lens, data.shift_x, data.shift_y = cameras.lens_of(view.camera, SENSOR, aspect)
     data.display_size, data.passepartout_alpha = size, 0.8
     data.clip_end = 1e4
-    camera = _object(collection, name, data, root)
+    camera = _add_object(collection, name, data, root)
     camera.rotation_mode = "QUATERNION"
-    matrix = view.camera.camera_to_world @ FLIP
+    matrix = view.camera.camera_to_world @ FLIP_YZ
     camera.location = matrix[:3, 3].tolist()
     camera.rotation_quaternion = quaternion_from_rotation(matrix[:3, :3]).tolist()
     return camera
 
 
 def _animate(camera: Any, views: Sequence[View], numbers: Sequence[int], aspect: tuple[float, float]) -> None:
-    """Keys of place and rotation at the frames' numbers; of focal length and shift where they change."""
-    matrices = [view.camera.camera_to_world @ FLIP for view in views]
+    """Insert keys of location and rotation at the frames' numbers, and of focal length and shift where they change."""
+    matrices = [view.camera.camera_to_world @ FLIP_YZ for view in views]
     places = np.array([matrix[:3, 3] for matrix in matrices])
     turns = np.array([quaternion_from_rotation(matrix[:3, :3]) for matrix in matrices])
-    for index in range(1, len(turns)):  # q and -q are one rotation; the nearer keeps what lies between sensible
+    for index in range(1, len(turns)):  # q and -q are the same rotation; the nearer one interpolates correctly
         if turns[index] @ turns[index - 1] < 0:
             turns[index] *= -1
-    keys(camera, {"location": places, "rotation_quaternion": turns}, numbers)
+    insert_keys(camera, {"location": places, "rotation_quaternion": turns}, numbers)
     lenses = np.array([cameras.lens_of(view.camera, SENSOR, aspect) for view in views])
     if np.ptp(lenses, axis=0).max() > 1e-6:
-        keys(camera.data, {"lens": lenses[:, :1], "shift_x": lenses[:, 1:2], "shift_y": lenses[:, 2:]}, numbers)
+        insert_keys(camera.data, {"lens": lenses[:, :1], "shift_x": lenses[:, 1:2], "shift_y": lenses[:, 2:]}, numbers)
 
 
-def expose(root: Any, exposures: Mapping[str, float]) -> None:
-    """Have the cameras of an imported capture show flares as its frames were exposed, by the names of the views; an
-    animated camera gets a key at each. Without any all are as usual again."""
+def set_exposures(root: Any, exposures: Mapping[str, float]) -> None:
+    """Set the exposure of the cameras of an imported capture from exposures by the names of the views.
+
+    An animated camera gets a key at each frame. A camera without a value gets 1.
+    """
     for camera in root.children:
         state = camera.fit_flare
         if camera.type != "CAMERA" or not state.view:
             continue
-        for own in fcurves.of(camera):  # of an earlier fit
-            for curve in [curve for curve in own if curve.data_path == EXPOSURE]:
-                own.remove(curve)
+        for curves in fcurves.fcurves_of(camera):  # from an earlier fit
+            for curve in [curve for curve in curves if curve.data_path == EXPOSURE_PATH]:
+                curves.remove(curve)
         state.exposure = exposures.get(state.view, 1.0)
-        for frame in numbered(exposures):
+        for frame in number_views(exposures):
             if Path(frame.view).parent.as_posix() == state.view:
                 state.exposure = exposures[frame.view]
-                camera.keyframe_insert(EXPOSURE, frame=frame.number)
+                camera.keyframe_insert(EXPOSURE_PATH, frame=frame.number)
 
 
-def keys(block: Any, channels: dict[str, NDArray[Any]], frames: Sequence[int]) -> None:
-    """Linear keys on a data block, in bulk: by RNA path, (frames, width) values."""
+def insert_keys(block: Any, channels: dict[str, NDArray[Any]], frames: Sequence[int]) -> None:
+    """Insert linear keys on a data block in bulk. channels: values (frames, width) by RNA path."""
     action = bpy.data.actions.new(f"{block.name} Action")
     block.animation_data_create().action = action
     curves: Any
@@ -241,17 +245,18 @@ def keys(block: Any, channels: dict[str, NDArray[Any]], frames: Sequence[int]) -
             curve.update()
 
 
-def _footage(camera: Any, capture: Capture, views: Sequence[View], numbers: Sequence[int]) -> bool:
-    """The frames as one sequence behind the camera; False, and the first alone, where their names are no sequence."""
+def _show_sequence(camera: Any, capture: Capture, views: Sequence[View], numbers: Sequence[int]) -> bool:
+    """Show the frames as a sequence behind the camera; where their names are no sequence, show the first, return
+    False."""
     paths = [capture.frame_path(view) for view in views]
     patterns = {(path.parent, _NUMBER.sub("#", path.name)) for path in paths}
     found = [_NUMBER.search(path.stem) for path in paths]
     in_order = len(patterns) == 1 and all(match is not None and int(match[1]) == number
                                           for match, number in zip(found, numbers, strict=True))
     if len(paths) == 1 or not in_order:
-        _backdrop(camera, loaded(paths[0]))
+        _add_background(camera, load_image(paths[0]))
         return len(paths) == 1
-    user = _backdrop(camera, loaded(paths[0], "SEQUENCE")).image_user
+    user = _add_background(camera, load_image(paths[0], "SEQUENCE")).image_user
     user.frame_start, user.frame_offset = numbers[0], numbers[0] - 1
     user.frame_duration = numbers[-1] - numbers[0] + 1
     user.use_auto_refresh = True
@@ -259,19 +264,21 @@ def _footage(camera: Any, capture: Capture, views: Sequence[View], numbers: Sequ
 
 
 def show_footage(scene: Any, which: str) -> int:
-    """Show the frames of the capture's folder images/ or removed/ behind its cameras, and under the flare where they
-    are that; how many images changed. A frame that has no twin there stays as it is, and so does an image wherever
-    else it is shown."""
+    """Show the frames of the capture's folder `which`, images/ or removed/; return how many images changed.
+
+    They are shown behind the cameras, and in the compositor's footage node. A frame without a picture of that name in
+    the folder is not changed, nor are other users of an image.
+    """
     root, folder = scene.fit_flare.root, scene.fit_flare.capture
     if root is None or not folder:
         return 0
     base = absolute(folder, scene.library)
-    twins = Twins(base / which) if (base / which).is_dir() else None
+    twins = PictureIndex(base / which) if (base / which).is_dir() else None
     showing: dict[Any, list[Any]] = {}
-    for one in (*_backdrops(root), *footage_nodes(scene)):
-        showing.setdefault(one.image, []).append(one)
+    for user in (*_background_images(root), *footage_nodes(scene)):
+        showing.setdefault(user.image, []).append(user)
     changed = 0
-    for image, those in showing.items():
+    for image, users in showing.items():
         path = absolute(image.filepath, image.library).resolve()
         inner = next((path.relative_to((base / name).resolve()) for name in ("images", REMOVED)
                       if path.is_relative_to((base / name).resolve())), None)
@@ -279,38 +286,39 @@ def show_footage(scene: Any, which: str) -> int:
             continue
         twin = twins.of(inner) if twins is not None else None
         if twin is not None and (base / which / twin).resolve() != path:
-            _of_their_own(image, those).filepath = stored(base / which / twin)
+            _own_image(image, users).filepath = blend_relative(base / which / twin)
             changed += 1
     return changed
 
 
-def _backdrops(root: Any) -> Iterator[Any]:
-    """What has an image behind the cameras of a capture."""
-    for data in {item.data for item in root.children if item.type == "CAMERA"}:  # which two cameras may share
+def _background_images(root: Any) -> Iterator[Any]:
+    """Yield the background images of the cameras of a capture."""
+    for data in {item.data for item in root.children if item.type == "CAMERA"}:  # cameras may share their data
         yield from (back for back in data.background_images if back.image is not None)
 
 
-def _of_their_own(image: Any, those: Sequence[Any]) -> Any:
-    """The image that `those` show, or a copy of it for them where others have it too."""
-    if image.users - image.use_fake_user > len(those):
+def _own_image(image: Any, users: Sequence[Any]) -> Any:
+    """Return the image of these users, or a copy that replaces it where it has other users too."""
+    if image.users - image.use_fake_user > len(users):
         image = image.copy()
-        for one in those:
-            one.image = image
+        for user in users:
+            user.image = image
     return image
 
 
-def _backdrop(camera: Any, image: Any) -> Any:
+def _add_background(camera: Any, image: Any) -> Any:
+    """Add a background image to a camera; return it."""
     camera.data.show_background_images = True
     back = camera.data.background_images.new()
     back.image, back.alpha, back.frame_method, back.display_depth = image, 1.0, "STRETCH", "BACK"
     return back
 
 
-# ---- the rest -------------------------------------------------------------------------------------
+# ---- points and objects -------------------------------------------------------------------------------------
 
 
-def _points(collection: Any, root: Any, cloud: PointCloud) -> Any:
-    """A mesh of vertices with the colour attribute "Col"; it is not rendered."""
+def _add_points(collection: Any, root: Any, cloud: PointCloud) -> Any:
+    """Add the point cloud as a mesh of vertices with the colour attribute "Col"; it is not rendered."""
     mesh = bpy.data.meshes.new("Points")
     mesh.vertices.add(len(cloud))
     mesh.vertices.foreach_set("co", np.ascontiguousarray(cloud.xyz, np.float32).ravel())
@@ -319,13 +327,14 @@ def _points(collection: Any, root: Any, cloud: PointCloud) -> Any:
     rgba[:, :3] = cloud.rgb / np.float32(255)
     colours.data.foreach_set("color_srgb", rgba.ravel())
     mesh.update()
-    points = _object(collection, "Points", mesh, root)
+    points = _add_object(collection, "Points", mesh, root)
     points.hide_render = points.hide_select = True
     points.display_type, points.fit_flare.is_points = "BOUNDS", True  # points.py draws them in their colours
     return points
 
 
-def _object(collection: Any, name: str, data: Any, parent: Any) -> Any:
+def _add_object(collection: Any, name: str, data: Any, parent: Any) -> Any:
+    """Add an object to a collection, as a child of `parent`; return it."""
     made = bpy.data.objects.new(name, data)
     collection.objects.link(made)
     made.parent = parent

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The reusable node group "Fit Flare", and the node of it in a scene, whose inputs are the sliders.
+"""The node group "Fit Flare", and its node in the compositor of a scene, whose inputs are the sliders.
 
-    Flare = Intensity * Tint * (sum of the flare layers, each by its Gain),   Image = Scene + Flare
+    Flare = Intensity * Tint * (sum of the flare layers, each times its Gain),   Image = Scene + Flare
 
-in scene-linear light, so that the picture is the bake's composite at Intensity 1 and white Tint and Gains.
-Written for the compositors of 4.2 to 5.2: up to 4.5 a scene owns a node tree, from 5.0 it points at a node
-group; the mix and math nodes changed family with it.
+in scene-linear light, so the picture is the bake's composite at Intensity 1 with white Tint and Gains. `setup` adds the
+node. It works with the compositors of 4.2 to 5.2: up to 4.5 a scene owns a node tree, from 5.0 it refers to a node
+group, and the mix and math nodes are of other types.
 """
 from __future__ import annotations
 
@@ -17,53 +17,54 @@ import bpy
 GROUP = "Fit Flare"
 GROUPS_ARE_TREES = bpy.app.version >= (5, 0, 0)
 MISSING_IS_MAGENTA = bpy.app.version < (4, 4, 0)
-"""Whether the compositor shows pictures that are missing in magenta, and not as nothing."""
+"""Whether the compositor shows missing pictures in magenta instead of black."""
 _GAIN = " Gain"
 _MIX, _MATH = (("ShaderNodeMix", "ShaderNodeMath") if GROUPS_ARE_TREES
                else ("CompositorNodeMixRGB", "CompositorNodeMath"))
 
 
 def tree_of(scene: Any) -> Any:
-    """The scene's compositor tree, None where it has none."""
+    """Return the compositor tree of the scene; None where it has none."""
     if GROUPS_ARE_TREES:
         return scene.compositing_node_group
     return scene.node_tree if scene.use_nodes else None
 
 
 def find_node(scene: Any) -> Any:
-    """The scene's "Fit Flare" node, whose inputs are the sliders; None where it is not set up."""
+    """Return the "Fit Flare" node of the scene; None where it is not set up."""
     tree = tree_of(scene)
     return tree.nodes.get(GROUP) if tree else None
 
 
 def node_group(layers: Sequence[str]) -> Any:
-    """The node group with one colour input for each flare layer; the one in the file where it fits.
+    """Return a node group with a colour input for each flare layer; one with these inputs is reused.
 
     layers: names of the inputs, such as "flare_lamp".
     """
-    wanted = ["Scene", *layers, "Intensity", "Tint", *(gain_of(layer) for layer in layers)]
+    wanted = ["Scene", *layers, "Intensity", "Tint", *(gain_input(layer) for layer in layers)]
     for group in bpy.data.node_groups:
         if group.bl_idname == "CompositorNodeTree" and group.name.split(".")[0] == GROUP:
             inputs = [item.name for item in group.interface.items_tree if getattr(item, "in_out", "") == "INPUT"]
             if inputs == wanted:
                 return group
     group = bpy.data.node_groups.new(GROUP, "CompositorNodeTree")
-    _declare(group, wanted)
-    _fill(group, layers)
+    _add_sockets(group, wanted)
+    _add_nodes(group, layers)
     return group
 
 
-def gain_of(layer: str) -> str:
-    """The input that holds a layer's factors on linear R, G, B."""
+def gain_input(layer: str) -> str:
+    """Return the name of the input for a layer's factors on linear R, G, B."""
     return f"{layer}{_GAIN}"
 
 
-def layer_of(name: str) -> str:
-    """The layer whose factors an input of that name holds; "" for any other input."""
+def layer_of_gain(name: str) -> str:
+    """Return the layer that a Gain input belongs to; "" for any other input."""
     return name.removesuffix(_GAIN) if name.endswith(_GAIN) else ""
 
 
-def _declare(group: Any, inputs: Iterable[str]) -> None:
+def _add_sockets(group: Any, inputs: Iterable[str]) -> None:
+    """Add the outputs and these inputs to the interface of the group."""
     for name in ("Image", "Flare"):
         group.interface.new_socket(name, in_out="OUTPUT", socket_type="NodeSocketColor")
     for name in inputs:
@@ -72,14 +73,15 @@ def _declare(group: Any, inputs: Iterable[str]) -> None:
         if name == "Intensity":
             socket.default_value, socket.min_value, socket.max_value = 1.0, 0.0, 1000.0
         else:
-            grey = 1.0 if name == "Tint" or layer_of(name) else 0.0
+            grey = 1.0 if name == "Tint" or layer_of_gain(name) else 0.0
             socket.default_value = (grey, grey, grey, 1.0)
 
 
-def _fill(group: Any, layers: Sequence[str]) -> None:
+def _add_nodes(group: Any, layers: Sequence[str]) -> None:
+    """Add the nodes that compute Flare and Image."""
     entry = new_node(group, "NodeGroupInput", 0, 0)
-    sized = [of_render_size(group, entry.outputs[name], 1, -row) for row, name in enumerate(layers, 1)]
-    gained = [_mix(group, "MULTIPLY", one.outputs[0], entry.outputs[gain_of(name)], 2, -row)
+    sized = [scale_to_render_size(group, entry.outputs[name], 1, -row) for row, name in enumerate(layers, 1)]
+    gained = [_mix(group, "MULTIPLY", one.outputs[0], entry.outputs[gain_input(name)], 2, -row)
               for row, (name, one) in enumerate(zip(layers, sized, strict=True), 1)]
     total = gained[0]
     for column, one in enumerate(gained[1:], 3):
@@ -90,11 +92,11 @@ def _fill(group: Any, layers: Sequence[str]) -> None:
     image = _mix(group, "ADD", entry.outputs["Scene"], scaled, column + 2, 0)
     leave = new_node(group, "NodeGroupOutput", column + 6, 0)
     group.links.new(image, leave.inputs["Image"])
-    group.links.new(_with_matte(group, scaled, column + 2), leave.inputs["Flare"])
+    group.links.new(_add_matte(group, scaled, column + 2), leave.inputs["Flare"])
 
 
-def _with_matte(group: Any, colour: Any, column: int) -> Any:
-    """Colour with alpha = max(R, G, B) in 0..1, the rule of the baked layers (core/bake/layers.py)."""
+def _add_matte(group: Any, colour: Any, column: int) -> Any:
+    """Return a colour with alpha = max(R, G, B) clamped to 0..1, as in the baked layers (core/bake/layers.py)."""
     split = new_node(group, "CompositorNodeSeparateColor", column, -2)
     group.links.new(colour, split.inputs[0])
     red, green, blue = split.outputs[:3]
@@ -106,15 +108,14 @@ def _with_matte(group: Any, colour: Any, column: int) -> Any:
 
 
 def new_node(tree: Any, kind: str, column: float, row: float) -> Any:
-    """A node of that type, placed on a grid."""
+    """Add a node of that type at a position on a grid; return it."""
     node = tree.nodes.new(kind)
     node.location = (220 * column, 220 * row)
     return node
 
 
-def of_render_size(tree: Any, socket: Any, column: float, row: float) -> Any:
-    """A node that brings a picture to the size that is rendered: at other percentages than it was baked for Blender
-    would lay it over the middle as it is."""
+def scale_to_render_size(tree: Any, socket: Any, column: float, row: float) -> Any:
+    """Add a node that scales a picture to the size of the render, which Blender does not do by itself; return it."""
     node = new_node(tree, "CompositorNodeScale", column, row)
     if hasattr(node, "space"):
         node.space, node.frame_method = "RENDER_SIZE", "STRETCH"
@@ -128,7 +129,7 @@ def of_render_size(tree: Any, socket: Any, column: float, row: float) -> Any:
 
 
 def _mix(tree: Any, blend: str, a: Any, b: Any, column: float, row: float) -> Any:
-    """The output socket of a (blend) b, at full factor and unclamped."""
+    """Add a mix node of a and b with full factor, unclamped; return its output socket."""
     node = new_node(tree, _MIX, column, row)
     if _MIX == "ShaderNodeMix":
         node.data_type, node.clamp_factor = "RGBA", False

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Baked layers put together in a scene's compositor, by the node "Fit Flare" (flare_node.py).
+"""Sets the compositor of a scene up to combine baked layers with the node "Fit Flare" (flare_node.py).
 
-What was there before is noted on the scene, so that it can all be taken away again. Written for the compositors of 4.2
-to 5.2: up to 4.5 the tree ends in a Composite node, from 5.0 in a Group Output.
+The previous state is stored on the scene, so that `remove` restores it. It works with the compositors of 4.2 to 5.2: up
+to 4.5 the tree ends in a Composite node, from 5.0 in a Group Output.
 """
 from __future__ import annotations
 
@@ -14,106 +14,117 @@ import bpy
 from ...core.bake.folder import LayerFolder
 from ...core.colour.ocio import CONFIGURED_NAMES
 from ...core.errors import FrameError
-from ...core.images.exr import exr_space
+from ...core.images.exr import exr_colour_space
 from .. import fcurves
-from ..images import loaded
+from ..images import load_image
 from ..paths import absolute
 from . import drivers
-from .flare_node import GROUP, GROUPS_ARE_TREES, find_node, layer_of, new_node, node_group, of_render_size, tree_of
+from .flare_node import (
+    GROUP,
+    GROUPS_ARE_TREES,
+    find_node,
+    layer_of_gain,
+    new_node,
+    node_group,
+    scale_to_render_size,
+    tree_of,
+)
 
 LAYERS = "Fit Flare Layers"
 PLATE = "Fit Flare Footage"
 VIEWER = "Fit Flare Viewer"
 RENDER = "Fit Flare Render"
 SIZE = "Fit Flare Size"
-_OURS = (GROUP, LAYERS, PLATE, SIZE, VIEWER, RENDER)
-NOTE = "fit_flare_compositor"  # a property of the scene: what was there before
-_TO_THE_END = 1048574  # frames, the most that Blender has; those without a file are without flare
-_POINTING = ("image", "frame_start", "frame_offset", "frame_duration", "use_auto_refresh")
-_END = "NodeGroupOutput" if GROUPS_ARE_TREES else "CompositorNodeComposite"
+_OUR_NODES = (GROUP, LAYERS, PLATE, SIZE, VIEWER, RENDER)
+STATE_PROPERTY = "fit_flare_compositor"  # of the scene: the state before the set-up
+_MAX_FRAMES = 1048574  # the limit of Blender; frames without a file have no flare
+_IMAGE_NODE_SETTINGS = ("image", "frame_start", "frame_offset", "frame_duration", "use_auto_refresh")
+_OUTPUT_TYPE = "NodeGroupOutput" if GROUPS_ARE_TREES else "CompositorNodeComposite"
 
 
 def set_up(scene: Any, layers: LayerFolder, *, keep_image: bool = False, plate: Any = None) -> Any:
-    """Build the graph that puts `layers` together, or point the one that is there at them.
+    """Build the nodes that combine `layers`, or make existing ones show them; return the "Fit Flare" node.
 
-    keep_image: the scene is what fed the output until now (a render, a plate), and the flare goes over
-    it; otherwise it is the baked scene. plate: (image, frame_start, frame_offset, frame_duration) of footage
-    that is the scene instead. Other nodes stay as they are. Returns the "Fit Flare" node.
-    Raises FrameError where the files hold no flare layers, and for a scene that renders a cropped region.
+    The flare goes over the baked scene by default. keep_image: it goes over the present input of the output (a render
+    or a plate). plate: it goes over footage, given as (image, frame_start, frame_offset, frame_duration). Other nodes
+    are not changed. Raises FrameError where the files hold no flare layers, and for a scene that renders a cropped
+    region.
     """
     if scene.render.use_border and scene.render.use_crop_to_border:
-        raise FrameError(f"The scene {scene.name!r} renders a region cut out of the frame, where layers of whole "
-                         "frames do not fit; switch Crop to Render Region off in its output properties.")
-    had = tree_of(scene)
-    there = _own_tree(scene)
-    if NOTE in scene and (there is None or not any(name in there.nodes for name in _OURS)):
-        del scene[NOTE]  # our nodes were deleted by hand: what was noted is of another compositor
-    note = _note(scene)
-    tree = there or _new_tree(scene, keep_image)
+        raise FrameError(f"The scene {scene.name!r} renders a cropped region, which layers of whole frames do not fit; "
+                         "switch Crop to Render Region off in its output properties.")
+    original = tree_of(scene)
+    own_tree = _own_tree(scene)
+    if STATE_PROPERTY in scene and (own_tree is None or not any(name in own_tree.nodes for name in _OUR_NODES)):
+        del scene[STATE_PROPERTY]  # our nodes were deleted by hand, so the stored state is of another compositor
+    state = _scene_state(scene)
+    tree = own_tree or _new_tree(scene, keep_image)
     source = tree.nodes.get(LAYERS)
-    pointed = None if source is None else {name: getattr(source, name) for name in _POINTING}
+    shown = None if source is None else {name: getattr(source, name) for name in _IMAGE_NODE_SETTINGS}
     if source is None:
-        source = _named(new_node(tree, "CompositorNodeImage", -4, 0), LAYERS)
-    _point_at(source, layers)
-    # The node keeps those that are linked of the files that it showed before.
+        source = _set_name(new_node(tree, "CompositorNodeImage", -4, 0), LAYERS)
+    _show_layers(source, layers)
+    # The node keeps linked sockets of layers that it showed before, as unavailable ones.
     sockets = {socket.name: socket for socket in source.outputs if not socket.is_unavailable}
     names = [name for name in sockets if name.startswith("flare_")] or [name for name in sockets if name == "flare"]
     if not names or "scene" not in sockets:
-        _take_back(scene, tree, source, pointed, note)
-        if had is not None and tree != had:  # it was copied for this
-            scene.compositing_node_group = had
+        _undo_set_up(scene, tree, source, shown, state)
+        if original is not None and tree != original:  # a copy made for this set-up
+            scene.compositing_node_group = original
             bpy.data.node_groups.remove(tree)
         raise FrameError(f"{layers.files[layers.first]} holds no scene and flare layers; choose a folder of a bake.")
-    if NOTE not in scene:
-        scene[NOTE] = {**note, **_before(tree)}
+    if STATE_PROPERTY not in scene:
+        scene[STATE_PROPERTY] = {**state, **_tree_state(tree)}
     node = tree.nodes.get(GROUP)
     if node is None:
-        node = _named(new_node(tree, "CompositorNodeGroup", -2, 0), GROUP)
-    drivers.cut(scene)
-    numbered = [socket.name for socket in node.inputs]
-    sliders = {name: (_value(node, name), _source(node.inputs[name])) for name in numbered
-               if name in ("Intensity", "Tint") or layer_of(name)}
+        node = _set_name(new_node(tree, "CompositorNodeGroup", -2, 0), GROUP)
+    drivers.disconnect(scene)
+    old_names = [socket.name for socket in node.inputs]
+    sliders = {name: (_input_value(node, name), _feeding_socket(node.inputs[name])) for name in old_names
+               if name in ("Intensity", "Tint") or layer_of_gain(name)}
     node.node_tree = node_group(names)
-    numbers = {socket.name: number for number, socket in enumerate(node.inputs)}
+    new_indices = {socket.name: index for index, socket in enumerate(node.inputs)}
     fcurves.renumber(tree, f'nodes["{GROUP}"].inputs',
-                    lambda number: numbers.get(numbered[number]) if number < len(numbered) else number)
+                     lambda old: new_indices.get(old_names[old]) if old < len(old_names) else old)
     for link in [link for socket in node.inputs for link in socket.links if socket.name != "Scene"]:
-        tree.links.remove(link)  # by its number it may lead to another slider now
-    for name, (value, fed) in sliders.items():
+        tree.links.remove(link)  # its index may belong to another input now
+    for name, (value, feeder) in sliders.items():
         if name in node.inputs:
             node.inputs[name].default_value = value
-            if fed is not None:
-                tree.links.new(fed, node.inputs[name])
+            if feeder is not None:
+                tree.links.new(feeder, node.inputs[name])
     for name in names:
         tree.links.new(sockets[name], node.inputs[name])
-    end = _output(tree)
-    before = _source(end)
-    inside = before is not None and _is_behind(before.node, node)  # set up earlier, perhaps with other nodes behind it
-    if inside or before is None or before.node.name in _OURS:
-        before = _under(tree, node, scene[NOTE])
+    end = _output_input(tree)
+    before = _feeding_socket(end)
+    is_set_up = before is not None and _depends_on(before.node, node)  # set up earlier, perhaps with nodes after it
+    if is_set_up or before is None or before.node.name in _OUR_NODES:
+        before = _image_under_flare(tree, node, scene[STATE_PROPERTY])
     if before is not None:
-        scene[NOTE].update({"from": before.node.name, "socket": before.identifier})
+        scene[STATE_PROPERTY].update({"from": before.node.name, "socket": before.identifier})
     scene_socket = sockets["scene"]
     if plate is not None:
-        scene_socket = _footage(tree, plate).outputs["Image"]
+        scene_socket = _footage_node(tree, plate).outputs["Image"]
     elif keep_image:
-        scene_socket = before or _render(tree).outputs["Image"]
+        scene_socket = before or _render_node(tree).outputs["Image"]
     if (size := tree.nodes.get(SIZE)) is not None:
         tree.nodes.remove(size)
     if scene_socket is not None and scene_socket.node.name in (LAYERS, PLATE):
-        scene_socket = _named(of_render_size(tree, scene_socket, -3, 1), SIZE).outputs[0]
+        scene_socket = _set_name(scale_to_render_size(tree, scene_socket, -3, 1), SIZE).outputs[0]
     tree.links.new(scene_socket, node.inputs["Scene"])
-    if not inside or end.links[0].from_node == node:
+    if not is_set_up or end.links[0].from_node == node:
         tree.links.new(node.outputs["Image"], end)
     if not any(other.bl_idname == "CompositorNodeViewer" for other in tree.nodes):
-        viewer = _named(new_node(tree, "CompositorNodeViewer", 1, -1), VIEWER)  # what the backdrop shows
+        viewer = _set_name(new_node(tree, "CompositorNodeViewer", 1, -1), VIEWER)  # what the backdrop shows
         tree.links.new(node.outputs["Image"], viewer.inputs["Image"])
     return node
 
 
 def _own_tree(scene: Any) -> Any:
-    """The scene's compositor tree, None where it has none. One that another scene has as well is copied first: what is
-    done to it would be done to the other scene's. So is one that is linked, to which nothing can be done."""
+    """Return the compositor tree of the scene; None where it has none.
+
+    A tree that another scene uses too, or that is linked, is copied first.
+    """
     tree = tree_of(scene)
     if GROUPS_ARE_TREES and tree is not None and (tree.library is not None or any(
             other != scene and tree_of(other) == tree for other in bpy.data.scenes)):
@@ -122,76 +133,82 @@ def _own_tree(scene: Any) -> Any:
 
 
 def footage_nodes(scene: Any) -> list[Any]:
-    """The node that lays footage under the flare, if there is one."""
+    """Return the node that shows footage under the flare, as a list; [] without one."""
     tree = tree_of(scene)
     node = tree.nodes.get(PLATE) if tree is not None else None
     return [node] if getattr(node, "image", None) is not None else []
 
 
-def plate_of(scene: Any) -> tuple[Any, int, int, int]:
-    """The footage behind the scene's camera, as `set_up` takes it. Raises FrameError where there is none."""
+def footage_behind_camera(scene: Any) -> tuple[Any, int, int, int]:
+    """Return the footage behind the scene's camera for `set_up`. Raises FrameError where there is none."""
     camera = scene.camera
     for back in camera.data.background_images if camera is not None and camera.type == "CAMERA" else ():
         if back.source == "IMAGE" and back.image is not None:
             user = back.image_user
             return back.image, user.frame_start, user.frame_offset, user.frame_duration
-    raise FrameError("The camera has no footage behind it; lay the flare over the present image instead.")
+    raise FrameError("The camera has no footage behind it; put the flare over the present image instead.")
 
 
-def _source(socket: Any) -> Any:
-    """The output socket that feeds an input, None where nothing does."""
+def _feeding_socket(socket: Any) -> Any:
+    """Return the output socket that feeds an input; None where nothing does."""
     return socket.links[0].from_socket if socket is not None and socket.is_linked else None
 
 
-def _is_behind(one: Any, node: Any) -> bool:
-    """Whether a node is `node`, or shows something of it."""
-    seen: set[str] = set()
-    left = [one]
-    while left:
-        here = left.pop()
-        if here == node:
+def _depends_on(candidate: Any, node: Any) -> bool:
+    """Return whether a node is `node`, or uses its output directly or through others."""
+    visited: set[str] = set()
+    remaining = [candidate]
+    while remaining:
+        current = remaining.pop()
+        if current == node:
             return True
-        if here.name not in seen:
-            seen.add(here.name)
-            left += [link.from_node for socket in here.inputs for link in socket.links]
+        if current.name not in visited:
+            visited.add(current.name)
+            remaining += [link.from_node for socket in current.inputs for link in socket.links]
     return False
 
 
-def _under(tree: Any, node: Any, note: Any) -> Any:
-    """The output socket of what someone has under the flare: what feeds our node, or fed the output before it. None
-    where that is nothing, or is behind the flare, from where it would make a cycle."""
-    had = tree.nodes.get(note["from"])
-    noted = next((one for one in had.outputs if one.identifier == note["socket"]), None) if had else None
-    for socket in (_source(node.inputs.get("Scene")), noted):
-        if socket is not None and socket.node.name not in _OURS and not _is_behind(socket.node, node):
+def _image_under_flare(tree: Any, node: Any, state: Any) -> Any:
+    """Return the output socket of the artist's image under the flare; None where there is none.
+
+    It feeds our node, or fed the output before the set-up. A node that depends on the flare would make a cycle and does
+    not count.
+    """
+    feeder = tree.nodes.get(state["from"])
+    stored = next((one for one in feeder.outputs if one.identifier == state["socket"]), None) if feeder else None
+    for socket in (_feeding_socket(node.inputs.get("Scene")), stored):
+        if socket is not None and socket.node.name not in _OUR_NODES and not _depends_on(socket.node, node):
             return socket
     return None
 
 
-def _take_back(scene: Any, tree: Any, source: Any, pointed: dict[str, Any] | None, note: dict[str, Any]) -> None:
-    """Leave no trace of layers that turned out to be none: `pointed` is where their node pointed before, if it was
-    there, `note` what the scene had."""
+def _undo_set_up(scene: Any, tree: Any, source: Any, shown: dict[str, Any] | None, state: dict[str, Any]) -> None:
+    """Restore the scene after files without flare layers.
+
+    shown: the previous settings of the layers' node, None where it is new. state: from `_scene_state`.
+    """
     image = source.image
-    if pointed is not None:
-        for name, value in pointed.items():
+    if shown is not None:
+        for name, value in shown.items():
             setattr(source, name, value)
     else:
         tree.nodes.remove(source)
-        if not note["tree"]:
-            _discard_tree(scene, tree, bool(note["use_nodes"]))
+        if not state["tree"]:
+            _discard_tree(scene, tree, bool(state["use_nodes"]))
         elif not GROUPS_ARE_TREES:
-            scene.use_nodes = bool(note["use_nodes"])
-    _drop([image], note)
+            scene.use_nodes = bool(state["use_nodes"])
+    _remove_unused([image], state)
 
 
-def _render(tree: Any) -> Any:
-    """A Render Layers node, the first there is."""
+def _render_node(tree: Any) -> Any:
+    """Return the first Render Layers node; one is added where there is none."""
     found = next((node for node in tree.nodes if node.bl_idname == "CompositorNodeRLayers"), None)
-    return found or _named(new_node(tree, "CompositorNodeRLayers", -4, 1), RENDER)
+    return found or _set_name(new_node(tree, "CompositorNodeRLayers", -4, 1), RENDER)
 
 
-def _footage(tree: Any, plate: tuple[Any, int, int, int]) -> Any:
-    node = tree.nodes.get(PLATE) or _named(new_node(tree, "CompositorNodeImage", -4, 2.5), PLATE)
+def _footage_node(tree: Any, plate: tuple[Any, int, int, int]) -> Any:
+    """Return the node that shows the footage `plate`."""
+    node = tree.nodes.get(PLATE) or _set_name(new_node(tree, "CompositorNodeImage", -4, 2.5), PLATE)
     image, start, offset, duration = plate
     node.image = image
     if image.source == "SEQUENCE":
@@ -200,78 +217,77 @@ def _footage(tree: Any, plate: tuple[Any, int, int, int]) -> Any:
     return node
 
 
-# ---- and away again -------------------------------------------------------------------------------
+# ---- removal -------------------------------------------------------------------------------
 
 
-def _note(scene: Any) -> dict[str, Any]:
-    """What the scene and the file had before any of this."""
-    viewer = any(image.type == "COMPOSITING" for image in bpy.data.images)  # Blender makes it for a Viewer node
+def _scene_state(scene: Any) -> dict[str, Any]:
+    """Return the compositor state of the scene and the file before the set-up."""
+    viewer = any(image.type == "COMPOSITING" for image in bpy.data.images)  # Blender makes one for a Viewer node
     if GROUPS_ARE_TREES:
         return {"tree": scene.compositing_node_group is not None, "use_nodes": True, "viewer": viewer}
     return {"tree": scene.node_tree is not None, "use_nodes": bool(scene.use_nodes), "viewer": viewer}
 
 
-def _before(tree: Any) -> dict[str, Any]:
-    """The names of a tree's nodes, and what fed its output."""
-    end = _output(tree, make=False)
-    fed = _source(end)
+def _tree_state(tree: Any) -> dict[str, Any]:
+    """Return the names of the nodes in a tree, and the socket that feeds its output."""
+    end = _output_input(tree, make=False)
+    feeder = _feeding_socket(end)
     return {"nodes": "\n".join(node.name for node in tree.nodes if node.name not in (GROUP, LAYERS)),
             "drivers": tree.animation_data is not None,
-            "from": fed.node.name if fed else "", "socket": fed.identifier if fed else ""}
+            "from": feeder.node.name if feeder else "", "socket": feeder.identifier if feeder else ""}
 
 
 def remove(scene: Any) -> None:
-    """Take the graph away: what was there before `set_up` is there again, and nothing else.
-
-    Raises FrameError where it is not set up.
-    """
+    """Remove our nodes and restore the state before `set_up`. Raises FrameError where it is not set up."""
     if find_node(scene) is None:
-        raise FrameError(f"The scene {scene.name!r} has no compositor of Fit Flare to remove.")
+        raise FrameError(f"The compositor of the scene {scene.name!r} has no nodes of Fit Flare to remove.")
     tree = _own_tree(scene)
     node = tree.nodes[GROUP]
-    note = dict(scene[NOTE]) if NOTE in scene else {**_note(scene), **_before(tree), "nodes": None}
+    state = dict(scene[STATE_PROPERTY]) if STATE_PROPERTY in scene else {**_scene_state(scene), **_tree_state(tree),
+                                                                         "nodes": None}
     group, images = node.node_tree, [tree.nodes[name].image for name in (LAYERS, PLATE) if tree.nodes.get(name)]
-    below = _under(tree, node, note)
-    if below is None and not note["tree"]:
-        below = _render(tree).outputs["Image"]
+    below = _image_under_flare(tree, node, state)
+    if below is None and not state["tree"]:
+        below = _render_node(tree).outputs["Image"]
     for fed in [link.to_socket for link in tree.links if link.from_node == node
-                and (link.from_socket.name == "Image" or link.to_node.bl_idname == _END)]:
+                and (link.from_socket.name == "Image" or link.to_node.bl_idname == _OUTPUT_TYPE)]:
         if below is not None:
             tree.links.new(below, fed)
-    drivers.cut(scene)
-    if not note.get("drivers", True) and tree.animation_data is not None and not tree.animation_data.drivers:
+    drivers.disconnect(scene)
+    if not state.get("drivers", True) and tree.animation_data is not None and not tree.animation_data.drivers:
         tree.animation_data_clear()
-    for name in _OURS:
+    for name in _OUR_NODES:
         ours = tree.nodes.get(name)
         if ours is not None and not (name == RENDER and any(one.is_linked for one in ours.outputs)):
             tree.nodes.remove(ours)
-    if not note["tree"] and all(one.bl_idname in (_END, "CompositorNodeViewer") or one.name == RENDER
+    if not state["tree"] and all(one.bl_idname in (_OUTPUT_TYPE, "CompositorNodeViewer") or one.name == RENDER
                                 for one in tree.nodes):
-        _discard_tree(scene, tree, bool(note["use_nodes"]))
-    elif note["tree"]:
-        if note.get("nodes") is not None:
-            known = note["nodes"].split("\n")
-            for extra in [one for one in tree.nodes if one.name not in known and one.bl_idname == _END]:
+        _discard_tree(scene, tree, bool(state["use_nodes"]))
+    elif state["tree"]:
+        if state.get("nodes") is not None:
+            known = state["nodes"].split("\n")
+            for extra in [one for one in tree.nodes if one.name not in known and one.bl_idname == _OUTPUT_TYPE]:
                 if not any(socket.is_linked for socket in extra.inputs):
                     tree.nodes.remove(extra)
         if not GROUPS_ARE_TREES:
-            scene.use_nodes = bool(note["use_nodes"])
-    if NOTE in scene:
-        del scene[NOTE]
+            scene.use_nodes = bool(state["use_nodes"])
+    if STATE_PROPERTY in scene:
+        del scene[STATE_PROPERTY]
     if group is not None and not group.users:
         bpy.data.node_groups.remove(group)
-    _drop(images, note)
+    _remove_unused(images, state)
 
 
-def _drop(images: Sequence[Any], note: dict[str, Any]) -> None:
-    """Remove images that nothing uses any more, and the viewer's where there was none before."""
-    viewers = [image for image in bpy.data.images if image.type == "COMPOSITING" and not note.get("viewer", True)]
+def _remove_unused(images: Sequence[Any], state: dict[str, Any]) -> None:
+    """Remove images without users, and the viewer's image where there was none before the set-up."""
+    viewers = [image for image in bpy.data.images if image.type == "COMPOSITING" and not state.get("viewer", True)]
     for image in (*images, *viewers):
-        if image is not None and (not image.users or image.type == "COMPOSITING"):  # that one counts itself
+        if image is not None and (not image.users or image.type == "COMPOSITING"):  # the viewer's image is its own user
             bpy.data.images.remove(image)
 
 
 def _discard_tree(scene: Any, tree: Any, use_nodes: bool) -> None:
+    """Remove the compositor tree of the scene."""
     if GROUPS_ARE_TREES:
         scene.compositing_node_group = None
         if not tree.users:
@@ -281,20 +297,22 @@ def _discard_tree(scene: Any, tree: Any, use_nodes: bool) -> None:
         scene.use_nodes = use_nodes
 
 
-def _value(node: Any, name: str) -> Any:
+def _input_value(node: Any, name: str) -> Any:
+    """Return the value of an input, a number or a tuple."""
     value = node.inputs[name].default_value
     return value if isinstance(value, float) else tuple(value)
 
 
-def _named(node: Any, name: str) -> Any:
+def _set_name(node: Any, name: str) -> Any:
+    """Set name and label of a node; return it."""
     node.name = node.label = name
     return node
 
 
 def _new_tree(scene: Any, keep_image: bool) -> Any:
-    """A compositor for a scene without one: with the render feeding the output, or empty.
+    """Return a new compositor tree, empty or, with `keep_image`, with the render as its output.
 
-    A Render Layers node makes Blender render the 3D scene, used or not, so there is none without need.
+    A Render Layers node makes Blender render the 3D scene even if it is not used, so none is added without need.
     """
     fresh = GROUPS_ARE_TREES or scene.node_tree is None
     if GROUPS_ARE_TREES:
@@ -305,61 +323,66 @@ def _new_tree(scene: Any, keep_image: bool) -> Any:
     if fresh:
         tree.nodes.clear()
         if keep_image:
-            render = _named(new_node(tree, "CompositorNodeRLayers", -4, 1), RENDER)
-            tree.links.new(render.outputs["Image"], _output(tree))
+            render = _set_name(new_node(tree, "CompositorNodeRLayers", -4, 1), RENDER)
+            tree.links.new(render.outputs["Image"], _output_input(tree))
     return tree
 
 
-def _output(tree: Any, make: bool = True) -> Any:
-    """The input socket that the final picture goes into; where there is none it is made, or None."""
-    found = sorted((node for node in tree.nodes if node.bl_idname == _END), key=lambda node: not _counts(tree, node))
+def _output_input(tree: Any, make: bool = True) -> Any:
+    """Return the input socket of the final picture; where there is none it is added, or None without `make`."""
+    found = sorted((node for node in tree.nodes if node.bl_idname == _OUTPUT_TYPE),
+                   key=lambda node: not _is_active_output(tree, node))
     if not make:
         return found[0].inputs[0] if found and len(found[0].inputs) else None
     if GROUPS_ARE_TREES and not any(getattr(item, "in_out", "") == "OUTPUT" for item in tree.interface.items_tree):
         tree.interface.new_socket("Image", in_out="OUTPUT", socket_type="NodeSocketColor")
-    node = found[0] if found else new_node(tree, _END, 1, 0)
+    node = found[0] if found else new_node(tree, _OUTPUT_TYPE, 1, 0)
     return node.inputs[0]
 
 
-def _counts(tree: Any, end: Any) -> bool:
-    """Whether an output is the one of several that Blender goes by. 4.x does not say so, but makes it the one that is
-    clicked on; once another node is, it is the one that shows our node, which was put there while it was known."""
+def _is_active_output(tree: Any, end: Any) -> bool:
+    """Return whether an output node is the one that Blender uses, where there are several.
+
+    4.x does not store it, but uses the one that was selected last. Where another node is selected now, it is the output
+    that shows our node, since that was linked to the active output.
+    """
     if hasattr(end, "is_active_output"):
         return bool(end.is_active_output)
-    if tree.nodes.active is not None and tree.nodes.active.bl_idname == _END:
+    if tree.nodes.active is not None and tree.nodes.active.bl_idname == _OUTPUT_TYPE:
         return bool(end == tree.nodes.active)
-    return GROUP in tree.nodes and _is_behind(end, tree.nodes[GROUP])
+    return GROUP in tree.nodes and _depends_on(end, tree.nodes[GROUP])
 
 
-def _point_at(node: Any, layers: LayerFolder) -> None:
-    """Make an Image node show the file of each frame's number, gaps and a frame 0 included."""
-    image = loaded(layers.files[layers.first], "SEQUENCE")
+def _show_layers(node: Any, layers: LayerFolder) -> None:
+    """Make an Image node show the file with the number of each frame; gaps and a frame 0 are possible."""
+    image = load_image(layers.files[layers.first], "SEQUENCE")
     node.image = image
-    if space := _space_of(image):  # a configuration may take EXRs for another
+    if space := _configured_space(image):  # a configuration may assign another space to EXRs
         image.colorspace_settings.name = space
     node.frame_start, node.frame_offset = layers.first, layers.first - 1
-    node.frame_duration = _TO_THE_END  # of the layers' own range the last one would be shown ever after
+    node.frame_duration = _MAX_FRAMES  # with the range of the layers the last one would be repeated after it
     node.use_auto_refresh = True
 
 
-def over_render(scene: Any) -> bool:
-    """Whether the flare lies over what the scene renders."""
+def is_over_render(scene: Any) -> bool:
+    """Return whether the flare goes over the render of the scene."""
     node = find_node(scene)
-    return node is not None and any(_is_behind(node, one) for one in tree_of(scene).nodes
+    return node is not None and any(_depends_on(node, one) for one in tree_of(scene).nodes
                                     if one.bl_idname == "CompositorNodeRLayers")
 
 
-def misread(scene: Any) -> str:
-    """A sentence where the colour configuration has no space for the light of the layers, "" where it has."""
+def colour_space_warning(scene: Any) -> str:
+    """Return a warning where the colour configuration has no space for the layers, "" where it has."""
     image = tree_of(scene).nodes[LAYERS].image
-    if _space_of(image):
+    if _configured_space(image):
         return ""
-    space = exr_space(absolute(image.filepath)).replace("linear", "linear Rec. 709")
-    return (f"The colour configuration has no space of {space or 'these chromaticities'}, which the layers are in; "
+    space = exr_colour_space(absolute(image.filepath)).replace("linear", "linear Rec. 709")
+    return (f"The colour configuration has no space for {space or 'these chromaticities'}, which the layers are in; "
             f"they are read as {image.colorspace_settings.name}, and their colours are wrong.")
 
 
-def _space_of(image: Any) -> str:
-    """What the colour configuration calls the space that an EXR's light is in; "" where it has none."""
+def _configured_space(image: Any) -> str:
+    """Return the name of an EXR's colour space in the colour configuration; "" where it has none."""
     known = {item.identifier for item in image.colorspace_settings.bl_rna.properties["name"].enum_items}
-    return next((one for one in CONFIGURED_NAMES.get(exr_space(absolute(image.filepath)), ()) if one in known), "")
+    return next((one for one in CONFIGURED_NAMES.get(exr_colour_space(absolute(image.filepath)), ()) if one in known),
+                "")

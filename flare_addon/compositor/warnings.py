@@ -1,46 +1,49 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What of a composite that is set up will not be as somebody may expect, each in one sentence."""
+"""Warnings about scene settings that keep a render from showing the composite."""
 from __future__ import annotations
 
 from collections.abc import Iterator
 from typing import Any
 
 from ...core.bake.folder import LayerFolder
-from ...core.conventions.frame_numbers import Frame, absent
-from ...core.images.picture import are_one_shape
+from ...core.conventions.frame_numbers import NumberedFrame, missing_numbers
+from ...core.images.picture import same_aspect
 from . import drivers, flare_node, setup
 
 
 def warnings(scene: Any, layers: LayerFolder, live: bool) -> Iterator[str]:
-    """Sentences on a scene whose compositor shows `layers`; `live`: the panel's sliders act on it."""
+    """Yield a warning for each problem of a scene whose compositor shows `layers`.
+
+    live: the sliders of the panel drive the compositor.
+    """
     render = scene.render
     if not render.use_compositing:
-        yield ("Compositing is switched off for this scene, so that renders are without the flare; switch it on in the "
-               "output properties, under Post Processing.")
-    if strips := _strips(scene):
+        yield ("Compositing is switched off for this scene, so renders have no flare; switch it on in the output "
+               "properties, under Post Processing.")
+    if strips := _active_strips(scene):
         yield (f"Renders show the video sequencer, which has {strips[0].name!r}, in place of the compositor, without "
                "the flare; switch Sequencer off in the output properties, under Post Processing.")
-    if render.film_transparent and setup.over_render(scene) and _loses_light(render.image_settings):
-        yield (f"The film is transparent, and {render.image_settings.file_format} files have no light where nothing is "
-               "but the flare; render to OpenEXR, or without alpha (RGB).")
+    if render.film_transparent and setup.is_over_render(scene) and _loses_light(render.image_settings):
+        yield (f"The film is transparent, and {render.image_settings.file_format} files lose the flare where alpha is "
+               "0; render to OpenEXR, or without alpha (RGB).")
     width, height = layers.size()
-    if not are_one_shape((width, height), (render.resolution_x, render.resolution_y)):
+    if not same_aspect((width, height), (render.resolution_x, render.resolution_y)):
         yield (f"The layers have {width} x {height} pixels and the scene renders {render.resolution_x} x "
-               f"{render.resolution_y}, another shape, into which they are stretched; bake them again.")
-    there = [Frame("", number, "") for number in layers.files]
-    if bare := absent(there, f"{max(scene.frame_start, 0)}-{max(scene.frame_end, scene.frame_start, 0)}"):
-        they = "Blender shows in magenta before 4.4" if flare_node.MISSING_IS_MAGENTA else "are without flare"
-        yield (f"The scene has the frames {scene.frame_start}-{scene.frame_end}, and there are no layers of {bare}, "
-               f"which {they}; bake them too.")
+               f"{render.resolution_y}, another aspect ratio, to which they are stretched; bake them again.")
+    baked = [NumberedFrame("", number, "") for number in layers.files]
+    if missing := missing_numbers(baked, f"{max(scene.frame_start, 0)}-{max(scene.frame_end, scene.frame_start, 0)}"):
+        effect = "this version of Blender shows in magenta" if flare_node.MISSING_IS_MAGENTA else "are without flare"
+        yield (f"The scene has the frames {scene.frame_start}-{scene.frame_end}, and there are no layers of {missing}, "
+               f"which {effect}; bake them too.")
     if live and drivers.is_animated(scene):
-        yield ("Sliders that act on it are animated: they stand still where this extension is not, on a farm say; bake "
+        yield ("Sliders that act on it are animated: without this extension, as on a farm, they do not move; bake "
                "without Keep Colours Live for that.")
-    if misread := setup.misread(scene):
-        yield misread
+    if warning := setup.colour_space_warning(scene):
+        yield warning
 
 
-def _strips(scene: Any) -> Any:
-    """What a render takes from the sequencer, if it does."""
+def _active_strips(scene: Any) -> Any:
+    """Return the strips of the sequencer that a render shows."""
     editor = scene.sequence_editor
     if not scene.render.use_sequencer or editor is None:
         return ()
@@ -49,5 +52,5 @@ def _strips(scene: Any) -> Any:
 
 
 def _loses_light(settings: Any) -> bool:
-    """Whether files have alpha, and no light where it is 0."""
+    """Return whether the file format has alpha and no light where it is 0."""
     return settings.color_mode == "RGBA" and settings.file_format not in ("OPEN_EXR", "OPEN_EXR_MULTILAYER")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What the buttons do: read the properties, call the module that does it, report what went wrong."""
+"""The operators of the buttons: they read properties, call the module that does the work, and report errors."""
 from __future__ import annotations
 
 from . import bake, capture, fit, library, lights

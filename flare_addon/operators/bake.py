@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Layers out, and back together in the compositor."""
+"""Operators that bake layers and set the compositor up for them."""
 from __future__ import annotations
 
 from pathlib import Path
@@ -12,21 +12,21 @@ from ...core.errors import CaptureError
 from .. import engine, jobs, render_settings, shots
 from ..compositor import drivers, flare_node, setup, warnings
 from ..paths import absolute, is_folder
-from ..reports import NO_CAMERA, NO_FLARE, Action, reported
+from ..reports import NO_CAMERA, NO_FLARE, GuardedOperator, report_errors
 
 
-class FITFLARE_OT_bake(Action, bpy.types.Operator):
+class FITFLARE_OT_bake(GuardedOperator, bpy.types.Operator):
     """Render the flares to EXR layers in the engine, for the frames and the camera of the scene"""
 
     bl_idname = "fit_flare.bake"
     bl_label = "Bake Layers"
-    bl_options = {"UNDO"}  # the folder that it chooses, or undoing what comes later would forget it
+    bl_options = {"UNDO"}  # else undoing a later step would reset the folder that it sets
 
     selected: bpy.props.BoolProperty(  # type: ignore[valid-type]
-        name="Selected Cameras", description="Bake from every selected camera, each into a folder of its own",
+        name="Selected Cameras", description="Bake from every selected camera, each to its own folder",
         default=False)
     replace: bpy.props.BoolProperty(  # type: ignore[valid-type]
-        name="Replace Others", description="Other frames of the folder that were baked otherwise may go",
+        name="Replace Others", description="Delete other frames in the folder that were baked with other settings",
         default=False, options={"HIDDEN", "SKIP_SAVE"})
 
     @classmethod
@@ -36,28 +36,28 @@ class FITFLARE_OT_bake(Action, bpy.types.Operator):
             return NO_FLARE
         if scene.camera is None:
             return NO_CAMERA
-        if missing := engine.missing():
+        if missing := engine.missing_reason():
             return missing
-        return "A bake is running" if _baking(scene) else ""
+        return "A bake is running" if _is_baking(scene) else ""
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
-        lost: list[int] = []
-        with reported(self) as outcome:
-            lost = shots.replaced(context.scene, self._chosen(context))
+        replaced: list[int] = []
+        with report_errors(self) as outcome:
+            replaced = shots.frames_to_replace(context.scene, self._chosen(context))
         if outcome.status == {"CANCELLED"}:
             return outcome.status
-        self.replace = True  # none go, or someone says that they may
-        if not lost:
+        self.replace = True  # nothing is replaced, or the dialog below asks first
+        if not replaced:
             return self.execute(context)
         return context.window_manager.invoke_confirm(
             self, event, title="Replace Layers", confirm_text="Replace",
-            message=shots.losing(shots.layers_folder(context.scene), lost))
+            message=shots.replacement_warning(shots.layers_folder(context.scene), replaced))
 
     def act(self, context: bpy.types.Context) -> None:
-        shots.bake(context.scene, self._chosen(context), others_may_go=self.replace)
+        shots.bake(context.scene, self._chosen(context), replace_others=self.replace)
 
     def _chosen(self, context: bpy.types.Context) -> list[Any]:
-        """The cameras to bake from; none for the scene's own. Raises CaptureError where none is selected."""
+        """Return the selected cameras; [] for the scene's camera. Raises CaptureError where none is selected."""
         if not self.selected:
             return []
         found = [item for item in context.selected_objects if item.type == "CAMERA"]
@@ -66,27 +66,30 @@ class FITFLARE_OT_bake(Action, bpy.types.Operator):
         return found
 
 
-def _baking(scene: Any) -> bool:
-    """Whether the engine is at work on this scene's layers."""
+def _is_baking(scene: Any) -> bool:
+    """Return whether a bake of this scene's layers is running."""
     job = jobs.find(shots.layers_folder(scene)) if scene.fit_flare.layers else None
     return job is not None and job.running
 
 
 def set_up(operator: Any, scene: Any, folder: str, *, keep_image: bool, plate: bool, match: bool = False) -> None:
-    """Nodes for the layers in a folder, over the baked scene, what the compositor shows now (`keep_image`) or the
-    footage behind the camera (`plate`); `match` gives the scene their frames and size. Raises FrameError."""
-    layers = LayerFolder.open(shots.folder_of_camera(absolute(folder), scene.camera))
-    setup.set_up(scene, layers, keep_image=keep_image, plate=setup.plate_of(scene) if plate else None)
+    """Set the compositor up for the layers in a folder.
+
+    The flare goes over the baked scene, the compositor's present output (`keep_image`), or the footage behind the
+    camera (`plate`). match: set the frames and the size of the scene to the layers'. Raises FrameError.
+    """
+    layers = LayerFolder.open(shots.camera_folder(absolute(folder), scene.camera))
+    setup.set_up(scene, layers, keep_image=keep_image, plate=setup.footage_behind_camera(scene) if plate else None)
     if match:
         render_settings.match_scene(scene, layers, layers.size())
-    live = "; Intensity and Tint of the panel act on it" if wire(scene, layers) else ""
-    for told in warnings.warnings(scene, layers, bool(live)):
-        operator.report({"WARNING"}, told)
+    live = "; Intensity and Tint of the panel act on it" if connect_sliders(scene, layers) else ""
+    for warning in warnings.warnings(scene, layers, bool(live)):
+        operator.report({"WARNING"}, warning)
     operator.report({"INFO"}, f"{len(layers.files)} frames of layers set up{live}")
 
 
-class FITFLARE_OT_set_up_compositor(Action, bpy.types.Operator):
-    """Put baked layers together in the compositor of this scene, over what is there"""
+class FITFLARE_OT_set_up_compositor(GuardedOperator, bpy.types.Operator):
+    """Combine baked layers in the compositor of this scene; existing nodes are kept"""
 
     bl_idname = "fit_flare.set_up_compositor"
     bl_label = "Set Up Compositor"
@@ -96,21 +99,21 @@ class FITFLARE_OT_set_up_compositor(Action, bpy.types.Operator):
         name="Layers",
         description="Folder of the baked EXR layers",
         subtype="DIR_PATH",
-        options={"SKIP_SAVE"},  # else the last one would pass for one that was dropped
+        options={"SKIP_SAVE"},  # else the last value would count as a dropped file
     )
     keep_image: bpy.props.BoolProperty(  # type: ignore[valid-type]
         name="Over the Present Image",
-        description="Lay the flare over what the compositor shows now, instead of the baked scene",
+        description="Put the flare over the present output of the compositor, instead of the baked scene",
         default=False,
     )
     plate: bpy.props.BoolProperty(  # type: ignore[valid-type]
         name="Over the Footage",
-        description="Lay the flare over the frames behind the scene's camera",
+        description="Put the flare over the frames behind the scene's camera",
         default=False,
     )
     match_scene: bpy.props.BoolProperty(  # type: ignore[valid-type]
         name="Match Scene",
-        description="Give the scene the frames and the size of the layers",
+        description="Set the frame range and the size of the scene to those of the layers",
         default=True,
     )
 
@@ -125,17 +128,18 @@ class FITFLARE_OT_set_up_compositor(Action, bpy.types.Operator):
                match=self.match_scene)
 
 
-def wire(scene: Any, layers: LayerFolder) -> bool:
-    """Connect the panel's sliders to layers that this scene has baked without them; whether it was done."""
+def connect_sliders(scene: Any, layers: LayerFolder) -> bool:
+    """Drive the compositor by the sliders of the panel Look, for layers baked without them; return whether it was
+    done."""
     gains = shots.live_layers(scene.fit_flare, layers.folder)
     if gains is None:
         return False
-    drivers.wire(scene, gains)
+    drivers.connect(scene, gains)
     return True
 
 
-class FITFLARE_OT_remove_compositor(Action, bpy.types.Operator):
-    """Take Fit Flare's nodes out of the compositor; what was there before is there again"""
+class FITFLARE_OT_remove_compositor(GuardedOperator, bpy.types.Operator):
+    """Remove Fit Flare's nodes from the compositor and restore its previous state"""
 
     bl_idname = "fit_flare.remove_compositor"
     bl_label = "Remove from Compositor"
@@ -151,8 +155,8 @@ class FITFLARE_OT_remove_compositor(Action, bpy.types.Operator):
         setup.remove(context.scene)
 
 
-class FITFLARE_OT_set_up_baked(Action, bpy.types.Operator):
-    """Put the layers that were baked here together in the compositor"""
+class FITFLARE_OT_set_up_baked(GuardedOperator, bpy.types.Operator):
+    """Combine the layers that were baked from this scene in the compositor"""
 
     bl_idname = "fit_flare.set_up_baked"
     bl_label = "Set Up Compositor"
@@ -163,7 +167,7 @@ class FITFLARE_OT_set_up_baked(Action, bpy.types.Operator):
         state = context.scene.fit_flare
         if not state.layers:
             return "Bake layers first, or choose their folder"
-        return "The bake is still running" if _baking(context.scene) else ""
+        return "The bake is still running" if _is_baking(context.scene) else ""
 
     def act(self, context: bpy.types.Context) -> None:
         state = context.scene.fit_flare
@@ -180,7 +184,7 @@ class FITFLARE_OT_open_folder(bpy.types.Operator):
 
     def execute(self, _context: bpy.types.Context) -> set[str]:
         if not is_folder(Path(self.folder)):
-            self.report({"ERROR"}, f"The folder {self.folder} is not there any more.")
+            self.report({"ERROR"}, f"The folder {self.folder} does not exist any more.")
             return {"CANCELLED"}
         bpy.ops.wm.path_open(filepath=self.folder)
         return {"FINISHED"}

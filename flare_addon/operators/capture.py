@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Import of a capture, and a capture made of a camera that Blender has solved or animated."""
+"""Operators that import a capture, and that make one from a solved or animated camera of Blender."""
 from __future__ import annotations
 
 from pathlib import Path
@@ -9,10 +9,10 @@ import bpy
 from .. import fits
 from ..capture import exporter
 from ..capture.importer import ImportSettings, import_capture
-from ..reports import NO_CAMERA, Action
+from ..reports import NO_CAMERA, GuardedOperator
 
 
-class FITFLARE_OT_import_capture(Action, bpy.types.Operator):
+class FITFLARE_OT_import_capture(GuardedOperator, bpy.types.Operator):
     """Import a capture: its cameras with the frames behind them, its points and its lights"""
 
     bl_idname = "fit_flare.import_capture"
@@ -22,25 +22,26 @@ class FITFLARE_OT_import_capture(Action, bpy.types.Operator):
     directory: bpy.props.StringProperty(name="Folder", description="The capture's folder, or one inside it",  # type: ignore[valid-type]
                                         subtype="DIR_PATH", options={"SKIP_SAVE"})
     filepath: bpy.props.StringProperty(name="File", description="A file of the capture", subtype="FILE_PATH",  # type: ignore[valid-type]
-                                       options={"SKIP_SAVE"})  # else the last one would pass for one that was dropped
+                                       options={"SKIP_SAVE"})  # else the last value would count as a dropped file
     filter_folder: bpy.props.BoolProperty(default=True, options={"HIDDEN"})  # type: ignore[valid-type]
     filter_glob: bpy.props.StringProperty(default="*.json;*.bin;*.txt", options={"HIDDEN"})  # type: ignore[valid-type]
     cameras: bpy.props.EnumProperty(  # type: ignore[valid-type]
-        name="Cameras", description="How the frames' cameras come in",
+        name="Cameras", description="How the cameras of the frames are imported",
         items=(("animated", "One, Animated", "One camera with a key for each frame; frames follow the timeline"),
-               ("each", "One for Each Frame", "A camera object for each frame, each with its picture")))
+               ("each", "One per Frame", "A camera object for each frame, with its picture")))
     up: bpy.props.EnumProperty(  # type: ignore[valid-type]
         name="Up Axis", description="The axis that points up in the capture",
-        items=(("Z", "+Z", "As Blender; what Fit Flare's own solve writes"),
-               ("-Y", "-Y", "As COLMAP often leaves it: y points down"), ("Y", "+Y", "As many game engines")))
+        items=(("Z", "+Z", "As in Blender, and in captures that Fit Flare solved"),
+               ("-Y", "-Y", "As in many COLMAP models: y points down"), ("Y", "+Y", "As in many game engines")))
     scale: bpy.props.FloatProperty(  # type: ignore[valid-type]
-        name="Scale", description="Scene units for each unit of the capture", default=1.0, min=1e-6, soft_max=100.0)
+        name="Scale", description="Scene units per unit of the capture", default=1.0, min=1e-6, soft_max=100.0)
     frames: bpy.props.BoolProperty(  # type: ignore[valid-type]
-        name="Frames", description="Show the frames behind the cameras, as background images", default=True)
+        name="Frames", description="Show the frames as background images of the cameras", default=True)
     points: bpy.props.BoolProperty(  # type: ignore[valid-type]
-        name="Points", description="Bring the point cloud in as a mesh with colours", default=True)
+        name="Points", description="Import the point cloud as a mesh with colours", default=True)
     match_scene: bpy.props.BoolProperty(  # type: ignore[valid-type]
-        name="Match Scene", description="Give the scene the frames' size, number and plain colours", default=True)
+        name="Match Scene", description="Set size, frame range and view transform of the scene to those of the frames",
+        default=True)
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
         if self.filepath or self.directory:  # dropped into the window
@@ -61,8 +62,8 @@ class FITFLARE_OT_import_capture(Action, bpy.types.Operator):
             chosen = Path(bpy.path.abspath(self.directory))
         settings = ImportSettings(self.cameras, self.up, self.scale, self.frames, self.points, self.match_scene)
         made = import_capture(context.scene, chosen, settings)
-        fits.leave_another(context.scene)
-        fits.expose_cameras(context.scene, fits.folder_of(context.scene))
+        fits.clear_other_run(context.scene)
+        fits.expose_cameras(context.scene, fits.run_folder(context.scene))
         for note in made.notes:
             self.report({"WARNING"}, note)
         self.report({"INFO"}, f"{chosen.name}: cameras {len(made.cameras)}, lights {len(made.lights)}")
@@ -70,7 +71,7 @@ class FITFLARE_OT_import_capture(Action, bpy.types.Operator):
 
 
 def _look_through_camera(context: bpy.types.Context) -> None:
-    """Turn the largest 3D view to the camera, so that the footage is seen at once."""
+    """Switch the largest 3D view to the camera, so that the footage is visible."""
     screen = context.screen
     views = [area for area in screen.areas if area.type == "VIEW_3D"] if screen is not None else []
     if views:
@@ -78,8 +79,8 @@ def _look_through_camera(context: bpy.types.Context) -> None:
         space.region_3d.view_perspective = "CAMERA"
 
 
-class FITFLARE_OT_capture_from_camera(Action, bpy.types.Operator):
-    """Make a capture of the scene's camera as it is animated, with the pictures of its background or clip"""
+class FITFLARE_OT_capture_from_camera(GuardedOperator, bpy.types.Operator):
+    """Make a capture from the scene's animated camera and the pictures of its background images or clip"""
 
     bl_idname = "fit_flare.capture_from_camera"
     bl_label = "Capture from This Camera"
@@ -100,13 +101,13 @@ class FITFLARE_OT_capture_from_camera(Action, bpy.types.Operator):
         return {"RUNNING_MODAL"}
 
     def act(self, context: bpy.types.Context) -> None:
-        count = exporter.export(context.scene, Path(bpy.path.abspath(self.directory)))
-        fits.leave_another(context.scene)
-        self.report({"INFO"}, f"{count} frames are now a capture in {self.directory}")
+        count = exporter.export_capture(context.scene, Path(bpy.path.abspath(self.directory)))
+        fits.clear_other_run(context.scene)
+        self.report({"INFO"}, f"A capture of {count} frames is in {self.directory}")
 
 
 class FITFLARE_FH_capture(bpy.types.FileHandler):
-    """A capture's file dropped into the 3D viewport imports the capture."""
+    """Imports the capture when one of its files is dropped on a 3D view."""
 
     bl_idname = "FITFLARE_FH_capture"
     bl_label = "Fit Flare Capture"

@@ -1,27 +1,29 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The fit: started, gone on with, cancelled, its log and preview shown."""
+"""Operators that start, resume and cancel a fit, make clean frames, and show log, preview and result."""
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import bpy
 
 from ...core.conventions.run_files import LOG, PREVIEW
 from .. import engine, fits, jobs, shots
 from ..paths import is_file, is_folder
-from ..reports import NO_CAPTURE, Action
+from ..reports import NO_CAPTURE, GuardedOperator
 
-SHOWN_OF_A_LOG = 200_000  # bytes, its last
+MAX_LOG_BYTES = 200_000
 
 _keymaps: list[tuple[object, object]] = []
 
 
-class FITFLARE_OT_fit(Action, bpy.types.Operator):
-    """Learn the flare of every light from the footage, in the engine; Blender stays free meanwhile"""
+class FITFLARE_OT_fit(GuardedOperator, bpy.types.Operator):
+    """Learn the flare of every light from the footage, in the engine; you can use Blender meanwhile"""
 
     bl_idname = "fit_flare.fit"
     bl_label = "Fit"
-    bl_options = {"UNDO"}  # the run that it names, or undoing what comes later would forget it
+    bl_options = {"UNDO"}  # else undoing a later step would reset the run that it sets
 
     @classmethod
     def why_not(cls, context: bpy.types.Context) -> str:
@@ -31,43 +33,43 @@ class FITFLARE_OT_fit(Action, bpy.types.Operator):
         fits.start(context.scene)
 
 
-class FITFLARE_OT_resume(Action, bpy.types.Operator):
-    """Go on with the fit where it was stopped"""
+class FITFLARE_OT_resume(GuardedOperator, bpy.types.Operator):
+    """Resume the fit from where it was stopped"""
 
     bl_idname = "fit_flare.resume"
     bl_label = "Resume"
 
     @classmethod
     def why_not(cls, context: bpy.types.Context) -> str:
-        if missing := engine.missing():
+        if missing := engine.missing_reason():
             return missing
-        if fits.state_of(context.scene) != "resumable":
-            return "There is no broken-off fit to go on with"
+        if fits.fit_state(context.scene) != "resumable":
+            return "There is no stopped fit to resume"
         return ""
 
     def act(self, context: bpy.types.Context) -> None:
         fits.resume(context.scene)
 
 
-class FITFLARE_OT_clean_frames(Action, bpy.types.Operator):
-    """Have the engine take the flares out of the frames: by the fit once it is finished, before that by a network"""
+class FITFLARE_OT_clean_frames(GuardedOperator, bpy.types.Operator):
+    """Remove the flares from the frames: with the fit if it is finished, else with the removal network"""
 
     bl_idname = "fit_flare.clean_frames"
     bl_label = "Make Clean Frames"
 
     @classmethod
     def why_not(cls, context: bpy.types.Context) -> str:
-        capture = fits.capture_of(context.scene)
+        capture = fits.capture_folder(context.scene)
         if capture is None or not is_folder(capture / "images"):
             return NO_CAPTURE
-        return engine.missing()
+        return engine.missing_reason()
 
     def act(self, context: bpy.types.Context) -> None:
-        fits.clean(context.scene)
+        fits.clean_frames(context.scene)
 
 
 class FITFLARE_OT_cancel(bpy.types.Operator):
-    """Stop this; what is done is kept, and it can be gone on with (ESC with the mouse over this panel)"""
+    """Stop this job; finished work is kept, and it can be resumed (ESC with the mouse over this panel)"""
 
     bl_idname = "fit_flare.cancel"
     bl_label = "Cancel"
@@ -83,14 +85,14 @@ class FITFLARE_OT_cancel(bpy.types.Operator):
         for job in stopped:
             job.stop()
         if not stopped:
-            self.report({"INFO"}, "It has ended already")
+            self.report({"INFO"}, "The job has ended already")
             return {"CANCELLED"}
         self.report({"INFO"}, "Stopping; what is done is kept")
         return {"FINISHED"}
 
 
 class FITFLARE_OT_cancel_by_key(bpy.types.Operator):
-    """Stop what the engine does for this scene, where the mouse is over the panel and nothing plays"""
+    """Stop the jobs of this scene while the mouse is over the panel and no animation plays"""
 
     bl_idname = "fit_flare.cancel_by_key"
     bl_label = "Cancel Fit Flare"
@@ -100,19 +102,19 @@ class FITFLARE_OT_cancel_by_key(bpy.types.Operator):
     def poll(cls, context: bpy.types.Context) -> bool:
         region, screen = context.region, context.screen
         return (region is not None and region.type == "UI"
-                and getattr(region, "active_panel_category", "") == "Fit Flare"
-                and not (screen is not None and screen.is_animation_playing)  # which ESC is to stop then
-                and bool(shots.jobs_of(context.scene)))
+                and getattr(region, "active_panel_category", "") == jobs.SIDEBAR_TAB
+                and not (screen is not None and screen.is_animation_playing)  # which ESC stops
+                and bool(shots.running_jobs(context.scene)))
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        for job in shots.jobs_of(context.scene):
+        for job in shots.running_jobs(context.scene):
             job.stop()
         self.report({"INFO"}, "Stopping; what is done is kept")
         return {"FINISHED"}
 
 
 class FITFLARE_OT_show_log(bpy.types.Operator):
-    """Open what the engine wrote in a text editor"""
+    """Open the log of the engine in a text editor"""
 
     bl_idname = "fit_flare.show_log"
     bl_label = "Show Log"
@@ -125,28 +127,28 @@ class FITFLARE_OT_show_log(bpy.types.Operator):
         for name in (LOG, jobs.EVENTS, jobs.LOG):
             path = Path(self.folder, name)
             if is_file(path):
-                parts.append(f"==== {path}\n{_end_of(path)}")
+                parts.append(f"==== {path}\n{_tail(path)}")
         if not parts:
             self.report({"ERROR"}, f"There is no log in {self.folder}.")
             return {"CANCELLED"}
         text = bpy.data.texts.get("Fit Flare Log") or bpy.data.texts.new("Fit Flare Log")
         text.from_string("\n".join(parts))
-        _show(context, "TEXT_EDITOR", lambda space: setattr(space, "text", text))
+        _show_in_editor(context, "TEXT_EDITOR", lambda space: setattr(space, "text", text))
         return {"FINISHED"}
 
 
-def _end_of(path: Path) -> str:
-    """The last of a log; why there is nothing to show where it may not be read."""
+def _tail(path: Path) -> str:
+    """Return the end of a log; the reason in brackets where it cannot be read."""
     try:
         with open(path, "rb") as file:
-            file.seek(max(path.stat().st_size - SHOWN_OF_A_LOG, 0))
+            file.seek(max(path.stat().st_size - MAX_LOG_BYTES, 0))
             return file.read().decode("utf-8", "replace")
     except OSError as problem:
         return f"(This cannot be read: {problem.strerror or problem}.)"
 
 
-class FITFLARE_OT_show_preview(Action, bpy.types.Operator):
-    """Open the fit's preview picture: frame, composite, scene, flare"""
+class FITFLARE_OT_show_preview(GuardedOperator, bpy.types.Operator):
+    """Open the preview of the fit: frame, composite, scene, flare"""
 
     bl_idname = "fit_flare.show_preview"
     bl_label = "Show Preview"
@@ -154,22 +156,22 @@ class FITFLARE_OT_show_preview(Action, bpy.types.Operator):
 
     @classmethod
     def why_not(cls, context: bpy.types.Context) -> str:
-        folder = fits.folder_of(context.scene)
+        folder = fits.run_folder(context.scene)
         if folder is None or not is_file(folder / PREVIEW):
-            return "The fit has not made a preview yet"
+            return "The fit has no preview yet"
         return ""
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        folder = fits.folder_of(context.scene)
+        folder = fits.run_folder(context.scene)
         assert folder is not None
         image = bpy.data.images.load(str(folder / PREVIEW), check_existing=True)
         image.reload()
-        _show(context, "IMAGE_EDITOR", lambda space: setattr(space, "image", image))
+        _show_in_editor(context, "IMAGE_EDITOR", lambda space: setattr(space, "image", image))
         return {"FINISHED"}
 
 
-class FITFLARE_OT_use_result(Action, bpy.types.Operator):
-    """Show the flare that this fit has learned"""
+class FITFLARE_OT_use_result(GuardedOperator, bpy.types.Operator):
+    """Show the flare that this fit learned"""
 
     bl_idname = "fit_flare.use_result"
     bl_label = "Use Result"
@@ -177,19 +179,18 @@ class FITFLARE_OT_use_result(Action, bpy.types.Operator):
 
     @classmethod
     def why_not(cls, context: bpy.types.Context) -> str:
-        if fits.state_of(context.scene) != "finished":
+        if fits.fit_state(context.scene) != "finished":
             return "The fit is not finished"
         return ""
 
     def act(self, context: bpy.types.Context) -> None:
-        folder = fits.folder_of(context.scene)
+        folder = fits.run_folder(context.scene)
         assert folder is not None
-        fits.show(context.scene, folder)
+        fits.show_result(context.scene, folder)
 
 
-def _show(context: bpy.types.Context, kind: str, give: object) -> None:
-    """Give something to an editor of that kind: one that is open, or a new window's."""
-    assert callable(give)
+def _show_in_editor(context: bpy.types.Context, kind: str, show: Callable[[Any], None]) -> None:
+    """Call `show` with the space of an editor of that kind, an open one or one in a new window."""
     if context.window is None or bpy.app.background:
         return
     area = next((area for area in context.screen.areas if area.type == kind), None)
@@ -197,7 +198,7 @@ def _show(context: bpy.types.Context, kind: str, give: object) -> None:
         bpy.ops.wm.window_new()
         area = context.window_manager.windows[-1].screen.areas[0]
         area.type = kind
-    give(area.spaces.active)
+    show(area.spaces.active)
 
 
 _CLASSES = (FITFLARE_OT_fit, FITFLARE_OT_resume, FITFLARE_OT_clean_frames, FITFLARE_OT_cancel,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Flares to the library and from it, on to other cameras, lights and single pictures."""
+"""Operators that save a flare to the library, and apply one to other cameras, lights and single pictures."""
 from __future__ import annotations
 
 from pathlib import Path
@@ -10,19 +10,19 @@ from mathutils import Vector
 
 from ...core.errors import FlareFileError
 from .. import cameras, library, lights, looks, overlay
-from ..reports import NO_CAMERA, NO_FLARE, Action
+from ..reports import NO_CAMERA, NO_FLARE, GuardedOperator
 
 
-class FITFLARE_OT_save_flare(Action, bpy.types.Operator):
-    """Keep this scene's flare in the library, with a thumbnail and notes"""
+class FITFLARE_OT_save_flare(GuardedOperator, bpy.types.Operator):
+    """Save this scene's flare to the library, with a thumbnail and notes"""
 
     bl_idname = "fit_flare.save_flare"
     bl_label = "Save to Library"
 
-    name: bpy.props.StringProperty(name="Name", description="What it is called in the library", options={"SKIP_SAVE"})  # type: ignore[valid-type]
-    notes: bpy.props.StringProperty(name="Notes", description="Lens, aperture, camera, what it is good for",  # type: ignore[valid-type]
+    name: bpy.props.StringProperty(name="Name", description="Name of the flare in the library", options={"SKIP_SAVE"})  # type: ignore[valid-type]
+    notes: bpy.props.StringProperty(name="Notes", description="Lens, aperture, camera, use",  # type: ignore[valid-type]
                                     options={"SKIP_SAVE"})
-    licence: bpy.props.StringProperty(name="Licence", description="Under which terms others may use it",  # type: ignore[valid-type]
+    licence: bpy.props.StringProperty(name="Licence", description="Terms of use for others",  # type: ignore[valid-type]
                                       options={"SKIP_SAVE"})
 
     @classmethod
@@ -42,7 +42,7 @@ class FITFLARE_OT_save_flare(Action, bpy.types.Operator):
         self.report({"INFO"}, f"{path.stem} is in the library")
 
 
-class FITFLARE_OT_apply_flare(Action, bpy.types.Operator):
+class FITFLARE_OT_apply_flare(GuardedOperator, bpy.types.Operator):
     """Show the chosen flare of the library in this scene, at the selected objects or the lights of the same names"""
 
     bl_idname = "fit_flare.apply_flare"
@@ -54,37 +54,39 @@ class FITFLARE_OT_apply_flare(Action, bpy.types.Operator):
     @classmethod
     def why_not(cls, _context: bpy.types.Context) -> str:
         if not library.files():
-            return "The library is empty: save a flare into it first"
+            return "The library is empty: save a flare to it first"
         return ""
 
     def act(self, context: bpy.types.Context) -> None:
         path = self.filepath or context.window_manager.fit_flare_library
         if not path:
             raise FlareFileError("Choose a flare of the library first.")
-        look = looks.use(context.scene, Path(path))
+        look = looks.show_look(context.scene, Path(path))
         free = [item for item in context.scene.fit_flare.lights if item.target is None]
         chosen = [item for item in context.selected_objects if item.type != "CAMERA"]
         for item, target in zip(free, chosen, strict=False):
             item.target = target
         for target in chosen[len(free):]:
             if all(item.target != target for item in context.scene.fit_flare.lights):
-                looks.add_instance(context.scene, target, look.names[0])
+                looks.add_flare(context.scene, target, look.names[0])
         missing = [item.name for item in context.scene.fit_flare.lights if item.target is None]
         if missing:
-            self.report({"WARNING"}, f"{', '.join(missing)}: choose the object it comes from in the panel Look")
+            self.report({"WARNING"}, f"{', '.join(missing)}: choose the light object in the panel Look")
 
 
-class FITFLARE_OT_pick_light(Action, bpy.types.Operator):
-    """Click on the light in the camera view: the flare comes from there"""
+class FITFLARE_OT_pick_light(GuardedOperator, bpy.types.Operator):
+    """Click on the light in the camera view to place the flare there"""
 
     bl_idname = "fit_flare.pick_light"
     bl_label = "Pick Light in Picture"
     bl_options = {"REGISTER", "UNDO"}
 
-    x: bpy.props.FloatProperty(name="X", description="Across the picture, 0 left to 1 right", default=-1.0)  # type: ignore[valid-type]
-    y: bpy.props.FloatProperty(name="Y", description="Down the picture, 0 top to 1 bottom", default=-1.0)  # type: ignore[valid-type]
+    x: bpy.props.FloatProperty(  # type: ignore[valid-type]
+        name="X", description="Horizontal position in the picture, 0 left to 1 right", default=-1.0)
+    y: bpy.props.FloatProperty(  # type: ignore[valid-type]
+        name="Y", description="Vertical position in the picture, 0 top to 1 bottom", default=-1.0)
     distance: bpy.props.FloatProperty(  # type: ignore[valid-type]
-        name="Distance", description="From the camera, where no object is hit; 0 takes ten units", default=0.0,
+        name="Distance", description="Distance from the camera where no object is hit; 0 uses ten units", default=0.0,
         min=0.0, subtype="DISTANCE")
 
     @classmethod
@@ -101,11 +103,11 @@ class FITFLARE_OT_pick_light(Action, bpy.types.Operator):
             self.report({"ERROR"}, "There is no 3D viewport to pick in.")
             return {"CANCELLED"}
         area = max(areas, key=lambda area: area.width * area.height)
-        self._area = area.as_pointer()  # the area itself may be gone when the click comes
+        self._area = area.as_pointer()  # the area may be closed before the click
         area.spaces.active.region_3d.view_perspective = "CAMERA"
         context.window_manager.modal_handler_add(self)
         context.window.cursor_modal_set("EYEDROPPER")
-        context.workspace.status_text_set("Click on the light in the picture; ESC or right click to leave it")
+        context.workspace.status_text_set("Click on the light in the picture; ESC or right click to cancel")
         return {"RUNNING_MODAL"}
 
     def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
@@ -120,7 +122,7 @@ class FITFLARE_OT_pick_light(Action, bpy.types.Operator):
         return self.execute(context)
 
     def _pick(self, context: bpy.types.Context, area: Any, event: Any) -> bool:
-        """Take the place of the mouse in the picture; whether it is over the picture."""
+        """Store the position of the mouse in the picture; return whether it is over the picture."""
         under = [region for region in area.regions if 0 <= event.mouse_x - region.x < region.width
                  and 0 <= event.mouse_y - region.y < region.height]
         space = area.spaces.active
@@ -129,15 +131,15 @@ class FITFLARE_OT_pick_light(Action, bpy.types.Operator):
         region = under[0]
         x, y = event.mouse_x - region.x, event.mouse_y - region.y
         with context.temp_override(area=area, region=region, space_data=space, region_data=space.region_3d):
-            frame = overlay.frame_in(bpy.context, context.scene, context.scene.camera)
+            frame = overlay.camera_frame(bpy.context, context.scene, context.scene.camera)
         if frame is None:
             return False
         self.x, self.y = (x - frame.left) / frame.width, 1 - (y - frame.bottom) / frame.height
         return 0 <= self.x <= 1 and 0 <= self.y <= 1
 
     def cancel(self, context: bpy.types.Context) -> None:
-        """Leave window and status line as they were; Blender calls it where it closes what is being picked in."""
-        if context.window is not None:  # it may be the window that is closed
+        """Restore cursor and status line; Blender also calls this when it closes the window."""
+        if context.window is not None:  # the window may be closed
             context.window.cursor_modal_restore()
             context.workspace.status_text_set(None)
 
@@ -153,23 +155,23 @@ class FITFLARE_OT_pick_light(Action, bpy.types.Operator):
             where = eye + ray * (self.distance or 10.0 * max(camera.matrix_world.to_scale()))
         look, state = looks.look_of(scene), scene.fit_flare
         item = next((one for one in state.lights if one.target is None), None)
-        light = lights.add(scene, where, item.name if item is not None else "light1")
+        light = lights.add_to_scene(scene, where, item.name if item is not None else "light1")
         light.fit_flare.is_light = state.root is not None
         light.empty_display_size = 0.02 * (where - eye).length
         if item is None:
-            item = looks.add_instance(scene, light, state.lights[state.light].source if state.lights
+            item = looks.add_flare(scene, light, state.lights[state.light].source if state.lights
                                       else look.names[0])
         item.target = light
 
 
-class FITFLARE_OT_shot_from_picture(Action, bpy.types.Operator):
-    """Set the scene up for a single picture: a camera of its size with the picture behind it"""
+class FITFLARE_OT_shot_from_picture(GuardedOperator, bpy.types.Operator):
+    """Set the scene up for a single picture: a camera of its size, with the picture as its background"""
 
     bl_idname = "fit_flare.shot_from_picture"
     bl_label = "Single Picture"
     bl_options = {"REGISTER", "UNDO"}
 
-    filepath: bpy.props.StringProperty(name="Picture", description="The picture to lay the flare over",  # type: ignore[valid-type]
+    filepath: bpy.props.StringProperty(name="Picture", description="The picture to put the flare over",  # type: ignore[valid-type]
                                        subtype="FILE_PATH")
     filter_image: bpy.props.BoolProperty(default=True, options={"HIDDEN"})  # type: ignore[valid-type]
 
@@ -188,9 +190,9 @@ class FITFLARE_OT_shot_from_picture(Action, bpy.types.Operator):
         data = bpy.data.cameras.new(Path(self.filepath).stem)
         data.sensor_fit, data.sensor_width = "HORIZONTAL", 36.0
         data.lens = 36.0
-        if scene.fit_flare.flare:  # the flare's own lens, which its shapes belong to
+        if scene.fit_flare.flare:  # the lens of the flare, to which its shapes belong
             filmed = looks.look_of(scene).camera
-            data.lens = 36.0 * filmed.fx * filmed.pixels_across(*image.size) / image.size[0]
+            data.lens = 36.0 * filmed.fx * filmed.pixel_ratio(*image.size) / image.size[0]
         camera = bpy.data.objects.new(data.name, data)
         scene.collection.objects.link(camera)
         camera.rotation_euler = (1.5707963, 0, 0)

@@ -1,35 +1,35 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Lights of the capture: added, taken from objects, removed, found."""
+"""Operators that add, mark, remove and find the lights of the capture."""
 from __future__ import annotations
 
 import bpy
 
 from .. import engine, fits, lights
 from ..paths import is_folder
-from ..reports import NO_CAPTURE, Action
+from ..reports import NO_CAPTURE, GuardedOperator
 
 
-class FITFLARE_OT_add_light(Action, bpy.types.Operator):
-    """Add a light at the 3D cursor; move it on to the lamp in the footage"""
+class FITFLARE_OT_add_light(GuardedOperator, bpy.types.Operator):
+    """Add a light at the 3D cursor; then move it to the light in the footage"""
 
     bl_idname = "fit_flare.add_light"
     bl_label = "Add at Cursor"
     bl_options = {"REGISTER", "UNDO"}
 
-    name: bpy.props.StringProperty(name="Name", description="Name of the light and of its flare's layer",  # type: ignore[valid-type]
+    name: bpy.props.StringProperty(name="Name", description="Name of the light and of the layer of its flare",  # type: ignore[valid-type]
                                    default="light1")
 
     def act(self, context: bpy.types.Context) -> None:
-        light = lights.add(context.scene, context.scene.cursor.location, self.name)
+        light = lights.add_to_scene(context.scene, context.scene.cursor.location, self.name)
         for item in context.selected_objects:
             item.select_set(False)
-        if context.view_layer.objects.get(light.name) == light:  # one in an excluded collection is not
+        if context.view_layer.objects.get(light.name) == light:  # not for an object in an excluded collection
             light.select_set(True)
             context.view_layer.objects.active = light
 
 
-class FITFLARE_OT_lights_from_selected(Action, bpy.types.Operator):
-    """Make the selected objects lights: the fit learns a flare for each"""
+class FITFLARE_OT_lights_from_selected(GuardedOperator, bpy.types.Operator):
+    """Mark the selected objects as lights; the fit learns a flare for each"""
 
     bl_idname = "fit_flare.lights_from_selected"
     bl_label = "From Selected"
@@ -40,18 +40,18 @@ class FITFLARE_OT_lights_from_selected(Action, bpy.types.Operator):
         if not context.selected_objects:
             return "Select the objects that are lights first"
         if any(item.library is not None for item in context.selected_objects):
-            return "Of what is linked from another file, make library overrides first"
+            return "Make library overrides of the linked objects first"
         return ""
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        taken = {lights.name_of(item) for item in lights.of_scene(context.scene)}
-        made = lights.take(context.selected_objects, taken)
+        taken = {lights.light_name(item) for item in lights.scene_lights(context.scene)}
+        made = lights.mark_as_lights(context.selected_objects, taken)
         self.report({"INFO"}, f"{made} objects are lights now")
         return {"FINISHED"}
 
 
 class FITFLARE_OT_remove_light(bpy.types.Operator):
-    """Take this light out; an empty that was made for it is deleted, other objects stay"""
+    """Remove this light; an empty that was made for it is deleted, other objects are kept"""
 
     bl_idname = "fit_flare.remove_light"
     bl_label = "Remove Light"
@@ -64,32 +64,32 @@ class FITFLARE_OT_remove_light(bpy.types.Operator):
         if light is None:
             self.report({"ERROR"}, f"The light {self.object!r} is not in this scene any more.")
             return {"CANCELLED"}
-        lights.remember(context.scene)
+        lights.remember_names(context.scene)
         light.fit_flare.is_light = False
         if light.fit_flare.is_made and not light.children:
             bpy.data.objects.remove(light)
         return {"FINISHED"}
 
 
-class FITFLARE_OT_find_lights(Action, bpy.types.Operator):
-    """Have the engine look for light sources in the frames; lights that are there already stay"""
+class FITFLARE_OT_find_lights(GuardedOperator, bpy.types.Operator):
+    """Search the frames for lights in the engine; existing lights are kept"""
 
     bl_idname = "fit_flare.find_lights"
     bl_label = "Find in Frames"
 
     @classmethod
     def why_not(cls, context: bpy.types.Context) -> str:
-        capture = fits.capture_of(context.scene)
+        capture = fits.capture_folder(context.scene)
         if capture is None or not is_folder(capture):
             return NO_CAPTURE
-        return engine.missing()
+        return engine.missing_reason()
 
     def act(self, context: bpy.types.Context) -> None:
         fits.find_lights(context.scene)
 
 
-class FITFLARE_OT_use_lights(Action, bpy.types.Operator):
-    """Bring the lights that were found since into the scene"""
+class FITFLARE_OT_use_lights(GuardedOperator, bpy.types.Operator):
+    """Add the lights that were found since to the scene"""
 
     bl_idname = "fit_flare.use_lights"
     bl_label = "Use Found Lights"
@@ -97,15 +97,15 @@ class FITFLARE_OT_use_lights(Action, bpy.types.Operator):
 
     @classmethod
     def why_not(cls, context: bpy.types.Context) -> str:
-        capture = fits.capture_of(context.scene)
+        capture = fits.capture_folder(context.scene)
         if capture is None or not is_folder(capture):
             return NO_CAPTURE
-        return "" if lights.unknown(context.scene, capture) else "All lights that were found are in the scene"
+        return "" if lights.new_names(context.scene, capture) else "All lights that were found are in the scene"
 
     def act(self, context: bpy.types.Context) -> None:
-        capture = fits.capture_of(context.scene)
+        capture = fits.capture_folder(context.scene)
         assert capture is not None
-        lights.bring_in(context.scene, capture)
+        lights.import_new(context.scene, capture)
 
 
 _CLASSES = (FITFLARE_OT_add_light, FITFLARE_OT_lights_from_selected, FITFLARE_OT_remove_light, FITFLARE_OT_find_lights,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The look: a .flare opened, flares given to objects, sliders put back."""
+"""Operators that open a .flare, add flares to objects, remove them, and reset sliders; the lists of flares."""
 from __future__ import annotations
 
 from pathlib import Path
@@ -11,31 +11,32 @@ from ...core.errors import FitFlareError
 from .. import looks
 from ..compositor import drivers
 from ..properties import EDIT_NAMES
-from ..reports import NO_FLARE, Action
+from ..reports import NO_FLARE, GuardedOperator
 
 
-def _sources(_self: Any, context: Any) -> list[tuple[str, str, str]]:
-    """The lights of the scene's .flare, for a menu; kept, since Blender holds no reference to the texts."""
-    global _shown
+def _look_items(_self: Any, context: Any) -> list[tuple[str, str, str]]:
+    """Return the lights of the scene's .flare as menu items, kept here since Blender holds no reference to the
+    texts."""
+    global _items
     try:
-        _shown = [(name, name, f"The look of {name}") for name in looks.look_of(context.scene).names]
+        _items = [(name, name, f"The look of {name}") for name in looks.look_of(context.scene).names]
     except FitFlareError:
-        _shown = []
-    return _shown or [("", "None", "No flare is open")]
+        _items = []
+    return _items or [("", "None", "No flare is open")]
 
 
-_shown: list[tuple[str, str, str]] = []
+_items: list[tuple[str, str, str]] = []
 
 
-class FITFLARE_OT_open_flare(Action, bpy.types.Operator):
-    """Show a .flare in this scene: its flares come from the lights of the same names, or the selected objects"""
+class FITFLARE_OT_open_flare(GuardedOperator, bpy.types.Operator):
+    """Show a .flare in this scene, at the lights of the same names or the selected objects"""
 
     bl_idname = "fit_flare.open_flare"
     bl_label = "Open Flare"
     bl_options = {"REGISTER", "UNDO"}
 
     filepath: bpy.props.StringProperty(name="Flare", description="A .flare file", subtype="FILE_PATH",  # type: ignore[valid-type]
-                                       options={"SKIP_SAVE"})  # else the last one would pass for one that was dropped
+                                       options={"SKIP_SAVE"})  # else the last value would count as a dropped file
     filter_glob: bpy.props.StringProperty(default="*.flare", options={"HIDDEN"})  # type: ignore[valid-type]
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
@@ -45,7 +46,7 @@ class FITFLARE_OT_open_flare(Action, bpy.types.Operator):
         return {"RUNNING_MODAL"}
 
     def act(self, context: bpy.types.Context) -> None:
-        look = looks.use(context.scene, Path(bpy.path.abspath(self.filepath)))
+        look = looks.show_look(context.scene, Path(bpy.path.abspath(self.filepath)))
         free = [item for item in context.scene.fit_flare.lights if item.target is None]
         chosen = [item for item in context.selected_objects if item.type != "CAMERA"]
         for item, target in zip(free, chosen, strict=False):
@@ -53,32 +54,33 @@ class FITFLARE_OT_open_flare(Action, bpy.types.Operator):
         self.report({"INFO"}, f"{Path(self.filepath).name}: {len(look.lights)} lights, {look.count} Gaussians")
 
 
-class FITFLARE_OT_add_flare(Action, bpy.types.Operator):
-    """Let the selected objects flare with the look of a light of the .flare"""
+class FITFLARE_OT_add_flare(GuardedOperator, bpy.types.Operator):
+    """Add a flare at each selected object, with the look of a light of the .flare"""
 
     bl_idname = "fit_flare.add_flare"
     bl_label = "Flare from Selected"
     bl_options = {"REGISTER", "UNDO"}
 
-    source: bpy.props.EnumProperty(name="Look", description="Which light's look they get", items=_sources)  # type: ignore[valid-type]
+    source: bpy.props.EnumProperty(  # type: ignore[valid-type]
+        name="Look", description="The light of the .flare whose look they get", items=_look_items)
 
     @classmethod
     def why_not(cls, context: bpy.types.Context) -> str:
         if not context.scene.fit_flare.flare:
             return NO_FLARE
         if not any(item.type != "CAMERA" for item in context.selected_objects):
-            return "Select the objects that are to flare first"
+            return "Select the objects that get a flare first"
         return ""
 
     def act(self, context: bpy.types.Context) -> None:
         look = looks.look_of(context.scene)
         for item in context.selected_objects:
             if item.type != "CAMERA":
-                looks.add_instance(context.scene, item, self.source or look.names[0])
+                looks.add_flare(context.scene, item, self.source or look.names[0])
 
 
-class FITFLARE_OT_remove_flare(Action, bpy.types.Operator):
-    """Take this flare out of the scene; its light object stays"""
+class FITFLARE_OT_remove_flare(GuardedOperator, bpy.types.Operator):
+    """Remove this flare from the scene; its light object is kept"""
 
     bl_idname = "fit_flare.remove_flare"
     bl_label = "Remove Flare"
@@ -94,16 +96,16 @@ class FITFLARE_OT_remove_flare(Action, bpy.types.Operator):
     def execute(self, context: bpy.types.Context) -> set[str]:
         state = context.scene.fit_flare
         name = state.lights[state.light].name
-        if state.light in drivers.wired(context.scene).values():
-            self.report({"WARNING"}, f"The layer of {name} stays in the compositor as it was baked; bake again to have "
-                        "it go")
-        looks.remove(context.scene, state.light)
+        if state.light in drivers.connected_flares(context.scene).values():
+            self.report({"WARNING"}, f"The layer of {name} stays in the compositor as it was baked; bake again to "
+                        "remove it")
+        looks.remove_flare(context.scene, state.light)
         state.light = max(min(state.light, len(state.lights) - 1), 0)
         return {"FINISHED"}
 
 
 class FITFLARE_OT_reset_look(bpy.types.Operator):
-    """Put every slider back: the flare as it was filmed"""
+    """Reset every slider: the flare is as filmed"""
 
     bl_idname = "fit_flare.reset_look"
     bl_label = "Reset"
@@ -118,7 +120,7 @@ class FITFLARE_OT_reset_look(bpy.types.Operator):
 
 
 class FITFLARE_FH_flare(bpy.types.FileHandler):
-    """A .flare dropped into the 3D viewport is shown in the scene."""
+    """Opens a .flare that is dropped on a 3D view."""
 
     bl_idname = "FITFLARE_FH_flare"
     bl_label = "Fit Flare Look"
@@ -131,7 +133,7 @@ class FITFLARE_FH_flare(bpy.types.FileHandler):
 
 
 class FITFLARE_UL_lights(bpy.types.UIList):
-    """The flares of a scene, with mute and solo."""
+    """The list of the flares of a scene, with mute and solo."""
 
     def draw_item(self, context: Any, layout: Any, _data: Any, item: Any, _icon: Any, _active: Any, _property: Any,
                   _index: int = 0) -> None:
@@ -144,7 +146,7 @@ class FITFLARE_UL_lights(bpy.types.UIList):
 
 
 class FITFLARE_UL_elements(bpy.types.UIList):
-    """The elements of a flare, with mute and solo."""
+    """The list of the elements of a flare, with mute and solo."""
 
     def draw_item(self, _context: Any, layout: Any, _data: Any, item: Any, _icon: Any, _active: Any, _property: Any,
                   _index: int = 0) -> None:

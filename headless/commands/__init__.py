@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The commands, in the order in which the help lists them. A new one is a module here and a line below."""
+"""The commands in the order of the help. To add one, write a module here and list it in `_MODULES`."""
 from __future__ import annotations
 
 from ..command import Command

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""bake: a run's views as multilayer EXR files."""
+"""bake: renders the layers of a run, a .flare or a shot as multilayer EXR files."""
 from __future__ import annotations
 
 import argparse
@@ -15,112 +15,116 @@ from . import transfer
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("run", type=Path, metavar="RUN_OR_FLARE",
-                        help="folder that `fit` has written; or a .flare, with --capture or --blend; or a shot: a JSON "
-                             "file of cameras and lights by frame, as the add-on writes it (core/look/shot.py)")
+                        help="a run, the folder that `fit` writes; or a .flare, with --capture or --blend; or a shot, "
+                             "the JSON file of cameras and lights by frame that the add-on writes "
+                             "(core/look/shot.py)")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for layers.####.exr")
     frames.add_option(parser)
     parser.add_argument("--size", metavar="WIDTH[xHEIGHT]", help="pixels (default: the frames')")
     layers.add_options(
-        parser, halfs="depth always 32", overwritten="bake",
-        edited="lamp.intensity=2, lamp.tint=1,0.8,0.6, lamp.tint=#ffcc88, lamp.scale=1.5; * for all lights, lamp/ghost "
-               "for one element; also saturation, spread, rotation (degrees), streak, mute, solo; repeatable")
+        parser, half="depth always 32", producer="bake",
+        edits="an edit: lamp.intensity=2, lamp.tint=1,0.8,0.6, lamp.tint=#ffcc88, lamp.scale=1.5; * for all "
+              "lights, lamp/ghost for one element; also saturation, spread, rotation (degrees), streak, mute, solo; "
+              "repeatable")
     parser.add_argument("--capture", type=Path, metavar="CAPTURE",
-                        help="where the capture is, if it was moved; of a .flare: whose cameras see it, the lights "
-                             "where it was learned")
+                        help="for a run: the capture, if it was moved; for a .flare: the capture whose cameras to "
+                             "use, with the lights where the flare was learned")
     parser.add_argument("--blend", type=Path, metavar="FILE",
-                        help="of a .flare: a .blend, whose camera and lights it is shown for, behind what hides them")
-    parser.add_argument("--scene", type=Path, metavar="PLY", help="of a .flare: a 3DGS scene that hides its lights")
+                        help="for a .flare: a .blend whose camera and lights to use, with the objects that hide them")
+    parser.add_argument("--scene", type=Path, metavar="PLY", help="for a .flare: a 3DGS scene that hides its lights")
     parser.add_argument("--lights", metavar="NAMES", help="objects of the .blend that are lights (default: its lamps)")
     parser.add_argument("--shot", type=Path, help=argparse.SUPPRESS)
     jobs.add_option(parser)
 
 
-def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
+def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
+    """Bake by the kind of input: a run here, a shot or a .flare by the functions below."""
     from ...core.bake.bake import bake
-    from ...core.conventions.frame_numbers import numbered
+    from ...core.conventions.frame_numbers import number_views
     from ...core.fit.run import Run
 
-    if words.run.suffix.lower() == ".json":
-        return run_shot(words, progress)
-    if words.run.suffix.lower() == ".flare":
-        return run_flare(words, progress)
-    if words.scene or words.lights:
-        raise SettingsError(f"--{'scene' if words.scene else 'lights'} is for a .flare: name the run's flare.flare.")
-    made = Run.open(words.run)
-    if not made.finished:
-        raise RunError(f"{words.run} is not finished; go on with it by `fit --resume` first.")
-    capture = made.capture(words.capture, need_frames=False)
+    if args.run.suffix.lower() == ".json":
+        return run_shot(args, progress)
+    if args.run.suffix.lower() == ".flare":
+        return run_flare(args, progress)
+    if args.scene or args.lights:
+        raise SettingsError(f"--{'scene' if args.scene else 'lights'} is for a .flare; name the run's flare.flare.")
+    run_ = Run.open(args.run)
+    if not run_.finished:
+        raise RunError(f"{args.run} is not finished; resume it with `fit --resume` first.")
+    capture = run_.capture(args.capture, need_frames=False)
     cameras = {view.name: view.camera for view in capture.views}
-    wanted = frames.asked(numbered(cameras), words.frames, progress)
-    if words.jobs != 1:
-        jobs.run_jobs(words, "bake", [frame.number for frame in wanted], progress)
-    settings = layers.settings(words, *layers.size(words.size))
-    record = bake(made, wanted, cameras, words.out, settings, progress, overwrite=words.overwrite)
-    return layers.told(wanted, words.out, len(record["frames"]), progress)
+    selected = frames.select(number_views(cameras), args.frames, progress)
+    if args.jobs != 1:
+        jobs.run_jobs(args, "bake", [frame.number for frame in selected], progress)
+    settings = layers.bake_settings(args, *layers.parse_size(args.size))
+    record = bake(run_, selected, cameras, args.out, settings, progress, overwrite=args.overwrite)
+    return layers.report_layers(selected, args.out, len(record["frames"]), progress)
 
 
-def look(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
-    """Blender's part of a bake for a .blend."""
-    if words.run.suffix.lower() != ".flare":
-        raise SettingsError("--blend is for a .flare: name the run's flare.flare.")
-    return transfer.look_at_blend(_as_transfer(words), progress)
+def read_blend(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
+    """Blender step of a bake for a .blend: writes its cameras and lights as a shot."""
+    if args.run.suffix.lower() != ".flare":
+        raise SettingsError("--blend is for a .flare; name the run's flare.flare.")
+    return transfer.read_blend(_as_transfer(args), progress)
 
 
-def run_flare(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
-    """A .flare's layers: with the cameras of a capture, the lights where it was learned; or for a .blend."""
+def run_flare(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
+    """Bake a .flare, for the cameras of a capture with the lights where it was learned, or for a .blend."""
     from ...core.capture import Capture
     from ...core.look import read
-    from ...core.transfer.target import of_cameras
+    from ...core.transfer.target import cameras_target
 
-    if words.blend is None and words.capture is None:
-        raise SettingsError(f"{words.run} has no cameras of its own; name a capture with --capture, or a .blend with "
+    if args.blend is None and args.capture is None:
+        raise SettingsError(f"{args.run} has no cameras of its own; name a capture with --capture, or a .blend with "
                             "--blend.")
-    if words.lights and words.blend is None:
-        raise SettingsError("--lights names objects of a .blend: it goes with --blend.")
-    asked = _as_transfer(words)
-    if words.blend is not None:
-        target = targets.target_of(asked, words.run)
+    if args.lights and args.blend is None:
+        raise SettingsError("--lights names objects of a .blend; give it with --blend.")
+    transfer_args = _as_transfer(args)
+    if args.blend is not None:
+        target = targets.open_target(transfer_args, args.run)
     else:
-        target = of_cameras(Capture.open(words.capture, need_frames=False), read(words.run), words.scene)
-    return transfer.make_layers(asked, "bake", target, words.run, None, progress)
+        target = cameras_target(Capture.open(args.capture, need_frames=False), read(args.run), args.scene)
+    return transfer.make_layers(transfer_args, "bake", target, args.run, None, progress)
 
 
-def _as_transfer(words: argparse.Namespace) -> argparse.Namespace:
+def _as_transfer(args: argparse.Namespace) -> argparse.Namespace:
     """What is asked of a .flare, in transfer's words. Raises SettingsError where two things name cameras."""
-    if words.blend is not None and words.capture is not None:
+    if args.blend is not None and args.capture is not None:
         raise SettingsError("--capture and --blend each name cameras for the flare; give one of them.")
     parser = argparse.ArgumentParser()
     transfer.arguments(parser)
-    usual = parser.parse_args([str(words.run), "--to", str(words.blend or words.capture), "--out", str(words.out)])
-    return argparse.Namespace(**{**vars(usual), **vars(words)})
+    defaults = parser.parse_args([str(args.run), "--to", str(args.blend or args.capture), "--out", str(args.out)])
+    return argparse.Namespace(**{**vars(defaults), **vars(args)})
 
 
-def run_shot(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
-    """A shot's layers; its edits are in the file."""
+def run_shot(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
+    """Bake a shot, whose file holds its edits."""
     from ...core.bake.shot import bake_shot
-    from ...core.conventions.frame_numbers import Frame
+    from ...core.conventions.frame_numbers import NumberedFrame
     from ...core.look.shot import Shot
 
-    if words.edits or words.keyed:
-        raise SettingsError("The edits of a shot stand in its file; --set and --edits are for runs.")
+    if args.edit_texts or args.keyed_edits:
+        raise SettingsError("A shot holds its edits in its file; --set and --edits are for runs.")
     for name in ("scene", "lights", "capture", "blend"):
-        if getattr(words, name):
-            raise SettingsError(f"--{name} is not for a shot, whose file says all; leave it out.")
-    shot = Shot.read(words.run).sized(*layers.size(words.size))
-    wanted = frames.asked([Frame("", one.frame, "") for one in shot.frames], words.frames, progress)
-    if words.jobs != 1:
-        jobs.run_jobs(words, "bake", [frame.number for frame in wanted], progress)
-    record = bake_shot(shot, words.out, half=not words.float, overwrite=words.overwrite, progress=progress,
-                       wanted={frame.number for frame in wanted}, space=words.space, config=words.ocio)
-    return layers.told(wanted, words.out, len(record["frames"]), progress)
+        if getattr(args, name):
+            raise SettingsError(f"--{name} does not apply to a shot, which has its own cameras and lights; leave it "
+                                "out.")
+    shot = Shot.read(args.run).resized(*layers.parse_size(args.size))
+    selected = frames.select([NumberedFrame("", one.frame, "") for one in shot.frames], args.frames, progress)
+    if args.jobs != 1:
+        jobs.run_jobs(args, "bake", [frame.number for frame in selected], progress)
+    record = bake_shot(shot, args.out, half=not args.float, overwrite=args.overwrite, progress=progress,
+                       wanted={frame.number for frame in selected}, space=args.space, config=args.ocio)
+    return layers.report_layers(selected, args.out, len(record["frames"]), progress)
 
 
 COMMAND = Command(
     "bake", "Renders a run, a .flare or a shot to EXR layers.",
-    """Writes one multilayer EXR a frame, scene-linear Rec. 709: composite at the root, scene, flare,
-flare_<light>, depth. scene + flare = composite, and the lights sum to the flare, so add them up in any
-compositor. Frames already made with the same settings are kept.
+    """Writes one multilayer EXR per frame, scene-linear Rec. 709: composite at the root, scene, flare, flare_<light>,
+depth. scene + flare = composite, and the layers of the lights sum to the flare, so any compositor can add them up.
+Frames that exist with the same settings are kept.
 
   run.py bake build/desk --out build/layers --frames 1-20 --set lamp.intensity=2""",
-    arguments, (Step("look", "blender", look, wanted=lambda words: words.blend is not None),
-                Step("bake", "engine", run)), after_a_stop="goes on")
+    arguments, (Step("look", "blender", read_blend, is_needed=lambda args: args.blend is not None),
+                Step("bake", "engine", run)), resume_rule="resumes")

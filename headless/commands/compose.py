@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""compose: baked layers, put together in Blender's compositor and rendered to frames."""
+"""compose: combines baked layers in Blender's compositor and renders the frames."""
 from __future__ import annotations
 
 import argparse
@@ -9,7 +9,7 @@ from typing import Any
 
 from ...core.errors import SettingsError
 from ...core.look import LookEdits
-from ...core.system.files import patiently
+from ...core.system.files import retry_while_locked
 from ...core.system.progress import Progress
 from .. import frames
 from ..command import Command, Step
@@ -18,7 +18,7 @@ BLEND = "compositor.blend"
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("layers", type=Path, metavar="LAYERS", help="folder that `bake` has written")
+    parser.add_argument("layers", type=Path, metavar="LAYERS", help="folder that `bake` wrote")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help=f"folder for the frames and {BLEND}")
     frames.add_option(parser)
     parser.add_argument("--intensity", type=float, default=1.0, metavar="X", help="factor on the flare (default 1)")
@@ -26,20 +26,21 @@ def arguments(parser: argparse.ArgumentParser) -> None:
                         help="colour on the flare, linear factors or #rrggbb (default 1,1,1)")
 
 
-def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
-    done = frames_of(words.layers, words.out, progress, wanted=words.frames, intensity=words.intensity,
-                     tint=words.tint)
+def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
+    """Compose the layers as the arguments say."""
+    done = compose_frames(args.layers, args.out, progress, wanted=args.frames, intensity=args.intensity,
+                     tint=args.tint)
     progress.say(f"The frames are in {done['frames']}; {done['blend']} opens in Blender.")
     return done
 
 
-def frames_of(folder: Path, out: Path, progress: Progress, *, wanted: str | None = None, intensity: float = 1.0,
+def compose_frames(folder: Path, out: Path, progress: Progress, *, wanted: str | None = None, intensity: float = 1.0,
               tint: str = "1,1,1") -> dict[str, Any]:
-    """Build the compositor over the layers in `folder`, save it as a .blend in `out`, render its frames there."""
+    """Build the compositor for the layers in `folder`, save it as a .blend in `out`, and render the frames there."""
     import bpy
 
     from ...core.bake.folder import LayerFolder
-    from ...core.conventions.frame_numbers import Frame
+    from ...core.conventions.frame_numbers import NumberedFrame
     from ...flare_addon import cameras, render_settings
     from ...flare_addon.compositor import setup
 
@@ -49,8 +50,8 @@ def frames_of(folder: Path, out: Path, progress: Progress, *, wanted: str | None
     if not 0 <= intensity < float("inf"):
         raise SettingsError(f"The intensity {intensity} is not a number of 0 or more.")
     colour = LookEdits.parse([f"flare.tint={tint}"], ["flare"]).light("flare").tint
-    known = [Frame("", number, str(path)) for number, path in layers.files.items()]
-    numbers = [frame.number for frame in frames.asked(known, wanted, progress)]
+    known = [NumberedFrame("", number, str(path)) for number, path in layers.files.items()]
+    numbers = [frame.number for frame in frames.select(known, wanted, progress)]
 
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
     scene = bpy.context.scene
@@ -58,33 +59,33 @@ def frames_of(folder: Path, out: Path, progress: Progress, *, wanted: str | None
     render_settings.match_scene(scene, layers, layers.size())
     render = scene.render
     render.pixel_aspect_x, render.pixel_aspect_y = cameras.pixel_aspect(1, layers.pixel_aspect())
-    for note in (render_settings.plain_view(scene), setup.misread(scene)):
+    for note in (render_settings.set_plain_view(scene), setup.colour_space_warning(scene)):
         if note:
             progress.say(note)
     node.inputs["Intensity"].default_value = intensity
     node.inputs["Tint"].default_value = (*colour, 1.0)
-    _keep(out.resolve() / BLEND, progress)
-    render_settings.save_beside(out.resolve() / BLEND)
+    _back_up(out.resolve() / BLEND, progress)
+    render_settings.save_blend(out.resolve() / BLEND)
     progress.stage("compose", len(numbers))
     render_settings.render_frames(scene, numbers, lambda number, suffix: out.resolve() / f"frame.{number:04d}{suffix}",
                              lambda _number: progress.advance())
     return {"frames": str(out), "blend": str(out / BLEND), "blender": bpy.app.version_string}
 
 
-def _keep(blend: Path, progress: Progress) -> None:
-    """Somebody may have worked in the .blend of before: it gets a name such as Blender itself gives, a free one."""
+def _back_up(blend: Path, progress: Progress) -> None:
+    """Rename an earlier .blend, in which somebody may have worked, to a free name as Blender numbers backups."""
     if blend.exists():
         names = (blend.with_suffix(f".blend{number}") for number in itertools.count(1))
-        kept = next(name for name in names if not name.exists())
-        patiently(blend.rename, kept)
-        progress.say(f"{blend} was there already, and is {kept.name} now.")
+        backup = next(name for name in names if not name.exists())
+        retry_while_locked(blend.rename, backup)
+        progress.say(f"{blend} existed already; it is now {backup.name}.")
 
 
 COMMAND = Command(
-    "compose", "Puts baked layers together in Blender's compositor and renders the frames.",
+    "compose", "Combines baked layers in Blender's compositor and renders the frames.",
     f"""Builds the node group "Fit Flare" over LAYERS and writes frame.####.exr (half float, scene-linear),
-frame.####.png (sRGB) and {BLEND}, which opens in Blender and shows the same; one of before is kept
-beside it as compositor.blend1, .blend2 and so on.
+frame.####.png (sRGB) and {BLEND}, which opens in Blender and shows the same. An earlier one is kept beside it
+as compositor.blend1, .blend2 and so on.
 
   run.py compose build/demo/layers --out build/frames --intensity 1.5 --tint 1,0.8,0.6""",
     arguments, (Step("compose", "blender", run),))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""engine: what the engine of this Python is."""
+"""engine: reports the versions and the device of the engine, and tests it."""
 from __future__ import annotations
 
 import argparse
@@ -17,11 +17,11 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def arguments(_parser: argparse.ArgumentParser) -> None:
-    """It takes none."""
+    """Add no options."""
 
 
-def run(_words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
-    """Version, torch and device; splats a few Gaussians, and raises EngineError where that comes to nothing."""
+def run(_args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
+    """Report version, torch and device. Raises EngineError where a test rasterisation gives a wrong result."""
     import torch
 
     from ...core.gaussians import splat
@@ -30,9 +30,9 @@ def run(_words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     centres = torch.full((2, 2), 8.0)
     covariances = torch.tensor([[4.0, 0.0, 4.0]]).repeat(2, 1)
     light = splat(centres, covariances, torch.ones(2), torch.ones(2, 3), 16, 16, blend="add").colour
-    if not float(light.max()) > 1:  # where both lie over each other; no number is no more
-        raise EngineError(f"The engine of {sys.executable} splats wrong: two Gaussians of light 1 come to "
-                          f"{float(light.max()):.3g}; set it up anew.")
+    if not float(light.max()) > 1:  # both Gaussians overlap; also false for NaN
+        raise EngineError(f"The engine of {sys.executable} rasterises wrongly: two Gaussians of light 1 add up to "
+                          f"{float(light.max()):.3g}; set it up again.")
     threads = torch.get_num_threads()
     device = (torch.cuda.get_device_name(0) if torch.cuda.is_available()
               else f"CPU, {threads} thread{'s' if threads > 1 else ''}")
@@ -41,8 +41,8 @@ def run(_words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
 
 
 COMMAND = Command(
-    "engine", "Says what the engine is: versions and device.",
-    """Splats two Gaussians to see that it works.
+    "engine", "Reports the versions and the device of the engine.",
+    """Rasterises two Gaussians as a test.
 
   run.py engine""",
     arguments, (Step("engine", "engine", run),))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""eval: how well a run separates, in figures."""
+"""eval: scores how well a run separates scene and flare."""
 from __future__ import annotations
 
 import argparse
@@ -14,20 +14,21 @@ VIEWS = ("held-out", "train", "all")
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("run", type=Path, metavar="RUN", help="folder that `fit` has written")
+    parser.add_argument("run", type=Path, metavar="RUN", help="a run, the folder that `fit` writes")
     parser.add_argument("--views", choices=VIEWS, default="held-out", help="which views to score (default held-out)")
-    parser.add_argument("--capture", type=Path, metavar="CAPTURE", help="where the capture is, if it was moved")
+    parser.add_argument("--capture", type=Path, metavar="CAPTURE", help="the capture, if it was moved")
     parser.add_argument("--lpips", type=Path, metavar="DIR", help="folder with the weights of LPIPS (AlexNet, v0.1)")
 
 
-def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
-    return scores_of(words.run, progress, which=words.views, capture_folder=words.capture,
-                     lpips_folder=words.lpips)
+def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
+    """Score the run as the arguments say."""
+    return score_run(args.run, progress, which=args.views, capture_folder=args.capture,
+                     lpips_folder=args.lpips)
 
 
-def scores_of(folder: Path, progress: Progress, *, which: str = "held-out",
+def score_run(folder: Path, progress: Progress, *, which: str = "held-out",
               capture_folder: Path | None = None, lpips_folder: Path | None = None) -> dict[str, Any]:
-    """Score a run's views, write its eval.json, show the table."""
+    """Score the views of a run, write its eval.json and report the table; return both. Raises RunError."""
     from ...core.conventions.run_files import EVALUATION
     from ...core.fit.frames import Frames
     from ...core.fit.run import Run
@@ -39,30 +40,30 @@ def scores_of(folder: Path, progress: Progress, *, which: str = "held-out",
         from ...core.metrics.lpips import Lpips
 
         perceptual = Lpips(lpips_folder)
-    made = Run.open(folder)
-    capture = made.capture(capture_folder)
-    train, held_out = capture.split(made.settings.holdout)
+    run_ = Run.open(folder)
+    capture = run_.capture(capture_folder)
+    train, held_out = capture.split(run_.settings.holdout)
     views = {"held-out": held_out, "train": train, "all": capture.views}[which]
     if not views:
-        raise RunError(f"{folder} held no view out; score others with --views train or all.")
-    frames = Frames(capture, made.settings.width)
-    scores = evaluate(made, capture, {view: frames.camera(view) for view in views}, progress, frames.inside,
+        raise RunError(f"{folder} has no held-out view; score others with --views train or all.")
+    frames = Frames(capture, run_.settings.width)
+    scores = evaluate(run_, capture, {view: frames.camera(view) for view in views}, progress, frames.picture_area,
                       perceptual)
-    progress.say(table(scores))  # first, since the folder may be one that is not to be written
+    progress.say(table(scores))  # first, since the folder may be read-only
     if worse_than_none(scores):
-        progress.say("The flare is farther from what was filmed than none at all would be: look at preview.png before "
-                     "anything is made of it; docs/handbook/first_fit.md says what footage a fit can use.")
-    write_json(made.folder / EVALUATION, scores)
-    return {"eval": str(made.folder / EVALUATION),
+        progress.say("This flare matches the frames worse than no flare would: look at preview.png before you use it. "
+                     "docs/handbook/first_fit.md describes the footage that a fit needs.")
+    write_json(run_.folder / EVALUATION, scores)
+    return {"eval": str(run_.folder / EVALUATION),
             "scores": {layer: part for layer, part in scores.items() if isinstance(part, dict)}}
 
 
 COMMAND = Command(
-    "eval", "Scores a run: composite, scene and flare, against what is known.",
-    """Writes RUN/eval.json and shows its means: PSNR, SSIM (11x11 window, sigma 1.5, inside the picture), FLIP
-where the flip-evaluator package is installed, LPIPS where --lpips names its weights. Scene and flare are
-scored against truth/ where the capture has it, else against removed/; "empty" is what no flare at all would
-score. Views that show no flare do not count in its PSNR, "empty" and relative error, and are told.
+    "eval", "Scores a run: composite, scene and flare against reference frames.",
+    """Writes RUN/eval.json and shows its means: PSNR, SSIM (11x11 window, sigma 1.5, inside the picture), FLIP where
+the flip-evaluator package is installed, LPIPS where --lpips names its weights. Scene and flare are scored against
+truth/ where the capture has it, else against removed/. "empty" is the score of an empty flare. Views without flare are
+left out of the flare's PSNR, "empty" and relative error, and are listed.
 
   run.py eval build/desk""",
     arguments, (Step("eval", "engine", run),))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""export: a flare as files that other tools take."""
+"""export: writes a flare in the file formats of other tools."""
 from __future__ import annotations
 
 import argparse
@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from ...core.errors import RunError, SettingsError
-from ...core.system.files import check_apart
+from ...core.system.files import check_no_overwrite
 from ...core.system.progress import Progress
 from .. import frames
 from ..command import Command, Step
@@ -16,76 +16,80 @@ KINDS = ("preset", "ply")
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("flare", type=Path, metavar="RUN_OR_FLARE", help="folder that `fit` has written, or a .flare")
+    parser.add_argument("flare", type=Path, metavar="RUN_OR_FLARE",
+                        help="a run, the folder that `fit` writes; or a .flare")
     parser.add_argument("--as", choices=KINDS, required=True, dest="kind",
-                        help="preset: elements with offset, size, colour, shape, in JSON; ply: the flare's Gaussians "
-                             "of each frame, 3DGS layout")
+                        help="preset: the elements with offset, size, colour and shape, as JSON. ply: the flare's "
+                             "Gaussians of each frame, in the layout of 3DGS")
     parser.add_argument("--out", type=Path, required=True, metavar="PATH",
                         help="preset: the JSON file; ply: a folder for flare.####.ply")
-    parser.add_argument("--capture", type=Path, metavar="CAPTURE", help="whose cameras to use (default: the run's own)")
-    frames.add_option(parser, "frame numbers; all for ply, the first for a preset")
-    parser.add_argument("--set", action="append", default=[], metavar="LIGHT.WHAT=VALUE", dest="edits",
-                        help="edits, as of `bake`; repeatable")
+    parser.add_argument("--capture", type=Path, metavar="CAPTURE",
+                        help="capture whose cameras to use (default: the run's)")
+    frames.add_option(parser, "frame numbers (default: all for ply, the first for a preset)")
+    parser.add_argument("--set", action="append", default=[], metavar="LIGHT.WHAT=VALUE", dest="edit_texts",
+                        help="an edit, as for `bake`; repeatable")
 
 
-def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
+def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
+    """Write the preset or the PLY files. Raises SettingsError and RunError."""
     from ...core.capture import Capture
-    from ...core.conventions.frame_numbers import numbered
+    from ...core.conventions.frame_numbers import number_views
     from ...core.conventions.run_files import FLARE
     from ...core.fit.run import Run
     from ...core.look import LookEdits, ViewOfLight, read
     from ...core.transfer.export import write_flare_ply, write_preset
 
-    folder = words.capture
-    if words.flare.is_dir():
-        folder = Run.open(words.flare).find_capture(folder)
-        if not (words.flare / FLARE).is_file():
-            raise RunError(Run.open(words.flare).without_flare)
-    if not words.flare.exists():
-        raise RunError(f"{words.flare} is missing; name a .flare, or the folder of a run.")
+    folder = args.capture
+    if args.flare.is_dir():
+        folder = Run.open(args.flare).find_capture(folder)
+        if not (args.flare / FLARE).is_file():
+            raise RunError(Run.open(args.flare).without_flare)
+    if not args.flare.exists():
+        raise RunError(f"{args.flare} is missing; name a .flare, or the folder of a run.")
     if folder is None:
-        raise SettingsError(f"{words.flare} says nothing of cameras; name a capture with --capture.")
-    source = words.flare / FLARE if words.flare.is_dir() else words.flare
-    check_apart([source], [words.out])
+        raise SettingsError(f"{args.flare} has no cameras; name a capture with --capture.")
+    source = args.flare / FLARE if args.flare.is_dir() else args.flare
+    check_no_overwrite([source], [args.out])
     look = read(source)
-    edits = LookEdits.parse(words.edits, look.names, look.element_names)
+    edits = LookEdits.parse(args.edit_texts, look.names, look.element_names)
     capture = Capture.open(folder, need_frames=False)
-    if words.flare.is_dir():
-        capture = capture.exposed(Run.open(words.flare).exposures)
+    if args.flare.is_dir():
+        capture = capture.with_exposures(Run.open(args.flare).exposures)
     cameras = {view.name: view.camera for view in capture.views}
-    wanted = frames.asked(numbered(cameras), words.frames, progress)
-    if words.kind == "preset":
-        if words.frames is not None and len(wanted) > 1:
-            raise SettingsError(f"A preset is of one frame, and --frames {words.frames} are {len(wanted)}; name one.")
-        number, camera = wanted[0].number, cameras[wanted[0].view]
-        seen = {light.name: ViewOfLight.of(camera.world_to_camera, light.xyz) for light in look.lights}
-        behind = [name for name, view in seen.items() if view.depth <= 0]
-        if len(behind) == len(seen):
+    selected = frames.select(number_views(cameras), args.frames, progress)
+    if args.kind == "preset":
+        if args.frames is not None and len(selected) > 1:
+            raise SettingsError(f"A preset holds one frame, and --frames {args.frames} selects {len(selected)}; select "
+                                "one.")
+        number, camera = selected[0].number, cameras[selected[0].view]
+        views = {light.name: ViewOfLight.of(camera.world_to_camera, light.xyz) for light in look.lights}
+        behind = [name for name, view in views.items() if view.depth <= 0]
+        if len(behind) == len(views):
             raise RunError(f"No light is in front of the camera in frame {number} of {folder}; name another with "
                            "--frames.")
-        write_preset(words.out, look, seen, edits, camera)
-        progress.say(f"The preset is {words.out}.")
+        write_preset(args.out, look, views, edits, camera)
+        progress.say(f"The preset is {args.out}.")
         if behind:
-            progress.say(f"Lights behind the camera in frame {number} are not in it: {', '.join(behind)}.")
-        return {"preset": str(words.out)}
-    progress.stage("export", len(wanted))
-    for frame in wanted:
+            progress.say(f"Lights behind the camera in frame {number} are left out: {', '.join(behind)}.")
+        return {"preset": str(args.out)}
+    progress.stage("export", len(selected))
+    for frame in selected:
         camera = cameras[frame.view]
         flares = {light: one.exposed(camera.exposure, look.blend)
                   for light, one in look.evaluate(camera.world_to_camera, edits=edits).items()}
-        write_flare_ply(words.out / frame.file.replace("layers.", "flare.").replace(".exr", ".ply"), flares, camera,
-                        look.blend, look.sampling)
+        write_flare_ply(args.out / frame.file.replace("layers.", "flare.").replace(".exr", ".ply"), flares, camera,
+                        look.blend, look.pixel_grid)
         progress.advance()
-    made = "1 frame of Gaussians is" if len(wanted) == 1 else f"{len(wanted)} frames of Gaussians are"
-    progress.say(f"{made} in {words.out}.")
-    return {"ply": str(words.out), "frames": len(wanted)}
+    summary = "1 frame of Gaussians is" if len(selected) == 1 else f"{len(selected)} frames of Gaussians are"
+    progress.say(f"{summary} in {args.out}.")
+    return {"ply": str(args.out), "frames": len(selected)}
 
 
 COMMAND = Command(
     "export", "Writes a flare as a preset (JSON) or as Gaussians (PLY), for other tools.",
-    """A preset is lights, their elements and the parts of each, for one frame: offset (0 at the light, 1 at
-the centre), size, colour, shape; procedural flare tools can be fed from it. The PLY has a frame's flare
-as 3D Gaussians before the camera, in 3DGS's layout, with ring_r0 and ring_w besides. docs/interop.md has both.
+    """A preset lists the lights, their elements and the parts of each for one frame: offset (0 at the light, 1 at the
+centre), size, colour, shape. Procedural flare tools can be set up from it. The PLY holds the flare of a frame as 3D
+Gaussians in front of the camera, in the layout of 3DGS with ring_r0 and ring_w added. docs/interop.md describes both.
 
   run.py export build/demo/run --as preset --out lamp.json --frames 20
   run.py export lamp.flare --capture my_capture --as ply --out build/flares""",

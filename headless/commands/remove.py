@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""remove: plates without their flares."""
+"""remove: removes the flares from plates."""
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ...core.errors import FrameError, RunError, SettingsError, spelled_out
+from ...core.errors import FrameError, RunError, SettingsError, join_failures
 from ...core.system.progress import Progress
 from .. import frames, glow, jobs
-from ..command import Command, Step, refuse_useless
+from ..command import Command, Step, reject_unused_options
 
 if TYPE_CHECKING:
     from ...core.capture import Capture
@@ -18,130 +18,134 @@ if TYPE_CHECKING:
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("plates", type=Path, nargs="*", metavar="PLATE",
-                        help="pictures (PNG, JPEG, TIFF, EXR), folders of them, where clean plates are left out, "
-                             "or videos, whose frames are taken out into DIR/NAME.frames")
+                        help="pictures (PNG, JPEG, TIFF, EXR), folders of them (plates that `remove` wrote are left "
+                             "out), or videos, whose frames are extracted to DIR/NAME.frames")
     parser.add_argument("--run", type=Path, metavar="RUN",
-                        help="instead of PLATE: the frames of the capture that this run was fitted to, less the flare "
-                             "that it found in them")
-    parser.add_argument("--capture", type=Path, metavar="CAPTURE", help="where the run's capture is, if it was moved")
+                        help="instead of PLATE: subtract the flare of this run from the frames that it was fitted to")
+    parser.add_argument("--capture", type=Path, metavar="CAPTURE", help="the run's capture, if it was moved")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR",
-                        help="folder for the clean plates, under the names that the plates have")
-    frames.add_option(parser, "frame numbers, such as 1-20,31 or 1-99:2, of those in the plates' names; all where not "
-                               "given")
-    parser.add_argument("--flare", type=Path, metavar="DIR", help="write the flares too, as EXR in linear light")
+                        help="folder for the clean plates; they keep the names of the plates")
+    frames.add_option(parser, "numbers of frames, as in the names of the plates, such as 1-20,31 or 1-99:2 (default: "
+                               "all)")
+    parser.add_argument("--flare", type=Path, metavar="DIR", help="also write the flares, as EXR in linear light")
     parser.add_argument("--matte", type=Path, metavar="PICTURE_OR_DIR",
                         help="where the flares are, white on black: one picture for all plates, or a folder with one "
-                             "for each, of its name; nothing is taken elsewhere, and what is faint is taken too")
+                             "of the same name for each; nothing is removed outside, and inside faint flares are "
+                             "removed as well")
     glow.add_options(parser)
     parser.add_argument("--stills", action="store_true",
-                        help="clean each plate by itself, in place of in line with those before and after it in its "
-                             "folder")
+                        help="clean each plate by itself, without the plates before and after it")
     parser.add_argument("--working-size", type=int, metavar="PIXELS",
-                        help="long side of the largest view that the network sees (default 480, a little more than it "
-                             "was trained at)")
+                        help="long side of the largest picture that the network gets (default 480, slightly more than "
+                             "in its training)")
     parser.add_argument("--weights", type=Path, metavar="FILE",
-                        help="weights of train-removal's (default: those that come with the program)")
+                        help="weights from `train-removal` (default: those that come with the program)")
     parser.add_argument("--model", choices=("network", "diffusion"), default="network",
-                        help="network: the one that comes with the program; diffusion: a base model and a LoRA of "
-                             "train-removal's, if diffusers, transformers and peft are at hand")
+                        help="network: the one that comes with the program. diffusion: a base model with a LoRA from "
+                             "`train-removal`; needs diffusers, transformers and peft (default network)")
     parser.add_argument("--base", metavar="FOLDER_OR_NAME", help="the base model, for diffusion")
     jobs.add_option(parser)
-    parser.add_argument("--overwrite", action="store_true", help="make again what is there")
+    parser.add_argument("--overwrite", action="store_true", help="replace existing clean plates")
 
 
-def run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
-    from ...core.conventions.frame_numbers import numbered
-    from ...core.removal.jobs.batch import plates_of, remove_all
+def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
+    """Clean the plates, in `--jobs` processes. Raises FrameError for plates that failed, after the others are done."""
+    from ...core.conventions.frame_numbers import number_views
+    from ...core.removal.jobs.batch import collect_plates, remove_all
     from ...core.removal.jobs.mattes import Mattes
-    from ...core.removal.jobs.video_frames import with_frames
+    from ...core.removal.jobs.video_frames import expand_videos
 
-    if (words.run is None) == (not words.plates):
-        raise SettingsError("remove needs plates, or a fitted run with --run: the one or the other.")
-    if words.run is not None:
-        return _by_run(words, progress)
-    refuse_useless(words, {"capture": None}, "--run")
-    given, left_out = with_frames(words.plates, words.out, progress)
+    if (args.run is None) == (not args.plates):
+        raise SettingsError("remove needs either plates or a fitted run with --run.")
+    if args.run is not None:
+        return _remove_fitted_flare(args, progress)
+    reject_unused_options(args, {"capture": None}, "--run")
+    inputs, left_out = expand_videos(args.plates, args.out, progress)
     for sentence in left_out:
         progress.say(f"Left out: {sentence}")
-    failed = left_out if words.frames is None else []  # a share of the frames does not fail by a video without any
+    failed = left_out if args.frames is None else []  # a video without frames fails the whole command only
     wanted = None
-    if words.frames is not None or words.jobs != 1:
-        names = [name.as_posix() for _, name in plates_of(given, [words.out, words.flare, words.matte])]
-        chosen = frames.asked(numbered(names), words.frames, progress)
+    if args.frames is not None or args.jobs != 1:
+        names = [name.as_posix() for _, name in collect_plates(inputs, [args.out, args.flare, args.matte])]
+        chosen = frames.select(number_views(names), args.frames, progress)
         wanted = {Path(frame.view) for frame in chosen}
-        if words.jobs != 1:
-            jobs.run_jobs(words, "remove", [frame.number for frame in chosen], progress, past_failures=True)
+        if args.jobs != 1:
+            jobs.run_jobs(args, "remove", [frame.number for frame in chosen], progress, continue_on_failure=True)
             if failed:
-                raise FrameError(f"The other clean plates are in {words.out}. {spelled_out(failed)}")
-            progress.say(f"The clean plates are in {words.out}.")
-            return {"plates": str(words.out)}
-    return remove_all(given, words.out, _remover(words), progress, flare_folder=words.flare,
-                      mattes=Mattes(words.matte) if words.matte else None, overwrite=words.overwrite, wanted=wanted,
-                      stills=words.stills, left_out=failed)
+                raise FrameError(f"The other clean plates are in {args.out}. {join_failures(failed)}")
+            progress.say(f"The clean plates are in {args.out}.")
+            return {"plates": str(args.out)}
+    return remove_all(inputs, args.out, _make_remover(args), progress, flare_folder=args.flare,
+                      mattes=Mattes(args.matte) if args.matte else None, overwrite=args.overwrite, only=wanted,
+                      independent=args.stills, failed_inputs=failed)
 
 
-def _by_run(words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
-    from ...core.conventions.frame_numbers import numbered
+def _remove_fitted_flare(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
+    """Subtract the flare of a run from the frames of its capture. Raises SettingsError and RunError."""
+    from ...core.conventions.frame_numbers import number_views
     from ...core.fit import Run
-    from ...core.removal.jobs.fitted import remove_fitted
+    from ...core.removal.jobs.fitted import remove_fitted_flare
 
-    network = (words.weights, words.working_size, words.matte, words.stills, words.base)
-    if words.jobs != 1 or words.model != "network" or glow.is_asked(words) or any(network):
-        raise SettingsError("--run takes away the flare that was fitted: of the other options only --out, --frames, "
-                            "--flare, --capture and --overwrite go with it.")
-    fitted = Run.open(words.run)
+    network = (args.weights, args.working_size, args.matte, args.stills, args.base)
+    if args.jobs != 1 or args.model != "network" or glow.is_set(args) or any(network):
+        raise SettingsError("--run subtracts the fitted flare; only --out, --frames, --flare, --capture and "
+                            "--overwrite go with it.")
+    fitted = Run.open(args.run)
     if fitted.settings.mode == "3dgs":
         raise RunError(fitted.without_flare)
-    capture = fitted.capture(words.capture)
-    chosen = frames.asked(numbered([view.name for view in capture.views]), words.frames, progress)
+    capture = fitted.capture(args.capture)
+    chosen = frames.select(number_views([view.name for view in capture.views]), args.frames, progress)
     wanted = {frame.view for frame in chosen}
-    return remove_fitted(fitted, capture, [view for view in capture.views if view.name in wanted], words.out, progress,
-                         flare_folder=words.flare, overwrite=words.overwrite, made_by=fitted.fingerprint,
-                         above_white=fitted.settings.display_white > 1)
+    views = [view for view in capture.views if view.name in wanted]
+    return remove_fitted_flare(fitted, capture, views, args.out, progress, flare_folder=args.flare,
+                               overwrite=args.overwrite, fit_digest=fitted.fingerprint,
+                               above_white=fitted.settings.display_white > 1)
 
 
-def _remover(words: argparse.Namespace) -> Remover:
+def _make_remover(args: argparse.Namespace) -> Remover:
+    """Return the remover that the options select. Raises SettingsError."""
     from ...core.removal.inference.remover import WORKING_SIZE, Remover
 
-    size = WORKING_SIZE if words.working_size is None else words.working_size
-    if words.model == "network":
-        if words.base is not None:
-            raise SettingsError("--base is for --model diffusion; leave it out.")
-        return Remover(words.weights, working_size=size, glow=glow.asked(words))
-    from ...core.removal.inference.diffusion import DiffusionRemover, need
+    size = WORKING_SIZE if args.working_size is None else args.working_size
+    if args.model == "network":
+        if args.base is not None:
+            raise SettingsError("--base is only for --model diffusion; leave it out.")
+        return Remover(args.weights, working_size=size, glow=glow.glow_mode(args))
+    from ...core.removal.inference.diffusion import DiffusionRemover, check_packages
 
-    need()
-    if words.base is None or words.weights is None or glow.is_asked(words):
-        raise SettingsError("--model diffusion wants --base and --weights, and knows no --keep-glare and no "
-                            "--all-glare: a LoRA is trained for the one or the other.")
-    return DiffusionRemover(words.base, words.weights, working_size=size)
+    check_packages()
+    if args.base is None or args.weights is None or glow.is_set(args):
+        raise SettingsError("--model diffusion needs --base and --weights, and takes neither --keep-glow nor "
+                            "--all-glow: that choice is made when the LoRA is trained.")
+    return DiffusionRemover(args.base, args.weights, working_size=size)
 
 
 def with_removed(capture: Capture, progress: Progress) -> Capture:
-    """The capture with its flare-free frames, which are made and written into its folder if it has none. Raises
-    CaptureError where it has some that were made of other frames."""
+    """Return the capture with clean frames; they are made and written to its folder where it has none.
+
+    Raises CaptureError where its clean frames were made from other frames.
+    """
     from ...core.removal.inference.remover import Remover
-    from ...core.removal.jobs.capture import remove_from
-    from ...core.removal.jobs.provenance import check_removed
+    from ...core.removal.jobs.capture import clean_capture
+    from ...core.removal.jobs.provenance import check_clean_frames_current
 
     if capture.has_removed:
-        check_removed(capture)
+        check_clean_frames_current(capture)
         return capture
-    progress.say(f"{capture.folder} has no removed/: the flares are taken out of its frames, and what comes of that is "
-                 "kept there.")
-    remove_from(capture, Remover(glow="taken"), progress)
-    return capture.reopened()
+    progress.say(f"{capture.folder} has no removed/; making clean frames there.")
+    clean_capture(capture, Remover(glow="taken"), progress)
+    return capture.reopen()
 
 
 COMMAND = Command(
-    "remove", "Takes the flares out of plates.",
-    """Writes each plate without its flare to DIR, in the kind and depth it came in. The network sees a reduced
-plate; the flare is carried up to full size and taken away in linear light, and where there is none the plate
-is kept to the last bit. A plate that cannot be read is told at the end, and does not stop the others.
+    "remove", "Removes the flares from plates.",
+    """Writes each plate without its flare to DIR, in its own file format and bit depth. The network gets a reduced
+plate; its flare is upsampled and subtracted in linear light, and pixels without flare keep their code values. A plate
+that cannot be read does not stop the others and is listed at the end.
 
   run.py remove plate.exr --out clean
-  run.py remove shots/sh010 --out clean/sh010 --flare flares/sh010 --keep-glare
+  run.py remove shots/sh010 --out clean/sh010 --flare flares/sh010 --keep-glow
   run.py remove clip.mp4 --out clean/clip                               # the clean frames as PNG
-  run.py remove shots/sh010 --matte roto/sh010 --out clean/sh010        # where the artist says that they are
-  run.py remove --run my_run --out clean          # what `fit` found, out of the frames it was fitted to""",
-    arguments, (Step("remove", "engine", run),), after_a_stop="goes on")
+  run.py remove shots/sh010 --matte roto/sh010 --out clean/sh010        # only where the artist has marked flares
+  run.py remove --run my_run --out clean          # subtracts the fitted flare""",
+    arguments, (Step("remove", "engine", run),), resume_rule="resumes")

@@ -60,7 +60,7 @@ def test_a_failure_is_told_and_leaves_nothing(tmp_path: Path) -> None:
 def test_a_folder_that_holds_something_else_is_left_alone(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("mine")
     status, events = set_up(tmp_path, tmp_path / "nowhere-1.0-py3-none-any.whl")
-    assert status == 1 and "is no virtual environment" in events[-1]["text"]
+    assert status == 1 and "is not a virtual environment" in events[-1]["text"]
     assert (tmp_path / "notes.txt").read_text() == "mine"
 
 
@@ -87,7 +87,7 @@ def test_a_blender_without_ensurepip_takes_another_python(tmp_path: Path, monkey
     assert event["type"] == "error"
     assert "python3-venv" in event["text"]
     (tmp_path / "python3.11").symlink_to(able)
-    assert set_up_.base() == str(tmp_path / "python3.11")
+    assert set_up_.find_base_python() == str(tmp_path / "python3.11")
 
 
 @pytest.mark.skipif(os.name == "nt", reason="signals")
@@ -119,19 +119,19 @@ def test_a_stop_ends_what_it_started_and_leaves_nothing(how: str, tmp_path: Path
     ("x86_64", "15.1", "Intel processors"), ("arm64", "13.6.1", "macOS 14 or later"), ("arm64", "14.0", "")])
 def test_macs_without_torch(machine: str, version: str, why: str, monkeypatch: pytest.MonkeyPatch) -> None:
     script = module()
-    assert script.unsuitable() == ""
+    assert script.unsupported_reason() == ""
     monkeypatch.setattr(sys, "platform", "darwin")
     monkeypatch.setattr(script.platform, "machine", lambda: machine)
     monkeypatch.setattr(script.platform, "mac_ver", lambda: (version, ("", "", ""), machine))
-    assert why in script.unsuitable()
-    assert bool(why) == bool(script.unsuitable())
+    assert why in script.unsupported_reason()
+    assert bool(why) == bool(script.unsupported_reason())
 
 
 def test_a_network_that_is_down_is_told_as_one() -> None:
     said = "print('WARNING: Retrying (Retry(total=4)) after connection broken'); print('ERROR: No matching'); exit(1)"
-    assert module().run([sys.executable, "-c", said]) == "the network could not be reached"
-    assert module().run([sys.executable, "-c", "print('ERROR: No room left.'); exit(1)"]) == "No room left"
-    assert module().run([sys.executable, "-c", "print('fine')"]) == ""
+    assert module().run_logged([sys.executable, "-c", said]) == "the network could not be reached"
+    assert module().run_logged([sys.executable, "-c", "print('ERROR: No room left.'); exit(1)"]) == "No room left"
+    assert module().run_logged([sys.executable, "-c", "print('fine')"]) == ""
 
 
 @pytest.mark.parametrize(("windows", "cure"), [(True, "vc_redist.x64"), (False, "look at the log")])
@@ -144,21 +144,21 @@ def test_an_engine_that_does_not_load_is_none(windows: bool, cure: str, tmp_path
         ran.append(command)
         return "OSError: [WinError 126] c10.dll" if "import cv2" in command[-1] else ""
 
-    monkeypatch.setattr(script, "run", run)
+    monkeypatch.setattr(script, "run_logged", run)
     monkeypatch.setattr(script, "WINDOWS", windows)
-    monkeypatch.setattr(script, "unsuitable", lambda: "")
+    monkeypatch.setattr(script, "unsupported_reason", lambda: "")
     assert script.main([str(tmp_path / "engine")]) == 1
     told = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     assert told[0] == {"type": "stage", "name": "set up", "total": len(ran), "done": 0}
     assert told[-1]["text"].startswith(
-        "The engine was installed, and cannot be loaded (OSError: [WinError 126] c10.dll); ")
+        "The engine was installed but cannot be loaded (OSError: [WinError 126] c10.dll); ")
     assert cure in told[-1]["text"]
-    assert [event["text"] for event in told if event["type"] == "say"][:2] == ["Making a place for the engine",
+    assert [event["text"] for event in told if event["type"] == "say"][:2] == ["Making the virtual environment",
                                                                                "Installing numpy"]
 
 
 def test_what_the_engine_is_tested_by_loads_here() -> None:
-    assert module().run([sys.executable, "-c", module().TEST]) == ""
+    assert module().run_logged([sys.executable, "-c", module().IMPORT_TEST]) == ""
 
 
 def test_an_engine_in_use_is_left_as_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch,

@@ -19,7 +19,7 @@ from core.flare.deformation import QueryRange
 from core.flare.file import FlareFile
 from core.flare.model import OURS, FlareModel, LightFlare
 from core.look import LookEdits, TrainedCamera, draw, read
-from core.look.shot import Shot, evaluate
+from core.look.shot import Shot
 from tests.core.flared import HEIGHT, LIGHT, WIDTH, cameras, flared_capture
 
 SCRIPTS = Path(__file__).parent / "scripts"
@@ -267,7 +267,7 @@ def test_the_overlay_is_what_is_baked(made: tuple[Any, Path], tmp_path: Path) ->
     shot = Shot.read(base / "shot.json")
     bake_shot(shot, tmp_path, half=False)
     frame = shot.frames[0]
-    shown = evaluate(read(shot.flare), frame.camera.world_to_camera, frame.lights,
+    shown = read(shot.flare).evaluate_lights(frame.camera.world_to_camera, frame.lights,
                      LookEdits.parse(frame.edits, shot.lights, None), shot.query)
     picture = draw(shown.values(), frame.camera.intrinsics, *frame.camera.size)
     assert picture.max() > 0.05

@@ -17,7 +17,7 @@ assert _spec is not None
 assert _spec.loader is not None
 _run = importlib.util.module_from_spec(_spec)
 _spec.loader.exec_module(_run)
-_run.load()
+_run.register_package()
 
 
 @pytest.fixture(scope="session")

@@ -21,7 +21,7 @@ from fit_flare.core.capture.colmap import PointCloud
 from fit_flare.core.errors import Cancelled, CaptureError, FitFlareError, SettingsError
 from fit_flare.core.system.progress import Progress
 from fit_flare.headless import cli, layers
-from fit_flare.headless.command import AfterAStop, Command, Step
+from fit_flare.headless.command import Command, ResumeRule, Step
 from fit_flare.headless.commands import COMMANDS, compose, fit, lights, remove
 
 from tests.core.captures import make_capture
@@ -33,7 +33,7 @@ def events(text: str) -> list[dict[str, Any]]:
     return [json.loads(line) for line in text.splitlines()]
 
 
-# ---- words ----------------------------------------------------------------------------------------
+# ---- arguments ------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", COMMANDS)
@@ -51,13 +51,14 @@ def test_runs_of_a_list_lie_below_the_folder_for_them(tmp_path: Path, monkeypatc
     (tmp_path / "shoot" / "lists" / "list.txt").write_text("..\n.\n../b\n")
     monkeypatch.chdir(tmp_path / "shoot" / "lists")
     for listed in (tmp_path / "shoot" / "lists" / "list.txt", Path("list.txt")):
-        named = [fit.place(argparse.Namespace(listed=listed, entry=entry, out=Path("runs")))[1] for entry in (1, 2, 3)]
+        named = [fit.resolve_folders(argparse.Namespace(list_file=listed, entry=entry,
+                                                        out=Path("runs")))[1] for entry in (1, 2, 3)]
         assert named == [Path("runs/shoot"), Path("runs/lists"), Path("runs/b")]
 
 
 def test_runs_whose_names_differ_by_case_alone_are_two_on_every_disk(tmp_path: Path) -> None:
     (tmp_path / "list.txt").write_text("a/Lamp\nb/lamp\nc/desk\n")
-    named = [fit.place(argparse.Namespace(listed=tmp_path / "list.txt", entry=entry, out=Path("runs")))[1]
+    named = [fit.resolve_folders(argparse.Namespace(list_file=tmp_path / "list.txt", entry=entry, out=Path("runs")))[1]
              for entry in (1, 2, 3)]
     assert named == [Path("runs/001_Lamp"), Path("runs/002_lamp"), Path("runs/desk")]
 
@@ -66,7 +67,7 @@ def test_a_capture_that_may_not_be_written_to_is_told_before_lights_are_looked_f
         tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "access", lambda path, mode: (Path(path), mode) != (tmp_path, os.W_OK))
     monkeypatch.setattr("fit_flare.core.lights.find_lights", lambda *_: pytest.fail("it looked"))
-    with pytest.raises(CaptureError, match=r"cannot be written to, where lights\.json belongs"):
+    with pytest.raises(CaptureError, match=r"cannot be written, and lights\.json belongs there"):
         lights.with_lights(Capture(tmp_path, (), PointCloud.empty()), Progress())
 
 
@@ -74,7 +75,7 @@ def test_a_file_in_the_place_of_the_pictures_of_lights_is_told_before_they_are_l
         tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "lights").touch()
     monkeypatch.setattr("fit_flare.core.lights.find_lights", lambda *_: pytest.fail("it looked"))
-    with pytest.raises(CaptureError, match=r"lights is a file, where the pictures of what is found belong"):
+    with pytest.raises(CaptureError, match=r"lights is a file where a folder for the sheets is needed"):
         lights.with_lights(Capture(tmp_path, (), PointCloud.empty()), Progress())
 
 
@@ -82,7 +83,8 @@ def test_lights_and_clean_frames_that_are_made_leave_the_room_for_pictures_as_it
         tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A fit keeps few pictures decoded here, since it has its own."""
     capture = Capture.open(make_capture(tmp_path / "c"), cache_bytes=100_000)
-    monkeypatch.setattr(lights, "_find", lambda *_: (tmp_path / "c" / "lights.json").write_text('{"lights": []}'))
+    monkeypatch.setattr(lights, "_find_and_record",
+                        lambda *_: (tmp_path / "c" / "lights.json").write_text('{"lights": []}'))
     monkeypatch.setattr("fit_flare.core.removal.inference.remover.Remover", lambda **_: None)
     monkeypatch.setattr("fit_flare.core.removal.captured.remove_from", lambda *_: None)
     for made in (lights.with_lights(capture, Progress()), remove.with_removed(capture, Progress())):
@@ -92,11 +94,11 @@ def test_lights_and_clean_frames_that_are_made_leave_the_room_for_pictures_as_it
 
 def test_a_compositor_of_before_is_kept(tmp_path: Path) -> None:
     blend = tmp_path / "compositor.blend"
-    compose._keep(blend, Progress())
+    compose._back_up(blend, Progress())
     assert not list(tmp_path.iterdir())
     for work in ("first", "second"):
         blend.write_text(work)
-        compose._keep(blend, Progress())
+        compose._back_up(blend, Progress())
         assert not blend.exists()
     assert [path.read_text() for path in sorted(tmp_path.iterdir())] == ["first", "second"]
 
@@ -114,7 +116,7 @@ def test_the_list_of_commands(capsys: pytest.CaptureFixture[str], monkeypatch: p
     ["fly"], ["fit"], ["fit", "a"], ["bake", "a"], ["fit", "a", "--out", "b", "--preset", "x"],
     ["fit", "a", "--out", "b", "--seed", "x"], ["fit", "a", "--out", "b", "--pres", "draft"],
     ["eval", "a", "--views", "none"]])
-def test_misuse_is_status_2_and_one_sentence(words: list[str], capfd: pytest.CaptureFixture[str]) -> None:
+def test_misuse_is_status_2_and_one_line(words: list[str], capfd: pytest.CaptureFixture[str]) -> None:
     assert cli.main(words) == 2
     told = capfd.readouterr()
     assert told.out == ""
@@ -130,8 +132,8 @@ def test_misuse_is_status_2_and_one_sentence(words: list[str], capfd: pytest.Cap
     ["demo", "--capture", "no/capture", "--out", "{tmp}/o"], ["engine", "--engine", "no/python"],
     ["transfer", "no.flare", "--to", "a.png", "--out", "{tmp}/o", "--light", "nan,20"],
 ])
-def test_what_cannot_be_done_is_status_1_and_one_sentence(words: list[str], capture: Path, tmp_path: Path,
-                                                          capfd: pytest.CaptureFixture[str]) -> None:
+def test_failures_are_status_1_and_one_line(words: list[str], capture: Path, tmp_path: Path,
+                                            capfd: pytest.CaptureFixture[str]) -> None:
     _is_refused(words, 1, capture, tmp_path, capfd)
 
 
@@ -168,7 +170,7 @@ def test_what_cannot_be_done_is_status_1_and_one_sentence(words: list[str], capt
     ["compose", "{capture}", "--out", "{capture}"],
     ["train-removal", "--backgrounds", "{capture}", "--out", "{tmp}/o", "--threads", "-1"],
     *(["train-removal", "--backgrounds", "{capture}", "--out", "{tmp}/o", *more] for more in (
-        ["--keep-glare"], ["--base", "sd-turbo"], ["--lpips", "no"], ["--most-lenses", "0"], ["--most-lenses", "7"],
+        ["--keep-glow"], ["--base", "sd-turbo"], ["--lpips", "no"], ["--max-lenses", "0"], ["--max-lenses", "7"],
         ["--model", "diffusion", "--start", "box"], ["--model", "diffusion", "--processes", "2"])),
     *(["eval-removal", "{capture}", "--out", "{tmp}/o", *more] for more in (
         ["--seed", "3"], ["--size", "64", "64"], ["--backgrounds", "{capture}"], ["--lenses", "no"],
@@ -178,12 +180,12 @@ def test_what_cannot_be_done_is_status_1_and_one_sentence(words: list[str], capt
     ["solve", "{capture}/images", "--out", "{tmp}/o", "--work-size", "-3"],
     ["bake", "no.flare", "--out", "{tmp}/o", "--capture", "{capture}", "--blend", "no.blend"],
     *(["train-removal", "--backgrounds", "{capture}", "--out", "{tmp}/o", "--set", change] for change in (
-        "learning_rate=abc", "stages=5", "polish=abc", "bank=1.5", "seed=-1", "pixels=NaN", "decay=-1", "canvas=abc",
-        "clean=7", "average=9", "own_share=abc", "blocks=[1,2]")),
+        "learning_rate=abc", "size_stages=5", "psnr_phase=abc", "bank_size=1.5", "seed=-1", "pixels_per_iteration=NaN",
+        "weight_decay=-1", "canvas_size=abc", "clean_share=7", "ema_decay=9", "user_flare_share=abc", "blocks=[1,2]")),
 ])
-def test_what_makes_no_sense_is_status_2_and_one_sentence(words: list[str], capture: Path, tmp_path: Path,
-                                                          capfd: pytest.CaptureFixture[str]) -> None:
-    """A farm need not repeat it."""
+def test_invalid_arguments_are_status_2_and_one_line(words: list[str], capture: Path, tmp_path: Path,
+                                                     capfd: pytest.CaptureFixture[str]) -> None:
+    """A farm does not retry status 2."""
     _is_refused(words, 2, capture, tmp_path, capfd)
 
 
@@ -200,8 +202,8 @@ def _is_refused(words: list[str], status: int, capture: Path, tmp_path: Path,
 
 
 def ending_with(problem: BaseException | None, monkeypatch: pytest.MonkeyPatch, options: Sequence[str] = (),
-                after_a_stop: AfterAStop = "starts over") -> None:
-    """A command "try" of these options."""
+                resume_rule: ResumeRule = "starts over") -> None:
+    """Register a command "try" with these options, which ends with this problem."""
     def run(_words: argparse.Namespace, progress: Progress) -> dict[str, Any]:
         print("a library prints")
         progress.say("working")
@@ -214,7 +216,7 @@ def ending_with(problem: BaseException | None, monkeypatch: pytest.MonkeyPatch, 
             parser.add_argument(option, nargs="?")
 
     monkeypatch.setitem(COMMANDS, "try", Command("try", "Tries.", "", arguments, (Step("try", "engine", run),),
-                                                 after_a_stop))
+                                                 resume_rule))
 
 
 def looped() -> RuntimeError:
@@ -233,14 +235,15 @@ def looped() -> RuntimeError:
      "The disk is full (x.exr); make room and start it again, what is finished is kept."),
     (OSError(13, "Permission denied", "x.exr"), 1, "The system refused: Permission denied (x.exr)."),
     (MemoryError(), 1,
-     "It does not fit into the memory of this machine; end other programs, or take a larger machine."),
+     "This machine has not enough memory for it; close other programs, or use a machine with more memory."),
     (RuntimeError("[enforce fail at alloc_cpu.cpp:127] err == 0. DefaultCPUAllocator: can't allocate memory: you tried "
                   "to allocate 972000000 bytes. Error code 12 (Cannot allocate memory)"), 1,
-     "It does not fit into the memory of this machine; end other programs, or take a larger machine."),
+     "This machine has not enough memory for it; close other programs, or use a machine with more memory."),
     (ZeroDivisionError("division by zero"), 1,
      "A defect of Fit Flare, please report it: ZeroDivisionError: division by zero."),
 ])
-def test_status_and_sentence(problem: BaseException, status: int, sentence: str, monkeypatch: pytest.MonkeyPatch,
+def test_every_error_has_its_status_and_message(problem: BaseException, status: int, sentence: str,
+                                                monkeypatch: pytest.MonkeyPatch,
                              capfd: pytest.CaptureFixture[str]) -> None:
     ending_with(problem, monkeypatch)
     assert cli.main(["try", "--progress=json"]) == status
@@ -249,27 +252,26 @@ def test_status_and_sentence(problem: BaseException, status: int, sentence: str,
     assert ("Traceback" in told.err) == sentence.startswith("A defect")
 
 
-@pytest.mark.parametrize(("after_a_stop", "hint"), [
-    ("goes on", "Give the command again to go on."),
-    ("goes on with --resume", "Give the command again with --resume to go on."),
-    ("starts over", "Given again, it starts over.")])
-def test_who_stops_a_command_is_told_how_it_goes_on(after_a_stop: AfterAStop, hint: str,
-                                                    monkeypatch: pytest.MonkeyPatch,
-                                                    capfd: pytest.CaptureFixture[str]) -> None:
-    ending_with(Cancelled("Stopped as asked."), monkeypatch, after_a_stop=after_a_stop)
+@pytest.mark.parametrize(("resume_rule", "hint"), [
+    ("resumes", "Run the command again to resume."),
+    ("resumes with --resume", "Run the command again with --resume to resume."),
+    ("starts over", "Run again, the command starts over.")])
+def test_a_stop_reports_how_to_resume(resume_rule: ResumeRule, hint: str, monkeypatch: pytest.MonkeyPatch,
+                                      capfd: pytest.CaptureFixture[str]) -> None:
+    ending_with(Cancelled("Stopped as asked."), monkeypatch, resume_rule=resume_rule)
     assert cli.main(["try"]) == 130
     assert f"Stopped as asked. {hint}" in capfd.readouterr().err
 
 
-def test_help_tells_what_goes_on_after_a_stop(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_help_lists_the_commands_that_resume(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
-        cli.parser().parse_args(["--help"])
+        cli.build_parser().parse_args(["--help"])
     told = " ".join(capsys.readouterr().out.split())
-    told = told[told.index("given again,"):]
+    told = told[told.index("run again,"):]
     for name, command in COMMANDS.items():
         resumes = any(option == "--resume" for option in _options(command))
-        assert (command.after_a_stop == "goes on with --resume") == resumes, name
-        assert (f" {name}," in told or f" {name} go on" in told) == (command.after_a_stop != "starts over"), name
+        assert (command.resume_rule == "resumes with --resume") == resumes, name
+        assert (f" {name}," in told or f" {name} resume" in told) == (command.resume_rule != "starts over"), name
 
 
 def _options(command: Command) -> list[str]:
@@ -280,11 +282,11 @@ def _options(command: Command) -> list[str]:
 
 @pytest.mark.parametrize(("options", "way"), [(["--size"], "use a smaller --size."),
                                               (["--size", "--jobs"], "use a smaller --size, or fewer --jobs.")])
-def test_what_takes_less_memory_is_of_the_command_at_hand(options: list[str], way: str, monkeypatch: pytest.MonkeyPatch,
-                                                          capfd: pytest.CaptureFixture[str]) -> None:
+def test_the_memory_advice_names_options_of_the_command(options: list[str], way: str, monkeypatch: pytest.MonkeyPatch,
+                                                        capfd: pytest.CaptureFixture[str]) -> None:
     ending_with(MemoryError(), monkeypatch, options)
     assert cli.main(["try"]) == 1
-    assert f"It does not fit into the memory of this machine; {way}" in capfd.readouterr().err
+    assert f"This machine has not enough memory for it; {way}" in capfd.readouterr().err
 
 
 def test_events_have_standard_output_for_themselves(monkeypatch: pytest.MonkeyPatch,
@@ -302,7 +304,7 @@ def test_events_have_standard_output_for_themselves(monkeypatch: pytest.MonkeyPa
 def test_streams_that_are_closed_are_not_missed(closed: tuple[int, ...]) -> None:
     """Daemons and schedulers start programs so."""
     for extra in ([], ["--progress", "json"]):
-        words = [sys.executable, str(cli.hand_off.RUN), "engine", *extra]
+        words = [sys.executable, str(cli.hand_off.RUN_SCRIPT), "engine", *extra]
         launcher = f"import os; [os.close(n) for n in {closed}]; os.execv({words[0]!r}, {words!r})"
         done = subprocess.run([sys.executable, "-c", launcher], capture_output=True, check=False)
         assert done.returncode == 0, done.stderr
@@ -313,7 +315,7 @@ def test_streams_that_are_closed_are_not_missed(closed: tuple[int, ...]) -> None
 @pytest.mark.parametrize(("options", "full"), [("", "2"), ("--progress json", "1"),
                                                ("--progress openjd", "1")])
 def test_a_full_disk_under_the_log_is_no_failure(options: str, full: str) -> None:
-    run = f"'{sys.executable}' '{cli.hand_off.RUN}'"
+    run = f"'{sys.executable}' '{cli.hand_off.RUN_SCRIPT}'"
     done = subprocess.run(f"{run} engine {options} {full}>/dev/full", shell=True, capture_output=True, check=False)
     assert (done.returncode, done.stderr) == (0, b"")
     assert subprocess.run(f"{run} fly {options} {full}>/dev/full", shell=True, check=False).returncode == 2
@@ -323,7 +325,7 @@ def test_a_torch_that_does_not_load_is_no_refusal_of_a_disk(tmp_path: Path) -> N
     """As Windows says that a library of its own is missing."""
     (tmp_path / "torch").mkdir()
     (tmp_path / "torch" / "__init__.py").write_text("raise OSError(126, 'The specified module could not be found')")
-    done = subprocess.run([sys.executable, str(cli.hand_off.RUN), "engine"], capture_output=True, check=False,
+    done = subprocess.run([sys.executable, str(cli.hand_off.RUN_SCRIPT), "engine"], capture_output=True, check=False,
                           text=True, env={**os.environ, "PYTHONPATH": str(tmp_path)})
     assert done.returncode == 1
     assert done.stderr.startswith("error: torch of ")
@@ -332,7 +334,8 @@ def test_a_torch_that_does_not_load_is_no_refusal_of_a_disk(tmp_path: Path) -> N
 
 def test_help_is_shown_on_a_terminal_of_ascii() -> None:
     environment = {**os.environ, "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0", "LC_ALL": "C"}
-    done = subprocess.run([sys.executable, str(cli.hand_off.RUN), "--help"], capture_output=True, env=environment,
+    done = subprocess.run([sys.executable, str(cli.hand_off.RUN_SCRIPT), "--help"], capture_output=True,
+                          env=environment,
                           check=False)
     assert (done.returncode, done.stderr) == (0, b"")
     assert b"COMMAND" in done.stdout
@@ -347,8 +350,8 @@ def test_an_option_may_end_with_an_equals_sign(capture: Path, tmp_path: Path,
 
 
 def test_a_farm_is_told_names_of_any_script(tmp_path: Path) -> None:
-    words = [sys.executable, str(cli.hand_off.RUN), "bake", str(tmp_path / "写真"), "--out", str(tmp_path / "out"),
-             "--progress", "openjd"]
+    words = [sys.executable, str(cli.hand_off.RUN_SCRIPT), "bake", str(tmp_path / "写真"), "--out",
+             str(tmp_path / "out"), "--progress", "openjd"]
     done = subprocess.run(words, capture_output=True, env={**os.environ, "PYTHONIOENCODING": "cp1252"}, check=False)
     assert done.returncode == 1
     lines = done.stdout.decode("utf-8").splitlines()
@@ -361,27 +364,27 @@ def test_a_farm_is_told_names_of_any_script(tmp_path: Path) -> None:
 
 
 def test_settings_on_the_command_line() -> None:
-    assert fit.change("flare.count=400") == ("flare.count", 400)
-    assert fit.change("flare.rates.network=1e-3") == ("flare.rates.network", 1e-3)
-    assert fit.change("detection = false") == ("detection", False)
-    assert fit.change("kernels=cpu") == ("kernels", "cpu")
+    assert fit.parse_setting("flare.count=400") == ("flare.count", 400)
+    assert fit.parse_setting("flare.rates.network=1e-3") == ("flare.rates.network", 1e-3)
+    assert fit.parse_setting("detection = false") == ("detection", False)
+    assert fit.parse_setting("kernels=cpu") == ("kernels", "cpu")
 
 
 def test_a_holdout_is_a_number_or_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "split.json").write_text("{}")
     monkeypatch.chdir(tmp_path)
-    assert fit.holdout("8") == 8
-    assert fit.holdout(None) is None
-    assert fit.holdout("split.json") == str(tmp_path / "split.json")
+    assert fit.parse_holdout("8") == 8
+    assert fit.parse_holdout(None) is None
+    assert fit.parse_holdout("split.json") == str(tmp_path / "split.json")
 
 
 def test_sizes() -> None:
-    assert layers.size(None) == (None, None)
-    assert layers.size("960") == (960, None)
-    assert layers.size("100x30") == (100, 30)
+    assert layers.parse_size(None) == (None, None)
+    assert layers.parse_size("960") == (960, None)
+    assert layers.parse_size("100x30") == (100, 30)
     for text in ("0", "x", "12x", "-5", "1.5", "999999"):
         with pytest.raises(SettingsError):
-            layers.size(text)
+            layers.parse_size(text)
 
 
 def test_a_blender_that_cannot_be_loaded_is_a_sentence(tmp_path: Path) -> None:
@@ -401,7 +404,7 @@ def test_an_engine_that_splats_wrong_is_found_out(light: float, monkeypatch: pyt
     wrong = SimpleNamespace(colour=torch.full((16, 16, 3), light))
     monkeypatch.setattr("fit_flare.core.gaussians.splat", lambda *_, **__: wrong)
     assert cli.main(["engine"]) == 1
-    assert "splats wrong" in capsys.readouterr().err
+    assert "rasterises wrongly" in capsys.readouterr().err
 
 
 def test_a_python_without_numpy_hands_over_to_the_engine(tmp_path: Path) -> None:
@@ -431,3 +434,36 @@ def test_reading_the_words_needs_numpy_alone() -> None:
     done = subprocess.run([sys.executable, "-I", "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert "--holdout" in done.stdout
+
+
+# ---- renamed options ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("argv", "current"), [
+    (["try", "--keep-glare"], ["try", "--keep-glow"]), (["try", "--most-lenses=7"], ["try", "--max-lenses=7"]),
+    (["try", "--", "--keep-glare"], ["try", "--", "--keep-glare"])])
+def test_renamed_options_work_under_their_old_names(argv: list[str], current: list[str],
+                                                    monkeypatch: pytest.MonkeyPatch,
+                                                    capfd: pytest.CaptureFixture[str]) -> None:
+    parsed: list[argparse.Namespace] = []
+
+    def arguments(parser: argparse.ArgumentParser) -> None:
+        parser.add_argument("--keep-glow", action="store_true")
+        parser.add_argument("--max-lenses")
+        parser.add_argument("files", nargs="*")
+
+    def run(args: argparse.Namespace, _progress: Progress) -> dict[str, Any]:
+        parsed.append(args)
+        return {}
+
+    monkeypatch.setitem(COMMANDS, "try", Command("try", "Tries.", "", arguments, (Step("try", "engine", run),)))
+    assert cli.main(argv) == 0
+    assert parsed[0].argv == current, "what the processes of --jobs get"
+    assert (f"{argv[1].partition('=')[0]} is now" in capfd.readouterr().err) == (argv != current)
+
+
+def test_the_help_has_no_renamed_option(capsys: pytest.CaptureFixture[str]) -> None:
+    for name in COMMANDS:
+        with pytest.raises(SystemExit):
+            cli.build_parser().parse_args([name, "--help"])
+        assert not any(option in capsys.readouterr().out for option in cli.OPTION_ALIASES), name

@@ -23,9 +23,9 @@ from core.bake.bake import read_record
 from core.capture import Capture
 from core.fit import fit, preset
 from core.fit.settings import changed
-from core.look import read
-from core.look.shot import PlacedLight, Shot, ShotFrame
-from core.removal.jobs.manifest import RECORD
+from core.look import PlacedLight, read
+from core.look.shot import Shot, ShotFrame
+from core.removal.jobs.manifest import MANIFEST
 from core.removal.model.weights import IN_THE_BOX
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -170,5 +170,6 @@ def test_plates_are_cleaned_in_chunks(capture: Path, tmp_path: Path) -> None:
     log = job("remove.yaml", "Remove", "--tasks", '[{"Frame": "2-3"}, {"Frame": "4-4"}]', Plates=capture / "images",
               Out=tmp_path / "clean", Flares=tmp_path / "flares", Frames="2-4")
     assert re.findall(r"openjd_progress: (\d+)", log).count("100") == 2
-    assert sorted(path.name for path in (tmp_path / "clean").iterdir()) == ["0002.png", "0003.png", "0004.png", RECORD]
+    assert sorted(path.name for path in (tmp_path / "clean").iterdir()) == ["0002.png", "0003.png", "0004.png",
+                                                                            MANIFEST]
     assert len(list((tmp_path / "flares").iterdir())) == 3

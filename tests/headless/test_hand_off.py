@@ -14,12 +14,12 @@ from typing import Any
 
 import pytest
 from fit_flare.core.errors import Cancelled, EngineError, FitFlareError, SettingsError
-from fit_flare.core.system.processes import environment
-from fit_flare.core.system.progress import Progress, stoppable
+from fit_flare.core.system.processes import child_environment
+from fit_flare.core.system.progress import Progress, stop_on_request
 from fit_flare.headless import hand_off
-from fit_flare.headless.child import Child, Inbox, next_event
+from fit_flare.headless.child import Child, EventQueue, next_event
 
-HERE = [sys.executable, str(hand_off.RUN)]
+HERE = [sys.executable, str(hand_off.RUN_SCRIPT)]
 
 
 class Heard(Progress):
@@ -46,7 +46,7 @@ def bare(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("PATH", "")
     monkeypatch.setattr(hand_off, "ROOT", tmp_path / "repository")
-    monkeypatch.setattr(hand_off, "_usual_places", lambda: iter(()))
+    monkeypatch.setattr(hand_off, "_default_locations", lambda: iter(()))
     return tmp_path / "repository"
 
 
@@ -109,7 +109,7 @@ def test_blender_is_looked_for_in_order(monkeypatch: pytest.MonkeyPatch, tmp_pat
     monkeypatch.setenv("FIT_FLARE_BLENDER", "blender --gpu-backend opengl")
     words = hand_off.blender_command(None)
     assert words[:4] == ["blender", "--gpu-backend", "opengl", "-b"]
-    assert words[-2:] == [str(hand_off.RUN), "--"]
+    assert words[-2:] == [str(hand_off.RUN_SCRIPT), "--"]
     assert hand_off.blender_command(str(program))[0] == str(program)
     with pytest.raises(EngineError, match="--blender names"):
         hand_off.blender_command("no-such-blender -x")
@@ -128,7 +128,7 @@ def test_a_blender_in_a_folder_with_spaces(on_windows: bool, tmp_path: Path, mon
 
 
 def test_a_process_is_one_side() -> None:
-    assert hand_off.here() == "engine"
+    assert hand_off.current_side() == "engine"
     assert "bpy" not in sys.modules
 
 
@@ -150,7 +150,7 @@ def test_events_of_the_other_process_become_ours(tmp_path: Path) -> None:
             "print('{not an event}')\n"
             "tell(type='say', text='äh')\n"
             "tell(type='result', data={'words': sys.argv[1:]})\n")
-    result = hand_off.run_there(child(tmp_path, code), ["demo", "--out", "a b"], "frames", heard)
+    result = hand_off.run_in_child(child(tmp_path, code), ["demo", "--out", "a b"], "frames", heard)
     assert result == {"words": ["demo", "--out", "a b", "--step", "frames", "--progress", "json"]}
     assert heard.lines == [("bake", 5, 2), (4, {"loss": 0.5}), "äh"]
 
@@ -159,40 +159,40 @@ def test_events_of_the_other_process_become_ours(tmp_path: Path) -> None:
 def test_its_error_is_ours(tmp_path: Path, status: int, error: type[FitFlareError]) -> None:
     code = f"tell(type='error', text='The lamp is broken.')\nsys.exit({status})"
     with pytest.raises(FitFlareError, match=r"^The lamp is broken\.$") as problem:
-        hand_off.run_there(child(tmp_path, code), [], "x", Heard())
+        hand_off.run_in_child(child(tmp_path, code), [], "x", Heard())
     assert type(problem.value) is error
 
 
 def test_options_stand_before_what_ends_them(tmp_path: Path) -> None:
     """Behind "--" all words are names of files."""
     code = "tell(type='result', data={'words': sys.argv[1:]})\n"
-    result = hand_off.run_there(child(tmp_path, code), ["remove", "--out", "o", "--", "-a.png"], "remove", Heard())
+    result = hand_off.run_in_child(child(tmp_path, code), ["remove", "--out", "o", "--", "-a.png"], "remove", Heard())
     assert result["words"] == ["remove", "--out", "o", "--step", "remove", "--progress", "json", "--", "-a.png"]
 
 
 def test_its_crash_is_told_with_its_last_words(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(EngineError, match="status 9"):
-        hand_off.run_there(child(tmp_path, "print('boom', file=sys.stderr)\nsys.exit(9)"), [], "x", Heard())
+        hand_off.run_in_child(child(tmp_path, "print('boom', file=sys.stderr)\nsys.exit(9)"), [], "x", Heard())
     assert "boom" in capsys.readouterr().err
 
 
 def test_a_program_that_cannot_start_is_a_sentence(tmp_path: Path) -> None:
     with pytest.raises(EngineError, match="cannot be started"):
-        hand_off.run_there([str(tmp_path / "nothing")], [], "x", Heard())
+        hand_off.run_in_child([str(tmp_path / "nothing")], [], "x", Heard())
 
 
 def test_who_waits_for_an_event_hears_a_stop_meanwhile(tmp_path: Path) -> None:
     """On Windows no signal gets through to who reads from a pipe."""
-    inbox: Inbox = queue.Queue()
+    event_queue: EventQueue = queue.Queue()
     code = ("import signal\nsignal.signal(signal.SIGINT, signal.default_int_handler)\n"  # also where it is ignored here
             "tell(type='say', text='here')\ntime.sleep(60)")
-    silent = Child(child(tmp_path, code), environment(), inbox)
-    while next_event(inbox) is None:
+    silent = Child(child(tmp_path, code), child_environment(), event_queue)
+    while next_event(event_queue) is None:
         pass
-    assert next_event(inbox) is None
+    assert next_event(event_queue) is None
     silent.interrupt()
-    silent.end()
-    assert next_event(inbox) == (silent, None)
+    silent.wait_or_kill()
+    assert next_event(event_queue) == (silent, None)
     assert silent.status != 0
 
 
@@ -220,8 +220,8 @@ def test_a_stop_reaches_the_other_process_which_ends_by_itself(tmp_path: Path, n
                 os.kill(os.getpid(), getattr(signal, number))
 
     heard, began = Stopping(), time.monotonic()
-    with pytest.raises(Cancelled), stoppable(heard):
-        hand_off.run_there(child(tmp_path, code), [str(tmp_path / "saved")], "x", heard)
+    with pytest.raises(Cancelled), stop_on_request(heard):
+        hand_off.run_in_child(child(tmp_path, code), [str(tmp_path / "saved")], "x", heard)
     assert (tmp_path / "saved").read_text() == "whole"
     assert heard.lines == ["saving"]
     assert time.monotonic() - began < 10
@@ -235,6 +235,6 @@ def test_no_process_is_left_behind_when_ours_fails(tmp_path: Path) -> None:
 
     code = "tell(type='say', text=str(os.getpid()))\ntime.sleep(30)\n"
     with pytest.raises(BrokenPipeError) as problem:
-        hand_off.run_there(child(tmp_path, code), [], "x", Failing())
+        hand_off.run_in_child(child(tmp_path, code), [], "x", Failing())
     with pytest.raises(ProcessLookupError):
         os.kill(int(str(problem.value)), 0)

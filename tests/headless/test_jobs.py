@@ -44,22 +44,22 @@ if word == "told":
 def program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """In place of run.py one that fails as its frames say."""
     (tmp_path / "run.py").write_text(PROCESS, encoding="utf-8")
-    monkeypatch.setattr(hand_off, "RUN", tmp_path / "run.py")
+    monkeypatch.setattr(hand_off, "RUN_SCRIPT", tmp_path / "run.py")
 
 
 def run(*frames: str) -> None:
-    words = argparse.Namespace(words=["remove"])
+    words = argparse.Namespace(argv=["remove"])
     parts = [["--frames", word] for word in frames]
-    jobs.run_parts(words, "remove", parts, len(parts), len(parts), Progress(), past_failures=True)
+    jobs.run_parts(words, "remove", parts, len(parts), len(parts), Progress(), continue_on_failure=True)
 
 
 @pytest.mark.parametrize(("numbers", "count", "expected"), [
     ([5, 1, 2, 3], 2, ["1-2", "3,5"]), ([4, 4], 3, ["4"]), ([], 2, []),
 ])
 def test_shares(numbers: list[int], count: int, expected: list[str]) -> None:
-    assert jobs.shares(numbers, count) == expected
+    assert jobs.split_frames(numbers, count) == expected
     with pytest.raises(SettingsError, match="--jobs 0"):
-        jobs.shares(numbers, 0)
+        jobs.split_frames(numbers, 0)
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="the system gives no process a part of its cores")
@@ -76,9 +76,9 @@ def test_processes_share_the_cores_that_are_theirs(monkeypatch: pytest.MonkeyPat
 
 @pytest.mark.usefixtures("program")
 def test_names_behind_two_dashes_stay_names() -> None:
-    words = argparse.Namespace(words=["remove", "--", "bad", "--frames"])
-    jobs.run_parts(words, "remove", [["--frames", "told"]], 1, 1, Progress(), past_failures=True)
-    told = json.loads(Path(f"{hand_off.RUN}.json").read_text(encoding="utf-8"))
+    words = argparse.Namespace(argv=["remove", "--", "bad", "--frames"])
+    jobs.run_parts(words, "remove", [["--frames", "told"]], 1, 1, Progress(), continue_on_failure=True)
+    told = json.loads(Path(f"{hand_off.RUN_SCRIPT}.json").read_text(encoding="utf-8"))
     assert told == ["remove", "--step", "remove", "--frames", "told", "--progress", "json", "--", "bad", "--frames"]
 
 
@@ -90,9 +90,9 @@ def test_every_failed_process_is_told_those_without_a_reason_too(capfd: pytest.C
     assert str(problem.value) == "Frame 7 is damaged."
     with pytest.raises(EngineError) as problem:
         run("bad", "killed")
-    assert str(problem.value) == ("Frame 7 is damaged. 1 of 2 processes of remove ended without a reason, status "
+    assert str(problem.value) == ("Frame 7 is damaged. 1 of 2 processes of remove ended without a message, status "
                                   "9; memory may have been short.")
-    with pytest.raises(EngineError, match="status 1; what one wrote last stands above"):
+    with pytest.raises(EngineError, match="status 1; the end of one log is above"):
         run("loud", "fine")
     assert "Bus error at 0x0" in capfd.readouterr().err
 
@@ -127,7 +127,7 @@ def test_a_python_that_cannot_be_started_is_a_sentence(monkeypatch: pytest.Monke
 
 @pytest.mark.usefixtures("program")
 def test_one_that_fails_stops_the_others(tmp_path: Path) -> None:
-    words, began = argparse.Namespace(words=["bake"]), time.monotonic()
+    words, began = argparse.Namespace(argv=["bake"]), time.monotonic()
     with pytest.raises(FitFlareError, match=r"^Frame 7 is damaged\.$"):
         jobs.run_parts(words, "bake", [["--frames", "sleep"], ["--frames", "bad"]], 2, 2, Progress())
     assert time.monotonic() - began < 30

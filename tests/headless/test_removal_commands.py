@@ -13,12 +13,13 @@ import pytest
 import torch
 from fit_flare.core.images.read import read_picture
 from fit_flare.core.images.write import write_png
-from fit_flare.core.removal.jobs.manifest import RECORD
-from fit_flare.core.removal.training.run import recipe_in
+from fit_flare.core.removal.jobs.manifest import MANIFEST
+from fit_flare.core.removal.training.run import read_recipe
 from fit_flare.headless import cli
 
 RUN = Path(__file__).resolve().parents[2] / "headless" / "run.py"
-SMALL = [word for change in ("widths=[8,8,8,8,8]", "stages=[[1.0,64,64]]", "pixels=1", "bank=2", "canvas=64")
+SMALL = [word for change in ("widths=[8,8,8,8,8]", "size_stages=[[1.0,64,64]]", "pixels_per_iteration=1",
+                             "bank_size=2", "canvas_size=64")
          for word in ("--set", change)]
 
 
@@ -43,7 +44,7 @@ def test_training_is_stopped_by_its_length_and_goes_on(backgrounds: Path, tmp_pa
     made = tmp_path / "made"
     shorter = ["train-removal", "--backgrounds", str(backgrounds), "--out", str(made), "--resume", "--processes", "1"]
     assert cli.main([*shorter, "--set", "clean=0.5"]) == 0
-    goes_by = recipe_in(made)  # with what it was begun by, not with the usual length and size
+    goes_by = read_recipe(made)  # with what it was begun by, not with the usual length and size
     assert goes_by is not None and (goes_by.iterations, goes_by.bank, goes_by.clean) == (3, 2, 0.5)
     weights = str(tmp_path / "made" / "removal.safetensors")
     assert cli.main(["remove", str(backgrounds), "--out", str(tmp_path / "clean"), "--weights", weights]) == 0
@@ -171,7 +172,7 @@ def test_fit_does_without_flare_free_frames_where_it_is_asked_to(capture: Path, 
     clean = tmp_path / "clean"
     assert cli.main(["remove", "--run", str(run), "--out", str(clean), "--frames", "0-1"]) == 0
     filmed = sorted(path.name for path in (bare / "images").iterdir())
-    assert sorted(path.name for path in clean.iterdir()) == [*filmed[:2], RECORD]
+    assert sorted(path.name for path in clean.iterdir()) == [*filmed[:2], MANIFEST]
     for words in (["remove", "--out", str(clean)], ["remove", str(bare), "--run", str(run), "--out", str(clean)],
                   ["remove", "--run", str(run), "--out", str(clean), "--keep-glare"],
                   ["remove", "--run", str(run), "--out", str(clean), "--all-glare"]):
@@ -199,7 +200,7 @@ def test_fit_takes_the_flare_out_where_nobody_did(capture: Path, tmp_path: Path,
     assert 'mode = "estimated"' in (tmp_path / "run" / "config.toml").read_text(encoding="utf-8")
     by_hand = ["remove", str(bare / "images"), "--out", str(bare / "removed"), "--all-glare"]
     assert cli.main(by_hand) == 0
-    assert f"{len(made)} plates were in" in capsys.readouterr().err, "as the panel has them made"
+    assert f"{len(made)} clean frames in" in capsys.readouterr().err, "as the panel has them made"
     for path in made.values():
         write_png(path, read_picture(path).pixels * 0.9)
     assert cli.main(["fit", str(bare), "--out", str(tmp_path / "worked on"), "--iterations", "2"]) == 0

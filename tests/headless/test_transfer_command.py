@@ -190,7 +190,7 @@ def test_on_to_a_blend_its_objects_hide_the_light(run: Run, made: Path, blend: P
     run("transfer", made, "--to", blend, "--out", out, "--frames", "1-9", "--jobs", "2", "--float")
     shot = Shot.read(out / "shot.1-9.json")
     assert [one.frame for one in shot.frames] == list(range(1, 10))
-    shares = [one.lights[0].share for one in shot.frames]
+    shares = [one.lights[0].visibility for one in shot.frames]
     assert shares[4] == 0
     assert shares[0] == shares[8] == 1
     camera = shot.frames[0].camera

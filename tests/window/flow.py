@@ -171,7 +171,7 @@ def fit():
         if not turned and job.done > 20:
             ui.drag(*middle, middle[0] + 120, middle[1] + 30, button="MIDDLEMOUSE")
             turned = True
-        if not shown and job.share > 0.4:
+        if not shown and job.fraction_done > 0.4:
             gaps.pause()
             shot("04_fitting")
             shown = True
@@ -358,7 +358,7 @@ def speed_of(overlay, scene) -> dict[str, float]:
     numpy_ms, gpu_ms = [], []
     for _ in range(8):
         began = time.perf_counter()
-        gaussians = overlay.joined(list(looks.seen(scene, depsgraph, scene.camera).values()))
+        gaussians = overlay.concatenate(list(looks.seen(scene, depsgraph, scene.camera).values()))
         overlay.levels(gaussians, window, look)
         middle = time.perf_counter()
         drawn = overlay.render(gaussians, window, look)

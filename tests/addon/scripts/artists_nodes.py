@@ -20,7 +20,7 @@ ROOT = Path(__file__).resolve().parents[3]
 spec = importlib.util.spec_from_file_location("run", ROOT / "headless" / "run.py")
 run = importlib.util.module_from_spec(spec)
 spec.loader.exec_module(run)
-run.load()
+run.register_package()
 
 from fit_flare.core.bake.folder import LayerFolder  # noqa: E402
 from fit_flare.flare_addon import render_settings  # noqa: E402
@@ -38,7 +38,7 @@ def empty() -> bpy.types.Scene:
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
     scene = bpy.context.scene
     render_settings.match_scene(scene, layers, layers.size())
-    render_settings.plain_view(scene)
+    render_settings.set_plain_view(scene)
     scene.camera = bpy.data.objects.new("Camera", bpy.data.cameras.new("Camera"))
     scene.collection.objects.link(scene.camera)
     return scene
@@ -59,7 +59,7 @@ def grade(tree: bpy.types.NodeTree, name: str = "Grade") -> bpy.types.Node:
     node = tree.nodes.new("CompositorNodeExposure")
     node.name = name
     node.inputs["Exposure"].default_value = 1
-    end = setup._output(tree)
+    end = setup._output_input(tree)
     tree.links.new(end.links[0].from_socket, node.inputs[0])
     tree.links.new(node.outputs[0], end)
     return node
@@ -139,7 +139,7 @@ scene = empty()
 tree, colour = plate(scene)
 node = setup.set_up(scene, layers, keep_image=True)
 after = grade(tree)
-tree.links.new(node.outputs["Image"], setup._output(tree))
+tree.links.new(node.outputs["Image"], setup._output_input(tree))
 tree.links.new(after.outputs[0], node.inputs["Scene"])
 facts["a cycle"] = shown(scene)
 setup.set_up(scene, layers, keep_image=True)

@@ -26,7 +26,7 @@ install(package)
 sys.path.remove(str(Path(__file__).parent))
 ops = bpy.ops.fit_flare
 jobs, fits, engine, looks = (part(f"flare_addon.{name}") for name in ("jobs", "fits", "engine", "looks"))
-preferences = part("flare_addon.preferences").own()
+preferences = part("flare_addon.user_settings").addon_preferences()
 folder = Path(out)
 said: dict[str, object] = {}
 os.environ.pop("FIT_FLARE_ENGINE", None)
@@ -184,7 +184,7 @@ paths = part("flare_addon.paths")
 said["written on Windows"] = str(paths.absolute("//captures\\desk")) == str(paths.absolute("//captures/desk"))
 (folder / "drive").mkdir()
 (folder / "Z").symlink_to(folder / "drive", target_is_directory=True)
-said["a linked drive"] = paths.stored(folder / "Z" / "x" / ".." / "run") == str(folder / "Z" / "run")
+said["a linked drive"] = paths.blend_relative(folder / "Z" / "x" / ".." / "run") == str(folder / "Z" / "run")
 
 # ---- a capture that moved ---------------------------------------------------------------------------
 scene.fit_flare.run = ""
@@ -197,16 +197,16 @@ Path(capture).with_name("away").rename(capture)
 # ---- places that cannot be looked at ----------------------------------------------------------------
 state, asking = scene.fit_flare, ("fit", "find_lights", "clean_frames", "use_lights", "use_result", "resume",
                                   "show_preview", "bake")
-kept, unseen = {name: getattr(state, name) for name in paths.OURS}, "x" * 300
+kept, unseen = {name: getattr(state, name) for name in paths.PATH_PROPERTIES}, "x" * 300
 said["a name too long for the disk"] = []
-for name in paths.OURS:
+for name in paths.PATH_PROPERTIES:
     setattr(state, name, str(folder / unseen))
     said["a name too long for the disk"].append([name, *map(shown, PANELS), *map(polls, asking)])
     setattr(state, name, kept[name])
 state.run = state.capture = str(folder / unseen)
 for state.mode in ("split", "estimated"):
     said["a name too long for the disk"].append(["all", *map(shown, PANELS), *map(polls, asking)])
-for name in paths.OURS:
+for name in paths.PATH_PROPERTIES:
     setattr(state, name, kept[name])
 
 # ---- .flare files -----------------------------------------------------------------------------------
@@ -253,10 +253,10 @@ lights, library, shots = (part(f"flare_addon.{name}") for name in ("lights", "li
 write_shot, shots.Shot.write = shots.Shot.write, full
 said["bake on a full disk"] = refusal(lambda: ops.bake())
 shots.Shot.write = write_shot
-annotated, library.annotated = library.annotated, full
+write_annotated, library.write_annotated = library.write_annotated, full
 said["save on a full disk"] = refusal(lambda: ops.save_flare(name="full"))
 said["library after"] = [path.name for path in library.files()]
-library.annotated = annotated
+library.write_annotated = write_annotated
 write_json, jobs.write_json = jobs.write_json, full
 scene.fit_flare.run = ""
 behave("sleeps")
@@ -293,7 +293,7 @@ bpy.data.objects.remove(target)
 said["light deleted"] = scene.fit_flare.lights[0].target is None
 second = bpy.data.scenes.new("Second")
 bpy.context.window.scene = second
-own_lights = part("flare_addon.lights").of_scene(second)
+own_lights = part("flare_addon.lights").scene_lights(second)
 said["second scene is empty"] = [second.fit_flare.flare, polls("bake"), len(own_lights)]
 ops.open_flare(filepath=flare)
 second.fit_flare.master.intensity = 3

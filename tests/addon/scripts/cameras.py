@@ -52,12 +52,12 @@ for fx, fy in ((70.0, 50.0), (50.0, 70.0)):
 
 # What a scene has one of.
 Camera = part("core.capture").Camera
-facts["unlike"] = [list(part("flare_addon.capture.importer").unlike_the_first(
+facts["unlike"] = [list(part("flare_addon.capture.importer").camera_differences(
     [Camera(64, 40, 70.0, 70.0, 32, 20, np.eye(4)), Camera(64, height, 70.0, fy, 32, 20, np.eye(4))]))
     for height, fy in ((40, 70.1), (44, 70.0), (40, 71.4))]
 
 # What was up in the capture is up in Blender.
-axes = part("flare_addon.capture.importer").UP
+axes = part("flare_addon.capture.importer").UP_ROTATIONS
 facts["up"] = {name: list(np.array(Euler(axes[name]).to_matrix()) @ up)
                for name, up in (("Z", (0, 0, 1)), ("-Y", (0, -1, 0)), ("Y", (0, 1, 0)))}
 
@@ -73,7 +73,7 @@ facts["footage"] = filmed.path(3).name
 
 # What the compositor does live is not baked too.
 edits = part("core.look").LookEdits.parse(["*.mute=1", "lamp.solo=1", "key.mute=1", "lamp.scale=2"], ["lamp", "key"])
-facts["baked edits"] = list(shots.without_live(edits).words())
+facts["baked edits"] = list(shots.without_live(edits).texts())
 
 # A light that was moved from where it was learned shows its flare as the source does, not as its capture did.
 facts["query"] = [looks.query_of(SimpleNamespace(root=1, native=native)) for native in (True, False)]

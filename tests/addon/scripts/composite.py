@@ -15,7 +15,7 @@ ROOT = Path(__file__).resolve().parents[3]
 spec = importlib.util.spec_from_file_location("run", ROOT / "headless" / "run.py")
 run = importlib.util.module_from_spec(spec)
 spec.loader.exec_module(run)
-run.load()
+run.register_package()
 
 from fit_flare.core.bake.folder import LayerFolder  # noqa: E402
 from fit_flare.core.errors import FrameError  # noqa: E402
@@ -35,7 +35,7 @@ def empty() -> bpy.types.Scene:
     scene = bpy.context.scene
     scene.frame_set(layers.last + 1)
     render_settings.match_scene(scene, layers, layers.size())
-    render_settings.plain_view(scene)
+    render_settings.set_plain_view(scene)
     return scene
 
 
@@ -57,7 +57,7 @@ render(scene, "plain", sorted(layers.files))
 node.inputs["Intensity"].default_value = INTENSITY
 node.inputs["Tint"].default_value = TINT
 render(scene, "changed", sorted(layers.files))
-render_settings.save_beside(out / "scene" / "compositor.blend")
+render_settings.save_blend(out / "scene" / "compositor.blend")
 
 # Set up again: nothing doubles, the sliders stay.
 count = len(flare_node.tree_of(scene).nodes), len(bpy.data.node_groups)
@@ -66,7 +66,7 @@ facts["doubled"] = [count, (len(flare_node.tree_of(scene).nodes), len(bpy.data.n
 facts["sliders"] = [again.inputs["Intensity"].default_value, list(again.inputs["Tint"].default_value)]
 
 # The flare alone.
-flare_node.tree_of(scene).links.new(again.outputs["Flare"], setup._output(flare_node.tree_of(scene)))
+flare_node.tree_of(scene).links.new(again.outputs["Flare"], setup._output_input(flare_node.tree_of(scene)))
 render(scene, "flare", sorted(layers.files)[:1])
 
 # Over what is there: a plain colour in place of the baked scene, twice.
@@ -74,7 +74,7 @@ scene = empty()
 tree = setup._new_tree(scene, keep_image=False)
 plate = tree.nodes.new("CompositorNodeRGB")
 plate.outputs[0].default_value = (0.25, 0.5, 0.75, 1.0)
-tree.links.new(plate.outputs[0], setup._output(tree))
+tree.links.new(plate.outputs[0], setup._output_input(tree))
 for _ in range(2):
     setup.set_up(scene, layers, keep_image=True)
 facts["plate stays"] = plate.name in tree.nodes
@@ -136,9 +136,9 @@ except FrameError as problem:
     facts["cropped"] = [str(problem), flare_node.find_node(scene) is None]
 
 # The command, of layers of wide pixels in ACEScg.
-compose.frames_of(aces, out / "aces", Progress())
+compose.compose_frames(aces, out / "aces", Progress())
 scene = bpy.context.scene
-facts["aces"] = [setup.misread(scene), scene.render.pixel_aspect_x, scene.render.pixel_aspect_y]
+facts["aces"] = [setup.colour_space_warning(scene), scene.render.pixel_aspect_x, scene.render.pixel_aspect_y]
 
 # A disk that fills up, which Blender does not tell of: files may not grow beyond a limit.
 if sys.platform == "linux":
@@ -151,7 +151,7 @@ if sys.platform == "linux":
     full, before = out / "full", resource.getrlimit(resource.RLIMIT_FSIZE)
     refused = []
     for write in (lambda: render(scene, "full", sorted(layers.files)[:1]),
-                  lambda: render_settings.save_beside(full / "compositor.blend")):
+                  lambda: render_settings.save_blend(full / "compositor.blend")):
         resource.setrlimit(resource.RLIMIT_FSIZE, (1000, before[1]))
         try:
             write()

@@ -224,7 +224,7 @@ first = Path(layers) / "layers.0001.exr"
 facts["baked again"] = [shown(scene)]
 kept = first.read_bytes()
 first.write_bytes((Path(out) / "again.exr").read_bytes())
-part("flare_addon.jobs").FINISHERS["bake"](SimpleNamespace(folder=Path(layers), state="done"))
+part("flare_addon.jobs").ON_FINISHED["bake"](SimpleNamespace(folder=Path(layers), state="done"))
 facts["baked again"].append(shown(scene))
 first.write_bytes(kept)
 

@@ -24,10 +24,10 @@ bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
 path, modules = list(sys.path), set(sys.modules)
 bpy.ops.extensions.package_install_files(filepath=package, repo="user_default", enable_on_install=True, overwrite=True)
 facts = {"enabled": NAME in bpy.context.preferences.addons, "classes": ours()}
-preferences = importlib.import_module(f"{NAME}.flare_addon.preferences")
-facts["engine"] = [preferences.engine_path()]
+settings = importlib.import_module(f"{NAME}.flare_addon.user_settings")
+facts["engine"] = [settings.engine_path()]
 bpy.context.preferences.addons[NAME].preferences.engine = sys.executable
-facts["engine"].append(preferences.engine_path())
+facts["engine"].append(settings.engine_path())
 facts["python"] = sys.executable
 
 facts["set up"] = list(bpy.ops.fit_flare.set_up_compositor(directory=layers))

@@ -40,7 +40,7 @@ def begun(name: str, events: str, **record: object) -> Path:
 
 # ---- another machine --------------------------------------------------------------------------------
 ended = []
-jobs.FINISHERS["fit"] = lambda job: ended.append(job.folder.name)
+jobs.ON_FINISHED["fit"] = lambda job: ended.append(job.folder.name)
 facts["ended elsewhere"] = jobs.find(begun("ended elsewhere", RESULT, host="another")).state
 far = jobs.find(begun("goes on elsewhere", GOES_ON, host="another"))
 facts["goes on elsewhere"] = [far.state, far.done]
@@ -51,21 +51,21 @@ with open(far.folder / jobs.EVENTS, "a") as stream:
 far.poll()
 facts["stopped elsewhere"] = [far.poll(), far.state, ended]
 silent = begun("silent", GOES_ON, host="another")
-os.utime(silent / jobs.EVENTS, (0, time.time() - 2 * jobs.SILENT_S))
+os.utime(silent / jobs.EVENTS, (0, time.time() - 2 * jobs.SILENCE_LIMIT_S))
 named = begun("named", GOES_ON, host="6f1c", host_name="studio-mac")
-os.utime(named / jobs.EVENTS, (0, time.time() - 2 * jobs.SILENT_S))
+os.utime(named / jobs.EVENTS, (0, time.time() - 2 * jobs.SILENCE_LIMIT_S))
 facts["silent on a Mac"] = jobs.find(named).error
 facts["silent elsewhere"] = [jobs.find(silent).state, jobs.find(silent).error]
 
 # ---- what is done in the scenes with one goes wrong ---------------------------------------------------
 goes_on, ends = (jobs.find(begun(name, GOES_ON, host="another")) for name in ("goes on still", "ends badly"))
-jobs.FINISHERS["fit"] = lambda _job: [].pop()
+jobs.ON_FINISHED["fit"] = lambda _job: [].pop()
 with open(ends.folder / jobs.EVENTS, "a") as stream:
     stream.write(RESULT)
 with contextlib.redirect_stderr(io.StringIO()) as console:
     again = jobs._tick()
 facts["ends badly"] = [again, ends.state, ends.error, "IndexError" in console.getvalue(), goes_on.state]
-jobs.forget(goes_on.folder)
+jobs.stop_watching(goes_on.folder)
 
 # ---- this machine -----------------------------------------------------------------------------------
 facts["written by the version before"] = [jobs.find(begun("old", GOES_ON)).state,
@@ -87,8 +87,8 @@ shots, scene = part("flare_addon.shots"), empty()
 scene.fit_flare.run = str(own)
 for folder in (own, other, bake):
     jobs.find(folder)
-facts["of the scene"] = [job.folder.name for job in shots.jobs_of(scene)]
-facts["of none"] = [job.folder.name for job in shots.unnamed()
+facts["of the scene"] = [job.folder.name for job in shots.running_jobs(scene)]
+facts["of none"] = [job.folder.name for job in shots.orphaned_jobs()
                     if job.folder.name not in ("old", "by name", "given out again")]
 cancel = part("flare_addon.operators.fit").FITFLARE_OT_cancel_by_key
 over = SimpleNamespace(region=SimpleNamespace(type="UI", active_panel_category="Fit Flare"), scene=scene,

@@ -123,7 +123,7 @@ for name in ("On", "Off", "Excluded"):
     group.objects.link(bpy.data.objects.new(f"Lamp {name}", bpy.data.lights.new(name, "POINT")))
 bpy.data.collections["Off"].hide_render = True
 bpy.context.view_layer.layer_collection.children["Excluded"].exclude = True
-facts["lamps"] = [thing.name for thing in part("flare_addon.capture.blend_shot")._lights(scene, ())]
+facts["lamps"] = [thing.name for thing in part("flare_addon.capture.blend_shot")._find_lights(scene, ())]
 
 # ---- an empty as the camera, and another file -------------------------------------------------------
 ops.open_flare(filepath=str(flare))
@@ -135,9 +135,9 @@ try:
 except errors.FitFlareError as problem:
     facts["an empty"] = str(problem)
 overlay, points = part("flare_addon.overlay"), part("flare_addon.points")
-overlay.problem, points._batches["Points", 3] = "That is wrong.", None
+overlay.last_error, points._batches["Points", 3] = "That is wrong.", None
 empty()
-facts["another file"] = [overlay.problem, len(points._batches)]
+facts["another file"] = [overlay.last_error, len(points._batches)]
 
 # ---- lamps of a linked asset ------------------------------------------------------------------------
 scene = empty()
@@ -165,7 +165,7 @@ for how in ("linked", "overridden"):
 
 # ---- a click in the picture -------------------------------------------------------------------------
 library = part("flare_addon.operators.library")
-frame_in, library.overlay.frame_in = overlay.frame_in, lambda *_words: overlay.Frame(100, 50, 200, 100)
+frame_in, library.overlay.frame_in = overlay.camera_frame, lambda *_words: overlay.CameraFrame(100, 50, 200, 100)
 view, panel = (SimpleNamespace(type=kind, x=left, y=0, width=width, height=300)
                for kind, left, width in (("WINDOW", 10, 500), ("UI", 260, 250)))
 area = SimpleNamespace(as_pointer=lambda: 7, regions=[view, panel],
@@ -189,7 +189,7 @@ for how, x, y in (("beside the picture", 50, 100), ("below the view", 150, -5), 
     facts["clicks"][how] = [list(result), left == ["cursor", None]]
     if how == "on the light":
         facts["clicked"] = [operator.x, operator.y]
-overlay.frame_in = frame_in
+overlay.camera_frame = frame_in
 
 # ---- a fit that has ended while the .blend was closed -----------------------------------------------
 run = out / "run"

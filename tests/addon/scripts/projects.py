@@ -159,10 +159,10 @@ bpy.ops.wm.save_as_mainfile(filepath=str(out / "two.blend"))
 bpy.ops.wm.open_mainfile(filepath=str(out / "two.blend"))
 scene = bpy.data.scenes["Shot"]
 place = {light.name: light.xyz + 0.1 for light in part("core.capture").read_lights(capture / "lights.json")}
-lights.follow(scene, place, capture)
+lights.move_to_fit(scene, place, capture)
 depsgraph = part("flare_addon.objects").depsgraph_of(scene)
-facts["moved unseen"] = max(abs(float(lights.place_of(item, scene.fit_flare.root, depsgraph)[0])
-                                - float(place[lights.name_of(item)][0])) for item in lights.of_scene(scene))
+facts["moved unseen"] = max(abs(float(lights.capture_position(item, scene.fit_flare.root, depsgraph)[0])
+                                - float(place[lights.light_name(item)][0])) for item in lights.scene_lights(scene))
 
 # ---- another flare is saved into the library while one is chosen ----------------------------------------
 library, look = part("flare_addon.library"), part("core.look").read(flare)

@@ -49,8 +49,8 @@ first, state.run = state.root, str(run)
 first.fit_flare.is_root = False  # as the version before left it
 state.footage = "removed"
 ops.import_capture(directory=str(capture))
-facts["imported again"] = [state.run == str(run), state.footage, len(lights.of_scene(scene)),
-                           lights.write(scene, capture)]
+facts["imported again"] = [state.run == str(run), state.footage, len(lights.scene_lights(scene)),
+                           lights.write_to_capture(scene, capture)]
 shutil.rmtree(second / "removed", ignore_errors=True)
 (second / "removed").mkdir()
 for path in (second / "images").iterdir():
@@ -61,13 +61,13 @@ facts["shown of clean frames"] = {Path(bpy.path.abspath(back.image.filepath)).su
                                   for item in state.root.children if item.type == "CAMERA"
                                   for back in item.data.background_images} == {".TIFF"}
 state.footage = "images"
-facts["another imported"] = [state.run, fits.state_of(scene), len(lights.of_scene(scene))]
+facts["another imported"] = [state.run, fits.fit_state(scene), len(lights.scene_lights(scene))]
 state.run = str(run)
-facts["another cleaned"] = "--run" in fits.cleaning(scene, fits.capture_of(scene))
+facts["another cleaned"] = "--run" in fits.cleaning_args(scene, fits.capture_folder(scene))
 state.root = first
-facts["the first's lights"] = len(lights.of_scene(scene))
+facts["the first's lights"] = len(lights.scene_lights(scene))
 ops.capture_from_camera(directory=str(out / "exported"))
-facts["exported"] = [state.run, len(lights.of_scene(scene))]
+facts["exported"] = [state.run, len(lights.scene_lights(scene))]
 
 def refused(*_words: object) -> None:
     """A file system without links."""
@@ -77,7 +77,7 @@ def refused(*_words: object) -> None:
 # ---- a newer plate, from where pictures are linked and from where they have to be copied ------------
 facts["newer plates"] = []
 plate = sorted((second / "images").iterdir())[0]
-frame_of = part("flare_addon.capture.exporter").entry_of
+frame_of = part("flare_addon.capture.exporter").write_frame
 for name in ("linked", "copied"):
     if name == "copied":
         os.link = refused

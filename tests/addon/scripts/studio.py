@@ -22,6 +22,6 @@ facts["import"] = [list(ops.import_capture(directory=capture)), scene.view_setti
 ops.open_flare(filepath=flare)
 scene.fit_flare.layers, scene.fit_flare.over = layers, "scene"
 ops.set_up_baked()
-facts["misread"] = compositor.misread(scene)
+facts["misread"] = compositor.colour_space_warning(scene)
 rendering.render_frames(scene, [1], lambda _number, suffix: Path(out) / f"shown{suffix}")
 leave(facts)

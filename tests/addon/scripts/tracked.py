@@ -155,7 +155,7 @@ for frame, filming in ((1, camera), (4, second)):
     scene.timeline_markers.new(f"F{frame}", frame=frame).camera = filming
 whole, part_of_it = (blend_shot.shot_of(scene, out / "lamp.flare", [], frames) for frames in ([1, 4], [4]))
 facts["cut"] = [list(whole.folders.values()), list(part_of_it.folders.values()),
-                whole.frames[1].described() == part_of_it.frames[0].described()]
+                whole.frames[1].cache_key() == part_of_it.frames[0].cache_key()]
 scene.timeline_markers.clear()
 nowhere = []
 lamp = bpy.data.objects.new("Nowhere", bpy.data.lights.new("Nowhere", "POINT"))

@@ -152,7 +152,7 @@ scene = shot()
 scene.fit_flare.layers = layers
 ops.set_up_baked()
 scene.fit_flare.lights[0].intensity, scene.fit_flare.master.tint = 3.0, (1, 0.5, 0.25)
-facts["complete"] = [part("flare_addon.compositor.drivers").complete(scene)]
+facts["complete"] = [part("flare_addon.compositor.drivers").is_complete(scene)]
 node = flare_node.find_node(scene)
 node.inputs["Tint"].driver_remove("default_value", 0)  # an artist's own in its place
 own = node.inputs["Tint"].driver_add("default_value", 0).driver
@@ -160,9 +160,9 @@ own.type = "SUM"
 moved = own.variables.new()
 moved.type, moved.targets[0].id, moved.targets[0].transform_type = "TRANSFORMS", scene.camera, "SCALE_X"
 bpy.ops.wm.save_as_mainfile(filepath=str(Path(out) / "worker.blend"))
-facts["complete"].append(part("flare_addon.compositor.drivers").complete(scene))
+facts["complete"].append(part("flare_addon.compositor.drivers").is_complete(scene))
 scene.fit_flare.lights.clear()
-facts["complete"].append(part("flare_addon.compositor.drivers").complete(scene))
+facts["complete"].append(part("flare_addon.compositor.drivers").is_complete(scene))
 bpy.ops.preferences.addon_disable(module=NAME)
 bpy.ops.wm.open_mainfile(filepath=str(Path(out) / "worker.blend"))
 scene = bpy.context.scene

@@ -51,7 +51,7 @@ for kind, up, scale in (("animated", "Z", 1.0), ("each", "-Y", 2.5)):
     to_world = np.array(root.matrix_world)
     cloud = original.points.xyz.astype(np.float64)
     worst = 0.0
-    frames = part("core.conventions.frame_numbers").numbered(view.name for view in original.views)
+    frames = part("core.conventions.frame_numbers").number_views(view.name for view in original.views)
     for frame in frames:
         view = original.view(frame.view)
         scene.frame_set(frame.number)
@@ -61,7 +61,7 @@ for kind, up, scale in (("animated", "Z", 1.0), ("each", "-Y", 2.5)):
         worst = max(worst, float(np.abs(expected - found)[depth > 0.3].max()))
     facts[f"pixels off, {kind}"] = worst
     fitted = part("flare_addon.capture.importer")
-    fitted.expose(root, {view.name: 0.5 + number for number, view in enumerate(original.views)})
+    fitted.set_exposures(root, {view.name: 0.5 + number for number, view in enumerate(original.views)})
     found = []
     for frame in frames:
         scene.frame_set(frame.number)
@@ -75,12 +75,12 @@ for kind, up, scale in (("animated", "Z", 1.0), ("each", "-Y", 2.5)):
     (earlier / "exposures.json").write_text('{"0001.png": 4.0}')
     for name, of in (("own", capture), ("other", out)):
         (earlier / "capture.txt").write_text(f"{of}\n")
-        fitted.expose(root, {})
+        fitted.set_exposures(root, {})
         fits.expose_cameras(scene, earlier)
         scene.frame_set(frames[1].number)
         camera = scene.camera if kind == "animated" else scene.objects["0001"]
         facts[f"{name} run, {kind}"] = camera.fit_flare.exposure
-    fitted.expose(root, {})
+    fitted.set_exposures(root, {})
     scene.frame_set(frames[2].number)
     facts[f"as usual, {kind}"] = [camera.fit_flare.exposure, scene.camera.fit_flare.exposure]
     facts[f"objects, {kind}"] = sorted(item.name for item in scene.objects)
@@ -98,25 +98,25 @@ for kind, up, scale in (("animated", "Z", 1.0), ("each", "-Y", 2.5)):
 
 # ---- clean frames -----------------------------------------------------------------------------------
 fits = part("flare_addon.fits")
-facts["cleaned by the network"] = [str(word) for word in fits.cleaning(scene, Path("capture"))]
+facts["cleaned by the network"] = [str(word) for word in fits.cleaning_args(scene, Path("capture"))]
 scene.fit_flare.matte = str(Path(out) / "roto")
-facts["cleaned by a matte"] = [str(word) for word in fits.cleaning(scene, Path("capture"))]
+facts["cleaned by a matte"] = [str(word) for word in fits.cleaning_args(scene, Path("capture"))]
 scene.fit_flare.keep_glow = True
-facts["cleaned, glow kept"] = [str(word) for word in fits.cleaning(scene, Path("capture"))]
-given, again = [str(word) for word in fits.cleaning(scene, fits.capture_of(scene))], []
+facts["cleaned, glow kept"] = [str(word) for word in fits.cleaning_args(scene, Path("capture"))]
+given, again = [str(word) for word in fits.cleaning_args(scene, fits.capture_folder(scene))], []
 find, start = fits.jobs.find, fits.engine.run
 fits.engine.run = lambda _kind, _folder, words: again.append(words[-1] == "--overwrite")
 for state, words in (("none", None), ("done", given), ("stopped", given), ("stopped", given[:-1])):
     made = None if words is None else SimpleNamespace(state=state, words=words)
     fits.jobs.find = lambda _, made=made: made
-    fits.clean(scene)
+    fits.clean_frames(scene)
 fits.jobs.find, fits.engine.run = find, start
 facts["cleaned again"] = again
 run = Path(out) / "a run"
 run.mkdir()
 (run / fits.FLARE).write_bytes(b"")
 scene.fit_flare.run = str(run)
-facts["cleaned by the fit"] = [str(word) for word in fits.cleaning(scene, Path("capture"))]
+facts["cleaned by the fit"] = [str(word) for word in fits.cleaning_args(scene, Path("capture"))]
 
 # ---- a project that was moved, its capture with it --------------------------------------------------
 moved, words = Path(out) / "moved" / "capture", []
@@ -126,7 +126,7 @@ scene.fit_flare.capture, chosen = str(moved), scene.fit_flare.capture
 fits.engine.run = lambda _kind, _folder, these: words.append(list(map(str, these)))
 (run / "capture.txt").write_text(f"{Path(out) / 'gone' / 'capture'}\n")
 fits.resume(scene)
-facts["moved"] = [words[-1][1], list(map(str, fits.cleaning(scene, moved))), str(moved)]
+facts["moved"] = [words[-1][1], list(map(str, fits.cleaning_args(scene, moved))), str(moved)]
 (run / "capture.txt").write_text(f"{Path(out) / 'gone' / 'another'}\n")
 try:
     fits.resume(scene)
@@ -144,7 +144,7 @@ shown = bpy.data.images.load(seen.filepath_raw)
 facts["clean frames"] = [shown.pixels[0]]
 seen.pixels.foreach_set(np.ones(64, np.float32))
 seen.save()
-fits.cleaned(SimpleNamespace(folder=moved / "removal", state="done"))
+fits.on_cleaning_finished(SimpleNamespace(folder=moved / "removal", state="done"))
 facts["clean frames"].append(shown.pixels[0])
 
 # ---- what a fit goes by -----------------------------------------------------------------------------
@@ -159,13 +159,13 @@ for which in ("own", "made", "none"):
         shutil.rmtree(goes / "removed")
     ops.import_capture(directory=str(goes))
     facts["goes by"].append(scene.fit_flare.mode)
-part("flare_addon.panels")._cleaning(drawn := MagicMock(), scene.fit_flare, goes, "none")
+part("flare_addon.panels")._draw_clean_frames(drawn := MagicMock(), scene.fit_flare, goes, "none")
 scene.fit_flare.keep_glow = True
-part("flare_addon.panels")._cleaning(glow := MagicMock(), scene.fit_flare, goes, "none")
+part("flare_addon.panels")._draw_clean_frames(glow := MagicMock(), scene.fit_flare, goes, "none")
 scene.fit_flare.keep_glow = False
 facts["says that a fit knows no matte"] = ["Press Make Clean" in str(one.mock_calls) for one in (drawn, glow)]
 scene.fit_flare.mode = "default"
-fits.cleaned(SimpleNamespace(folder=goes / "removal", state="done"))
+fits.on_cleaning_finished(SimpleNamespace(folder=goes / "removal", state="done"))
 facts["goes by"].append(scene.fit_flare.mode)
 
 # ---- one undo step ----------------------------------------------------------------------------------
@@ -188,28 +188,28 @@ scene.collection.objects.link(cube)
 for item in scene.objects:
     item.select_set(item == cube)
 ops.lights_from_selected()
-facts["lights now"] = [lights.name_of(item) for item in lights.of_scene(scene)]
+facts["lights now"] = [lights.light_name(item) for item in lights.scene_lights(scene)]
 ops.remove_light(object="Bulb")
 facts["bulb stays"] = "Bulb" in scene.objects
-lights.write(scene, Path(capture))
+lights.write_to_capture(scene, Path(capture))
 written = core_capture.read_lights(Path(capture) / "lights.json")
 facts["lights.json"] = {light.name: light.xyz.tolist() for light in written}
 key, places = scene.objects["key"], {light.name: light.xyz + 1 for light in written}
 key.location.x += 0.5
 bpy.context.view_layer.update()
-lights.follow(scene, places, Path(capture))
+lights.move_to_fit(scene, places, Path(capture))
 bpy.context.view_layer.update()
 depsgraph = part("flare_addon.objects").depsgraph_of(scene)
-facts["followed"] = {name: bool(np.allclose(lights.place_of(item, scene.fit_flare.root, depsgraph), places[name],
+facts["followed"] = {name: bool(np.allclose(lights.capture_position(item, scene.fit_flare.root, depsgraph), places[name],
                                             atol=1e-4))
-                     for name in places for item in lights.of_scene(scene) if lights.name_of(item) == name}
-lights.follow(scene, {light.name: light.xyz for light in written}, Path(capture))
+                     for name in places for item in lights.scene_lights(scene) if lights.light_name(item) == name}
+lights.move_to_fit(scene, {light.name: light.xyz for light in written}, Path(capture))
 bpy.context.view_layer.update()
-facts["followed back"] = lights.place_of(scene.objects["lamp"], scene.fit_flare.root, depsgraph).tolist()
+facts["followed back"] = lights.capture_position(scene.objects["lamp"], scene.fit_flare.root, depsgraph).tolist()
 scene.objects["lamp"].location = next(light.xyz for light in written if light.name == "lamp").tolist()
 bpy.context.view_layer.update()
 ops.remove_light(object="key")
-lights.write(scene, Path(capture))
+lights.write_to_capture(scene, Path(capture))
 
 # ---- look -------------------------------------------------------------------------------------------
 facts["open"] = list(ops.open_flare(filepath=flare))
@@ -239,16 +239,16 @@ state.master.driver_remove("scale")
 state.master.scale = 1.0
 element = item.elements[0]
 element.rotation, element.tint = math.radians(30), (1.0, 0.5, 0.25)
-words = looks.edits_of(state).words()
+words = looks.edits_of(state).texts()
 facts["words"] = words
 ops.reset_look()
-facts["reset"] = looks.edits_of(state).neutral or looks.edits_of(state).words()
+facts["reset"] = looks.edits_of(state).is_neutral or looks.edits_of(state).texts()
 
 # The overlay's quads, drawn by numpy as the GPU draws them, against the definition.
 look = looks.look_of(scene)
 scene.frame_set(2)
 state.occlusion = False
-gaussians = overlay.joined(list(looks.seen(scene, bpy.context.evaluated_depsgraph_get(), scene.camera).values()))
+gaussians = overlay.concatenate(list(looks.seen(scene, bpy.context.evaluated_depsgraph_get(), scene.camera).values()))
 evaluated = scene.camera.evaluated_get(bpy.context.evaluated_depsgraph_get())
 core = cameras.core_camera(evaluated.data, evaluated.matrix_world, scene.render)
 
@@ -297,7 +297,7 @@ def far_off(picture, expected):
 
 whole = overlay.window_of(overlay.Frame(0, 0, 3 * core.width, 3 * core.height), (3 * core.width, 3 * core.height), core)
 large = core.scaled(3 * core.width, 3 * core.height)
-expected = drawing.draw([gaussians], large.intrinsics, *large.size, look.blend, look.sampling)
+expected = drawing.draw([gaussians], large.intrinsics, *large.size, look.blend, look.pixel_grid)
 facts["overlay off"] = far_off(drawn(whole), expected)
 # Zoomed in, the frame larger than the region and beyond its edges.
 cropped = overlay.window_of(overlay.Frame(-40, -30, 3 * core.width, 3 * core.height), (100, 80), core)
@@ -307,7 +307,7 @@ facts["outside"] = overlay.window_of(overlay.Frame(500, 0, 64, 40), (100, 80), c
 
 # What is shown and what is baked are as bright as the frame was exposed.
 scene.camera.fit_flare.exposure = 2.0
-brighter = overlay.joined(list(looks.seen(scene, bpy.context.evaluated_depsgraph_get(), scene.camera).values()))
+brighter = overlay.concatenate(list(looks.seen(scene, bpy.context.evaluated_depsgraph_get(), scene.camera).values()))
 facts["brighter"] = [far_off(brighter.colours, 2 * gaussians.colours), float(np.abs(gaussians.colours).max())]
 exposed_shot = shots.of_scene(scene, [scene.camera], [2], Path(flare), None)
 exposed_shot.write(Path(out) / "exposed.json")
@@ -319,7 +319,7 @@ shot = shots.of_scene(scene, [scene.camera], [1, 3], Path(flare), None)
 pose = original.views[1].camera.world_to_camera
 facts["pose off"] = float(np.abs(shot.frames[0].camera.world_to_camera - pose).max())
 facts["place off"] = float(np.abs(shot.frames[0].lights[0].xyz - original.lights[0].xyz).max())
-facts["shares"] = [light.share for light in shot.frames[0].lights]
+facts["shares"] = [light.visibility for light in shot.frames[0].lights]
 root = state.root
 root.rotation_euler, root.scale, root.location = (0.3, 0.2, 0.1), (2, 2, 2), (1, 2, 3)
 moved = shots.of_scene(scene, [scene.camera], [1, 3], Path(flare), None)
@@ -388,7 +388,7 @@ facts["enabled again"] = [round(value, 3) for value in bpy.context.scene.fit_fla
 extensions = Path(bpy.utils.user_resource("EXTENSIONS"))
 facts["library's place"] = [part("flare_addon.library").folder().is_absolute(),
                             part("flare_addon.library").folder().is_relative_to(extensions)]
-part("flare_addon.preferences").own().library = str(Path(out) / "library")
+part("flare_addon.user_settings").addon_preferences().library = str(Path(out) / "library")
 facts["saved"] = [list(ops.save_flare(name="Desk: lamp", notes="35 mm")),
                   refusal(lambda: ops.save_flare(name="Desk: lamp"))]
 library = part("flare_addon.library")
@@ -408,7 +408,7 @@ lamp.select_set(True)
 facts["applied"] = list(ops.apply_flare(filepath=str(library.files()[0])))
 state = other.fit_flare
 try:
-    shots.layers_folder(other, create=True)  # the .blend is not saved, so they would go beside the flare
+    shots.choose_layers_folder(other)  # the .blend is not saved, so they would go beside the flare
 except part("core.errors").RunError as problem:
     facts["layers beside a flare of the library"] = [str(problem), other.fit_flare.layers]
 facts["applied to"] = [item.target.name if item.target else "" for item in state.lights]
@@ -482,9 +482,9 @@ beside.mkdir()
 link.symlink_to(real, target_is_directory=True)
 bpy.ops.wm.save_as_mainfile(filepath=str(link / "a.blend"))
 paths = part("flare_addon.paths")
-facts["through a link"] = [paths.stored(beside)[:2], paths.absolute(paths.stored(beside)).is_dir()]
+facts["through a link"] = [paths.blend_relative(beside)[:2], paths.absolute(paths.blend_relative(beside)).is_dir()]
 state = bpy.context.scene.fit_flare
-state.capture, state.flare = paths.stored(beside), str(beside / "a.flare")
+state.capture, state.flare = paths.blend_relative(beside), str(beside / "a.flare")
 (beside / "versions").mkdir()
 bpy.ops.wm.save_as_mainfile(filepath=str(beside / "copy.blend"), copy=True)
 facts["after a copy"] = paths.absolute(state.capture) == beside.resolve()

@@ -25,7 +25,7 @@ ROOT = Path(__file__).resolve().parents[1]
 CAMERAS, POINTS, GAUSSIANS, LEVELS = 400, 100_000, 2_000, 16
 
 
-def load(name: str) -> Any:
+def load_module(name: str) -> Any:
     """A module of the tree, as the package fit_flare."""
     spec = importlib.util.spec_from_file_location("run", ROOT / "headless" / "run.py")
     assert spec is not None
@@ -106,34 +106,34 @@ def make_flare(path: Path) -> Path:
     return path
 
 
-def best(call: Any, times: int = 10) -> tuple[float, float]:
+def time_range(call: Any, times: int = 10) -> tuple[float, float]:
     """(fastest, slowest) of some calls, in milliseconds."""
-    taken = []
+    times_ms = []
     for _ in range(times):
-        began = time.perf_counter()
+        start = time.perf_counter()
         call()
-        taken.append(1e3 * (time.perf_counter() - began))
-    return min(taken), max(taken)
+        times_ms.append(1e3 * (time.perf_counter() - start))
+    return min(times_ms), max(times_ms)
 
 
 def main() -> None:
     import bpy
 
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
-    load("flare_addon").register()
-    importing, looks, overlay, cameras, jobs = (load(f"flare_addon.{name}") for name in (
+    load_module("flare_addon").register()
+    importing, looks, overlay, cameras, jobs = (load_module(f"flare_addon.{name}") for name in (
         "capture.importer", "looks", "overlay", "cameras", "jobs"))
-    rows = [f"Blender {bpy.app.version_string}, {os.cpu_count()} cores"]
+    lines = [f"Blender {bpy.app.version_string}, {os.cpu_count()} cores"]
     with tempfile.TemporaryDirectory() as base:
         folder = Path(base)
         capture, flare = make_capture(folder / "capture"), make_flare(folder / "lamp.flare")
         for kind in ("each", "animated"):
             bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
             scene = bpy.context.scene
-            began = time.perf_counter()
+            start = time.perf_counter()
             importing.import_capture(scene, capture, importing.ImportSettings(cameras=kind))
-            rows.append(f"import of {CAMERAS} cameras ({kind}), {POINTS} points: {time.perf_counter() - began:.2f} s")
-        looks.use(scene, flare)
+            lines.append(f"import of {CAMERAS} cameras ({kind}), {POINTS} points: {time.perf_counter() - start:.2f} s")
+        looks.show_look(scene, flare)
         bpy.context.view_layer.update()
 
         run = folder / "run"
@@ -142,24 +142,24 @@ def main() -> None:
         (run / jobs.EVENTS).write_text("".join(json.dumps({**event, "done": number}) + "\n" for number in range(3000)))
         job = jobs.Job("fit", run, os.getpid(), None)
         job._alive = lambda: True  # the process that is watched is this one
-        fast, slow = best(job.poll, 20)
-        rows.append(f"reading a fit's events, at most {jobs.AT_ONCE >> 10} kB a time: {fast:.2f} to {slow:.2f} ms")
+        fast, slow = time_range(job.poll, 20)
+        lines.append(f"reading a fit's events, at most {jobs.READ_CHUNK >> 10} kB a time: {fast:.2f} to {slow:.2f} ms")
 
         depsgraph = bpy.context.evaluated_depsgraph_get()
         core = cameras.core_camera(scene.camera.data, scene.camera.matrix_world, scene.render)
-        window = overlay.window_of(overlay.Frame(0, 0, 1920, 1080), (1920, 1080), core)
+        window = overlay.drawn_region(overlay.CameraFrame(0, 0, 1920, 1080), (1920, 1080), core)
 
         look = looks.look_of(scene)
 
         def frame() -> None:
-            found = overlay.concatenate(list(looks.seen(scene, depsgraph, scene.camera).values()))
-            overlay.levels(found, window, look)
+            gaussians = overlay.concatenate(list(looks.evaluate_flares(scene, depsgraph, scene.camera).values()))
+            overlay.quads_by_level(gaussians, window, look)
 
         frame()
-        fast, slow = best(frame, 20)
-        count = sum(len(one) for one in looks.seen(scene, depsgraph, scene.camera).values())
-        rows.append(f"overlay of {count} Gaussians, all but the GPU: {fast:.1f} to {slow:.1f} ms")
-    print("\n".join(rows))
+        fast, slow = time_range(frame, 20)
+        count = sum(len(one) for one in looks.evaluate_flares(scene, depsgraph, scene.camera).values())
+        lines.append(f"overlay of {count} Gaussians, all but the GPU: {fast:.1f} to {slow:.1f} ms")
+    print("\n".join(lines))
     sys.stdout.flush()
     os._exit(0)
 

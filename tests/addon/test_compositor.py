@@ -181,5 +181,5 @@ def test_the_saved_file_shows_the_same_elsewhere_and_without_us(made: Made, blen
 @pytest.mark.skipif(sys.platform != "linux", reason="files are kept from growing in another way elsewhere")
 def test_a_file_that_does_not_fit_the_disk_is_told_and_not_left(made: Made) -> None:
     refused, left = made.facts["full"]
-    assert [sentence.startswith("Blender could not write a whole file to ") for sentence in refused] == [True, True]
+    assert [sentence.startswith("Blender could not write a complete file to ") for sentence in refused] == [True, True]
     assert left == []

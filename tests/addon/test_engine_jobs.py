@@ -27,8 +27,8 @@ def test_work_of_another_machine_goes_by_what_it_tells(facts: Any) -> None:
     assert facts["stopped elsewhere"] == [False, "stopped", ["goes on elsewhere"]]
     state, error = facts["silent elsewhere"]
     assert state == "failed"
-    assert error.startswith("The engine on another has told nothing for an hour")
-    assert facts["silent on a Mac"].startswith("The engine on studio-mac has told nothing")
+    assert error.startswith("The engine on another has reported nothing for an hour")
+    assert facts["silent on a Mac"].startswith("The engine on studio-mac has reported nothing")
 
 
 def test_what_goes_wrong_with_one_ends_the_watching_of_no_other(facts: Any) -> None:

@@ -81,7 +81,7 @@ def test_frames_without_layers_are_told_and_without_flare(facts: Any) -> None:
     last, *after = facts["after the last"]
     assert last == PLATE + LAMP + KEY
     if facts["missing is magenta"]:
-        assert "which Blender shows in magenta" in told
+        assert "which this version of Blender shows in magenta" in told
     else:
         assert "which are without flare" in told
         assert after == [PLATE, PLATE]
@@ -90,8 +90,8 @@ def test_frames_without_layers_are_told_and_without_flare(facts: Any) -> None:
 @pytest.mark.parametrize(("case", "sentence"), [
     ("switched off", "Compositing is switched off for this scene"),
     ("sequenced", "the video sequencer, which has 'title', in place of the compositor"),
-    ("square", "The layers have 16 x 8 pixels and the scene renders 8 x 8, another shape"),
-    ("transparent", "The film is transparent, and PNG files have no light"),
+    ("square", "The layers have 16 x 8 pixels and the scene renders 8 x 8, another aspect ratio"),
+    ("transparent", "The film is transparent, and PNG files lose the flare"),
 ])
 def test_renders_that_would_not_show_the_composite_are_told(facts: Any, case: str, sentence: str) -> None:
     (told,) = facts[case]
@@ -106,4 +106,4 @@ def test_of_renders_that_show_it_nothing_is_told(facts: Any, case: str) -> None:
 def test_animated_sliders_that_a_farm_would_not_have_are_told(facts: Any) -> None:
     assert facts["scale keyed"] == []
     (told,) = facts["intensity keyed"]
-    assert "they stand still where this extension is not" in told
+    assert "without this extension, as on a farm, they do not move" in told

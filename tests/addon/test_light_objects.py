@@ -24,7 +24,7 @@ def test_one_that_is_animated_and_stands_still_is_not_refused(facts: Any) -> Non
 
 
 def test_one_that_is_moved_by_itself_is_refused(facts: Any) -> None:
-    assert facts["moved by itself"].startswith("'Headlamp' is switched off in the viewport")
+    assert facts["moved by itself"].startswith("'Headlamp' is disabled in the viewport")
 
 
 @pytest.mark.parametrize("how", ["excluded", "disabled"])
@@ -83,7 +83,7 @@ def test_lamps_that_are_not_rendered_do_not_flare(facts: Any) -> None:
 
 def test_an_empty_is_no_camera(facts: Any) -> None:
     assert not facts["no camera"]
-    assert facts["an empty"].startswith("The scene's active camera is an object of another kind")
+    assert facts["an empty"].startswith("The scene's active camera is not a camera object")
 
 
 def test_another_file_begins_anew(facts: Any) -> None:

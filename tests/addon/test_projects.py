@@ -16,7 +16,7 @@ def facts(told_by: Callable[[str, int], Any]) -> Any:
 @pytest.mark.parametrize("how", ["under other numbers", "over others"])
 def test_plates_are_not_replaced_by_those_of_a_capture(facts: Any, how: str) -> None:
     said, whole = facts[how]
-    assert "is there already and would be replaced by" in said and "choose another folder" in said
+    assert "exists already and would be replaced by" in said and "choose another folder" in said
     assert whole
 
 
@@ -35,7 +35,7 @@ def test_a_capture_that_was_begun_is_finished(facts: Any) -> None:
 
 def test_pictures_of_another_shape_are_told_at_once(facts: Any) -> None:
     assert facts["of another shape"].endswith("is 64 x 40 pixels and the scene renders 1920 x 40, which is another "
-                                              "shape; set the scene's resolution to that of the pictures.")
+                                              "aspect ratio; set the scene's resolution to that of the pictures.")
 
 
 def test_a_camera_that_is_mirrored_or_skewed_is_refused_before_anything_is_written(facts: Any) -> None:

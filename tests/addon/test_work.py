@@ -58,7 +58,7 @@ def facts(made: tuple[Any, Path]) -> Any:
 def test_frames_are_cleaned_by_the_network_or_by_a_finished_fit(made: tuple[Any, Path]) -> None:
     facts, base = made
     images, removed = str(Path("capture") / "images"), str(Path("capture") / "removed")
-    assert facts["cleaned by the network"] == ["remove", images, "--out", removed, "--all-glare"]
+    assert facts["cleaned by the network"] == ["remove", images, "--out", removed, "--all-glow"]
     assert facts["cleaned by the fit"] == ["remove", "--run", str(base / "a run"), "--out", removed]
 
 
@@ -66,8 +66,8 @@ def test_frames_are_cleaned_by_a_matte_and_otherwise_again(made: tuple[Any, Path
     facts, base = made
     images, removed = str(Path("capture") / "images"), str(Path("capture") / "removed")
     by_matte = ["remove", images, "--out", removed, "--matte", str(base / "roto")]
-    assert facts["cleaned by a matte"] == [*by_matte, "--all-glare"]
-    assert facts["cleaned, glow kept"] == [*by_matte, "--keep-glare"]
+    assert facts["cleaned by a matte"] == [*by_matte, "--all-glow"]
+    assert facts["cleaned, glow kept"] == [*by_matte, "--keep-glow"]
     first, made, stopped, stopped_otherwise = facts["cleaned again"]
     assert made and stopped_otherwise, "what the engine made is made again, and no two ways are mixed"
     assert not first and not stopped
@@ -161,7 +161,7 @@ def test_a_flare_finds_its_light(facts: Any) -> None:
 
 def test_a_flare_over_frames_that_have_their_own_is_told(facts: Any) -> None:
     as_filmed, without = facts["look says"]
-    assert "The frames behind the camera have their own flare" in as_filmed
+    assert "The frames behind the camera contain their own flare" in as_filmed
     assert "their own flare" not in without
 
 

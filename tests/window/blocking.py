@@ -54,7 +54,7 @@ def steps():
     scene.fit_flare.preset = "high"  # outlasts the watching
     with ui.override():
         assert bpy.ops.fit_flare.fit() == {"FINISHED"}
-    job = module("fits").job_of(scene)
+    job = module("fits").fit_job(scene)
     while job.running and job.done < 1:
         yield 0.5
     assert job.running, job.error
@@ -69,7 +69,7 @@ def steps():
     flare = made.make_flare(out / "made.flare")
     gaps = Gaps()
     yield 1
-    module("looks").use(scene, flare)  # what the end of a fit does
+    module("looks").show_look(scene, flare)  # what the end of a fit does
     yield 2
     figures["a flare taken in"] = gaps.stop()
     figures.update(ours.longest())

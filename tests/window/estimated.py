@@ -29,7 +29,7 @@ def steps():
     yield 0.5
     flow.shot("01_no_clean_frames")
     yield from ui.press_button("fit_flare.fit", flow.panel())
-    job = fits.job_of(scene)
+    job = fits.fit_job(scene)
     assert job is not None and job.running, f"the fit did not start: {fits.why_not(scene)}"
     yield from flow.wait(lambda: (job.stage == "remove" and job.done > 2) or not job.running, 300)
     flow.shot("02_cleaning")

@@ -109,8 +109,8 @@ def name_the_engine(area):
     assert bpy.context.preferences.addons[NAME].preferences.engine == ENGINE
     yield from ui.press_button("fit_flare.test_engine", place, across=0.15, below=y)
     engine = module("engine")
-    yield from wait(lambda: engine.tested() is not None and not engine.tested().running, 120)
-    test = engine.tested()
+    yield from wait(lambda: engine.last_test() is not None and not engine.last_test().running, 120)
+    test = engine.last_test()
     assert test.state == "done", test.error
     yield 0.5
     shot("01_preferences")
@@ -159,7 +159,7 @@ def fit():
     redraw_ms = milliseconds(time.perf_counter() - began)  # of Blender's whole window, before any fit
     ours = Ours()
     yield from ui.press_button("fit_flare.fit", panel(), below=y)
-    job = fits.job_of(scene)
+    job = fits.fit_job(scene)
     assert job is not None and job.running, f"the fit did not start: {fits.why_not(scene)}"
     gaps = Gaps()
     seen: set[int] = set()
@@ -200,14 +200,14 @@ def brighten():
     assert ui.area().spaces.active.region_3d.view_perspective == "CAMERA"
     shot("05_flare")
     overlay = module("overlay")
-    dim = overlay.picture(scene, bpy.context.evaluated_depsgraph_get(), scene.camera, 480, 270)
+    dim = overlay.render_picture(scene, bpy.context.evaluated_depsgraph_get(), scene.camera, 480, 270)
     np.save(out / "overlay.npy", dim)
     x, y = yield from ui.find("fit_flare.master.intensity", panel(), path=True, across=0.6)
     ui.drag(x, y, x + 50, y)
     yield 0.5
     assert state.master.intensity > 1.1, f"Intensity is {state.master.intensity}"
     shot("06_brighter")
-    bright = overlay.picture(scene, bpy.context.evaluated_depsgraph_get(), scene.camera, 480, 270)
+    bright = overlay.render_picture(scene, bpy.context.evaluated_depsgraph_get(), scene.camera, 480, 270)
     done("drag", intensity=round(state.master.intensity, 3), brightness=round(float(bright.sum() / dim.sum()), 3))
     np.testing.assert_allclose(bright.sum() / dim.sum(), state.master.intensity, rtol=0.01)
     yield from ui.fill(x, y, "1")
@@ -241,7 +241,7 @@ def compositor_and_render():
     x, y = yield from ui.find("fit_flare.over", panel(), path=True, across=0.65)
     yield from ui.choose_item(x, y, lambda: state.over == "plate")
     yield from ui.press_button("fit_flare.set_up_baked", panel(), below=y)
-    flare_node = module("flare_node")
+    flare_node = module("compositor.flare_node")
     assert flare_node.find_node(scene) is not None
     scene.render.engine = "BLENDER_WORKBENCH"  # the quickest; what it renders lies behind the plate
     figures = {}
@@ -317,13 +317,13 @@ def transfer():
     yield 1
     assert [item.target.name for item in other.fit_flare.lights if item.target] == ["Sun lamp"]
     shot("08_transferred")
-    free = overlay.picture(other, bpy.context.evaluated_depsgraph_get(), camera, 480, 270)
+    free = overlay.render_picture(other, bpy.context.evaluated_depsgraph_get(), camera, 480, 270)
     mesh = bpy.data.meshes.new("Wall")
     mesh.from_pydata([(-3, 3, -3), (0, 3, -3), (0, 3, 3), (-3, 3, 3)], [], [(0, 1, 2, 3)])
     wall = bpy.data.objects.new("Wall", mesh)
     other.collection.objects.link(wall)
     bpy.context.view_layer.update()
-    hidden = overlay.picture(other, bpy.context.evaluated_depsgraph_get(), camera, 480, 270)
+    hidden = overlay.render_picture(other, bpy.context.evaluated_depsgraph_get(), camera, 480, 270)
     done("transfer", transferred=float(free.sum()), behind_a_wall=float(hidden.sum()))
     assert free.sum() > 1
     assert hidden.sum() < 0.01 * free.sum()
@@ -353,13 +353,13 @@ def speed_of(overlay, scene) -> dict[str, float]:
     depsgraph = bpy.context.evaluated_depsgraph_get()
     camera = scene.camera.evaluated_get(depsgraph)
     core = cameras.core_camera(camera.data, camera.matrix_world, scene.render)
-    window = overlay.window_of(overlay.Frame(0, 0, 1920, 1080), (1920, 1080), core)
+    window = overlay.drawn_region(overlay.CameraFrame(0, 0, 1920, 1080), (1920, 1080), core)
     look = looks.look_of(scene)
     numpy_ms, gpu_ms = [], []
     for _ in range(8):
         began = time.perf_counter()
-        gaussians = overlay.concatenate(list(looks.seen(scene, depsgraph, scene.camera).values()))
-        overlay.levels(gaussians, window, look)
+        gaussians = overlay.concatenate(list(looks.evaluate_flares(scene, depsgraph, scene.camera).values()))
+        overlay.quads_by_level(gaussians, window, look)
         middle = time.perf_counter()
         drawn = overlay.render(gaussians, window, look)
         with drawn[-1].bind():  # reading back waits for the drawing

@@ -96,7 +96,7 @@ class Ours:
         timed(module("jobs"), "_tick", self._of("look at the engine"))
         for panel in module("panels")._CLASSES:
             timed_draw(panel, self._of(f"panel {panel.bl_label}"))
-        timed(module("looks"), "use", self._of("take the flare in"))
+        timed(module("looks"), "show_look", self._of("take the flare in"))
         timed(module("looks"), "read", self._of("read a .flare"))
         for name in ("overlay", "points"):
             drawn = module(name)

@@ -48,7 +48,7 @@ def steps():
     began = time.perf_counter()
     yield from ui.press_button("fit_flare.set_up_engine", place, across=0.5)
     engine = module("engine")
-    making = engine.setting_up()
+    making = engine.set_up_job()
     assert making is not None, "the set-up did not start"
     gaps, seen, shown = Gaps(), set(), False
     while making.running and time.perf_counter() - began < 1200:
@@ -62,13 +62,13 @@ def steps():
     facts: dict[str, object] = {"blender": bpy.app.version_string, "set_up_s": round(time.perf_counter() - began, 1),
                                 "bar_positions": len(seen), **gaps.stop()}
     yield from ui.press_button("fit_flare.test_engine", place, across=0.15)
-    while engine.tested() is None or engine.tested().running:
+    while engine.last_test() is None or engine.last_test().running:
         yield 0.5
-    assert engine.tested().state == "done", engine.tested().error
-    facts["engine"] = engine.tested().result
+    assert engine.last_test().state == "done", engine.last_test().error
+    facts["engine"] = engine.last_test().result
     yield 0.5
     shot("12_set_up")
-    folder = engine.user_folder(engine.FOLDER)
+    folder = engine.user_folder(engine.ENGINE_FOLDER)
     facts["megabytes"] = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()) >> 20
     yield from ui.press_button("fit_flare.remove_engine", place, across=0.85)
     yield 0.5

@@ -99,9 +99,9 @@ said["engine named, not there"] = [polls("fit"), polls("test_engine")]
 said["panel without an engine"] = shown("fit")
 preferences.engine = sham
 os.environ["FIT_FLARE_ENGINE"] = "gone"
-said["engine of the variable, not there"] = [polls("fit"), engine.missing().split(" Name")[0]]
+said["engine of the variable, not there"] = [polls("fit"), engine.missing_reason().split(" Name")[0]]
 preferences.engine, os.environ["FIT_FLARE_ENGINE"] = str(folder / "nowhere"), sham
-said["engine of the variable"] = str(engine.find()) == sham
+said["engine of the variable"] = str(engine.find_engine()) == sham
 preferences.engine = sham
 del os.environ["FIT_FLARE_ENGINE"]
 
@@ -115,7 +115,7 @@ fit_words: dict[str, str] = {}
 for how in ("dies", "refuses", "chatters", "ends"):
     behave(how)
     fit_words[how] = refusal(lambda: ops.fit())
-    fit_words[f"{how}, state"] = fits.state_of(scene)
+    fit_words[f"{how}, state"] = fits.fit_state(scene)
 said["fits"] = fit_words
 behave("vanishes")
 long_ago = folder / "long ago"
@@ -124,12 +124,12 @@ long_ago.mkdir()
 with contextlib.suppress(part("core.errors").FitFlareError):
     jobs.start("fit", long_ago, [sham])
 said["dies without a word"] = jobs.find(long_ago).error
-jobs.forget(long_ago)
+jobs.stop_watching(long_ago)
 said["dies without a word, found again"] = jobs.find(long_ago).error
 
 # As one that is stopped while it loads its modules: with a status, and without a word to us.
 (long_ago / jobs.STOP).touch()
-jobs.forget(long_ago)
+jobs.stop_watching(long_ago)
 found = jobs.find(long_ago)
 said["stopped before it listened"] = [found.state, found.error]
 (long_ago / jobs.STOP).unlink()
@@ -140,19 +140,19 @@ try:
 except part("core.errors").EngineError as problem:
     said["cannot be executed"] = str(problem)
 behave("finishes")
-said["a fit that ends well"] = [refusal(lambda: ops.fit()), fits.state_of(scene), scene.fit_flare.flare != ""]
+said["a fit that ends well"] = [refusal(lambda: ops.fit()), fits.fit_state(scene), scene.fit_flare.flare != ""]
 behave("answers")
-said["test"] = [refusal(lambda: ops.test_engine()), engine.tested().result]
+said["test"] = [refusal(lambda: ops.test_engine()), engine.last_test().result]
 
 preferences.engine = str(folder / "nowhere")
-said["test of another engine"] = engine.tested() is None
+said["test of another engine"] = engine.last_test() is None
 preferences.engine = sham
 
 # ---- work that goes on while Blender is closed, found again and cancelled ---------------------------
 behave("sleeps")
 run = folder / "long"
 with open(folder / "events", "wb") as events:
-    process = subprocess.Popen([sham, str(engine.RUN), "fit"], stdout=events, start_new_session=True)
+    process = subprocess.Popen([sham, str(engine.RUN_SCRIPT), "fit"], stdout=events, start_new_session=True)
 run.mkdir()
 shutil.copy(folder / "events", run / jobs.EVENTS)
 (run / jobs.RECORD).write_text(f'{{"kind": "fit", "pid": {process.pid}, "started": {time.time()}}}')
@@ -162,7 +162,7 @@ found = jobs.find(run)
 found.poll()
 said["found again"] = [found.state, found.stage, found.done, found.total]
 scene.fit_flare.run = str(run)
-said["state of the found"] = fits.state_of(scene)
+said["state of the found"] = fits.fit_state(scene)
 found.stop()
 said["asked by a file too"] = (run / jobs.STOP).exists()
 process.wait(20)
@@ -170,14 +170,14 @@ shutil.copy(folder / "events", run / jobs.EVENTS)
 found.poll()
 said["cancelled"] = [found.state, found.error]
 (run / jobs.RECORD).write_text(f'{{"kind": "fit", "pid": {os.getpid()}, "started": {time.time() - 86400}}}')
-jobs.forget(run)
+jobs.stop_watching(run)
 again = jobs.find(run)
 again.poll()
 said["another program has the number"] = again.state
 shutil.rmtree(run)
-jobs.forget(run)
+jobs.stop_watching(run)
 said["panel of a lost run"] = shown("fit")
-said["run folder deleted"] = [fits.state_of(scene), jobs.find(run) is None, polls("resume")]
+said["run folder deleted"] = [fits.fit_state(scene), jobs.find(run) is None, polls("resume")]
 
 # ---- paths -------------------------------------------------------------------------------------------
 paths = part("flare_addon.paths")
@@ -189,7 +189,7 @@ said["a linked drive"] = paths.blend_relative(folder / "Z" / "x" / ".." / "run")
 # ---- a capture that moved ---------------------------------------------------------------------------
 scene.fit_flare.run = ""
 Path(capture).rename(Path(capture).with_name("away"))
-said["capture moved"] = [polls("fit"), fits.capture_of(scene).is_dir()]
+said["capture moved"] = [polls("fit"), fits.capture_folder(scene).is_dir()]
 said["panels of a moved capture"] = [shown("capture"), shown("fit")]
 said["operators of a moved capture"] = [refusal(ops.find_lights), refusal(ops.clean_frames), refusal(ops.fit)]
 Path(capture).with_name("away").rename(capture)
@@ -241,7 +241,7 @@ job = jobs._jobs[jobs._key(fits._cleaning_folder(Path(capture)))] = jobs.find(fo
 job.error = "It cannot be shown."
 said["done, and not shown"] = [job.state, shown("fit"), shown("bake")]
 job.error = ""
-jobs.forget(fits._cleaning_folder(Path(capture)))
+jobs.stop_watching(fits._cleaning_folder(Path(capture)))
 
 
 def full(*_words: object, **_named: object) -> None:
@@ -263,10 +263,10 @@ behave("sleeps")
 began = time.monotonic()
 said["fit on a full disk"] = refusal(lambda: ops.fit())
 said["its engine is not left alone"] = time.monotonic() - began < 5 and not jobs.running()
-jobs.write_json, jobs.FULL = write_json, 1 << 62  # every disk is full by that
+jobs.write_json, jobs.MIN_FREE_BYTES = write_json, 1 << 62  # every disk is full by that
 behave("ends")
 said["no room for the last words"] = refusal(lambda: ops.fit())
-jobs.FULL = 1 << 16
+jobs.MIN_FREE_BYTES = 1 << 16
 scene.fit_flare.run = ""
 
 # ---- cameras and scenes -----------------------------------------------------------------------------

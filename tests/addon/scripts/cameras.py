@@ -63,7 +63,7 @@ facts["up"] = {name: list(np.array(Euler(axes[name]).to_matrix()) @ up)
 
 # Frames: of a custom range, and which file of a sequence a frame of the scene shows.
 custom = SimpleNamespace(bake_range="custom", bake_first=3, bake_last=5)
-facts["custom"] = list(shots.frames_of(SimpleNamespace(fit_flare=custom)))
+facts["custom"] = list(shots.frames_to_bake(SimpleNamespace(fit_flare=custom)))
 sequence = SimpleNamespace(source="SEQUENCE", library=None, filepath="/s/plate.1001.exr")
 behind = SimpleNamespace(source="IMAGE", image=sequence,
                          image_user=SimpleNamespace(frame_start=1, frame_offset=1004))
@@ -73,7 +73,7 @@ facts["footage"] = filmed.path(3).name
 
 # What the compositor does live is not baked too.
 edits = part("core.look").LookEdits.parse(["*.mute=1", "lamp.solo=1", "key.mute=1", "lamp.scale=2"], ["lamp", "key"])
-facts["baked edits"] = list(shots.without_live(edits).texts())
+facts["baked edits"] = list(shots.without_live_edits(edits).texts())
 
 # A light that was moved from where it was learned shows its flare as the source does, not as its capture did.
 facts["query"] = [looks.query_of(SimpleNamespace(root=1, native=native)) for native in (True, False)]
@@ -86,7 +86,7 @@ facts["native"] = []
 for away in (0, 5):
     lamp.location = (away, 0, 0)
     depsgraph = part("flare_addon.objects").depsgraph_of(scene)
-    facts["native"].append([bool(looks._is_of(learned, SimpleNamespace(root=its, capture=capture), {"lamp": lamp},
+    facts["native"].append([bool(looks._was_learned_here(learned, SimpleNamespace(root=its, capture=capture), {"lamp": lamp},
                                               depsgraph))
                             for its, capture in ((root, "//capture"), (None, "//of this camera"), (None, ""))])
 leave(facts)

@@ -17,9 +17,10 @@ package, flare, layers, more, out = sys.argv[1:6]
 install(package)
 sys.path.remove(str(Path(__file__).parent))
 ops = bpy.ops.fit_flare
-compositor, flare_node, wires, rendering, looks, shots, bake, panels, curves = (
-    part(f"flare_addon.{name}") for name in ("compositor", "flare_node", "wires", "rendering", "looks", "shots",
-                                             "operators.bake", "panels", "curves"))
+setup, flare_node, drivers, render_settings, looks, shots, bake, panels, fcurves = (
+    part(f"flare_addon.{name}") for name in ("compositor.setup", "compositor.flare_node", "compositor.drivers",
+                                             "render_settings", "looks", "shots",
+                                             "operators.bake", "panels", "fcurves"))
 facts: dict[str, object] = {}
 
 
@@ -31,14 +32,14 @@ def shot(lamps, *, over="scene"):
     scene.render.resolution_x, scene.render.resolution_y = 16, 8
     if hasattr(scene.render, "compositor_device"):
         scene.render.compositor_device = "CPU"
-    rendering.plain_view(scene)
+    render_settings.set_plain_view(scene)
     for name in lamps:
         lamp = bpy.data.objects.new(name, None)
         scene.collection.objects.link(lamp)
         lamp.fit_flare.is_light, lamp.fit_flare.light = True, name
     ops.open_flare(filepath=flare)
     for name in lamps[1:]:
-        looks.add_instance(scene, scene.objects[name], "lamp")
+        looks.add_flare(scene, scene.objects[name], "lamp")
     scene.fit_flare.layers, scene.fit_flare.over = layers, over
     return scene
 
@@ -46,7 +47,7 @@ def shot(lamps, *, over="scene"):
 def shown(scene, frame=1):
     """The middle of the picture."""
     scene.frame_set(frame)
-    rendering.render_frames(scene, [frame], lambda _number, suffix: Path(out) / f"shown{suffix}")
+    render_settings.render_frames(scene, [frame], lambda _number, suffix: Path(out) / f"shown{suffix}")
     image = bpy.data.images.load(str(Path(out) / "shown.exr"))
     value = float(image.pixels[0])
     bpy.data.images.remove(image)
@@ -68,13 +69,13 @@ def told(scene):
 
 
 def work(scene):
-    return all(curve.driver.is_valid for curve in wires.drivers(scene))
+    return all(curve.driver.is_valid for curve in drivers.node_drivers(scene))
 
 
 # ---- renamed ----------------------------------------------------------------------------------------
 scene = shot(["lamp", "key"])
 state = scene.fit_flare
-live = Path(layers) / shots.LIVE
+live = Path(layers) / shots.LIVE_FILE
 old = live.read_text()
 ops.set_up_baked()
 facts["both"] = shown(scene)
@@ -82,7 +83,7 @@ state.lights[0].name = "sun"
 state.lights[0].intensity = 2
 facts["renamed"] = [shown(scene), work(scene)]
 state.lights[0].name = "lamp"
-shots.write_json(live, shots.live_of(state, ["lamp", "key"]))  # as a bake writes it
+shots.write_json(live, shots.live_record(state, ["lamp", "key"]))  # as a bake writes it
 state.lights[0].name = "sun"
 ops.set_up_baked()
 facts["renamed, set up again"] = [shown(scene), work(scene), "act on it." in said(scene)]
@@ -111,7 +112,7 @@ facts["removed"].append(shown(scene))
 scene = shot(["lamp", "key"])
 state = scene.fit_flare
 ops.set_up_baked()
-for curve in wires.drivers(scene):
+for curve in drivers.node_drivers(scene):
     for variable in curve.driver.variables:
         target = variable.targets[0]
         for number, name in enumerate(("lamp", "key")):
@@ -127,7 +128,7 @@ ops.set_up_baked()
 facts["of an earlier version"] += [shown(scene), work(scene)]
 
 # ---- dead drivers are told --------------------------------------------------------------------------
-for curve in wires.drivers(scene):
+for curve in drivers.node_drivers(scene):
     for variable in curve.driver.variables:
         variable.targets[0].data_path = "fit_flare.nothing"
     curve.driver.expression = curve.driver.expression  # compiled again
@@ -148,7 +149,7 @@ state.light = 1
 ops.remove_flare()
 scene.frame_set(3)
 facts["keyed"] = [[item.name, item.intensity, item.scale] for item in state.lights]
-looks.add_instance(scene, scene.objects["key"], "lamp")
+looks.add_flare(scene, scene.objects["key"], "lamp")
 scene.frame_set(1)
 scene.frame_set(3)
 facts["keyed"].append([state.lights[2].intensity, state.lights[2].scale])
@@ -172,10 +173,10 @@ live.with_suffix(".away").rename(live)
 
 # ---- what is told of frames without layers and of animated sliders ----------------------------------
 scene = shot(["lamp"])
-compositor._new_tree(scene, keep_image=False)
+setup._new_tree(scene, keep_image=False)
 colour = flare_node.tree_of(scene).nodes.new("CompositorNodeRGB")
 colour.outputs[0].default_value = (0.5, 0.5, 0.5, 1)
-flare_node.tree_of(scene).links.new(colour.outputs[0], compositor._output(flare_node.tree_of(scene)))
+flare_node.tree_of(scene).links.new(colour.outputs[0], setup._output_input(flare_node.tree_of(scene)))
 scene.frame_start, scene.frame_end = 1, 3
 facts["all frames"] = told(scene)
 scene.frame_start, scene.frame_end = 0, 6
@@ -215,7 +216,7 @@ scene = shot(["lamp"])
 still = bpy.data.images.load(str(Path(layers) / "layers.0001.exr"))
 still.use_fake_user = True
 ops.set_up_baked()
-facts["still"] = [still.source, flare_node.tree_of(scene).nodes[compositor.LAYERS].image.source]
+facts["still"] = [still.source, flare_node.tree_of(scene).nodes[setup.LAYERS].image.source]
 
 # ---- a frame that is shown is baked again -----------------------------------------------------------
 scene = shot(["lamp"])

@@ -35,7 +35,7 @@ def linked(name: str, data: object = None) -> object:
 
 def places(frames: list[int]) -> list[list[float]]:
     """Where the only flare's light is in a shot."""
-    shot = shots.of_scene(scene, [], frames, flare, None)
+    shot = shots.scene_shot(scene, [], frames, flare, None)
     return [np.round(frame.lights[0].xyz, 3).tolist() for frame in shot.frames]
 
 
@@ -58,7 +58,7 @@ for how in ("visible", "disabled", "excluded"):
     facts[f"on a car, {how}"] = places([1, 11])
     scene.frame_set(11)
     lamp.fit_flare.is_light = True
-    lights.write(scene, out)
+    lights.write_to_capture(scene, out)
     facts[f"written, {how}"] = read_lights(out / "lights.json")[0].xyz.round(3).tolist()
 lamp.keyframe_insert("hide_render", frame=1)
 lamp["share"] = 1.0
@@ -83,8 +83,8 @@ for how in ("excluded", "disabled"):
     bpy.ops.wm.open_mainfile(filepath=str(out / "off.blend"))
     scene = bpy.context.scene
     ops.open_flare(filepath=str(flare))
-    lights.write(scene, out)
-    placed = looks.placed(scene, depsgraph_of(scene), scene.camera)[1][0]
+    lights.write_to_capture(scene, out)
+    placed = looks.place_lights(scene, depsgraph_of(scene), scene.camera)[1][0]
     written = {light.name: light.xyz.round(3).tolist() for light in read_lights(out / "lights.json")}
     facts[f"capture {how}"] = [written["lamp"], learned.round(3).tolist(), written["added"],
                                placed.xyz.round(3).tolist(), scene.fit_flare.native]
@@ -96,15 +96,15 @@ root, bulb = scene.fit_flare.root, linked("Bulb")
 bulb.location = (1, 2, 3)
 bpy.context.view_layer.update()
 bulb.parent, bulb.matrix_parent_inverse = root, root.matrix_world.inverted()
-lights.take([bulb], {"lamp"})
+lights.mark_as_lights([bulb], {"lamp"})
 bpy.context.view_layer.update()
 before = bulb.matrix_world.translation.copy()
-lights.write(scene, capture)
+lights.write_to_capture(scene, capture)
 written = {light.name: light.xyz for light in read_lights(capture / "lights.json")}
-lights.follow(scene, {lights.name_of(bulb): written[lights.name_of(bulb)] + 1}, capture)
-lights.follow(scene, written, capture)
+lights.move_to_fit(scene, {lights.light_name(bulb): written[lights.light_name(bulb)] + 1}, capture)
+lights.move_to_fit(scene, written, capture)
 moved = (bulb.matrix_world.translation - before).length
-lights._put(bulb, written[lights.name_of(bulb)])
+lights._move_to(bulb, written[lights.light_name(bulb)])
 bpy.context.view_layer.update()
 facts["parented, brought back"] = [moved > 0.1, (bulb.matrix_world.translation - before).length < 1e-4,
                                    bool(np.allclose(before, (1, 2, 3), atol=1e-4))]
@@ -131,7 +131,7 @@ scene.fit_flare.lights[0].target = scene.objects["Lamp On"]
 scene.camera = linked("No Camera")
 facts["no camera"] = ops.pick_light.poll()
 try:
-    shots.of_scene(scene, [], [1], flare, None)
+    shots.scene_shot(scene, [], [1], flare, None)
 except errors.FitFlareError as problem:
     facts["an empty"] = str(problem)
 overlay, points = part("flare_addon.overlay"), part("flare_addon.points")
@@ -161,7 +161,7 @@ for how in ("linked", "overridden"):
         ops.lights_from_selected()
     bpy.ops.wm.save_as_mainfile(filepath=str(out / f"{how}.blend"))
     bpy.ops.wm.open_mainfile(filepath=str(out / f"{how}.blend"))
-    facts["linked"][how] = [possible, [lights.name_of(item) for item in lights.of_scene(bpy.context.scene)]]
+    facts["linked"][how] = [possible, [lights.light_name(item) for item in lights.scene_lights(bpy.context.scene)]]
 
 # ---- a click in the picture -------------------------------------------------------------------------
 library = part("flare_addon.operators.library")
@@ -203,32 +203,32 @@ for how in ("open", "closed"):
     lamp = scene.objects["lamp"]
     lamp.location = [learned[0] + 0.5, *learned[1:]]
     bpy.context.view_layer.update()
-    lights.write(scene, capture)
+    lights.write_to_capture(scene, capture)
     scene.fit_flare.run = str(run)
     if how == "open":
         job = part("flare_addon.jobs").Job("fit", run, 0, None)
         job.state = "done"
-        fits.finished(job)
+        fits.on_fit_finished(job)
     else:
         assert ops.use_result() == {"FINISHED"}
-    place = lights.place_of(lamp, scene.fit_flare.root, depsgraph_of(scene))
+    place = lights.capture_position(lamp, scene.fit_flare.root, depsgraph_of(scene))
     facts[f"fitted, {how}"] = [bool(np.allclose(place, learned, atol=1e-4)), scene.fit_flare.native]
 
 # ---- lights that were found while the .blend was closed ---------------------------------------------
 path = capture / "lights.json"
 content = json.loads(path.read_text())
 path.write_text(json.dumps({"lights": [*content["lights"], {"name": "found", "xyz": [1, 2, 3], "score": 0.5}]}))
-facts["found"] = lights.unknown(scene, capture)
-lights.write(scene, capture)
+facts["found"] = lights.new_names(scene, capture)
+lights.write_to_capture(scene, capture)
 facts["kept"] = [entry for entry in json.loads(path.read_text())["lights"] if entry["name"] == "found"]
 ops.use_lights()
-facts["used"] = [[lights.name_of(item) for item in lights.of_scene(scene)], lights.unknown(scene, capture)]
+facts["used"] = [[lights.light_name(item) for item in lights.scene_lights(scene)], lights.new_names(scene, capture)]
 ops.remove_light(object="found")
-lights.write(scene, capture)
-facts["taken out"] = [[light.name for light in read_lights(path)], lights.unknown(scene, capture)]
+lights.write_to_capture(scene, capture)
+facts["taken out"] = [[light.name for light in read_lights(path)], lights.new_names(scene, capture)]
 lamp = scene.objects["lamp"]
-lights.write(scene, capture)
-lights.remember(scene)
+lights.write_to_capture(scene, capture)
+lights.remember_names(scene)
 lamp.location.x += 0.5  # while they are looked for
 lamp.fit_flare.light = "desk lamp"
 bpy.context.view_layer.update()
@@ -236,17 +236,17 @@ stood = lamp.matrix_world.translation.copy()
 path.write_text(json.dumps({"lights": [*json.loads(path.read_text())["lights"], {"name": "more", "xyz": [1, 2, 3]}]}))
 job = part("flare_addon.jobs").Job("lights", capture / "lights", 0, None)
 job.state = "done"
-fits.lights_found(job)
+fits.on_lights_found(job)
 bpy.context.view_layer.update()
-facts["found meanwhile"] = [[lights.name_of(item) for item in lights.of_scene(scene)],
+facts["found meanwhile"] = [[lights.light_name(item) for item in lights.scene_lights(scene)],
                             (lamp.matrix_world.translation - stood).length, job.error]
-for item in lights.of_scene(scene):
+for item in lights.scene_lights(scene):
     bpy.data.objects.remove(item)
-fits.lights_found(job)
-facts["found with none left"] = [lights.name_of(item) for item in lights.of_scene(scene)]
+fits.on_lights_found(job)
+facts["found with none left"] = [lights.light_name(item) for item in lights.scene_lights(scene)]
 scene.fit_flare.property_unset("known_lights")
 path.write_text(json.dumps({"lights": [*content["lights"], {"name": "found", "xyz": [1, 2, 3]}]}))
-lights.write(scene, capture)
+lights.write_to_capture(scene, capture)
 facts["of the version before"] = [light.name for light in read_lights(path)]
 
 # ---- other scenes with the capture: linked from a file, and made of this one's settings -----------------
@@ -266,12 +266,12 @@ facts["added in the second"] = refusal(lambda: ops.add_light(name="own"))
 path.write_text(json.dumps({"lights": [*only, {"name": "later", "xyz": [1, 2, 3]}]}))
 job = part("flare_addon.jobs").Job("lights", capture / "lights", 0, None)
 job.state = "done"
-fits.lights_found(job)
-facts["of each scene"] = {one.name: [lights.name_of(item) for item in lights.of_scene(one)] for one in bpy.data.scenes}
+fits.on_lights_found(job)
+facts["of each scene"] = {one.name: [lights.light_name(item) for item in lights.scene_lights(one)] for one in bpy.data.scenes}
 bpy.ops.scene.new(type="NEW")
 scene = bpy.context.scene
 scene.collection.children.link(root.users_collection[0])
 scene.fit_flare.root = root
 facts["beside a linked root"] = [refusal(lambda: ops.add_light(name="own")), "own" in map(
-    lights.name_of, lights.of_scene(scene))]
+    lights.light_name, lights.scene_lights(scene))]
 leave(facts)

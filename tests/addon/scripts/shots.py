@@ -101,8 +101,8 @@ state.layers = str(folder)
 begun: list[list[object]] = []
 shots.engine.run = lambda _kind, _folder, words: begun.append(words)
 shots.engine.command = lambda *_words: []
-part("flare_addon.operators.bake").engine.find = lambda: Path("python")
-recorded(shots.of_scene(scene, [], [0, 1, 2], flare, None), range(5))
+part("flare_addon.operators.bake").engine.find_engine = lambda: Path("python")
+recorded(shots.scene_shot(scene, [], [0, 1, 2], flare, None), range(5))
 state.bake_range = "current"
 facts["as it was baked"] = [refusal(ops.bake), len(begun)]
 state.bake_live = False
@@ -118,27 +118,27 @@ facts["renamed"] = refusal(ops.bake)
 unplaced = state.lights.add()
 unplaced.name, unplaced.source, unplaced.mute = "sun", "sun", True
 state.lights[0].intensity, state.bake_live = 2.0, False
-(one,) = shots.of_scene(scene, [], [0], flare, None).frames
+(one,) = shots.scene_shot(scene, [], [0], flare, None).frames
 facts["edits"] = [[light.name for light in one.lights], list(one.edits)]
 state.lights[0].intensity, state.bake_live = 1.0, True
 state.lights.remove(len(state.lights) - 1)
 
 # ---- chosen cameras ---------------------------------------------------------------------------------
-one = shots._shot(scene, [scene.camera], [0])
+one = shots._panel_shot(scene, [scene.camera], [0])
 facts["one chosen"] = list(one.folders.values())
 one.write(folder / "shot.json")
-facts["one chosen, read again"] = shots.folder_of_camera(folder, scene.camera).name
+facts["one chosen, read again"] = shots.camera_folder(folder, scene.camera).name
 scene.camera.name = "Other"
 try:
-    shots.folder_of_camera(folder, scene.camera)
+    shots.camera_folder(folder, scene.camera)
 except part("core.errors").FrameError as problem:
     facts["renamed since"] = str(problem)
 write_json(folder / "bake.json", {"version": 1, "made_from": {}, "layers": {}, "frames": [
     {"file": f"Other_2/layers.{number:04d}.exr", "frame": number, "view": f"Other/{number}", "width": 8, "height": 8}
     for number in range(2)]})
-facts["of an earlier bake"] = shots.folder_of_camera(folder, scene.camera).name
+facts["of an earlier bake"] = shots.camera_folder(folder, scene.camera).name
 (folder / "bake.json").unlink()
-facts["the scene's own"] = list(shots._shot(scene, [], [0]).folders.values())
+facts["the scene's own"] = list(shots._panel_shot(scene, [], [0]).folders.values())
 for item in scene.objects:
     item.select_set(False)
 facts["none chosen"] = refusal(lambda: ops.bake(selected=True))

@@ -19,9 +19,9 @@ from start import empty, install, leave, part
 
 package, out = sys.argv[1], Path(sys.argv[2])
 install(package)
-cameras, capture_export, lights, looks, occlusion, blend_shot = (
-    part(f"flare_addon.{name}") for name in ("cameras", "capture_export", "lights", "looks", "occlusion",
-                                           "blend_shot"))
+cameras, exporter, lights, looks, occlusion, blend_shot = (
+    part(f"flare_addon.{name}") for name in ("cameras", "capture.exporter", "lights", "looks", "occlusion",
+                                           "capture.blend_shot"))
 facts: dict[str, object] = {}
 
 FRAMES, WIDTH, HEIGHT, K1 = 20, 320, 180, -0.12
@@ -74,12 +74,12 @@ back.source, back.clip = "MOVIE_CLIP", clip
 def tracks_missed_by(folder: Path) -> float:
     """Greatest distance, pixels of the distorted frames, of the capture's points from the tracks they are of."""
     bpy.context.view_layer.update()
-    capture_export.export(scene, folder)
+    exporter.export_capture(scene, folder)
     entries = json.loads((folder / "transforms.json").read_text())["frames"]
-    found = capture_export.points_of(scene, camera)
+    found = exporter.scene_points(scene, camera)
     worst = 0.0
     for number, entry in enumerate(entries, 1):
-        pose = np.linalg.inv(np.array(entry["transform_matrix"]) @ cameras.FLIP)
+        pose = np.linalg.inv(np.array(entry["transform_matrix"]) @ cameras.FLIP_YZ)
         seen = found @ pose[:3, :3].T + pose[:3, 3]
         plane = seen[:, :2] / seen[:, 2:]
         plane = plane * (1 + entry.get("k1", 0.0) * (plane**2).sum(1, keepdims=True))
@@ -103,14 +103,14 @@ camera.matrix_parent_inverse = parent.matrix_world.inverted()
 parent.location.z = 4
 facts["on a dolly"] = tracks_missed_by(out / "on_a_dolly")
 
-facts["frames from elsewhere"] = capture_export.distortion_of(camera, out / "undistorted" / "0001.png")
+facts["frames from elsewhere"] = exporter.lens_distortion(camera, out / "undistorted" / "0001.png")
 tracking.camera.distortion_model, tracking.camera.division_k1 = "DIVISION", 0.1
 try:
-    capture_export.distortion_of(camera, out / "clip" / "0001.png")
+    exporter.lens_distortion(camera, out / "clip" / "0001.png")
 except part("core.errors").CaptureError as problem:
     facts["another model"] = str(problem)
 clip.frame_start, clip.frame_offset = 11, 3
-facts["offset"] = [capture_export.footage_of(camera).path(frame).name for frame in (11, 12)]
+facts["offset"] = [exporter.footage_of(camera).path(frame).name for frame in (11, 12)]
 
 # ---- sizes -----------------------------------------------------------------------------------------
 scene.render.resolution_x, scene.render.resolution_y, scene.render.resolution_percentage = 1280, 720, 35
@@ -138,14 +138,14 @@ def off(place: object) -> float:
 
 
 sun.fit_flare.is_light = True
-lights.write(scene, out)
+lights.write_to_capture(scene, out)
 facts["sun"] = [off(json.loads((out / "lights.json").read_text())["lights"][0]["xyz"]),
-                off(blend_shot.shot_of(scene, out / "x.flare", [], [1]).frames[0].lights[0].xyz)]
+                off(blend_shot.read_shot(scene, out / "x.flare", [], [1]).frames[0].lights[0].xyz)]
 sun.hide_render = True
 bpy.ops.mesh.primitive_cube_add()
 cube = bpy.context.object
 plate = next((out / "clip").iterdir())
-blend_shot.capture_of(scene, {1: plate}, out / "no lights", [])
+blend_shot.write_capture(scene, {1: plate}, out / "no lights", [])
 facts["no lights"] = sorted(path.name for path in (out / "no lights").iterdir())
 bpy.data.objects.remove(cube)
 sun.hide_render = False
@@ -153,7 +153,7 @@ second = bpy.data.objects.new("Second", bpy.data.cameras.new("Second"))
 scene.collection.objects.link(second)
 for frame, filming in ((1, camera), (4, second)):
     scene.timeline_markers.new(f"F{frame}", frame=frame).camera = filming
-whole, part_of_it = (blend_shot.shot_of(scene, out / "lamp.flare", [], frames) for frames in ([1, 4], [4]))
+whole, part_of_it = (blend_shot.read_shot(scene, out / "lamp.flare", [], frames) for frames in ([1, 4], [4]))
 facts["cut"] = [list(whole.folders.values()), list(part_of_it.folders.values()),
                 whole.frames[1].cache_key() == part_of_it.frames[0].cache_key()]
 scene.timeline_markers.clear()
@@ -164,7 +164,7 @@ lamp.location.x = math.nan
 for filming, scale, place in ((camera, 1, 0), (second, 0, 0), (second, 1, math.nan)):
     scene.camera, second.scale, second.location.x = filming, (scale,) * 3, place
     try:
-        blend_shot.shot_of(scene, out / "lamp.flare", ["Nowhere"], [1])
+        blend_shot.read_shot(scene, out / "lamp.flare", ["Nowhere"], [1])
     except Exception as problem:
         nowhere.append([type(problem).__name__, str(problem)])
 facts["nowhere"] = nowhere
@@ -172,7 +172,7 @@ bpy.data.objects.remove(lamp)
 scene.camera = camera
 item = scene.fit_flare.lights.add()
 item.name, item.source, item.target = "lamp", "lamp", sun
-facts["sun"].append(off(looks.placed(scene, depsgraph, camera)[1][0].xyz))
+facts["sun"].append(off(looks.place_lights(scene, depsgraph, camera)[1][0].xyz))
 
 mesh = bpy.data.meshes.new("Wall")
 mesh.from_pydata([(-50, 10, -50), (50, 10, -50), (50, 10, 50), (-50, 10, 50)], [], [(0, 1, 2, 3)])
@@ -182,7 +182,7 @@ scene.collection.objects.link(wall)
 
 def share() -> float:
     bpy.context.view_layer.update()
-    return occlusion.visible_share(scene, bpy.context.evaluated_depsgraph_get(), eye, item)
+    return occlusion.visibility(scene, bpy.context.evaluated_depsgraph_get(), eye, item)
 
 
 facts["behind a wall"] = share()

@@ -66,7 +66,7 @@ for kind, up, scale in (("animated", "Z", 1.0), ("each", "-Y", 2.5)):
     for frame in frames:
         scene.frame_set(frame.number)
         camera = scene.camera if kind == "animated" else scene.objects[Path(frame.view).stem]
-        found.append(shots.frame_of(scene, bpy.context.evaluated_depsgraph_get(), camera, frame.number).camera.exposure)
+        found.append(shots.shot_frame(scene, bpy.context.evaluated_depsgraph_get(), camera, frame.number).camera.exposure)
     facts[f"exposed, {kind}"] = found
     # A run of this capture exposes cameras that are imported later, too; one of another does not.
     fits = part("flare_addon.fits")
@@ -248,7 +248,7 @@ facts["reset"] = looks.edits_of(state).is_neutral or looks.edits_of(state).texts
 look = looks.look_of(scene)
 scene.frame_set(2)
 state.occlusion = False
-gaussians = overlay.concatenate(list(looks.seen(scene, bpy.context.evaluated_depsgraph_get(), scene.camera).values()))
+gaussians = overlay.concatenate(list(looks.evaluate_flares(scene, bpy.context.evaluated_depsgraph_get(), scene.camera).values()))
 evaluated = scene.camera.evaluated_get(bpy.context.evaluated_depsgraph_get())
 core = cameras.core_camera(evaluated.data, evaluated.matrix_world, scene.render)
 
@@ -256,7 +256,7 @@ core = cameras.core_camera(evaluated.data, evaluated.matrix_world, scene.render)
 def drawn(window):
     """The sum of the levels, as the last shader makes it."""
     total = np.zeros((window.height, window.width, 3), np.float32)
-    for divisor, quads in overlay.levels(gaussians, window, look).items():
+    for divisor, quads in overlay.quads_by_level(gaussians, window, look).items():
         size = -(-window.height // divisor), -(-window.width // divisor)
         level = np.zeros((*size, 3), np.float32)
         x, y = np.arange(size[1]) + 0.5, np.arange(size[0])[:, None] + 0.5
@@ -295,34 +295,34 @@ def far_off(picture, expected):
     return float(np.sqrt(((picture - expected) ** 2).sum() / (expected**2).sum()))
 
 
-whole = overlay.window_of(overlay.Frame(0, 0, 3 * core.width, 3 * core.height), (3 * core.width, 3 * core.height), core)
+whole = overlay.drawn_region(overlay.CameraFrame(0, 0, 3 * core.width, 3 * core.height), (3 * core.width, 3 * core.height), core)
 large = core.scaled(3 * core.width, 3 * core.height)
 expected = drawing.draw([gaussians], large.intrinsics, *large.size, look.blend, look.pixel_grid)
 facts["overlay off"] = far_off(drawn(whole), expected)
 # Zoomed in, the frame larger than the region and beyond its edges.
-cropped = overlay.window_of(overlay.Frame(-40, -30, 3 * core.width, 3 * core.height), (100, 80), core)
+cropped = overlay.drawn_region(overlay.CameraFrame(-40, -30, 3 * core.width, 3 * core.height), (100, 80), core)
 rows = slice(3 * core.height - 30 - 80, 3 * core.height - 30)  # the frame reaches 10 pixels above the region
 facts["cropped off"] = far_off(drawn(cropped), expected[rows, 40:140])
-facts["outside"] = overlay.window_of(overlay.Frame(500, 0, 64, 40), (100, 80), core) is None
+facts["outside"] = overlay.drawn_region(overlay.CameraFrame(500, 0, 64, 40), (100, 80), core) is None
 
 # What is shown and what is baked are as bright as the frame was exposed.
 scene.camera.fit_flare.exposure = 2.0
-brighter = overlay.concatenate(list(looks.seen(scene, bpy.context.evaluated_depsgraph_get(), scene.camera).values()))
+brighter = overlay.concatenate(list(looks.evaluate_flares(scene, bpy.context.evaluated_depsgraph_get(), scene.camera).values()))
 facts["brighter"] = [far_off(brighter.colours, 2 * gaussians.colours), float(np.abs(gaussians.colours).max())]
-exposed_shot = shots.of_scene(scene, [scene.camera], [2], Path(flare), None)
+exposed_shot = shots.scene_shot(scene, [scene.camera], [2], Path(flare), None)
 exposed_shot.write(Path(out) / "exposed.json")
 scene.camera.fit_flare.exposure = 1.0
 
 # ---- a shot, and the same by hand ------------------------------------------------------------------
 state.occlusion = True
-shot = shots.of_scene(scene, [scene.camera], [1, 3], Path(flare), None)
+shot = shots.scene_shot(scene, [scene.camera], [1, 3], Path(flare), None)
 pose = original.views[1].camera.world_to_camera
 facts["pose off"] = float(np.abs(shot.frames[0].camera.world_to_camera - pose).max())
 facts["place off"] = float(np.abs(shot.frames[0].lights[0].xyz - original.lights[0].xyz).max())
 facts["shares"] = [light.visibility for light in shot.frames[0].lights]
 root = state.root
 root.rotation_euler, root.scale, root.location = (0.3, 0.2, 0.1), (2, 2, 2), (1, 2, 3)
-moved = shots.of_scene(scene, [scene.camera], [1, 3], Path(flare), None)
+moved = shots.scene_shot(scene, [scene.camera], [1, 3], Path(flare), None)
 facts["moved root off"] = float(np.abs(moved.frames[0].camera.world_to_camera - pose).max())
 root.rotation_euler, root.scale, root.location = (0, 0, 0), (1, 1, 1), (0, 0, 0)
 
@@ -334,9 +334,9 @@ angle.matrix_world = first.matrix_world
 angle.location.x += 3
 for frame, camera in ((1, first), (3, angle)):
     scene.timeline_markers.new("cut", frame=frame).camera = camera
-cut = shots.of_scene(scene, [], [1, 2, 3], Path(flare), None)
+cut = shots.scene_shot(scene, [], [1, 2, 3], Path(flare), None)
 facts["cut"] = [sorted({one.name for one in cut.frames}), *(float(np.abs(one.camera.world_to_camera - np.linalg.inv(
-    np.array(angle.matrix_world) @ cameras.FLIP)).max()) for one in cut.frames)]
+    np.array(angle.matrix_world) @ cameras.FLIP_YZ)).max()) for one in cut.frames)]
 scene.timeline_markers.clear()
 scene.camera = first
 bpy.data.objects.remove(angle)
@@ -358,7 +358,7 @@ for edge in np.linspace(-0.06, 0.06, 13):
     wall = bpy.data.objects.new("Wall", mesh)
     scene.collection.objects.link(wall)
     bpy.context.view_layer.update()
-    shares.append(occlusion.visible_share(scene, bpy.context.evaluated_depsgraph_get(), eye, state.lights[0]))
+    shares.append(occlusion.visibility(scene, bpy.context.evaluated_depsgraph_get(), eye, state.lights[0]))
     bpy.data.objects.remove(wall)
 facts["fades"] = shares
 bpy.context.view_layer.update()
@@ -369,7 +369,7 @@ scene.collection.objects.link(behind)
 behind.location = light + 0.5 * forward
 behind.rotation_euler = forward.to_track_quat("-Z", "Y").to_euler()
 bpy.context.view_layer.update()
-seen = looks.seen(scene, bpy.context.evaluated_depsgraph_get(), behind)
+seen = looks.evaluate_flares(scene, bpy.context.evaluated_depsgraph_get(), behind)
 facts["behind"] = [name for name in seen if name == state.lights[0].name]
 
 # ---- save, reload ----------------------------------------------------------------------------------
@@ -412,7 +412,7 @@ try:
 except part("core.errors").RunError as problem:
     facts["layers beside a flare of the library"] = [str(problem), other.fit_flare.layers]
 facts["applied to"] = [item.target.name if item.target else "" for item in state.lights]
-seen = looks.seen(other, bpy.context.evaluated_depsgraph_get(), camera)
+seen = looks.evaluate_flares(other, bpy.context.evaluated_depsgraph_get(), camera)
 facts["transferred"] = [state.native, len(seen), float(drawing.draw(seen.values(), cameras.core_camera(
     camera.data, camera.matrix_world, other.render).scaled(96, 54).intrinsics, 96, 54).sum()) > 0.1]
 

@@ -33,14 +33,14 @@ from core.conventions.run_files import FLARE
 from core.errors import CaptureError
 from core.fit.run import Run
 from core.images.write import write_png
-from core.look import Look, ViewOfLight, read
-from core.look.shot import PlacedLight, Shot, ShotFrame
+from core.look import Look, PlacedLight, ViewOfLight, read
+from core.look.shot import Shot, ShotFrame
 from core.metrics.evaluation import displayed_flare
 from core.system.files import read_json, write_json
-from core.transfer.target import Target, of_capture, of_shot
+from core.transfer.target import Target, capture_target, shot_target
 from core.transfer.transfer import Transfer, TransferSettings
-from sample_scenes.description import looking_at
-from sample_scenes.flares import LOOKS, render_flare
+from sample_scenes.description import look_at
+from sample_scenes.flares import LENS_SETUPS, render_flare
 from sample_scenes.scenes.desk import DESK
 
 Pixels = NDArray[np.float32]
@@ -55,17 +55,17 @@ class Truth:
     scene: Pixels
 
 
-def path(number: int, count: int) -> NDArray[np.float64]:
+def camera_path(number: int, count: int) -> NDArray[np.float64]:
     """A slow arc from left to right, rising and coming nearer, with a turn of the head; another than the capture's."""
     t = number / max(count - 1, 1)
     azimuth = np.radians(-32 + 64 * t)
     distance = 5.9 - 0.5 * t
     eye = np.array([distance * np.sin(azimuth), 0.7 - distance * np.cos(azimuth), 1.3 + 0.9 * t])
     target = np.array([0.3 * np.cos(5 * t), 0.75, 1.0 + 0.25 * np.sin(4 * t)])
-    return looking_at(eye, target, np.radians(2) * np.sin(6 * t))
+    return look_at(eye, target, np.radians(2) * np.sin(6 * t))
 
 
-def moved(pose: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def move_world(pose: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """A rigid motion of the world (4, 4), and the pose in it."""
     angle = np.radians(117.0)
     motion = np.eye(4)
@@ -78,42 +78,42 @@ def target(count: int, world: str, size: tuple[int, int], look: Look) -> list[Tr
     """Frames with exact flares. Each light is hidden for some frames, and behind an edge for two beside them."""
     sources = sources_of(look)
     width, height = size
-    made = []
+    truths = []
     for number in range(count):
-        pose, motion = path(number, count), np.eye(4)
+        pose, motion = camera_path(number, count), np.eye(4)
         camera = Camera(width, height, 0.93 * width, 0.93 * width, 0.487 * width, 0.52 * height, pose)
         if world == "moved":
-            motion, there = moved(pose)
-            camera = Camera(width, height, camera.fx, camera.fy, camera.cx, camera.cy, there)
+            motion, moved_pose = move_world(pose)
+            camera = Camera(width, height, camera.fx, camera.fy, camera.cx, camera.cy, moved_pose)
         lights, flare = [], np.zeros((height, width, 3), np.float32)
         for index, light in enumerate(DESK.lights):
             centre = count * (0.35 + 0.3 * index)
             share = float(np.clip((abs(number - centre) - 2.5) / 3, 0, 1))
             xyz = np.array(light.xyz)
             local = pose[:3, :3] @ xyz + pose[:3, 3]
-            flare += render_flare(LOOKS[DESK.lens], camera, local, colour=light.colour, visible_share=share,
-                                  intensity=light.strength(float(np.linalg.norm(local))))
+            flare += render_flare(LENS_SETUPS[DESK.lens], camera, local, colour=light.colour, visible_share=share,
+                                  intensity=light.flare_strength(float(np.linalg.norm(local))))
             lights.append(PlacedLight(light.name, sources[light.name], motion[:3, :3] @ xyz + motion[:3, 3], share))
-        made.append(Truth(ShotFrame(number + 1, "Camera", camera, tuple(lights)), flare, background(camera)))
-    return made
+        truths.append(Truth(ShotFrame(number + 1, "Camera", camera, tuple(lights)), flare, background(camera)))
+    return truths
 
 
-def rendered(folder: Path, scene: Path, look: Look) -> tuple[list[Truth], Target]:
+def rendered_target(folder: Path, scene: Path, look: Look) -> tuple[list[Truth], Target]:
     """The frames of a capture with exact layers, and the target that a transfer on to it has: its cameras, the
     places of its lights, and its splats, but nothing that only the truth knows."""
     capture = Capture.open(folder)
     shares = read_json(folder / "truth" / "visible_share.json", CaptureError)
-    found = of_capture(capture, look, sources_of(look), scene=scene)
+    target_ = capture_target(capture, look, sources_of(look), scene=scene)
     views = {view.name: view for view in capture.views}
-    made = []
-    for one in found.frames:
+    truths = []
+    for one in target_.frames:
         view = views[one.frame.view]
         flare, below = capture.truth_flare(view), capture.truth_scene(view)
         if flare is None or below is None:
             raise CaptureError(f"{folder} has no exact layers; make it with sample_scenes/render.py.")
-        lights = tuple(replace(light, share=shares[view.name][light.name]) for light in one.shot.lights)
-        made.append(Truth(replace(one.shot, lights=lights), flare.pixels, below.pixels))
-    return made, found
+        lights = tuple(replace(light, visibility=shares[view.name][light.name]) for light in one.shot.lights)
+        truths.append(Truth(replace(one.shot, lights=lights), flare.pixels, below.pixels))
+    return truths, target_
 
 
 def sources_of(look: Look) -> dict[str, str]:
@@ -145,36 +145,37 @@ def main() -> None:
     parser.add_argument("--to", type=Path, metavar="CAPTURE", help="a rendered target with exact layers")
     parser.add_argument("--scene", type=Path, metavar="PLY", help="of the rendered target")
     parser.add_argument("--out", type=Path)
-    words = parser.parse_args()
+    args = parser.parse_args()
 
-    made = Run.open(words.run)
-    look = read(words.run / FLARE)
-    capture = Capture.open(made.capture_folder if made.capture_folder.is_dir() else "sample_scenes/desk",
+    truths = Run.open(args.run)
+    look = read(args.run / FLARE)
+    capture = Capture.open(truths.capture_folder if truths.capture_folder.is_dir() else "sample_scenes/desk",
                            need_frames=False)
-    training = [view.camera.world_to_camera for view in capture.split(made.settings.holdout)[0]]
-    if words.to:
-        truths, onto = rendered(words.to, words.scene, look)
+    training = [view.camera.world_to_camera for view in capture.split(truths.settings.holdout)[0]]
+    if args.to:
+        truths, transfer_target = rendered_target(args.to, args.scene, look)
     else:
-        truths = target(words.frames, words.world, (words.width, words.width * 5 // 8), look)
-        onto = of_shot(Shot(words.run / FLARE, tuple(truth.shot for truth in truths)), look, {})
-    transfer = Transfer(words.run / FLARE, onto, TransferSettings(query=words.query, smooth=words.smooth), training)
-    ranges = {light.name: transfer.seen[light.name] for light in look.lights}
+        truths = target(args.frames, args.world, (args.width, args.width * 5 // 8), look)
+        transfer_target = shot_target(Shot(args.run / FLARE, tuple(truth.shot for truth in truths)), look, {})
+    transfer = Transfer(args.run / FLARE, transfer_target, TransferSettings(query=args.query, smooth=args.smooth), training)
+    ranges = {light.name: transfer.training_views[light.name] for light in look.lights}
 
     rows: list[dict[str, Any]] = []
-    hidden, pictures = 0.0, []
+    max_hidden_light, pictures = 0.0, []
     for index, truth in enumerate(truths):
         camera = truth.shot.camera
         exact, scene = truth.flare, truth.scene
-        layers = transfer.of_frame(transfer.target.frames[index].frame).render(camera)
+        layers = transfer.frame_renderer(transfer.target.frames[index].frame).render(camera)
         ours = sum(layers.flare_by_light.values())
         for light in truth.shot.lights:
-            if light.share == 0:
-                hidden = max(hidden, float(np.abs(layers.flare_by_light[light.name]).max()))
+            if light.visibility == 0:
+                max_hidden_light = max(max_hidden_light, float(np.abs(layers.flare_by_light[light.name]).max()))
         inside = all(is_inside(ranges[light.source], ViewOfLight.of(camera.world_to_camera, light.xyz),
                                float(np.linalg.norm(camera.position - light.xyz))) for light in truth.shot.lights)
         clipped = np.clip(scene + exact, 0, 1), np.clip(scene + ours, 0, 1)
         shown = displayed_flare(scene + exact, scene)
-        rows.append({"frame": truth.shot.frame, "inside": inside, "shares": [one.share for one in truth.shot.lights],
+        rows.append({"frame": truth.shot.frame, "inside": inside,
+                     "shares": [light.visibility for light in truth.shot.lights],
                      "flare": psnr(shown, displayed_flare(scene + ours, scene)), "flare_linear": psnr(*clipped),
                      "empty": psnr(shown, 0 * shown)})
         if index % max(len(truths) // 6, 1) == 0:
@@ -188,16 +189,16 @@ def main() -> None:
     worst = min(scored, key=lambda row: row["flare"])
     print(f"{len(scored)} of {len(rows)} views inside the trained range: flare {means['flare']:.2f} dB (worst "
           f"{worst['flare']:.2f}, frame {worst['frame']}), in linear light {means['flare_linear']:.2f}, empty "
-          f"{means['empty']:.2f}; most light of a hidden light: {hidden:g}")
-    if words.out:
-        name = f"transfer_{words.to.name if words.to else words.world}_{words.query}"
-        write_png(words.out / f"{name}.png", np.concatenate(pictures))
-        write_json(words.out / f"{name}.json", {"means": means, "views": rows})
+          f"{means['empty']:.2f}; most light of a hidden light: {max_hidden_light:g}")
+    if args.out:
+        name = f"transfer_{args.to.name if args.to else args.world}_{args.query}"
+        write_png(args.out / f"{name}.png", np.concatenate(pictures))
+        write_json(args.out / f"{name}.json", {"means": means, "views": rows})
 
 
-def is_inside(seen: object, view: ViewOfLight, distance: float) -> bool:
+def is_inside(training: object, view: ViewOfLight, distance: float) -> bool:
     """Whether a light stands where training saw it: in the frame's quadrant-folded plane and at its distances."""
-    lights, distances = np.abs(seen.lights), seen.distances  # type: ignore[attr-defined]
+    lights, distances = np.abs(training.lights), training.distances  # type: ignore[attr-defined]
     place = np.abs(view.light)
     return bool((place <= lights.max(0)).all() and distances.min() <= distance <= distances.max())
 

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What the scripts here have in common: how their work is shown, stopped and refused, and how a process with Blender's
-module in it keeps quiet and ends."""
+"""Helpers that the scripts here share: progress, cancellation and errors in the terminal, and a quiet Blender that
+exits cleanly."""
 from __future__ import annotations
 
 import contextlib
@@ -9,21 +9,21 @@ import sys
 from collections.abc import Callable, Iterator
 from typing import NoReturn
 
-from core.errors import FitFlareError, refusal
-from core.system.progress import Progress, TerminalProgress, stoppable
+from core.errors import FitFlareError, os_error_message
+from core.system.progress import Progress, TerminalProgress, stop_on_request
 
 
-def run(work: Callable[[Progress], None]) -> int:
-    """Do the work in the terminal; its exit code. What goes wrong is told in one sentence."""
+def run_command(work: Callable[[Progress], None]) -> int:
+    """Do the work with progress in the terminal and return the exit code. An error is printed as one sentence."""
     progress = TerminalProgress()
     try:
-        with stoppable(progress):
+        with stop_on_request(progress):
             work(progress)
     except FitFlareError as problem:
         progress.error(str(problem))
         return 1
     except OSError as problem:
-        progress.error(refusal(problem))
+        progress.error(os_error_message(problem))
         return 1
     finally:
         progress.close()
@@ -31,8 +31,8 @@ def run(work: Callable[[Progress], None]) -> int:
 
 
 @contextlib.contextmanager
-def silent() -> Iterator[None]:
-    """Blender's own lines go to the null device for as long as this context lasts."""
+def silence_blender() -> Iterator[None]:
+    """Send Blender's own output to the null device within this context."""
     sys.stdout.flush()
     saved, null = os.dup(1), os.open(os.devnull, os.O_WRONLY)
     os.dup2(null, 1)
@@ -44,7 +44,7 @@ def silent() -> Iterator[None]:
         os.close(null)
 
 
-def leave(code: int) -> NoReturn:
-    """End the process at once: Blender's library may hang when its interpreter winds down."""
+def exit_process(code: int) -> NoReturn:
+    """End the process at once: Blender's library may hang when its interpreter shuts down."""
     sys.stdout.flush()
     os._exit(code)

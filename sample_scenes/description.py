@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What a sample capture is made of: a camera path, lights, a lens, how bright things are. No Blender here.
+"""Describes a sample capture: camera path, lights, lens, brightness. It needs no Blender.
 
-World axes are Blender's (z up); cameras are OpenCV's and COLMAP's (x right, y down, z forward). Lengths
-are scene units.
+World axes are Blender's (z up); cameras are OpenCV's and COLMAP's (x right, y down, z forward). Lengths are scene
+units.
 """
 from __future__ import annotations
 
@@ -36,10 +36,9 @@ class Pinhole:
 class LightSource:
     """A small bright sphere in the scene, and the strength of the flare that it causes.
 
-    colour: linear RGB, about 1 at its largest. radius: of the sphere, scene units. emission: what a
-    camera sees of it, linear. power: of the lamp that lights the scene, watts (a sun: W/m^2). flare: strength of its
-    flare at `reference` units from the camera; it falls with the square of the distance, as light does,
-    unless `distant` (a sun).
+    colour: linear RGB, about 1 at its largest. radius: of the sphere, scene units. emission: its radiance to a camera,
+    linear. power: of the lamp that lights the scene, watts (a sun: W/m^2). flare: strength of its flare at `reference`
+    units from the camera; it falls with the square of the distance, as light does, unless `distant` (a sun).
     """
 
     name: str
@@ -52,8 +51,8 @@ class LightSource:
     reference: float = 5.0
     distant: bool = False
 
-    def strength(self, distance: float) -> float:
-        """Flare strength seen from `distance` units."""
+    def flare_strength(self, distance: float) -> float:
+        """Return the strength of the flare at `distance` units."""
         return self.flare if self.distant else self.flare * (self.reference / distance) ** 2
 
 
@@ -63,7 +62,7 @@ class SceneDescription:
 
     name: str
     seed: int
-    first: int
+    first_number: int
     views: int
     camera: Pinhole
     path: Callable[[Array], Array]
@@ -71,15 +70,15 @@ class SceneDescription:
     build: Callable[[SceneDescription], None]
     lights: tuple[LightSource, ...]
     lens: str
-    """Name of a look in `flares.LOOKS`."""
+    """Name of a setup in `flares.LENS_SETUPS`."""
     samples: int = 40
-    test: tuple[int, ...] = field(default=())
-    """Numbers of views held out besides every eighth."""
+    held_out: tuple[int, ...] = field(default=())
+    """Numbers of views that are held out besides every eighth."""
 
     @property
     def numbers(self) -> NDArray[np.int64]:
         """The views' numbers on the path; a file is called after its view's."""
-        return self.first + np.arange(self.views)
+        return self.first_number + np.arange(self.views)
 
     @property
     def stems(self) -> list[str]:
@@ -92,8 +91,8 @@ class SceneDescription:
         return self.path(self.numbers.astype(float))
 
 
-def looking_at(eye: Array, target: Array, roll: float = 0.0) -> Array:
-    """world_to_camera (4, 4) of a camera at `eye` that looks at `target`, z up, rolled by `roll` radians."""
+def look_at(eye: Array, target: Array, roll: float = 0.0) -> Array:
+    """Return world_to_camera (4, 4) of a camera at `eye` that looks at `target`, z up, rolled by `roll` radians."""
     forward = target - eye
     forward = forward / np.linalg.norm(forward)
     right = np.cross(forward, (0.0, 0.0, 1.0))

@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Lay traced flares over a real capture: `python sample_scenes/over_photos.py CAPTURE --light X Y Z --out FOLDER`.
 
-The capture has images/ and sparse/0 (cameras without distortion, or with it: frames are undistorted). A
-light is put at a place in its world, its flare is traced for every view and added in linear light, and the
-result is clipped and stored as a frame; where the photographs' exposure changes the flare's does too. The new
-capture has those in images/, the untouched photographs in removed/, the flares in truth/flare, lights.json, and
-cameras scaled to the new size. What a photograph shows in front of the light hides nothing: the visible share is
-1 in every view.
+The capture has images/ and sparse/0; distorted frames are undistorted. A light is placed at a point in its world, its
+flare is traced for every view and added in linear light, and the result is clipped and stored as a frame; where the
+photographs' exposure changes the flare's does too. The new capture has those frames in images/, the untouched
+photographs in removed/, the flares in truth/flare, lights.json, and cameras scaled to the new size. Objects in front of
+the light do not hide it: the visible share is 1 in every view.
 """
 from __future__ import annotations
 
@@ -20,7 +19,7 @@ from numpy.typing import NDArray
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from core.capture import LIGHTS, Capture
-from core.capture.colmap import Observed, write_model
+from core.capture.colmap import ObservedFrame, write_model
 from core.capture.lens import Lens
 from core.colour.srgb import linear_from_srgb, srgb_from_linear
 from core.fit import metering
@@ -29,15 +28,15 @@ from core.images.read import read_picture
 from core.images.write import write_png
 from core.system.files import write_json
 from core.system.progress import Progress
-from sample_scenes.command import run
-from sample_scenes.flares import LOOKS, Look, render_flare
-from sample_scenes.layers import FLARE_LEVEL, write_layer
+from sample_scenes.capture_files import FLARE_LEVEL, write_layer
+from sample_scenes.command import run_command
+from sample_scenes.flares import LENS_SETUPS, LensSetup, render_flare
 
 
-def add_flares(capture: Capture, out: Path, look: Look, light: NDArray[np.float64], colour: tuple[float, ...],
+def add_flares(capture: Capture, out: Path, setup: LensSetup, light: NDArray[np.float64], colour: tuple[float, ...],
                intensity: float, width: int, progress: Progress) -> None:
-    """Write the new capture; views that are there already are kept. light: world coordinates (3,)."""
-    capture = capture.exposed(metering.found(capture, Frames(capture, width)))
+    """Write the new capture; views that exist already are kept. light: world coordinates (3,)."""
+    capture = capture.with_exposures(metering.found(capture, Frames(capture, width)))
     progress.stage("flares", len(capture.views))
     for view in capture.views:
         stem = Path(view.name).stem
@@ -47,7 +46,7 @@ def add_flares(capture: Capture, out: Path, look: Look, light: NDArray[np.float6
             camera = view.camera.scaled(width)
             photo = np.round(capture.frame(view, camera.size).display() * 255) / np.float32(255)
             pose = view.camera.world_to_camera
-            flare = render_flare(look, camera, pose[:3, :3] @ light + pose[:3, 3], colour=colour,
+            flare = render_flare(setup, camera, pose[:3, :3] @ light + pose[:3, 3], colour=colour,
                                  intensity=intensity * camera.exposure)
             write_layer(layer, flare, FLARE_LEVEL)
             flare = read_picture(layer).pixels  # as stored, so that the files agree
@@ -59,13 +58,13 @@ def add_flares(capture: Capture, out: Path, look: Look, light: NDArray[np.float6
 
 
 def _write_model(capture: Capture, folder: Path, width: int) -> None:
-    """Cameras at the new size, the capture's points, and which were found in which photograph."""
+    """Write cameras at the new size, the capture's points, and which photograph shows which points."""
     frames = []
     for view in capture.views:
         camera = view.camera.scaled(width)
         lens = Lens("PINHOLE", (camera.fx, camera.fy, camera.cx, camera.cy), *camera.size)
         pixels, _ = camera.project(capture.points.xyz[view.points])
-        frames.append(Observed(f"{Path(view.name).stem}.png", lens, camera.world_to_camera, pixels, view.points))
+        frames.append(ObservedFrame(f"{Path(view.name).stem}.png", lens, camera.world_to_camera, pixels, view.points))
     write_model(folder, frames, capture.points)
 
 
@@ -78,12 +77,12 @@ def main() -> int:
                         help="the light's place, world coordinates")
     parser.add_argument("--colour", type=float, nargs=3, default=(1.0, 0.85, 0.65), metavar=("R", "G", "B"))
     parser.add_argument("--intensity", type=float, default=1.0)
-    parser.add_argument("--lens", choices=sorted(LOOKS), default="fast")
+    parser.add_argument("--lens", choices=sorted(LENS_SETUPS), default="fast")
     parser.add_argument("--width", type=int, default=640, help="of the new frames, pixels")
-    chosen = parser.parse_args()
-    return run(lambda progress: add_flares(
-        Capture.open(chosen.capture), chosen.out, LOOKS[chosen.lens], np.array(chosen.light), tuple(chosen.colour),
-        chosen.intensity, chosen.width, progress))
+    args = parser.parse_args()
+    return run_command(lambda progress: add_flares(
+        Capture.open(args.capture), args.out, LENS_SETUPS[args.lens], np.array(args.light), tuple(args.colour),
+        args.intensity, args.width, progress))
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Textures drawn from a seed: posters, paper with writing, wood, marble, maps, tiles. All sRGB 0..1.
+"""Draws textures from a seed: posters, paper with writing, wood, marble, maps, tiles. All are sRGB 0..1.
 
-Structure from motion needs corners and blobs at several scales, a fit of Gaussians needs textures that
-are not finer than a pixel; every pattern here keeps to that middle.
+Structure from motion needs corners and blobs at several scales, a fit of Gaussians needs textures that are not finer
+than a pixel; every pattern here is between the two.
 """
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ STONE: Palette = ((120, 113, 108), (168, 162, 158), (87, 83, 78), (214, 211, 209
 
 def noise(rng: np.random.Generator, height: int, width: int, cell: float, octaves: int = 4,
           stretch: float = 1.0) -> Texture:
-    """Smooth noise in 0..1: octaves of interpolated random grids, `cell` pixels at the coarsest."""
+    """Return smooth noise 0..1: octaves of interpolated random grids, `cell` pixels at the coarsest."""
     total = np.zeros((height, width), np.float32)
     for octave in range(octaves):
         size = cell / 2**octave
@@ -36,7 +36,7 @@ def noise(rng: np.random.Generator, height: int, width: int, cell: float, octave
 
 
 def gradient(values: Texture, palette: Palette) -> Texture:
-    """Values 0..1 to colours along the palette."""
+    """Map values 0..1 to colours along the palette."""
     colours = np.array(palette, np.float32) / 255
     at = np.clip(values, 0, 1) * (len(colours) - 1)
     low = np.minimum(at.astype(int), len(colours) - 2)
@@ -50,7 +50,7 @@ def _colour(rng: np.random.Generator, palette: Palette) -> tuple[int, int, int]:
 
 
 def poster(rng: np.random.Generator, height: int, width: int, palette: Palette, shapes: int = 60) -> Texture:
-    """Overlapping discs, rings, polygons, bars and lines."""
+    """Draw overlapping discs, rings, polygons, bars and lines."""
     picture = np.full((height, width, 3), _colour(rng, palette), np.uint8)
     size = min(height, width)
     for index in range(shapes):
@@ -77,7 +77,7 @@ def poster(rng: np.random.Generator, height: int, width: int, palette: Palette, 
 
 
 def framed(picture: Texture, border: float = 0.07, colour: tuple[int, int, int] = (235, 230, 220)) -> Texture:
-    """A picture with a plain margin."""
+    """Return a picture with a plain margin."""
     margin = int(border * min(picture.shape[:2]))
     result = picture.copy()
     for edge in (np.s_[:margin], np.s_[-margin:], np.s_[:, :margin], np.s_[:, -margin:]):
@@ -87,7 +87,7 @@ def framed(picture: Texture, border: float = 0.07, colour: tuple[int, int, int] 
 
 def writing(rng: np.random.Generator, height: int, width: int, paper: tuple[int, int, int],
             ink: tuple[int, int, int], line: int = 26) -> Texture:
-    """A sheet with rows of marks of word length, a heading and a figure."""
+    """Draw a sheet with rows of marks of word length, a heading and a figure."""
     picture = np.full((height, width, 3), paper, np.uint8)
     top = int(1.2 * line)
     cv2.rectangle(picture, (line, line // 2), (int(width * 0.6), top), ink, -1)
@@ -104,7 +104,7 @@ def writing(rng: np.random.Generator, height: int, width: int, paper: tuple[int,
 
 
 def planks(rng: np.random.Generator, height: int, width: int, palette: Palette, rows: int = 6) -> Texture:
-    """Boards along x with grain, knots and gaps."""
+    """Draw boards along x with grain, knots and gaps."""
     picture = np.zeros((height, width, 3), np.float32)
     edges = np.linspace(0, height, rows + 1).astype(int)
     for low, high in pairwise(edges):
@@ -122,14 +122,14 @@ def planks(rng: np.random.Generator, height: int, width: int, palette: Palette, 
 
 
 def marble(rng: np.random.Generator, height: int, width: int, palette: Palette) -> Texture:
-    """Veined stone."""
+    """Draw veined stone."""
     warp = noise(rng, height, width, height / 3, 5)
     veins = 1 - np.abs(np.sin(warp * 14 + noise(rng, height, width, height / 6, 4) * 5))
     return gradient(np.clip(0.25 + 0.75 * warp - 0.6 * veins**4, 0, 1), palette)
 
 
 def map_of_islands(rng: np.random.Generator, height: int, width: int) -> Texture:
-    """Land, sea, mountains, a grid of meridians; wraps round in x."""
+    """Draw land, sea, mountains, a grid of meridians; it wraps in x."""
     field = noise(rng, height, 2 * width, height / 4, 6)
     ramp = np.linspace(0, 1, width, dtype=np.float32)
     field = field[:, :width] * (1 - ramp) + field[:, width:] * ramp
@@ -148,7 +148,7 @@ def map_of_islands(rng: np.random.Generator, height: int, width: int) -> Texture
 
 def tiles(rng: np.random.Generator, height: int, width: int, palette: Palette, rows: int, columns: int,
           joint: tuple[int, int, int] = (60, 56, 52), offset: bool = False) -> Texture:
-    """Tiles or bricks, each of another tone with spots of its own."""
+    """Draw tiles or bricks of different tones with spots."""
     picture = np.full((height, width, 3), joint, np.float32) / 255
     grain = noise(rng, height, width, height / rows / 2, 4)
     tall, wide = height / rows, width / columns
@@ -170,7 +170,7 @@ def tiles(rng: np.random.Generator, height: int, width: int, palette: Palette, r
 
 
 def weave(rng: np.random.Generator, height: int, width: int, palette: Palette) -> Texture:
-    """A rug: nested borders, lozenges and stripes, a little worn."""
+    """Draw a rug: nested borders, lozenges and stripes, a little worn."""
     picture = np.zeros((height, width, 3), np.uint8)
     border = min(height, width) // 14
     for ring in range(4):
@@ -192,7 +192,7 @@ def weave(rng: np.random.Generator, height: int, width: int, palette: Palette) -
 
 
 def facade(rng: np.random.Generator, height: int, width: int, palette: Palette, floors: int, bays: int) -> Texture:
-    """The front of a house: plaster, rows of windows with shutters, a door or two, a cornice."""
+    """Draw the front of a house: plaster, rows of windows with shutters, a door or two, a cornice."""
     plaster = np.array(_colour(rng, palette), np.float32) / 255
     picture = plaster * (0.75 + 0.35 * noise(rng, height, width, height / 5, 4)[..., None])
     tall, wide = height / floors, width / bays
@@ -218,7 +218,7 @@ def facade(rng: np.random.Generator, height: int, width: int, palette: Palette, 
 
 def sky(rng: np.random.Generator, height: int, width: int, low: tuple[int, int, int], high: tuple[int, int, int],
         cloud: tuple[int, int, int]) -> Texture:
-    """An evening sky for the inside of a dome: glow at the horizon (the picture's middle), streaks of cloud."""
+    """Draw an evening sky for the inside of a dome: glow at the horizon (the picture's middle), streaks of cloud."""
     up = np.clip(1 - 2 * (np.arange(height, dtype=np.float32) + 0.5) / height, 0, 1)[:, None, None] ** 0.6
     colours = [np.array(colour, np.float32) / 255 for colour in (low, high, cloud)]
     clouds = noise(rng, height, width, height / 5, 5, stretch=5.0)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Make a sample capture: `python sample_scenes/render.py [--scene desk] [--out FOLDER]`.
 
-Renders the scene with Cycles, traces the flares, adds them in linear light, exposes the frames, matches
-features and triangulates the points. A view that is there already is not made again, so an interrupted
-run goes on where it stopped; delete truth/flare, images and removed to make the flares anew.
+Renders the scene with Cycles, traces the flares, adds them in linear light, exposes the frames, matches features and
+triangulates the points. Views that exist already are kept, so an interrupted run resumes; delete truth/flare, images
+and removed to make the flares again.
 """
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ from core.errors import CaptureError
 from core.images.read import read_picture
 from core.system.files import read_json, write_json
 from core.system.progress import Progress
-from sample_scenes.command import leave, run, silent
+from sample_scenes.capture_files import FLARE_LEVEL, FRAME_SUFFIX, SCENE_LEVEL, write_frame, write_layer
+from sample_scenes.command import exit_process, run_command, silence_blender
 from sample_scenes.description import SceneDescription, camera_positions
-from sample_scenes.flares import LOOKS, render_flare
-from sample_scenes.layers import FLARE_LEVEL, FRAME_SUFFIX, SCENE_LEVEL, write_frame, write_layer
+from sample_scenes.flares import LENS_SETUPS, render_flare
 from sample_scenes.scenes import SCENES
 
 CACHE = Path(__file__).resolve().parents[1] / "build" / "sample_scenes"
 
 
 def render_scene(scene: SceneDescription, out: Path, progress: Progress) -> None:
-    """truth/scene and truth/visible_share.json, by Blender."""
+    """Render truth/scene and compute truth/visible_share.json in Blender."""
     target, table = out / "truth" / "scene", out / "truth" / "visible_share.json"
     names, poses = scene.stems, scene.poses
     missing = [i for i, name in enumerate(names) if not (target / f"{name}.exr").is_file()]
@@ -39,23 +39,23 @@ def render_scene(scene: SceneDescription, out: Path, progress: Progress) -> None
     from sample_scenes import shots
 
     scene.build(scene)
-    camera = shots.set_up(scene.camera, scene.samples)
+    camera = shots.set_up_render(scene.camera, scene.samples)
     eyes = camera_positions(poses)
     write_json(table, {f"{name}{FRAME_SUFFIX}": {light.name: shots.visible_share(light, eye) for light in scene.lights}
                        for name, eye in zip(names, eyes, strict=True)})
     progress.stage("render", len(names), len(names) - len(missing))
     for index in missing:
-        with silent():
-            pixels = shots.render(camera, poses[index], scene.seed * 1000 + int(scene.numbers[index]))
+        with silence_blender():
+            pixels = shots.render_view(camera, poses[index], scene.seed * 1000 + int(scene.numbers[index]))
         write_layer(target / f"{names[index]}.exr", pixels, SCENE_LEVEL)
         progress.advance()
 
 
 def add_flares(scene: SceneDescription, out: Path, progress: Progress) -> None:
-    """truth/flare, images and removed."""
+    """Write truth/flare, images and removed."""
     names, poses = scene.stems, scene.poses
     shares = read_json(out / "truth" / "visible_share.json", CaptureError)
-    look = LOOKS[scene.lens]
+    setup = LENS_SETUPS[scene.lens]
     progress.stage("flares", len(names))
     for index, name in enumerate(names):
         layer, frame, clean = (out / "truth" / "flare" / f"{name}.exr", out / "images" / f"{name}{FRAME_SUFFIX}",
@@ -64,8 +64,8 @@ def add_flares(scene: SceneDescription, out: Path, progress: Progress) -> None:
             flare = np.zeros((scene.camera.height, scene.camera.width, 3), np.float32)
             for light in scene.lights:
                 at = poses[index][:3, :3] @ np.array(light.xyz) + poses[index][:3, 3]
-                flare += render_flare(look, scene.camera, at, colour=light.colour,
-                                      intensity=light.strength(float(np.linalg.norm(at))),
+                flare += render_flare(setup, scene.camera, at, colour=light.colour,
+                                      intensity=light.flare_strength(float(np.linalg.norm(at))),
                                       visible_share=shares[f"{name}{FRAME_SUFFIX}"][light.name])
             write_layer(layer, flare, FLARE_LEVEL)
             # The frames are made of the layers as stored, so that the files agree to the last bit.
@@ -77,17 +77,17 @@ def add_flares(scene: SceneDescription, out: Path, progress: Progress) -> None:
 
 
 def write_lists(scene: SceneDescription, out: Path) -> None:
-    """lights.json and split.json."""
+    """Write lights.json and split.json."""
     write_json(out / LIGHTS, {"lights": [
         {"name": light.name, "xyz": list(light.xyz), "radius": light.radius, "colour": list(light.colour)}
         for light in scene.lights]})
-    test = sorted(set(scene.stems[4::8]) | {f"{number:04d}" for number in scene.test})
-    write_json(out / "split.json", {"test": [f"{stem}{FRAME_SUFFIX}" for stem in test]})
+    held_out = sorted(set(scene.stems[4::8]) | {f"{number:04d}" for number in scene.held_out})
+    write_json(out / "split.json", {"test": [f"{stem}{FRAME_SUFFIX}" for stem in held_out]})
 
 
-def make(scene: SceneDescription, out: Path, progress: Progress) -> None:
-    """The whole capture folder."""
-    from sample_scenes.solve import write_model
+def make_capture(scene: SceneDescription, out: Path, progress: Progress) -> None:
+    """Make the whole capture folder."""
+    from sample_scenes.colmap_model import write_model
 
     render_scene(scene, out, progress)
     add_flares(scene, out, progress)
@@ -100,10 +100,10 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, help="capture folder to write; else build/sample_scenes/SCENE")
     parser.add_argument("--scene", choices=sorted(SCENES), default="desk")
-    chosen = parser.parse_args()
-    out = chosen.out or CACHE / chosen.scene
-    return run(lambda progress: make(SCENES[chosen.scene], out, progress))
+    args = parser.parse_args()
+    out = args.out or CACHE / args.scene
+    return run_command(lambda progress: make_capture(SCENES[args.scene], out, progress))
 
 
 if __name__ == "__main__":
-    leave(main())
+    exit_process(main())

@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Clean pictures for `train-removal`: `python sample_scenes/rooms.py --out FOLDER --photos FOLDER --maps FOLDER`.
+"""Render clean pictures for `train-removal`: `python sample_scenes/rooms.py --out FOLDER --photos FOLDER --maps
+FOLDER`.
 
-What is taken for a flare most often is bright and soft, and belongs to the scene. Of such places there are few among
-photographs, and none to be sure of; rooms that Cycles renders (`random_room`) are seen through no lens, so that
-whatever they show is no flare. Photographs are their pictures and textures, environment maps their skies; those that
-trainings hold out are left out here too. A room is a function of its number and of the pictures, but for the noise of
-rendering; one that is there already is not rendered again.
+What a network most often mistakes for a flare is bright and soft and belongs to the scene. Photographs show few such
+places, and none that are certainly free of flare; rooms that Cycles renders (`random_room`) have no lens flare at all.
+Photographs are their pictures and textures, environment maps their skies; those that trainings hold out are left out
+here too. A room is a function of its number and of the pictures, but for the render noise; existing ones are not
+rendered again.
 """
 from __future__ import annotations
 
@@ -22,14 +23,14 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from core.colour.srgb import Pixels
 from core.errors import SettingsError
 from core.images.write import write_png
-from core.removal.training.backgrounds import MAPS, PHOTOS, pictures_of
+from core.removal.training.backgrounds import MAP_SUFFIXES, PHOTO_SUFFIXES, list_pictures
 from core.system.progress import Progress
-from sample_scenes.command import leave, run
+from sample_scenes.command import exit_process, run_command
 from sample_scenes.random_room import Room
 
 
-def developed(random: np.random.Generator, light: Pixels) -> Pixels:
-    """Display values 0..1, exposed by all but the brightest twentieth."""
+def develop(random: np.random.Generator, light: Pixels) -> Pixels:
+    """Return display values 0..1, exposed by all but the brightest twentieth."""
     grey = light.mean(-1)
     level = (np.percentile(grey, 60) + np.minimum(grey, np.percentile(grey, 95)).mean()) / 2
     light = light * min(math.exp(random.normal(math.log(0.13), 0.55)) / max(float(level), 1e-4), 500)
@@ -38,16 +39,17 @@ def developed(random: np.random.Generator, light: Pixels) -> Pixels:
     return np.asarray(np.clip(light, 0, 1) ** (1 / random.choice([1.8, 2.0, 2.2])), np.float32)
 
 
-def pictures(folder: Path, suffixes: Set[str]) -> list[Path]:
-    """Those of a folder that trainings may see. Raises SettingsError where there are none."""
-    found = pictures_of(folder, suffixes, "train")
+def training_pictures(folder: Path, suffixes: Set[str]) -> list[Path]:
+    """Return the pictures of a folder that trainings may see. Raises SettingsError where there are none."""
+    found = list_pictures(folder, suffixes, "train")
     if not found:
         raise SettingsError(f"{folder} holds none of {', '.join(sorted(suffixes))}; name a folder of clean pictures.")
     return found
 
 
-def make(folder: Path, photos: Sequence[Path], maps: Sequence[Path], count: int, progress: Progress) -> None:
-    """The first `count` pictures of all, those that are not in the folder yet. Raises SettingsError for none at all."""
+def make_rooms(folder: Path, photos: Sequence[Path], maps: Sequence[Path], count: int, progress: Progress) -> None:
+    """Render those of the first `count` rooms that are not in the folder yet. Raises SettingsError for a count below 1.
+    """
     if count < 1:
         raise SettingsError(f"--count is the number of rooms, 1 or more, not {count}.")
     paths = [folder / f"room_{number:05d}.png" for number in range(count)]
@@ -56,7 +58,7 @@ def make(folder: Path, photos: Sequence[Path], maps: Sequence[Path], count: int,
     progress.stage("rooms", count, count - len(missing))
     for number in missing:
         random = np.random.default_rng(number)
-        write_png(paths[number], developed(random, Room(random, photos, maps).filmed()))
+        write_png(paths[number], develop(random, Room(random, photos, maps).render()))
         progress.advance()
 
 
@@ -67,10 +69,11 @@ def main() -> int:
     parser.add_argument("--photos", type=Path, required=True, help="folder of clean photographs")
     parser.add_argument("--maps", type=Path, required=True, help="folder of environment maps")
     parser.add_argument("--count", type=int, default=100)
-    chosen = parser.parse_args()
-    return run(lambda progress: make(chosen.out, pictures(chosen.photos, PHOTOS), pictures(chosen.maps, MAPS),
-                                     chosen.count, progress))
+    args = parser.parse_args()
+    return run_command(lambda progress: make_rooms(args.out, training_pictures(args.photos, PHOTO_SUFFIXES),
+                                                   training_pictures(args.maps, MAP_SUFFIXES),
+                                     args.count, progress))
 
 
 if __name__ == "__main__":
-    leave(main())
+    exit_process(main())

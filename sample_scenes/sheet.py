@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A contact sheet of a capture: `python sample_scenes/sheet.py CAPTURE --out SHEET.png`.
+"""Draw a contact sheet of a capture: `python sample_scenes/sheet.py CAPTURE --out SHEET.png`.
 
-For each of some views, from top to bottom: the frame, the scene, the flare (display values). Prints what
-an empty flare would score, |frame - scene| against nothing, in dB.
+For each of some views, from top to bottom: frame, scene, flare (display values). Prints the score of an empty flare,
+|frame - scene| against zero, in dB.
 """
 from __future__ import annotations
 
@@ -21,23 +21,23 @@ from core.images.read import read_picture
 from core.system.files import atomic_path
 
 
-def empty_flare(frame: NDArray[np.float32], scene: NDArray[np.float32]) -> float:
-    """PSNR of no flare at all against |frame - scene|, display values; infinite where there is no flare."""
+def psnr_without_flare(frame: NDArray[np.float32], scene: NDArray[np.float32]) -> float:
+    """Return the PSNR of no flare against |frame - scene|, display values; infinite where there is no flare."""
     error = float(np.mean((frame - scene) ** 2))
     return -10 * math.log10(error) if error > 0 else math.inf
 
 
 def contact_sheet(capture: Path, columns: int, rows: int, width: int) -> NDArray[np.uint8]:
-    """The sheet, (…, …, 3) BGR, of columns x rows views spread evenly over the capture."""
+    """Return the sheet, (height, width, 3) BGR, of columns x rows views spread evenly over the capture."""
     frames = sorted(path for path in (capture / "images").iterdir() if not path.name.startswith("."))
-    chosen = [frames[i] for i in np.linspace(0, len(frames) - 1, columns * rows).round().astype(int)]
+    args = [frames[i] for i in np.linspace(0, len(frames) - 1, columns * rows).round().astype(int)]
     tiles = []
-    for path in chosen:
+    for path in args:
         frame = read_picture(path)
         clean = capture / "removed" / path.name
         scene = read_picture(clean if clean.is_file() else capture / "truth" / "scene" / f"{path.stem}.exr")
         flare = read_picture(capture / "truth" / "flare" / f"{path.stem}.exr")
-        print(f"{path.stem}  empty flare {empty_flare(frame.display(), scene.display()):.2f} dB")
+        print(f"{path.stem}  empty flare {psnr_without_flare(frame.display(), scene.display()):.2f} dB")
         height = round(width * frame.size[1] / frame.size[0])
         tiles.append(np.vstack([picture.resized(width, height).display() for picture in (frame, scene, flare)]))
     lines = [np.hstack(tiles[at:at + columns]) for at in range(0, len(tiles), columns)]
@@ -52,9 +52,9 @@ def main() -> int:
     parser.add_argument("--columns", type=int, default=4)
     parser.add_argument("--rows", type=int, default=2)
     parser.add_argument("--width", type=int, default=360)
-    chosen = parser.parse_args()
-    sheet = contact_sheet(chosen.capture, chosen.columns, chosen.rows, chosen.width)
-    with atomic_path(chosen.out) as temporary:
+    args = parser.parse_args()
+    sheet = contact_sheet(args.capture, args.columns, args.rows, args.width)
+    with atomic_path(args.out) as temporary:
         cv2.imwrite(str(temporary), sheet)
     return 0
 

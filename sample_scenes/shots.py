@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Cycles on the CPU: one view to scene-linear pixels, and how much of a light a camera sees."""
+"""Renders views with Cycles on the CPU as scene-linear pixels, and measures how much of a light a camera sees."""
 from __future__ import annotations
 
 import tempfile
@@ -17,11 +17,11 @@ from core.images.read import read_picture
 from .description import Array, LightSource, Pinhole
 
 SHARE_SAMPLES = 512
-Layers = TypeVar("Layers")
+Rendered = TypeVar("Layers")
 
 
-def set_up(camera: Pinhole, samples: int) -> Any:
-    """Render settings and a camera object with the intrinsics of `camera` (square pixels)."""
+def set_up_render(camera: Pinhole, samples: int) -> Any:
+    """Set the render settings and return a camera object with the intrinsics of `camera` (square pixels)."""
     scene = bpy.context.scene
     scene.render.engine = "CYCLES"
     scene.cycles.device = "CPU"
@@ -48,28 +48,28 @@ def set_up(camera: Pinhole, samples: int) -> Any:
     data.shift_x = (camera.width / 2 - camera.cx) / camera.width
     data.shift_y = (camera.cy - camera.height / 2) / camera.width
     data.clip_start, data.clip_end = 0.01, 1000.0
-    thing = bpy.data.objects.new("Camera", data)
-    scene.collection.objects.link(thing)
-    scene.camera = thing
-    return thing
+    camera_object = bpy.data.objects.new("Camera", data)
+    scene.collection.objects.link(camera_object)
+    scene.camera = camera_object
+    return camera_object
 
 
-def aim(camera: Any, world_to_camera: Array) -> None:
+def set_pose(camera: Any, world_to_camera: Array) -> None:
     """Move the camera object to a pose in OpenCV's axes."""
     pose = np.linalg.inv(world_to_camera) @ np.diag([1.0, -1.0, -1.0, 1.0])
     camera.matrix_world = Matrix(pose.tolist())
     bpy.context.view_layer.update()
 
 
-def render(camera: Any, world_to_camera: Array, seed: int) -> NDArray[np.float32]:
-    """Scene-linear Rec. 709 pixels (height, width, 3)."""
-    aim(camera, world_to_camera)
+def render_view(camera: Any, world_to_camera: Array, seed: int) -> NDArray[np.float32]:
+    """Return scene-linear Rec. 709 pixels (height, width, 3)."""
+    set_pose(camera, world_to_camera)
     bpy.context.scene.cycles.seed = seed
-    return rendered(lambda path: read_picture(path).pixels)
+    return render_with(lambda path: read_picture(path).pixels)
 
 
-def rendered(read: Callable[[Path], Layers]) -> Layers:
-    """What `read` finds in the file of a rendering of the scene as it is set up now."""
+def render_with(read: Callable[[Path], Rendered]) -> Rendered:
+    """Render the scene as it is set up and return what `read` returns for the file."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "view.exr"
         bpy.context.scene.render.filepath = str(path)
@@ -78,11 +78,11 @@ def rendered(read: Callable[[Path], Layers]) -> Layers:
 
 
 def visible_share(light: LightSource, eye: Array) -> float:
-    """The part of the light's disc, as `eye` sees it, that no geometry hides: 0..1.
+    """Return the share of the light's disc, seen from `eye`, that no geometry hides: 0..1.
 
     Rays go from the eye to points spread evenly over the disc (a sunflower spiral) and must reach it.
     """
-    scene, graph = bpy.context.scene, bpy.context.evaluated_depsgraph_get()
+    scene, depsgraph = bpy.context.scene, bpy.context.evaluated_depsgraph_get()
     centre, origin = np.array(light.xyz), np.asarray(eye, float)
     towards = centre - origin
     distance = float(np.linalg.norm(towards))
@@ -94,17 +94,17 @@ def visible_share(light: LightSource, eye: Array) -> float:
     radius = light.radius * np.sqrt(index / SHARE_SAMPLES)
     angle = index * np.pi * (3 - np.sqrt(5))
     points = centre + radius[:, None] * (np.cos(angle)[:, None] * side + np.sin(angle)[:, None] * up)
-    bulbs = [thing for thing in scene.objects if thing.get("light_source")]
+    bulbs = [camera_object for camera_object in scene.objects if camera_object.get("light_source")]
     for bulb in bulbs:
         bulb.hide_viewport = True
-    graph.update()
-    free = 0
+    depsgraph.update()
+    visible = 0
     for point in points:
         ray = point - origin
         length = float(np.linalg.norm(ray))
-        hit = scene.ray_cast(graph, Vector(origin), Vector(ray / length), distance=length - light.radius)[0]
-        free += not hit
+        hit = scene.ray_cast(depsgraph, Vector(origin), Vector(ray / length), distance=length - light.radius)[0]
+        visible += not hit
     for bulb in bulbs:
         bulb.hide_viewport = False
-    graph.update()
-    return free / SHARE_SAMPLES
+    depsgraph.update()
+    return visible / SHARE_SAMPLES

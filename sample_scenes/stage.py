@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Building blocks for scenes in Blender: textured boxes, lathed shapes, lamps. Runs where bpy is."""
+"""Building blocks for scenes in Blender: textured boxes, lathed shapes, lamps."""
 from __future__ import annotations
 
 from collections.abc import Sequence
@@ -18,13 +18,13 @@ Vec = Sequence[float] | NDArray[np.float64]
 
 
 def empty_scene() -> Any:
-    """Forget whatever Blender started with."""
+    """Remove everything from Blender's startup scene."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
     return bpy.context.scene
 
 
 def picture_material(name: str, texture: Texture, roughness: float = 0.7) -> Any:
-    """A matt material that shows `texture` by the UV map."""
+    """Return a matt material that shows `texture` by the UV map."""
     height, width = texture.shape[:2]
     image = bpy.data.images.new(name, width, height)
     pixels = np.ones((height, width, 4), np.float32)
@@ -44,7 +44,7 @@ def picture_material(name: str, texture: Texture, roughness: float = 0.7) -> Any
 
 
 def plain_material(name: str, colour: Vec, roughness: float = 0.5, metallic: float = 0.0) -> Any:
-    """One linear colour."""
+    """Return a material of one linear colour."""
     material = bpy.data.materials.new(name)
     material.use_nodes = True
     shader = next(node for node in material.node_tree.nodes if node.type == "BSDF_PRINCIPLED")
@@ -62,24 +62,23 @@ def _add(name: str, mesh: bmesh.types.BMesh, materials: Sequence[Any], smooth: b
     mesh.free()
     for material in materials:
         data.materials.append(material)
-    thing = bpy.data.objects.new(name, data)
-    bpy.context.scene.collection.objects.link(thing)
-    return thing
+    obj = bpy.data.objects.new(name, data)
+    bpy.context.scene.collection.objects.link(obj)
+    return obj
 
 
-def place(thing: Any, location: Vec, turn: float = 0.0, tilt: Vec = (0.0, 0.0)) -> Any:
-    """Put a thing at `location`, turned by `turn` degrees about z after `tilt` degrees about x and y."""
-    thing.rotation_euler = tuple(np.radians((*tilt, turn)))
-    thing.location = location
-    return thing
+def place(obj: Any, location: Vec, turn: float = 0.0, tilt: Vec = (0.0, 0.0)) -> Any:
+    """Put an object at `location`, turned by `turn` degrees about z after `tilt` degrees about x and y."""
+    obj.rotation_euler = tuple(np.radians((*tilt, turn)))
+    obj.location = location
+    return obj
 
 
 def box(name: str, size: Vec, location: Vec, materials: Sequence[Any], turn: float = 0.0,
         tilt: Vec = (0.0, 0.0), bevel: float = 0.0) -> Any:
-    """A box of `size`, its base centre at `location`.
+    """Add a box of `size`, its base centre at `location`.
 
-    Materials: one for all faces, or one each for the sides (-y, +x, +y, -x) and top; each face shows its
-    whole texture.
+    materials: one for all faces, or one each for the sides (-y, +x, +y, -x) and top; each face shows its whole texture.
     """
     x, y, z = size[0] / 2, size[1] / 2, size[2]
     mesh = bmesh.new()
@@ -95,16 +94,16 @@ def box(name: str, size: Vec, location: Vec, materials: Sequence[Any], turn: flo
         for loop, at in zip(made.loops, ((0, 0), (1, 0), (1, 1), (0, 1)), strict=True):
             loop[uv].uv = at
     bmesh.ops.remove_doubles(mesh, verts=mesh.verts, dist=1e-6)
-    thing = place(_add(name, mesh, materials), location, turn, tilt)
+    obj = place(_add(name, mesh, materials), location, turn, tilt)
     if bevel > 0:
-        modifier = thing.modifiers.new("Bevel", "BEVEL")
+        modifier = obj.modifiers.new("Bevel", "BEVEL")
         modifier.width, modifier.segments = bevel, 2
-    return thing
+    return obj
 
 
 def sheet(name: str, width: float, height: float, location: Vec, material: Any, turn: float = 0.0,
           tilt: Vec = (0.0, 0.0), repeat: Vec = (1.0, 1.0)) -> Any:
-    """A rectangle in x and y about its centre (tilt by 90 about x to stand it up)."""
+    """Add a rectangle in x and y about its centre (tilt by 90 about x to stand it up)."""
     mesh = bmesh.new()
     uv = mesh.loops.layers.uv.new("UVMap")
     x, y = width / 2, height / 2
@@ -116,7 +115,7 @@ def sheet(name: str, width: float, height: float, location: Vec, material: Any, 
 
 def lathe(name: str, profile: Sequence[tuple[float, float]], location: Vec, material: Any,
           segments: int = 48, turn: float = 0.0, tilt: Vec = (0.0, 0.0), repeat: Vec = (1.0, 1.0)) -> Any:
-    """A shape of revolution about z: `profile` is (radius, height) from below to the top."""
+    """Add a surface of revolution about z: `profile` is (radius, height) from below to the top."""
     mesh = bmesh.new()
     uv = mesh.loops.layers.uv.new("UVMap")
     angles = np.linspace(0, 2 * np.pi, segments, endpoint=False)
@@ -136,38 +135,38 @@ def lathe(name: str, profile: Sequence[tuple[float, float]], location: Vec, mate
 
 def ball(name: str, radius: float, location: Vec, material: Any, turn: float = 0.0,
          tilt: Vec = (0.0, 0.0)) -> Any:
-    """A sphere about `location`."""
+    """Add a sphere about `location`."""
     steps = np.linspace(-np.pi / 2, np.pi / 2, 33)
     profile = [(max(radius * float(np.cos(a)), 1e-4), radius * float(np.sin(a))) for a in steps]
     return lathe(name, profile, location, material, 64, turn, tilt)
 
 
 def rod(name: str, start: Vec, end: Vec, radius: float, material: Any) -> Any:
-    """A cylinder from `start` to `end`."""
+    """Add a cylinder from `start` to `end`."""
     direction = Vector(end) - Vector(start)
-    thing = lathe(name, [(1e-4, 0.0), (radius, 0.0), (radius, direction.length), (1e-4, direction.length)],
+    obj = lathe(name, [(1e-4, 0.0), (radius, 0.0), (radius, direction.length), (1e-4, direction.length)],
                   (0, 0, 0), material, 24)
-    thing.matrix_world = Matrix.Translation(Vector(start)) @ direction.to_track_quat("Z", "Y").to_matrix().to_4x4()
-    return thing
+    obj.matrix_world = Matrix.Translation(Vector(start)) @ direction.to_track_quat("Z", "Y").to_matrix().to_4x4()
+    return obj
 
 
 def monkey(name: str, size: float, location: Vec, material: Any, turn: float = 0.0) -> Any:
-    """Blender's monkey head, subdivided once."""
+    """Add Blender's monkey head, subdivided once."""
     bpy.ops.mesh.primitive_monkey_add(size=size, location=location, rotation=(0, 0, np.radians(turn)))
-    thing = bpy.context.object
-    thing.name = name
-    modifier = thing.modifiers.new("Smooth", "SUBSURF")
+    obj = bpy.context.object
+    obj.name = name
+    modifier = obj.modifiers.new("Smooth", "SUBSURF")
     modifier.levels = modifier.render_levels = 1
-    for face in thing.data.polygons:
+    for face in obj.data.polygons:
         face.use_smooth = True
-    thing.data.materials.append(material)
-    return thing
+    obj.data.materials.append(material)
+    return obj
 
 
 def lamp(light: LightSource) -> Any:
-    """A light source: a sphere that only the camera sees, and a lamp in its place (a sun, if distant).
+    """Add a light: a sphere that only the camera sees, and a lamp in its place (a sun, if distant).
 
-    The sphere is marked `light_source`, so that the ray casts of the visible share can leave it out.
+    The sphere has the property `light_source`, so that the ray casts of the visible share can skip it.
     """
     material = bpy.data.materials.new(light.name)
     material.use_nodes = True
@@ -197,20 +196,20 @@ def lamp(light: LightSource) -> Any:
 
 
 def softbox(name: str, location: Vec, target: Vec, size: Vec, power: float, colour: Vec) -> Any:
-    """An area light that faces `target`; cameras do not see it."""
+    """Add an area light that faces `target` and is invisible to cameras."""
     data = bpy.data.lights.new(name, "AREA")
     data.shape, data.size, data.size_y = "RECTANGLE", size[0], size[1]
     data.energy, data.color = power, colour
-    thing = bpy.data.objects.new(name, data)
-    thing.location = location
-    thing.rotation_euler = (Vector(target) - Vector(location)).to_track_quat("-Z", "Y").to_euler()
-    thing.visible_camera = False
-    bpy.context.scene.collection.objects.link(thing)
-    return thing
+    obj = bpy.data.objects.new(name, data)
+    obj.location = location
+    obj.rotation_euler = (Vector(target) - Vector(location)).to_track_quat("-Z", "Y").to_euler()
+    obj.visible_camera = False
+    bpy.context.scene.collection.objects.link(obj)
+    return obj
 
 
-def surroundings(colour: Vec, strength: float) -> None:
-    """An even world."""
+def uniform_world(colour: Vec, strength: float) -> None:
+    """Set a world of one colour."""
     world = bpy.data.worlds.new("World")
     bpy.context.scene.world = world
     world.use_nodes = True
@@ -220,7 +219,7 @@ def surroundings(colour: Vec, strength: float) -> None:
 
 
 def dome(radius: float, texture: Texture, strength: float) -> Any:
-    """The sky: a sphere about the origin that shines inwards."""
+    """Add a sky: a sphere about the origin that emits inwards."""
     material = picture_material("sky", texture)
     nodes, links = material.node_tree.nodes, material.node_tree.links
     emission = nodes.new("ShaderNodeEmission")
@@ -236,7 +235,7 @@ def dome(radius: float, texture: Texture, strength: float) -> Any:
 
 def poster_box(name: str, rng: np.random.Generator, size: Vec, location: Vec, palette: Palette,
                turn: float = 0.0) -> Any:
-    """A box with a drawing of its own on each side, as crates, cubes and plinths are."""
+    """Add a box with a different drawing on each side, as crates, cubes and plinths have."""
     x, y, z = size
     sides = [(x, z), (y, z), (x, z), (y, z), (x, y)]
     scale = 420 / max(size)

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""How good a removal is: scores of cleaned pictures against flare-free ones, beside the untouched input.
+"""Scores flare removal: clean pictures against flare-free ones, and beside them the untouched input. `eval-removal`
+calls it.
 
-Paired folders are read as the field keeps them: input/ and gt/ (also target/, clean/ or scene/ for the
-latter, flare/ or blend/ for the former), pictures matched by name, or by the number in it, as Flare7K++'s
-real and synthetic test sets have input_000001.png beside gt_000001.png; mask/ if there is one. Of several the
-first of these counts: beside input/ a folder flare/ holds what was taken away. A folder of such folders is a set
-of categories.
+Paired folders are read in their common layout: input/ and gt/ (also target/, clean/ or scene/ for the latter, flare/ or
+blend/ for the former), pictures matched by name, or by the number in it: Flare7K++'s real and synthetic test sets have
+input_000001.png and gt_000001.png. mask/ is optional. The first name that exists counts: beside input/, a folder flare/
+holds what was removed. A folder of such folders is a set of categories.
 """
 from __future__ import annotations
 
@@ -21,40 +21,43 @@ import numpy as np
 
 from ..colour.srgb import Pixels
 from ..errors import FrameError, SettingsError
-from ..images.contact_sheet import labelled, side_by_side
+from ..images.contact_sheet import add_label, side_by_side
 from ..images.listing import pictures_in
-from ..images.picture import are_one_shape
+from ..images.picture import same_aspect
 from ..images.read import read_picture
 from ..metrics.evaluation import cell
 from ..metrics.pictures import Perceptual, flip, psnr, ssim
 from ..system.progress import Progress
-from .synthesis.prescription import Prescription, built_in
-from .training.backgrounds import Backgrounds, kept_for_test
+from .synthesis.prescription import Prescription, built_in_lenses
+from .training.backgrounds import Backgrounds, is_held_out
 
-INPUTS = ("input", "flare", "blend")
-TRUTHS = ("gt", "target", "clean", "scene")
-WORST = 10
-TALLEST = 2
-"""Heights of a picture on the sheet by its width: what is taller, a column of pixels say, is squeezed."""
-CANVAS = 640
+INPUT_FOLDERS = ("input", "flare", "blend")
+TRUTH_FOLDERS = ("gt", "target", "clean", "scene")
+SHEET_ROWS = 10
+"""Pictures on the sheet of the worst."""
+MAX_TILE_ASPECT = 2
+"""Height of a tile of the sheet divided by its width, at most; taller pictures, such as a column of pixels, are
+squeezed."""
+CANVAS_SIZE = 640
 """Pixels a side of the canvas of synthesised flares."""
-ALIKE = 100.0
-"""PSNR in dB that pictures which are the same count for in gains and means: that of an error of 0.00001."""
+IDENTICAL_PSNR = 100.0
+"""PSNR in dB that stands for that of identical pictures in gains and means: an error of 0.00001."""
 Scores = dict[str, float | None]
 
 
 @dataclass(frozen=True)
 class Case:
-    """A picture with flare and the same without: display values 0..1 (height, width, 3), read when asked for."""
+    """A picture with flare and without: display values 0..1 (height, width, 3), then a mask if there is one; read on
+    demand."""
 
     name: str
     category: str
     read: Callable[[], tuple[Pixels, Pixels, Pixels | None]]
 
 
-def paired(folder: Path | str) -> list[Case]:
-    """The cases of a folder, see the module's head. Raises SettingsError where it holds none, or some without
-    their counterpart."""
+def read_cases(folder: Path | str) -> list[Case]:
+    """Return the cases of a folder, see the module's head. Raises SettingsError where it holds none, or a picture has
+    no counterpart."""
     folder = Path(folder)
     cases: list[Case] = []
     if not folder.is_dir():
@@ -62,30 +65,31 @@ def paired(folder: Path | str) -> list[Case]:
                             "and gt/, or a folder of such folders.")
     for inputs in sorted(path for path in folder.rglob("*") if path.is_dir()):
         root = inputs.parent
-        if inputs.name.lower() not in INPUTS or inputs != _first_of(root, INPUTS):
+        if inputs.name.lower() not in INPUT_FOLDERS or inputs != _find_folder(root, INPUT_FOLDERS):
             continue
-        truth = _first_of(root, TRUTHS)
+        truth = _find_folder(root, TRUTH_FOLDERS)
         if truth is None:
             continue
-        marked = _first_of(root, ("mask",))
+        mask_folder = _find_folder(root, ("mask",))
         category = root.relative_to(folder).as_posix() if root != folder else root.name
-        truths, masks = _by_key(truth), _by_key(marked) if marked else {}
-        for key, path in _by_key(inputs).items():
+        truths, masks = _index_by_key(truth), _index_by_key(mask_folder) if mask_folder else {}
+        for key, path in _index_by_key(inputs).items():
             if key not in truths:
                 raise SettingsError(f"{path} has no counterpart in {truth}; add it, or remove the picture.")
-            cases.append(Case(path.stem, category, _reader(path, truths[key], masks.get(key))))
+            cases.append(Case(path.stem, category, _case_reader(path, truths[key], masks.get(key))))
     if not cases:
         raise SettingsError(f"{folder} holds no pairs; give a folder with input/ and gt/, or a folder of such folders.")
     return cases
 
 
-def _first_of(root: Path, names: Sequence[str]) -> Path | None:
-    """The folder in `root` that has the first of these names, in capitals or not."""
+def _find_folder(root: Path, names: Sequence[str]) -> Path | None:
+    """Return the folder in `root` with the first of these names that exists, in upper or lower case."""
     folders = {path.name.lower(): path for path in sorted(root.iterdir()) if path.is_dir()}
     return next((folders[name] for name in names if name in folders), None)
 
 
-def _by_key(folder: Path) -> dict[str, Path]:
+def _index_by_key(folder: Path) -> dict[str, Path]:
+    """Return a folder's pictures by name without prefix, or by the whole name if that is ambiguous."""
     paths = pictures_in(folder)
     twice = [stem for stem, count in Counter(path.stem for path in paths).items() if count > 1]
     if twice:
@@ -94,30 +98,31 @@ def _by_key(folder: Path) -> dict[str, Path]:
     return plain if len(plain) == len(paths) else {path.stem: path for path in paths}
 
 
-def _reader(path: Path, truth: Path, mask: Path | None) -> Callable[[], tuple[Pixels, Pixels, Pixels | None]]:
+def _case_reader(path: Path, truth: Path, mask: Path | None) -> Callable[[], tuple[Pixels, Pixels, Pixels | None]]:
     def read() -> tuple[Pixels, Pixels, Pixels | None]:
         frame, clean = read_picture(path), read_picture(truth)
         if frame.size != clean.size:
             raise FrameError(f"{path} is {frame.size[0]} x {frame.size[1]} pixels and {truth} {clean.size[0]} x "
                              f"{clean.size[1]}; make them one size.")
-        marked = read_picture(mask) if mask else None
-        if marked and not are_one_shape(marked.size, frame.size):
-            raise FrameError(f"{mask} is {marked.size[0]} x {marked.size[1]} pixels, another shape than {path} of "
-                             f"{frame.size[0]} x {frame.size[1]}; make it for that picture, or remove it.")
-        return frame.display(), clean.display(), marked.resized(*frame.size).display() if marked else None
+        mask_picture = read_picture(mask) if mask else None
+        if mask_picture and not same_aspect(mask_picture.size, frame.size):
+            raise FrameError(f"{mask} is {mask_picture.size[0]} x {mask_picture.size[1]} pixels, another shape than "
+                             f"{path} of {frame.size[0]} x {frame.size[1]}; make it for that picture, or remove it.")
+        values = mask_picture.resized(*frame.size).display() if mask_picture else None
+        return frame.display(), clean.display(), values
 
     return read
 
 
 def evaluate(cases: Sequence[Case], clean: Callable[[Pixels], Pixels], progress: Progress | None = None, *,
              lpips: Perceptual | None = None) -> dict[str, Any]:
-    """Scores of every case, means by category and of all; JSON-able.
+    """Return scores of every case, means by category and of all; JSON-able.
 
-    clean: display values (height, width, 3) to the same without flare. `gain_db` is the PSNR above the untouched
-    input's (where two pictures are the same and have none, `ALIKE` counts, in means too), `made_worse` the share of
-    pictures with a gain below -0.5 dB; `failed` what is wrong with pairs that cannot be read, which are left out;
-    `masked_psnr` counts the pixels of the mask alone. lpips is null where no weights for it were given, FLIP where its
-    package is not installed. Raises FrameError where none can be read.
+    clean: removes the flare from display values (height, width, 3). gain_db: PSNR minus that of the untouched input;
+    where two pictures are identical, IDENTICAL_PSNR counts, in means too. made_worse: share of pictures with a gain
+    below -0.5 dB. failed: messages about pairs that cannot be read, which are left out. masked_psnr: over the pixels of
+    the mask. lpips is null without weights for it, FLIP where its package is not installed. Raises FrameError where no
+    pair can be read.
     """
     progress = progress or Progress()
     progress.stage("eval-removal", len(cases))
@@ -135,7 +140,7 @@ def evaluate(cases: Sequence[Case], clean: Callable[[Pixels], Pixels], progress:
         row: dict[str, Any] = {"name": case.name, "category": case.category,
                                "result": _scores(result, truth, mask, lpips),
                                "input": _scores(frame, truth, mask, lpips)}
-        row["gain_db"] = round(_level(row["result"]) - _level(row["input"]), 4)
+        row["gain_db"] = round(_psnr_or_identical(row["result"]) - _psnr_or_identical(row["input"]), 4)
         rows.append(row)
         progress.advance()
     if not rows:
@@ -162,14 +167,14 @@ def _summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
                                "made_worse": round(sum(gain < -0.5 for gain in gains) / max(len(gains), 1), 4)}
     for side in ("result", "input"):
         others = sorted({name for row in rows for name in row[side]} - {"psnr"})
-        summary[side] = {"psnr": _mean([_level(row[side]) for row in rows]),
+        summary[side] = {"psnr": _mean([_psnr_or_identical(row[side]) for row in rows]),
                          **{name: _mean([row[side].get(name) for row in rows]) for name in others}}
     return summary
 
 
-def _level(scores: Scores) -> float:
-    """PSNR in dB; `ALIKE` where there is none, of pictures that are the same."""
-    return ALIKE if scores["psnr"] is None else scores["psnr"]
+def _psnr_or_identical(scores: Scores) -> float:
+    """Return PSNR in dB; IDENTICAL_PSNR for identical pictures."""
+    return IDENTICAL_PSNR if scores["psnr"] is None else scores["psnr"]
 
 
 def _mean(values: Iterable[float | None]) -> float | None:
@@ -177,8 +182,8 @@ def _mean(values: Iterable[float | None]) -> float | None:
     return round(sum(numbers) / len(numbers), 4) if numbers else None
 
 
-def table(scores: dict[str, Any]) -> str:
-    """The means as text: result, input in brackets."""
+def format_table(scores: dict[str, Any]) -> str:
+    """Return the means as text: the result, in brackets the input."""
     lines = [f"{'category':24}{'n':>5}{'PSNR':>16}{'gain':>7}{'SSIM':>18}{'LPIPS':>8}{'FLIP':>8}{'worse':>7}"]
     for name, part in [*scores["categories"].items(), ("all", scores["mean"])]:
         after, before = part["result"], part["input"]
@@ -191,46 +196,46 @@ def table(scores: dict[str, Any]) -> str:
 
 def worst_sheet(cases: Sequence[Case], clean: Callable[[Pixels], Pixels], scores: dict[str, Any],
                 width: int = 400) -> Pixels:
-    """The pictures with the lowest gain, worst first: input | result | truth | flare taken, display values."""
+    """Return the pictures with the lowest gain, worst first: input | result | truth | removed flare, display values."""
     import cv2
 
     by_name = {(case.category, case.name): case for case in cases}
     strips = []
-    for row in sorted(scores["pictures"], key=lambda row: row["gain_db"])[:WORST]:
+    for row in sorted(scores["pictures"], key=lambda row: row["gain_db"])[:SHEET_ROWS]:
         case, gain = by_name[row["category"], row["name"]], row["gain_db"]
         frame, truth, _ = case.read()
         result = clean(frame)
         taken = np.clip((frame - result) * 2, 0, 1)
-        height = int(np.clip(round(width * frame.shape[0] / frame.shape[1]), 1, TALLEST * width))
+        height = int(np.clip(round(width * frame.shape[0] / frame.shape[1]), 1, MAX_TILE_ASPECT * width))
         parts = [np.asarray(cv2.resize(part, (width, height), interpolation=cv2.INTER_AREA), np.float32)
                  for part in (frame, result, truth, taken)]
         text = f"{case.category} / {case.name}: {gain:+.2f} dB   input | result | truth | taken away x2"
-        strips.append(labelled(text, side_by_side(parts)))
+        strips.append(add_label(text, side_by_side(parts)))
     return np.concatenate(strips) if strips else np.zeros((20, 4 * width, 3), np.float32)
 
 
-def held_out(lenses: Iterable[Prescription]) -> list[Prescription]:
-    """Those that are kept from training, by name; the built-in ones where none is."""
-    return [lens for lens in lenses if kept_for_test(lens.name)] or built_in()
+def held_out_lenses(lenses: Iterable[Prescription]) -> list[Prescription]:
+    """Return the lenses that are kept out of training by name, or the built-in ones if none is."""
+    return [lens for lens in lenses if is_held_out(lens.name)] or built_in_lenses()
 
 
-def synthetic(seed: int, count: int, backgrounds: Backgrounds, lenses: Sequence[Prescription],
+def synthetic_cases(seed: int, count: int, backgrounds: Backgrounds, lenses: Sequence[Prescription],
               size: tuple[int, int]) -> list[Case]:
-    """`count` cases of every class of flare, a function of the seed: the test set that needs no data but clean
+    """Return `count` cases of every flare class, a function of the seed: a test set that needs no data but clean
     pictures. Frames are 8 bit codes."""
-    from .synthesis.flare import CLASSES
-    from .training.flare_bank import OneFlare
-    from .training.pairs import pair
+    from .synthesis.flare import FLARE_CLASSES
+    from .training.flare_bank import SingleFlareBank
+    from .training.pairs import make_pair
 
     def reader(index: int, number: int) -> Callable[[], tuple[Pixels, Pixels, None]]:
         def read() -> tuple[Pixels, Pixels, None]:
             random = np.random.default_rng((seed, index, number))
-            bank = OneFlare((seed, index, number), CANVAS, lenses, CLASSES[index])
-            made = pair(random, bank, backgrounds, *size, clean=0)
-            return np.round(made.frame * 255).astype(np.float32) / 255, made.scene, None
+            bank = SingleFlareBank((seed, index, number), CANVAS_SIZE, lenses, FLARE_CLASSES[index])
+            pair = make_pair(random, bank, backgrounds, *size, clean_share=0)
+            return np.round(pair.frame * 255).astype(np.float32) / 255, pair.scene, None
 
         return read
 
     return [Case(f"{number:04d}", kind, reader(index, number))
-            for index, kind in enumerate(CLASSES) for number in range(count)]
+            for index, kind in enumerate(FLARE_CLASSES) for number in range(count)]
 

@@ -2,6 +2,6 @@
 """Lens flares by optics alone: traced ghosts, diffraction, scatter. See `render_flare`."""
 from __future__ import annotations
 
-from .flare import LOOKS, Look, render_flare
+from .flare import LENS_SETUPS, LensSetup, render_flare
 
-__all__ = ["LOOKS", "Look", "render_flare"]
+__all__ = ["LENS_SETUPS", "LensSetup", "render_flare"]

@@ -12,9 +12,12 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Aperture:
-    """radius: of the circle through the corners, mm. turn: of the first corner from +x, degrees. curved:
-    0 straight blades, 1 a circle. uneven: spread of the blades' distances from the centre, of the radius.
-    dust: number of specks. seed: of what is uneven."""
+    """An aperture stop.
+
+    radius: of the circle through the corners, mm. turn: of the first corner from +x, degrees. curved: 0 for straight
+    blades, 1 for a circle. uneven: standard deviation of the blades' distances from the centre, relative to the radius.
+    dust: number of specks. seed: of the unevenness.
+    """
 
     radius: float
     blades: int
@@ -26,7 +29,8 @@ class Aperture:
 
 
 def edge_radius(aperture: Aperture, sectors: int) -> Array:
-    """Distance of the edge from the centre, of the radius, for `sectors` directions from +x round to +y."""
+    """Return the distance of the edge from the centre, relative to the radius, for `sectors` directions from +x round
+    to +y."""
     rng = np.random.default_rng(aperture.seed)
     angles = np.arange(sectors) / sectors * 2 * np.pi
     normals = np.radians(aperture.turn) + (np.arange(aperture.blades) + 0.5) / aperture.blades * 2 * np.pi
@@ -37,7 +41,7 @@ def edge_radius(aperture: Aperture, sectors: int) -> Array:
 
 
 def transmission(aperture: Aperture, size: int, fill: float) -> Array:
-    """The stop as a picture (size, size), 0..1, its radius `fill` of half the side; with dust on the glass."""
+    """Return the stop as a picture (size, size), 0..1, its radius `fill` of half the side, with dust on the glass."""
     axis = (np.arange(size) + 0.5) / size * 2 - 1
     x, y = np.meshgrid(axis / fill, axis / fill)
     radius, angle = np.hypot(x, y), np.arctan2(y, x)

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The ghosts of one light: every strong pair of reflections, traced and drawn.
+"""Traces and draws the ghosts of one light: every strong pair of reflections.
 
-The lens is round but for its stop, so a light at field angle theta and azimuth phi is traced in the plane
-phi = 0 and turned afterwards; the stop's polygon keeps its place in the camera. Where rays of a cell end
-on the sensor gives the ghost's shape and brightness (the inverse of the area's change, as in Hullin et
-al. 2011, section 4.2); where they crossed the stop, interpolated by pixel, gives its edge.
+The lens is round but for its stop, so a light at field angle theta and azimuth phi is traced in the plane phi = 0 and
+rotated afterwards; the stop's polygon keeps its orientation in the camera. Where the rays of a cell end on the sensor
+gives the ghost's shape and brightness (the inverse of the area's change, as in Hullin et al. 2011, section 4.2); where
+they crossed the stop, interpolated by pixel, gives its edge.
 """
 from __future__ import annotations
 
@@ -17,28 +17,29 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from core.removal.synthesis.prescription import Prescription
+
 from .aperture import Aperture, edge_radius
-from .prescription import Prescription
 from .spectrum import responses, wavelengths
 from .trace import SENSOR_X, STOP_X, STRAY, WEIGHT, trace_grid
 
 Array = NDArray[np.float64]
 
-REFERENCE = 0.55
+REFERENCE_WAVELENGTH = 0.55
 """Micrometres."""
-COARSE = 25
-"""Rays a side of the grid that looks for the bundle which comes through."""
-WIDEST = 1300
-"""Pixels a row beyond which ghosts are not drawn finer than the picture."""
-DENSEST = 40.0
-"""Where rays cross (caustics) the density of light has no bound; here it has."""
+COARSE_RAYS = 25
+"""Rays a side of the grid that finds the bundle which passes the lens."""
+MAX_SUPERSAMPLED_WIDTH = 1300
+"""Pixels a row beyond which ghosts are not supersampled."""
+MAX_DENSITY = 40.0
+"""Largest density of light; where rays cross (caustics) it would be unbounded."""
 
 
 @dataclass(frozen=True)
 class GhostSettings:
-    """count: ghosts kept, the brightest first. grid: rays a side. bands: wavelengths. gain: brightness.
-    rim: how much brighter the edge is than the inside (diffraction at the stop). size: standard deviation
-    (tan) of the blur that a light of some size gives its ghosts. supersample: pixels drawn for one."""
+    """How ghosts are drawn. count: ghosts, the brightest first. grid: rays a side. bands: wavelengths. gain:
+    brightness. rim: how much brighter the edge is than the inside (diffraction at the stop). size: standard deviation
+    (tan) of the blur by the extent of the light. supersample: pixels drawn for one."""
 
     count: int = 22
     grid: int = 40
@@ -51,7 +52,7 @@ class GhostSettings:
 
 @dataclass(frozen=True)
 class Optics:
-    """A lens in use: its prescription, coatings (micrometres per surface, 0 bare), and its stop."""
+    """A lens in use: its prescription, coatings (micrometres per surface, 0 for bare), and its stop."""
 
     lens: Prescription
     coating: Array
@@ -60,11 +61,11 @@ class Optics:
     @property
     def sensor(self) -> float:
         """z of the sensor, focused at infinity."""
-        return float(self.lens.vertices[-1] + self.lens.paraxial()[1])
+        return float(self.lens.vertices[-1] + self.lens.back_focus())
 
     def pairs(self, count: int, fill: float = 0.12) -> list[tuple[int, int]]:
-        """The `count` brightest pairs (first, second) for a light at tan(field angle) = `fill`."""
-        surfaces = _surfaces(self, REFERENCE)
+        """Return the `count` brightest pairs (first, second) for a light at tan(field angle) = `fill`."""
+        surfaces = _trace_arguments(self, REFERENCE_WAVELENGTH)
         optical = [at for at in range(len(self.coating)) if at != self.lens.stop]
         scored = []
         axis = np.linspace(-1, 1, 21) * self.lens.semi_aperture[0]
@@ -75,13 +76,13 @@ class Optics:
                 passes = arrived & (rays[..., STRAY] < 1) & (radius < self.aperture.radius)
                 if passes.sum() < 2:
                     continue
-                spread = np.ptp(rays[passes][:, :2], axis=0).max() + 0.02 * self.lens.paraxial()[0]
+                spread = np.ptp(rays[passes][:, :2], axis=0).max() + 0.02 * self.lens.focal_length()
                 scored.append((rays[passes][:, WEIGHT].sum() / spread**2, first, second))
         return [(first, second) for _, first, second in sorted(scored, reverse=True)[:count]]
 
 
 def coatings(lens: Prescription, design: tuple[float, ...], cemented: float = 0.0) -> Array:
-    """Quarter-wave wavelengths, `design` in turn over the surfaces between glass and air."""
+    """Return quarter-wave wavelengths, `design` in turn over the surfaces between glass and air."""
     values = np.full(len(lens.index), cemented)
     before, turn = 1.0, 0
     for at, after in enumerate(lens.index):
@@ -93,8 +94,8 @@ def coatings(lens: Prescription, design: tuple[float, ...], cemented: float = 0.
 
 
 @njit(cache=True)
-def _span(start: float, slope: float, left: float, right: float) -> tuple[float, float]:
-    """The part of left..right where start + slope u is not negative."""
+def _non_negative_span(start: float, slope: float, left: float, right: float) -> tuple[float, float]:
+    """Return the part of left..right where start + slope u is not negative."""
     if slope > 0.0:
         return max(left, -start / slope), right
     if slope < 0.0:
@@ -103,7 +104,7 @@ def _span(start: float, slope: float, left: float, right: float) -> tuple[float,
 
 
 @njit(cache=True)
-def _draw(rays: Array, arrived: NDArray[np.bool_], px: Array, py: Array, light: Array, stop_x: Array,
+def _rasterise(rays: Array, arrived: NDArray[np.bool_], px: Array, py: Array, light: Array, stop_x: Array,
           stop_y: Array, radius: float, edges: Array, rim: float, colour: Array, picture: NDArray[np.float32]) -> None:
     """Add the cells of a traced grid to `picture`. px, py: pixels; light: density by ray."""
     rows, columns = px.shape
@@ -140,9 +141,9 @@ def _draw(rays: Array, arrived: NDArray[np.bool_], px: Array, py: Array, light: 
                     # Barycentric coordinates run linearly along a row: b = start + slope (u - x0).
                     v = y + 0.5 - y0
                     start1, start2 = (x0 - x2) * v / area, (x1 - x0) * v / area
-                    left, right = _span(start1, slope1, low_x - x0, high_x - x0)
-                    left, right = _span(start2, slope2, left, right)
-                    left, right = _span(1.0 - start1 - start2, -slope1 - slope2, left, right)
+                    left, right = _non_negative_span(start1, slope1, low_x - x0, high_x - x0)
+                    left, right = _non_negative_span(start2, slope2, left, right)
+                    left, right = _non_negative_span(1.0 - start1 - start2, -slope1 - slope2, left, right)
                     first = max(0, math.ceil(left + x0 - 0.5))
                     for x in range(first, min(width - 1, math.floor(right + x0 - 0.5)) + 1):
                         u = x + 0.5 - x0
@@ -152,7 +153,7 @@ def _draw(rays: Array, arrived: NDArray[np.bool_], px: Array, py: Array, light: 
                         mask = min(max((1.0 - stray) / ramp + 0.5, 0.0), 1.0)
                         if mask == 0.0:
                             continue
-                        glow = 0.0
+                        rim_glow = 0.0
                         for passage in range(3):
                             if passage > 0 and stop_x[r0, c0, passage] == s0x:
                                 break
@@ -166,43 +167,43 @@ def _draw(rays: Array, arrived: NDArray[np.bool_], px: Array, py: Array, light: 
                             edge = edges[low % sectors] * (1.0 - part) + edges[(low + 1) % sectors] * part
                             inside = edge - math.sqrt(sx * sx + sy * sy) / radius
                             mask *= min(max(inside / ramp + 0.5, 0.0), 1.0)
-                            glow = max(glow, math.exp(-(inside * inside) / (0.0036 + ramp * ramp)))
+                            rim_glow = max(rim_glow, math.exp(-(inside * inside) / (0.0036 + ramp * ramp)))
                         if mask == 0.0:
                             continue
-                        value = mask * (1.0 + rim * glow)
+                        value = mask * (1.0 + rim * rim_glow)
                         value *= b0 * light[r0, c0] + b1 * light[r1, c1] + b2 * light[r2, c2]
                         for channel in range(3):
                             picture[y, x, channel] += value * colour[channel]
 
 
 def _density(x: Array, y: Array, cell: float) -> Array:
-    """Area on the plane of entry (of pi f^2) over area on the sensor (tan^2), by ray."""
+    """Return area on the plane of entry (of pi f^2) divided by area on the sensor (tan^2), by ray."""
     xr, xc = np.gradient(x)
     yr, yc = np.gradient(y)
     stretch = (xr * yc - xc * yr) / cell
-    return 1.0 / np.sqrt(stretch**2 + DENSEST**-2)
+    return 1.0 / np.sqrt(stretch**2 + MAX_DENSITY**-2)
 
 
 def draw_ghosts(optics: Optics, pairs: list[tuple[int, int]], settings: GhostSettings, light: tuple[float, float],
                 focal: tuple[float, float], centre: tuple[float, float], width: int, height: int
                 ) -> NDArray[np.float32]:
-    """Linear light (height, width, 3) of the ghosts of a white light of strength 1.
+    """Return linear light (height, width, 3) of the ghosts of a white light of strength 1.
 
     light: normalised coordinates (x/z, y/z). focal, centre: pixels.
     """
-    fine = max(1, min(settings.supersample, WIDEST // width))
-    picture = np.zeros((height * fine, width * fine, 3), np.float32)
+    supersample = max(1, min(settings.supersample, MAX_SUPERSAMPLED_WIDTH // width))
+    picture = np.zeros((height * supersample, width * supersample, 3), np.float32)
     lens = optics.lens
-    length, _ = lens.paraxial()
+    length = lens.focal_length()
     slope = math.hypot(*light)
     azimuth = math.atan2(light[1], light[0])
     cosine, sine = math.cos(azimuth), math.sin(azimuth)
     edges = edge_radius(optics.aperture, 720)
     bands = responses(settings.bands)
-    surfaces = _surfaces(optics, REFERENCE)
-    grids = {pair: _bundle(optics, slope, pair, surfaces, settings.grid) for pair in pairs}
+    surfaces = _trace_arguments(optics, REFERENCE_WAVELENGTH)
+    grids = {pair: _find_bundle(optics, slope, pair, surfaces, settings.grid) for pair in pairs}
     for band, wavelength in enumerate(wavelengths(settings.bands)):
-        surfaces = _surfaces(optics, wavelength)
+        surfaces = _trace_arguments(optics, wavelength)
         for pair, grid in grids.items():
             if grid is None:
                 continue
@@ -211,28 +212,29 @@ def draw_ghosts(optics: Optics, pairs: list[tuple[int, int]], settings: GhostSet
             x, y = -rays[..., SENSOR_X] / length, -rays[..., SENSOR_X + 1] / length
             cell = (grid[0][1] - grid[0][0]) * (grid[1][1] - grid[1][0]) / (math.pi * length**2)
             dense = _density(x, y, cell) * rays[..., WEIGHT] / math.sqrt(1 + slope**2)
-            px = fine * (centre[0] + focal[0] * (cosine * x - sine * y))
-            py = fine * (centre[1] + focal[1] * (sine * x + cosine * y))
+            px = supersample * (centre[0] + focal[0] * (cosine * x - sine * y))
+            py = supersample * (centre[1] + focal[1] * (sine * x + cosine * y))
             sx, sy = rays[..., STOP_X::2], rays[..., STOP_X + 1::2]
-            _draw(rays, arrived, px, py, dense, cosine * sx - sine * sy, sine * sx + cosine * sy,
+            _rasterise(rays, arrived, px, py, dense, cosine * sx - sine * sy, sine * sx + cosine * sy,
                   optics.aperture.radius, edges, settings.rim, bands[band], picture)
-    soft = cv2.GaussianBlur(picture, (0, 0), max(settings.size * focal[0] * fine, 0.3))
+    soft = cv2.GaussianBlur(picture, (0, 0), max(settings.size * focal[0] * supersample, 0.3))
     small = cv2.resize(soft, (width, height), interpolation=cv2.INTER_AREA)
     return (small * np.float32(settings.gain)).astype(np.float32)
 
 
-def _surfaces(optics: Optics, wavelength: float) -> tuple[Any, ...]:
-    """What `trace_grid` wants to know of the lens at a wavelength."""
+def _trace_arguments(optics: Optics, wavelength: float) -> tuple[Any, ...]:
+    """Return the arguments of `trace_grid` that describe the lens at a wavelength."""
     lens = optics.lens
     return (lens.curvature, lens.vertices, lens.indices(wavelength), lens.semi_aperture, optics.coating, lens.stop,
             optics.sensor, wavelength)
 
 
-def _bundle(optics: Optics, slope: float, pair: tuple[int, int], surfaces: tuple[Any, ...], grid: int
+def _find_bundle(optics: Optics, slope: float, pair: tuple[int, int], surfaces: tuple[Any, ...], grid: int
             ) -> tuple[Array, Array] | None:
-    """Where rays must enter to come through: a grid over the bounds of those of a coarse grid that do."""
-    reach = 1.15 * optics.lens.semi_aperture[0]
-    axis = np.linspace(-reach, reach, COARSE)
+    """Return where rays must enter to pass the lens: a grid over the bounds of those rays of a coarse grid that do;
+    None if none does."""
+    extent = 1.15 * optics.lens.semi_aperture[0]
+    axis = np.linspace(-extent, extent, COARSE_RAYS)
     rays, arrived = trace_grid(axis, axis, slope, *pair, *surfaces)
     radius = np.hypot(rays[..., STOP_X::2], rays[..., STOP_X + 1::2]).max(axis=-1)
     passes = arrived & (rays[..., STRAY] < 1.05) & (radius < 1.05 * optics.aperture.radius)

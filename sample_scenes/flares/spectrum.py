@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Wavelengths and what a camera's red, green and blue make of them."""
+"""Wavelengths, and a camera's response to them in red, green and blue."""
 from __future__ import annotations
 
 import numpy as np
@@ -7,22 +7,23 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-SHORTEST, LONGEST = 0.40, 0.70
+MIN_WAVELENGTH, MAX_WAVELENGTH = 0.40, 0.70
 """Micrometres."""
 PEAKS = (0.605, 0.540, 0.455)
 WIDTHS = (0.046, 0.044, 0.036)
 
 
 def wavelengths(count: int) -> Array:
-    """Middles of `count` equal bands, micrometres."""
-    return SHORTEST + (np.arange(count) + 0.5) * (LONGEST - SHORTEST) / count
+    """Return the middles of `count` equal bands, micrometres."""
+    return MIN_WAVELENGTH + (np.arange(count) + 0.5) * (MAX_WAVELENGTH - MIN_WAVELENGTH) / count
 
 
 def responses(count: int) -> Array:
-    """(count, 3): share of each band in R, G, B, a bell about each peak; an even spectrum gives (1, 1, 1).
+    """Return (count, 3), the share of each band in R, G, B: a Gaussian about each peak; an even spectrum gives (1, 1,
+    1).
 
-    Bells of a camera's kind, not the eye's matching functions: those are negative in places, and light of
-    one colour must never take away from another.
+    They are a camera's curves, not the eye's matching functions: those are negative in places, and monochromatic light
+    must never reduce another colour.
     """
     bells = np.exp(-0.5 * ((wavelengths(count)[:, None] - PEAKS) / WIDTHS) ** 2)
     return bells / bells.sum(axis=0)

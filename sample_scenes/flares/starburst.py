@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Light spread about the light itself: starburst, veiling glare, a ring, a streak.
+"""Draws light spread about the light itself: starburst, glow, rings, streaks.
 
-Starburst: far-field diffraction at the stop is the power of its Fourier transform, wider for longer
-wavelengths in proportion. Veiling glare: scatter in glass and on sensor, two broad lobes. Ring: the
-diffraction of fine concentric grooves (a lens polished or moulded on a lathe), at an angle in proportion
-to the wavelength. Streak: what a cylindrical lens makes of a point.
+Starburst: far-field diffraction at the stop is the power of its Fourier transform, wider for longer wavelengths in
+proportion. Glow: scatter in glass and on the sensor, two broad lobes. Ring: the diffraction of fine concentric grooves
+(a lens polished or moulded on a lathe), at an angle in proportion to the wavelength. Streak: the image of a point by a
+cylindrical lens.
 """
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ from .spectrum import responses, wavelengths
 
 Pixels = NDArray[np.float32]
 
-TEXTURE = 1024
-REFERENCE = 0.55
+TEXTURE_SIZE = 1024
+REFERENCE_WAVELENGTH = 0.55
 BANDS = 25
 
 
 @dataclass(frozen=True)
 class Starburst:
-    """gain: brightness. extent: tan of the angle that half the pattern spans at 0.55 micrometres.
-    core: softening radius of the centre (tan). peak: what the core saturates at."""
+    """gain: brightness. extent: tan of the angle that half the pattern spans at 0.55 micrometres. core: softening
+    radius of the centre (tan). peak: where the core saturates."""
 
     gain: float = 1.0
     extent: float = 0.6
@@ -38,7 +38,7 @@ class Starburst:
 
 
 @dataclass(frozen=True)
-class Glare:
+class Glow:
     """Two lobes gain / (1 + (r / radius)^2)^power, r the tangent of the angle from the light, and a floor."""
 
     gain: float = 0.25
@@ -51,9 +51,9 @@ class Glare:
 
 @dataclass(frozen=True)
 class Ring:
-    """radius: tan at 0.55 micrometres; width: of one wavelength's ring, of the radius. follow: where the
-    centre lies on the line from the principal point (0) to the light (1). lean: how much brighter the far
-    side is. grow: further radius per tan of the field angle. dispersion: 1 as grooves have it, 0 white."""
+    """radius: tan at 0.55 micrometres; width: of one wavelength's ring, relative to the radius. follow: position of the
+    centre on the line from the principal point (0) to the light (1). lean: how much brighter the far side is. grow:
+    additional radius per tan of the field angle. dispersion: 1 for that of grooves, 0 for white."""
 
     gain: float = 0.05
     radius: float = 0.3
@@ -66,8 +66,8 @@ class Ring:
 
 @dataclass(frozen=True)
 class Streak:
-    """A line through the light along `turn` degrees: gain / (1 + (along / length)^2)^power, of Gaussian
-    `width` (tan) across. colour: linear RGB. mirror: share of a second one through the mirrored light."""
+    """A line through the light along `turn` degrees: gain / (1 + (along / length)^2)^power, of Gaussian `width` (tan)
+    across. colour: linear RGB. mirror: share of a second one through the mirrored light."""
 
     gain: float = 0.6
     length: float = 0.12
@@ -80,15 +80,15 @@ class Streak:
 
 @lru_cache(maxsize=8)
 def starburst_texture(aperture: Aperture, settings: Starburst) -> Pixels:
-    """The pattern (TEXTURE, TEXTURE, 3) about its centre; +-extent wide."""
-    stop = transmission(aperture, TEXTURE, 0.25)
+    """Return the pattern (TEXTURE_SIZE, TEXTURE_SIZE, 3) about its centre; +-extent wide."""
+    stop = transmission(aperture, TEXTURE_SIZE, 0.25)
     power = np.abs(np.fft.fftshift(np.fft.fft2(np.fft.ifftshift(stop)))) ** 2
     power = (power / stop.sum() ** 2).astype(np.float32)
-    texture = np.zeros((TEXTURE, TEXTURE, 3), np.float32)
-    centre = TEXTURE // 2
-    rows, columns = np.mgrid[:TEXTURE, :TEXTURE].astype(np.float32) - centre
+    texture = np.zeros((TEXTURE_SIZE, TEXTURE_SIZE, 3), np.float32)
+    centre = TEXTURE_SIZE // 2
+    rows, columns = np.mgrid[:TEXTURE_SIZE, :TEXTURE_SIZE].astype(np.float32) - centre
     for wavelength, share in zip(wavelengths(BANDS), responses(BANDS), strict=True):
-        scale = np.float32(REFERENCE / wavelength)
+        scale = np.float32(REFERENCE_WAVELENGTH / wavelength)
         wide = cv2.remap(power, columns * scale + centre, rows * scale + centre, cv2.INTER_LINEAR)
         texture += (wide * scale**2)[..., None] * share.astype(np.float32)
     sigma = settings.core / settings.extent * centre
@@ -100,17 +100,17 @@ def starburst_texture(aperture: Aperture, settings: Starburst) -> Pixels:
 
 
 def draw_starburst(aperture: Aperture, settings: Starburst, x: Pixels, y: Pixels) -> Pixels:
-    """The pattern at offsets (x, y) from the light (tan), each (height, width)."""
+    """Return the pattern at offsets (x, y) from the light (tan), each (height, width)."""
     texture = starburst_texture(aperture, settings)
-    half = TEXTURE // 2
+    half = TEXTURE_SIZE // 2
     scale = half / settings.extent
     columns, rows = (x * scale + half).astype(np.float32), (y * scale + half).astype(np.float32)
     drawn = cv2.remap(texture, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=(0,))
     return drawn.astype(np.float32)
 
 
-def draw_glare(settings: Glare, x: Pixels, y: Pixels) -> Pixels:
-    """White veil at offsets (x, y) from the light, (height, width, 3)."""
+def draw_glow(settings: Glow, x: Pixels, y: Pixels) -> Pixels:
+    """Return the white glow at offsets (x, y) from the light, (height, width, 3)."""
     squared = x * x + y * y
     veil = settings.gain / (1 + squared / settings.radius**2) ** settings.power
     veil += settings.wide_gain / (1 + squared / settings.wide_radius**2) ** 2 + settings.floor
@@ -118,7 +118,7 @@ def draw_glare(settings: Glare, x: Pixels, y: Pixels) -> Pixels:
 
 
 def draw_ring(settings: Ring, light: tuple[float, float], x: Pixels, y: Pixels) -> Pixels:
-    """A ring at image coordinates (x, y) (tan from the principal point), (height, width, 3)."""
+    """Return a ring at image coordinates (x, y) (tan from the principal point), (height, width, 3)."""
     u, v = x - settings.follow * light[0], y - settings.follow * light[1]
     distance = np.hypot(u, v)
     field = math.hypot(*light)
@@ -126,7 +126,7 @@ def draw_ring(settings: Ring, light: tuple[float, float], x: Pixels, y: Pixels) 
     bright = settings.gain * np.maximum(1 - settings.lean * side, 0)
     ring = np.zeros((*x.shape, 3), np.float32)
     for wavelength, share in zip(wavelengths(BANDS), responses(BANDS), strict=True):
-        stretch = 1 + settings.dispersion * (wavelength / REFERENCE - 1)
+        stretch = 1 + settings.dispersion * (wavelength / REFERENCE_WAVELENGTH - 1)
         radius = (settings.radius + settings.grow * field) * stretch
         bell = np.exp(-0.5 * ((distance - radius) / (settings.width * radius)) ** 2) / stretch
         ring += (bright * bell)[..., None] * share.astype(np.float32)
@@ -134,7 +134,7 @@ def draw_ring(settings: Ring, light: tuple[float, float], x: Pixels, y: Pixels) 
 
 
 def draw_streak(settings: Streak, light: tuple[float, float], x: Pixels, y: Pixels) -> Pixels:
-    """A streak through the light, and its fainter mirror image, (height, width, 3)."""
+    """Return a streak through the light, and its fainter mirror image, (height, width, 3)."""
     cosine, sine = math.cos(math.radians(settings.turn)), math.sin(math.radians(settings.turn))
     total = np.zeros(x.shape, np.float32)
     for side, share in ((1.0, 1.0), (-0.7, settings.mirror)):

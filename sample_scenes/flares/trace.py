@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Rays through a lens that are reflected twice on their way: the ghosts of Hullin et al. 2011.
+"""Traces rays through a lens that are reflected twice on their way: the ghosts of Hullin et al. 2011.
 
-"Physically-Based Real-Time Lens Flare Rendering": a parallel beam enters the lens as a grid of rays; for a
-pair of surfaces (i, j), i < j, each ray is refracted up to j, reflected there, goes back to i, is reflected
-again and goes on to the sensor. What a ray brings along is where it met the stop, how far out of any
-surface's rim it strayed, and how much light Fresnel's equations leave it. The grid's cells, stretched or
-squeezed on the sensor, give the density of light.
+"Physically-Based Real-Time Lens Flare Rendering": a parallel beam enters the lens as a grid of rays; for a pair of
+surfaces (i, j), i < j, each ray is refracted up to j, reflected there, returns to i, is reflected again and continues
+to the sensor. A ray records where it met the stop, how far outside any surface's rim it strayed, and how much light
+Fresnel's equations leave it. The grid's cells, stretched or squeezed on the sensor, give the density of light.
 
 Axes: z from the front towards the sensor, the first vertex at 0, lengths in mm.
 """
@@ -20,21 +19,21 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 COATING_INDEX = 1.38
-"""Magnesium fluoride."""
+"""Refractive index of magnesium fluoride."""
 
 # What a traced ray holds.
 SENSOR_X, SENSOR_Y, STRAY, WEIGHT = 0, 1, 2, 3
 STOP_X, STOP_Y = 4, 5
 FIELDS = 10
-"""The four above and (x, y) of three passages through the stop."""
+"""Numbers of a traced ray: the four above and (x, y) of three passages through the stop."""
 
 
 @njit(cache=True)
 def reflectance(cosine: float, n0: float, n2: float, wavelength: float, coating: float) -> float:
-    """Unpolarised reflectance between n0 and n2 at an angle of incidence; 1 for total reflection.
+    """Return the unpolarised reflectance between n0 and n2 at an angle of incidence; 1 for total reflection.
 
-    coating: wavelength (micrometres) for which a layer of magnesium fluoride is a quarter wave thick; 0
-    for bare glass. One thin film: R = |(r01 + r12 e^{i d}) / (1 + r01 r12 e^{i d})|^2 for each polarisation.
+    coating: wavelength (micrometres) for which a layer of magnesium fluoride is a quarter wave thick; 0 for bare glass.
+    One thin film: R = |(r01 + r12 e^{i d}) / (1 + r01 r12 e^{i d})|^2 for each polarisation.
     """
     sine = math.sqrt(max(0.0, 1.0 - cosine * cosine))
     s2 = sine * n0 / n2
@@ -68,9 +67,9 @@ def reflectance(cosine: float, n0: float, n2: float, wavelength: float, coating:
 def trace_ray(x: float, y: float, slope: float, first: int, second: int, curvature: Array, vertices: Array,
               index: Array, semi_aperture: Array, coating: Array, stop: int, sensor: float, wavelength: float,
               out: Array) -> bool:
-    """One ray that meets the plane z = 0 at (x, y), from a light at tan(field angle) = `slope` along +x.
+    """Trace one ray that meets the plane z = 0 at (x, y), from a light at tan(field angle) = `slope` along +x.
 
-    first < second: the pair that reflects; both -1 for none. False where the ray misses a surface or is
+    first < second: the pair that reflects; both -1 for none. Returns False where the ray misses a surface or is
     reflected totally. `out` (FIELDS,) receives the result.
     """
     length = math.sqrt(1.0 + slope * slope)
@@ -145,7 +144,7 @@ def trace_ray(x: float, y: float, slope: float, first: int, second: int, curvatu
 def trace_grid(xs: Array, ys: Array, slope: float, first: int, second: int, curvature: Array, vertices: Array,
                index: Array, semi_aperture: Array, coating: Array, stop: int, sensor: float,
                wavelength: float) -> tuple[Array, NDArray[np.bool_]]:
-    """Rays through the points xs x ys of the plane z = 0: (rows, columns, FIELDS), and which arrived."""
+    """Trace rays through the points xs x ys of the plane z = 0: (rows, columns, FIELDS), and which arrived."""
     rays = np.zeros((ys.shape[0], xs.shape[0], FIELDS))
     arrived = np.zeros((ys.shape[0], xs.shape[0]), np.bool_)
     for row in range(ys.shape[0]):

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..description import Array, LightSource, Pinhole, SceneDescription, looking_at
+from ..description import Array, LightSource, Pinhole, SceneDescription, look_at
 
 LAMP = LightSource("lamp", (-1.72, 0.75, 2.28), (1.0, 0.72, 0.42), 0.085, 30.0, 130.0, 0.78)
 LANTERN = LightSource("lantern", (1.15, 1.35, 1.42), (0.45, 0.72, 1.0), 0.075, 30.0, 80.0, 0.62)
 
 
 def path(numbers: Array) -> Array:
-    """A figure of eight in front of the desk, 80 degrees wide, that also drifts nearer and farther; a
+    """Return poses on a figure of eight in front of the desk, 80 degrees wide, that also moves nearer and farther; a
     round takes 66 views."""
     poses = []
     for t in np.asarray(numbers) / 66 * 2 * np.pi:
@@ -20,12 +20,12 @@ def path(numbers: Array) -> Array:
         distance = 5.6 + 0.55 * np.cos(t + 0.8)
         target = np.array([0.42 * np.sin(t + 0.9), 0.7, 0.92 + 0.34 * np.cos(t)])
         eye = np.array([distance * np.sin(azimuth), 0.7 - distance * np.cos(azimuth), height])
-        poses.append(looking_at(eye, target, np.radians(2.5) * np.sin(3 * t)))
+        poses.append(look_at(eye, target, np.radians(2.5) * np.sin(3 * t)))
     return np.array(poses)
 
 
 def build(scene: SceneDescription) -> None:
-    """Geometry, materials and lights, in Blender."""
+    """Build geometry, materials and lights in Blender."""
     from .. import patterns as p
     from .. import stage as s
 
@@ -125,9 +125,9 @@ def build(scene: SceneDescription) -> None:
         s.lamp(light)
     s.softbox("window", (-4.5, -4.0, 5.0), (0, 0.8, 0.6), (3.0, 3.0), 215, (1.0, 0.96, 0.9))
     s.softbox("room", (5.0, -3.0, 4.5), (0, 0.8, 0.6), (4.0, 4.0), 100, (0.75, 0.86, 1.0))
-    s.surroundings((0.55, 0.65, 0.8), 0.14)
+    s.uniform_world((0.55, 0.65, 0.8), 0.14)
 
 
 DESK = SceneDescription(
-    name="desk", seed=20, views=60, first=6, camera=Pinhole(480, 270, 470.0, 470.0, 242.3, 133.1), path=path,
-    build=build, lights=(LAMP, LANTERN), lens="fast", test=(37, 40, 60))
+    name="desk", seed=20, views=60, first_number=6, camera=Pinhole(480, 270, 470.0, 470.0, 242.3, 133.1), path=path,
+    build=build, lights=(LAMP, LANTERN), lens="fast", held_out=(37, 40, 60))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..description import Array, LightSource, Pinhole, SceneDescription, looking_at
+from ..description import Array, LightSource, Pinhole, SceneDescription, look_at
 
 PENDANT = LightSource("pendant", (-1.3, 0.6, 2.55), (1.0, 0.8, 0.55), 0.11, 25.0, 150.0, 0.75)
 SIGN = LightSource("sign", (2.45, 2.2, 1.75), (1.0, 0.25, 0.6), 0.05, 35.0, 40.0, 0.55)
@@ -12,19 +12,19 @@ STUDIO = LightSource("studio", (0.75, 3.1, 1.5), (0.7, 0.88, 1.0), 0.08, 50.0, 1
 
 
 def path(numbers: Array) -> Array:
-    """A slow arc through the room, 75 degrees round, low then high."""
+    """Return poses on a slow arc through the room, 75 degrees, low then high."""
     poses = []
     for t in np.asarray(numbers) / 40:
         azimuth = np.radians(-36 + 74 * t)
         distance = 4.7 + 0.6 * np.sin(5 * t)
         eye = np.array([distance * np.sin(azimuth), 1.2 - distance * np.cos(azimuth), 1.5 + 0.5 * np.sin(7 * t)])
         target = np.array([0.5 * np.sin(4 * t + 1), 1.2, 1.35 + 0.25 * np.cos(6 * t)])
-        poses.append(looking_at(eye, target, np.radians(2) * np.sin(6 * t)))
+        poses.append(look_at(eye, target, np.radians(2) * np.sin(6 * t)))
     return np.array(poses)
 
 
 def build(scene: SceneDescription) -> None:
-    """Geometry, materials and lights, in Blender."""
+    """Build geometry, materials and lights in Blender."""
     from .. import patterns as p
     from .. import stage as s
 
@@ -72,9 +72,9 @@ def build(scene: SceneDescription) -> None:
     for light in scene.lights:
         s.lamp(light)
     s.softbox("skylight", (0, -1, 3.7), (0, 0.5, 0), (5, 4), 70, (0.9, 0.95, 1.0))
-    s.surroundings((0.6, 0.65, 0.75), 0.15)
+    s.uniform_world((0.6, 0.65, 0.75), 0.15)
 
 
 GALLERY = SceneDescription(
-    name="gallery", seed=47, first=0, views=40, camera=Pinhole(480, 270, 395.0, 395.0, 243.1, 131.6), path=path,
+    name="gallery", seed=47, first_number=0, views=40, camera=Pinhole(480, 270, 395.0, 395.0, 243.1, 131.6), path=path,
     build=build, samples=24, lights=(PENDANT, SIGN, STUDIO), lens="wide")

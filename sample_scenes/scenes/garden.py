@@ -6,13 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..description import Array, LightSource, Pinhole, SceneDescription, looking_at
+from ..description import Array, LightSource, Pinhole, SceneDescription, look_at
 
 LAMP = LightSource("lamp", (0.2, 1.2, 2.1), (0.95, 0.9, 1.0), 0.1, 40.0, 320.0, 1.0, reference=6.0)
 
 
 def path(numbers: Array) -> Array:
-    """Half round the lamp at changing height, near and far."""
+    """Return poses half round the lamp at changing height, near and far."""
     poses = []
     for t in np.asarray(numbers) / 40:
         azimuth = np.radians(-60 + 120 * t)
@@ -20,12 +20,12 @@ def path(numbers: Array) -> Array:
         height = 2.1 + 0.9 * np.sin(4 * np.pi * t)
         eye = np.array([distance * np.sin(azimuth), 1.2 - distance * np.cos(azimuth), height])
         target = np.array([0.9 * np.sin(6 * t), 1.2, 1.3 + 0.35 * np.cos(8 * t)])
-        poses.append(looking_at(eye, target))
+        poses.append(look_at(eye, target))
     return np.array(poses)
 
 
 def build(scene: SceneDescription) -> None:
-    """Geometry, materials and lights, in Blender."""
+    """Build geometry, materials and lights in Blender."""
     from .. import patterns as p
     from .. import stage as s
 
@@ -72,12 +72,12 @@ def build(scene: SceneDescription) -> None:
     for light in scene.lights:
         s.lamp(light)
     s.softbox("dusk", (-6, -8, 9), (0, 1, 0.5), (6, 6), 900, (0.6, 0.7, 1.0))
-    s.surroundings((0.4, 0.5, 0.8), 0.2)
+    s.uniform_world((0.4, 0.5, 0.8), 0.2)
 
 
 GARDEN = SceneDescription(
-    name="garden", seed=63, first=0, views=40, camera=Pinhole(480, 270, 440.0, 440.0, 236.9, 137.4), path=path,
+    name="garden", seed=63, first_number=0, views=40, camera=Pinhole(480, 270, 440.0, 440.0, 236.9, 137.4), path=path,
     build=build, samples=24, lights=(LAMP,), lens="ringed")
 
 RIMS = replace(GARDEN, name="rims", lens="rimmed")
-"""The same views through a lens of thin rings: those of the garden's are broad bands of colours."""
+"""The same views through a lens of thin rings; the garden's are broad bands of colour."""

@@ -4,24 +4,24 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..description import Array, LightSource, Pinhole, SceneDescription, looking_at
+from ..description import Array, LightSource, Pinhole, SceneDescription, look_at
 
 SUN = LightSource("sun", (4.0, 118.0, 19.0), (1.0, 0.82, 0.6), 0.95, 60.0, 2.6, 0.9, distant=True)
 
 
 def path(numbers: Array) -> Array:
-    """A walk up the street that sways from side to side and pans further than the sun is wide of centre."""
+    """Return poses of a walk up the street that sways from side to side and pans until the sun leaves the frame."""
     poses = []
     for t in np.asarray(numbers) / 40:
         eye = np.array([1.9 * np.sin(2 * np.pi * t), -9.5 + 4.5 * t, 1.7 + 0.45 * np.sin(4 * np.pi * t + 1)])
         pan = 5.6 * np.sin(2 * np.pi * t * 1.5 + 0.6)
         target = np.array([0.4 + pan, 1.5, 2.0 + 0.3 * np.cos(5 * t)])
-        poses.append(looking_at(eye, target, np.radians(1.5) * np.sin(9 * t)))
+        poses.append(look_at(eye, target, np.radians(1.5) * np.sin(9 * t)))
     return np.array(poses)
 
 
 def build(scene: SceneDescription) -> None:
-    """Geometry, materials and lights, in Blender."""
+    """Build geometry, materials and lights in Blender."""
     from .. import patterns as p
     from .. import stage as s
 
@@ -62,9 +62,9 @@ def build(scene: SceneDescription) -> None:
     s.dome(160, p.sky(rng, 1000, 2000, (255, 190, 120), (70, 100, 150), (235, 170, 150)), 0.9)
     for light in scene.lights:
         s.lamp(light)
-    s.surroundings((0.5, 0.6, 0.8), 0.4)
+    s.uniform_world((0.5, 0.6, 0.8), 0.4)
 
 
 STREET = SceneDescription(
-    name="street", seed=31, first=0, views=40, camera=Pinhole(480, 270, 415.0, 415.0, 238.4, 136.2), path=path,
+    name="street", seed=31, first_number=0, views=40, camera=Pinhole(480, 270, 415.0, 415.0, 238.4, 136.2), path=path,
     build=build, samples=24, lights=(SUN,), lens="anamorphic")

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Another room for the desk's lens and lights: what a transfer is measured on. Not a capture to fit flares to.
+"""Another room for the desk's lens and lights, on which transfer is measured; flares are not fitted to it.
 
-The world's origin is elsewhere and its axes turned, so that nothing in its coordinates is the desk's; the camera's
-focal length, principal point and aspect are others; columns hide the lights from some places.
+The world's origin is elsewhere and its axes are rotated, so that its coordinates share nothing with the desk's; the
+camera's focal length, principal point and aspect differ; columns hide the lights from some places.
 """
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..description import Array, Pinhole, SceneDescription, looking_at
+from ..description import Array, Pinhole, SceneDescription, look_at
 from .desk import LAMP, LANTERN
 
 CENTRE = np.array([40.0, -12.0, 3.0])
@@ -18,25 +18,25 @@ TURN = np.radians(117.0)
 
 
 def world(x: float, y: float, z: float) -> tuple[float, float, float]:
-    """A place in the room, x to the right and y away from the camera, in the world."""
+    """Return a point of the room (x to the right, y away from the camera) in world coordinates."""
     cosine, sine = np.cos(TURN), np.sin(TURN)
     here = CENTRE + np.array([cosine * x - sine * y, sine * x + cosine * y, z])
     return float(here[0]), float(here[1]), float(here[2])
 
 
 def path(numbers: Array) -> Array:
-    """An arc from left to right, rising and coming nearer, with a turn of the head."""
+    """Return poses on an arc from left to right, rising and coming nearer, with a pan."""
     poses = []
     for t in np.asarray(numbers) / 31:
         azimuth, distance = np.radians(-33 + 66 * t), 5.9 - 0.5 * t
         eye = world(distance * np.sin(azimuth), 0.7 - distance * np.cos(azimuth), 1.3 + 0.9 * t)
         target = world(0.3 * np.cos(5 * t), 0.75, 1.0 + 0.25 * np.sin(4 * t))
-        poses.append(looking_at(np.array(eye), np.array(target), np.radians(2) * np.sin(6 * t)))
+        poses.append(look_at(np.array(eye), np.array(target), np.radians(2) * np.sin(6 * t)))
     return np.array(poses)
 
 
 def build(scene: SceneDescription) -> None:
-    """Geometry, materials and lights, in Blender."""
+    """Build geometry, materials and lights in Blender."""
     from .. import patterns as p
     from .. import stage as s
 
@@ -70,10 +70,10 @@ def build(scene: SceneDescription) -> None:
         s.rod(f"{light.name} cord", (x, y, z + 3), (x, y, z + light.radius * 1.3), 0.012, steel)
         s.lamp(light)
     s.softbox("window", world(-4.0, -4.0, 4.8), world(0, 0.8, 0.6), (3.0, 3.0), 160, (1.0, 0.95, 0.88))
-    s.surroundings((0.6, 0.6, 0.7), 0.16)
+    s.uniform_world((0.6, 0.6, 0.7), 0.16)
 
 
 STUDIO = SceneDescription(
-    name="studio", seed=71, first=0, views=32, camera=Pinhole(448, 280, 416.6, 416.6, 218.2, 145.6), path=path,
+    name="studio", seed=71, first_number=0, views=32, camera=Pinhole(448, 280, 416.6, 416.6, 218.2, 145.6), path=path,
     build=build, samples=24, lens="fast",
     lights=(replace(LAMP, xyz=world(-1.6, 0.85, 2.2)), replace(LANTERN, xyz=world(1.2, 1.2, 1.5))))

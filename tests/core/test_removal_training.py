@@ -17,30 +17,31 @@ import torch
 
 from core.colour.srgb import Pixels
 from core.errors import Cancelled, EngineError, FrameError, RunError, SettingsError
-from core.images.contact_sheet import GAP, HEAD
+from core.images.contact_sheet import GAP, LABEL_HEIGHT
 from core.images.write import write_png
 from core.metrics.lpips import Lpips
 from core.removal import evaluation
 from core.removal.model import network, weights
 from core.removal.model.network import Attention, RemovalNetwork
-from core.removal.model.recipe import Recipe, as_dict, from_dict
-from core.removal.synthesis.prescription import built_in
+from core.removal.model.recipe import RETIRED, Recipe, as_dict, from_dict
+from core.removal.synthesis.prescription import built_in_lenses
 from core.removal.training import backgrounds as removal_backgrounds
 from core.removal.training import optimiser, run
 from core.removal.training.backgrounds import Backgrounds
 from core.removal.training.batches import Batch, Batches
-from core.removal.training.flare_bank import OwnFlares
-from core.removal.training.optimiser import Optimiser
-from core.removal.training.shared_arrays import Mapped
-from core.removal.training.trainer import Trainer
-from core.removal.training.workers import ALONE, Learner, Table, shared
-from core.system.folder_lock import held
+from core.removal.training.flare_bank import UserFlares
+from core.removal.training.optimiser import MuonAdamW
+from core.removal.training.shared_arrays import SharedArrays
+from core.removal.training.trainer import RemovalTrainer
+from core.removal.training.workers import SINGLE_WORKER, SharedBuffers, Worker, worker_group
+from core.system.folder_lock import folder_lock
 from core.system.progress import Progress
 
 torch.set_num_threads(1)  # small tensors, on which threads only wait for each other
 
 WIDTHS = (8, 8, 8, 8, 8)
-RECIPE = Recipe(iterations=4, stages=((0.5, 64, 64), (1.0, 64, 96)), pixels=8000, widths=WIDTHS, bank=2, canvas=64)
+RECIPE = Recipe(iterations=4, size_stages=((0.5, 64, 64), (1.0, 64, 96)), pixels_per_iteration=8000, widths=WIDTHS,
+                bank_size=2, canvas_size=64)
 
 
 def backgrounds() -> Backgrounds:
@@ -49,7 +50,7 @@ def backgrounds() -> Backgrounds:
 
 
 def widths_of(path: Path) -> tuple[int, ...]:
-    return tuple(see.out_channels for see in weights.load(path).see)  # type: ignore[union-attr, misc]
+    return tuple(see.out_channels for see in weights.load(path).input_convs)  # type: ignore[union-attr, misc]
 
 
 class StopAfter(Progress):
@@ -67,16 +68,16 @@ class StopAfter(Progress):
         super().advance(steps, **figures)
 
 
-def test_a_training_that_was_stopped_goes_on_as_if_it_was_not(tmp_path: Path) -> None:
-    whole = run.train(RECIPE, tmp_path / "whole", backgrounds(), built_in(), processes=1)
+def test_a_resumed_training_ends_as_an_uninterrupted_one(tmp_path: Path) -> None:
+    whole = run.train(RECIPE, tmp_path / "whole", backgrounds(), built_in_lenses(), processes=1)
     with pytest.raises(Cancelled):
-        run.train(RECIPE, tmp_path / "parts", backgrounds(), built_in(), processes=1,
+        run.train(RECIPE, tmp_path / "parts", backgrounds(), built_in_lenses(), processes=1,
                        progress=StopAfter(2))
     with pytest.raises(RunError, match="--resume"):
-        run.train(RECIPE, tmp_path / "parts", backgrounds(), built_in())
-    with held(tmp_path / "parts"), pytest.raises(RunError, match="Another process"):
-        run.train(RECIPE, tmp_path / "parts", backgrounds(), built_in(), resume=True)
-    parts = run.train(RECIPE, tmp_path / "parts", backgrounds(), built_in(), resume=True, processes=2)
+        run.train(RECIPE, tmp_path / "parts", backgrounds(), built_in_lenses())
+    with folder_lock(tmp_path / "parts"), pytest.raises(RunError, match="Another process"):
+        run.train(RECIPE, tmp_path / "parts", backgrounds(), built_in_lenses(), resume=True)
+    parts = run.train(RECIPE, tmp_path / "parts", backgrounds(), built_in_lenses(), resume=True, processes=2)
     a, b = weights.read(whole)[0], weights.read(parts)[0]
     assert a.keys() == b.keys()
     for name in a:
@@ -85,14 +86,14 @@ def test_a_training_that_was_stopped_goes_on_as_if_it_was_not(tmp_path: Path) ->
     assert widths_of(whole) == RECIPE.widths
 
 
-def test_the_step_after_a_stop_is_the_one_that_would_have_come() -> None:
+def test_a_loaded_state_gives_the_same_next_step() -> None:
     """To the last bit, of moments too: those of weights that lie channels last are saved in rows."""
-    batches = Batches(RECIPE, backgrounds(), built_in())
-    drawn = [batches[number] for number in range(3)]
-    whole = Trainer(RECIPE)
+    compose_batches = Batches(RECIPE, backgrounds(), built_in_lenses())
+    drawn = [compose_batches[number] for number in range(3)]
+    whole = RemovalTrainer(RECIPE)
     for batch in drawn[:2]:
         whole.step(batch)
-    gone_on = Trainer(RECIPE)
+    gone_on = RemovalTrainer(RECIPE)
     gone_on.load_state({name: value.clone() for name, value in whole.state().items()}, 2)
     for one in (whole, gone_on):
         one.step(drawn[2])
@@ -100,9 +101,9 @@ def test_the_step_after_a_stop_is_the_one_that_would_have_come() -> None:
     assert [name for name, value in gone_on.state().items() if not torch.equal(value, expected[name])] == []
 
 
-def test_learners_share_the_frames_of_one(tmp_path: Path) -> None:
-    alone = run.train(RECIPE, tmp_path / "alone", backgrounds(), built_in(), processes=1)
-    by_three = run.train(RECIPE, tmp_path / "three", backgrounds(), built_in(), processes=3)
+def test_workers_share_the_frames_of_one_process(tmp_path: Path) -> None:
+    alone = run.train(RECIPE, tmp_path / "alone", backgrounds(), built_in_lenses(), processes=1)
+    by_three = run.train(RECIPE, tmp_path / "three", backgrounds(), built_in_lenses(), processes=3)
     logs = [json.loads((path.parent / run.LOG).read_text(encoding="utf-8")) for path in (alone, by_three)]
     assert logs[0]["untouched"] == pytest.approx(logs[1]["untouched"], rel=1e-4), "the pictures are the same"
     a, b = weights.read(alone)[0], weights.read(by_three)[0]
@@ -111,72 +112,72 @@ def test_learners_share_the_frames_of_one(tmp_path: Path) -> None:
     assert torch.get_num_threads() == 1
     assert not multiprocessing.active_children()
 
-    whole = Batches(RECIPE, backgrounds(), built_in())[0]
-    parts = [Batches(RECIPE, backgrounds(), built_in(), learner=Learner(rank, 3))[0] for rank in range(3)]
+    whole = Batches(RECIPE, backgrounds(), built_in_lenses())[0]
+    parts = [Batches(RECIPE, backgrounds(), built_in_lenses(), worker=Worker(rank, 3))[0] for rank in range(3)]
     assert len(whole.frame) == 2
     assert [len(part.frame) for part in parts] == [1, 1, 0]
     assert [part.share for part in parts] == [0.5, 0.5, 0]
     assert np.array_equal(whole.scene[1], parts[1].scene[0])
 
 
-def adds_up(learner: Learner) -> None:
+def adds_up(worker: Worker) -> None:
     """A learner that has numbers in several layouts, and makes every piece of work that is its own."""
-    sums, pieces = numbers(learner)
+    sums, pieces = numbers(worker)
     for _ in range(2):
-        learner.add_up(sums)
-        learner.hand_round(pieces)
+        worker.all_reduce(sums)
+        worker.all_gather(pieces)
 
 
-def numbers(learner: Learner) -> tuple[list[torch.Tensor], list[torch.Tensor]]:
-    plain = torch.arange(24.0).view(2, 3, 2, 2) + 100 * learner.rank
-    pieces = [torch.full((2, 3), float(k if learner.makes(k) else -1)) for k in range(5)]
-    return [plain.contiguous(memory_format=torch.channels_last), torch.tensor([1.0 + learner.rank])], pieces
+def numbers(worker: Worker) -> tuple[list[torch.Tensor], list[torch.Tensor]]:
+    plain = torch.arange(24.0).view(2, 3, 2, 2) + 100 * worker.rank
+    pieces = [torch.full((2, 3), float(k if worker.is_responsible_for(k) else -1)) for k in range(5)]
+    return [plain.contiguous(memory_format=torch.channels_last), torch.tensor([1.0 + worker.rank])], pieces
 
 
-def test_learners_see_what_others_have() -> None:
-    with shared(3, adds_up) as learner:
-        sums, pieces = numbers(learner)
-        learner.add_up(sums)
-        learner.hand_round(pieces)
+def test_workers_reduce_and_gather_tensors() -> None:
+    with worker_group(3, adds_up) as worker:
+        sums, pieces = numbers(worker)
+        worker.all_reduce(sums)
+        worker.all_gather(pieces)
         assert torch.equal(sums[0], 3 * torch.arange(24.0).view(2, 3, 2, 2) + 300)
         assert sums[1].tolist() == [6]
         assert [piece.unique().tolist() for piece in pieces] == [[0], [1], [2], [3], [4]]
         once = sums[0].clone()
-        learner.add_up(sums)
+        worker.all_reduce(sums)
         assert torch.equal(sums[0], 3 * once), "the others have the sum too"
-        learner.hand_round(pieces)
-    alone, pieces = numbers(ALONE)
-    ALONE.add_up(alone)
-    ALONE.hand_round(pieces)
+        worker.all_gather(pieces)
+    alone, pieces = numbers(SINGLE_WORKER)
+    SINGLE_WORKER.all_reduce(alone)
+    SINGLE_WORKER.all_gather(pieces)
     assert alone[1].tolist() == [1] and [float(piece[0, 0]) for piece in pieces] == [0, 1, 2, 3, 4]
 
 
-def test_what_learners_share_is_never_made_shorter(tmp_path: Path) -> None:
+def test_shared_buffers_are_never_truncated(tmp_path: Path) -> None:
     """Windows refuses that where another has it mapped."""
     (tmp_path / "2x3").write_bytes(b"\1" * 64)
-    rows = Table(str(tmp_path), multiprocessing.get_context("spawn").Barrier(1)).rows(2, 3)
+    rows = SharedBuffers(str(tmp_path), multiprocessing.get_context("spawn").Barrier(1)).rows(2, 3)
     assert (tmp_path / "2x3").stat().st_size == 64 and rows.shape == (2, 3)
     assert (rows != 0).all(), "what is there stays"
 
 
-def ends(_learner: Learner) -> None:
+def ends(_learner: Worker) -> None:
     """A learner that ends at once."""
 
 
-def test_a_learner_that_is_no_more_is_told(tmp_path: Path) -> None:
-    with pytest.raises(RunError, match="ended before"), shared(2, ends) as learner:
+def test_an_ended_worker_raises_an_error(tmp_path: Path) -> None:
+    with pytest.raises(RunError, match="ended too early"), worker_group(2, ends) as worker:
         for _ in range(100):
-            learner.add_up([torch.zeros(1000)])
+            worker.all_reduce([torch.zeros(1000)])
     assert not multiprocessing.active_children()
-    with shared(1, ends) as learner:
-        assert learner == ALONE
+    with worker_group(1, ends) as worker:
+        assert worker == SINGLE_WORKER
     with pytest.raises(SettingsError, match="at least one process"):
-        run.train(RECIPE, tmp_path, backgrounds(), built_in(), processes=0)
+        run.train(RECIPE, tmp_path, backgrounds(), built_in_lenses(), processes=0)
 
 
-def test_pictures_that_processes_share_are_mapped(tmp_path: Path) -> None:
+def test_shared_arrays_are_mapped_by_other_processes(tmp_path: Path) -> None:
     arrays = [np.arange(5, dtype=np.uint8), np.arange(7, dtype=np.float16)[:, None], np.zeros((0, 2), np.float32)]
-    mapped = Mapped(tmp_path / "some", arrays)
+    mapped = SharedArrays(tmp_path / "some", arrays)
     there = pickle.loads(pickle.dumps(mapped))
     for some in (mapped, there):
         assert len(some) == 3
@@ -190,25 +191,25 @@ def test_pictures_that_processes_share_are_mapped(tmp_path: Path) -> None:
     assert len(pickle.dumps(there)) < 1000, "what has been mapped is not sent"
 
 
-def test_backgrounds_out_of_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_shared_backgrounds_equal_those_in_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for number in range(3):
         write_png(tmp_path / f"{number}.png", np.random.default_rng(number).random((80, 96, 3)).astype(np.float32))
     (tmp_path / "cut_off.png").write_bytes(b"\x89PNG")
-    held_in_memory = removal_backgrounds.read_backgrounds([tmp_path], varied=True)
-    with removal_backgrounds.mapped_backgrounds([tmp_path], varied=True) as found:
-        assert found.left_out == [tmp_path / "cut_off.png"]
+    held_in_memory = removal_backgrounds.read_backgrounds([tmp_path], augmented=True)
+    with removal_backgrounds.shared_backgrounds([tmp_path], augmented=True) as found:
+        assert found.unusable == [tmp_path / "cut_off.png"]
         sent = pickle.loads(pickle.dumps(found))
-        assert sent.varied
+        assert sent.augmented
         for seed in range(4):
             drawn, expected = (some.draw(np.random.default_rng(seed), 96, 64, 2.0) for some in (sent, held_in_memory))
             assert np.array_equal(drawn, expected)
 
-    def full(*_: object) -> Mapped:
+    def full(*_: object) -> SharedArrays:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(removal_backgrounds, "Mapped", full)
+    monkeypatch.setattr(removal_backgrounds, "SharedArrays", full)
     with pytest.raises(RunError, match=r"No space left on device.*TMPDIR"), \
-            removal_backgrounds.mapped_backgrounds([tmp_path]):
+            removal_backgrounds.shared_backgrounds([tmp_path]):
         pass
 
 
@@ -218,14 +219,15 @@ def test_a_training_without_opencvs_extra_modules_is_refused(tmp_path: Path, mon
     write_png(tmp_path / "a.png", np.zeros((80, 96, 3), np.float32))
     monkeypatch.delattr(cv2, "ximgproc")
     with pytest.raises(EngineError, match="opencv-contrib-python-headless"):
-        removal_backgrounds.read_backgrounds([tmp_path], varied=True)
+        removal_backgrounds.read_backgrounds([tmp_path], augmented=True)
     assert removal_backgrounds.read_backgrounds([tmp_path]).photos
 
 
 def test_a_handful_of_pairs_is_learned() -> None:
-    recipe = Recipe(stages=((1.0, 64, 64),), pixels=16_384, widths=(16, 16, 16, 16, 16), bank=2, canvas=64, clean=0)
-    trainer = Trainer(recipe)
-    batch = Batches(recipe, backgrounds(), built_in())[0]
+    recipe = Recipe(size_stages=((1.0, 64, 64),), pixels_per_iteration=16_384,
+                    widths=(16, 16, 16, 16, 16), bank_size=2, canvas_size=64, clean_share=0)
+    trainer = RemovalTrainer(recipe)
+    batch = Batches(recipe, backgrounds(), built_in_lenses())[0]
     figures = {}
     for _ in range(120):
         loss, figures = trainer.loss(batch)
@@ -234,10 +236,10 @@ def test_a_handful_of_pairs_is_learned() -> None:
     assert figures["error"] < 0.2 * figures["untouched"]
 
 
-def test_what_is_told_of_clean_pictures_counts_for_more_in_the_end() -> None:
-    recipe = replace(RECIPE, iterations=100, polish=1.0, clean=1.0)
-    trainer = Trainer(recipe)
-    batch = Batches(recipe, backgrounds(), built_in())[0]
+def test_false_flares_weigh_more_late_in_a_training() -> None:
+    recipe = replace(RECIPE, iterations=100, psnr_phase=1.0, clean_share=1.0)
+    trainer = RemovalTrainer(recipe)
+    batch = Batches(recipe, backgrounds(), built_in_lenses())[0]
     assert torch.equal(batch.frame, batch.scene)
     torch.nn.init.constant_(trainer.network.head.bias, 0.03)
     losses = {}
@@ -247,14 +249,14 @@ def test_what_is_told_of_clean_pictures_counts_for_more_in_the_end() -> None:
     assert losses[80] == losses[99]
 
 
-def test_a_local_goal_minds_what_is_told_where_no_flare_is() -> None:
+def test_the_patch_loss_penalises_false_flares_beside_a_flare() -> None:
     scene = torch.full((1, 3, 96, 192), 0.25)
     frame = scene.clone()
     frame[..., :96] += 0.5
     batch = Batch(frame, scene, scene, 1.0)
     losses = {}
     for local in (0.0, 0.5, 1.0):
-        trainer = Trainer(replace(RECIPE, polish=1.0, local=local))
+        trainer = RemovalTrainer(replace(RECIPE, psnr_phase=1.0, patch_loss_share=local))
         torch.nn.init.constant_(trainer.network.head.bias, 0.1)
         losses[local] = float(trainer.loss(batch)[0].detach())
     # All of the picture is nearer to its scene; of its squares one half is, by less than what the other half loses.
@@ -263,27 +265,27 @@ def test_a_local_goal_minds_what_is_told_where_no_flare_is() -> None:
     assert losses[0.5] == pytest.approx((losses[0.0] + losses[1.0]) / 2, rel=0.02)
 
 
-def test_the_steps_of_hidden_weights_are_as_long_in_every_direction() -> None:
+def test_muon_steps_are_equally_long_in_every_direction() -> None:
     """And as long as AdamW's usually are, a fifth of the rate; other weights take AdamW's, whose first is the rate."""
-    recipe = Recipe(widths=(16, 16, 16, 16, 16), decay=0)
-    trainer = Trainer(recipe)
+    recipe = Recipe(widths=(16, 16, 16, 16, 16), weight_decay=0)
+    trainer = RemovalTrainer(recipe)
     before = {name: value.detach().clone() for name, value in trainer.network.named_parameters()}
     for parameter in trainer.network.parameters():
         parameter.grad = torch.randn_like(parameter) * torch.rand(parameter.shape[-1]) ** 4
     trainer.optimiser.step(1e-2)
     steps = {name: value.detach() - before[name] for name, value in trainer.network.named_parameters()}
-    hidden = steps["enter.2.0.first.weight"].permute(0, 2, 3, 1).flatten(1)
+    hidden = steps["encoder.2.0.conv1.weight"].permute(0, 2, 3, 1).flatten(1)
     assert float(torch.linalg.matrix_norm(hidden, -2) / torch.linalg.matrix_norm(hidden, 2)) > 0.6
     assert float(hidden.square().mean().sqrt()) == pytest.approx(0.2e-2, rel=0.3)
-    for name in ("see.2.weight", "head.weight", "attention.0.place.weight", "enter.2.0.first.bias"):
+    for name in ("input_convs.2.weight", "head.weight", "attention.0.pos_embed.weight", "encoder.2.0.conv1.bias"):
         assert float(steps[name].abs().median()) == pytest.approx(1e-2, rel=0.05)
     assert all(parameter.grad is None for parameter in trainer.network.parameters())
 
 
-def test_muon_s_steps_are_torch_s() -> None:
+def test_muon_steps_equal_those_of_torch() -> None:
     """But for bfloat16, in which torch takes them."""
-    recipe = Recipe(widths=(16, 16, 24, 16, 16), decay=0.1)
-    trainer = Trainer(recipe)
+    recipe = Recipe(widths=(16, 16, 24, 16, 16), weight_decay=0.1)
+    trainer = RemovalTrainer(recipe)
     name = "up.1.weight"
     weight = dict(trainer.network.named_parameters())[name]
     theirs = torch.nn.Parameter(weight.detach().permute(0, 2, 3, 1).flatten(1).clone())
@@ -300,165 +302,167 @@ def test_muon_s_steps_are_torch_s() -> None:
 
 
 @pytest.mark.parametrize(("rows", "columns", "rank"), [(24, 216, 24), (40, 16, 16), (24, 216, 3)])
-def test_muon_s_rounds_in_one_are_the_rounds_one_by_one(rows: int, columns: int, rank: int) -> None:
+def test_merged_newton_schulz_steps_equal_single_ones(rows: int, columns: int, rank: int) -> None:
     torch.manual_seed(3)
     matrix = torch.randn(rows, rank) @ torch.randn(rank, columns)
-    a, b, c = optimiser.QUINTIC
+    a, b, c = optimiser.NEWTON_SCHULZ_COEFFICIENTS
     expected = matrix.double() / matrix.double().norm()
-    for _ in range(optimiser.ROUNDS):
+    for _ in range(optimiser.NEWTON_SCHULZ_STEPS):
         square = expected @ expected.mT
         expected = a * expected + (b * square + c * square @ square) @ expected
     stack = torch.stack([torch.randn(rows, columns), matrix])
-    found = optimiser.orthogonalised(stack)[1]
+    found = optimiser.orthogonalise(stack)[1]
     assert found.dtype == torch.float32
     assert float((found - expected).norm() / expected.norm()) < 2e-3
 
 
-def test_weights_that_lie_otherwise_are_refused() -> None:
+def test_weights_that_are_not_channels_last_are_refused() -> None:
     with pytest.raises(ValueError, match="channels last"):
-        Optimiser(RemovalNetwork((16,) * 5, (0, 0, 1, 0, 0), (0, 0)), 0.0)
+        MuonAdamW(RemovalNetwork((16,) * 5, (0, 0, 1, 0, 0), (0, 0)), 0.0)
 
 
-def test_stages_of_a_training() -> None:
-    recipe = Recipe(iterations=100, stages=((0.5, 64, 96), (1.0, 160, 256)), pixels=40_000, bank=2, canvas=64)
-    assert [recipe.stage(at) for at in (0, 49, 50, 200)] == [(64, 96), (64, 96), (160, 256), (160, 256)]
+def test_frame_sizes_follow_the_stages_of_the_recipe() -> None:
+    recipe = Recipe(iterations=100, size_stages=((0.5, 64, 96), (1.0, 160, 256)), pixels_per_iteration=40_000,
+                    bank_size=2, canvas_size=64)
+    assert [recipe.size_range_at(at) for at in (0, 49, 50, 200)] == [(64, 96), (64, 96), (160, 256), (160, 256)]
     for at in range(100):
-        count, width, height = recipe.frames(np.random.default_rng(at), at)
-        least, most = recipe.stage(at)
+        count, width, height = recipe.draw_batch_shape(np.random.default_rng(at), at)
+        least, most = recipe.size_range_at(at)
         assert least - 16 <= max(width, height) <= most + 16
         assert width % 32 == height % 32 == 0 and min(width, height) >= 64
         assert count == max(round(40_000 / (width * height)), 1)
-    batches = Batches(recipe, backgrounds(), built_in())
-    early, late = batches[3], batches[70]
-    assert early.frame.shape == early.scene.shape == early.gentle.shape
+    compose_batches = Batches(recipe, backgrounds(), built_in_lenses())
+    early, late = compose_batches[3], compose_batches[70]
+    assert early.frame.shape == early.scene.shape == early.scene_with_glow.shape
     assert len(early.frame) > len(late.frame) >= 1
     assert max(early.frame.shape[2:]) < max(late.frame.shape[2:])
-    assert torch.equal(batches[3].frame, early.frame)
+    assert torch.equal(compose_batches[3].frame, early.frame)
 
 
-def test_going_on_from_weights(tmp_path: Path) -> None:
-    first = run.train(RECIPE, tmp_path / "first", backgrounds(), built_in(), processes=1)
-    second = run.train(RECIPE, tmp_path / "second", backgrounds(), built_in(), start=first, processes=1)
+def test_a_training_starts_from_weights(tmp_path: Path) -> None:
+    first = run.train(RECIPE, tmp_path / "first", backgrounds(), built_in_lenses(), processes=1)
+    second = run.train(RECIPE, tmp_path / "second", backgrounds(), built_in_lenses(), start=first, processes=1)
     assert weights.read(second)[1]["iteration"] == "4"
     other = Recipe(**{**RECIPE.__dict__, "widths": (16, 8, 8, 8, 8)})
-    third = run.train(other, tmp_path / "third", backgrounds(), built_in(), start=first, processes=1)
+    third = run.train(other, tmp_path / "third", backgrounds(), built_in_lenses(), start=first, processes=1)
     assert widths_of(third) == RECIPE.widths, "the network is that of the weights"
     tensors, _ = weights.read(first)
     weights.write(tmp_path / "foreign.safetensors", tensors, {"recipe": "{}"})
     with pytest.raises(RunError, match="holds no weights"):
-        run.train(RECIPE, tmp_path / "fourth", backgrounds(), built_in(), start=tmp_path / "foreign.safetensors")
+        run.train(RECIPE, tmp_path / "fourth", backgrounds(), built_in_lenses(), start=tmp_path / "foreign.safetensors")
 
 
-def test_attention_is_torch_s_own(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_attention_equals_torch_s(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where it is written out and where it is not."""
-    attention = Attention(16, 4, waves=2)
-    torch.nn.init.normal_(attention.told.weight)
+    attention = Attention(16, 4, octaves=2)
+    torch.nn.init.normal_(attention.proj.weight)
     x = torch.randn(2, 16, 6, 9)
     with torch.no_grad():
         written_out = attention(x)
-        monkeypatch.setattr(network, "WRITTEN_OUT", 53)
+        monkeypatch.setattr(network, "MAX_EXPLICIT_POSITIONS", 53)
         torch.testing.assert_close(attention(x), written_out, rtol=1e-4, atol=1e-5)
     assert (written_out - x).abs().max() > 0.1
 
 
-def test_a_network_grows_by_blocks_that_do_nothing_yet(tmp_path: Path) -> None:
+def test_added_blocks_leave_the_prediction_unchanged(tmp_path: Path) -> None:
     small = replace(RECIPE, blocks=(0, 1, 1, 1, 1), attention=(0, 0))
     large = replace(RECIPE, blocks=(1, 0, 2, 1, 3), attention=(0, 1))
-    first = run.train(small, tmp_path / "first", backgrounds(), built_in(), processes=1)
-    grown = run.Beginning(large, first, False, backgrounds(), built_in(), None).trainer(ALONE)
-    assert [len(enter) for enter in grown.network.enter] == [1, 1, 2, 1, 3]  # type: ignore[arg-type]
+    first = run.train(small, tmp_path / "first", backgrounds(), built_in_lenses(), processes=1)
+    grown = run.TrainingSetup(large, first, False, backgrounds(), built_in_lenses(), None).trainer(SINGLE_WORKER)
+    assert [len(level) for level in grown.network.encoder] == [1, 1, 2, 1, 3]  # type: ignore[arg-type]
     frame = torch.rand(1, 3, 64, 64)
     with torch.no_grad():
         before, after = weights.load(first)(frame), grown.network(frame)
     assert before.flare.std() > 0
     torch.testing.assert_close(after.flare, before.flare, rtol=1e-3, atol=1e-6)  # a fused layout adds up otherwise
-    grown_to = run.train(large, tmp_path / "second", backgrounds(), built_in(), start=first, processes=1)
-    form = weights.form(grown_to, weights.read(grown_to)[1])
+    grown_to = run.train(large, tmp_path / "second", backgrounds(), built_in_lenses(), start=first, processes=1)
+    form = weights.read_architecture(grown_to, weights.read(grown_to)[1])
     assert form == (small.widths, (1, 1, 2, 1, 3), (0, 1))
     longer = replace(large, iterations=5, blocks=(4, 4, 4, 4, 4), attention=(2, 2))
-    run.train(longer, tmp_path / "second", backgrounds(), built_in(), resume=True, processes=1)
-    assert weights.form(grown_to, weights.read(grown_to)[1]) == form, "none grows on the way"
+    run.train(longer, tmp_path / "second", backgrounds(), built_in_lenses(), resume=True, processes=1)
+    assert weights.read_architecture(grown_to, weights.read(grown_to)[1]) == form, "none grows on the way"
     of_before = {name: value for name, value in as_dict(small).items() if name != "attention"}
-    assert weights.form(first, {"recipe": json.dumps(of_before)}).attention == (0, 0)
+    assert weights.read_architecture(first, {"recipe": json.dumps(of_before)}).attention == (0, 0)
 
 
-def test_the_log_has_figures_and_checks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(run, "checks", partial(run.checks, count=8))
-    run.train(RECIPE, tmp_path, backgrounds(), built_in(), tests=(backgrounds(), built_in()), processes=1)
+def test_the_log_has_metrics_and_validation_gains(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(run, "make_validation_pairs", partial(run.make_validation_pairs, count=8))
+    run.train(RECIPE, tmp_path, backgrounds(), built_in_lenses(), validation=(backgrounds(), built_in_lenses()),
+              processes=1)
     (line,) = [json.loads(text) for text in (tmp_path / run.LOG).read_text(encoding="utf-8").splitlines()]
     assert line["iteration"] == 4
     assert "gain_db" in line
-    drawn = [Batches(RECIPE, backgrounds(), built_in())[at] for at in range(4)]
+    drawn = [Batches(RECIPE, backgrounds(), built_in_lenses())[at] for at in range(4)]
     untouched = [np.square(batch.frame - batch.scene).mean() for batch in drawn]
     assert line["untouched"] == pytest.approx(np.mean(untouched), abs=1e-5), "means since the last line"
 
 
-def test_the_log_of_a_training_that_was_killed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_log_of_a_killed_training_restarts_at_its_checkpoint(tmp_path: Path,
+                                                                 monkeypatch: pytest.MonkeyPatch) -> None:
     """What it told after its last checkpoint is told anew, once."""
-    monkeypatch.setattr(run, "CHECK_EVERY", 1)
+    monkeypatch.setattr(run, "VALIDATE_EVERY", 1)
     with pytest.raises(Cancelled):
-        run.train(RECIPE, tmp_path, backgrounds(), built_in(), processes=1, progress=StopAfter(2))
+        run.train(RECIPE, tmp_path, backgrounds(), built_in_lenses(), processes=1, progress=StopAfter(2))
     log = tmp_path / run.LOG
     log.write_text(log.read_text(encoding="utf-8") + '{"iteration": 3, "loss": 7.0}\n{"iterat', encoding="utf-8")
-    run.train(RECIPE, tmp_path, backgrounds(), built_in(), resume=True, processes=1)
+    run.train(RECIPE, tmp_path, backgrounds(), built_in_lenses(), resume=True, processes=1)
     lines = [json.loads(text) for text in log.read_text(encoding="utf-8").splitlines()]
     assert [line["iteration"] for line in lines] == [1, 2, 3, 4] and lines[2]["loss"] != 7.0
 
 
-def test_the_weights_of_the_best_check_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_weights_of_the_best_validation_are_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     gains = {1: 1.0, 2: 2.5, 3: 2.0, 4: 2.5, 5: 3.0, 6: 0.0}
-    monkeypatch.setattr(run, "checks", lambda *_: {"streak": []})
-    monkeypatch.setattr(run, "CHECK_EVERY", 1)
-    monkeypatch.setattr(Trainer, "check", lambda trainer, _: {"mean": gains[trainer.iteration]})
-    train = partial(run.train, RECIPE, backgrounds=backgrounds(), lenses=built_in(), processes=1)
-    tests = backgrounds(), built_in()
+    monkeypatch.setattr(run, "make_validation_pairs", lambda *_: {"streak": []})
+    monkeypatch.setattr(run, "VALIDATE_EVERY", 1)
+    monkeypatch.setattr(RemovalTrainer, "validate", lambda trainer, _: {"mean": gains[trainer.iteration]})
+    train = partial(run.train, RECIPE, backgrounds=backgrounds(), lenses=built_in_lenses(), processes=1)
+    tests = backgrounds(), built_in_lenses()
 
     def kept(folder: str) -> str:
         return weights.read(tmp_path / folder / run.WEIGHTS)[1]["iteration"]
 
-    train(tmp_path / "whole", tests=tests)
+    train(tmp_path / "whole", validation=tests)
     assert kept("whole") == "2"
     with pytest.raises(Cancelled):
-        train(tmp_path / "parts", tests=tests, progress=StopAfter(3))
+        train(tmp_path / "parts", validation=tests, progress=StopAfter(3))
     assert weights.read(tmp_path / "parts" / run.CHECKPOINT)[1]["iteration"] == "3"
-    train(tmp_path / "parts", tests=tests, resume=True)
+    train(tmp_path / "parts", validation=tests, resume=True)
     assert kept("parts") == "2", "what a part before had found is still the best"
     longer = replace(RECIPE, iterations=6)
-    run.train(longer, tmp_path / "parts", backgrounds(), built_in(), tests=tests, resume=True, processes=1)
+    run.train(longer, tmp_path / "parts", backgrounds(), built_in_lenses(), validation=tests, resume=True, processes=1)
     assert kept("parts") == "5"
     train(tmp_path / "untested")
     assert kept("untested") == "4"
     write_png(tmp_path / "flares" / "one.png", np.full((48, 64, 3), 0.3))
-    train(tmp_path / "own", tests=tests, own=OwnFlares(tmp_path / "flares", RECIPE.canvas))
+    train(tmp_path / "own", validation=tests, user_flares=UserFlares(tmp_path / "flares", RECIPE.canvas_size))
     assert kept("own") == "4", "the checks have none of the user's flares"
 
 
-def test_a_training_that_comes_to_no_number_stops(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    step = Trainer.step
+def test_a_training_with_a_non_finite_loss_stops(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    step = RemovalTrainer.step
 
-    def broken(trainer: Trainer, batch: Batch) -> dict[str, float]:
+    def broken(trainer: RemovalTrainer, batch: Batch) -> dict[str, float]:
         figures = step(trainer, batch)
         return figures if trainer.iteration < 3 else {**figures, "loss": float("nan")}
 
-    monkeypatch.setattr(Trainer, "step", broken)
+    monkeypatch.setattr(RemovalTrainer, "step", broken)
     with pytest.raises(RunError, match=r"Iteration 3 .* no number.*learning_rate"):
-        run.train(RECIPE, tmp_path, backgrounds(), built_in(), processes=1, save_every_s=0)
+        run.train(RECIPE, tmp_path, backgrounds(), built_in_lenses(), processes=1, save_every_s=0)
     state, about = weights.read(tmp_path / run.CHECKPOINT)
     assert about["iteration"] == "2", "what was saved last is whole"
     assert all(torch.isfinite(value).all() for value in state.values())
 
 
-def test_recipes() -> None:
-    recipe = Recipe(iterations=1000, warm=10)
-    assert recipe.rate(0) == pytest.approx(recipe.learning_rate / 10)
-    assert recipe.rate(500) == pytest.approx(recipe.learning_rate / 2)
-    assert recipe.rate(1000) == 0
+def test_recipes_are_checked_and_survive_a_round_trip() -> None:
+    recipe = Recipe(iterations=1000, warmup_iterations=10)
+    assert recipe.learning_rate_at(0) == pytest.approx(recipe.learning_rate / 10)
+    assert recipe.learning_rate_at(500) == pytest.approx(recipe.learning_rate / 2)
+    assert recipe.learning_rate_at(1000) == 0
     assert from_dict(as_dict(recipe)) == recipe
     with pytest.raises(SettingsError, match="has no speed"):
         from_dict({"speed": 1})
-    assert from_dict({**as_dict(recipe), "repeats": 4}) == recipe, "of before"
-    with pytest.raises(SettingsError, match="local is a share from 0 to 1, not 2"):
-        Recipe(local=2)
+    with pytest.raises(SettingsError, match="patch_loss_share lies between 0 and 1, not at 2"):
+        Recipe(patch_loss_share=2)
     with pytest.raises(SettingsError, match="5 levels"):
         Recipe(widths=())
     with pytest.raises(SettingsError, match="5 levels"):
@@ -467,10 +471,19 @@ def test_recipes() -> None:
         with pytest.raises(SettingsError, match="attention for two levels"):
             Recipe(attention=attention)
     for stage in ((1.0, 32, 64), (1.0, 96, 64), (1.0, 96)):
-        with pytest.raises(SettingsError, match="stages"):
-            Recipe(stages=(stage,))  # type: ignore[arg-type]
+        with pytest.raises(SettingsError, match="size_stages"):
+            Recipe(size_stages=(stage,))  # type: ignore[arg-type]
     with pytest.raises(SettingsError, match="one iteration, pixel and flare"):
-        Recipe(pixels=0)
+        Recipe(pixels_per_iteration=0)
+
+
+def test_a_recipe_is_read_under_the_names_of_format_0() -> None:
+    recipe = Recipe(warmup_iterations=10, patch_loss_share=0.5, size_stages=((1.0, 64, 96),))
+    retired = {present: name for name, present in RETIRED.items()}
+    data = {retired.get(name, name): value for name, value in as_dict(recipe).items()}
+    assert {"warm", "local", "stages"} < data.keys()
+    assert from_dict({**data, "repeats": 4}) == recipe
+    assert from_dict({**as_dict(recipe), "warm": 20}).warmup_iterations == 20, "the last one counts"
 
 
 # Scores.
@@ -485,10 +498,10 @@ def pair_folder(folder: Path, names: tuple[str, ...] = ("input_0.png", "gt_0.png
     return folder
 
 
-def test_scores_beside_the_untouched_input(tmp_path: Path) -> None:
+def test_scores_have_those_of_the_untouched_input_beside_them(tmp_path: Path) -> None:
     pair_folder(tmp_path / "real")
     pair_folder(tmp_path / "synthetic", ("a0.png", "a0.png"))
-    cases = evaluation.paired(tmp_path)
+    cases = evaluation.read_cases(tmp_path)
     assert sorted({case.category for case in cases}) == ["real", "synthetic"]
     scores = evaluation.evaluate(cases, lambda frame: frame - np.float32(0.05))
     assert scores["mean"]["count"] == 4
@@ -497,26 +510,26 @@ def test_scores_beside_the_untouched_input(tmp_path: Path) -> None:
     assert scores["mean"]["result"]["lpips"] is None
     worse = evaluation.evaluate(cases, lambda frame: frame + np.float32(0.05))
     assert worse["mean"]["made_worse"] == 1
-    assert "real" in evaluation.table(worse)
+    assert "real" in evaluation.format_table(worse)
     sheet = evaluation.worst_sheet(cases, lambda frame: frame, worse, 40)
-    assert sheet.shape == (4 * (HEAD + 32), 4 * 40 + 3 * GAP, 3)
+    assert sheet.shape == (4 * (LABEL_HEIGHT + 32), 4 * 40 + 3 * GAP, 3)
 
 
 @pytest.mark.parametrize(("shape", "height"), [((1, 1200), 1), ((1200, 1), 80)])
-def test_rows_and_columns_of_pixels_have_a_place_on_the_sheet(shape: tuple[int, int], height: int,
+def test_extreme_aspects_are_squeezed_on_the_sheet(shape: tuple[int, int], height: int,
                                                               tmp_path: Path) -> None:
     for kind, level in (("input", 200), ("gt", 100)):
         write_png(tmp_path / kind / "0.png", np.full((*shape, 3), level / 255))
-    cases = evaluation.paired(tmp_path)
+    cases = evaluation.read_cases(tmp_path)
     scores = evaluation.evaluate(cases, lambda frame: frame)
-    assert evaluation.worst_sheet(cases, lambda frame: frame, scores, 40).shape[0] == HEAD + height
+    assert evaluation.worst_sheet(cases, lambda frame: frame, scores, 40).shape[0] == LABEL_HEIGHT + height
 
 
-def test_a_clean_picture_that_is_changed_was_made_worse(tmp_path: Path) -> None:
+def test_changing_a_clean_picture_counts_as_made_worse(tmp_path: Path) -> None:
     pair_folder(tmp_path)
     shutil.rmtree(tmp_path / "gt")
     shutil.copytree(tmp_path / "input", tmp_path / "gt")
-    cases = evaluation.paired(tmp_path)
+    cases = evaluation.read_cases(tmp_path)
     kept = evaluation.evaluate(cases, lambda frame: frame)["mean"]
     assert (kept["gain_db"], kept["made_worse"]) == (0, 0)
     assert kept["result"]["psnr"] == kept["input"]["psnr"] == 100, "means are of the same pictures as gains"
@@ -525,7 +538,7 @@ def test_a_clean_picture_that_is_changed_was_made_worse(tmp_path: Path) -> None:
     assert evaluation.worst_sheet(cases, np.zeros_like, black, 40).any()
 
 
-def test_masks_count_alone(tmp_path: Path) -> None:
+def test_masked_psnr_counts_the_mask_alone(tmp_path: Path) -> None:
     pair_folder(tmp_path)
     mask = np.zeros((24, 30, 3))
     mask[:4] = 1
@@ -537,7 +550,7 @@ def test_masks_count_alone(tmp_path: Path) -> None:
         result[:4] -= np.float32(0.1)
         return result
 
-    result = evaluation.evaluate(evaluation.paired(tmp_path), half)["mean"]["result"]
+    result = evaluation.evaluate(evaluation.read_cases(tmp_path), half)["mean"]["result"]
     assert result["masked_psnr"] > 45 > result["psnr"]
 
 
@@ -545,34 +558,35 @@ def test_a_mask_of_another_shape_is_refused(tmp_path: Path) -> None:
     """Stretched over its picture it would count other pixels than it marks; a smaller one is only coarser."""
     for name, shape in (("input", (24, 30, 3)), ("gt", (24, 30, 3)), ("mask", (12, 15, 3))):
         write_png(tmp_path / name / "0.png", np.ones(shape))
-    marked = evaluation.paired(tmp_path)[0].read()[2]
+    marked = evaluation.read_cases(tmp_path)[0].read()[2]
     assert marked is not None and marked.shape == (24, 30, 3)
     write_png(tmp_path / "mask" / "0.png", np.ones((30, 24, 3)))
     with pytest.raises(FrameError, match=r"0\.png is 24 x 30 pixels, another shape than .* of 30 x 24; make it for"):
-        evaluation.paired(tmp_path)[0].read()
+        evaluation.read_cases(tmp_path)[0].read()
 
 
-def test_what_was_taken_away_is_no_input_where_there_is_one(tmp_path: Path) -> None:
+def test_a_flare_folder_beside_an_input_folder_is_no_input(tmp_path: Path) -> None:
     """`remove PAIRS/input --out PAIRS/clean --flare PAIRS/flare` leaves such a folder."""
     pair_folder(tmp_path)
     for folder in ("flare", "clean"):
         shutil.copytree(tmp_path / "gt", tmp_path / folder)
-    assert {case.name for case in evaluation.paired(tmp_path)} == {"input_0", "input_1"}
+    assert {case.name for case in evaluation.read_cases(tmp_path)} == {"input_0", "input_1"}
     (tmp_path / "gt").rename(tmp_path / "GT")
-    assert all(np.allclose(case.read()[1], 0.5, atol=0.01) for case in evaluation.paired(tmp_path))
+    assert all(np.allclose(case.read()[1], 0.5, atol=0.01) for case in evaluation.read_cases(tmp_path))
 
 
-def test_pairs_that_are_none(tmp_path: Path) -> None:
+def test_folders_without_complete_pairs_are_refused(tmp_path: Path) -> None:
     with pytest.raises(SettingsError, match="no pairs"):
-        evaluation.paired(tmp_path)
+        evaluation.read_cases(tmp_path)
     pair_folder(tmp_path)
     (tmp_path / "gt" / "gt_1.png").unlink()
     with pytest.raises(SettingsError, match="counterpart"):
-        evaluation.paired(tmp_path)
+        evaluation.read_cases(tmp_path)
 
 
-def test_the_synthetic_test_set_is_its_seed() -> None:
-    one, again, other = (evaluation.synthetic(seed, 1, backgrounds(), built_in(), (96, 64)) for seed in (5, 5, 6))
+def test_the_synthetic_test_set_is_a_function_of_its_seed() -> None:
+    one, again, other = (evaluation.synthetic_cases(seed, 1, backgrounds(), built_in_lenses(), (96, 64))
+                         for seed in (5, 5, 6))
     assert len(one) == 8
     for a, b, c in zip(one[:3], again[:3], other[:3], strict=True):
         (frame, scene, _), (frame2, _, _), (frame3, _, _) = a.read(), b.read(), c.read()
@@ -582,7 +596,7 @@ def test_the_synthetic_test_set_is_its_seed() -> None:
         np.testing.assert_allclose(frame * 255, np.round(frame * 255), rtol=0, atol=1e-4)
 
 
-def test_lpips_with_weights_of_the_user(tmp_path: Path) -> None:
+def test_lpips_uses_the_user_s_weights(tmp_path: Path) -> None:
     with pytest.raises(SettingsError, match="lacks weights"):
         Lpips(tmp_path)
     shapes = {0: (64, 3, 11, 11), 3: (192, 64, 5, 5), 6: (384, 192, 3, 3), 8: (256, 384, 3, 3), 10: (256, 256, 3, 3)}
@@ -600,30 +614,30 @@ def test_lpips_with_weights_of_the_user(tmp_path: Path) -> None:
     assert 0 < measure(a, near) < measure(a, far)
 
 
-def test_a_share_of_the_weights_begun_with_is_kept(tmp_path: Path) -> None:
-    first = run.train(RECIPE, tmp_path / "first", backgrounds(), built_in(), processes=1)
+def test_final_weights_contain_a_share_of_the_initial_ones(tmp_path: Path) -> None:
+    first = run.train(RECIPE, tmp_path / "first", backgrounds(), built_in_lenses(), processes=1)
     kept = {}
     for share in (0.0, 0.5, 1.0):
-        folder, recipe = tmp_path / str(share), replace(RECIPE, begun=share, seed=2)
+        folder, recipe = tmp_path / str(share), replace(RECIPE, initial_weights_mix=share, seed=2)
         with pytest.raises(Cancelled):
-            run.train(recipe, folder, backgrounds(), built_in(), start=first, processes=1, progress=StopAfter(2))
-        run.train(recipe, folder, backgrounds(), built_in(), start=first, processes=1, resume=True)
+            run.train(recipe, folder, backgrounds(), built_in_lenses(), start=first, processes=1, progress=StopAfter(2))
+        run.train(recipe, folder, backgrounds(), built_in_lenses(), start=first, processes=1, resume=True)
         kept[share] = weights.read(folder / run.WEIGHTS)[0]
-    begun = weights.read(first)[0]
-    assert any(not torch.equal(kept[0.0][name], value) for name, value in begun.items())
-    for name, value in begun.items():
+    initial = weights.read(first)[0]
+    assert any(not torch.equal(kept[0.0][name], value) for name, value in initial.items())
+    for name, value in initial.items():
         assert torch.equal(kept[1.0][name], value)
         torch.testing.assert_close(kept[0.5][name].float(), (value.float() + kept[0.0][name].float()) / 2, atol=1e-3,
                                    rtol=1e-3)
 
 
-def test_what_has_grown_is_kept_by_the_same_share(tmp_path: Path) -> None:
+def test_added_layers_are_interpolated_by_the_same_share(tmp_path: Path) -> None:
     """Of a network that grew, the weights begun with are those of the smaller one, which tells the same."""
-    small, large = replace(RECIPE, blocks=(0, 1, 1, 2, 2), attention=(0, 0)), replace(RECIPE, blocks=(0, 1, 2, 2, 2),
-                                                                                      attention=(1, 1), begun=1.0)
-    first = run.train(small, tmp_path / "first", backgrounds(), built_in(), processes=1)
-    grown = run.train(large, tmp_path / "grown", backgrounds(), built_in(), start=first, processes=1)
-    name = "between.0.0.asked.weight"
+    small = replace(RECIPE, blocks=(0, 1, 1, 2, 2), attention=(0, 0))
+    large = replace(RECIPE, blocks=(0, 1, 2, 2, 2), attention=(1, 1), initial_weights_mix=1.0)
+    first = run.train(small, tmp_path / "first", backgrounds(), built_in_lenses(), processes=1)
+    grown = run.train(large, tmp_path / "grown", backgrounds(), built_in_lenses(), start=first, processes=1)
+    name = "inner_attention.0.0.qkv.weight"
     assert weights.read(grown)[0][name].any()
     frame = torch.rand(1, 3, 64, 64)
     with torch.no_grad():

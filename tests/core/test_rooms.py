@@ -12,7 +12,7 @@ import pytest
 
 from core.images.read import read_picture
 from core.images.write import write_png
-from core.removal.training.backgrounds import kept_for_test
+from core.removal.training.backgrounds import is_held_out
 
 ROOT = Path(__file__).parents[2]
 SMALL = """
@@ -40,7 +40,7 @@ def sources(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     return photos, maps
 
 
-def test_rooms_are_functions_of_their_numbers_and_none_is_made_twice(sources: tuple[Path, Path],
+def test_rooms_are_functions_of_their_numbers_and_none_is_rendered_twice(sources: tuple[Path, Path],
                                                                       tmp_path: Path) -> None:
     photos, maps = sources
     words = ("--photos", photos, "--maps", maps)
@@ -61,9 +61,9 @@ def test_rooms_are_functions_of_their_numbers_and_none_is_made_twice(sources: tu
     assert np.abs(read_picture(worked_on).pixels - one[1]).mean() < 0.02  # but for the order of sums
 
 
-def test_held_out_pictures_are_in_no_room_and_an_empty_folder_is_said(sources: tuple[Path, Path],
+def test_rooms_use_no_held_out_pictures_and_refuse_an_empty_folder(sources: tuple[Path, Path],
                                                                      tmp_path: Path) -> None:
-    held_out = next(name for name in (f"{number}.png" for number in range(1000)) if kept_for_test(name))
+    held_out = next(name for name in (f"{number}.png" for number in range(1000)) if is_held_out(name))
     write_png(tmp_path / held_out, np.zeros((40, 60, 3), np.float32))
     refused = made("--out", tmp_path / "out", "--photos", tmp_path, "--maps", sources[1])
     assert refused.returncode == 1
@@ -71,7 +71,7 @@ def test_held_out_pictures_are_in_no_room_and_an_empty_folder_is_said(sources: t
     assert not (tmp_path / "out").exists()
 
 
-def test_a_picture_that_cannot_be_read_is_named_and_so_is_a_count_of_none(sources: tuple[Path, Path],
+def test_rooms_refuse_unreadable_pictures_and_a_count_of_0(sources: tuple[Path, Path],
                                                                          tmp_path: Path) -> None:
     broken = tmp_path / "photos" / "broken.png"
     broken.parent.mkdir()

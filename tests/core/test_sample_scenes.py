@@ -18,24 +18,24 @@ from core.capture import Capture
 from core.colour.srgb import srgb_from_linear
 from core.errors import SettingsError
 from core.images.read import read_picture
+from core.removal.synthesis.prescription import read_prescription
 from core.system.progress import Progress
-from sample_scenes.description import Pinhole, looking_at
-from sample_scenes.flares import LOOKS, Look, render_flare
+from sample_scenes.capture_files import expose, write_layer
+from sample_scenes.description import Pinhole, look_at
+from sample_scenes.flares import LENS_SETUPS, LensSetup, render_flare
 from sample_scenes.flares.aperture import Aperture
-from sample_scenes.flares.flare import optics_of
+from sample_scenes.flares.flare import LENS_FOLDER, build_optics
 from sample_scenes.flares.ghosts import GhostSettings, draw_ghosts
-from sample_scenes.flares.prescription import FOLDER, read_prescription
-from sample_scenes.flares.starburst import Glare, Ring, Starburst, Streak, draw_ring, draw_streak, starburst_texture
+from sample_scenes.flares.starburst import Glow, Ring, Starburst, Streak, draw_ring, draw_streak, starburst_texture
 from sample_scenes.flares.trace import FIELDS, SENSOR_X, reflectance, trace_ray
-from sample_scenes.layers import exposed, write_layer
 from sample_scenes.over_photos import add_flares
 from sample_scenes.scenes import SCENES
 from tests.core.captures import make_capture
 
 SAMPLE = Path(__file__).parents[2] / "sample_scenes" / "desk"
 SMALL = Pinhole(120, 68, 118.0, 118.0, 60.0, 34.0)
-LENSES = sorted(path.stem for path in FOLDER.glob("*.lens"))
-ROUND = Look("US3576360", stop_down=0.34, blades=8, curved=1.0, uneven=0.0,
+LENSES = sorted(path.stem for path in LENS_FOLDER.glob("*.lens"))
+ROUND = LensSetup("US3576360", stop_down=0.34, blades=8, curved=1.0, uneven=0.0,
              ghosts=GhostSettings(count=8, gain=300.0, bands=3))
 """A lens with a round stop: nothing about it has a direction."""
 
@@ -46,8 +46,8 @@ def psnr(a: NDArray[np.float32], b: NDArray[np.float32]) -> float:
 
 def straight(name: str, x: float, slope: float) -> tuple[float, float]:
     """(sensor x, focal length) of a ray that no surface reflects."""
-    lens = read_prescription(FOLDER / f"{name}.lens")
-    focal, back = lens.paraxial()
+    lens = read_prescription(LENS_FOLDER / f"{name}.lens")
+    focal, back = lens.focal_length(), lens.back_focus()
     out = np.zeros(FIELDS)
     bare = np.zeros(len(lens.index))
     arrived = trace_ray(x, 0.0, slope, -1, -1, lens.curvature, lens.vertices, lens.indices(0.5876),
@@ -57,16 +57,16 @@ def straight(name: str, x: float, slope: float) -> tuple[float, float]:
 
 
 @pytest.mark.parametrize("name", LENSES)
-def test_prescription_gives_the_focal_length_it_is_known_for(name: str) -> None:
-    stated = float((FOLDER / f"{name}.lens").read_text().split(" mm,")[0].split()[-1])
-    assert read_prescription(FOLDER / f"{name}.lens").paraxial()[0] == pytest.approx(stated, rel=0.05)
+def test_a_prescription_has_its_stated_focal_length(name: str) -> None:
+    stated = float((LENS_FOLDER / f"{name}.lens").read_text().split(" mm,")[0].split()[-1])
+    assert read_prescription(LENS_FOLDER / f"{name}.lens").focal_length() == pytest.approx(stated, rel=0.05)
 
 
 @pytest.mark.parametrize("name", LENSES)
-def test_prescription_focuses_where_its_last_line_puts_the_film(name: str) -> None:
+def test_a_prescription_focuses_at_its_last_thickness(name: str) -> None:
     """Sensitive to every digit: a radius or thickness copied wrong moves the focus."""
-    lens = read_prescription(FOLDER / f"{name}.lens")
-    assert lens.paraxial()[1] == pytest.approx(lens.thickness[-1], rel=0.003)
+    lens = read_prescription(LENS_FOLDER / f"{name}.lens")
+    assert lens.back_focus() == pytest.approx(lens.thickness[-1], rel=0.003)
 
 
 @pytest.mark.parametrize("name", LENSES)
@@ -78,7 +78,7 @@ def test_a_real_ray_near_the_axis_ends_where_the_paraxial_one_does(name: str) ->
 
 
 @pytest.mark.parametrize("text, fault", [
-    ("1 2 3 4 5\n1 2 3 4 5\n", "stop"), ("stop 1 1 0 5\n", "stop"), ("10 1 1.5\nstop 1 1 0 5\n", "columns"),
+    ("1 2 3 4 5\n1 2 3 4 5\n", "stop"), ("stop 1 1 0 5\n", "stop"), ("10 1 1.5\nstop 1 1 0 5\n", "surface"),
     ("10 1 glass 60 5\n", "surface")])
 def test_a_broken_prescription_is_refused(tmp_path: Path, text: str, fault: str) -> None:
     (tmp_path / "x.lens").write_text(text)
@@ -86,7 +86,7 @@ def test_a_broken_prescription_is_refused(tmp_path: Path, text: str, fault: str)
         read_prescription(tmp_path / "x.lens")
 
 
-def test_reflectance_at_normal_incidence_and_of_a_quarter_wave() -> None:
+def test_reflectance_matches_fresnel_and_a_quarter_wave() -> None:
     assert reflectance(1.0, 1.0, 1.5, 0.55, 0.0) == pytest.approx(0.04)
     ideal = ((1.9 - 1.38**2) / (1.9 + 1.38**2)) ** 2
     assert reflectance(1.0, 1.0, 1.9, 0.55, 0.55) == pytest.approx(ideal, abs=1e-9)
@@ -101,7 +101,7 @@ def test_reflectance_at_normal_incidence_and_of_a_quarter_wave() -> None:
 @given(*(st.floats(low, high, allow_subnormal=False)
          for low, high in ((0.01, 1), (1.0, 2.0), (1.0, 2.0), (0.4, 0.7), (0, 0.8))))
 @example(cosine=0.21875, n0=1.0, n2=1.0, wavelength=0.5, coating=1.1754943508222875e-38)
-def test_reflectance_is_a_share_and_the_same_both_ways(
+def test_reflectance_is_between_0_and_1_and_reciprocal(
         cosine: float, n0: float, n2: float, wavelength: float, coating: float) -> None:
     there = reflectance(cosine, n0, n2, wavelength, coating)
     assert 0.0 <= there <= 1.0 + 1e-12
@@ -110,23 +110,23 @@ def test_reflectance_is_a_share_and_the_same_both_ways(
         assert reflectance(math.sqrt(1 - sine**2), n2, n0, wavelength, coating) == pytest.approx(there, abs=1e-9)
 
 
-@pytest.mark.parametrize("name", sorted(LOOKS))
-def test_a_flare_is_the_same_twice_finite_and_never_dark(name: str) -> None:
-    look = replace(LOOKS[name], ghosts=replace(LOOKS[name].ghosts, bands=2, count=6))
+@pytest.mark.parametrize("name", sorted(LENS_SETUPS))
+def test_a_rendered_flare_is_reproducible_finite_and_non_negative(name: str) -> None:
+    setup = replace(LENS_SETUPS[name], ghosts=replace(LENS_SETUPS[name].ghosts, bands=2, count=6))
     light = (-0.22, -0.13)
-    flare = render_flare(look, SMALL, light)
+    flare = render_flare(setup, SMALL, light)
     assert flare.shape == (68, 120, 3) and flare.dtype == np.float32
     assert np.isfinite(flare).all() and flare.min() >= 0 and flare.max() > 1
-    assert np.array_equal(flare, render_flare(look, SMALL, light))
+    assert np.array_equal(flare, render_flare(setup, SMALL, light))
 
 
-def test_energy_follows_share_intensity_and_colour() -> None:
+def test_flare_energy_scales_with_share_intensity_and_colour() -> None:
     full = render_flare(ROUND, SMALL, (0.1, 0.1))
     half = render_flare(ROUND, SMALL, (0.1, 0.1), visible_share=0.25, intensity=2.0, colour=(1.0, 0.5, 0.0))
     np.testing.assert_allclose(half, full * np.array([0.5, 0.25, 0.0], np.float32), rtol=1e-5)
 
 
-def test_no_flare_without_light() -> None:
+def test_a_light_that_is_hidden_or_behind_has_no_flare() -> None:
     assert not render_flare(ROUND, SMALL, (0.1, 0.2, -3.0)).any()
     assert not render_flare(ROUND, SMALL, (0.1, 0.2, 0.0)).any()
     assert not render_flare(ROUND, SMALL, (0.1, 0.2), visible_share=0.0).any()
@@ -134,12 +134,12 @@ def test_no_flare_without_light() -> None:
     assert render_flare(ROUND, SMALL, (0.62, 0.0)).any()  # out of the frame, not of the hood
 
 
-def test_a_position_and_its_normalised_coordinates_are_one() -> None:
+def test_a_position_and_its_normalised_coordinates_give_one_flare() -> None:
     assert np.array_equal(render_flare(ROUND, SMALL, (0.4, -0.2, 4.0)), render_flare(ROUND, SMALL, (0.1, -0.05)))
 
 
 def test_ghosts_lie_on_the_line_through_principal_point_and_light() -> None:
-    optics, pairs = optics_of(ROUND)
+    optics, pairs = build_optics(ROUND)
     camera = Pinhole(160, 120, 118.0, 118.0, 71.3, 64.2)
     light = np.array([0.14, -0.09])
     across = np.array([-light[1], light[0]]) / np.linalg.norm(light)
@@ -157,7 +157,7 @@ def test_ghosts_lie_on_the_line_through_principal_point_and_light() -> None:
     assert seen >= 4
 
 
-def test_a_round_lens_turns_its_flare_with_the_light() -> None:
+def test_the_flare_of_a_round_lens_rotates_with_the_light() -> None:
     camera = Pinhole(96, 96, 90.0, 90.0, 48.0, 48.0)
     across = render_flare(ROUND, camera, (0.2, 0.0))
     down = render_flare(ROUND, camera, (0.0, 0.2))
@@ -167,9 +167,9 @@ def test_a_round_lens_turns_its_flare_with_the_light() -> None:
 
 
 def test_a_flare_moves_smoothly() -> None:
-    look = replace(LOOKS["fast"], ghosts=replace(LOOKS["fast"].ghosts, count=10, bands=3))
+    setup = replace(LENS_SETUPS["fast"], ghosts=replace(LENS_SETUPS["fast"].ghosts, count=10, bands=3))
     camera = SCENES["desk"].camera.scaled(240, 135)
-    flares = [np.minimum(render_flare(look, camera, (0.2 + step * 1e-4, -0.1)), 2) for step in range(5)]
+    flares = [np.minimum(render_flare(setup, camera, (0.2 + step * 1e-4, -0.1)), 2) for step in range(5)]
     steps = [float(np.linalg.norm(b - a)) for a, b in pairwise(flares)]
     assert max(steps) < 0.01 * np.linalg.norm(flares[0])
     assert max(steps) < 1.5 * min(steps)
@@ -197,12 +197,12 @@ def test_ring_is_wider_for_longer_wavelengths() -> None:
 
 
 def test_an_anamorphic_lens_draws_its_ghosts_and_streak_along_x() -> None:
-    bare = replace(ROUND, starburst=Starburst(gain=0.0), glare=Glare(0.0, wide_gain=0.0, floor=0.0))
+    bare = replace(ROUND, starburst=Starburst(gain=0.0), glow=Glow(0.0, wide_gain=0.0, floor=0.0))
     camera = Pinhole(400, 120, 80.0, 80.0, 200.0, 60.0)
     columns = np.arange(400) + 0.5 - 200
     spread = []
-    for look, light in ((bare, (0.1, 0.1)), (replace(bare, squeeze=2.0), (0.2, 0.1))):
-        ghosts = render_flare(look, camera, light).sum(axis=2)
+    for setup, light in ((bare, (0.1, 0.1)), (replace(bare, squeeze=2.0), (0.2, 0.1))):
+        ghosts = render_flare(setup, camera, light).sum(axis=2)
         spread.append((ghosts * np.abs(columns)).sum() / ghosts.sum())
     assert spread[1] == pytest.approx(2 * spread[0], rel=0.03)
     x, y = np.meshgrid(np.linspace(-1, 1, 81, dtype=np.float32), np.linspace(-1, 1, 81, dtype=np.float32))
@@ -210,19 +210,19 @@ def test_an_anamorphic_lens_draws_its_ghosts_and_streak_along_x() -> None:
     assert streak[40, 0].min() > 20 * streak[0, 40].max()
 
 
-def test_every_scene_has_a_look_and_a_lens_of_its_own() -> None:
+def test_every_scene_has_its_own_lens_setup() -> None:
     own = {name: scene for name, scene in SCENES.items() if name != "rims"}  # the garden again, under other rings
     assert len({scene.seed for scene in own.values()}) == len(own) >= 4
     # The studio is what the desk's flare is put on to, so it has the desk's lens.
-    lenses = [LOOKS[scene.lens].lens for name, scene in own.items() if name != "studio"]
+    lenses = [LENS_SETUPS[scene.lens].lens for name, scene in own.items() if name != "studio"]
     assert len(set(lenses)) == len(lenses) and set(lenses) <= set(LENSES)
-    assert len({scene.lens for scene in SCENES.values()}) == len(LOOKS) == len(SCENES) - 1
+    assert len({scene.lens for scene in SCENES.values()}) == len(LENS_SETUPS) == len(SCENES) - 1
     for scene in SCENES.values():
         np.testing.assert_allclose(np.linalg.det(scene.poses[:, :3, :3]), 1.0)
         assert scene.views == len(scene.poses) == len(set(scene.stems))
 
 
-def test_flares_over_photographs(tmp_path: Path) -> None:
+def test_flares_are_added_to_photographs(tmp_path: Path) -> None:
     make_capture(tmp_path / "photos", 3)
     capture = Capture.open(tmp_path / "photos")
     add_flares(capture, tmp_path / "out", ROUND, np.array([0.3, -0.2, 1.0]), (1.0, 0.8, 0.6), 2.0, 48, Progress())
@@ -240,19 +240,19 @@ def test_flares_over_photographs(tmp_path: Path) -> None:
         assert made.frame(view).display()[int(place[1]), int(place[0])].min() > 0.8
 
 
-def test_looking_at_puts_the_target_in_the_middle() -> None:
-    pose = looking_at(np.array([1.0, -4.0, 2.0]), np.array([0.3, 0.5, 1.0]), 0.2)
+def test_look_at_centres_the_target() -> None:
+    pose = look_at(np.array([1.0, -4.0, 2.0]), np.array([0.3, 0.5, 1.0]), 0.2)
     at = pose[:3, :3] @ (0.3, 0.5, 1.0) + pose[:3, 3]
     np.testing.assert_allclose(at[:2], 0, atol=1e-12)
     assert at[2] > 0 and np.linalg.det(pose[:3, :3]) == pytest.approx(1)
 
 
-def test_noise_is_of_the_stated_size_and_layers_survive_their_file(tmp_path: Path) -> None:
+def test_sensor_noise_has_the_stated_size_and_layers_survive_their_file(tmp_path: Path) -> None:
     grey = np.full((200, 200, 3), 0.25, np.float32)
-    noisy = exposed(grey, np.random.default_rng(1))
+    noisy = expose(grey, np.random.default_rng(1))
     slope = 1.055 / 2.4 * 0.25 ** (1 / 2.4 - 1)
     assert noisy.std() == pytest.approx(slope * math.hypot(0.0006, 0.0025 * 0.5), rel=0.03)
-    assert exposed(grey * 8, np.random.default_rng(1)).min() == pytest.approx(1.0, abs=1e-6)  # clips
+    assert expose(grey * 8, np.random.default_rng(1)).min() == pytest.approx(1.0, abs=1e-6)  # clips
     ramp = np.linspace(0, 6, 64 * 96 * 3, dtype=np.float32).reshape(64, 96, 3)
     write_layer(tmp_path / "a.exr", ramp, 45.0)
     np.testing.assert_allclose(read_picture(tmp_path / "a.exr").pixels, ramp, rtol=0.05, atol=0.02)
@@ -263,14 +263,14 @@ def sample() -> Capture:
     return Capture.open(SAMPLE)
 
 
-def test_the_sample_is_whole_and_small(sample: Capture) -> None:
+def test_the_sample_capture_is_complete_and_small(sample: Capture) -> None:
     assert len(sample.views) >= 60 and (sample.views[0].camera.width, sample.views[0].camera.height) == (480, 270)
     assert len(sample.points.xyz) >= 3000 and float(np.mean(sample.points.error)) < 0.6
     assert sample.has_removed and sample.has_truth
     assert sum(path.stat().st_size for path in SAMPLE.rglob("*") if path.is_file()) <= 25_000_000
 
 
-def test_the_sample_has_the_cameras_and_lights_of_its_script(sample: Capture) -> None:
+def test_the_sample_capture_has_the_cameras_and_lights_of_its_script(sample: Capture) -> None:
     scene = SCENES["desk"]
     for view, stem, pose in zip(sample.views, scene.stems, scene.poses, strict=True):
         assert Path(view.name).stem == stem
@@ -281,7 +281,7 @@ def test_the_sample_has_the_cameras_and_lights_of_its_script(sample: Capture) ->
         np.testing.assert_allclose(found.xyz, light.xyz)
 
 
-def test_frames_are_their_layers_seen_by_a_sensor(sample: Capture) -> None:
+def test_sample_frames_are_their_layers_seen_by_a_sensor(sample: Capture) -> None:
     for view in sample.views[2::17]:
         frame, removed = sample.frame(view), sample.removed(view)
         scene, flare = sample.truth_scene(view), sample.truth_flare(view)
@@ -292,7 +292,7 @@ def test_frames_are_their_layers_seen_by_a_sensor(sample: Capture) -> None:
         assert psnr(frame.display(), removed.display()) < 33
 
 
-def test_an_empty_flare_scores_what_the_readme_says(sample: Capture) -> None:
+def test_an_empty_flare_scores_as_the_readme_says(sample: Capture) -> None:
     scores = []
     for view in sample.views[::4]:
         scene, flare = sample.truth_scene(view), sample.truth_flare(view)
@@ -301,7 +301,7 @@ def test_an_empty_flare_scores_what_the_readme_says(sample: Capture) -> None:
     assert 23.5 < float(np.mean(scores)) < 26
 
 
-def test_lights_are_where_they_are_said_to_be(sample: Capture) -> None:
+def test_sample_lights_are_at_their_stated_positions(sample: Capture) -> None:
     """The bulbs as rendered agree with the cameras to a third of a pixel; the flares' cores sit on them."""
     shares = json.loads((SAMPLE / "truth" / "visible_share.json").read_text())
     checked = 0
@@ -325,7 +325,7 @@ def test_lights_are_where_they_are_said_to_be(sample: Capture) -> None:
     assert checked >= 8
 
 
-def test_the_split_holds_out_what_is_hard(sample: Capture) -> None:
+def test_the_split_holds_out_hard_views(sample: Capture) -> None:
     shares = json.loads((SAMPLE / "truth" / "visible_share.json").read_text())
     train, test = sample.split(None)
     assert len(train) >= 48 and len(test) >= 8

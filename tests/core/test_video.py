@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from core.colour.srgb import linear_from_srgb
 from core.errors import Cancelled, FrameError, SettingsError
 from core.images.video import Video
-from core.removal.jobs.video_frames import frames_of, with_frames
+from core.removal.jobs.video_frames import expand_videos, extract_frames
 from core.removal.training import flare_bank
-from core.removal.training.flare_bank import OwnFlares
+from core.removal.training.flare_bank import UserFlares
 from core.system.progress import Progress
 from tests.core.heard import Heard
 
@@ -61,7 +61,7 @@ def test_the_colours_of_a_video_are_those_that_players_show(height: int, weights
                                                              tmp_path: Path) -> None:
     with Video(patches(tmp_path / "a.mp4", height, weights, told)) as video:
         frames = list(video)
-        assert video.says == ()
+        assert video.warnings == ()
     assert len(frames) == 3
     shown = frames[-1][height // 2, STRIPE // 2::STRIPE, ::-1].astype(int)
     assert np.abs(shown - PATCHES).max() <= 5, "24 by the wrong matrix"
@@ -84,8 +84,8 @@ def test_colours_that_are_read_as_they_are_stay(suffix: str, codec: str, tmp_pat
 @pytest.mark.parametrize(("transfer", "name"), [(16, "PQ"), (18, "HLG")])
 def test_high_dynamic_range_is_told(transfer: int, name: str, tmp_path: Path) -> None:
     with Video(patches(tmp_path / "a.mp4", 64, (0.299, 0.114), box(transfer, 9))) as video:
-        assert len(video.says) == 1
-        assert name in video.says[0]
+        assert len(video.warnings) == 1
+        assert name in video.warnings[0]
 
 
 def test_an_upright_telephone_s_video_stands_upright(tmp_path: Path) -> None:
@@ -109,12 +109,12 @@ def test_what_is_no_video_or_cut_off_is_told(content: bytes | None, tmp_path: Pa
         Video(path)
 
 
-def test_a_clip_of_a_flare_trains_in_its_own_colours(tmp_path: Path) -> None:
+def test_a_video_of_a_flare_is_drawn_in_its_own_colours(tmp_path: Path) -> None:
     """Of high definition."""
     path = tmp_path / "clips" / "flare.mp4"
     path.parent.mkdir()
     patches(path, 720, (0.2126, 0.0722))
-    own = OwnFlares(path.parent, 256)
+    own = UserFlares(path.parent, 256)
     layers = own.draw(np.random.default_rng(0))
     high, wide = np.nonzero(layers.rest.sum(-1) > 0.01)
     shown = layers.rest[high.min():high.max() + 1, wide.min():wide.max() + 1]
@@ -123,7 +123,7 @@ def test_a_clip_of_a_flare_trains_in_its_own_colours(tmp_path: Path) -> None:
     assert np.abs(shown[len(shown) // 2, columns] - truth).max() < 0.04
 
 
-def test_a_clip_that_claims_more_frames_than_it_has_trains(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_flare_video_that_claims_too_many_frames_is_drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As one does whose sound is longer."""
     class Longer(Video):
         def __init__(self, path: Path) -> None:
@@ -134,7 +134,7 @@ def test_a_clip_that_claims_more_frames_than_it_has_trains(tmp_path: Path, monke
     path.parent.mkdir()
     patches(path, 360, (0.299, 0.114))
     monkeypatch.setattr(flare_bank, "Video", Longer)
-    assert OwnFlares(path.parent, 256).draw(np.random.default_rng(0)).rest.max() > 0.1
+    assert UserFlares(path.parent, 256).draw(np.random.default_rng(0)).rest.max() > 0.1
 
 
 def with_pixels(path: Path, wide: int, high: int) -> Path:
@@ -161,9 +161,9 @@ def test_the_shape_of_pixels_is_told(tmp_path: Path) -> None:
         assert video.aspect == pytest.approx(4 / 3) and len(list(video)) == 3
 
 
-def test_the_frames_of_a_video_are_taken_out_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_frames_of_a_video_are_extracted_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     clip, out = patches(tmp_path / "clip.mp4", 64, (0.299, 0.114)), tmp_path / "out"
-    frames = frames_of(clip, out, Progress())
+    frames = extract_frames(clip, out, Progress())
     assert frames == out / "clip.mp4.frames"
     assert sorted(path.name for path in frames.glob("*.png")) == [f"clip.{number:06d}.png" for number in (1, 2, 3)]
     first = cv2.imread(str(frames / "clip.000001.png"))
@@ -171,47 +171,47 @@ def test_the_frames_of_a_video_are_taken_out_once(tmp_path: Path, monkeypatch: p
     with Video(clip) as again:
         assert np.array_equal(first, next(iter(again)))
     with monkeypatch.context() as patch:
-        patch.setattr("core.removal.jobs.video_frames._take_out", lambda *_: pytest.fail("they are there"))
-        assert frames_of(clip, out, Progress()) == frames
+        patch.setattr("core.removal.jobs.video_frames._decode_frames", lambda *_: pytest.fail("they are there"))
+        assert extract_frames(clip, out, Progress()) == frames
     patches(clip, 96, (0.299, 0.114))
     with pytest.raises(SettingsError, match=r"another video of that name"):
-        frames_of(clip, out, Progress())
+        extract_frames(clip, out, Progress())
 
 
-def test_what_another_task_has_taken_out_meanwhile_is_taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_frames_that_another_task_has_extracted_are_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     clip, out = patches(tmp_path / "clip.mp4", 64, (0.299, 0.114)), tmp_path / "out"
-    there = frames_of(clip, tmp_path / "other", Progress())
-    monkeypatch.setattr("core.removal.jobs.video_frames._take_out", lambda *_: there.rename(out / there.name))
-    assert len(list(frames_of(clip, out, Progress()).glob("*.png"))) == 3
+    there = extract_frames(clip, tmp_path / "other", Progress())
+    monkeypatch.setattr("core.removal.jobs.video_frames._decode_frames", lambda *_: there.rename(out / there.name))
+    assert len(list(extract_frames(clip, out, Progress()).glob("*.png"))) == 3
 
 
-def test_frames_that_a_video_lacks_are_told(tmp_path: Path) -> None:
+def test_missing_frames_of_a_video_are_reported(tmp_path: Path) -> None:
     writer = cv2.VideoWriter(str(tmp_path / "clip.avi"), cv2.VideoWriter_fourcc(*"MJPG"), 25, (64, 48))
     for _ in range(4):
         writer.write(np.random.default_rng(0).integers(0, 255, (48, 64, 3)).astype(np.uint8))
     writer.release()
     whole = (tmp_path / "clip.avi").read_bytes()
     told = Heard()
-    frames_of(tmp_path / "clip.avi", tmp_path / "whole", told)
+    extract_frames(tmp_path / "clip.avi", tmp_path / "whole", told)
     assert not told.texts
     (tmp_path / "clip.avi").write_bytes(whole[:len(whole) * 6 // 10])
-    frames_of(tmp_path / "clip.avi", tmp_path / "cut", told)
+    extract_frames(tmp_path / "clip.avi", tmp_path / "cut", told)
     assert [sentence for sentence in told.texts if "tells of 4 frames" in sentence]
 
 
-def test_a_video_that_cannot_be_read_or_is_stopped_leaves_no_frames(tmp_path: Path) -> None:
+def test_an_unreadable_or_cancelled_video_leaves_no_frames(tmp_path: Path) -> None:
     (tmp_path / "empty.mov").touch()
     clip, out = patches(tmp_path / "clip.mp4", 64, (0.299, 0.114)), tmp_path / "out"
     stopped = Progress()
     stopped.request_stop()
     with pytest.raises(Cancelled):
-        frames_of(clip, out, stopped)
+        extract_frames(clip, out, stopped)
     with pytest.raises(FrameError, match=r"empty\.mov cannot be decoded"):
-        frames_of(tmp_path / "empty.mov", out, Progress())
+        extract_frames(tmp_path / "empty.mov", out, Progress())
     assert list(out.iterdir()) == []
     given = [tmp_path / "empty.mov", clip, tmp_path / "plate.png"]
-    plates, left_out = with_frames(given, out, Progress())
+    plates, left_out = expand_videos(given, out, Progress())
     assert plates == [out / "clip.mp4.frames", given[2]]
     assert len(left_out) == 1 and left_out[0].startswith(f"{given[0]} cannot be decoded")
     with pytest.raises(FrameError, match=r"^\S+empty\.mov cannot be decoded"):
-        with_frames(given[:1], out, Progress())
+        expand_videos(given[:1], out, Progress())

@@ -1,151 +1,171 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Removal of many plates: one after the other, past those that cannot be read, resumable."""
+"""Removes the flares from a list of plates, folders and shots; interrupted, it resumes.
+
+`headless/commands/remove.py` calls `remove_all`. Plates that cannot be read are reported at the end and do not stop the
+others.
+"""
 from __future__ import annotations
 
 import contextlib
 import itertools
 import os
-from collections import Counter
-from collections.abc import Container, Iterable, Sequence
+from collections.abc import Callable, Container, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from ...errors import DISK_FULL, FrameError, SettingsError, refusal, spelled_out
-from ...images.exr import window_of
+from ...errors import DISK_FULL, FrameError, SettingsError, join_failures, os_error_message
+from ...images.exr import read_data_window
 from ...images.formats.exif import read_exif
 from ...images.listing import pictures_below, pictures_in
-from ...images.plates import is_of_the_plate, write_results
-from ...system.files import check_apart, resolved
+from ...images.plates import is_plate_error, write_results
+from ...system.files import check_no_overwrite, real_path
 from ...system.progress import Progress
-from ..inference.neighbours import Sequences, shot_order
+from ..inference.neighbours import ShotPredictor, shot_sort_key
 from ..inference.remover import Remover
-from .manifest import RECORD, Kept, Record, made_from
+from .clean_frames import CleanFrame, write_clean_frames
+from .manifest import MANIFEST, Manifest, digest_inputs
 from .mattes import Mattes
 
+MIN_CONFIDENCE = 0.5
+"""Confidence of a prediction below which the user is told that a possible flare was kept."""
 
-def plates_of(inputs: Iterable[Path], apart_from: Iterable[Path | None] = ()) -> list[tuple[Path, Path]]:
-    """(file, name below the output folder) of pictures, and of the pictures in folders.
 
-    apart_from: files and folders in these folders that hold no plates: the results of this run, mattes. Clean plates
-    and flares of an earlier one, which its record tells, are none either, unless their own folder is given. Raises
-    SettingsError where there are none, or where two would be written to one name; on Windows and macOS a.png is A.png.
+def collect_plates(inputs: Iterable[Path], exclude: Iterable[Path | None] = ()) -> list[tuple[Path, Path]]:
+    """Return (file, name below the output folder) of the item pictures and of all pictures in the item folders.
+
+    exclude: files and folders that hold no plates, such as the results of this run and mattes. Results of earlier runs,
+    which their manifests list, are excluded too unless their own folder is an input. Raises SettingsError where no
+    plate is left, and where two would be written to one name; on Windows and macOS a.png and A.png are one name.
     """
-    found: dict[str, tuple[Path, Path]] = {}
-    apart = [other for other in apart_from if other is not None]
-    for given in inputs:
-        if given.is_dir():
-            inner = _no_plates(given, apart)
-            for record in given.rglob(RECORD):
-                if record.parent != given:
-                    inner.update(Record(record.parent).results())
-            files = [(path, path.relative_to(given)) for path in pictures_below(given)
-                     if inner.isdisjoint(_itself_and_its_folders(path))]
+    plates: dict[str, tuple[Path, Path]] = {}
+    excluded = [other for other in exclude if other is not None]
+    for item in inputs:
+        if item.is_dir():
+            excluded_paths = _excluded_paths(item, excluded)
+            for manifest in item.rglob(MANIFEST):
+                if manifest.parent != item:
+                    excluded_paths.update(Manifest(manifest.parent).results())
+            files = [(path, path.relative_to(item)) for path in pictures_below(item)
+                     if excluded_paths.isdisjoint(_self_and_parents(path))]
             if not files:
-                raise SettingsError(f"{given} holds no pictures, or results alone; give a folder with PNG, JPEG, "
+                raise SettingsError(f"{item} holds no pictures, or results alone; give a folder with PNG, JPEG, "
                                     "TIFF or EXR files.")
         else:
-            files = [(given, Path(given.name))]
+            files = [(item, Path(item.name))]
         for path, name in files:
             key = name.as_posix().casefold()
-            if key in found:
-                raise SettingsError(f"{found[key][0]} and {path} would be written to the same file, on Windows and "
+            if key in plates:
+                raise SettingsError(f"{plates[key][0]} and {path} would be written to the same file, on Windows and "
                                     "macOS at least; remove them apart.")
-            found[key] = path, name
-    return list(found.values())
+            plates[key] = path, name
+    return list(plates.values())
 
 
-def with_neighbours(inputs: Sequence[Path], apart_from: Iterable[Path | None] = ()) -> list[Path]:
-    """The plates of `plates_of`, and what lies beside those that were given by themselves: one frame of a shot comes
-    out as it does with all of them."""
-    apart = [other for other in apart_from if other is not None]
-    found = dict.fromkeys(path for path, _ in plates_of(inputs, apart))
-    for folder in dict.fromkeys(given.parent for given in inputs if not given.is_dir()):
-        others = _no_plates(folder, apart)
+def collect_with_neighbours(inputs: Sequence[Path], exclude: Iterable[Path | None] = ()) -> list[Path]:
+    """Return the plates of `collect_plates` and the pictures beside those that were item one by one.
+
+    A frame of a shot that is cleaned alone then comes out as it does with the whole shot.
+    """
+    excluded = [other for other in exclude if other is not None]
+    plates = dict.fromkeys(path for path, _ in collect_plates(inputs, excluded))
+    for folder in dict.fromkeys(item.parent for item in inputs if not item.is_dir()):
+        others = _excluded_paths(folder, excluded)
         with contextlib.suppress(OSError):  # a plate may be read out of a folder that may not be
-            found.update(dict.fromkeys(path for path in pictures_in(folder) if path.resolve() not in others))
-    return list(found)
+            plates.update(dict.fromkeys(path for path in pictures_in(folder) if path.resolve() not in others))
+    return list(plates)
 
 
-def _no_plates(folder: Path, apart: Iterable[Path]) -> set[Path]:
-    """Files and folders in `folder` that hold no plates: those of `apart` that lie in it, and the results of an earlier
-    run that wrote to one of them."""
-    inner = {other.resolve() for other in apart if folder.resolve() in other.resolve().parents}
-    return inner.union(*(Record(other).results() for other in apart))
+def _excluded_paths(folder: Path, excluded: Iterable[Path]) -> set[Path]:
+    """Return files and folders in `folder` that hold no plates: those of `excluded` that lie in it, and the results
+    that their manifests list."""
+    excluded_paths = {other.resolve() for other in excluded if folder.resolve() in other.resolve().parents}
+    return excluded_paths.union(*(Manifest(other).results() for other in excluded))
 
 
-def _itself_and_its_folders(path: Path) -> list[Path]:
-    whole = resolved(path)
+def _self_and_parents(path: Path) -> list[Path]:
+    """Return the resolved path and all folders that it is in."""
+    whole = real_path(path)
     return [whole, *whole.parents]
 
 
-def _in_place_of(folder: Path) -> Path | None:
-    """What bars a folder from being made: a file, or a link that leads nowhere, of its name or that of one it is in."""
+def _blocking_path(folder: Path) -> Path | None:
+    """Return what prevents a folder from being created: a file or a dangling link in its place or in that of a parent;
+    None if nothing does."""
     first = next((path for path in (folder, *folder.parents) if os.path.lexists(path)), None)
     return None if first is None or first.is_dir() else first
 
 
 def remove_all(inputs: Sequence[Path], folder: Path, remover: Remover, progress: Progress, *,
                flare_folder: Path | None = None, mattes: Mattes | None = None, overwrite: bool = False,
-               wanted: Container[Path] | None = None, stills: bool = False,
-               left_out: Sequence[str] = ()) -> dict[str, Any]:
-    """Clean every plate into `folder`; one whose result is there, made from the same plate, neighbours and matte in the
-    same way (`Record`), is left as it is, and so is one that was worked on since it was made from the same plate.
+               only: Container[Path] | None = None, independent: bool = False,
+               failed_inputs: Sequence[str] = ()) -> dict[str, Any]:
+    """Clean every plate into `folder` and return the counts; the events of `remove` have the same keys.
 
-    mattes: where the flares are; None to have them found anywhere. wanted: names below the output folder of those to be
-    cleaned; None for all. stills: each by itself, in place of in line with its neighbours. left_out: what was said
-    of inputs that turned out to be no plates (`footage.with_frames`), which have failed with it.
+    A result is kept if it was made from the same plate, neighbours and matte by the same remover, or if it was edited
+    since it was made from the same plate (`Manifest`).
 
-    Raises SettingsError before anything is written, FrameError at once where the folder may not be written to, and
-    FrameError after everything was tried, with a list of the plates that failed.
+    flare_folder: where to write the removed flares, if at all. mattes: where flares may be removed; None for
+    everywhere. overwrite: make every frame again. only: names below the output folder of the plates to clean; None for
+    all. independent: predict each plate without its neighbours. failed_inputs: messages about inputs that turned out to
+    be no plates (`video_frames.expand_videos`); they count as failed.
+
+    Raises SettingsError before anything is written, FrameError at once where the folder cannot be written to, and
+    FrameError at the end with a list of the plates that failed.
     """
     for place in (folder, flare_folder):
-        if place is not None and (other := _in_place_of(place)):
+        if place is not None and (other := _blocking_path(place)):
             raise SettingsError(f"{other} is no folder, and results are to go into {place}; name another.")
-    apart = [folder, flare_folder, mattes.given if mattes else None]
-    plates = plates_of(inputs, apart)
+    excluded = [folder, flare_folder, mattes.source if mattes else None]
+    plates = collect_plates(inputs, excluded)
     results = {name: [folder / name, *([flare_folder / name.with_suffix(".exr")] if flare_folder else [])]
                for _, name in plates}
-    check_apart([*(path for path, _ in plates), *(mattes.files if mattes else ())],
+    check_no_overwrite([*(path for path, _ in plates), *(mattes.files if mattes else ())],
                 itertools.chain.from_iterable(results.values()))
-    record = Record(folder)
-    sequences = Sequences(remover, [] if stills else with_neighbours(inputs, apart))
-    if wanted is not None:
-        plates = [(path, name) for path, name in plates if name in wanted]
+    manifest = Manifest(folder)
+    predictor = ShotPredictor(remover, [] if independent else collect_with_neighbours(inputs, excluded))
+    if only is not None:
+        plates = [(path, name) for path, name in plates if name in only]
     progress.stage("remove", len(plates))
-    failed = list(left_out)
-    made, doubted, kept = 0, 0, Counter[Kept]()
-    for path, name in sorted(plates, key=lambda plate: shot_order(plate[0])):
-        try:
-            matte = [mattes.path(name)] if mattes else []
-            how = made_from(remover.described, [path, *sequences.beside(path), *matte])
-            if not overwrite and (why := record.keeps(name, path, how, results[name])):
-                kept[why] += 1
-            else:
-                plate, told = sequences.read(path)
-                marked = mattes.read(name, window_of(path), read_exif(path)[0]) if mattes else None
-                record.begin(name, path, how, results[name], overwrite)  # once it can be read: what is there goes
-                write_results(results[name], plate, *remover.remove(plate, marked, told))
-                record.end(results[name])
-                made += 1
-                doubted += marked is None and bool(told.worth < 0.5)
-        except Exception as problem:
-            if not is_of_the_plate(problem):
-                raise
-            if isinstance(problem, OSError) and problem.errno in DISK_FULL:
-                raise  # none of the others would fit either
-            if isinstance(problem, OSError) and record.is_refused(problem):
-                raise FrameError(f"{folder} cannot be written to ({problem.strerror}); choose another folder for the "
-                                 "clean plates, or have the rights to this one.") from problem
-            failed.append(refusal(problem) if isinstance(problem, OSError) else str(problem)
-                          if isinstance(problem, FrameError) else f"{path} does not fit into memory.")
-            progress.say(f"Left out: {failed[-1]}")
-        progress.advance()
-    record.tell_kept(kept, progress)
+    failed, unsure = list(failed_inputs), list[Path]()
+
+    def digest(frame: CleanFrame) -> str:
+        matte = [mattes.path(frame.name)] if mattes else []
+        return digest_inputs(remover.cache_key, [frame.source, *predictor.dependencies(frame.source), *matte])
+
+    def clean(frame: CleanFrame) -> Callable[[], None]:
+        plate, prediction = predictor.predict(frame.source)
+        matte = mattes.read(frame.name, read_data_window(frame.source), read_exif(frame.source)[0]) if mattes else None
+
+        def write() -> None:
+            write_results(frame.results, plate, *remover.remove(plate, matte, prediction))
+            if matte is None and prediction.confidence < MIN_CONFIDENCE:
+                unsure.append(frame.name)
+
+        return write
+
+    def leave_out(frame: CleanFrame, error: Exception) -> None:
+        if not is_plate_error(error):
+            raise error
+        if isinstance(error, OSError) and error.errno in DISK_FULL:
+            raise error  # none of the others would fit either
+        if isinstance(error, OSError) and manifest.is_write_error(error):
+            raise FrameError(f"{folder} cannot be written to ({error.strerror}); choose another folder for the clean "
+                             "frames, or get write permission for this one.") from error
+        failed.append(os_error_message(error) if isinstance(error, OSError)
+                      else str(error) if isinstance(error, FrameError)
+                      else f"{frame.source} does not fit into memory.")
+        progress.say(f"Left out: {failed[-1]}")
+
+    frames = (CleanFrame(name, path, results[name])
+              for path, name in sorted(plates, key=lambda plate: shot_sort_key(plate[0])))
+    written, kept = write_clean_frames(frames, manifest, progress, digest=digest, clean=clean,
+                                       keep_finished=not overwrite, overwrite=overwrite, on_error=leave_out)
+    manifest.report_kept(kept, progress)
     if failed:
-        raise FrameError(f"{len(failed)} of {len(plates) + len(left_out)} plates could not be cleaned: "
-                         f"{spelled_out(failed)}")
-    if doubted:
-        progress.say(f"In {doubted} of them what may be a flare was left, since it may as well be the scene or its "
-                     "grade; a matte, white all over, has it taken.")
-    progress.say(f"{made + kept.total()} clean plates are in {folder}.")
-    return {"plates": str(folder), "made": made, "kept": kept.total()}
+        raise FrameError(f"{len(failed)} of {len(plates) + len(failed_inputs)} plates could not be cleaned: "
+                         f"{join_failures(failed)}")
+    if unsure:
+        progress.say(f"In {len(unsure)} of them a possible flare was kept, because it may be part of the scene or of "
+                     "its grade; an all-white matte removes it.")
+    progress.say(f"{written + kept.total()} clean frames are in {folder}.")
+    return {"plates": str(folder), "made": written, "kept": kept.total()}

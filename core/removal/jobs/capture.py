@@ -1,56 +1,62 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The flare-free frames of a capture, made once and kept in its folder removed/."""
+"""Cleans all frames of a capture into its folder removed/, which a fit reads.
+
+`fit` without exact clean frames and the panel's Make Clean Frames run it.
+"""
 from __future__ import annotations
 
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 from ...capture import REMOVED, Capture
 from ...errors import CaptureError
 from ...images.plates import write_plate
-from ...system.files import inside, patiently
+from ...system.files import retry_while_locked, safe_join
 from ...system.progress import Progress
-from ..inference.neighbours import Sequences, shot_order
+from ..inference.neighbours import ShotPredictor, shot_sort_key
 from ..inference.remover import Remover
-from .manifest import Record, made_from
+from .clean_frames import CleanFrame, write_clean_frames
+from .manifest import Manifest, digest_inputs
 
-UNFINISHED = "removed.unfinished"
-"""Where they are until they are all there: half a removed/ would be taken for a whole one."""
-_LOSSY = frozenset({".jpg", ".jpeg"})
+UNFINISHED_FOLDER = "removed.unfinished"
+"""Holds the clean frames until all exist: an incomplete removed/ would be read as a complete one."""
+_JPEG_SUFFIXES = frozenset({".jpg", ".jpeg"})
 
 
-def remove_from(capture: Capture, remover: Remover, progress: Progress) -> Path:
-    """Clean every frame into the capture's removed/, JPEG frames as PNG; what an earlier call has made is kept.
+def clean_capture(capture: Capture, remover: Remover, progress: Progress) -> Path:
+    """Clean every frame into the capture's removed/ and return that folder; frames of an interrupted call are kept.
 
-    remover: one that takes all of a glow, where the frames are for a fit.
+    JPEG frames are written as PNG. remover: one that removes all of a glow, if the frames are for a fit.
 
-    Raises CaptureError where there is a removed/ already, where the folder cannot be written or two frames would have
-    one clean picture, FrameError for a frame that cannot be read, and Cancelled when asked to stop.
+    Raises CaptureError where removed/ exists already, where the folder cannot be written to and where two frames would
+    have one clean file; FrameError for a frame that cannot be read; Cancelled.
     """
-    target, work = capture.folder / REMOVED, capture.folder / UNFINISHED
+    target, work = capture.folder / REMOVED, capture.folder / UNFINISHED_FOLDER
     if target.exists():
-        raise CaptureError(f"{target} is there already; remove it, and the frames are cleaned again.")
-    names = _names(capture)
+        raise CaptureError(f"{target} exists already; delete it to clean the frames again.")
+    names = _clean_names(capture)
     progress.stage("remove", len(capture.views))
-    sequences = Sequences(remover, [capture.frame_path(view) for view in capture.views])
-    record, results = Record(work), []
+    predictor = ShotPredictor(remover, [capture.frame_path(view) for view in capture.views])
+    frames = [CleanFrame(names[view.name], capture.frame_path(view),
+                         [safe_join(work, str(names[view.name]), CaptureError)])
+              for view in sorted(capture.views, key=lambda view: shot_sort_key(capture.frame_path(view)))]
+
+    def digest(frame: CleanFrame) -> str:
+        return digest_inputs(remover.cache_key, [frame.source, *predictor.dependencies(frame.source)])
+
+    def clean(frame: CleanFrame) -> Callable[[], None]:
+        plate, prediction = predictor.predict(frame.source)
+        return lambda: write_plate(frame.results[0], plate, remover.remove(plate, prediction=prediction)[0])
+
     try:
-        for view in sorted(capture.views, key=lambda one: shot_order(capture.frame_path(one))):
-            frame, name = capture.frame_path(view), names[view.name]
-            result = inside(work, str(name), CaptureError)
-            results.append(result)
-            how = made_from(remover.described, [frame, *sequences.beside(frame)])
-            if not record.is_made(name, how, [result]):
-                record.begin(name, frame, how, [result], overwrite=True)
-                plate, told = sequences.read(frame)
-                write_plate(result, plate, remover.remove(plate, told=told)[0])
-                record.end([result])
-            progress.advance()
+        write_clean_frames(frames, Manifest(work), progress, digest=digest, clean=clean, keep_finished=True,
+                           overwrite=True)
         # In this order: what is missing because another has just renamed its folder is in `target` by then.
-        if not all(path.is_file() for path in results) and not target.exists():
+        if not all(frame.results[0].is_file() for frame in frames) and not target.exists():
             raise CaptureError(f"Another fit cleans the frames of {capture.folder} in another way at the same time; "
                                "wait for it, and start this one again.")
-        patiently(work.rename, target)
+        retry_while_locked(work.rename, target)
     except OSError as problem:
         if target.is_dir():  # another fit of this capture was first
             shutil.rmtree(work, ignore_errors=True)
@@ -60,14 +66,14 @@ def remove_from(capture: Capture, remover: Remover, progress: Progress) -> Path:
     return target
 
 
-def _names(capture: Capture) -> dict[str, Path]:
-    """Of every view's clean picture, below the folder. Raises CaptureError where two would be one, on any file system.
-    """
+def _clean_names(capture: Capture) -> dict[str, Path]:
+    """Return each view's clean file below the folder, by view name. Raises CaptureError where two would be one file, on
+    any file system."""
     names: dict[str, Path] = {}
     views: dict[str, str] = {}
     for view in capture.views:
         name = Path(view.name)
-        name = name.with_suffix(".png") if name.suffix.lower() in _LOSSY else name
+        name = name.with_suffix(".png") if name.suffix.lower() in _JPEG_SUFFIXES else name
         key = name.as_posix().casefold()
         if key in views:
             raise CaptureError(f"The frames {views[key]} and {view.name} of {capture.folder} would both have "

@@ -1,18 +1,17 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A capture's frames without the flare that a fit has found in them.
+"""Removes from a capture's frames the flare that a fit has separated.
 
-What a fit knows of a flare it knows from all views together, which is more than any single plate says. Its flare is
-taken from a plate in linear light, of each light as much as the plate shows of it. Where the plate is clipped, nothing
-is left of what lay under the flare: there the fitted scene stands in, as far as it is brighter. The lights' own clipped
-discs stay as they are; where the fit was shown light above white the scene stands in there too, so that a lamp keeps
-the light that is its own.
+A fit knows a flare from all views together, which is more than any single frame shows. Its flare is subtracted from the
+frame in linear light, scaled for each light by how much of it the frame shows. Where the frame is clipped, nothing is
+left of what lay under the flare; the fitted scene is used there, as far as it is brighter. The light discs stay as
+filmed; if the fit was given light above white, the scene is used there too, so that a light keeps its own brightness.
 """
 from __future__ import annotations
 
 import itertools
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,171 +19,189 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...capture import Capture, View
-from ...capture.discs import clipped_discs
+from ...capture.discs import light_disc_mask
 from ...colour.srgb import Pixels, linear_from_srgb, srgb_from_linear
 from ...errors import CaptureError
-from ...images.exr import window_of
-from ...images.plates import Plate, finite, read_plate, write_results
+from ...images.exr import read_data_window
+from ...images.plates import Plate, finite_light, read_plate, write_results
 from ...metrics.evaluation import Renderer
-from ...system.files import check_apart, inside
+from ...system.files import check_no_overwrite, safe_join
 from ...system.progress import Progress
-from ..inference.remover import CLIPPED
-from .manifest import Kept, Record, made_from
+from ..inference.plate_light import CLIPPING_LEVEL
+from .clean_frames import CleanFrame, write_clean_frames
+from .manifest import Manifest, digest_inputs
 
 Floats = NDArray[np.float64]
 
-ASKED = 100_000
-"""Pixels of a plate, about, that are asked how much of each light's flare is there."""
-HALF = 0.5
-"""Part of a flare below which it is told that there is less of it."""
-UNEVEN = 1.25
-"""Times that a plate's scene may be brighter or darker than it was fitted: what `core.fit.metering` leaves."""
-ROUNDS, SWEEPS = 8, 50
-FAINT = 0.01
-"""Linear light, below which errors count by their squares."""
-KEPT = 1e-4
-"""How much, a pixel, counts what was fitted: more than the plate does for flares of a thousandth of white."""
+MAX_SAMPLES = 100_000
+"""Pixels of a frame, about, that the gains of the flares are estimated from."""
+DIM_FLARE = 0.5
+"""Gain of a light's flare below which the frame is reported."""
+MAX_SCENE_GAIN = 1.25
+"""Largest factor by which a frame's scene may be brighter or darker than it was fitted: what `core.fit.metering`
+leaves."""
+REWEIGHTINGS, DESCENT_SWEEPS = 8, 50
+"""Reweightings of the least squares, and sweeps of coordinate descent in each."""
+L1_EPSILON = 0.01
+"""Linear light; smaller residuals count by their squares."""
+PRIOR_WEIGHT = 1e-4
+"""Weight per pixel of the fitted gains of 1; it exceeds the frame's for flares of a thousandth of white."""
 
 
-def remove_fitted(fitted: Renderer, capture: Capture, views: Sequence[View], folder: Path, progress: Progress, *,
-                  flare_folder: Path | None = None, overwrite: bool = False,
-                  made_by: str = "", above_white: bool = False) -> dict[str, Any]:
-    """Write the views' frames without the fitted flare below `folder`, each under its own name, in its own kind and
-    depth; those that are there, made from the same frame, camera and lights by the same fit, their flares too where
-    those are wanted, or worked on since they were made from the same frame, are kept, unless `overwrite`. made_by:
-    changes whenever the fit's pictures would. above_white: whether the fit was shown light above white.
+def remove_fitted_flare(renderer: Renderer, capture: Capture, views: Sequence[View], folder: Path,
+                        progress: Progress, *, flare_folder: Path | None = None, overwrite: bool = False,
+                        fit_digest: str = "", above_white: bool = False) -> dict[str, Any]:
+    """Write the views' frames without the fitted flare below `folder`, and return the counts.
 
-    Raises CaptureError for frames with lens distortion, which the flare was not fitted with, SettingsError where frames
-    would be overwritten, FrameError for a frame that cannot be read or whose plate in `folder` is not from here.
+    Each frame keeps its name, file format and depth. A result is kept if it was made from the same frame, camera,
+    lights and fit, or edited since, unless `overwrite`. flare_folder: where to write the removed flares, if at all.
+    fit_digest: changes whenever the fit's pictures do. above_white: the fit was given light above white.
+
+    Raises CaptureError for frames with lens distortion, without which the flare was fitted; SettingsError where frames
+    would be overwritten; FrameError for a frame that cannot be read, and for a file in `folder` that is not listed in
+    its manifest.
     """
     if any(view.lens for view in views):
         raise CaptureError(f"The frames of {capture.folder} are distorted by their lens, and the flare was fitted "
                            "without that; undistort them first (for instance with COLMAP's image_undistorter).")
-    results = [_results(view, folder, flare_folder) for view in views]
-    check_apart([capture.frame_path(view) for view in capture.views], itertools.chain.from_iterable(results))
+    views_by_name = {Path(view.name): view for view in views}
+    frames = [CleanFrame(name, capture.frame_path(view), _results(view, folder, flare_folder))
+              for name, view in views_by_name.items()]
+    check_no_overwrite([frame.source for frame in frames],
+                       itertools.chain.from_iterable(frame.results for frame in frames))
     progress.stage("remove", len(views))
-    record, lights = Record(folder), [(light.name, light.xyz.tolist()) for light in capture.lights]
-    made, kept, dim = 0, Counter[Kept](), Counter[str]()
-    for view, targets in zip(views, results, strict=True):
-        name = Path(view.name)
-        frame = capture.frame_path(view)
-        how = made_from(repr((made_by, view.camera.numbers, lights)), [frame])
-        if not overwrite and (why := record.keeps(name, frame, how, targets)):
-            kept[why] += 1
-        else:
-            record.begin(name, frame, how, targets, overwrite)
-            parts = _remove(fitted, capture, view, targets, above_white)
-            record.end(targets)
-            dim.update(light for light, part in parts.items() if part < HALF)
-            made += 1
-        progress.advance()
+    manifest, lights = Manifest(folder), [(light.name, light.xyz.tolist()) for light in capture.lights]
+    dim = Counter[str]()
+
+    def digest(frame: CleanFrame) -> str:
+        camera = views_by_name[frame.name].camera
+        return digest_inputs(repr((fit_digest, camera.numbers, lights)), [frame.source])
+
+    def clean(frame: CleanFrame) -> Callable[[], None]:
+        plate, codes, flare, gains = _clean_view(renderer, capture, views_by_name[frame.name], above_white)
+
+        def write() -> None:
+            write_results(frame.results, plate, codes, flare)
+            dim.update(light for light, gain in gains.items() if gain < DIM_FLARE)
+
+        return write
+
+    written, kept = write_clean_frames(frames, manifest, progress, digest=digest, clean=clean,
+                                       keep_finished=not overwrite, overwrite=overwrite)
     for light, count in dim.items():
-        progress.say(f"{count} of {made} frames show less than half of the flare that {light!r} has in the fit; no "
-                     "more than they show was taken from them.")
-    record.tell_kept(kept, progress)
-    progress.say(f"{len(views)} clean plates are in {folder}.")
-    return {"plates": str(folder), "made": made, "kept": kept.total()}
+        progress.say(f"{count} of {written} frames show less than half of the flare that {light!r} has in the fit; no "
+                     "more than they show was removed.")
+    manifest.report_kept(kept, progress)
+    progress.say(f"{len(views)} clean frames are in {folder}.")
+    return {"plates": str(folder), "made": written, "kept": kept.total()}
 
 
 def _results(view: View, folder: Path, flare_folder: Path | None) -> list[Path]:
-    """Of the clean plate, and of the flare where it is wanted."""
-    plate = inside(folder, view.name, CaptureError)
+    """Return the path of the clean frame, then that of its flare where one is requested."""
+    plate = safe_join(folder, view.name, CaptureError)
     if flare_folder is None:
         return [plate]
-    return [plate, inside(flare_folder, str(Path(view.name).with_suffix(".exr")), CaptureError)]
+    return [plate, safe_join(flare_folder, str(Path(view.name).with_suffix(".exr")), CaptureError)]
 
 
-def _remove(fitted: Renderer, capture: Capture, view: View, results: Sequence[Path],
-            above_white: bool) -> dict[str, float]:
-    """results: the clean plate's path, and the flare's where it is wanted. Gives the part of each light's flare that
-    was there."""
+def _clean_view(renderer: Renderer, capture: Capture, view: View,
+                above_white: bool) -> tuple[Plate, NDArray[Any], Pixels, dict[str, float]]:
+    """Return a view's plate, the codes of its clean frame, the removed flare in linear light, and each light's gain."""
     plate = read_plate(capture.frame_path(view))
     height, width = plate.codes.shape[:2]
-    window = window_of(capture.frame_path(view))  # an EXR's pixels may be more than those of the frame, or fewer
+    window = read_data_window(capture.frame_path(view))  # an EXR's pixels may be more than those of the frame, or fewer
     camera = view.camera if view.camera.size == window.frame else view.camera.scaled(*window.frame)
     camera = camera if window.is_frame else camera.cropped(*window.origin, *window.size)
-    layers = fitted.render(camera)
+    layers = renderer.render(camera)
     flare = np.zeros((height, width, 3), np.float32)
-    part = plate.inside.part  # the borders, which were not fitted, stay
+    fitted_part = plate.picture_area.slices  # the borders were not fitted, and stay
     flares, scene = layers.flare_by_light, layers.scene
     if plate.encoding == "linear":  # the fit was shown Rec. 709
-        flares = {light: plate.space.from_linear(one) for light, one in flares.items()}
+        flares = {light: plate.space.from_linear(pixels) for light, pixels in flares.items()}
         scene = plate.space.from_linear(scene)
-    flares, scene = {light: plate.shown(one) for light, one in flares.items()}, plate.shown(scene)
-    parts = _parts(plate, scene, flares)
-    for light, one in flares.items():
-        flare[part] += np.float32(parts[light]) * one[part]
-    lights = clipped_discs(_display(plate), camera, [light.xyz for light in capture.lights])
+    flares = {light: plate.to_plate_channels(pixels) for light, pixels in flares.items()}
+    scene = plate.to_plate_channels(scene)
+    gains = _fit_flare_gains(plate, scene, flares)
+    for light, light_flare in flares.items():
+        flare[fitted_part] += np.float32(gains[light]) * light_flare[fitted_part]
+    light_discs = light_disc_mask(_display_values(plate), camera, [light.xyz for light in capture.lights])
     if above_white and plate.encoding == "linear":
-        clean = without(plate, flare, scene, lights)
+        codes = subtract_fitted_flare(plate, flare, scene, light_discs)
     else:
-        clean = without(plate, np.where(lights[..., None], 0, flare), scene)
-    write_results(results, plate, clean, flare)
-    return parts
+        codes = subtract_fitted_flare(plate, np.where(light_discs[..., None], 0, flare), scene)
+    return plate, codes, flare, gains
 
 
-def _parts(plate: Plate, scene: Pixels, flares: Mapping[str, Pixels]) -> dict[str, float]:
-    """Of each light's flare the part, 0..1, that the plate holds beside the scene, in the sense of least absolute
-    errors: a light that is switched off, or hidden by what the fit knows nothing of, leaves no dark flare. The scene
-    may be a little brighter or darker than it was fitted, or a frame exposed for less would seem to lack flare."""
+def _fit_flare_gains(plate: Plate, scene: Pixels, flares: Mapping[str, Pixels]) -> dict[str, float]:
+    """Return how much of each light's fitted flare the frame shows, 0..1: least absolute errors beside the scene.
+
+    A light that is switched off, or hidden by something that the fit does not know, then leaves no dark flare. The
+    scene has a gain too, within MAX_SCENE_GAIN, or an underexposed frame would seem to lack flare. Clipped pixels do
+    not count.
+    """
     if not flares:
         return {}
-    part = plate.inside.part
-    step = max(round(math.sqrt(math.prod(plate.codes.shape[:2]) / ASKED)), 1)
-    shown, *layers = (one[part][::step, ::step] for one in (_light(plate), scene, *flares.values()))
-    clipped = linear_from_srgb(np.array(CLIPPED)) if plate.encoding == "srgb" else np.inf
-    tells = (shown < clipped).all(-1)
-    light = shown[tells].ravel().astype(np.float64)
-    columns = np.stack([one[tells].ravel() for one in layers], 1).astype(np.float64)
-    low, high = np.array([[1 / UNEVEN, UNEVEN], *len(flares) * [[0.0, 1.0]]]).T
-    parts, weights = np.ones(len(layers)), np.ones(len(light))
-    held = KEPT * max(len(light), 1) * np.eye(len(layers))  # of a plate that is white all over nothing else tells
-    for _ in range(ROUNDS):
+    part = plate.picture_area.slices
+    step = max(round(math.sqrt(math.prod(plate.codes.shape[:2]) / MAX_SAMPLES)), 1)
+    observed, *layers = (one[part][::step, ::step] for one in (_linear_light(plate), scene, *flares.values()))
+    clipped = linear_from_srgb(np.array(CLIPPING_LEVEL)) if plate.encoding == "srgb" else np.inf
+    unclipped = (observed < clipped).all(-1)
+    light = observed[unclipped].ravel().astype(np.float64)
+    columns = np.stack([one[unclipped].ravel() for one in layers], 1).astype(np.float64)
+    low, high = np.array([[1 / MAX_SCENE_GAIN, MAX_SCENE_GAIN], *len(flares) * [[0.0, 1.0]]]).T
+    gains, weights = np.ones(len(layers)), np.ones(len(light))
+    prior = PRIOR_WEIGHT * max(len(light), 1) * np.eye(len(layers))  # alone decides where the whole plate is clipped
+    for _ in range(REWEIGHTINGS):
         weighted = columns.T * weights
-        parts = _least_squares(weighted @ columns + held, weighted @ light + held.sum(1), parts, low, high)
-        weights = 1 / (np.abs(light - columns @ parts) + FAINT)
-    return dict(zip(flares, parts[1:].tolist(), strict=True))
+        gains = _bounded_least_squares(weighted @ columns + prior, weighted @ light + prior.sum(1), gains, low, high)
+        weights = 1 / (np.abs(light - columns @ gains) + L1_EPSILON)
+    return dict(zip(flares, gains[1:].tolist(), strict=True))
 
 
-def _least_squares(product: Floats, goal: Floats, begin: Floats, low: Floats, high: Floats) -> Floats:
-    """x (n,) between two bounds that product x = goal comes nearest to, one coordinate after the other."""
-    found = begin.copy()
-    for _ in range(SWEEPS):
-        for at in range(len(found)):
-            rest = goal[at] - product[at] @ found + product[at, at] * found[at]
-            found[at] = min(max(rest / product[at, at], low[at]), high[at])
-    return found
+def _bounded_least_squares(product: Floats, target: Floats, start: Floats, low: Floats, high: Floats) -> Floats:
+    """Solve product x = target for x (n,) between bounds, by coordinate descent."""
+    solution = start.copy()
+    for _ in range(DESCENT_SWEEPS):
+        for at in range(len(solution)):
+            rest = target[at] - product[at] @ solution + product[at, at] * solution[at]
+            solution[at] = min(max(rest / product[at, at], low[at]), high[at])
+    return solution
 
 
-def _light(plate: Plate) -> Pixels:
-    """Linear light of the codes by sRGB's curve, which is that of a fit's layers; the network's has its own
-    (`formation.GAMMA`)."""
+def _linear_light(plate: Plate) -> Pixels:
+    """Return linear light of the codes by sRGB's curve, which the layers of a fit have; the network has a gamma of its
+    own (`image_formation.GAMMA_RANGE`)."""
     if plate.encoding == "srgb":
-        return linear_from_srgb(_display(plate))
-    return finite(plate.codes)
+        return linear_from_srgb(_display_values(plate))
+    return finite_light(plate.codes)
 
 
-def _display(plate: Plate) -> Pixels:
-    """Display values of the codes, 0..1."""
+def _display_values(plate: Plate) -> Pixels:
+    """Return display values of the codes, 0..1."""
     if plate.encoding == "srgb":
         return plate.values
     return srgb_from_linear(np.clip(np.nan_to_num(plate.codes.astype(np.float32)), 0, 1))
 
 
-def without(plate: Plate, flare: Pixels, scene: Pixels, hidden: NDArray[np.bool_] | None = None) -> NDArray[Any]:
-    """The plate's codes less a flare, given linear light of flare and scene as (height, width, 3); kept to the last bit
-    where there is no flare, and where they are no numbers. The scene stands in where the plate is clipped and where,
-    (height, width), what lies under the flare is `hidden` otherwise."""
-    light = _light(plate)
+def subtract_fitted_flare(plate: Plate, flare: Pixels, scene: Pixels,
+                          hidden: NDArray[np.bool_] | None = None) -> NDArray[Any]:
+    """Return the plate's codes (height, width, 3) minus a flare; unchanged to the last bit where the flare is zero or
+    the codes are not finite.
+
+    flare, scene: linear light (height, width, 3). The scene replaces the result where the plate is clipped and where
+    `hidden` (height, width) is set, as far as it is brighter than the result.
+    """
+    light = _linear_light(plate)
     clipped = np.zeros((*light.shape[:2], 1), bool)
     if plate.encoding == "srgb":
-        clipped = _display(plate).max(-1, keepdims=True) >= CLIPPED
+        clipped = _display_values(plate).max(-1, keepdims=True) >= CLIPPING_LEVEL
     if hidden is not None:
         clipped = clipped | hidden[..., None]
-    less = light - flare
-    less = np.maximum(np.where(clipped, np.maximum(less, np.minimum(scene, light)), less), np.minimum(light, 0))
+    difference = light - flare
+    filled = np.maximum(difference, np.minimum(scene, light))
+    difference = np.maximum(np.where(clipped, filled, difference), np.minimum(light, 0))
     if plate.encoding == "srgb":
-        codes = (srgb_from_linear(less) * np.float32(plate.top) + np.float32(0.5)).astype(plate.codes.dtype)
+        codes = (srgb_from_linear(difference) * np.float32(plate.max_code) + np.float32(0.5)).astype(plate.codes.dtype)
     else:
-        codes = less.astype(plate.codes.dtype)
+        codes = difference.astype(plate.codes.dtype)
     return np.where((flare != 0) & np.isfinite(plate.codes.astype(np.float32)), codes, plate.codes)

@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What each clean plate of a folder was made from and how, and where its flare is, in remove.json there, so that one is
-kept as long as it would come out the same, and whatever else lies there, or was made of it by hand, is not taken for
-one."""
+"""The manifest of a folder of clean frames: remove.json, which lists what each frame was made from.
+
+With it `clean_frames` keeps a frame as long as it would come out the same, and never takes a file for a clean frame
+that someone else put there or edited. `provenance` asks it where a capture's clean frames come from.
+"""
 from __future__ import annotations
 
 import contextlib
@@ -13,151 +15,172 @@ from pathlib import Path
 from typing import Literal
 
 from ...errors import FrameError
-from ...system.files import content_of, locked, read_json, remove_file, write_json
+from ...system.files import content_hash, file_lock, read_json, remove_file, write_json
 from ...system.progress import Progress
 
-RECORD = "remove.json"
+MANIFEST = "remove.json"
 LOCK = ".remove.lock"
-Kept = Literal["made", "worked on"]
-_TABLES = ("plates", "flares", "flares_made", "sources", "written")
-"""Of each plate how it was made, where from here its flare is, and how that was made: the plate may have been made in
-another way since, without one. The content of what it was made from; and by where it is, that of each file as it was
+KeepReason = Literal["up to date", "edited"]
+_Tables = dict[str, dict[str, str]]
+TABLES = ("plates", "flares", "flares_made", "sources", "written")
+"""By frame: digest of the clean frame; path of its flare relative to the folder; digest of the flare, since the frame
+may have been made again without one; content hash of the frame as filmed. By path: content hash of each file as it was
 written."""
 
 
-def made_from(maker: str, sources: Iterable[Path]) -> str:
-    """A short text that changes whenever a plate would: what makes it, and the content of all files that it depends on.
-    One that cannot be read counts as such."""
+def digest_inputs(maker: str, sources: Iterable[Path]) -> str:
+    """Return a short text that changes whenever a clean frame would.
+
+    maker: identifies the network or fit with its settings. sources: all files that the result depends on; one that
+    cannot be read counts as unreadable, whatever it holds.
+    """
     digest = hashlib.sha256(maker.encode())
     for path in sources:
         try:
-            digest.update(content_of(path).encode())
+            digest.update(content_hash(path).encode())
         except OSError:
             digest.update(b"none")
     return digest.hexdigest()[:16]
 
 
-class Record:
-    """The plates below a folder by their names there. Any number of processes may add to it, also ones that make the
-    same plates: it is read anew each time."""
+class Manifest:
+    """The manifest of one output folder; its keys are the frames' names below the folder.
+
+    Any number of processes may add to it, also for the same frames: every method reads the file anew, once.
+    """
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
 
-    def is_made(self, name: Path, how: str, results: Sequence[Path]) -> bool:
-        """Whether all files of a plate are there, made in this way (`made_from`)."""
-        written = all(self._read(what).get(name.as_posix()) == value for what, value in self._row(how, results).items())
-        return written and all(path.is_file() and path.stat().st_size for path in results)
+    def is_up_to_date(self, name: Path, digest: str, results: Sequence[Path]) -> bool:
+        """Return whether all files of a frame exist and were made with this digest (`digest_inputs`)."""
+        return self._is_up_to_date(self._read(), name, digest, results)
 
-    def begin(self, name: Path, source: Path, how: str, results: Sequence[Path], overwrite: bool) -> None:
-        """Before the files of a plate are written, itself and maybe its flare: what was made there in another way goes,
-        so that a kill leaves none under what is now written down. Raises FrameError for a plate or flare that is not
-        from here, or was worked on since, unless `overwrite`."""
+    def reason_to_keep(self, name: Path, source: Path, digest: str, results: Sequence[Path]) -> KeepReason | None:
+        """Return why the files of a frame are kept, or None if they are to be made.
+
+        "up to date": they would come out the same. "edited": someone has changed them since they were made from what
+        `source` still holds. Where a process was killed before it wrote down the content of finished files, that is
+        done now, so that later edits are noticed.
+        """
+        tables = self._read()
+        if self._is_up_to_date(tables, name, digest, results):
+            if not all(_relative_path(self._folder, path) in tables["written"] for path in results):
+                with contextlib.suppress(OSError):  # a frame is kept in a read-only folder too
+                    self.finish(results)
+            return "up to date"
+        is_edited = (bool(self._edited(tables, results))
+                     and tables["sources"].get(name.as_posix()) == content_hash(source))
+        return "edited" if is_edited else None
+
+    def begin(self, name: Path, source: Path, digest: str, results: Sequence[Path], overwrite: bool) -> None:
+        """Enter a frame before its files are written, and delete those that were made with another digest.
+
+        A process that is killed afterwards leaves no old file under the new digest. Raises FrameError for a file that
+        the manifest does not list or that was edited, unless `overwrite`.
+        """
         key = name.as_posix()
-        with locked(self._folder / LOCK):
-            known = {what: self._read(what) for what in _TABLES}
-            told = {what: {**rows} for what, rows in known.items()}
-            for what, value in {**self._row(how, results), "sources": content_of(source)}.items():
-                told[what][key] = value
-            from_here = (key in known["plates"], known["flares"].get(key) == told["flares"].get(key))
-            for path, is_known in zip(results, from_here, strict=False):
-                if not overwrite and not is_known and path.exists():
-                    raise FrameError(f"{path} is there, and {self._folder / RECORD} does not tell of it: it may be "
-                                     "someone's work; choose another folder, or have it written over (--overwrite).")
-            if not overwrite and (changed := self._worked_on(results)):
-                raise FrameError(f"{changed[0]} was worked on since it was made, of another {source.name} than there "
-                                 "is now; choose another folder, or have it written over (--overwrite).")
+        with file_lock(self._folder / LOCK):
+            old = self._read()
+            new = {table: {**rows} for table, rows in old.items()}
+            for table, value in {**self._entries(digest, results), "sources": content_hash(source)}.items():
+                new[table][key] = value
+            is_listed = (key in old["plates"], old["flares"].get(key) == new["flares"].get(key))
+            for path, listed in zip(results, is_listed, strict=False):
+                if not overwrite and not listed and path.exists():
+                    raise FrameError(f"{path} exists and is not listed in {self._folder / MANIFEST}, so it may be "
+                                     "someone's work; choose another folder, or replace it with --overwrite.")
+            if not overwrite and (changed := self._edited(old, results)):
+                raise FrameError(f"{changed[0]} was edited after it was made, from another {source.name} than there is "
+                                 "now; choose another folder, or replace it with --overwrite.")
             for path in results:
-                told["written"].pop(_from(self._folder, path), None)
-            for path, what in zip(results, ("plates", "flares_made"), strict=False):
-                if known[what].get(key) != how:
+                new["written"].pop(_relative_path(self._folder, path), None)
+            for path, table in zip(results, ("plates", "flares_made"), strict=False):
+                if old[table].get(key) != digest:
                     remove_file(path)
-            if told != known:
-                self._write(told)
+            if new != old:
+                self._write(new)
 
-    def end(self, results: Sequence[Path]) -> None:
-        """After the files of a plate are written."""
-        with locked(self._folder / LOCK):
-            known = {what: self._read(what) for what in _TABLES}
-            known["written"] |= {_from(self._folder, path): content_of(path) for path in results}
-            self._write(known)
+    def finish(self, results: Sequence[Path]) -> None:
+        """Enter the content of a frame's files after they were written."""
+        with file_lock(self._folder / LOCK):
+            tables = self._read()
+            tables["written"] |= {_relative_path(self._folder, path): content_hash(path) for path in results}
+            self._write(tables)
 
-    def keeps(self, name: Path, source: Path, how: str, results: Sequence[Path]) -> Kept | None:
-        """Why the files of a plate stay as they are: "made", as they would be now; or "worked on", by hand; None where
-        they are to be made. Where a process was killed before it wrote down what these hold, that is done now, so that
-        it is known of those that are worked on from here on."""
-        if self.is_made(name, how, results):
-            written = self._read("written")
-            if not all(_from(self._folder, path) in written for path in results):  # a kill came before `end`
-                with contextlib.suppress(OSError):  # a plate is kept in a folder that may not be written to, too
-                    self.end(results)
-            return "made"
-        return "worked on" if self._is_worked_on(name, source, results) else None
-
-    def tell_kept(self, kept: Mapping[Kept, int], progress: Progress) -> None:
-        """How many plates stayed as they were, and why."""
-        if count := kept.get("made"):
-            progress.say(f"{count} plates were in {self._folder} already; --overwrite makes them again.")
-        if count := kept.get("worked on"):
-            progress.say(f"{count} plates in {self._folder} were worked on since they were made, and are kept; "
+    def report_kept(self, kept: Mapping[KeepReason, int], progress: Progress) -> None:
+        """Say how many frames were kept, and why."""
+        if count := kept.get("up to date"):
+            progress.say(f"{count} clean frames in {self._folder} are up to date; --overwrite makes them again.")
+        if count := kept.get("edited"):
+            progress.say(f"{count} clean frames in {self._folder} were edited after they were made, and are kept; "
                          "--overwrite makes them again.")
 
-    def _is_worked_on(self, name: Path, source: Path, results: Sequence[Path]) -> bool:
-        """Whether someone has gone on by hand from a plate that was made here from what `source` still holds, or from
-        its flare: that is theirs, and kept however plates are made now."""
-        return bool(self._worked_on(results)) and self._read("sources").get(name.as_posix()) == content_of(source)
-
-    def _worked_on(self, results: Sequence[Path]) -> list[Path]:
-        """Those that hold something else than was written."""
-        written = self._read("written")
-        return [path for path in results
-                if path.is_file() and written.get(_from(self._folder, path), content_of(path)) != content_of(path)]
-
-    def _write(self, tables: Mapping[str, Mapping[str, str]]) -> None:
-        write_json(self._folder / RECORD, {what: dict(sorted(rows.items())) for what, rows in tables.items()})
-
-    def _row(self, how: str, results: Sequence[Path]) -> dict[str, str]:
-        """What is written down of a plate, by table."""
-        of_flare = {"flares": _from(self._folder, results[1]), "flares_made": how} if results[1:] else {}
-        return {"plates": how, **of_flare}
-
-    def made_from_others(self, sources: Mapping[Path, Path]) -> list[Path]:
-        """Of plates by their names here, and what each is to be made from, those that were made from something else."""
-        told = self._read("sources")
+    def changed_sources(self, sources: Mapping[Path, Path]) -> list[Path]:
+        """Return the names of those frames that were made from another content than `sources` (by name) has now."""
+        known = self._read()["sources"]
         return [name for name, source in sources.items()
-                if name.as_posix() in told and told[name.as_posix()] != content_of(source)]
+                if name.as_posix() in known and known[name.as_posix()] != content_hash(source)]
 
-    def as_made(self, names: Iterable[Path]) -> Iterator[Path]:
-        """Of plates by their names here, those that `remove` made and nobody has worked on since, one by one, since
-        each is read for it."""
-        made = self._read("plates")
+    def unedited(self, names: Iterable[Path]) -> Iterator[Path]:
+        """Yield those of the frames that `remove` made and nobody has edited since.
+
+        Each one's file is read when its turn comes.
+        """
+        tables = self._read()
         for name in names:
             path = self._folder / name
-            if name.as_posix() in made and path.is_file() and not self._worked_on([path]):
+            if name.as_posix() in tables["plates"] and path.is_file() and not self._edited(tables, [path]):
                 yield name
 
     def results(self) -> list[Path]:
-        """The paths of the plates and flares that it lists, there or not."""
-        return [(self._folder / name).resolve() for name in (*self._read("plates"), *self._read("flares").values())]
+        """Return the paths of the clean frames and flares that are listed, whether they exist or not."""
+        tables = self._read()
+        return [(self._folder / name).resolve() for name in (*tables["plates"], *tables["flares"].values())]
 
-    def is_refused(self, problem: OSError) -> bool:
-        """Whether it is the folder itself that may not be written, whichever plate is next."""
-        if not isinstance(problem, PermissionError) and problem.errno != errno.EROFS:
+    def is_write_error(self, error: OSError) -> bool:
+        """Return whether the folder itself cannot be written to, so that every other frame would fail too."""
+        if not isinstance(error, PermissionError) and error.errno != errno.EROFS:
             return False
-        own = (self._folder / LOCK, self._folder / RECORD, self._folder, *self._folder.parents)
-        return problem.filename is not None and Path(problem.filename) in own
+        paths = (self._folder / LOCK, self._folder / MANIFEST, self._folder, *self._folder.parents)
+        return error.filename is not None and Path(error.filename) in paths
 
-    def _read(self, what: str) -> dict[str, str]:
-        """Of each plate one of `_TABLES`; {} where it is not written down."""
+    def _is_up_to_date(self, tables: _Tables, name: Path, digest: str, results: Sequence[Path]) -> bool:
+        entered = all(tables[table].get(name.as_posix()) == value
+                      for table, value in self._entries(digest, results).items())
+        return entered and all(path.is_file() and path.stat().st_size for path in results)
+
+    def _edited(self, tables: _Tables, results: Sequence[Path]) -> list[Path]:
+        """Return those files that hold something else than was written."""
+        written = tables["written"]
+        return [path for path in results if path.is_file()
+                and written.get(_relative_path(self._folder, path), content_hash(path)) != content_hash(path)]
+
+    def _entries(self, digest: str, results: Sequence[Path]) -> dict[str, str]:
+        """Return a frame's entry for each table that has one when it is begun."""
+        flare = ({"flares": _relative_path(self._folder, results[1]), "flares_made": digest} if results[1:] else {})
+        return {"plates": digest, **flare}
+
+    def _read(self) -> _Tables:
+        """Return all tables; one that is missing or damaged is empty."""
         try:
-            told = read_json(self._folder / RECORD, FrameError)[what]
-            return {str(name): str(one) for name, one in told.items()}
-        except (FrameError, AttributeError, KeyError, TypeError):
-            return {}
+            data = read_json(self._folder / MANIFEST, FrameError)
+        except FrameError:
+            data = {}
+        tables: _Tables = {}
+        for table in TABLES:
+            try:
+                tables[table] = {str(name): str(value) for name, value in data[table].items()}
+            except (AttributeError, KeyError, TypeError):
+                tables[table] = {}
+        return tables
+
+    def _write(self, tables: _Tables) -> None:
+        write_json(self._folder / MANIFEST, {table: dict(sorted(rows.items())) for table, rows in tables.items()})
 
 
-def _from(folder: Path, path: Path) -> str:
-    """A path as seen from a folder, which may be moved with it; as it is where that is on another drive."""
+def _relative_path(folder: Path, path: Path) -> str:
+    """Return a path relative to a folder, which may be moved with it; the absolute path on another drive."""
     path = path.resolve()
     try:
         return Path(os.path.relpath(path, folder.resolve())).as_posix()

@@ -1,34 +1,38 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Where the flare-free frames in a capture's folder removed/ come from: someone's hand, or `remove`, and of what."""
+"""Tells whether the clean frames in a capture's removed/ are someone's own or estimates that `remove` made, and of
+which frames."""
 from __future__ import annotations
 
 from pathlib import Path
 
 from ...capture import REMOVED, Capture
 from ...errors import CaptureError
-from .manifest import Record
+from .manifest import Manifest
 
 
-def has_exact(capture: Capture) -> bool:
-    """Whether a capture has clean frames that are taken for exact: someone's own, made here and all worked on since, or
-    where there is no removed/ the layers of a scene that is known. As `remove` makes them they are estimates."""
+def has_exact_clean_frames(capture: Capture) -> bool:
+    """Return whether a capture has clean frames that a fit may take as exact.
+
+    Someone's own are exact, and those that `remove` made if all were edited since; without removed/, the layers of a
+    rendered scene. Unedited results of `remove` are estimates.
+    """
     if not capture.has_removed:
         return capture.has_truth
-    return not any(Record(capture.folder / REMOVED).as_made(_sources(capture)))
+    return not any(Manifest(capture.folder / REMOVED).unedited(_frames_by_clean_name(capture)))
 
 
-def check_removed(capture: Capture) -> None:
-    """Raises CaptureError where the capture has clean frames that were made here from others than it has now. Those of
-    which nothing is written down are someone's own."""
-    folder, sources = capture.folder / REMOVED, _sources(capture)
-    if others := Record(folder).made_from_others(sources):
+def check_clean_frames_current(capture: Capture) -> None:
+    """Raise CaptureError if clean frames were made by `remove` from other frames than the capture has now. Those that
+    no manifest lists are someone's own and pass."""
+    folder, sources = capture.folder / REMOVED, _frames_by_clean_name(capture)
+    if others := Manifest(folder).changed_sources(sources):
         raise CaptureError(f"{len(others)} of the {len(sources)} flare-free frames in {folder} were made from other "
                            f"frames than the capture has now ({others[0].as_posix()} first); remove that folder, and "
                            "they are made again.")
 
 
-def _sources(capture: Capture) -> dict[Path, Path]:
-    """Of every clean frame, by its name below removed/, the frame that it is of."""
+def _frames_by_clean_name(capture: Capture) -> dict[Path, Path]:
+    """Return the frame of every clean frame, by the latter's name below removed/."""
     folder = (capture.folder / REMOVED).resolve()
     frames = {capture.removed_path(view).resolve(): view for view in capture.views}
     return {path.relative_to(folder): capture.frame_path(view) for path, view in frames.items()

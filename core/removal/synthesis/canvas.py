@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The canvas that flares are drawn on: its coordinates, light by wavelength, and shapes of stops."""
+"""The canvas that flares are drawn on: its coordinates, spectral colours, random colours, and the rasterisation of one
+ghost."""
 from __future__ import annotations
 
 import math
@@ -13,16 +14,16 @@ Point = tuple[float, float]
 Random = np.random.Generator
 
 
-def grid(size: int) -> tuple[Array, Array]:
-    """x, y of the pixel centres of a square canvas, each (size, size), -1..1, x to the right, y down."""
+def canvas_grid(size: int) -> tuple[Array, Array]:
+    """Return x and y of the pixel centres of a square canvas, each (size, size), -1..1, x to the right, y down."""
     at = ((np.arange(size) + 0.5) / size * 2 - 1).astype(np.float32)
     x, y = np.meshgrid(at, at)
     return x, y
 
 
-def colour_of(wavelength: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(n, 3) linear RGB of spectral light, 0.4..0.7 micrometres, smooth and never negative; a mixture of
-    bells in place of the eye's curves, red with its second bump in the violet."""
+def spectral_colour(wavelength: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return (n, 3) linear RGB of spectral light of 0.4..0.7 micrometres, smooth and never negative: Gaussian lobes
+    instead of the eye's curves, red with its second lobe in the violet."""
     def bell(centre: float, below: float, above: float) -> NDArray[np.float64]:
         width = np.where(wavelength < centre, below, above)
         return np.exp(-0.5 * ((wavelength - centre) / width) ** 2)
@@ -31,8 +32,8 @@ def colour_of(wavelength: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.stack([red, bell(0.545, 0.036, 0.034), bell(0.455, 0.024, 0.028)], -1)
 
 
-def tint(random: Random, strength: float = 0.5) -> Array:
-    """(3,) a random colour of mean 1: warm, cool, or anything, the further from white the greater `strength`."""
+def random_tint(random: Random, strength: float = 0.5) -> Array:
+    """Return (3,), a random colour of mean 1: warm, cool, or any; farther from white for a greater `strength`."""
     colour = np.exp(random.normal(0, strength, 3))
     if random.random() < 0.5:  # along the axis of colour temperature, where lamps are
         warm = random.normal(0, strength)
@@ -40,8 +41,8 @@ def tint(random: Random, strength: float = 0.5) -> Array:
     return (colour / colour.mean()).astype(np.float32)
 
 
-def uniform_log(random: Random, low: float, high: float) -> float:
-    """A number whose logarithm is evenly spread."""
+def log_uniform(random: Random, low: float, high: float) -> float:
+    """Return a number whose logarithm is uniformly distributed between those of the bounds."""
     return float(math.exp(random.uniform(math.log(low), math.log(high))))
 
 
@@ -49,12 +50,12 @@ def uniform_log(random: Random, low: float, high: float) -> float:
 def draw_ghost(layer: Array, centre: Array, radius: Array, clip_centre: Array, clip_radius: Array,
                second_centre: Array, second_radius: Array, weight: Array, blades: int, turn: float, roundness: float,
                soft: float, rim: float, rim_width: float, hollow: float, slope: float) -> None:
-    """Add a ghost, channel by channel, to `layer` (n, n, 3), coordinates of the canvas.
+    """Add a ghost to `layer` (n, n, 3), channel by channel, in canvas coordinates.
 
-    centre, clip_centre, second_centre: (3, 2), of the stop's shadow, of the entrance's, and of the stop's as
-    the light met it the last time; the radii (3,). weight: (3,). blades: of the stop, turned by `turn`
-    radians, from straight (roundness 0) to a circle (1). soft: width of the edge; rim: brightness added
-    within rim_width of the edge; hollow: share taken from the middle; slope: one side brighter than the other.
+    centre, clip_centre, second_centre: (3, 2), of the images of the stop, of the entrance, and of the stop at the
+    light's last passage; the radii (3,). weight: (3,). blades: of the stop, turned by `turn` radians, from straight
+    (roundness 0) to a circle (1). soft: width of the edge. rim: brightness added within rim_width of the edge. hollow:
+    share removed from the middle. slope: one side brighter than the other.
     """
     n = layer.shape[0]
     sector = 2 * math.pi / blades

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Reflective flares: ghosts traced through lens prescriptions, freely drawn ones, and mirrored lights."""
+"""Draws reflective flares: ghosts traced through lens prescriptions, freehand ones, mirrored lights and arcs."""
 from __future__ import annotations
 
 import math
@@ -9,128 +9,130 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from .canvas import Array, Point, Random, colour_of, draw_ghost, tint, uniform_log
-from .prescription import SENSOR, WAVELENGTHS, Ghost, Prescription, ghosts, reflectance
+from .canvas import Array, Point, Random, draw_ghost, log_uniform, random_tint, spectral_colour
+from .prescription import CHANNEL_WAVELENGTHS, HALF_DIAGONAL, GhostPath, Prescription, reflectance, trace_ghost_pairs
 
 
 @lru_cache(maxsize=2048)
-def _ghosts(lens: Prescription) -> list[Ghost]:
-    return ghosts(lens)
+def _ghost_paths(lens: Prescription) -> list[GhostPath]:
+    """Return the lens's ghost paths, cached."""
+    return trace_ghost_pairs(lens)
 
 
-def traced(random: Random, lens: Prescription, light: Point, size: int) -> Array:
-    """Ghosts of one light through a lens: (size, size, 3), the brightest parts around 1.
+def draw_traced(random: Random, lens: Prescription, light: Point, size: int) -> Array:
+    """Return the ghosts of one light through a lens: (size, size, 3), the brightest parts around 1.
 
-    The stop's number of blades and opening, the coatings' colours, how many of the weak ghosts are seen and
-    how bright they are is drawn at random; where ghosts lie, how large they are, how they are clipped and how
-    their colours come apart is the lens.
+    Random are the stop's blades and opening, the coatings' colours, how many weak ghosts are visible and how bright
+    they are. The lens determines where ghosts lie, how large they are, how they are clipped and how their colours
+    separate.
     """
     layer = np.zeros((size, size, 3), np.float32)
     crop = random.uniform(0.6, 1.3)  # the sensor may be smaller or larger than the lens was made for
     focal = lens.focal_length()
-    slopes = np.array(light) * SENSOR * crop / focal
-    opening = uniform_log(random, 0.12, 1.0)
+    slopes = np.array(light) * HALF_DIAGONAL * crop / focal
+    opening = log_uniform(random, 0.12, 1.0)
     stop = lens.semi_aperture[lens.stop] * opening
     entrance = lens.semi_aperture[0]
     blades, turn = int(random.integers(5, 12)), random.uniform(0, 2 * math.pi)
     roundness = random.choice([0.0, 0.0, 0.3, 1.0]) if opening < 0.9 else 1.0
-    made_for = _coatings(random, lens)
-    soft = uniform_log(random, 0.002, 0.03)
-    rim, rim_width = (uniform_log(random, 0.1, 2.0), random.uniform(0.02, 0.12)) if random.random() < 0.6 else (0, 0.1)
+    coating_wavelengths = _draw_coatings(random, lens)
+    soft = log_uniform(random, 0.002, 0.03)
+    rim, rim_width = (log_uniform(random, 0.1, 2.0), random.uniform(0.02, 0.12)) if random.random() < 0.6 else (0, 0.1)
     candidates = []
-    for ghost in _ghosts(lens):
-        weight, radius = _brightness(ghost, made_for, stop, entrance)
-        if 0.004 < radius / (SENSOR * crop) < 6 and np.isfinite(weight).all():
+    for ghost in _ghost_paths(lens):
+        weight, radius = _brightness(ghost, coating_wavelengths, stop, entrance)
+        if 0.004 < radius / (HALF_DIAGONAL * crop) < 6 and np.isfinite(weight).all():
             candidates.append((float(weight.max()), weight, ghost))
-    candidates.sort(key=lambda one: -one[0])
-    seen = candidates[:int(random.integers(4, 45))]
-    if not seen:
+    candidates.sort(key=lambda candidate: -candidate[0])
+    strongest = candidates[:int(random.integers(4, 45))]
+    if not strongest:
         return layer
     # Ghosts differ by orders of magnitude; cameras show the strong ones. The power brings weak ones closer.
-    top, power = np.median([one[0] for one in seen[:5]]), random.uniform(0.45, 1.0)
-    colourful = random.uniform(0, 0.8) if random.random() < 0.6 else 0.0  # real coatings have many layers
-    unit = SENSOR * crop
-    for strength, weight, ghost in seen:
+    reference, power = np.median([candidate[0] for candidate in strongest[:5]]), random.uniform(0.45, 1.0)
+    saturation = random.uniform(0, 0.8) if random.random() < 0.6 else 0.0  # real coatings have many layers
+    unit = HALF_DIAGONAL * crop
+    for strength, weight, ghost in strongest:
         a, b = ghost.stop[:, 0], ghost.stop[:, 1]
         s, t = ghost.sensor[:, 0], ghost.sensor[:, 1]
         a = np.where(np.abs(a) < 1e-4, 1e-4, a)
         scale = s / a
         centre = np.outer(t - scale * b, slopes) / unit
         radius = np.maximum(np.abs(scale) * stop / unit, 0.004)
-        second = np.where(np.abs(ghost.again[:, 0]) < 1e-4, 1e-4, ghost.again[:, 0])
-        back = s / second
+        last_scale = np.where(np.abs(ghost.last_stop[:, 0]) < 1e-4, 1e-4, ghost.last_stop[:, 0])
+        magnification = s / last_scale
         if np.hypot(*centre[1]) - radius[1] > 1.5:
             continue
-        gain = (strength / top) ** power / strength
-        level = np.minimum(weight * gain, 4.0) * tint(random, colourful)
-        draw_ghost(layer, _f32(centre), _f32(radius),
-                   _f32(np.outer(t, slopes) / unit), _f32(np.maximum(np.abs(s) * entrance / unit, 1e-3)),
-                   _f32(np.outer(t - back * ghost.again[:, 1], slopes) / unit),
-                   _f32(np.maximum(np.abs(back) * stop / unit, 1e-3)),
-                   _f32(level), blades, turn, float(roundness), soft * (1 + 0.4 * float(radius[1])), rim, rim_width,
-                   random.uniform(0, 0.6) if rim else 0.0, random.uniform(-0.4, 0.4))
+        gain = (strength / reference) ** power / strength
+        level = np.minimum(weight * gain, 4.0) * random_tint(random, saturation)
+        draw_ghost(layer, _to_float32(centre), _to_float32(radius),
+                   _to_float32(np.outer(t, slopes) / unit), _to_float32(np.maximum(np.abs(s) * entrance / unit, 1e-3)),
+                   _to_float32(np.outer(t - magnification * ghost.last_stop[:, 1], slopes) / unit),
+                   _to_float32(np.maximum(np.abs(magnification) * stop / unit, 1e-3)),
+                   _to_float32(level), blades, turn, float(roundness), soft * (1 + 0.4 * float(radius[1])), rim,
+                   rim_width, random.uniform(0, 0.6) if rim else 0.0, random.uniform(-0.4, 0.4))
     return layer
 
 
-def _coatings(random: Random, lens: Prescription) -> NDArray[np.float64]:
-    """Wavelength each surface is coated for; 0 for bare glass. Old lenses have none."""
+def _draw_coatings(random: Random, lens: Prescription) -> NDArray[np.float64]:
+    """Return the wavelength that each surface is coated for; 0 for bare glass. Old lenses have no coatings."""
     count = len(lens.index)
     era = random.random()
     if era < 0.15:
         return np.zeros(count)
-    made_for = random.uniform(0.42, 0.66, count) if era < 0.7 else np.full(count, random.uniform(0.45, 0.6))
-    made_for[random.random(count) < random.uniform(0, 0.25)] = 0
-    return made_for
+    coating_wavelengths = random.uniform(0.42, 0.66, count) if era < 0.7 else np.full(count, random.uniform(0.45, 0.6))
+    coating_wavelengths[random.random(count) < random.uniform(0, 0.25)] = 0
+    return coating_wavelengths
 
 
-def _brightness(ghost: Ghost, made_for: NDArray[np.float64], stop: float,
+def _brightness(ghost: GhostPath, coating_wavelengths: NDArray[np.float64], stop: float,
                 entrance: float) -> tuple[NDArray[np.float64], float]:
-    """(3,) light by channel, before any exposure, and the ghost's radius on the sensor, mm."""
+    """Return (3,), a ghost's light by channel before any exposure, and its radius on the sensor, mm."""
     i, j = ghost.surfaces
-    waves = np.array(WAVELENGTHS)
+    waves = np.array(CHANNEL_WAVELENGTHS)
     k = ghost.contrast
-    mirror = (reflectance(k[:, 0], k[:, 1], waves, float(made_for[i]))
-              * reflectance(k[:, 2], k[:, 3], waves, float(made_for[j])))
+    mirror = (reflectance(k[:, 0], k[:, 1], waves, float(coating_wavelengths[i]))
+              * reflectance(k[:, 2], k[:, 3], waves, float(coating_wavelengths[j])))
     a = np.maximum(np.abs(ghost.stop[:, 0]), 1e-4)
     s = np.maximum(np.abs(ghost.sensor[:, 0]), 0.02)  # a ghost in focus is as large as the light, not a point
     beam = min(stop / float(a[1]), entrance)
     return mirror / s**2, float(s[1]) * beam
 
 
-def freehand(random: Random, light: Point, size: int) -> Array:
-    """Ghosts as film effects and phones show them: a chain of discs, polygons and rings on the line through
-    the middle, their places and colours free."""
+def draw_freehand(random: Random, light: Point, size: int) -> Array:
+    """Return ghosts as film effects and phones show them: a chain of discs, polygons and rings on the line through the
+    middle, of random positions and colours."""
     layer = np.zeros((size, size, 3), np.float32)
     blades, turn = int(random.integers(5, 10)), random.uniform(0, 2 * math.pi)
-    kinship = random.random() < 0.6  # all of one shape, or each its own
+    one_shape = random.random() < 0.6  # all of one shape, or each its own
     roundness = random.choice([0.0, 0.5, 1.0])
-    base = uniform_log(random, 0.02, 0.25)
+    base = log_uniform(random, 0.02, 0.25)
     for _ in range(int(random.integers(1, 14))):
         at = random.normal(0, 0.8) if random.random() < 0.7 else -1 + random.normal(0, 0.1)
-        aside = random.normal(0, 0.01, 2) if random.random() < 0.2 else np.zeros(2)
+        offset = random.normal(0, 0.01, 2) if random.random() < 0.2 else np.zeros(2)
         spread = random.normal(0, 0.02) if random.random() < 0.4 else 0.0
         places = at * (1 + spread * np.array([-1.0, 0.0, 1.0]))
-        centre = np.outer(places, light) + aside
-        radius = base * uniform_log(random, 0.2, 4) * (1 + random.normal(0, 0.03) * np.array([-1, 0, 1]))
-        if not kinship:
+        centre = np.outer(places, light) + offset
+        radius = base * log_uniform(random, 0.2, 4) * (1 + random.normal(0, 0.03) * np.array([-1, 0, 1]))
+        if not one_shape:
             roundness = random.choice([0.0, 0.5, 1.0, 1.0])
         hollow = random.uniform(0, 1) if random.random() < 0.5 else 0.0
-        rim = uniform_log(random, 0.1, 3) if random.random() < 0.5 else 0.0
+        rim = log_uniform(random, 0.1, 3) if random.random() < 0.5 else 0.0
         clip = centre + random.normal(0, 0.3, 2) * radius[1] if random.random() < 0.3 else centre
-        level = uniform_log(random, 0.03, 1) * tint(random, 0.6)
-        draw_ghost(layer, _f32(centre), _f32(np.abs(radius)), _f32(clip), _f32(np.abs(radius) * 1.02), _f32(centre),
-                   _f32(np.abs(radius) * 1.01), level, blades, turn, float(roundness),
-                   float(radius[1]) * uniform_log(random, 0.02, 0.8), rim, uniform_log(random, 0.03, 0.3), hollow,
+        level = log_uniform(random, 0.03, 1) * random_tint(random, 0.6)
+        draw_ghost(layer, _to_float32(centre), _to_float32(np.abs(radius)), _to_float32(clip),
+                   _to_float32(np.abs(radius) * 1.02), _to_float32(centre),
+                   _to_float32(np.abs(radius) * 1.01), level, blades, turn, float(roundness),
+                   float(radius[1]) * log_uniform(random, 0.02, 0.8), rim, log_uniform(random, 0.03, 0.3), hollow,
                    random.uniform(-0.6, 0.6))
     return layer
 
 
-def mirrored(random: Random, source: Array, light: Point) -> Array:
-    """The light's own image, reflected between sensor and lens: its shape turned by 180 degrees about the
-    middle, a little larger or smaller, coloured, as phones show it at night.
+def draw_mirrored_light(random: Random, source: Array, light: Point) -> Array:
+    """Return the light's own image, reflected between sensor and lens: rotated by 180 degrees about the middle, scaled
+    and coloured, as phones show it at night.
 
-    source: (n, n, 3), the layer of the light. (Dai et al. 2023, "Nighttime Smartphone Reflective Flare Removal
-    Using Optical Center Symmetry Prior", describe the symmetry.)
+    source: (n, n, 3), the layer of the light. Dai et al. 2023, "Nighttime Smartphone Reflective Flare Removal Using
+    Optical Center Symmetry Prior", describe the symmetry.
     """
     import cv2
 
@@ -141,41 +143,41 @@ def mirrored(random: Random, source: Array, light: Point) -> Array:
     layer = np.zeros_like(source)
     for _ in range(int(random.integers(1, 4))):
         place, zoom = -random.uniform(0.8, 1.2) if random.random() < 0.7 else random.normal(0, 0.9), \
-            uniform_log(random, 0.5, 2.0) * (-1 if random.random() < 0.8 else 1)
+            log_uniform(random, 0.5, 2.0) * (-1 if random.random() < 0.8 else 1)
         half = size / 2
         centre = (np.array(light) + 1) * half
         target = (np.array(light) * place + 1) * half
         matrix = np.array([[zoom, 0, target[0] - zoom * centre[0]], [0, zoom, target[1] - zoom * centre[1]]])
         moved = cv2.warpAffine(shape, matrix, (size, size))
-        blur = uniform_log(random, 0.5, 0.015 * size)
-        level = uniform_log(random, 0.02, 0.6) * tint(random, 0.8)
+        blur = log_uniform(random, 0.5, 0.015 * size)
+        level = log_uniform(random, 0.02, 0.6) * random_tint(random, 0.8)
         layer += cv2.GaussianBlur(moved, (0, 0), blur) * level
     return layer
 
 
-def arc(random: Random, light: Point, size: int, x: Array, y: Array) -> Array:
-    """A caustic at the frame's edge opposite to the light: a rainbow arc about the middle."""
-    away = math.hypot(*light)
-    radius, width = random.uniform(0.5, 1.3), uniform_log(random, 0.01, 0.12)
-    towards = math.atan2(-light[1], -light[0]) + (math.pi if random.random() < 0.3 else 0)
-    angle = np.arctan2(y, x) - towards
-    open_by = random.uniform(0.1, 0.9) * (1 + away)
-    window = np.exp(-(np.arctan2(np.sin(angle), np.cos(angle)) / open_by) ** 2 * 2)
+def draw_arc(random: Random, light: Point, size: int, x: Array, y: Array) -> Array:
+    """Return a caustic at the frame's edge opposite to the light: a rainbow arc about the middle."""
+    light_radius = math.hypot(*light)
+    radius, width = random.uniform(0.5, 1.3), log_uniform(random, 0.01, 0.12)
+    direction = math.atan2(-light[1], -light[0]) + (math.pi if random.random() < 0.3 else 0)
+    angle = np.arctan2(y, x) - direction
+    opening_angle = random.uniform(0.1, 0.9) * (1 + light_radius)
+    window = np.exp(-(np.arctan2(np.sin(angle), np.cos(angle)) / opening_angle) ** 2 * 2)
     r = np.hypot(x, y)
     waves = np.linspace(0.42, 0.68, 9)
-    colours = colour_of(waves)
+    colours = spectral_colour(waves)
     layer = np.zeros((size, size, 3), np.float32)
     spread = random.uniform(-0.6, 0.6)
     for wave, colour in zip(waves, colours / colours.sum(0), strict=True):
         at = radius * (1 + spread * (wave - 0.55))
         layer += np.exp(-((r - at) / width) ** 2)[..., None] * colour.astype(np.float32)
-    return layer * window[..., None] * uniform_log(random, 0.1, 1.0)
+    return layer * window[..., None] * log_uniform(random, 0.1, 1.0)
 
 
-def lens_of(random: Random, lenses: Sequence[Prescription]) -> Prescription:
-    """One of them."""
+def choose_lens(random: Random, lenses: Sequence[Prescription]) -> Prescription:
+    """Return a random lens."""
     return lenses[int(random.integers(len(lenses)))]
 
 
-def _f32(values: NDArray[np.float64]) -> Array:
+def _to_float32(values: NDArray[np.float64]) -> Array:
     return np.ascontiguousarray(values, np.float32)

@@ -1,15 +1,21 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Lens prescriptions, and the paraxial ghosts that follow from them.
+"""Lens prescriptions: the surfaces of a lens as its patent lists them, and the paraxial ghosts that follow from them.
 
-The text format, one surface a line from the front: radius, thickness, refractive index, Abbe number, clear
-diameter, coated 0/1; radius 0 is a plane, `stop` in place of a radius the aperture stop; lengths in mm,
-thickness and glass are those behind the surface. Lines with a colon and comments after # are left unread.
+A prescription is text, one surface a line from the front to the sensor's side:
 
-Ghosts follow Lee and Eisemann 2013, "Practical Real-Time Lens-Flare Rendering": light that is reflected at
-surface j and then at surface i < j crosses the lens by a product of 2x2 matrices that act on height and
-reduced slope. One product leads to the stop, one to the sensor; both are linear in the ray's height at the
-entrance and in the slope of the beam, so a ghost is the stop's shape, scaled and moved along the line
-through the principal point.
+    radius  thickness  index  Abbe number  clear diameter
+
+Lengths are mm. Thickness and glass are those behind the surface; radius 0 is a plane, a positive radius has its centre
+towards the sensor; `stop` in place of a radius is the aperture stop. `#` starts a comment; lines with a colon, and
+columns after the fifth, are ignored. (Collections of prescriptions on the web often head the last column "semi
+aperture" although it holds diameters; compare it with f / N.)
+
+Ghosts follow Lee and Eisemann 2013, "Practical Real-Time Lens-Flare Rendering": light that is reflected at surface j
+and then at surface i < j crosses the lens by a product of 2x2 matrices that act on height and reduced slope. One
+product leads to the stop, one to the sensor; both are linear in the ray's height at the entrance and in the slope of
+the beam, so a ghost is the stop's shape, scaled and moved along the line through the principal point.
+
+The sample scenes trace real rays through the same prescriptions.
 """
 from __future__ import annotations
 
@@ -24,16 +30,17 @@ from ...errors import SettingsError
 
 Array = NDArray[np.float64]
 
-F, D, C = 0.4861, 0.5876, 0.6563  # Fraunhofer lines, micrometres
-WAVELENGTHS = (0.61, 0.54, 0.46)
+LINE_F, LINE_D, LINE_C = 0.4861, 0.5876, 0.6563  # Fraunhofer lines, micrometres
+"""Fraunhofer lines, micrometres."""
+CHANNEL_WAVELENGTHS = (0.61, 0.54, 0.46)
 """Of the red, green and blue channel, micrometres."""
-SENSOR = 21.6
+HALF_DIAGONAL = 21.6
 """Half the diagonal of the 24 x 36 mm frame, mm: the unit of the canvas."""
 
 
 @dataclass(frozen=True, eq=False)
 class Prescription:
-    """Arrays of length n, front to back; `stop` is the index of the stop's plane. Lengths in mm."""
+    """Surfaces from front to back; arrays of length n, lengths in mm. stop: index of the aperture stop's plane."""
 
     name: str
     curvature: Array
@@ -41,20 +48,30 @@ class Prescription:
     index: Array
     abbe: Array
     semi_aperture: Array
-    coated: NDArray[np.bool_]
     stop: int
 
     def indices(self, wavelength: float) -> Array:
-        """Index behind each surface: Cauchy's first two terms, fixed by the d line and the Abbe number."""
-        slope = np.where(self.abbe > 0, (self.index - 1) / np.maximum(self.abbe, 1e-6) / (F**-2 - C**-2), 0.0)
-        return self.index + slope * (wavelength**-2 - D**-2)
+        """Return the refractive index behind each surface at a wavelength in micrometres: Cauchy's first two terms,
+        through the index at the d line and the Abbe number."""
+        slope = np.where(self.abbe > 0, (self.index - 1) / np.maximum(self.abbe, 1e-6) / (LINE_F**-2 - LINE_C**-2), 0.0)
+        return self.index + slope * (wavelength**-2 - LINE_D**-2)
 
     def focal_length(self) -> float:
-        """Paraxial, mm, at the d line; infinite for an afocal system."""
-        system = self._through(self.indices(D))
-        return math.inf if abs(system[1, 0]) < 1e-9 else -1.0 / system[1, 0]
+        """Return the paraxial focal length, mm, at the d line; infinite for an afocal system."""
+        system = self._system_matrix(self.indices(LINE_D))
+        return math.inf if abs(system[1, 0]) < 1e-9 else float(-1.0 / system[1, 0])
 
-    def _through(self, index: Array) -> Array:
+    def back_focus(self) -> float:
+        """Return the distance from the last surface to the paraxial focus, mm, at the d line."""
+        system = self._system_matrix(self.indices(LINE_D))
+        return float(-system[0, 0] / system[1, 0])
+
+    @property
+    def vertices(self) -> Array:
+        """z of each surface's vertex, the first at 0."""
+        return np.concatenate([[0.0], np.cumsum(self.thickness[:-1])])
+
+    def _system_matrix(self, index: Array) -> Array:
         system, before = np.eye(2), 1.0
         for k in range(len(index)):
             system = _refraction(before, index[k], self.curvature[k]) @ system
@@ -65,18 +82,17 @@ class Prescription:
 
 
 @dataclass(frozen=True)
-class Ghost:
-    """One pair of reflections; arrays over the three wavelengths, lengths in mm, slopes in radians.
+class GhostPath:
+    """One pair of reflections; arrays over the three channel wavelengths, lengths in mm, slopes in radians.
 
-    A ray that enters at height h with slope u meets the stop at `stop[:, 0] h + stop[:, 1] u` (where it
-    passes it first, `again` where it passes it last) and the sensor at `sensor[:, 0] h + sensor[:, 1] u`.
-    `surfaces` are (i, j); `contrast` (3, 4) has, by wavelength, the indices before and behind each of the two, for
-    `reflectance`.
+    A ray that enters at height h with slope u meets the stop at `stop[:, 0] h + stop[:, 1] u` at its first passage, by
+    `last_stop` at its last, and the sensor at `sensor[:, 0] h + sensor[:, 1] u`. surfaces: (i, j). contrast: (3, 4), by
+    wavelength, the indices before and behind each of the two, for `reflectance`.
     """
 
     surfaces: tuple[int, int]
     stop: Array
-    again: Array
+    last_stop: Array
     sensor: Array
     contrast: Array
 
@@ -89,33 +105,29 @@ def _transfer(length: float, index: float) -> Array:
     return np.array([[1.0, length / index], [0.0, 1.0]])
 
 
-def ghosts(lens: Prescription) -> list[Ghost]:
-    """Every pair of glass surfaces that reflects, with the paraxial system of each wavelength."""
-    focus = _back_focus(lens)
-    optics = [lens.indices(wavelength) for wavelength in WAVELENGTHS]
-    jump = [k for k in range(len(lens.index)) if abs(lens.index[k] - _before(lens.index, k)) > 1e-3]
-    found = []
-    for i in jump:
-        for j in jump:
+def trace_ghost_pairs(lens: Prescription) -> list[GhostPath]:
+    """Return every pair of glass surfaces that reflects, with the paraxial system of each wavelength."""
+    focus = lens.back_focus()
+    indices_by_channel = [lens.indices(wavelength) for wavelength in CHANNEL_WAVELENGTHS]
+    refracting = [k for k in range(len(lens.index)) if abs(lens.index[k] - _index_before(lens.index, k)) > 1e-3]
+    paths = []
+    for i in refracting:
+        for j in refracting:
             if j > i:
-                rows = [_path(lens, index, i, j, focus) for index in optics]
-                contrast = np.array([[_before(index, i), index[i], _before(index, j), index[j]] for index in optics])
-                found.append(Ghost((i, j), np.array([row[0] for row in rows]), np.array([row[1] for row in rows]),
+                rows = [_trace_path(lens, index, i, j, focus) for index in indices_by_channel]
+                contrast = np.array([[_index_before(index, i), index[i], _index_before(index, j), index[j]]
+                                     for index in indices_by_channel])
+                paths.append(GhostPath((i, j), np.array([row[0] for row in rows]), np.array([row[1] for row in rows]),
                                    np.array([row[2] for row in rows]), contrast))
-    return found
+    return paths
 
 
-def _before(index: Array, k: int) -> float:
+def _index_before(index: Array, k: int) -> float:
     return float(index[k - 1]) if k else 1.0
 
 
-def _back_focus(lens: Prescription) -> float:
-    system = lens._through(lens.indices(D))
-    return float(-system[0, 0] / system[1, 0])
-
-
-def _path(lens: Prescription, index: Array, i: int, j: int, focus: float) -> tuple[Array, Array, Array]:
-    """Rows (a, b) for stop, stop again, sensor: height there = a h + b u."""
+def _trace_path(lens: Prescription, index: Array, i: int, j: int, focus: float) -> tuple[Array, Array, Array]:
+    """Return rows (a, b) for stop, stop at the last passage, and sensor: height there = a h + b u."""
     system = np.eye(2)
     crossings = []
     c, t, last = lens.curvature, lens.thickness, len(index) - 1
@@ -123,7 +135,7 @@ def _path(lens: Prescription, index: Array, i: int, j: int, focus: float) -> tup
     def forward(system: Array, first: int, end: int) -> Array:
         """Refract at `first`..`end` - 1, each followed by its gap."""
         for k in range(first, end):
-            system = _refraction(_before(index, k), index[k], c[k]) @ system
+            system = _refraction(_index_before(index, k), index[k], c[k]) @ system
             if k == lens.stop:
                 crossings.append(system[0])
             if k < last:
@@ -131,12 +143,12 @@ def _path(lens: Prescription, index: Array, i: int, j: int, focus: float) -> tup
         return system
 
     system = forward(system, 0, j)
-    system = np.array([[1.0, 0.0], [2 * _before(index, j) * c[j], 1.0]]) @ system
+    system = np.array([[1.0, 0.0], [2 * _index_before(index, j) * c[j], 1.0]]) @ system
     for k in range(j - 1, i, -1):
         system = _transfer(t[k], index[k]) @ system
         if k == lens.stop:
             crossings.append(system[0])
-        system = _refraction(index[k], _before(index, k), -c[k]) @ system
+        system = _refraction(index[k], _index_before(index, k), -c[k]) @ system
     system = _transfer(t[i], index[i]) @ system
     system = np.array([[1.0, 0.0], [-2 * index[i] * c[i], 1.0]]) @ system
     if i < last:
@@ -147,10 +159,10 @@ def _path(lens: Prescription, index: Array, i: int, j: int, focus: float) -> tup
 
 
 def reflectance(n0: Array, n2: Array, wavelengths: Array, coating: float) -> Array:
-    """Of a surface between indices n0 and n2 at normal incidence.
+    """Return the reflectance of a surface between indices n0 and n2 at normal incidence.
 
-    coating: the wavelength (micrometres) for which a layer of magnesium fluoride is a quarter wave thick,
-    0 for bare glass; cemented surfaces have none.
+    coating: the wavelength (micrometres) for which a layer of magnesium fluoride is a quarter wave thick, 0 for bare
+    glass; cemented surfaces have none.
     """
     bare: Array = np.square((n0 - n2) / (n0 + n2))
     if coating <= 0 or min(float(np.min(n0)), float(np.min(n2))) > 1.01:
@@ -163,7 +175,7 @@ def reflectance(n0: Array, n2: Array, wavelengths: Array, coating: float) -> Arr
 
 
 def read_prescription(path: Path | str) -> Prescription:
-    """Read the text format of the module's head. Raises SettingsError where the file is none."""
+    """Read the text format of the module's head. Raises SettingsError where the file is no prescription."""
     path = Path(path)
     try:
         text = path.read_text(encoding="utf-8", errors="replace")
@@ -173,7 +185,7 @@ def read_prescription(path: Path | str) -> Prescription:
 
 
 def parse_prescription(text: str, name: str, where: str = "The lens") -> Prescription:
-    """The same from the text itself; `where` begins the message of a SettingsError."""
+    """Parse the text format of the module's head; `where` begins the message of a SettingsError."""
     rows: list[list[float]] = []
     stop = -1
     for number, line in enumerate(text.splitlines(), 1):
@@ -184,28 +196,29 @@ def parse_prescription(text: str, name: str, where: str = "The lens") -> Prescri
         if words[0] == "stop":
             stop, words[0] = len(rows), "0"
         try:
-            row = [float(word) for word in words[:6]]
+            row = [float(word) for word in words[:5]]
         except ValueError:
             row = []
         if len(row) < 5 or not all(map(math.isfinite, row)) or row[2] < 0.9 or row[4] <= 0:
             raise SettingsError(f"{where}, line {number}, is not a surface; give radius, thickness, index, Abbe "
                                 "number, clear diameter.")
-        rows.append([*row, 0.0][:6])
+        rows.append(row)
     if stop < 0 or len(rows) < 3:
         raise SettingsError(f"{where} is not a lens; it needs two surfaces at least and a line that starts with stop.")
-    radius, thickness, index, abbe, diameter, coated = np.array(rows).T
+    radius, thickness, index, abbe, diameter = np.array(rows).T
     curvature = np.divide(1.0, radius, out=np.zeros_like(radius), where=radius != 0)
-    return Prescription(name, curvature, thickness, index, abbe, diameter / 2, coated > 0, stop)
+    return Prescription(name, curvature, thickness, index, abbe, diameter / 2, stop)
 
 
-def read_lenses(folder: Path | str, most: int = 0) -> list[Prescription]:
-    """Photographic lenses of a folder, in order of name; files that are no lens, mirror lenses, converters and
-    what is not between 5 and 800 mm are left out. `most` picks that many, evenly spread; 0 is all.
+def read_lenses(folder: Path | str, max_count: int = 0) -> list[Prescription]:
+    """Return the photographic lenses of a folder, by name.
 
-    Raises SettingsError where there is none."""
+    Left out are files that are no prescription, mirror lenses, converters, and what is not between 5 and 800 mm.
+    max_count: read at most that many, evenly spread; 0 for all. Raises SettingsError where there is none.
+    """
     paths = sorted(Path(folder).glob("*.lens"))
-    if most and len(paths) > most:
-        paths = [paths[k * len(paths) // most] for k in range(most)]
+    if max_count and len(paths) > max_count:
+        paths = [paths[k * len(paths) // max_count] for k in range(max_count)]
     lenses = []
     for path in paths:
         try:
@@ -253,6 +266,6 @@ _PATENTS = {
 }
 
 
-def built_in() -> list[Prescription]:
-    """A few photographic lenses as their patents list them, so that ghosts need no data."""
+def built_in_lenses() -> list[Prescription]:
+    """Return a few photographic lenses as their patents list them, so that ghosts need no data."""
     return [parse_prescription(text.replace("|", "\n"), name) for name, text in _PATENTS.items()]

@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Scattering flares: what a dirty stop, and dust, grease and scratches on the front glass, do to a light.
+"""Draws scattering flares: what a dirty stop, and dust, grease and scratches on the front glass, do to a light.
 
-A point's image is the power of the Fourier transform of the stop (Wu et al. 2021, "How to Train Neural
-Networks for Flare Removal"): blades give spikes, dust gives shimmer, scratches give streaks, defocus opens
-the core to the stop's own shape. It grows in proportion to the wavelength, which is where its colours come
-from.
+A point's image is the power of the Fourier transform of the stop (Wu et al. 2021, "How to Train Neural Networks for
+Flare Removal"): blades give spikes, dust gives shimmer, scratches give streaks, defocus opens the core to the stop's
+own shape. It grows in proportion to the wavelength, which gives it its colours.
 """
 from __future__ import annotations
 
@@ -12,47 +11,48 @@ import math
 
 import numpy as np
 
-from .canvas import Array, Point, Random, colour_of, uniform_log
+from .canvas import Array, Point, Random, log_uniform, spectral_colour
 
-STOP = 256  # samples across the transform's plane; the stop fills about half of it
+STOP_SAMPLES = 256  # samples across the transform's plane; the stop fills about half of it
 
 
 def starburst(random: Random, light: Point, size: int) -> Array:
-    """(size, size, 3): the light's diffraction image, 1 near the core, falling over several decades."""
+    """Return (size, size, 3), the light's diffraction image: 1 near the core, falling over several decades."""
     import cv2
 
-    stop = _stop(random, dirt=random.random() ** 2)
-    phase = _defocus(random)
-    plane = np.fft.fftshift(np.fft.fft2(stop * np.exp(1j * phase), (2 * STOP, 2 * STOP)))
+    stop = _draw_stop(random, dirt=random.random() ** 2)
+    phase = _draw_phase(random)
+    plane = np.fft.fftshift(np.fft.fft2(stop * np.exp(1j * phase), (2 * STOP_SAMPLES, 2 * STOP_SAMPLES)))
     raw = (np.abs(plane) ** 2).astype(np.float32)
-    blur = uniform_log(random, 0.5, 2.0)  # lights are no points, and no camera resolves the fringes
+    blur = log_uniform(random, 0.5, 2.0)  # lights are no points, and no camera resolves the fringes
     power = np.asarray(cv2.GaussianBlur(raw / raw.max(), (0, 0), blur), np.float32)
     power /= power.max()
-    reach = uniform_log(random, 0.5, 4.0)
+    reach = log_uniform(random, 0.5, 4.0)
     layer = np.zeros((size, size, 3), np.float32)
     waves = np.linspace(0.41, 0.69, 10)
-    colours = colour_of(waves)
+    colours = spectral_colour(waves)
     colours /= colours.sum(0)
     spread = random.uniform(0.3, 1.0)  # of the colours; the eye of a sensor mixes them
     for wave, colour in zip(waves, colours.astype(np.float32), strict=True):
-        zoom = reach * (1 + spread * (wave / 0.55 - 1)) * size / (2 * STOP)
+        zoom = reach * (1 + spread * (wave / 0.55 - 1)) * size / (2 * STOP_SAMPLES)
         x, y = (light[0] + 1) * size / 2, (light[1] + 1) * size / 2
-        matrix = np.array([[zoom, 0, x - zoom * STOP], [0, zoom, y - zoom * STOP]])
+        matrix = np.array([[zoom, 0, x - zoom * STOP_SAMPLES], [0, zoom, y - zoom * STOP_SAMPLES]])
         layer += cv2.warpAffine(power, matrix, (size, size))[..., None] * (colour / zoom**2)
     return layer / max(float(layer.max()), 1e-12)
 
 
-def _stop(random: Random, dirt: float) -> Array:
-    """(STOP, STOP): what passes; dirt: 0 for a clean stop (spikes alone) to 1."""
+def _draw_stop(random: Random, dirt: float) -> Array:
+    """Return the transmission of the stop (STOP_SAMPLES, STOP_SAMPLES). dirt: 0 for a clean stop (spikes alone) to 1.
+    """
     import cv2
 
-    at = np.linspace(-1, 1, STOP)
+    at = np.linspace(-1, 1, STOP_SAMPLES)
     x, y = np.meshgrid(at, at)
     blades = int(random.integers(5, 10))
     if random.random() < 0.2:
         blades = 18
     turn = random.uniform(0, 2 * math.pi)
-    shape = np.ones((STOP, STOP))
+    shape = np.ones((STOP_SAMPLES, STOP_SAMPLES))
     soft = 90.0
     for k in range(blades):
         angle = turn + 2 * math.pi * (k + random.normal(0, 0.03)) / blades
@@ -63,16 +63,16 @@ def _stop(random: Random, dirt: float) -> Array:
                                          -60, 60)))
     mask = shape.astype(np.float32)
     for _ in range(int(random.poisson(60 * dirt))):
-        middle = (random.uniform(0.25, 0.75, 2) * STOP).astype(int)
+        middle = (random.uniform(0.25, 0.75, 2) * STOP_SAMPLES).astype(int)
         spot = np.ones_like(mask)
-        cv2.circle(spot, tuple(int(v) for v in middle), int(uniform_log(random, 1, 6)), (random.uniform(0, 0.9),), -1,
+        cv2.circle(spot, tuple(int(v) for v in middle), int(log_uniform(random, 1, 6)), (random.uniform(0, 0.9),), -1,
                    cv2.LINE_AA)
         mask *= spot
     along = random.uniform(0, math.pi)  # wiping leaves scratches in one direction
     spread = random.choice([0.03, 0.2, 2.0])
     for _ in range(int(random.poisson(40 * dirt))):
-        middle, angle = random.uniform(0.2, 0.8, 2) * STOP, along + random.normal(0, spread)
-        reach = uniform_log(random, 5, STOP) / 2
+        middle, angle = random.uniform(0.2, 0.8, 2) * STOP_SAMPLES, along + random.normal(0, spread)
+        reach = log_uniform(random, 5, STOP_SAMPLES) / 2
         ends = [(int(middle[0] + sign * reach * math.cos(angle)), int(middle[1] + sign * reach * math.sin(angle)))
                 for sign in (-1, 1)]
         line = np.ones_like(mask)
@@ -81,39 +81,39 @@ def _stop(random: Random, dirt: float) -> Array:
     return mask
 
 
-def _defocus(random: Random) -> Array:
-    """Phase, radians: defocus, and grease that is smooth."""
+def _draw_phase(random: Random) -> Array:
+    """Return the phase, radians, of defocus and of smooth grease."""
     import cv2
 
-    at = np.linspace(-1, 1, STOP)
+    at = np.linspace(-1, 1, STOP_SAMPLES)
     x, y = np.meshgrid(at, at)
-    phase = np.zeros((STOP, STOP))
+    phase = np.zeros((STOP_SAMPLES, STOP_SAMPLES))
     if random.random() < 0.5:
         phase += random.normal(0, 12) * (x**2 + y**2)
     if random.random() < 0.4:
-        grease = cv2.GaussianBlur(random.normal(0, 1, (STOP, STOP)), (0, 0), uniform_log(random, 4, 30))
-        phase += grease / grease.std() * uniform_log(random, 0.1, 2.0)
+        grease = cv2.GaussianBlur(random.normal(0, 1, (STOP_SAMPLES, STOP_SAMPLES)), (0, 0), log_uniform(random, 4, 30))
+        phase += grease / grease.std() * log_uniform(random, 0.1, 2.0)
     return phase.astype(np.float32)
 
 
-def rays(random: Random, light: Point, x: Array, y: Array) -> Array:
-    """Shimmer: many fine rays round the light, of uneven strength and length."""
+def shimmer(random: Random, light: Point, x: Array, y: Array) -> Array:
+    """Return many fine rays round the light, of uneven strength and length."""
     dx, dy = x - light[0], y - light[1]
     r, angle = np.hypot(dx, dy), np.arctan2(dy, dx)
     count = 2048
     strength = np.zeros(count)
     kind = random.random()
     if kind < 0.4:  # a few long ones
-        number, width = int(random.integers(4, 30)), uniform_log(random, 0.002, 0.03)
+        number, width = int(random.integers(4, 30)), log_uniform(random, 0.002, 0.03)
     else:  # a curtain of them
-        number, width = int(random.integers(40, 300)), uniform_log(random, 0.001, 0.01)
+        number, width = int(random.integers(40, 300)), log_uniform(random, 0.001, 0.01)
     at = np.arange(count) / count
     for _ in range(number):
         centre = random.random()
         gap = np.abs(at - centre)
         strength += random.exponential(1) * np.exp(-(np.minimum(gap, 1 - gap) / (width * random.uniform(0.5, 2))) ** 2)
     strength = strength / strength.max() + random.uniform(0, 0.3)
-    reach = uniform_log(random, 0.08, 0.8) * (0.5 + 0.5 * np.roll(strength, int(random.integers(20))))
+    reach = log_uniform(random, 0.08, 0.8) * (0.5 + 0.5 * np.roll(strength, int(random.integers(20))))
     turn = ((angle / (2 * math.pi)) % 1) * count
     low = turn.astype(int) % count
     part = (turn - np.floor(turn)).astype(np.float32)
@@ -124,29 +124,29 @@ def rays(random: Random, light: Point, x: Array, y: Array) -> Array:
                     else 1 / (1 + (r / far * 2) ** 2.5))
     if random.random() < 0.5:
         layer = layer * (1 - np.exp(-(r / max(inner, 1e-3)) ** 2))
-    hue = _along(random, r)
+    hue = _radial_tint(random, r)
     return (layer[..., None] * hue).astype(np.float32)
 
 
-def _along(random: Random, r: Array) -> Array:
-    """(…, 3) a colour that changes with the distance from the light, mean about 1."""
+def _radial_tint(random: Random, r: Array) -> Array:
+    """Return (..., 3), a colour that changes with the distance from the light, mean about 1."""
     turns = random.normal(0, 0.35, (2, 3))
-    share = np.clip(r / uniform_log(random, 0.2, 1.5), 0, 1)[..., None]
+    share = np.clip(r / log_uniform(random, 0.2, 1.5), 0, 1)[..., None]
     return np.exp(turns[0] * (1 - share) + turns[1] * share).astype(np.float32)
 
 
-def glare(random: Random, light: Point, x: Array, y: Array) -> Array:
-    """The glow round a light: lobes that fall as a power, with a colour of its own further out."""
+def glow(random: Random, light: Point, x: Array, y: Array) -> Array:
+    """Return the glow round a light: lobes that fall off as a power, coloured farther out."""
     dx, dy = x - light[0], y - light[1]
     if random.random() < 0.25:  # stretched, as a smear is
-        angle, ratio = random.uniform(0, math.pi), uniform_log(random, 1.1, 4)
+        angle, ratio = random.uniform(0, math.pi), log_uniform(random, 1.1, 4)
         dx, dy = dx * math.cos(angle) + dy * math.sin(angle), (dy * math.cos(angle) - dx * math.sin(angle)) * ratio
     r = np.hypot(dx, dy)
     layer = np.zeros((*r.shape, 3), np.float32)
     for _ in range(int(random.integers(1, 4))):
-        width, power = uniform_log(random, 0.015, 0.5), random.uniform(1.6, 4)
+        width, power = log_uniform(random, 0.015, 0.5), random.uniform(1.6, 4)
         lobe: Array = 1 / (1 + (r / width) ** power) if random.random() < 0.7 else np.exp(-((r / width) ** 2))
-        layer += (lobe * uniform_log(random, 0.05, 1) * (0.05 / width) ** 0.5)[..., None] * _along(random, r)
+        layer += (lobe * log_uniform(random, 0.05, 1) * (0.05 / width) ** 0.5)[..., None] * _radial_tint(random, r)
     if random.random() < 0.3:  # uneven round the circle
         about = np.arctan2(dy, dx)
         waves = [random.normal(0, 0.3) * np.cos(k * about + random.uniform(0, 7)) for k in range(1, 5)]
@@ -155,7 +155,7 @@ def glare(random: Random, light: Point, x: Array, y: Array) -> Array:
 
 
 def veil(random: Random, light: Point, x: Array, y: Array) -> Array:
-    """Veiling glare: light over the whole frame, more on the light's side, without any edge."""
+    """Return veiling glare: light over the whole frame, more on the light's side, without any edge."""
     distance = np.hypot(x - light[0], y - light[1])
-    layer = 1 / (1 + (distance / uniform_log(random, 0.3, 2.5)) ** random.uniform(1, 3)) + random.uniform(0, 0.6)
-    return (layer / layer.max())[..., None].astype(np.float32) * _along(random, distance)
+    layer = 1 / (1 + (distance / log_uniform(random, 0.3, 2.5)) ** random.uniform(1, 3)) + random.uniform(0, 0.6)
+    return (layer / layer.max())[..., None].astype(np.float32) * _radial_tint(random, distance)

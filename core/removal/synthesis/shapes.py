@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Streaks, smears, halos and rings, and the light sources themselves."""
+"""Draws streaks, smears, halos and rings, and the lights themselves."""
 from __future__ import annotations
 
 import math
@@ -7,24 +7,24 @@ from collections.abc import Callable
 
 import numpy as np
 
-from .canvas import Array, Point, Random, colour_of, tint, uniform_log
+from .canvas import Array, Point, Random, log_uniform, random_tint, spectral_colour
 
 
 def streak(random: Random, light: Point, x: Array, y: Array) -> Array:
-    """The long level line of an anamorphic lens, or a few close to each other."""
+    """Return the long horizontal line of an anamorphic lens, or a few close to each other."""
     layer = np.zeros((*x.shape, 3), np.float32)
     blue = np.array([0.25, 0.6, 1.6], np.float32)
     for number in range(1 if random.random() < 0.6 else int(random.integers(2, 5))):
-        angle, aside = random.normal(0, 0.02), random.normal(0, 0.01) if number else 0.0
+        angle, offset = random.normal(0, 0.02), random.normal(0, 0.01) if number else 0.0
         dx, dy = x - light[0], y - light[1]
         along = dx * math.cos(angle) + dy * math.sin(angle)
-        across = dy * math.cos(angle) - dx * math.sin(angle) - aside
-        reach, width = uniform_log(random, 0.1, 2.5), uniform_log(random, 0.003, 0.05)
+        across = dy * math.cos(angle) - dx * math.sin(angle) - offset
+        reach, width = log_uniform(random, 0.1, 2.5), log_uniform(random, 0.003, 0.05)
         cross = np.exp(-(across / width) ** 2) if random.random() < 0.5 else 1 / (1 + (across / width) ** 2) ** 1.5
         fall = np.exp(-np.abs(along) / reach) if random.random() < 0.5 else 1 / (1 + (along / reach * 2) ** 2)
         if random.random() < 0.3:  # uneven along its length
             fall *= 1 + 0.4 * np.sin(along * random.uniform(4, 60) + random.uniform(0, 7))
-        colour = blue * tint(random, 0.2) if random.random() < 0.6 else tint(random, 0.6)
+        colour = blue * random_tint(random, 0.2) if random.random() < 0.6 else random_tint(random, 0.6)
         core = np.exp(-np.abs(along) / (0.3 * reach))[..., None]
         layer += (cross * fall * width ** -0.2 * random.uniform(0.3, 1))[..., None] * (
             colour * (1 - 0.6 * core) + 0.6 * core).astype(np.float32)
@@ -32,42 +32,43 @@ def streak(random: Random, light: Point, x: Array, y: Array) -> Array:
 
 
 def smear(random: Random, light: Point, x: Array, y: Array) -> Array:
-    """What wiped grease on the front glass shows, as most telephones do at night: beams across the marks, which
-    open as they go, of fine rays or even, on both sides of the light or on one; 1 at a quarter of the canvas' half."""
+    """Return what wiped grease on the front glass shows, as on most telephones at night: beams across the wiping marks,
+    which widen outwards, of fine rays or even, on one or both sides of the light; 1 at a quarter of the canvas's half.
+    """
     dx, dy = x - light[0], y - light[1]
     r, angle = np.hypot(dx, dy), np.arctan2(dy, dx)
     layer = np.zeros((*x.shape, 3), np.float32)
     for number in range(1 if random.random() < 0.5 else int(random.integers(2, 6))):
-        layer += _beam(random, r, angle, fainter=number > 0)
+        layer += _draw_beam(random, r, angle, fainter=number > 0)
     return layer
 
 
-def _beam(random: Random, r: Array, angle: Array, *, fainter: bool) -> Array:
-    """One of a smear's, in polar coordinates about the light."""
-    towards = random.uniform(-math.pi, math.pi)
+def _draw_beam(random: Random, r: Array, angle: Array, *, fainter: bool) -> Array:
+    """Return one beam of a smear, in polar coordinates about the light."""
+    direction = random.uniform(-math.pi, math.pi)
     bend = random.normal(0, 0.12) if random.random() < 0.3 else 0.0
-    width, opening = uniform_log(random, 0.002, 0.04), uniform_log(random, 0.003, 0.15)
-    reach, power, end = uniform_log(random, 0.03, 1.5), random.uniform(0.7, 3), uniform_log(random, 0.25, 4)
+    width, opening = log_uniform(random, 0.002, 0.04), log_uniform(random, 0.003, 0.15)
+    reach, power, end = log_uniform(random, 0.03, 1.5), random.uniform(0.7, 3), log_uniform(random, 0.25, 4)
     other_side = 1.0 if random.random() < 0.6 else random.random() * (random.random() < 0.5)
-    form, level = random.random(), uniform_log(random, 0.1, 1) if fainter else 1.0
-    rays = _uneven(random) if random.random() < 0.5 else None
-    colour = tint(random, 0.15) + (tint(random, 0.5) - 1) * np.clip(r / end, 0, 1)[..., None]
+    form, level = random.random(), log_uniform(random, 0.1, 1) if fainter else 1.0
+    rays = _draw_ray_profile(random) if random.random() < 0.5 else None
+    colour = random_tint(random, 0.15) + (random_tint(random, 0.5) - 1) * np.clip(r / end, 0, 1)[..., None]
     fall = (1 + (0.25 / reach) ** power) / (1 + (r / reach) ** power) * np.exp(-((r / end) ** 2))
     spread = np.sqrt(width**2 + (opening * r) ** 2)
     light = np.zeros_like(r)
     for turn, strength in ((0.0, level), (math.pi, level * other_side)):
-        off = angle - towards - turn - bend * r
-        off = np.arctan2(np.sin(off), np.cos(off))
-        u = np.minimum(np.abs(off), 1.5) * r / spread
+        deviation = angle - direction - turn - bend * r
+        deviation = np.arctan2(np.sin(deviation), np.cos(deviation))
+        u = np.minimum(np.abs(deviation), 1.5) * r / spread
         cross = np.exp(-(u**2)) if form < 0.4 else 1 / (1 + u**2) ** 1.5 if form < 0.7 else np.exp(-(u**4))
         if rays is not None:
-            cross = cross * rays(off / max(opening, 0.01))
+            cross = cross * rays(deviation / max(opening, 0.01))
         light += np.minimum(strength * cross * fall, 30)
     return np.asarray(light[..., None] * np.maximum(colour, 0.05), np.float32)
 
 
-def _uneven(random: Random) -> Callable[[Array], Array]:
-    """Rays: a random brightness by the direction, mean about 1, of an opening's width on either side."""
+def _draw_ray_profile(random: Random) -> Callable[[Array], Array]:
+    """Return a function of direction: random brightness of rays, mean about 1, one opening's width to either side."""
     count = int(random.integers(6, 60))
     at, values = np.linspace(-2.5, 2.5, count), random.exponential(1, count) + random.uniform(0, 1)
     values /= values.mean()
@@ -75,16 +76,16 @@ def _uneven(random: Random) -> Callable[[Array], Array]:
 
 
 def halo(random: Random, light: Point, x: Array, y: Array) -> Array:
-    """Rings about the light (or about the middle), bare or with the colours of diffraction, whole or in part."""
-    about = np.array(light) * (random.uniform(-0.5, 1) if random.random() < 0.3 else 1)
-    dx, dy = x - about[0], y - about[1]
+    """Return rings about the light (or about the middle), white or in the colours of diffraction, whole or partial."""
+    centre = np.array(light) * (random.uniform(-0.5, 1) if random.random() < 0.3 else 1)
+    dx, dy = x - centre[0], y - centre[1]
     r, angle = np.hypot(dx, dy), np.arctan2(dy, dx)
     layer = np.zeros((*x.shape, 3), np.float32)
     for _ in range(1 if random.random() < 0.7 else 2):
-        radius, width = uniform_log(random, 0.08, 1.4), uniform_log(random, 0.005, 0.2)
-        level = uniform_log(random, 0.2, 1)
+        radius, width = log_uniform(random, 0.08, 1.4), log_uniform(random, 0.005, 0.2)
+        level = log_uniform(random, 0.2, 1)
         waves = np.linspace(0.42, 0.68, 9)
-        colours = colour_of(waves)
+        colours = spectral_colour(waves)
         colours = colours / colours.sum(0)
         spread = random.uniform(-1, 1) if random.random() < 0.7 else 0.0
         ring = np.zeros_like(layer)
@@ -93,23 +94,24 @@ def halo(random: Random, light: Point, x: Array, y: Array) -> Array:
             side = np.where(r < at, random.uniform(0.7, 1.3), 1.0)
             ring += np.exp(-((r - at) / (width * side)) ** 2)[..., None] * colour
         if random.random() < 0.4:
-            towards, open_by = random.uniform(-math.pi, math.pi), random.uniform(0.3, 2)
-            ring *= np.exp(-((np.arctan2(np.sin(angle - towards), np.cos(angle - towards)) / open_by) ** 2))[..., None]
+            direction, opening_angle = random.uniform(-math.pi, math.pi), random.uniform(0.3, 2)
+            away = np.arctan2(np.sin(angle - direction), np.cos(angle - direction))
+            ring *= np.exp(-((away / opening_angle) ** 2))[..., None]
         if random.random() < 0.3:
             fine = sum(random.normal(0, 0.3) * np.cos(k * angle + random.uniform(0, 7))
                        for k in random.integers(8, 120, 6))
             ring *= np.exp(np.asarray(fine, np.float32))[..., None]
-        layer += level * ring * (tint(random, 0.5) if spread == 0 else tint(random, 0.15))
+        layer += level * ring * (random_tint(random, 0.5) if spread == 0 else random_tint(random, 0.15))
     return layer / max(float(layer.max()), 1e-9)
 
 
 def rings(random: Random, x: Array, y: Array) -> Array:
-    """The method's procedural rings: any centre, any radius, any colour, opacity below 0.7, times a mask that
-    is 0 at the middle of the frame."""
+    """Return the paper's procedural rings: any centre, radius and colour, opacity below 0.7, times a mask that is 0 at
+    the middle of the frame."""
     layer = np.zeros((*x.shape, 3), np.float32)
     for _ in range(int(random.integers(1, 4))):
         centre, radius = random.uniform(-1, 1, 2), random.uniform(0.1, 1.2)
-        width = uniform_log(random, 0.004, 0.12)
+        width = log_uniform(random, 0.004, 0.12)
         r = np.hypot(x - centre[0], y - centre[1])
         ring = np.exp(-((r - radius) / width) ** 2)
         layer += (random.uniform(0.05, 0.7) * ring)[..., None] * (random.random(3) ** 0.7).astype(np.float32)
@@ -117,21 +119,21 @@ def rings(random: Random, x: Array, y: Array) -> Array:
     return layer * fade[..., None].astype(np.float32)
 
 
-def source(random: Random, light: Point, x: Array, y: Array) -> Array:
-    """The light itself, which belongs to the scene: a disc, tube, window or cluster, brighter than white."""
+def light_shape(random: Random, light: Point, x: Array, y: Array) -> Array:
+    """Return the light itself, which belongs to the scene: a disc, tube, window or cluster, brighter than white."""
     layer = np.zeros((*x.shape, 3), np.float32)
-    kind, colour = random.random(), tint(random, 0.15)
-    level = uniform_log(random, 1.2, 12)
+    kind, colour = random.random(), random_tint(random, 0.15)
+    level = log_uniform(random, 1.2, 12)
     edge = 2.0 / x.shape[0]
     for _ in range(1 if random.random() < 0.85 else int(random.integers(2, 6))):
         dx, dy = x - light[0], y - light[1]
         if kind > 0.85:
             dx, dy = dx + random.normal(0, 0.03), dy + random.normal(0, 0.03)
-        radius = uniform_log(random, 0.006, 0.07)
+        radius = log_uniform(random, 0.006, 0.07)
         if kind < 0.65:
             far = np.hypot(dx, dy) - radius
         else:
-            angle, ratio = random.choice([0.0, random.uniform(0, math.pi)]), uniform_log(random, 1, 6)
+            angle, ratio = random.choice([0.0, random.uniform(0, math.pi)]), log_uniform(random, 1, 6)
             along = np.abs(dx * math.cos(angle) + dy * math.sin(angle)) - radius * ratio ** 0.5
             far = np.maximum(along, np.abs(dy * math.cos(angle) - dx * math.sin(angle)) - radius / ratio ** 0.5)
         layer += np.clip(0.5 - far / (2 * edge), 0, 1)[..., None] * colour * level

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Few photographs made to look like many: filmed askew, graded, cut up and laid over each other, with bright things
+"""Augments backgrounds, so that few photographs look like many: warped, graded, cut up, overlaid, with bright objects
 that are no flare.
 
-A network that has seen the same photograph often enough knows it, and what it then takes away for a flare is the
-difference from what it knows; over pictures it has not seen it fails. Of pieces there are no end (dead leaves: Lee,
-Mumford and Huang 2001, "Occlusion models for natural images").
+A network that has seen a photograph often enough knows it, and then predicts as flare whatever differs from it; on new
+pictures it fails. Dead leaves give no end of pictures (Lee, Mumford and Huang 2001, "Occlusion models for natural
+images"). `backgrounds.Backgrounds.draw` calls `augment`.
 """
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from numpy.typing import NDArray
 
 from ...colour.srgb import Pixels
 from ...errors import EngineError
-from ..synthesis.canvas import uniform_log
+from ..synthesis.canvas import log_uniform
 
 Random = np.random.Generator
-Film = Callable[[Random, int, int], Pixels]
-"""A random view of that width and height, (height, width, 3) linear light."""
+DrawView = Callable[[Random, int, int], Pixels]
+"""Draws a random view of that width and height: (height, width, 3) linear light."""
 
-ROOM = 1.4
-"""Parts of its size by which a picture to be laid askew is filmed larger."""
-SQUARE = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
-"""The corners of a frame, from its middle in halves of its sides."""
+WARP_MARGIN = 1.4
+"""Factor by which a picture that will be warped is drawn larger than the frame."""
+UNIT_SQUARE = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+"""The corners of a frame, relative to its middle, in half sides."""
 
 
-def need() -> None:
-    """Raises EngineError where OpenCV has not what `varied` asks of it."""
+def require_ximgproc() -> None:
+    """Raise EngineError if OpenCV lacks the module that `augment` needs."""
     import cv2
 
     if not hasattr(cv2, "ximgproc"):
@@ -37,103 +37,106 @@ def need() -> None:
                           "every opencv package there and install opencv-contrib-python-headless alone.")
 
 
-def varied(random: Random, film: Film, width: int, height: int) -> Pixels:
-    """(height, width, 3) linear light: as filmed in one of six, else changed in some of the ways below."""
-    scene = _askew(random, film, width, height)
+def augment(random: Random, draw_view: DrawView, width: int, height: int) -> Pixels:
+    """Return (height, width, 3) linear light: a view as drawn in one of six cases, else changed in some of the ways
+    below."""
+    scene = _random_pose(random, draw_view, width, height)
     if random.random() < 0.12:
-        scene = _out_of_focus(random, scene)
+        scene = _random_defocus(random, scene)
     if random.random() < 0.35:
-        scene = _under_leaves(random, scene, film)
+        scene = _add_dead_leaves(random, scene, draw_view)
     elif random.random() < 0.2:
-        scene = _joined(random, scene, _askew(random, film, width, height))
+        scene = _join(random, scene, _random_pose(random, draw_view, width, height))
     if random.random() < 0.4:
-        scene = _graded(random, scene)
+        scene = _grade(random, scene)
     if random.random() < 0.15:
-        scene = _hazy(random, scene)
+        scene = _add_haze(random, scene)
     if random.random() < 0.15:
-        scene = _with_bright_things(random, scene)
+        scene = _add_bright_objects(random, scene)
     return scene
 
 
-def _askew(random: Random, film: Film, width: int, height: int) -> Pixels:
-    """Upright in six of ten, else sideways, or turned by some degrees and seen from the side."""
+def _random_pose(random: Random, draw_view: DrawView, width: int, height: int) -> Pixels:
+    """Return a view: upright in six of ten, else on its side, or rolled by some degrees and seen in perspective."""
     import cv2
 
-    how = random.random()
-    if how < 0.6:
-        return film(random, width, height)
-    if how < 0.75:
-        return np.ascontiguousarray(film(random, height, width).swapaxes(0, 1))
-    wide, high = math.ceil(width * ROOM), math.ceil(height * ROOM)
-    scene = film(random, wide, high)
-    turn = math.radians(random.normal(0, 12))
-    spin = np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]])
-    corners = (SQUARE * (width, height) / 2) @ spin.T * np.exp(random.normal(0, 0.1, (4, 1))) + (wide / 2, high / 2)
-    onto = (SQUARE + 1) / 2 * (width, height)
-    matrix = cv2.getPerspectiveTransform(corners.astype(np.float32), onto.astype(np.float32))
+    choice = random.random()
+    if choice < 0.6:
+        return draw_view(random, width, height)
+    if choice < 0.75:
+        return np.ascontiguousarray(draw_view(random, height, width).swapaxes(0, 1))
+    piece_width, piece_height = math.ceil(width * WARP_MARGIN), math.ceil(height * WARP_MARGIN)
+    scene = draw_view(random, piece_width, piece_height)
+    roll = math.radians(random.normal(0, 12))
+    rotation = np.array([[math.cos(roll), -math.sin(roll)], [math.sin(roll), math.cos(roll)]])
+    corners = (UNIT_SQUARE * (width, height) / 2) @ rotation.T * np.exp(random.normal(0, 0.1, (4, 1)))
+    corners += (piece_width / 2, piece_height / 2)
+    target_corners = (UNIT_SQUARE + 1) / 2 * (width, height)
+    matrix = cv2.getPerspectiveTransform(corners.astype(np.float32), target_corners.astype(np.float32))
     return np.asarray(cv2.warpPerspective(scene, matrix, (width, height), flags=cv2.INTER_LINEAR,
                                           borderMode=cv2.BORDER_REFLECT), np.float32)
 
 
-def _out_of_focus(random: Random, scene: Pixels) -> Pixels:
-    """What lies behind, as a lens focused on something nearer shows it: its lights become discs or polygons."""
-    radius = math.hypot(*scene.shape[:2]) * uniform_log(random, 0.004, 0.04)
+def _random_defocus(random: Random, scene: Pixels) -> Pixels:
+    """Blur the scene as a lens that is focused nearer does: lights become discs or polygons."""
+    radius = math.hypot(*scene.shape[:2]) * log_uniform(random, 0.004, 0.04)
     blades = int(random.integers(5, 9)) if random.random() < 0.4 else 48  # so many that it looks round
     at = np.arange(blades) * (2 * math.pi / blades) + random.uniform(0, 2 * math.pi)
     side = 2 * math.ceil(radius) + 1
-    return seen_through(scene, _polygon(np.stack([np.cos(at), np.sin(at)], -1) * radius + side // 2, side, side))
+    return defocus(scene, _draw_polygon(np.stack([np.cos(at), np.sin(at)], -1) * radius + side // 2, side, side))
 
 
-def seen_through(scene: Pixels, opening: Pixels) -> Pixels:
-    """A scene out of focus, behind a lens of that opening (height, width) in pixels."""
+def defocus(scene: Pixels, aperture: Pixels) -> Pixels:
+    """Convolve a scene with the image (height, width) of the aperture, in pixels."""
     import cv2
 
-    blurred = cv2.filter2D(scene, -1, opening / opening.sum(), borderType=cv2.BORDER_REFLECT)
+    blurred = cv2.filter2D(scene, -1, aperture / aperture.sum(), borderType=cv2.BORDER_REFLECT)
     return np.asarray(np.maximum(blurred, 0), np.float32)  # by Fourier transform, which rounds to either side
 
 
-def _under_leaves(random: Random, scene: Pixels, film: Film) -> Pixels:
-    """Under pieces of other pictures, each in its own light, some of them out of focus."""
+def _add_dead_leaves(random: Random, scene: Pixels, draw_view: DrawView) -> Pixels:
+    """Cover the scene with pieces of other views, each in its own exposure, some out of focus."""
     height, width = scene.shape[:2]
     scene = scene.copy()
     for _ in range(int(random.integers(1, 9))):
-        size = math.hypot(width, height) * uniform_log(random, 0.1, 0.8)
-        lengthened = math.exp(random.normal(0, 0.5))
-        wide, high = (max(int(size * part), 8) for part in (math.sqrt(lengthened), 1 / math.sqrt(lengthened)))
-        left, top = int(random.uniform(-wide / 2, width - wide / 2)), int(random.uniform(-high / 2, height - high / 2))
-        shape = _leaf(random, wide, high)[..., None]
-        piece = film(random, wide, high) * np.float32(math.exp(random.normal(0, 0.5)))
-        seen = np.s_[max(-top, 0):height - top, max(-left, 0):width - left]
-        covered = np.s_[max(top, 0):top + high, max(left, 0):left + wide]
-        scene[covered] = _mixed(scene[covered], piece[seen], shape[seen])
+        size = math.hypot(width, height) * log_uniform(random, 0.1, 0.8)
+        aspect = math.exp(random.normal(0, 0.5))
+        piece_width, piece_height = (max(int(size * part), 8) for part in (math.sqrt(aspect), 1 / math.sqrt(aspect)))
+        left = int(random.uniform(-piece_width / 2, width - piece_width / 2))
+        top = int(random.uniform(-piece_height / 2, height - piece_height / 2))
+        shape = _draw_leaf(random, piece_width, piece_height)[..., None]
+        piece = draw_view(random, piece_width, piece_height) * np.float32(math.exp(random.normal(0, 0.5)))
+        piece_window = np.s_[max(-top, 0):height - top, max(-left, 0):width - left]
+        scene_window = np.s_[max(top, 0):top + piece_height, max(left, 0):left + piece_width]
+        scene[scene_window] = _blend(scene[scene_window], piece[piece_window], shape[piece_window])
     return scene
 
 
-def _mixed(one: Pixels, other: Pixels, of_other: Pixels) -> Pixels:
-    """By a share 0..1 of the other; light that rounding would leave below zero is none."""
-    return np.asarray(np.maximum(one + (other - one) * of_other, 0), np.float32)
+def _blend(one: Pixels, other: Pixels, weight: Pixels) -> Pixels:
+    """Mix two pictures by the weight 0..1 of the other; light that rounding leaves below zero becomes zero."""
+    return np.asarray(np.maximum(one + (other - one) * weight, 0), np.float32)
 
 
-def _leaf(random: Random, width: int, height: int) -> Pixels:
-    """(height, width) 0..1: a blot, a polygon or an ellipse, sharp in two of three."""
+def _draw_leaf(random: Random, width: int, height: int) -> Pixels:
+    """Return the mask (height, width) 0..1 of a blob, a polygon or an ellipse, sharp in two of three."""
     import cv2
 
     kind = random.integers(3)
     if kind == 0:
-        shape = _blot(random, width, height)
+        shape = _draw_blob(random, width, height)
     else:
         corners = int(random.integers(3, 8)) if kind == 1 else 48  # so many that it looks round
         at = np.sort(random.uniform(0, 2 * math.pi, corners)) if kind == 1 else np.linspace(0, 2 * math.pi, corners)
         reach = random.uniform(0.5, 1, (corners, 1)) if kind == 1 else 0.95
-        shape = _polygon((np.stack([np.cos(at), np.sin(at)], -1) * reach + 1) / 2 * (width, height), width, height)
+        shape = _draw_polygon((np.stack([np.cos(at), np.sin(at)], -1) * reach + 1) / 2 * (width, height), width, height)
     if random.random() < 1 / 3:
-        soft = max(width, height) * uniform_log(random, 0.005, 0.08)
-        return np.asarray(cv2.GaussianBlur(shape, (0, 0), soft, borderType=cv2.BORDER_CONSTANT), np.float32)
+        softness = max(width, height) * log_uniform(random, 0.005, 0.08)
+        return np.asarray(cv2.GaussianBlur(shape, (0, 0), softness, borderType=cv2.BORDER_CONSTANT), np.float32)
     return shape
 
 
-def _blot(random: Random, width: int, height: int) -> Pixels:
-    """(height, width) 0..1: what of some smooth hills is above a level."""
+def _draw_blob(random: Random, width: int, height: int) -> Pixels:
+    """Return the mask (height, width) 0..1 of smooth random hills above a level."""
     import cv2
 
     coarse = random.random((int(random.integers(3, 9)), int(random.integers(3, 9)))).astype(np.float32)
@@ -142,8 +145,8 @@ def _blot(random: Random, width: int, height: int) -> Pixels:
     return np.asarray(np.clip((hills - random.uniform(0.3, 0.5)) * min(width, height) / 4 + 0.5, 0, 1), np.float32)
 
 
-def _polygon(corners: NDArray[np.float64], width: int, height: int) -> Pixels:
-    """(height, width) 0..1, with smooth edges. corners: (n, 2) in pixels."""
+def _draw_polygon(corners: NDArray[np.float64], width: int, height: int) -> Pixels:
+    """Return an anti-aliased mask (height, width) 0..1. corners: (n, 2) in pixels."""
     import cv2
 
     shape = np.zeros((height, width), np.float32)
@@ -151,8 +154,8 @@ def _polygon(corners: NDArray[np.float64], width: int, height: int) -> Pixels:
     return shape
 
 
-def _graded(random: Random, scene: Pixels) -> Pixels:
-    """More or less of contrast and colour, under coloured light, in a few with colours exchanged."""
+def _grade(random: Random, scene: Pixels) -> Pixels:
+    """Change contrast, saturation and colour balance; exchange channels in a few."""
     level = np.float32(max(float(scene.mean()), 1e-4))
     if random.random() < 0.5:
         scene = level * (scene / level) ** np.float32(math.exp(random.normal(0, 0.25)))
@@ -166,73 +169,77 @@ def _graded(random: Random, scene: Pixels) -> Pixels:
     return np.asarray(scene, np.float32)
 
 
-def _joined(random: Random, scene: Pixels, other: Pixels) -> Pixels:
-    """One beside the other, with a sharp or a soft edge between them; or one as a pane of glass reflects it over the
-    other."""
+def _join(random: Random, scene: Pixels, other: Pixels) -> Pixels:
+    """Put one scene beside the other, with a sharp or soft edge between them, or mix them as a reflection in a pane of
+    glass."""
     height, width = scene.shape[:2]
     if random.random() < 0.3:
         share = np.float32(random.uniform(0.2, 0.8))
         return scene * share + other * (1 - share)
-    angle, soft = random.uniform(0, 2 * math.pi), uniform_log(random, 0.005, 0.3)
+    angle, softness = random.uniform(0, 2 * math.pi), log_uniform(random, 0.005, 0.3)
     x = np.linspace(-1, 1, width, dtype=np.float32)[None, :]
     y = np.linspace(-1, 1, height, dtype=np.float32)[:, None]
-    beside = (x * np.float32(math.cos(angle)) + y * np.float32(math.sin(angle)) - random.uniform(-0.7, 0.7)) / soft
-    of_other = (1 / (1 + np.exp(-np.clip(beside, -30, 30)))).astype(np.float32)[..., None]
-    return _mixed(scene, other, of_other)
+    distance = x * np.float32(math.cos(angle)) + y * np.float32(math.sin(angle)) - random.uniform(-0.7, 0.7)
+    weight = (1 / (1 + np.exp(-np.clip(distance / softness, -30, 30)))).astype(np.float32)[..., None]
+    return _blend(scene, other, weight)
 
 
-def _hazy(random: Random, scene: Pixels) -> Pixels:
-    """Under haze of its own, lit by a low sun in half of them: bright and soft as a veil of flare, but behind what is
-    near (Koschmieder's law; He, Sun and Tang 2009, "Single image haze removal using dark channel prior", take it out
-    so)."""
+def _add_haze(random: Random, scene: Pixels) -> Pixels:
+    """Add haze, lit by a low sun in half of the cases: bright and soft as a veil, but behind what is near.
+
+    Koschmieder's law; He, Sun and Tang 2009, "Single image haze removal using dark channel prior", invert it.
+    """
     height, width = scene.shape[:2]
     across = math.hypot(width, height)
     x, y = np.meshgrid(np.arange(width, dtype=np.float32) - random.uniform(-0.3, 1.3) * width,
                        np.arange(height, dtype=np.float32) - random.uniform(0, 0.7) * height)
-    hidden = np.float32(1) - np.exp(-_haze_before(random, scene, y / height))[..., None]
+    opacity = np.float32(1) - np.exp(-_optical_depth(random, scene, y / height))[..., None]
     colour = np.exp(random.normal(0, 0.12, 3)).astype(np.float32)
-    air = np.float32(np.quantile(scene.mean(-1), 0.9) * uniform_log(random, 0.5, 1.5)) * colour
+    air = np.float32(np.quantile(scene.mean(-1), 0.9) * log_uniform(random, 0.5, 1.5)) * colour
     if random.random() < 0.5:
         warm = np.exp(random.normal((0.2, 0, -0.3), 0.2)).astype(np.float32)
-        near_sun = np.exp(-np.hypot(x, y) / np.float32(across * uniform_log(random, 0.15, 0.8)))[..., None]
-        air = air * (1 + near_sun * warm * np.float32(uniform_log(random, 0.5, 6)))
-    return _mixed(scene, air, hidden)
+        near_sun = np.exp(-np.hypot(x, y) / np.float32(across * log_uniform(random, 0.15, 0.8)))[..., None]
+        air = air * (1 + near_sun * warm * np.float32(log_uniform(random, 0.5, 6)))
+    return _blend(scene, air, opacity)
 
 
-def _haze_before(random: Random, scene: Pixels, below_horizon: Pixels) -> Pixels:
-    """(height, width), how much haze lies before each place: none before what is near. How far a place is, is guessed:
-    farther up to a horizon, and where it is bright, with the edges of the picture. below_horizon: in heights."""
+def _optical_depth(random: Random, scene: Pixels, below_horizon: Pixels) -> Pixels:
+    """Return the optical depth of haze (height, width), 0 where the scene is near.
+
+    Distance is guessed: it grows up to the horizon and with brightness, along the edges of the picture. below_horizon:
+    (height, width) in picture heights.
+    """
     import cv2
 
     grey = np.log(scene.mean(-1) + np.float32(0.01))
     grey = (grey - grey.mean()) / max(float(grey.std()), 1e-2)
     up = np.float32(random.uniform(0.5, 4)) * np.minimum(-below_horizon, 0)
-    radius = max(round(math.hypot(*scene.shape[:2]) * uniform_log(random, 0.01, 0.05)), 2)
+    radius = max(round(math.hypot(*scene.shape[:2]) * log_uniform(random, 0.01, 0.05)), 2)
     distance = cv2.ximgproc.guidedFilter(grey, up + grey, radius, 0.02)
     distance -= np.quantile(distance, random.uniform(0.15, 0.5))
-    thick = uniform_log(random, 0.4, 4) / max(float(distance.max()), 1e-3)
-    return np.asarray(np.maximum(distance, 0) * np.float32(thick), np.float32)
+    density = log_uniform(random, 0.4, 4) / max(float(distance.max()), 1e-3)
+    return np.asarray(np.maximum(distance, 0) * np.float32(density), np.float32)
 
 
-def _with_bright_things(random: Random, scene: Pixels) -> Pixels:
-    """With some panels, or with what a floor or water shows of some lamps."""
+def _add_bright_objects(random: Random, scene: Pixels) -> Pixels:
+    """Add some panels, or the reflections of some lamps on a floor or water."""
     on_floor = random.random() < 0.4
     for _ in range(int(random.integers(1, 5))):
         colour = np.exp(random.normal(0, 0.3, 3) + random.uniform(-1.5, 1.5)).astype(np.float32)
         if on_floor:
-            scene = scene + _reflection(random, *scene.shape[:2])[..., None] * colour
+            scene = scene + _draw_reflection(random, *scene.shape[:2])[..., None] * colour
         else:
-            shown = _panel(random, *scene.shape[:2])[..., None]
-            scene = _mixed(scene, colour, shown)
+            mask = _draw_panel(random, *scene.shape[:2])[..., None]
+            scene = _blend(scene, colour, mask)
     return scene
 
 
-def _reflection(random: Random, height: int, width: int) -> Pixels:
-    """(height, width) 0..1: of a lamp on a floor, long, upright, and broken up."""
+def _draw_reflection(random: Random, height: int, width: int) -> Pixels:
+    """Return the mask (height, width) 0..1 of a lamp's reflection on a floor: long, upright, broken up."""
     import cv2
 
-    across = math.hypot(width, height) * uniform_log(random, 0.004, 0.03)
-    along = across * uniform_log(random, 2, 12)
+    across = math.hypot(width, height) * log_uniform(random, 0.004, 0.03)
+    along = across * log_uniform(random, 2, 12)
     x = (np.arange(width, dtype=np.float32)[None, :] - random.uniform(0, width)) / across
     y = (np.arange(height, dtype=np.float32)[:, None] - random.uniform(0, height)) / along
     waves = random.random((max(height // int(random.integers(2, 12)), 1), 3)).astype(np.float32)
@@ -240,14 +247,15 @@ def _reflection(random: Random, height: int, width: int) -> Pixels:
     return np.asarray(np.exp(-(x**2) - y**2) * (1 - random.uniform(0.4, 1) * waves), np.float32)
 
 
-def _panel(random: Random, height: int, width: int) -> Pixels:
-    """(height, width) 0..1: a window, screen or sign, level or in perspective, of one pane or of several."""
+def _draw_panel(random: Random, height: int, width: int) -> Pixels:
+    """Return the mask (height, width) 0..1 of a window, screen or sign of one or several panes, level or in
+    perspective."""
     import cv2
 
-    half = math.hypot(width, height) * np.array([uniform_log(random, 0.01, 0.15), uniform_log(random, 0.01, 0.15)])
-    corners = random.uniform(0, (width, height)) + SQUARE * half * np.exp(random.normal(0, 0.15, (4, 2)))
-    shown = _polygon(corners, width, height)
+    half = math.hypot(width, height) * np.array([log_uniform(random, 0.01, 0.15), log_uniform(random, 0.01, 0.15)])
+    corners = random.uniform(0, (width, height)) + UNIT_SQUARE * half * np.exp(random.normal(0, 0.15, (4, 2)))
+    mask = _draw_polygon(corners, width, height)
     if random.random() < 0.5:
         panes = random.uniform(random.random(), 1, tuple(random.integers(1, 8, 2))).astype(np.float32)
-        shown *= cv2.resize(panes, (width, height), interpolation=cv2.INTER_NEAREST)
-    return shown
+        mask *= cv2.resize(panes, (width, height), interpolation=cv2.INTER_NEAREST)
+    return mask

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What takes a training's steps.
+"""The optimiser of the removal network: Muon for the hidden convolutions, AdamW for everything else.
 
-The weights of the convolutions between hidden planes take steps that are as long in every direction (Muon, Jordan
-2024), and on average as long as AdamW's (Liu et al. 2025, "Muon is Scalable for LLM Training"), so that one learning
-rate serves both; all else takes AdamW's. torch has a Muon, which is made for bfloat16: on processors that are slow at
-that it takes thirty times as long as this one, and on those that are not it takes more than twice the processor's time.
+Muon (Jordan 2024) takes steps of equal length in every direction of a weight matrix. They are scaled to the average
+length of AdamW's (Liu et al. 2025, "Muon is Scalable for LLM Training"), so that one learning rate serves both. torch's
+own Muon computes in bfloat16: on processors that are slow at it this takes thirty times as long as here, on others more
+than twice.
 """
 from __future__ import annotations
 
@@ -15,26 +15,26 @@ from typing import cast
 import torch
 from torch import Tensor, nn
 
-from .workers import ALONE, Learner
+from .workers import SINGLE_WORKER, Worker
 
-NOT_HIDDEN = ("see.", "head.", ".place.")
-"""In the names of weights that are shown the frame, or places, and of those that give the answer."""
-MOMENTUM, LENGTH = 0.95, 0.2
-"""Of Muon's steps: how much of what they went by before counts; their length where AdamW's are of 1."""
-ROUNDS, QUINTIC = 5, (3.4445, -4.7750, 2.0315)
-"""Of the iteration that makes a matrix's singular values alike: x to a x + b x^3 + c x^5."""
+INPUT_AND_OUTPUT_LAYERS = ("input_convs.", "head.", ".pos_embed.")
+"""Parts of the names of weights next to the input, the positions and the output, which AdamW optimises."""
+MUON_MOMENTUM, MUON_UPDATE_RMS = 0.95, 0.2
+"""Momentum of Muon's steps, and their root mean square where AdamW's is 1."""
+NEWTON_SCHULZ_STEPS, NEWTON_SCHULZ_COEFFICIENTS = 5, (3.4445, -4.7750, 2.0315)
+"""The Newton-Schulz iteration: number of steps, and a, b, c of x -> a x + b x^3 + c x^5 on the singular values."""
 
 
-class Optimiser:
-    """Of all of a network's parameters, which keep where they lie in memory."""
+class MuonAdamW:
+    """Optimises all parameters of a network in place, without moving them in memory."""
 
     def __init__(self, network: nn.Module, decay: float) -> None:
-        """decay: of the weights in each step, in parts of its learning rate. Raises ValueError where the weights do not
-        lie channels last."""
+        """decay: weight decay per step, relative to the learning rate. Raises ValueError where the weights are not
+        channels last in memory."""
         self._decay = decay
         self._parameters = dict(network.named_parameters())
-        self._matrices = {name: _rows(weight.detach()) for name, weight in self._parameters.items()
-                          if weight.ndim > 1 and not any(part in name for part in NOT_HIDDEN)}
+        self._matrices = {name: _as_matrix(weight.detach()) for name, weight in self._parameters.items()
+                          if weight.ndim > 1 and not any(part in name for part in INPUT_AND_OUTPUT_LAYERS)}
         if any(rows.data_ptr() != self._parameters[name].data_ptr() for name, rows in self._matrices.items()):
             raise ValueError("The network's weights do not lie channels last.")
         self._momenta = {name: torch.zeros_like(rows) for name, rows in self._matrices.items()}
@@ -42,39 +42,40 @@ class Optimiser:
         self._adam = torch.optim.AdamW(others, weight_decay=decay, fused=True)
 
     @torch.no_grad()
-    def step(self, rate: float, learner: Learner = ALONE) -> None:
-        """One step by the gradients that the parameters have, which they have no more afterwards. Learners have the
-        same gradients, and share the work of Muon's steps, which is nearly a third of an iteration's."""
-        stepping = {name: rows for name, rows in self._matrices.items() if self._parameters[name].grad is not None}
-        gradients = [_rows(cast(Tensor, self._parameters[name].grad)) for name in stepping]
-        momenta = [self._momenta[name] for name in stepping]
-        torch._foreach_lerp_(momenta, gradients, 1 - MOMENTUM)
-        directions = [ahead.contiguous() for ahead in torch._foreach_lerp(gradients, momenta, MOMENTUM)]
-        for together in _parcels(directions, filter(learner.makes, range(len(directions)))):
-            made = orthogonalised(torch.stack([directions[number] for number in together]))
-            for number, direction in zip(together, made.contiguous().unbind(), strict=True):
+    def step(self, rate: float, worker: Worker = SINGLE_WORKER) -> None:
+        """Take one step with the gradients of the parameters, and clear them. Workers have the same gradients and share
+        the work of Muon's steps, nearly a third of an iteration's."""
+        matrices_to_step = {name: matrix for name, matrix in self._matrices.items()
+                            if self._parameters[name].grad is not None}
+        gradients = [_as_matrix(cast(Tensor, self._parameters[name].grad)) for name in matrices_to_step]
+        momenta = [self._momenta[name] for name in matrices_to_step]
+        torch._foreach_lerp_(momenta, gradients, 1 - MUON_MOMENTUM)
+        directions = [direction.contiguous() for direction in torch._foreach_lerp(gradients, momenta, MUON_MOMENTUM)]
+        for group in _group_same_shapes(directions, filter(worker.is_responsible_for, range(len(directions)))):
+            orthogonal = orthogonalise(torch.stack([directions[number] for number in group]))
+            for number, direction in zip(group, orthogonal.contiguous().unbind(), strict=True):
                 directions[number] = direction
-        learner.hand_round(directions)
-        rows = list(stepping.values())
+        worker.all_gather(directions)
+        rows = list(matrices_to_step.values())
         torch._foreach_mul_(rows, 1 - rate * self._decay)
-        torch._foreach_mul_(directions, [rate * LENGTH * math.sqrt(max(matrix.shape)) for matrix in rows])
+        torch._foreach_mul_(directions, [rate * MUON_UPDATE_RMS * math.sqrt(max(matrix.shape)) for matrix in rows])
         torch._foreach_sub_(rows, directions)
-        for group in self._adam.param_groups:
-            group["lr"] = rate
+        for param_group in self._adam.param_groups:
+            param_group["lr"] = rate
         self._adam.step()
         for parameter in self._parameters.values():
             parameter.grad = None
 
     def state(self) -> dict[str, Tensor]:
-        """What a training needs to go on: `moment.`, which of a parameter's moments, `.` and its name."""
-        found = {f"moment.momentum.{name}": value for name, value in self._momenta.items()}
+        """Return what a resumed training needs: keys are `moment.`, the name of the moment, `.` and the parameter."""
+        result = {f"moment.momentum.{name}": value for name, value in self._momenta.items()}
         for name, parameter in self._parameters.items():
-            found |= {f"moment.{moment}.{name}": value
+            result |= {f"moment.{moment}.{name}": value
                       for moment, value in self._adam.state.get(parameter, {}).items()}
-        return found
+        return result
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
-        """Go on from a state; moments that it lacks begin anew."""
+        """Load a state; moments that it lacks begin at zero."""
         for key, value in state.items():
             kind, _, rest = key.partition(".")
             moment, _, name = rest.partition(".")
@@ -90,42 +91,45 @@ class Optimiser:
                     else value.to(parameter.device, copy=True))
 
 
-def _parcels(matrices: Sequence[Tensor], numbers: Iterable[int]) -> Iterable[list[int]]:
-    """The numbers, each alone on a processor; on a graphics card, which one does not keep busy, those of matrices of
-    the same shape together."""
-    found: dict[object, list[int]] = {}
+def _group_same_shapes(matrices: Sequence[Tensor], numbers: Iterable[int]) -> Iterable[list[int]]:
+    """Return the numbers in groups to compute together: each alone on a CPU; on a GPU, which one does not keep busy,
+    those of the same shape."""
+    result: dict[object, list[int]] = {}
     for number in numbers:
         matrix = matrices[number]
-        found.setdefault(matrix.shape if matrix.is_cuda else number, []).append(number)
-    return found.values()
+        result.setdefault(matrix.shape if matrix.is_cuda else number, []).append(number)
+    return result.values()
 
 
-def orthogonalised(matrices: Tensor) -> Tensor:
-    """(k, n, m), float32: the same singular vectors, singular values between about 0.7 and 1.2.
+def orthogonalise(matrices: Tensor) -> Tensor:
+    """Return matrices (k, n, m), float32, with the same singular vectors and singular values between about 0.7 and 1.2.
 
-    Each round multiplies a matrix by a polynomial of its square x x^T, and those of all rounds commute. So they are
-    multiplied with each other first, as matrices of the shorter side alone, and the matrix itself comes in twice."""
-    a, b, c = QUINTIC
+    Each step multiplies a matrix by a polynomial of its square x x^T, and the polynomials of all steps commute. So they
+    are multiplied with each other first, as matrices of the shorter side alone, and the matrix itself is multiplied
+    twice.
+    """
+    a, b, c = NEWTON_SCHULZ_COEFFICIENTS
     tall = matrices.shape[-2] > matrices.shape[-1]
     wide = matrices.mT if tall else matrices
     wide = wide / torch.linalg.matrix_norm(wide, keepdim=True).clamp(min=1e-7)
     square = torch.bmm(wide, wide.mT)
     factors = torch.eye(square.shape[-1], dtype=square.dtype, device=square.device).expand_as(square)
-    for _ in range(ROUNDS):
+    for _ in range(NEWTON_SCHULZ_STEPS):
         factor = torch.baddbmm(square, square, square, beta=b, alpha=c)
         factor.diagonal(dim1=-2, dim2=-1).add_(a)
         factors = torch.bmm(factors, factor)
         square = torch.bmm(torch.bmm(square, factor), factor)
-    found = torch.bmm(factors, wide)
-    return found.mT if tall else found
+    result = torch.bmm(factors, wide)
+    return result.mT if tall else result
 
 
 def has_bfloat16(on: torch.device) -> bool:
-    """Whether it is fast there: on processors without it torch's convolutions take 9 times as long as in float32."""
+    """Return whether bfloat16 is fast on a device; on processors without it torch's convolutions take 9 times as long
+    as in float32."""
     return on.type != "cpu" or bool(torch.cpu.get_capabilities().get("avx512_bf16"))
 
 
-def _rows(weight: Tensor) -> Tensor:
-    """A convolution's weights (out, in, height, width) as a matrix of `out` rows; no copy where they lie in memory
-    channels last."""
+def _as_matrix(weight: Tensor) -> Tensor:
+    """Return a convolution's weights (out, in, height, width) as a matrix of `out` rows; no copy if they are channels
+    last in memory."""
     return weight.permute(0, 2, 3, 1).flatten(1)

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""How frames come about at random: exposures, curves and grain of cameras, and how flares lie over them. Pairs that are
-made one by one (`pairs`) and those that are made all at once (`card.composition`) draw from here, so that a network
-learns from the same frames by both.
+"""Draws the random parameters of cameras and flares: exposures, curves, grain, placements.
+
+`pairs` (one by one) and `gpu.composition` (in batches) draw from here, so that a network learns from the same
+distribution by both.
 """
 from __future__ import annotations
 
@@ -15,35 +16,35 @@ Random = np.random.Generator
 Triple = NDArray[np.float32]
 """(3,): one for each channel."""
 
-SECOND = 0.15
+SECOND_FLARE_SHARE = 0.15
 """Share of the frames that have a second flare."""
-DEVELOPED = 0.35
-"""Share of the frames that a camera gave a curve and a saturation of its own."""
-TRIES = 12
-"""Ways of laying a flare, of which the one with its light in the brightest place is taken."""
-AIMED = (0.3, 3.0)
-"""How many times as bright a scene may become when it is brought to a light (`aim`)."""
+DEVELOPED_SHARE = 0.35
+"""Share of the frames with a camera's own curve and saturation."""
+PLACEMENTS = 12
+"""Placements of a flare, of which the one with its light in the brightest place is taken."""
+EXPOSURE_LIMITS = (0.3, 3.0)
+"""Smallest and largest factor by which a scene's exposure is changed to reach `draw_target_light`."""
 
 
-def exposure(random: Random) -> Triple:
-    """Day and night: gain and balance of the scene alone."""
+def draw_exposure(random: Random) -> Triple:
+    """Draw gain and white balance of the scene alone, by day or night."""
     gain = random.uniform(0.5, 1.2) if random.random() < 0.65 else math.exp(random.uniform(math.log(0.03), 0))
     balance = np.exp(random.normal(0, 0.06, 3))
     return np.asarray(gain * balance, np.float32)
 
 
-def aim(random: Random) -> float:
-    """Light that the scene is brought to where the first light lies; 0 for as it is."""
+def draw_target_light(random: Random) -> float:
+    """Draw the light to which the scene is exposed at the first light; 0 to leave the exposure."""
     return float(random.uniform(0.4, 2)) if random.random() < 0.5 else 0.0
 
 
-def graininess(random: Random) -> float:
-    """Of the sensor, in parts of what is usual; 0 for none."""
+def draw_grain(random: Random) -> float:
+    """Draw a sensor's noise relative to the usual; 0 for none."""
     return float(random.chisquare(1)) if random.random() < 0.5 else 0.0
 
 
-def bend(random: Random) -> float:
-    """Of a curve that bends towards white (`formation.under_shoulder`)."""
+def draw_shoulder(random: Random) -> float:
+    """Draw the strength of a curve that bends towards white (`image_formation.add_under_shoulder`)."""
     return float(random.uniform(0.3, 1))
 
 
@@ -55,72 +56,75 @@ class Development(NamedTuple):
     lift: float
 
 
-AS_IT_IS = Development(0.0, 1.0, 0.0)
+NEUTRAL_DEVELOPMENT = Development(0.0, 1.0, 0.0)
 
 
-def development(random: Random) -> Development:
-    """Of a camera that has its own."""
+def draw_development(random: Random) -> Development:
+    """Draw the curve and saturation of a camera that has its own."""
     contrast, saturation = random.uniform(0, 0.7), random.uniform(0.8, 1.3)
     return Development(contrast, saturation, random.uniform(0, 0.04) if random.random() < 0.3 else 0.0)
 
 
-def fade(random: Random) -> tuple[Triple, Triple]:
-    """Display values that black and white come to."""
+def draw_fade(random: Random) -> tuple[Triple, Triple]:
+    """Draw the display values that black and white become."""
     black = random.uniform(0.02, 0.2) + random.normal(0, 0.015, 3)
     white = random.uniform(0.75, 1) + random.normal(0, 0.01, 3)
     return np.clip(black, 0, 1).astype(np.float32), np.clip(white, 0, 1).astype(np.float32)
 
 
-def dither(random: Random) -> float:
-    """In codes of 8 bits, before they are cut to whole ones."""
+def draw_dither(random: Random) -> float:
+    """Draw the offset in 8 bit codes that is added before they are truncated."""
     return float(random.uniform(0.3, 0.7))
 
 
-def quality(random: Random) -> int:
-    """Of JPEG, in four of ten; 0 for none."""
+def draw_jpeg_quality(random: Random) -> int:
+    """Draw a JPEG quality for four of ten frames; 0 for none."""
     return int(random.integers(60, 99)) if random.random() < 0.4 else 0
 
 
-def second_strength(random: Random) -> float:
-    """Of a second flare, in parts of the first's."""
+def draw_second_strength(random: Random) -> float:
+    """Draw the strength of a second flare relative to the first."""
     return float(random.uniform(0.1, 1))
 
 
-class Shining(NamedTuple):
-    """How a flare shines: blurred by so many pixels (0 for none), in a colour, by a gain; and the mean light over the
-    frame to which it is held, since frames that are washed out altogether teach nothing."""
+class FlareAppearance(NamedTuple):
+    """How a flare shines. blur: pixels, 0 for none. max_mean: mean light over the frame that it is limited to, since
+    nothing is learned from frames that are washed out completely."""
 
     blur: float
     colour: Triple
     gain: np.float32
-    most: float
+    max_mean: float
 
 
-def shining(random: Random, strength: float) -> Shining:
-    """Of a flare of that strength."""
+def draw_appearance(random: Random, strength: float) -> FlareAppearance:
+    """Draw the appearance of a flare of that strength."""
     blur = random.uniform(0.3, 2.0) if random.random() < 0.25 else 0.0
     colour = np.exp(random.normal(0, 0.12, 3)).astype(np.float32)
     gain = np.float32(math.exp(random.normal(0, 0.6)) * strength)
-    return Shining(blur, colour, gain, random.uniform(0.02, 0.18))
+    return FlareAppearance(blur, colour, gain, random.uniform(0.02, 0.18))
 
 
-def laid(random: Random, canvas: int, width: int, height: int, some: tuple[int, ...] = ()) -> NDArray[np.float64]:
-    """(*some, 2, 3), from a canvas of so many pixels a side to a frame in pixels: turned, scaled from where the
-    canvas's inner circle goes through the frame's corners on, mirrored, sheared a little; the canvas's middle at the
-    frame's in four of five."""
+def draw_placement(random: Random, canvas: int, width: int, height: int,
+                   count_shape: tuple[int, ...] = ()) -> NDArray[np.float64]:
+    """Draw affine matrices (*count_shape, 2, 3) from a canvas of `canvas` pixels a side to a frame in pixels.
+
+    The canvas is rotated, mirrored, sheared a little, and scaled by at least what lets its inner circle pass through
+    the frame's corners; its middle is the frame's in four of five.
+    """
     half = math.hypot(width, height) / 2
-    zoom, turn = random.uniform(0.85, 1.5, some), random.uniform(0, 2 * math.pi, some)
-    mirror = random.choice([-1.0, 1.0], some)
-    longer, shear = np.exp(random.normal(0, 0.05, some)), random.normal(0, 0.05, some)
-    off_middle = np.where(random.random(some) < 0.8, 0.01, 0.25)[..., None]
-    shift = random.normal(0, off_middle, (*some, 2))
-    stretch = _matrix(longer, shear, np.zeros(some), np.ones(some))
-    spin = _matrix(np.cos(turn) * mirror, -np.sin(turn), np.sin(turn) * mirror, np.cos(turn))
-    linear = (half / (canvas / 2) * zoom)[..., None, None] * spin @ stretch
+    zoom, roll = random.uniform(0.85, 1.5, count_shape), random.uniform(0, 2 * math.pi, count_shape)
+    mirror = random.choice([-1.0, 1.0], count_shape)
+    stretch_x, shear = np.exp(random.normal(0, 0.05, count_shape)), random.normal(0, 0.05, count_shape)
+    off_middle = np.where(random.random(count_shape) < 0.8, 0.01, 0.25)[..., None]
+    shift = random.normal(0, off_middle, (*count_shape, 2))
+    stretch = _matrix(stretch_x, shear, np.zeros(count_shape), np.ones(count_shape))
+    rotation = _matrix(np.cos(roll) * mirror, -np.sin(roll), np.sin(roll) * mirror, np.cos(roll))
+    linear = (half / (canvas / 2) * zoom)[..., None, None] * rotation @ stretch
     offset = np.array([width / 2, height / 2]) + shift * half - linear @ np.array([canvas / 2, canvas / 2])
     return np.concatenate([linear, offset[..., None]], -1)
 
 
 def _matrix(a: Any, b: Any, c: Any, d: Any) -> NDArray[np.float64]:
-    """(..., 2, 2): a and b above c and d."""
+    """Return (..., 2, 2): a and b above c and d."""
     return np.stack([np.stack([a, b], -1), np.stack([c, d], -1)], -2)

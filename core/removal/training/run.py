@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A training of the network in the box from begin to end: shared among processes, logged, checked, kept."""
+"""Runs a training of the removal network from start to end: workers, log, validation, checkpoints and weights.
+`train-removal` calls `train`."""
 from __future__ import annotations
 
 import contextlib
@@ -16,194 +17,202 @@ import numpy as np
 
 from ...errors import Cancelled, RunError, SettingsError
 from ...system.files import write_text
-from ...system.folder_lock import held
-from ...system.processes import cores
+from ...system.folder_lock import folder_lock
+from ...system.processes import available_cores
 from ...system.progress import Progress
 from ..model import weights
 from ..model.recipe import Recipe, as_dict, from_dict
-from ..synthesis.flare import CLASSES
+from ..synthesis.flare import FLARE_CLASSES
 from ..synthesis.prescription import Prescription
 from .backgrounds import Backgrounds
 from .batches import Batch, Batches
-from .flare_bank import OneFlare, OwnFlares
-from .gpu.batches import drawn_on_card
-from .pairs import Pair, pair
-from .trainer import FIGURES, Trainer, device
-from .workers import ALONE, Learner, shared
+from .flare_bank import SingleFlareBank, UserFlares
+from .gpu.batches import gpu_batches
+from .pairs import Pair, make_pair
+from .trainer import METRICS, RemovalTrainer, device
+from .workers import SINGLE_WORKER, Worker, worker_group
 
 CHECKPOINT, WEIGHTS, LOG = "checkpoint.safetensors", "removal.safetensors", "training.jsonl"
 GAIN = "gain_db"  # of a check: in the log, and in the header of the weights that were kept for it
-CHECK_EVERY = 1000
-CHECK_SEED = 20_000
-CHECKS = 64
-CHECK_SIZE, CHECK_CANVAS = (384, 256), 448
-MOST_LEARNERS = 4
-"""Large frames are not many in an iteration."""
+VALIDATE_EVERY = 1000
+VALIDATION_SEED = 20_000
+VALIDATION_PAIRS = 64
+VALIDATION_SIZE, VALIDATION_CANVAS = (384, 256), 448
+MAX_WORKERS = 4
+"""Workers on a CPU by default; an iteration has few large frames to share."""
 
 
-def processes_here() -> int:
-    """How many processes a training is best shared among on this machine: learners on a processor; beside a graphics
-    card that learns, those that draw scenes and flares."""
-    return min(cores(), MOST_LEARNERS) if device().type == "cpu" else max(cores(), 3)
+def default_process_count() -> int:
+    """Return how many processes share a training on this machine by default: workers on a CPU; beside a GPU, the
+    processes that draw scenes and flares."""
+    return min(available_cores(), MAX_WORKERS) if device().type == "cpu" else max(available_cores(), 3)
 
 
-def checks(backgrounds: Backgrounds, lenses: Sequence[Prescription], count: int = CHECKS) -> dict[str, list[Pair]]:
-    """Pairs that no training sees: other flares, lenses and backgrounds, some of each class."""
-    def bank(kind: str, number: int) -> OneFlare:
-        return OneFlare((CHECK_SEED, number), CHECK_CANVAS, lenses, kind)
+def make_validation_pairs(backgrounds: Backgrounds, lenses: Sequence[Prescription],
+                          count: int = VALIDATION_PAIRS) -> dict[str, list[Pair]]:
+    """Return pairs that no training sees, by flare class: other flares, lenses and backgrounds."""
+    def bank(kind: str, number: int) -> SingleFlareBank:
+        return SingleFlareBank((VALIDATION_SEED, number), VALIDATION_CANVAS, lenses, kind)
 
-    return {kind: [pair(np.random.default_rng((CHECK_SEED, index, k)), bank(kind, k), backgrounds, *CHECK_SIZE,
-                        clean=0)
-                   for k in range(max(count // len(CLASSES), 1))]
-            for index, kind in enumerate(CLASSES)}
+    return {kind: [make_pair(np.random.default_rng((VALIDATION_SEED, index, k)), bank(kind, k), backgrounds,
+                             *VALIDATION_SIZE, clean_share=0)
+                   for k in range(max(count // len(FLARE_CLASSES), 1))]
+            for index, kind in enumerate(FLARE_CLASSES)}
 
 
-def recipe_in(folder: Path | str) -> Recipe | None:
-    """By which the training in a folder went when it was last kept; None where it holds none. Raises RunError where its
-    checkpoint is damaged, SettingsError where it is of a program that knew other recipes."""
+def read_recipe(folder: Path | str) -> Recipe | None:
+    """Return the recipe of the training in a folder at its last checkpoint, or None if it holds none. Raises RunError
+    where the checkpoint is damaged, SettingsError where an incompatible version wrote it."""
     path = Path(folder) / CHECKPOINT
     if not path.exists():
         return None
-    _, about = weights.read(path)
-    weights.form(path, about)  # or it is none of ours
-    return from_dict(json.loads(about["recipe"]))
+    _, metadata = weights.read(path)
+    weights.read_architecture(path, metadata)  # or it is none of ours
+    return from_dict(json.loads(metadata["recipe"]))
 
 
 def train(recipe: Recipe, folder: Path | str, backgrounds: Backgrounds, lenses: Sequence[Prescription], *,
-          tests: tuple[Backgrounds, Sequence[Prescription]] | None = None, own: OwnFlares | None = None,
+          validation: tuple[Backgrounds, Sequence[Prescription]] | None = None, user_flares: UserFlares | None = None,
           resume: bool = False, start: Path | None = None, save_every_s: float = 300, processes: int | None = None,
           progress: Progress | None = None) -> Path:
-    """Train in `folder` and give the path of the weights (safetensors, fp16).
+    """Train in `folder` and return the path of the weights (safetensors, fp16).
 
-    With `resume` a training in the folder goes on, by the given recipe from there on. `start`: weights to begin with,
-    in a network of their widths and with as many blocks as they or the recipe have, whichever are more. `tests`:
-    backgrounds and lenses kept out, for the checks in the log; the weights given are those of the best check then.
-    Without them, and with flares of the user's own, which the checks have none of, they are the last. `processes`
-    share the work, this one among them: on a processor the pictures are the same by any number, the weights but for
+    validation: backgrounds and lenses kept out of training; with them the log has validation gains and the weights are
+    those of the best one. Without them, and with user_flares, which the validation has none of, the weights are the
+    last. resume: continue the training in the folder, by the given recipe from there on. start: weights to begin with,
+    in a network of their widths and with as many blocks as they or the recipe have, whichever are more. processes: how
+    many share the work, this one included; on a CPU the pictures are the same for any number, the weights but for
     rounding.
-    Raises RunError, SettingsError, and Cancelled when asked to stop (after a checkpoint).
+
+    Raises RunError, SettingsError, and Cancelled after a checkpoint.
     """
     progress, folder = progress or Progress(), Path(folder)
-    processes = processes_here() if processes is None else processes
+    processes = default_process_count() if processes is None else processes
     if processes < 1:
         raise SettingsError(f"A training has at least one process, not {processes}.")
-    with held(folder):
+    with folder_lock(folder):
         path = folder / CHECKPOINT
         if path.exists() and not resume:
             raise RunError(f"{folder} holds a training already; go on with --resume, or choose another folder.")
-        beginning = Beginning(recipe, path if path.exists() else start, path.exists(), backgrounds, lenses, own)
-        trainer = beginning.trainer(ALONE)  # before others are asked: it may refuse
-        with shared(processes if trainer.device.type == "cpu" else 1, _learn, beginning) as learner:
-            trainer.learner = learner
-            held_out = checks(*tests) if tests else {}
-            with beginning.batches(trainer, processes - 1) as batches:
-                _run(trainer, batches, folder, held_out, bool(held_out) and own is None, save_every_s, progress)
+        setup = TrainingSetup(recipe, path if path.exists() else start, path.exists(), backgrounds, lenses, user_flares)
+        trainer = setup.trainer(SINGLE_WORKER)  # before others are asked: it may refuse
+        with worker_group(processes if trainer.device.type == "cpu" else 1, _run_worker, setup) as worker:
+            trainer.worker = worker
+            pairs = make_validation_pairs(*validation) if validation else {}
+            with setup.batches(trainer, processes - 1) as batches:
+                _run_to_end(trainer, batches, folder, pairs, bool(pairs) and user_flares is None, save_every_s,
+                            progress)
     return folder / WEIGHTS
 
 
-class Beginning(NamedTuple):
-    """What every learner begins with: the same."""
+class TrainingSetup(NamedTuple):
+    """What every worker begins with."""
 
     recipe: Recipe
     source: Path | None  # weights, or the checkpoint of the same training
-    goes_on: bool
+    resumes: bool
     backgrounds: Backgrounds
     lenses: Sequence[Prescription]
-    own: OwnFlares | None
+    user_flares: UserFlares | None
 
-    def trainer(self, learner: Learner) -> Trainer:
-        """Of the recipe, as wide as the weights' network and at least as deep. Raises RunError."""
+    def trainer(self, worker: Worker) -> RemovalTrainer:
+        """Return the trainer of a worker: its network is as wide as the weights' and at least as deep. Raises RunError.
+        """
         if self.source is None:
-            return Trainer(self.recipe, learner)
-        state, about = weights.read(self.source)
-        form = weights.form(self.source, about)
+            return RemovalTrainer(self.recipe, worker)
+        state, metadata = weights.read(self.source)
+        form = weights.read_architecture(self.source, metadata)
         recipe = replace(self.recipe, widths=form.widths, blocks=tuple(map(max, self.recipe.blocks, form.blocks)),
                          attention=tuple(map(max, self.recipe.attention, form.attention)))
         iteration = 0
-        if self.goes_on:
-            recipe = replace(recipe, **form._asdict(), seed=json.loads(about["recipe"])["seed"])
-            iteration = int(about["iteration"])
-        trainer = Trainer(recipe, learner)
+        if self.resumes:
+            recipe = replace(recipe, **form._asdict(), seed=json.loads(metadata["recipe"])["seed"])
+            iteration = int(metadata["iteration"])
+        trainer = RemovalTrainer(recipe, worker)
         trainer.load_state(state, iteration)
         return trainer
 
     @contextmanager
-    def batches(self, trainer: Trainer, drawing: int = 0) -> Iterator[Iterator[Batch]]:
-        """That the trainer's learner sees from its iteration on; on a card out of what `drawing` processes draw."""
+    def batches(self, trainer: RemovalTrainer, drawing_processes: int = 0) -> Iterator[Iterator[Batch]]:
+        """Yield the batches of the trainer's worker from its iteration on; on a GPU, `drawing_processes` draw what they
+        are composed of."""
         if trainer.device.type == "cpu":
-            drawn = Batches(trainer.recipe, self.backgrounds, self.lenses, self.own, trainer.learner)
+            drawn = Batches(trainer.recipe, self.backgrounds, self.lenses, self.user_flares, trainer.worker)
             yield (drawn[iteration] for iteration in range(trainer.iteration, trainer.recipe.iterations))
         else:
-            with drawn_on_card(trainer.recipe, trainer.iteration, self.backgrounds, self.lenses, self.own,
-                               trainer.device, max(drawing, 2)) as on_card:
-                yield on_card
+            with gpu_batches(trainer.recipe, trainer.iteration, self.backgrounds, self.lenses, self.user_flares,
+                             trainer.device, max(drawing_processes, 2)) as batches:
+                yield batches
 
 
-def _learn(learner: Learner, beginning: Beginning) -> None:
-    """What the learners beside the first do."""
-    trainer = beginning.trainer(learner)
-    with beginning.batches(trainer) as batches:
+def _run_worker(worker: Worker, setup: TrainingSetup) -> None:
+    """Run a worker other than the first."""
+    trainer = setup.trainer(worker)
+    with setup.batches(trainer) as batches:
         for batch in batches:
             trainer.step(batch)
 
 
-def _run(trainer: Trainer, batches: Iterator[Batch], folder: Path, held_out: Mapping[str, Sequence[Pair]],
-         chosen: bool, save_every_s: float, progress: Progress) -> None:
-    """To the recipe's end, with log and checkpoints; the weights are `chosen` by the checks, or the last."""
+def _run_to_end(trainer: RemovalTrainer, batches: Iterator[Batch], folder: Path,
+                pairs: Mapping[str, Sequence[Pair]], keeps_best: bool, save_every_s: float,
+                progress: Progress) -> None:
+    """Train to the recipe's end, with log and checkpoints. keeps_best: write the weights of the best validation, not
+    the last."""
     iterations = trainer.recipe.iterations
     progress.stage("train", iterations, trainer.iteration)
-    saved, began, first = time.monotonic(), time.monotonic(), trainer.iteration
-    told, sums = first, dict.fromkeys(FIGURES, 0.0)
-    best = _best_of(folder) if chosen and first else None
-    log = _log_until(folder / LOG, first)
+    saved, started, first_iteration = time.monotonic(), time.monotonic(), trainer.iteration
+    last_logged, sums = first_iteration, dict.fromkeys(METRICS, 0.0)
+    best = _best_gain(folder) if keeps_best and first_iteration else None
+    log = _read_log(folder / LOG, first_iteration)
     try:
         while trainer.iteration < iterations:
-            figures = trainer.step(next(batches))
-            if not math.isfinite(figures["loss"]):
+            metrics = trainer.step(next(batches))
+            if not math.isfinite(metrics["loss"]):
                 raise RunError(f"Iteration {trainer.iteration} of the training came to no number; go on from the last "
                                f"checkpoint in {folder} with --resume and a lower learning_rate.")
-            sums = {name: value + figures[name] for name, value in sums.items()}
-            here = trainer.iteration
-            if here % CHECK_EVERY == 0 or here == iterations:
-                line: dict[str, Any] = {"iteration": here, "seconds": round(time.monotonic() - began, 1),
-                                        "pace": round((time.monotonic() - began) / (here - first), 3),
-                                        **{name: round(value / (here - told), 5) for name, value in sums.items()}}
-                told, sums = here, dict.fromkeys(FIGURES, 0.0)
-                if held_out:
-                    line[GAIN] = trainer.check(held_out)
-                    if chosen:
-                        best = _keep_better(trainer, folder, line[GAIN]["mean"], best)
+            sums = {name: value + metrics[name] for name, value in sums.items()}
+            iteration = trainer.iteration
+            if iteration % VALIDATE_EVERY == 0 or iteration == iterations:
+                count = iteration - last_logged
+                line: dict[str, Any] = {"iteration": iteration, "seconds": round(time.monotonic() - started, 1),
+                                        "pace": round((time.monotonic() - started) / (iteration - first_iteration), 3),
+                                        **{name: round(value / count, 5) for name, value in sums.items()}}
+                last_logged, sums = iteration, dict.fromkeys(METRICS, 0.0)
+                if pairs:
+                    line[GAIN] = trainer.validate(pairs)
+                    if keeps_best:
+                        best = _write_weights_if_better(trainer, folder, line[GAIN]["mean"], best)
                 log.append(line)
                 write_text(folder / LOG, "".join(json.dumps(one) + "\n" for one in log))
             if time.monotonic() - saved > save_every_s:
-                _save(trainer, folder, best)
+                _save_checkpoint(trainer, folder, best)
                 saved = time.monotonic()
-            progress.advance(1, **figures)
+            progress.advance(1, **metrics)
     except Cancelled:
-        _save(trainer, folder, best)
+        _save_checkpoint(trainer, folder, best)
         raise
-    _save(trainer, folder, best)
+    _save_checkpoint(trainer, folder, best)
 
 
-def _save(trainer: Trainer, folder: Path, best: float | None) -> None:
-    """The checkpoint; the weights too where there are none of a check. Those are better than the last, when a training
-    begins to know its photographs by heart."""
-    weights.write(folder / CHECKPOINT, trainer.state(), _about(trainer))
+def _save_checkpoint(trainer: RemovalTrainer, folder: Path, best: float | None) -> None:
+    """Write the checkpoint, and the weights too unless a validation has chosen some: those are better than the last
+    when a training begins to overfit."""
+    weights.write(folder / CHECKPOINT, trainer.state(), _metadata(trainer))
     if best is None:
-        _write_kept(trainer, folder, _about(trainer))
+        _write_weights(trainer, folder, _metadata(trainer))
 
 
-def _keep_better(trainer: Trainer, folder: Path, gain: float, best: float | None) -> float:
-    """Keep the weights when their check gains more than `best`, dB; the best gain then."""
+def _write_weights_if_better(trainer: RemovalTrainer, folder: Path, gain: float, best: float | None) -> float:
+    """Write the weights if their validation gain exceeds `best`, dB; return the best gain."""
     if best is not None and gain <= best:
         return best
-    _write_kept(trainer, folder, {**_about(trainer), GAIN: str(gain)})
+    _write_weights(trainer, folder, {**_metadata(trainer), GAIN: str(gain)})
     return gain
 
 
-def _log_until(path: Path, iteration: int) -> list[dict[str, Any]]:
-    """The lines of a log up to an iteration: those of a training that was killed after its last checkpoint are told
-    anew."""
+def _read_log(path: Path, iteration: int) -> list[dict[str, Any]]:
+    """Return the lines of a log up to an iteration; later ones are of a training that was killed after its last
+    checkpoint and are logged again."""
     lines: list[dict[str, Any]] = []
     for text in path.read_text(encoding="utf-8", errors="replace").splitlines() if path.is_file() else ():
         with contextlib.suppress(ValueError):  # cut off by an earlier program
@@ -211,19 +220,20 @@ def _log_until(path: Path, iteration: int) -> list[dict[str, Any]]:
     return [line for line in lines if line.get("iteration", math.inf) <= iteration]
 
 
-def _best_of(folder: Path) -> float | None:
-    """What the weights in the folder gained in their check, dB; None where they are of none, or not there."""
+def _best_gain(folder: Path) -> float | None:
+    """Return the validation gain of the weights in the folder, dB; None if there are none, or they were not validated.
+    """
     path = folder / WEIGHTS
     if not path.exists():
         return None
-    _, about = weights.read(path)
-    return float(about[GAIN]) if GAIN in about else None
+    _, metadata = weights.read(path)
+    return float(metadata[GAIN]) if GAIN in metadata else None
 
 
-def _write_kept(trainer: Trainer, folder: Path, about: Mapping[str, str]) -> None:
-    half = {name: value.half().contiguous() for name, value in trainer.kept().items()}
-    weights.write(folder / WEIGHTS, half, about)
+def _write_weights(trainer: RemovalTrainer, folder: Path, metadata: Mapping[str, str]) -> None:
+    half = {name: value.half().contiguous() for name, value in trainer.final_weights().items()}
+    weights.write(folder / WEIGHTS, half, metadata)
 
 
-def _about(trainer: Trainer) -> dict[str, str]:
+def _metadata(trainer: RemovalTrainer) -> dict[str, str]:
     return {"recipe": json.dumps(as_dict(trainer.recipe)), "iteration": str(trainer.iteration)}

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Arrays that several processes read and none holds: the photographs of a training."""
+"""Arrays in a file that several processes map and none holds a copy of: the photographs of a training."""
 from __future__ import annotations
 
 import math
@@ -10,32 +10,35 @@ from typing import Any, NamedTuple, overload
 import numpy as np
 from numpy.typing import NDArray
 
-ALIGNED = 64
-"""Bytes; no array begins between multiples of these."""
+ALIGNMENT = 64
+"""Bytes; every array begins at a multiple of it."""
 
 
-class _Place(NamedTuple):
+class _ArraySpan(NamedTuple):
     first: int
     shape: tuple[int, ...]
     dtype: str
 
 
-class Mapped(Sequence[NDArray[Any]]):
-    """Arrays in a file, which a process that is sent them maps: they are in memory once, however many have them, and
-    sent in no time. Who makes them keeps the file for as long as anyone reads."""
+class SharedArrays(Sequence[NDArray[Any]]):
+    """Arrays in a file. A process that receives this object maps the file: the arrays are in memory once, and sending
+    them takes no time.
+
+    Whoever writes the file keeps it for as long as anyone reads.
+    """
 
     def __init__(self, path: Path, arrays: Iterable[NDArray[Any]]) -> None:
-        """Written to `path`."""
-        self._path, self._places = path, []
+        """Write the arrays to `path`."""
+        self._path, self._spans = path, []
         self._bytes: NDArray[np.uint8] | None = None
         with open(path, "wb") as file:
             for array in arrays:
-                file.seek(-file.tell() % ALIGNED, 1)
-                self._places.append(_Place(file.tell(), array.shape, array.dtype.str))
+                file.seek(-file.tell() % ALIGNMENT, 1)
+                self._spans.append(_ArraySpan(file.tell(), array.shape, array.dtype.str))
                 file.write(np.ascontiguousarray(array).data)
 
     def __len__(self) -> int:
-        return len(self._places)
+        return len(self._spans)
 
     @overload
     def __getitem__(self, at: int) -> NDArray[Any]: ...
@@ -43,17 +46,17 @@ class Mapped(Sequence[NDArray[Any]]):
     def __getitem__(self, at: slice) -> Sequence[NDArray[Any]]: ...
 
     def __getitem__(self, at: int | slice) -> NDArray[Any] | Sequence[NDArray[Any]]:
-        """Read-only."""
+        """Return a read-only array, or a list of them."""
         if isinstance(at, slice):
             return [self[number] for number in range(*at.indices(len(self)))]
-        first, shape, dtype = self._places[at]
+        first, shape, dtype = self._spans[at]
         if self._bytes is None:
             self._bytes = np.memmap(self._path, np.uint8, "r").view(np.ndarray)
         size = math.prod(shape) * np.dtype(dtype).itemsize
         return self._bytes[first:first + size].view(dtype).reshape(shape)
 
-    def clear(self) -> None:
-        """Let go of the file, which Windows does not delete before."""
+    def close(self) -> None:
+        """Release the mapping; Windows does not delete a mapped file."""
         self._bytes = None
 
     def __getstate__(self) -> dict[str, Any]:

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""One iteration of a training of the network in the box: its loss, its step, and the state that goes on from there."""
+"""One iteration of a training of the removal network: its loss, its step, and the state that a resumed training
+continues from. `run` drives it."""
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
@@ -16,216 +17,228 @@ from ...errors import RunError
 from ..model.network import RemovalNetwork
 from ..model.recipe import Recipe
 from .batches import Batch
-from .gpu.cuda_graphs import OnItsWay, Recorded
-from .optimiser import Optimiser, has_bfloat16
+from .gpu.cuda_graphs import AsyncCopy, GraphedFunction
+from .optimiser import MuonAdamW, has_bfloat16
 from .pairs import Pair
-from .workers import ALONE, Learner
+from .workers import SINGLE_WORKER, Worker
 
-FIGURES = ("loss", "error", "untouched", "gain")
-"""Of an iteration, means over its frames: the loss, mean squares of the error and of the flare, the gain in PSNR."""
-FAINT = (1e-3, 2e-4)
-"""Mean square of a flare, to which the errors of fainter ones are compared: 30 dB, and from three quarters of a
-training on falling to 37 dB."""
-UNSEEN, SEEN_FROM = (3e-4, 3e-5), 0.8
-"""Mean square of an error that is not seen: 35 dB, from that share of a training on 45 dB. By 45 dB from the first
-iteration on, pictures without any flare have the larger part of the gradients, and what is told of flares that are
-plain to see is held down with the rest."""
+METRICS = ("loss", "error", "untouched", "gain")
+"""Logged per iteration, means over its frames: the loss, mean squares of the error and of the flare, the gain in PSNR.
+They are keys of training.jsonl."""
+FAINT_FLARE_MSE = (1e-3, 2e-4)
+"""Mean square added to that of a flare, so that errors of fainter flares count less: 30 dB, falling to 37 dB from three
+quarters of a training on."""
+ERROR_FLOOR_MSE, ERROR_FLOOR_RAMP = (3e-4, 3e-5), 0.8
+"""Mean square of an error that does not matter: 35 dB, falling to 45 dB until that share of a training. With 45 dB from
+the start, pictures without flare have the larger part of the gradients, and predictions of obvious flares are held down
+with the rest."""
 
-PATCH = 48
-"""Pixels a side of the patches of a picture whose own gains count beside the picture's, by the recipe's `local`."""
+PATCH_SIZE = 48
+"""Pixels a side of the patches whose own gain counts beside the picture's, by the recipe's share."""
 
-NOTHING_AT_FIRST = (".second.", ".told.")
-"""In the names of the last convolutions of blocks and of layers of attention, which are zero before training."""
+ZERO_INITIALISED = (".conv2.", ".proj.")
+"""Parts of the names of the last convolutions of blocks and attention layers, which are zero before training."""
 
 
 def device() -> torch.device:
-    """The graphics card where there is one."""
+    """Return the GPU if there is one, else the CPU."""
     return torch.device("cuda" if torch.cuda.is_available() else "cpu")
 
 
-class Trainer:
-    """Network and optimiser at an iteration, of one of the learners."""
+class RemovalTrainer:
+    """Network and optimiser at an iteration, of one worker."""
 
-    def __init__(self, recipe: Recipe, learner: Learner = ALONE) -> None:
-        self.recipe, self.iteration, self.learner = recipe, 0, learner
+    def __init__(self, recipe: Recipe, worker: Worker = SINGLE_WORKER) -> None:
+        self.recipe, self.iteration, self.worker = recipe, 0, worker
         self.device = device()
         torch.manual_seed(recipe.seed)
         self.network = RemovalNetwork(recipe.widths, recipe.blocks, recipe.attention).to(self.device)
         self.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # twice as fast here
-        self.optimiser = Optimiser(self.network, recipe.decay)
-        self.averaged = {name: value.detach().clone() for name, value in self.network.state_dict().items()}
-        self.begun_with: dict[str, Tensor] = {}
-        self._recorded = {polishes: Recorded(partial(self._gradients, polishes)) for polishes in (False, True)}
-        self._latest: OnItsWay | None = None
+        self.optimiser = MuonAdamW(self.network, recipe.weight_decay)
+        self.averaged_weights = {name: value.detach().clone() for name, value in self.network.state_dict().items()}
+        self.initial_weights: dict[str, Tensor] = {}
+        self._graphed_gradients = {phase: GraphedFunction(partial(self._gradients, phase)) for phase in (False, True)}
+        self._pending_metrics: AsyncCopy | None = None
         if self.device.type == "cuda":
             torch.backends.cudnn.benchmark, torch.backends.cudnn.benchmark_limit = True, 4  # a minute for five shapes
             torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.allow_tf32 = True
 
     def step(self, batch: Batch) -> dict[str, float]:
-        """One iteration; its figures."""
+        """Run one iteration and return its metrics."""
         recipe = self.recipe
-        figures = self._backward(batch)
+        metrics = self._backward(batch)
         torch.nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
-        self.optimiser.step(recipe.rate(self.iteration), self.learner)
-        # The first steps' weights are not worth keeping for as long as later ones'.
-        kept = min(recipe.average, (self.iteration + 1) / (self.iteration + 10))
+        self.optimiser.step(recipe.learning_rate_at(self.iteration), self.worker)
+        # The weights of the first steps leave the average sooner.
+        decay = min(recipe.ema_decay, (self.iteration + 1) / (self.iteration + 10))
         with torch.no_grad():
-            torch._foreach_lerp_(list(self.averaged.values()), list(self.network.state_dict().values()), 1 - kept)
+            torch._foreach_lerp_(list(self.averaged_weights.values()), list(self.network.state_dict().values()),
+                                 1 - decay)
         self.iteration += 1
-        return figures
+        return metrics
 
     def _backward(self, batch: Batch) -> dict[str, float]:
-        """Set the gradients, and give the figures, of all learners' frames together."""
+        """Set the gradients and return the metrics, of all workers' frames together."""
         if self.device.type != "cpu":
-            return self._backward_on_card(batch)
-        figures = dict.fromkeys(FIGURES, 0.0)
+            return self._backward_on_gpu(batch)
+        metrics = dict.fromkeys(METRICS, 0.0)
         if batch.share:
-            loss, figures = self.loss(batch)
+            loss, metrics = self.loss(batch)
             (loss * batch.share).backward()
-        if self.learner.count > 1:
-            of_all = torch.tensor([figures[name] * batch.share for name in FIGURES])
+        if self.worker.count > 1:
+            reduced = torch.tensor([metrics[name] * batch.share for name in METRICS])
             parameters = list(self.network.parameters())
             for parameter in parameters:
                 if parameter.grad is None:
                     parameter.grad = torch.zeros_like(parameter)
-            self.learner.add_up([*(parameter.grad for parameter in parameters if parameter.grad is not None), of_all])
-            figures = dict(zip(FIGURES, of_all.tolist(), strict=True))
-        return figures
+            self.worker.all_reduce([*(parameter.grad for parameter in parameters if parameter.grad is not None),
+                                    reduced])
+            metrics = dict(zip(METRICS, reduced.tolist(), strict=True))
+        return metrics
 
-    def _backward_on_card(self, batch: Batch) -> dict[str, float]:
-        """As recorded; the figures are those of the iteration before, so that the card is not waited for."""
-        polishes, numbers = self._goal()
-        *gradients, figures = self._recorded[polishes](batch.frame, batch.scene, batch.gentle,
-                                                       numbers.pin_memory().to(self.device, non_blocking=True))
+    def _backward_on_gpu(self, batch: Batch) -> dict[str, float]:
+        """Set the gradients by the captured graph; the metrics are those of the iteration before, so that the CPU does
+        not wait for the GPU."""
+        psnr_phase, schedule = self._schedule()
+        *gradients, metrics = self._graphed_gradients[psnr_phase](batch.frame, batch.scene, batch.scene_with_glow,
+                                                       schedule.pin_memory().to(self.device, non_blocking=True))
         for parameter, gradient in zip(self.network.parameters(), gradients, strict=True):
             parameter.grad = gradient
-        before, self._latest = self._latest, OnItsWay(figures)
-        return dict(zip(FIGURES, (before or self._latest).arrived(), strict=True))
+        before, self._pending_metrics = self._pending_metrics, AsyncCopy(metrics)
+        return dict(zip(METRICS, (before or self._pending_metrics).wait(), strict=True))
 
-    def _gradients(self, polishes: bool, frame: Tensor, scene: Tensor, gentle: Tensor, numbers: Tensor) -> list[Tensor]:
-        """Of every parameter, then the figures."""
-        loss, figures = self._loss(polishes, frame, scene, gentle, numbers)
-        return [*torch.autograd.grad(loss, list(self.network.parameters())), figures]
+    def _gradients(self, psnr_phase: bool, frame: Tensor, scene: Tensor, scene_with_glow: Tensor,
+                   schedule: Tensor) -> list[Tensor]:
+        """Return the gradient of every parameter, then the metrics."""
+        loss, metrics = self._compute_loss(psnr_phase, frame, scene, scene_with_glow, schedule)
+        return [*torch.autograd.grad(loss, list(self.network.parameters())), metrics]
 
     def loss(self, batch: Batch) -> tuple[Tensor, dict[str, float]]:
-        """As of this iteration (`_loss`), and the figures."""
-        polishes, numbers = self._goal()
-        frame, scene, gentle = (part.to(self.device) for part in (batch.frame, batch.scene, batch.gentle))
-        loss, figures = self._loss(polishes, frame, scene, gentle, numbers.to(self.device))
-        return loss, dict(zip(FIGURES, figures.tolist(), strict=True))
+        """Return the loss at this iteration (`_compute_loss`), and the metrics."""
+        psnr_phase, schedule = self._schedule()
+        frame, scene, scene_with_glow = (part.to(self.device)
+                                         for part in (batch.frame, batch.scene, batch.scene_with_glow))
+        loss, metrics = self._compute_loss(psnr_phase, frame, scene, scene_with_glow, schedule.to(self.device))
+        return loss, dict(zip(METRICS, metrics.tolist(), strict=True))
 
-    def _goal(self) -> tuple[bool, Tensor]:
-        """Whether a training polishes by now; then the power, the mean square of a faint flare, and that of an error
-        which is not seen."""
-        done = min(self.iteration / self.recipe.iterations, 1.0)
-        faint = FAINT[0] * (FAINT[1] / FAINT[0]) ** max(4 * done - 3, 0.0)
-        unseen = UNSEEN[0] * (UNSEEN[1] / UNSEEN[0]) ** min(done / SEEN_FROM, 1.0)
-        return done >= 1 - self.recipe.polish, torch.tensor([0.5 + 0.5 * done, faint, unseen])
+    def _schedule(self) -> tuple[bool, Tensor]:
+        """Return whether the training is in its PSNR phase; then (3,): the power of the flare's mean square, that of a
+        faint flare, and the error floor."""
+        progress = min(self.iteration / self.recipe.iterations, 1.0)
+        faint_mse = FAINT_FLARE_MSE[0] * (FAINT_FLARE_MSE[1] / FAINT_FLARE_MSE[0]) ** max(4 * progress - 3, 0.0)
+        first, last = ERROR_FLOOR_MSE
+        error_floor = first * (last / first) ** min(progress / ERROR_FLOOR_RAMP, 1.0)
+        return progress >= 1 - self.recipe.psnr_phase, torch.tensor([0.5 + 0.5 * progress, faint_mse, error_floor])
 
-    def _loss(self, polishes: bool, frame: Tensor, scene: Tensor, gentle: Tensor,
-              numbers: Tensor) -> tuple[Tensor, Tensor]:
-        """Of each picture the squared error in parts of the flare's own square to a power that rises from a half to
-        one: at first strong flares lead, which are learned sooner, in the end faint ones count as much, and what
-        is told where there is none counts for more. Over the last `polish` of a training the logarithm of the
-        error in parts of that square, which is the picture's gain in PSNR; what a picture loses counts twice. A
-        share of that goal, `local`, is the mean of the same over patches of the picture. At half the weight the same of
-        the gentle part. Then the FIGURES. `polishes` and `numbers` are those of `_goal`, given so that a card's record
-        of this serves every iteration."""
-        with _precision(self.device):
-            told = self.network(frame)
-        goals = torch.stack([frame - scene, frame - gentle])
-        flares = goals.square().mean(2)
-        errors = (torch.stack([told.flare, told.gentle]) - goals).square().mean(2)
+    def _compute_loss(self, psnr_phase: bool, frame: Tensor, scene: Tensor, scene_with_glow: Tensor,
+              schedule: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the loss and the metrics.
+
+        At first, the squared error of each picture divided by its flare's mean square to a power that rises from 0.5 to
+        1: strong flares lead, which are learned sooner; in the end faint ones count as much, and false flares count
+        more. In the last phase, the log of the error divided by that square, which is the picture's gain in PSNR; a
+        loss counts twice. The recipe weighs it against the mean of the same over patches. The prediction without the
+        glow has half the weight of the whole.
+
+        psnr_phase, schedule: of `_schedule`, arguments so that one captured graph serves every iteration.
+        """
+        with _autocast(self.device):
+            prediction = self.network(frame)
+        targets = torch.stack([frame - scene, frame - scene_with_glow])
+        flares = targets.square().mean(2)
+        errors = (torch.stack([prediction.flare, prediction.flare_without_glow]) - targets).square().mean(2)
         before, error = flares.mean((2, 3)), errors.mean((2, 3))
-        power, faint, unseen = numbers.unbind()
-        if polishes:
-            left = _log_left(error, before, unseen)
-            if self.recipe.local:
-                in_patches = _log_left(_by_patch(errors), _by_patch(flares), unseen).mean((2, 3))
-                left = torch.lerp(left, in_patches, self.recipe.local)
+        power, faint_mse, error_floor = schedule.unbind()
+        if psnr_phase:
+            error_term = _log_error_ratio(error, before, error_floor)
+            if self.recipe.patch_loss_share:
+                in_patches = _log_error_ratio(_patch_means(errors), _patch_means(flares), error_floor).mean((2, 3))
+                error_term = torch.lerp(error_term, in_patches, self.recipe.patch_loss_share)
         else:
-            left = error / (before[0] + faint) ** power
-        loss = left[0].mean() + 0.5 * left[1].mean()
+            error_term = error / (before[0] + faint_mse) ** power
+        loss = error_term[0].mean() + 0.5 * error_term[1].mean()
         with torch.no_grad():
-            gain = 10 * torch.log10((before[0] + UNSEEN[1]) / (error[0] + UNSEEN[1]))
-            figures = torch.stack([loss.detach(), error[0].mean(), before[0].mean(), gain.mean()])
-        return loss, figures
+            gain = 10 * torch.log10((before[0] + ERROR_FLOOR_MSE[1]) / (error[0] + ERROR_FLOOR_MSE[1]))
+            metrics = torch.stack([loss.detach(), error[0].mean(), before[0].mean(), gain.mean()])
+        return loss, metrics
 
     @torch.no_grad()
-    def check(self, pairs: Mapping[str, Sequence[Pair]]) -> dict[str, float]:
-        """PSNR gained over the untouched frame, dB, by class and on average, by the weights that are kept."""
+    def validate(self, pairs: Mapping[str, Sequence[Pair]]) -> dict[str, float]:
+        """Return the PSNR gained over the untouched frame, dB, by class and on average, with the averaged weights."""
         network = RemovalNetwork(self.recipe.widths, self.recipe.blocks, self.recipe.attention)
-        network.load_state_dict(self.kept())
+        network.load_state_dict(self.final_weights())
         network.to(self.device)
         gains: dict[str, float] = {}
-        for kind, some in pairs.items():
+        for kind, class_pairs in pairs.items():
             values = []
-            for one in some:
+            for pair in class_pairs:
                 frame, scene = (torch.from_numpy(part).permute(2, 0, 1)[None].to(self.device)
-                                for part in (one.frame, one.scene))
-                told = network(frame).flare.clamp(min=0)
-                after = ((frame - told).clamp(min=0) - scene).square().mean()
+                                for part in (pair.frame, pair.scene))
+                prediction = network(frame).flare.clamp(min=0)
+                after = ((frame - prediction).clamp(min=0) - scene).square().mean()
                 before = (frame - scene).square().mean()
                 values.append(float(10 * torch.log10((before + 1e-6) / (after + 1e-6))))
             gains[kind] = round(float(np.mean(values)), 3)
         gains["mean"] = round(float(np.mean(list(gains.values()))), 3)
         return gains
 
-    def kept(self) -> dict[str, Tensor]:
-        """The weights to keep: averaged over iterations, and with the recipe's share of those that the training began
-        with, which wins back what it has forgotten (Wortsman et al. 2022, "Robust fine-tuning of zero-shot models")."""
-        return {name: value.lerp(self.begun_with.get(name, value), self.recipe.begun)
-                for name, value in self.averaged.items()}
+    def final_weights(self) -> dict[str, Tensor]:
+        """Return the weights to write: averaged over iterations, and interpolated with the initial ones by the recipe's
+        share.
+
+        That recovers what a fine-tuning forgets (Wortsman et al. 2022, "Robust fine-tuning of zero-shot models").
+        """
+        return {name: value.lerp(self.initial_weights.get(name, value), self.recipe.initial_weights_mix)
+                for name, value in self.averaged_weights.items()}
 
     def state(self) -> dict[str, Tensor]:
-        """Everything that a resumed training needs."""
+        """Return everything that a resumed training needs."""
         state = {f"network.{name}": value for name, value in self.network.state_dict().items()}
-        state |= {f"averaged.{name}": value for name, value in self.averaged.items()}
-        state |= {f"begun.{name}": value for name, value in self.begun_with.items()}
+        state |= {f"averaged.{name}": value for name, value in self.averaged_weights.items()}
+        state |= {f"initial.{name}": value for name, value in self.initial_weights.items()}
         state |= self.optimiser.state()
         return {name: value.detach().cpu().contiguous() for name, value in state.items()}
 
     def load_state(self, state: Mapping[str, Tensor], iteration: int) -> None:
-        """Go on from `state`, or from weights alone (then with fresh moments), of a network that may have fewer
-        blocks and layers of attention: the others do nothing yet."""
+        """Load a state, or weights alone, whose moments begin at zero. The weights' network may have fewer blocks and
+        attention layers; the added ones begin as the identity."""
         self.iteration = iteration
-        grown: dict[str, Tensor] = {}
+        added: dict[str, Tensor] = {}
         if not any(name.startswith("network.") for name in state):
-            grown = {name: value.clone() for name, value in self.network.state_dict().items()
-                     if name.startswith(("enter.", "between.")) and name not in state}
-            state = {f"{part}.{name}": value for name, value in {**grown, **state}.items()
+            added = {name: value.clone() for name, value in self.network.state_dict().items()
+                     if name.startswith(("encoder.", "inner_attention.")) and name not in state}
+            state = {f"{part}.{name}": value for name, value in {**added, **state}.items()
                      for part in ("network", "averaged")}
         try:
             self.network.load_state_dict({name.removeprefix("network."): value.float()
                                           for name, value in state.items() if name.startswith("network.")})
         except RuntimeError as problem:
-            raise RunError("The weights to go on from are of another network; give the recipe they were made "
-                           "with.") from problem
-        for name in self.averaged:
-            self.averaged[name] = state[f"averaged.{name}"].to(self.device, torch.float32, copy=True)
+            raise RunError("The weights to start from belong to another network; give the recipe they were "
+                           "trained with.") from problem
+        for name in self.averaged_weights:
+            self.averaged_weights[name] = state[f"averaged.{name}"].to(self.device, torch.float32, copy=True)
         if iteration:
-            self.begun_with = {name.removeprefix("begun."): value.float().to(self.device)
-                               for name, value in state.items() if name.startswith("begun.")}
+            self.initial_weights = {name.removeprefix("initial."): value.float().to(self.device)
+                                    for name, value in state.items() if name.startswith("initial.")}
         else:
-            # What has grown began with nothing, which is what the last of its convolutions say, not with what the
-            # others were drawn as.
-            self.begun_with = {name: value.clone() for name, value in self.averaged.items()
-                               if name not in grown or any(part in name for part in NOTHING_AT_FIRST)}
+            # Added blocks begin as the identity, by their zero-initialised last convolutions; the random values of
+            # their other convolutions are no weights to pull towards.
+            self.initial_weights = {name: value.clone() for name, value in self.averaged_weights.items()
+                                    if name not in added or any(part in name for part in ZERO_INITIALISED)}
         self.optimiser.load_state(state)
 
 
-def _log_left(error: Tensor, before: Tensor, unseen: Tensor) -> Tensor:
-    """The logarithm of squared errors in parts of what they were untouched; what has become worse counts twice."""
-    left = torch.log((error + unseen) / (before + unseen))
-    return left + left.clamp(min=0)
+def _log_error_ratio(error: Tensor, before: Tensor, error_floor: Tensor) -> Tensor:
+    """Return the log of squared errors relative to those of the untouched frame; where it got worse it counts twice."""
+    log_ratio = torch.log((error + error_floor) / (before + error_floor))
+    return log_ratio + log_ratio.clamp(min=0)
 
 
-def _by_patch(squared: Tensor) -> Tensor:
-    """Means over patches, of which the last of a row or column may be narrower: (2, n, h, w) to (2, n, rows,
-    columns)."""
-    return F.avg_pool2d(squared, PATCH, ceil_mode=True)
+def _patch_means(squared: Tensor) -> Tensor:
+    """Return means over patches, the last of a row or column maybe narrower: (2, n, h, w) to (2, n, rows, columns)."""
+    return F.avg_pool2d(squared, PATCH_SIZE, ceil_mode=True)
 
 
-def _precision(on: torch.device) -> Any:
-    # Weights that were cached in it would not be those of a recorded step's next time.
+def _autocast(on: torch.device) -> Any:
+    # A cache would hold the weights of the step that was captured as a graph, not of the one that replays it.
     return torch.autocast(on.type, dtype=torch.bfloat16, cache_enabled=False) if has_bfloat16(on) else nullcontext()

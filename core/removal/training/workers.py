@@ -1,6 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A training shared among processes: each learns from its share of an iteration's frames, and all take the same step,
-by the sum of their gradients. On a processor this is a good deal faster than threads within one process."""
+"""Workers: processes that share a training on one machine. Each computes the gradients of its share of an iteration's
+frames, and all take the same step with their sum.
+
+On a CPU this is a good deal faster than threads within one process. `run.train` starts them.
+"""
 from __future__ import annotations
 
 import multiprocessing
@@ -24,27 +27,24 @@ from torch import Tensor
 from ...errors import RunError
 from ...system.progress import stop_signals
 
-PATIENCE_S = 600.0
-"""How long one waits for the others: they may have flares to make."""
-PARTING_S = 2.0
-"""How long one that is through stays for the first to wake from their last meeting."""
+BARRIER_TIMEOUT_S = 600.0
+"""How long a worker waits for the others, which may have flares to synthesise."""
+EXIT_GRACE_S = 2.0
+"""How long a finished worker stays, so that the first can leave their last barrier."""
 
-ENDED = ("A process of the training ended before it was through; where memory is short, go on with --resume and fewer "
-         "--processes.")
+WORKER_ENDED = ("A process of the training ended too early; if memory is short, run it again with --resume and fewer "
+                "--processes.")
 
 
-class Table:
-    """Where the learners of a machine lay down what they have, for all to see: files that each of them maps.
-
-    Sockets would take more than twice the time of memory that is shared.
-    """
+class SharedBuffers:
+    """Buffers in files that every worker maps. Sockets would take more than twice the time."""
 
     def __init__(self, folder: str, barrier: Barrier) -> None:
         self._folder, self._barrier = folder, barrier
         self._mapped: dict[tuple[int, int], Tensor] = {}
 
     def rows(self, count: int, length: int) -> Tensor:
-        """(count, length) float32, the same memory for all who ask for as many."""
+        """Return (count, length) float32, the same memory in all workers for the same arguments."""
         if (count, length) not in self._mapped:
             path = Path(self._folder) / f"{count}x{length}"
             path.touch()
@@ -58,111 +58,109 @@ class Table:
         return self._mapped[count, length]
 
     def clear(self) -> None:
-        """Let go of the files, which Windows does not delete before."""
+        """Release the mappings; Windows does not delete a mapped file."""
         self._mapped.clear()
 
-    def meet(self) -> None:
-        """Go on when all are here. Raises RunError when one of them will not come."""
+    def wait(self) -> None:
+        """Wait until all workers are here. Raises RunError if one of them has ended."""
         try:
-            self._barrier.wait(PATIENCE_S)
+            self._barrier.wait(BARRIER_TIMEOUT_S)
         except threading.BrokenBarrierError as problem:
-            raise RunError(ENDED) from problem
+            raise RunError(WORKER_ENDED) from problem
 
 
 @dataclass(frozen=True)
-class Learner:
-    """One of `count` processes that share a training; the first saves and tells."""
+class Worker:
+    """One of `count` processes that share a training; the first saves and reports."""
 
     rank: int
     count: int
-    table: Table | None = None
+    buffers: SharedBuffers | None = None
 
-    def add_up(self, tensors: Sequence[Tensor]) -> None:
-        """Each becomes the sum of what the learners have, the same to the last bit for all of them. Raises
-        RunError."""
-        if self.table is None:
+    def all_reduce(self, tensors: Sequence[Tensor]) -> None:
+        """Replace each tensor by the sum over all workers, identical to the last bit in each. Raises RunError."""
+        if self.buffers is None:
             return
-        rows = self.table.rows(self.count, sum(tensor.numel() for tensor in tensors))
-        for tensor, mine in _parts(tensors, rows[self.rank]):
-            mine.copy_(tensor)
-        self.table.meet()
-        for tensor, part in _parts(tensors, rows[0]):
+        rows = self.buffers.rows(self.count, sum(tensor.numel() for tensor in tensors))
+        for tensor, buffer in _buffer_slices(tensors, rows[self.rank]):
+            buffer.copy_(tensor)
+        self.buffers.wait()
+        for tensor, part in _buffer_slices(tensors, rows[0]):
             tensor.copy_(part)
         for row in rows[1:]:
-            for tensor, part in _parts(tensors, row):
+            for tensor, part in _buffer_slices(tensors, row):
                 tensor.add_(part)
-        self.table.meet()  # before anyone lays down anew
+        self.buffers.wait()  # before anyone lays down anew
 
-    def makes(self, number: int) -> bool:
-        """Whether a piece of work that is to be shared is this one's."""
+    def is_responsible_for(self, number: int) -> bool:
+        """Return whether this worker does a piece of shared work."""
         return number % self.count == self.rank
 
-    def hand_round(self, tensors: Sequence[Tensor]) -> None:
-        """Everyone gets those that another `makes`. Raises RunError."""
-        if self.table is None:
+    def all_gather(self, tensors: Sequence[Tensor]) -> None:
+        """Replace those tensors that another worker is responsible for by its values. Raises RunError."""
+        if self.buffers is None:
             return
-        row = self.table.rows(1, sum(tensor.numel() for tensor in tensors))[0]
-        for number, (tensor, part) in enumerate(_parts(tensors, row)):
-            if self.makes(number):
+        row = self.buffers.rows(1, sum(tensor.numel() for tensor in tensors))[0]
+        for number, (tensor, part) in enumerate(_buffer_slices(tensors, row)):
+            if self.is_responsible_for(number):
                 part.copy_(tensor)
-        self.table.meet()
-        for number, (tensor, part) in enumerate(_parts(tensors, row)):
-            if not self.makes(number):
+        self.buffers.wait()
+        for number, (tensor, part) in enumerate(_buffer_slices(tensors, row)):
+            if not self.is_responsible_for(number):
                 tensor.copy_(part)
-        self.table.meet()
+        self.buffers.wait()
 
 
-ALONE = Learner(0, 1)
+SINGLE_WORKER = Worker(0, 1)
 
 
-def _parts(tensors: Sequence[Tensor], row: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
-    """Each tensor, as it lies in memory, and its part of a row."""
+def _buffer_slices(tensors: Sequence[Tensor], row: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
+    """Yield each tensor, in its memory order, and its slice of a row."""
     first = 0
     for tensor in tensors:
-        lying = tensor.permute(sorted(range(tensor.ndim), key=tensor.stride, reverse=True))
-        yield lying, row[first:first + tensor.numel()].view(lying.shape)
+        in_memory_order = tensor.permute(sorted(range(tensor.ndim), key=tensor.stride, reverse=True))
+        yield in_memory_order, row[first:first + tensor.numel()].view(in_memory_order.shape)
         first += tensor.numel()
 
 
 @contextmanager
-def shared(count: int, learn: Callable[..., None], *words: Any) -> Iterator[Learner]:
-    """This process as the first of `count`; the others call `learn(learner, *words)` until this one is through.
-
-    What learners do together raises RunError where one of them ends before.
-    """
+def worker_group(count: int, run_worker: Callable[..., None], *args: Any) -> Iterator[Worker]:
+    """Run this process as the first of `count` workers; the others call `run_worker(worker, *args)` until this one
+    leaves. Collective operations raise RunError where one of them has ended."""
     if count == 1:
-        yield ALONE
+        yield SINGLE_WORKER
         return
     spawning = multiprocessing.get_context("spawn")
     threads = torch.get_num_threads()
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
         barrier = spawning.Barrier(count)
-        table = Table(folder, barrier)
-        others = [spawning.Process(target=_other, args=(rank, count, folder, barrier, threads, learn, words),
+        buffers = SharedBuffers(folder, barrier)
+        others = [spawning.Process(target=_worker_main, args=(rank, count, folder, barrier, threads, run_worker, args),
                                    daemon=True)
                   for rank in range(1, count)]
         try:
             for process in others:
                 process.start()
-            _watch([process.sentinel for process in others], barrier)
-            _take_share(threads, count)
-            yield Learner(0, count, table)
+            _abort_when_any_ends([process.sentinel for process in others], barrier)
+            _limit_threads(threads, count)
+            yield Worker(0, count, buffers)
         finally:
-            table.clear()
-            end(others)
+            buffers.clear()
+            kill_processes(others)
             torch.set_num_threads(threads)
 
 
-def end(processes: Iterable[BaseProcess]) -> None:
-    """Those that were started."""
+def kill_processes(processes: Iterable[BaseProcess]) -> None:
+    """Kill those processes that were started."""
     for process in processes:
         if process.pid is not None:
             process.kill()
             process.join()
 
 
-def begin_process() -> None:
-    """Of any process beside the first, that learns or draws: a stop is for the first alone, which ends the others."""
+def initialise_process() -> None:
+    """Prepare a process other than the first, which trains or draws: signals to stop are for the first alone, which
+    ends the others."""
     import cv2
 
     cv2.setNumThreads(1)
@@ -170,25 +168,25 @@ def begin_process() -> None:
         signal.signal(number, signal.SIG_IGN)
 
 
-def _other(rank: int, count: int, folder: str, barrier: Barrier, threads: int, learn: Callable[..., None],
-           words: tuple[Any, ...]) -> None:
-    begin_process()
+def _worker_main(rank: int, count: int, folder: str, barrier: Barrier, threads: int, run_worker: Callable[..., None],
+                 args: tuple[Any, ...]) -> None:
+    initialise_process()
     first = multiprocessing.parent_process()
     if first is not None:
-        _watch([first.sentinel], barrier)
-    _take_share(threads, count)
-    learn(Learner(rank, count, Table(folder, barrier)), *words)
+        _abort_when_any_ends([first.sentinel], barrier)
+    _limit_threads(threads, count)
+    run_worker(Worker(rank, count, SharedBuffers(folder, barrier)), *args)
     if first is not None:  # which may not have woken from their last meeting: an end here would break that up
-        wait([first.sentinel], PARTING_S)
+        wait([first.sentinel], EXIT_GRACE_S)
 
 
-def _take_share(threads: int, count: int) -> None:
-    """Of the processor's threads."""
+def _limit_threads(threads: int, count: int) -> None:
+    """Give this worker its share of the CPU's threads."""
     torch.set_num_threads(max(threads // count, 1))
 
 
-def _watch(sentinels: Sequence[int], barrier: Barrier) -> None:
-    """Let nobody wait for a process that has ended."""
+def _abort_when_any_ends(sentinels: Sequence[int], barrier: Barrier) -> None:
+    """Break the barrier as soon as a process has ended, so that nobody waits for it."""
     def watch() -> None:
         wait(sentinels)
         barrier.abort()

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Training where a graphics card learns: its pairs are composed on it, out of scenes and flares that processes draw."""
+"""Training on a GPU: it composes pairs in batches from scenes and flares that CPU processes draw."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What a training sees on a card."""
+"""The batches of a training on a GPU: random scenes and flares of the pools, composed on the GPU."""
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
@@ -8,38 +8,43 @@ from contextlib import contextmanager
 import numpy as np
 import torch
 
-from ...model.network import MULTIPLE
+from ...model.network import SIZE_MULTIPLE
 from ...model.recipe import Recipe
 from ...synthesis.prescription import Prescription
 from .. import random_cameras
 from ..backgrounds import Backgrounds
 from ..batches import Batch
-from ..flare_bank import OwnFlares
-from .composition import composed, filming, laying
-from .pools import Pools, filled, room, shapes_of
+from ..flare_bank import UserFlares
+from .composition import compose, draw_flare_placements, draw_frame_parameters
+from .pools import Pools, filled_pools, frame_shapes, pool_sizes
 
 
 @contextmanager
-def drawn_on_card(recipe: Recipe, first: int, backgrounds: Backgrounds, lenses: Sequence[Prescription],
-                  own: OwnFlares | None, device: torch.device, processes: int) -> Iterator[Iterator[Batch]]:
-    """Batches without end, from iteration `first` on; `processes` draw what they are composed of. Unlike those of a
-    processor they are no function of the recipe: what is in the pools depends on how fast it was drawn. Raises
-    RunError where nothing is drawn."""
-    shapes = shapes_of(recipe, MULTIPLE)
-    pools = Pools(shapes, recipe.canvas, device, *room(torch.cuda.mem_get_info(device)[0], shapes, recipe.canvas))
-    with filled(pools, recipe, backgrounds, lenses, own, processes):
-        yield batches(pools, recipe, np.random.default_rng((recipe.seed, first)))
+def gpu_batches(recipe: Recipe, first: int, backgrounds: Backgrounds, lenses: Sequence[Prescription],
+                user_flares: UserFlares | None, device: torch.device, processes: int) -> Iterator[Iterator[Batch]]:
+    """Yield endless batches from iteration `first` on; `processes` draw the scenes and flares.
+
+    Unlike those on a CPU they are no function of the recipe: what is in the pools depends on how fast it was drawn.
+    Raises RunError where nothing is drawn.
+    """
+    shapes = frame_shapes(recipe, SIZE_MULTIPLE)
+    sizes = pool_sizes(torch.cuda.mem_get_info(device)[0], shapes, recipe.canvas_size)
+    pools = Pools(shapes, recipe.canvas_size, device, *sizes)
+    with filled_pools(pools, recipe, backgrounds, lenses, user_flares, processes):
+        yield compose_batches(pools, recipe, np.random.default_rng((recipe.seed, first)))
 
 
-def batches(pools: Pools, recipe: Recipe, random: np.random.Generator) -> Iterator[Batch]:
-    """Each of frames of one of the shapes, under flares of the pools."""
+def compose_batches(pools: Pools, recipe: Recipe, random: np.random.Generator) -> Iterator[Batch]:
+    """Yield batches of frames of one shape each, with flares of the pools."""
     while True:
         number = int(random.choice(len(pools.shapes), p=[shape.share for shape in pools.shapes]))
         width, height, count, _ = pools.shapes[number]
-        scenes, gammas = pools.scenes(random, number)
+        scenes, gammas = pools.sample_scenes(random, number)
         device = scenes.device
-        twice = max(round(random_cameras.SECOND * count), 1)
-        over = [(pools.flares(random, some),
-                 laying(random, some, recipe.canvas, width, height, second=second).on(device))
-                for some, second in ((count, False), (twice, True))]
-        yield Batch(*composed(scenes, gammas, filming(random, count, recipe).on(device), over), 1.0)
+        second_count = max(round(random_cameras.SECOND_FLARE_SHARE * count), 1)
+        flares = [(pools.sample_flares(random, number_of_flares),
+                   draw_flare_placements(random, number_of_flares, recipe.canvas_size, width, height,
+                                         second=second).to(device))
+                  for number_of_flares, second in ((count, False), (second_count, True))]
+        frames = draw_frame_parameters(random, count, recipe).to(device)
+        yield Batch(*compose(scenes, gammas, frames, flares), 1.0)

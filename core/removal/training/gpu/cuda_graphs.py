@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Work on a card that is recorded once for each shape of its input, and then given to it whole: the thousands of small
-pieces that a network's gradients are made of keep a processor longer than they do a card. And what comes of it, without
-waiting for it."""
+"""CUDA graphs: work that is captured once for each shape of its inputs and then replayed; and results that are copied
+without waiting.
+
+Launching the thousands of small kernels of a network's gradients takes a CPU longer than the GPU takes to run them.
+"""
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
@@ -10,61 +12,61 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-REHEARSALS = 3
-"""Of a piece of work before it is recorded, in which libraries choose how to do it and lay out what they need."""
+WARMUP_RUNS = 3
+"""Runs before the capture, in which libraries choose algorithms and allocate memory."""
 
 
-class _Recording(NamedTuple):
+class _CapturedGraph(NamedTuple):
     graph: torch.cuda.CUDAGraph
-    given: list[Tensor]
-    results: list[Tensor]
+    inputs: list[Tensor]
+    outputs: list[Tensor]
 
 
-class Recorded:
-    """Work on tensors of a card, as it was when first done on inputs of their shapes: what it reads and writes besides
-    stays where it lay then. On a processor it is merely done."""
+class GraphedFunction:
+    """A function of GPU tensors that is captured as a CUDA graph when first called with inputs of their shapes.
+    Whatever else it reads and writes must keep its memory. On a CPU it is called as usual."""
 
-    def __init__(self, work: Callable[..., Sequence[Tensor]]) -> None:
-        self._work = work
-        self._recordings: dict[tuple[torch.Size, ...], _Recording] = {}
+    def __init__(self, function: Callable[..., Sequence[Tensor]]) -> None:
+        self._function = function
+        self._graphs: dict[tuple[torch.Size, ...], _CapturedGraph] = {}
 
-    def __call__(self, *given: Tensor) -> list[Tensor]:
-        """What the work gives, until the next call."""
-        if not given[0].is_cuda:
-            return list(self._work(*given))
-        shapes = tuple(one.shape for one in given)
-        if shapes not in self._recordings:
-            self._recordings[shapes] = self._record([one.clone() for one in given])
-        graph, places, results = self._recordings[shapes]
-        for place, one in zip(places, given, strict=True):
-            place.copy_(one)
+    def __call__(self, *inputs: Tensor) -> list[Tensor]:
+        """Return the function's outputs; on a GPU they are overwritten by the next call."""
+        if not inputs[0].is_cuda:
+            return list(self._function(*inputs))
+        input_shapes = tuple(value.shape for value in inputs)
+        if input_shapes not in self._graphs:
+            self._graphs[input_shapes] = self._capture([value.clone() for value in inputs])
+        graph, static_inputs, outputs = self._graphs[input_shapes]
+        for static_input, value in zip(static_inputs, inputs, strict=True):
+            static_input.copy_(value)
         graph.replay()
-        return results
+        return outputs
 
-    def _record(self, given: list[Tensor]) -> _Recording:
-        beside = torch.cuda.Stream(given[0].device)
-        beside.wait_stream(torch.cuda.current_stream())
-        with torch.cuda.stream(beside):
-            for _ in range(REHEARSALS):
-                self._work(*given)
-        torch.cuda.current_stream().wait_stream(beside)
+    def _capture(self, inputs: list[Tensor]) -> _CapturedGraph:
+        side_stream = torch.cuda.Stream(inputs[0].device)
+        side_stream.wait_stream(torch.cuda.current_stream())
+        with torch.cuda.stream(side_stream):
+            for _ in range(WARMUP_RUNS):
+                self._function(*inputs)
+        torch.cuda.current_stream().wait_stream(side_stream)
         graph = torch.cuda.CUDAGraph()
-        pool = next(iter(self._recordings.values())).graph.pool() if self._recordings else None
+        pool = next(iter(self._graphs.values())).graph.pool() if self._graphs else None
         # Other threads go on with copies of their own.
         with torch.cuda.graph(graph, pool=pool, capture_error_mode="thread_local"):
-            results = list(self._work(*given))
-        return _Recording(graph, given, results)
+            outputs = list(self._function(*inputs))
+        return _CapturedGraph(graph, inputs, outputs)
 
 
-class OnItsWay:
-    """Numbers that a card sends without being waited for."""
+class AsyncCopy:
+    """A copy of numbers from the GPU that nobody waits for until they are needed."""
 
-    def __init__(self, numbers: Tensor) -> None:
-        self._there, self._here = torch.cuda.Event(), torch.empty(numbers.shape, pin_memory=True)
-        self._here.copy_(numbers, non_blocking=True)
-        self._there.record()
+    def __init__(self, values: Tensor) -> None:
+        self._event, self._values = torch.cuda.Event(), torch.empty(values.shape, pin_memory=True)
+        self._values.copy_(values, non_blocking=True)
+        self._event.record()
 
-    def arrived(self) -> list[float]:
-        """When they have."""
-        self._there.synchronize()
-        return [float(number) for number in self._here]
+    def wait(self) -> list[float]:
+        """Wait for the copy and return the numbers."""
+        self._event.synchronize()
+        return [float(value) for value in self._values]

@@ -1,0 +1,61 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The loop that writes clean frames and resumes where it was interrupted.
+
+`batch`, `capture` and `fitted` call it; they differ in which frames there are, what each depends on and how it is
+cleaned. The manifest decides which results are kept.
+"""
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import NamedTuple
+
+from ...system.progress import Progress
+from .manifest import KeepReason, Manifest
+
+
+class CleanFrame(NamedTuple):
+    """One frame to clean.
+
+    name: of the result below the output folder, its key in the manifest. source: the frame as filmed. results: the
+    files to write, the clean frame first, then its flare where one is requested.
+    """
+
+    name: Path
+    source: Path
+    results: list[Path]
+
+
+def write_clean_frames(frames: Iterable[CleanFrame], manifest: Manifest, progress: Progress, *,
+                       digest: Callable[[CleanFrame], str], clean: Callable[[CleanFrame], Callable[[], None]],
+                       keep_finished: bool, overwrite: bool,
+                       on_error: Callable[[CleanFrame, Exception], None] | None = None
+                       ) -> tuple[int, Counter[KeepReason]]:
+    """Write every frame that is not finished; return how many were written, and how many were kept for which reason.
+
+    digest: a text that changes whenever the result would (`digest_inputs`). clean: reads and cleans a frame and returns
+    a function that writes its results; nothing is deleted if it raises. keep_finished: keep results that are up to
+    date, and edited ones unless `overwrite`. overwrite: replace files that are not in the manifest or were edited.
+    on_error: called with an exception, to raise it or to go on with the next frame; without it the first one is
+    raised.
+    """
+    written, kept = 0, Counter[KeepReason]()
+    for frame in frames:
+        try:
+            key = digest(frame)
+            reason = manifest.reason_to_keep(frame.name, frame.source, key, frame.results) if keep_finished else None
+            if reason is not None and not (overwrite and reason == "edited"):
+                kept[reason] += 1
+            else:
+                write = clean(frame)
+                manifest.begin(frame.name, frame.source, key, frame.results, overwrite)
+                write()
+                manifest.finish(frame.results)
+                written += 1
+        except Exception as error:
+            if on_error is None:
+                raise
+            on_error(frame, error)
+        progress.advance()
+    return written, kept

@@ -22,11 +22,11 @@ from core.fit.settings import preset
 from core.gaussians.ply import read_ply
 from core.look import LookEdits
 from core.look import read as read_look
-from core.look.shot import Shot, evaluate
+from core.look.shot import Shot
 from core.removal.inference.remover import Remover
 from core.removal.jobs.batch import remove_all
 from core.removal.model import weights
-from core.removal.synthesis.prescription import built_in
+from core.removal.synthesis.prescription import built_in_lenses
 from core.removal.training import run as training_run
 from core.system.progress import Progress
 from tests.core.test_removal_training import backgrounds
@@ -79,7 +79,7 @@ def test_a_look_and_a_shot_of_format_0_evaluate_to_the_same_gaussians(files: Pat
     compared = 0
     for number, frame in enumerate(shot.frames):
         edits = LookEdits.parse(list(frame.edits), look.names, look.element_names)
-        (gaussians,) = evaluate(look, frame.camera.world_to_camera, frame.lights, edits).values()
+        (gaussians,) = look.evaluate_lights(frame.camera.world_to_camera, frame.lights, edits).values()
         for name in ("means", "covariances", "opacities", "colours", "rings"):
             np.testing.assert_allclose(getattr(gaussians, name), expected[f"look/{number}/{name}"], rtol=1e-4,
                                        atol=1e-6)
@@ -98,8 +98,8 @@ def test_clean_frames_of_format_0_are_kept(files: Path) -> None:
 
 
 def test_a_training_stopped_in_format_0_resumes_to_the_same_weights(files: Path) -> None:
-    recipe = training_run.recipe_in(files / "training")
-    path = training_run.train(recipe, files / "training", backgrounds(), built_in(), processes=1, resume=True)
+    recipe = training_run.read_recipe(files / "training")
+    path = training_run.train(recipe, files / "training", backgrounds(), built_in_lenses(), processes=1, resume=True)
     made, expected = load_file(path), load_file(files / "expected_weights.safetensors")
     assert len(made) == len(expected)
     network, reference = weights.load(path), weights.load(files / "expected_weights.safetensors")

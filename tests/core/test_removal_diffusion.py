@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from core.errors import EngineError, RunError
-from core.removal.inference.remover import diffusion
+from core.removal.inference import diffusion
 from core.system.progress import Progress
 
 HERE = all(importlib.util.find_spec(name) for name in ("diffusers", "transformers", "peft"))
@@ -65,24 +65,25 @@ def pairs() -> list[tuple[np.ndarray, np.ndarray]]:
 def test_what_is_trained_and_what_keeps_its_bits(base: Path) -> None:
     model = diffusion.DiffusionRemoval(base)
     frozen = {name: value.clone() for name, value in model.named_parameters() if not value.requires_grad}
-    names = model.trained().keys()
+    names = model.trained_tensors().keys()
     assert any("unet" in name and "lora_A" in name for name in names)
     assert any("vae.encoder" in name and "lora" in name for name in names)
     assert any("vae.decoder" in name and "lora" in name for name in names)
     assert sum(name.startswith("skips") for name in names) == 4
     assert all("lora" in name or name.startswith("skips") or "decoder.conv_out" in name for name in names)
     trainer = diffusion.DiffusionTrainer(model)
-    before = {name: value.clone() for name, value in model.trained().items()}
+    before = {name: value.clone() for name, value in model.trained_tensors().items()}
     for frame, scene in pairs():
         trainer.step(frame, scene)
     assert all(torch.equal(value, frozen[name]) for name, value in model.named_parameters() if name in frozen)
-    assert sum(not torch.equal(value, before[name]) for name, value in model.trained().items()) > len(before) / 2
+    changed = [name for name, value in model.trained_tensors().items() if not torch.equal(value, before[name])]
+    assert len(changed) > len(before) / 2
 
 
 @needs
 def test_a_handful_of_pairs_is_learned(base: Path) -> None:
     torch.manual_seed(0)
-    trainer = diffusion.DiffusionTrainer(diffusion.DiffusionRemoval(base), rate=5e-3)
+    trainer = diffusion.DiffusionTrainer(diffusion.DiffusionRemoval(base), learning_rate=5e-3)
     few = pairs()
     losses = [float(np.mean([trainer.step(*pair)["loss"] for pair in few])) for _ in range(150)]
     assert min(losses[-10:]) < 0.1 * losses[0]
@@ -99,7 +100,7 @@ def test_lora_files_load_back(base: Path, tmp_path: Path) -> None:
     model = diffusion.DiffusionRemoval(base)
     path = diffusion.train_diffusion(model, tmp_path, draw, 3, Progress())
     frame = torch.rand(1, 3, 32, 40)
-    again = diffusion.DiffusionRemoval(base, diffusion.rank_of(path))
+    again = diffusion.DiffusionRemoval(base, diffusion.read_rank(path))
     assert not torch.equal(again.eval()(frame), model.eval()(frame))
     again.load(path)
     assert torch.equal(again(frame), model(frame))
@@ -107,7 +108,7 @@ def test_lora_files_load_back(base: Path, tmp_path: Path) -> None:
         diffusion.train_diffusion(model, tmp_path, draw, 5, Progress())
     diffusion.train_diffusion(again, tmp_path, draw, 5, Progress(), resume=True)
     assert drawn == [0, 1, 2, 3, 4]
-    added = diffusion.DiffusionRemover(base, path).told(pairs()[0][0]).added
+    added = diffusion.DiffusionRemover(base, path).predict(pairs()[0][0]).flare
     assert added.shape == (32, 32, 3)
     assert added.min() >= 0
     with pytest.raises(RunError, match="not trained on this base"):
@@ -123,4 +124,4 @@ def test_a_base_that_is_none(tmp_path: Path) -> None:
 def test_without_the_packages(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(importlib.util, "find_spec", lambda _name: None)
     with pytest.raises(EngineError, match="needs diffusers, transformers, peft"):
-        diffusion.need()
+        diffusion.check_packages()

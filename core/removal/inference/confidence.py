@@ -1,11 +1,14 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Whether what a network tells over a frame is a flare, or what lies in the frame, or how it is graded.
+"""Confidence that a predicted flare is a flare, not a part of the scene or of its grade.
 
-A flare is one in every view of a frame (`views`); what is taken for one in some alone seldom is. It is brightest near
-its light and falls off from there; snow, haze and white walls, which are taken for one, are as even or as patchy as
-they are in the scene. Pictures printed or graded so that black is grey look much as veiled ones do, but a grade lifts
-display values and a veil adds light: so the frame is graded back, black to black, and the network asked again. Of a
-lifted black it then tells nothing, of most flares, which are not even, what it told before.
+A logistic regression on five features of the prediction. A flare is predicted under every test-time augmentation; a
+scene that resembles one often only under some. A flare is brightest near its light and falls off from there; snow,
+haze and white walls are as even or as patchy as they are in the scene. A grade that lifts black to grey looks much like
+a veil, but a grade lifts display values where a veil adds light. So the frame's black point is stretched back to 0 and
+the network runs again: for a lifted black it then predicts nothing, for most flares the same as before, since they are
+not even.
+
+`test_time_augmentation` computes the features, `temporal` combines those of neighbouring frames.
 """
 from __future__ import annotations
 
@@ -14,65 +17,83 @@ from typing import NamedTuple
 import numpy as np
 
 from ...colour.srgb import Pixels
-from ..model.image_formation import flare_light
-from . import optical_flow
+from ..model.image_formation import flare_to_linear
+from .filters import downsample
 
-ASKED = 0.0005
-"""Mean over the frame of what is told, from which on it is asked whether it is a flare; less counts for none."""
-BLACK = 0.002
-"""Share of a frame that is darker than its black."""
-NOTHING = 0.02
-"""Part of what is told that has to be told again to count for something."""
-AGREED = 0.05
-"""Part of what is told by which views are apart that agree."""
-PATCH = 8
-"""How many patches the long side of a frame has: what is narrower than one is patchy."""
-WEIGHTS, CONSTANT = (0.6, 0.6, -2.0, 0.9, -2.0), 0.5
-"""By how much each of the `Signs` raises the log odds of a flare, in their order, and those without any; those of a
-logistic regression (`benchmarks/removal.py odds`, and clean photographs besides), rounded."""
-BELIEVED = (-0.25, 0.25)
-"""Log odds of a flare up to which nothing is believed, and from which on all."""
+MIN_MEAN = 0.0005
+"""Mean of a predicted flare (display values) from which on its confidence is computed; fainter ones are gated anyway.
+"""
+BLACK_QUANTILE = 0.002
+"""Quantile of a channel that is stretched to 0."""
+REGRADED_FLOOR = 0.02
+"""Added to the regraded ratio before the logarithm."""
+DISAGREEMENT_FLOOR = 0.05
+"""Added to the disagreement before the logarithm."""
+LIGHT_FLOOR = 0.002
+"""Added to the mean linear light before the logarithm."""
+PATCHES_PER_SIDE = 8
+"""Patches along the long side of a frame; detail narrower than one patch is fine."""
+FEATURE_WEIGHTS, BIAS = (0.6, 0.6, -2.0, 0.9, -2.0), 0.5
+"""Weights of the `FlareFeatures` in their order, and the bias, of the log odds of a flare; rounded."""
+LOG_ODDS_RAMP = (-0.25, 0.25)
+"""Log odds at which the confidence is 0 and 1; linear in between."""
 
 
-class Signs(NamedTuple):
-    """By what a flare is known: the logarithms of how much of what is told is told again of the frame graded back, as a
-    part, of its mean light over the frame, of how far the views are apart, as a part of what they tell, and of how many
-    times its mean its brightest place is; and how much of it is narrower than a patch, as a part."""
+class FlareFeatures(NamedTuple):
+    """Five features of a predicted flare.
 
-    again: float
+    regraded_ratio: log of (mean prediction for the frame with its black point stretched / mean prediction).
+    light: log of the mean linear light.
+    disagreement: log of (standard deviation over test-time augmentations / mean).
+    peak: log of (maximum / mean).
+    fine_fraction: of the prediction that is narrower than one patch.
+    """
+
+    regraded_ratio: float
     light: float
-    apart: float
+    disagreement: float
     peak: float
-    patchy: float
+    fine_fraction: float
 
     @property
     def log_odds(self) -> float:
-        """Of a flare against none."""
-        return float(np.dot(WEIGHTS, self) + CONSTANT)
+        """Log odds that the prediction is a flare."""
+        return float(np.dot(FEATURE_WEIGHTS, self) + BIAS)
 
 
-def signs(display: Pixels, told: Pixels, apart: Pixels, again: Pixels) -> Signs:
-    """Of display values 0..1, what views tell over them in the mean, how far they are apart from that (standard
-    deviation), and what is told over them `graded_back`, each (h, w, 3)."""
+def extract_features(display: Pixels, mean_prediction: Pixels, deviation: Pixels,
+                     regraded_prediction: Pixels) -> FlareFeatures:
+    """Compute the features of a prediction, all arguments (h, w, 3).
+
+    display: the frame, display values 0..1. mean_prediction, deviation: mean and standard deviation of the predicted
+    flare over test-time augmentations. regraded_prediction: the flare predicted for `stretch_black_point(display)`.
+    """
     import cv2
 
-    mean = max(float(told.mean()), 1e-9)
-    coarse = optical_flow.coarser(told.mean(-1))
-    patch = max(coarse.shape) // PATCH | 1
+    mean = max(float(mean_prediction.mean()), 1e-9)
+    coarse = downsample(mean_prediction.mean(-1))
+    patch = max(coarse.shape) // PATCHES_PER_SIDE | 1
     broad = cv2.morphologyEx(coarse, cv2.MORPH_OPEN, np.ones((patch, patch), np.uint8))
-    return Signs(again=float(np.log(again.mean() / mean + NOTHING)),
-                 light=float(np.log(flare_light(display, told).mean() + 0.002)),
-                 apart=float(np.log(apart.mean() / mean + AGREED)),
-                 peak=float(np.log(max(coarse.max(), 1e-9) / mean)),
-                 patchy=1 - float(broad.mean()) / mean)
+    return FlareFeatures(
+        regraded_ratio=float(np.log(regraded_prediction.mean() / mean + REGRADED_FLOOR)),
+        light=float(np.log(flare_to_linear(display, mean_prediction).mean() + LIGHT_FLOOR)),
+        disagreement=float(np.log(deviation.mean() / mean + DISAGREEMENT_FLOOR)),
+        peak=float(np.log(max(coarse.max(), 1e-9) / mean)),
+        fine_fraction=1 - float(broad.mean()) / mean)
 
 
-def graded_back(display: Pixels) -> Pixels:
-    """Display values 0..1 (h, w, 3) with the black of each channel at none."""
-    black = np.quantile(display.reshape(-1, 3), BLACK, axis=0).astype(np.float32)
+def stretch_black_point(display: Pixels) -> Pixels:
+    """Stretch display values 0..1 (h, w, 3) so that the black of each channel is 0."""
+    black = np.quantile(display.reshape(-1, 3), BLACK_QUANTILE, axis=0).astype(np.float32)
     return np.asarray(np.clip((display - black) / np.maximum(1 - black, 0.1), 0, 1), np.float32)
 
 
-def worth(log_odds: float) -> np.float32:
-    """The part of what is told that is believed, 0..1."""
-    return np.float32(np.interp(log_odds, BELIEVED, (0, 1)))
+def confidence_from_log_odds(log_odds: float) -> np.float32:
+    """Return the confidence, 0..1."""
+    return np.float32(np.interp(log_odds, LOG_ODDS_RAMP, (0, 1)))
+
+
+def gate_by_mean(flare: Pixels, min_mean: float) -> Pixels:
+    """Scale a predicted flare by a gate that opens with its mean over the frame: 0 up to `min_mean`, 1 from twice that
+    on."""
+    return np.asarray(flare * np.clip((flare.mean() - min_mean) / max(min_mean, 1e-9), 0, 1), np.float32)

@@ -1,14 +1,15 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The method's own removal: a latent diffusion model of one step (after Difix3D+ and img2img-turbo), fine-tuned.
+"""Removal by a fine-tuned one-step latent diffusion model (after Difix3D+ and img2img-turbo), the removal model of the
+method that `core.fit` implements.
 
-The frame's latents are taken for those of step 199 of the noise schedule and denoised once under a fixed
-prompt. What is trained: LoRA of rank 16 on the UNet and on the VAE's encoder and decoder, and 1x1
-convolutions that carry the encoder's features past the bottleneck to the decoder, so that detail survives,
-with the decoder's last convolution. Everything else keeps the bits of the base model.
+The latents of the frame are treated as those of step 199 of the noise schedule, and denoised once under a fixed prompt.
+Training changes LoRAs of rank 16 on the UNet and on the VAE's encoder and decoder, 1x1 skip convolutions from the
+encoder past the bottleneck to the decoder, which preserve detail, and the decoder's last convolution. All other weights
+stay those of the base model.
 
 The base is a folder in the layout of diffusers (vae/, unet/, text_encoder/, tokenizer/, scheduler/), such as
-SD-Turbo's, or its name in the local cache of Hugging Face; nothing is downloaded. diffusers, transformers
-and peft are optional.
+SD-Turbo's, or its name in the local cache of Hugging Face; nothing is downloaded. diffusers, transformers and peft are
+optional. `remove --model diffusion` and `train-removal --model diffusion` call this module.
 """
 from __future__ import annotations
 
@@ -25,65 +26,69 @@ from torch import Tensor, nn
 
 from ...colour.srgb import Pixels
 from ...errors import EngineError, RunError, SettingsError
-from ...system.folder_lock import held
+from ...system.folder_lock import folder_lock
 from ...system.progress import Progress
 from ..model import weights
-from .remover import WORKING_SIZE, Remover, described
-from .test_time_views import Views, told_once
+from .prediction import TtaPrediction, single_prediction
+from .remover import WORKING_SIZE, Remover, compute_cache_key
 
 PROMPT = "remove flares and keep the original image. High quality. Retain original colors"
-STEP = 199
+NOISE_STEP = 199
+"""Step of the noise schedule that a frame's latents are treated as."""
 RANK = 16
-RATE = 1e-4
+"""Rank of the LoRAs."""
+LEARNING_RATE = 1e-4
 ITERATIONS = 200_000
 SAVE_EVERY = 500  # iterations
-MULTIPLE = 8
+SIZE_MULTIPLE = 8
+"""Height and width of the model's input are multiples of this, pixels."""
 KIND = "fit-flare diffusion removal"
+"""Kind of the file, in its header."""
 
 _UNET_LAYERS = ["to_q", "to_k", "to_v", "to_out.0", "conv1", "conv2", "conv_shortcut", "conv_in", "conv_out",
                 "proj_in", "proj_out", "ff.net.0.proj", "ff.net.2", "downsamplers.0.conv", "upsamplers.0.conv"]
 _VAE_LAYERS = r".*(encoder|decoder)\..*(conv1|conv2|conv_shortcut|conv_in|to_q|to_k|to_v|to_out\.0|samplers\.0\.conv)$"
 
 
-def need() -> None:
-    """Raises EngineError, in one sentence, where the optional packages are absent."""
-    lacking = [name for name in ("diffusers", "transformers", "peft") if importlib.util.find_spec(name) is None]
-    if lacking:
-        raise EngineError(f"The diffusion model needs {', '.join(lacking)}, which this Python has not; install the "
+def check_packages() -> None:
+    """Raise EngineError where the optional packages are missing."""
+    missing = [name for name in ("diffusers", "transformers", "peft") if importlib.util.find_spec(name) is None]
+    if missing:
+        raise EngineError(f"The diffusion model needs {', '.join(missing)}, which this Python lacks; install the "
                           "group `diffusion` of pyproject.toml, or use the network that comes with the program.")
 
 
 class DiffusionRemoval(nn.Module):
-    """A base pipeline with what is trained on top of it; pictures are (n, 3, h, w), display values 0..1, sides
-    multiples of MULTIPLE."""
+    """The base model with its LoRAs and skip convolutions; frames are (n, 3, h, w), display values 0..1, h and w
+    multiples of SIZE_MULTIPLE."""
 
     unet: Any
     vae: Any
-    kept: Tensor
+    alpha_cumprod: Tensor
     prompt: Tensor
 
     def __init__(self, base: Path | str, rank: int = RANK) -> None:
-        """Raises EngineError without the packages, RunError where the base cannot be read."""
+        """Raises EngineError where packages are missing, RunError where the base cannot be read."""
         super().__init__()
-        need()
+        check_packages()
         from diffusers import AutoencoderKL, DDPMScheduler, UNet2DConditionModel
         from peft import LoraConfig
         from transformers import CLIPTextModel, CLIPTokenizer
 
-        where = str(base)
+        source = str(base)
         try:
-            tokenizer = CLIPTokenizer.from_pretrained(where, subfolder="tokenizer", local_files_only=True)
-            text = CLIPTextModel.from_pretrained(where, subfolder="text_encoder", local_files_only=True)
-            self.unet = UNet2DConditionModel.from_pretrained(where, subfolder="unet", local_files_only=True)
-            self.vae = AutoencoderKL.from_pretrained(where, subfolder="vae", local_files_only=True)
-            schedule = DDPMScheduler.from_pretrained(where, subfolder="scheduler", local_files_only=True)
+            tokenizer = CLIPTokenizer.from_pretrained(source, subfolder="tokenizer", local_files_only=True)
+            text = CLIPTextModel.from_pretrained(source, subfolder="text_encoder", local_files_only=True)
+            self.unet = UNet2DConditionModel.from_pretrained(source, subfolder="unet", local_files_only=True)
+            self.vae = AutoencoderKL.from_pretrained(source, subfolder="vae", local_files_only=True)
+            schedule = DDPMScheduler.from_pretrained(source, subfolder="scheduler", local_files_only=True)
         except (OSError, ValueError) as problem:
             raise RunError(f"{base} is no base model in the layout of diffusers, in a folder or in this machine's "
                            f"cache ({str(problem).splitlines()[0]:.200}); get one and name its folder with "
                            "--base.") from problem
         self.rank = rank
-        self.register_buffer("kept", schedule.alphas_cumprod[STEP].clone(), persistent=False)
-        self.register_buffer("prompt", _embedded(tokenizer, text), persistent=False)
+        self.register_buffer("alpha_cumprod", schedule.alphas_cumprod[NOISE_STEP].clone(), persistent=False)
+        self.register_buffer("prompt", _embed_prompt(tokenizer, text), persistent=False)
         self.requires_grad_(False)
         self.unet.add_adapter(LoraConfig(r=rank, lora_alpha=rank, init_lora_weights="gaussian",
                                          target_modules=_UNET_LAYERS))
@@ -93,23 +98,23 @@ class DiffusionRemoval(nn.Module):
         self.vae.decoder.conv_out.requires_grad_(True)
 
     def _new_skips(self) -> nn.ModuleList:
-        """1x1 convolutions from what enters each of the encoder's blocks to what enters the decoder's, from the
-        deepest; almost nothing at first."""
+        """Return 1x1 convolutions from the input of each block of the encoder to that of the decoder, deepest first;
+        almost zero at first."""
         encoder, decoder = self.vae.encoder, self.vae.decoder
-        entering = [block.resnets[0].in_channels for block in encoder.down_blocks][::-1]
-        wanted = [block.resnets[0].in_channels for block in decoder.up_blocks]
-        layers = nn.ModuleList(nn.Conv2d(a, b, 1, bias=False) for a, b in zip(entering, wanted, strict=True))
+        in_channels = [block.resnets[0].in_channels for block in encoder.down_blocks][::-1]
+        out_channels = [block.resnets[0].in_channels for block in decoder.up_blocks]
+        layers = nn.ModuleList(nn.Conv2d(a, b, 1, bias=False) for a, b in zip(in_channels, out_channels, strict=True))
         for layer in layers:
             nn.init.constant_(layer.get_parameter("weight"), 1e-5)
         return layers
 
     def forward(self, display: Tensor) -> Tensor:
-        """The pictures without flare, not clipped."""
+        """Return the frames without flare, not clipped."""
         latents, features = self._encode(display * 2 - 1)
         prompt = self.prompt.expand(len(display), -1, -1)
-        step = torch.full((len(display),), STEP, dtype=torch.long, device=display.device)
+        step = torch.full((len(display),), NOISE_STEP, dtype=torch.long, device=display.device)
         noise = self.unet(latents, step, encoder_hidden_states=prompt).sample
-        clean = (latents - (1 - self.kept).sqrt() * noise) / self.kept.sqrt()
+        clean = (latents - (1 - self.alpha_cumprod).sqrt() * noise) / self.alpha_cumprod.sqrt()
         return (self._decode(clean, features) + 1) / 2
 
     def _encode(self, x: Tensor) -> tuple[Tensor, list[Tensor]]:
@@ -132,59 +137,61 @@ class DiffusionRemoval(nn.Module):
             x = block(x + skip(feature))
         return decoder.conv_out(decoder.conv_act(decoder.conv_norm_out(x)))
 
-    def trained(self) -> dict[str, Tensor]:
-        """The tensors that training changes, by name."""
+    def trained_tensors(self) -> dict[str, Tensor]:
+        """Return the tensors that training changes, by name."""
         return {name: value.detach() for name, value in self.named_parameters() if value.requires_grad}
 
-    def save(self, path: Path | str, about: Mapping[str, str] | None = None) -> None:
-        """Write what was trained, which is of use with the same base alone."""
-        weights.write(path, {name: value.contiguous() for name, value in self.trained().items()},
-                      {"kind": KIND, "rank": str(self.rank), **(about or {})})
+    def save(self, path: Path | str, metadata: Mapping[str, str] | None = None) -> None:
+        """Write the trained tensors, for use with the same base model."""
+        weights.write(path, {name: value.contiguous() for name, value in self.trained_tensors().items()},
+                      {"kind": KIND, "rank": str(self.rank), **(metadata or {})})
 
     def load(self, path: Path | str) -> dict[str, str]:
-        """Read it again. Raises RunError where it is none, or belongs to another base."""
-        tensors, about = weights.read(path)
-        own = self.trained()
-        if about.get("kind") != KIND or tensors.keys() != own.keys() or any(
-                tensors[name].shape != own[name].shape for name in own):
+        """Read the file that `save` wrote, and return the text of its header. Raises RunError where it is another kind
+        of file, or belongs to another base model."""
+        tensors, metadata = weights.read(path)
+        trained = self.trained_tensors()
+        if metadata.get("kind") != KIND or tensors.keys() != trained.keys() or any(
+                tensors[name].shape != trained[name].shape for name in trained):
             raise RunError(f"{path} was not trained on this base model, or is no LoRA of train-removal --model "
                            "diffusion; use the base that it was trained on.")
         parameters = dict(self.named_parameters())
         with torch.no_grad():
             for name, value in tensors.items():
                 parameters[name].copy_(value)
-        return about
+        return metadata
 
 
-def rank_of(path: Path | str) -> int:
-    """Of the LoRA in a file that `DiffusionRemoval.save` wrote."""
+def read_rank(path: Path | str) -> int:
+    """Return the rank of the LoRAs in a file that `DiffusionRemoval.save` wrote."""
     return int(weights.read(path)[1].get("rank", RANK))
 
 
 @torch.no_grad()
-def _embedded(tokenizer: Any, text: Any) -> Tensor:
-    words = tokenizer(PROMPT, padding="max_length", max_length=tokenizer.model_max_length, truncation=True,
+def _embed_prompt(tokenizer: Any, text: Any) -> Tensor:
+    tokens = tokenizer(PROMPT, padding="max_length", max_length=tokenizer.model_max_length, truncation=True,
                       return_tensors="pt")
-    embedded: Tensor = text(words.input_ids)[0]
+    embedded: Tensor = text(tokens.input_ids)[0]
     return embedded
 
 
 class DiffusionTrainer:
-    """L2 + LPIPS, batch 1, AdamW at 1e-4, on the pairs that the network in the box is trained on."""
+    """Trains the model by L2 + LPIPS with batches of 1 and AdamW, on the same pairs as the removal network."""
 
-    def __init__(self, model: DiffusionRemoval, *, rate: float = RATE,
+    def __init__(self, model: DiffusionRemoval, *, learning_rate: float = LEARNING_RATE,
                  perceptual: Callable[[Tensor, Tensor], Tensor] | None = None) -> None:
         self.model, self._perceptual = model, perceptual
-        self.optimiser = torch.optim.AdamW([value for value in model.parameters() if value.requires_grad], rate)
+        self.optimiser = torch.optim.AdamW([value for value in model.parameters() if value.requires_grad],
+                                           learning_rate)
 
     def step(self, frame: Pixels, scene: Pixels) -> dict[str, float]:
-        """One iteration on a picture and its counterpart, display values (height, width, 3)."""
+        """Run one iteration and return its losses. frame, scene: with and without flare, display values (h, w, 3)."""
         device = next(self.model.parameters()).device
-        given, goal = (torch.from_numpy(np.ascontiguousarray(picture.transpose(2, 0, 1)))[None].to(device)
+        source, target = (torch.from_numpy(np.ascontiguousarray(picture.transpose(2, 0, 1)))[None].to(device)
                        for picture in (frame, scene))
-        told = self.model(given)
-        squared = F.mse_loss(told, goal)
-        loss = squared if self._perceptual is None else squared + self._perceptual(told, goal)
+        prediction = self.model(source)
+        squared = F.mse_loss(prediction, target)
+        loss = squared if self._perceptual is None else squared + self._perceptual(prediction, target)
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()
         self.optimiser.step()
@@ -192,37 +199,40 @@ class DiffusionTrainer:
 
 
 class DiffusionRemover(Remover):
-    """Takes flares from plates by the diffusion model: what its answer lacks of the frame is the flare."""
+    """Removes flares from plates with the diffusion model: the frame minus the model's output is the flare."""
 
-    sure = 0.0
+    min_mean_flare = 0.0
 
     def __init__(self, base: Path | str, lora: Path | str, *, working_size: int = WORKING_SIZE) -> None:
         """lora: the file that `DiffusionRemoval.save` wrote. Raises EngineError, RunError."""
         self.working_size, self.glow = working_size, "taken"
-        self.model = DiffusionRemoval(base, rank_of(lora))
+        self.model = DiffusionRemoval(base, read_rank(lora))
         self.model.load(lora)
         self.model.eval()
-        self.described = described("diffusion", lora, str(base), working_size)
+        self.cache_key = compute_cache_key("diffusion", lora, str(base), working_size)
 
     @torch.inference_mode()
-    def views(self, display: Pixels) -> Views:
-        """Of display values whose sides are multiples of MULTIPLE, which the model is shown once."""
+    def predict_with_tta(self, display: Pixels) -> TtaPrediction:
+        """Predict the flare of display values (h, w, 3), h and w multiples of SIZE_MULTIPLE, in one pass without
+        augmentation."""
         frame = torch.from_numpy(np.ascontiguousarray(display.transpose(2, 0, 1)))[None]
-        added = (frame - self.model(frame).clamp(0, 1)).clamp(min=0)
-        return told_once(np.ascontiguousarray(added[0].permute(1, 2, 0).numpy()))
+        flare = (frame - self.model(frame).clamp(0, 1)).clamp(min=0)
+        return single_prediction(np.ascontiguousarray(flare[0].permute(1, 2, 0).numpy()))
 
 
 def train_diffusion(model: DiffusionRemoval, folder: Path | str, draw: Callable[[int], tuple[Pixels, Pixels]],
                     iterations: int, progress: Progress, *, resume: bool = False,
                     perceptual: Callable[[Tensor, Tensor], Tensor] | None = None) -> Path:
-    """Train and write lora.safetensors, again and again; `draw` gives the pair of an iteration.
+    """Train the model and return the path of its weights, lora.safetensors in `folder`, which is saved every SAVE_EVERY
+    iterations.
 
-    Resuming starts the optimiser's moments anew. Raises RunError, SettingsError, Cancelled.
+    draw: returns the frame and the scene of an iteration. resume: continue the training in the folder; the moments of
+    the optimiser start at zero. Raises RunError, SettingsError, Cancelled.
     """
     if iterations < 1:
         raise SettingsError("A training needs at least one iteration.")
     folder = Path(folder)
-    with held(folder):
+    with folder_lock(folder):
         path, first = folder / "lora.safetensors", 0
         if path.exists():
             if not resume:
@@ -233,11 +243,11 @@ def train_diffusion(model: DiffusionRemoval, folder: Path | str, draw: Callable[
         done = first
         try:
             for number in range(first, iterations):
-                figures = trainer.step(*draw(number))
+                metrics = trainer.step(*draw(number))
                 done = number + 1
                 if done % SAVE_EVERY == 0:
                     model.save(path, {"iteration": str(done)})
-                progress.advance(1, **figures)
+                progress.advance(1, **metrics)
         finally:
             if done > first:
                 model.save(path, {"iteration": str(done)})

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Where a place of one frame is in another: dense optical flow, there and back.
+"""Dense optical flow between frames, warping along it, and how far it can be relied on.
 
-By dense inverse search (Kroeger et al. 2016, "Fast Optical Flow using Dense Inverse Search", OpenCV's DIS). A flow is
-worth as much as the one back agrees with it: where something hides a place they lead to other places (Sundaram et al.
-2010, "Dense Point Trajectories by GPU-accelerated Large Displacement Optical Flow").
+The flow is OpenCV's DIS (Kroeger et al. 2016, "Fast Optical Flow using Dense Inverse Search"). Its confidence is the
+forward-backward consistency: where something hides a place, the two flows lead to different places (Sundaram et al.
+2010, "Dense Point Trajectories by GPU-accelerated Large Displacement Optical Flow"). `neighbours` computes flows,
+`temporal` warps along them.
 """
 from __future__ import annotations
 
@@ -11,26 +12,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...colour.srgb import Pixels
+from .filters import DOWNSAMPLING, downsample
 
-COARSER = 2
-"""Pixels of a frame that are one of its flow, by side."""
-APART, APART_PER_PIXEL = 0.5, 0.02
-"""Pixels of the flow by which there and back are apart where a flow counts for e**-1, and how many more of them for
-each pixel of its length."""
+FB_TOLERANCE_PX, FB_TOLERANCE_PER_PX = 0.5, 0.02
+"""Forward-backward error, pixels of the flow, at which the confidence is 1 / e; and what is added to it for each pixel
+of the flow's length."""
 
 
-def grey(display: Pixels) -> NDArray[np.uint8]:
-    """8 bit codes (h, w) by which frames are followed, of display values 0..1 (h, w, 3)."""
+def to_grey_codes(display: Pixels) -> NDArray[np.uint8]:
+    """Convert display values 0..1 (h, w, 3) to the 8 bit codes (h, w) that the flow is computed on."""
     import cv2
 
     return np.asarray(cv2.cvtColor((np.clip(display, 0, 1) * 255).astype(np.uint8), cv2.COLOR_RGB2GRAY))
 
 
-def flow(here: NDArray[np.uint8], there: NDArray[np.uint8]) -> Pixels:
-    """(h / COARSER, w / COARSER, 2): how far right and down what `here` shows is `there`, in its own pixels.
+def compute_flow(source: NDArray[np.uint8], target: NDArray[np.uint8]) -> Pixels:
+    """Return the flow from a frame to another, (h / DOWNSAMPLING, w / DOWNSAMPLING, 2): x and y, in pixels of the flow.
 
-    By one thread, since the search goes from place to place within what a thread is given: by several it would find
-    others on another machine.
+    One thread computes it: the search propagates within the part of the frame that a thread gets, so that with several
+    threads the result would depend on their number.
     """
     import cv2
 
@@ -38,38 +38,32 @@ def flow(here: NDArray[np.uint8], there: NDArray[np.uint8]) -> Pixels:
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:
-        found = np.asarray(search.calc(here, there, None), np.float32)  # type: ignore[call-overload]
+        flow = np.asarray(search.calc(source, target, None), np.float32)  # type: ignore[call-overload]
     finally:
         cv2.setNumThreads(threads)
-    return coarser(found) / COARSER
+    return downsample(flow) / DOWNSAMPLING
 
 
-def coarser(values: Pixels) -> Pixels:
-    """Means of squares of COARSER pixels."""
+def warp(values: Pixels, flow: Pixels) -> Pixels:
+    """Resample `values` (h, w, c) of the target frame to the source frame along the flow to it (h, w, 2); beyond its
+    edges the values at the edge."""
     import cv2
 
-    height, width = values.shape[:2]
-    return np.asarray(cv2.resize(values, (width // COARSER, height // COARSER), interpolation=cv2.INTER_AREA))
-
-
-def brought(values: Pixels, there: Pixels) -> Pixels:
-    """`values` (h, w, c) of the other frame, laid where this one shows the same; beyond its edges, those at them."""
-    import cv2
-
-    x, y = _places(there)
+    x, y = _target_coordinates(flow)
     return np.asarray(cv2.remap(values, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.float32)
 
 
-def followed(there: Pixels, back: Pixels) -> Pixels:
-    """0..1 (h, w): how far the flow to another frame can be relied on, by the one back; 0 where it leads out of it."""
-    height, width = there.shape[:2]
-    x, y = _places(there)
-    apart = np.linalg.norm(there + brought(back, there), axis=-1)
-    allowed = APART + APART_PER_PIXEL * np.linalg.norm(there, axis=-1)
+def forward_backward_confidence(flow_forward: Pixels, flow_backward: Pixels) -> Pixels:
+    """Return the confidence in the flow to another frame by its consistency with the flow back, 0..1, (h, w); 0 where
+    it leads out of that frame."""
+    height, width = flow_forward.shape[:2]
+    x, y = _target_coordinates(flow_forward)
+    error = np.linalg.norm(flow_forward + warp(flow_backward, flow_forward), axis=-1)
+    tolerance = FB_TOLERANCE_PX + FB_TOLERANCE_PER_PX * np.linalg.norm(flow_forward, axis=-1)
     inside = (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
-    return np.asarray(inside * np.exp(-np.square(apart / allowed)), np.float32)
+    return np.asarray(inside * np.exp(-np.square(error / tolerance)), np.float32)
 
 
-def _places(there: Pixels) -> tuple[Pixels, Pixels]:
-    y, x = np.mgrid[:there.shape[0], :there.shape[1]].astype(np.float32)
-    return x + there[..., 0], y + there[..., 1]
+def _target_coordinates(flow: Pixels) -> tuple[Pixels, Pixels]:
+    y, x = np.mgrid[:flow.shape[0], :flow.shape[1]].astype(np.float32)
+    return x + flow[..., 0], y + flow[..., 1]

@@ -1,18 +1,20 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What is told of a frame of a shot, put right by the frames about it, which show the same scene.
+"""Temporal filter: corrects the prediction for a frame with those for neighbouring frames of its shot.
 
-A flare moves as nothing in the scene does: what it covers in one frame lies bare in another. So every place is followed
-to where it is in the frames about it (`motion`), and the scene's colour there is taken to be the median of what their
-clean frames have, at one exposure, each weighted by how far the flow can be relied on and by how little had to be taken
-away: where hardly any flare is told, the scene was seen. A network that sees each frame by itself tells a little more
-now and a little less then; what it missed, or took too much, is put right by those that saw better, and the clean
-plates do not breathe. Only what is smooth is put right, since a frame's detail is its own, and by no more than was told
-about there: where there is no flare, a lamp that comes on changes nothing. What is not found again stays as it was
-told.
+A flare moves as nothing in the scene does: what it covers in one frame is visible in another. So each place is followed
+by optical flow into the neighbouring frames. The scene there is estimated as the weighted median of the clean frames,
+at one exposure; weights are the confidence of the flow and the absence of flare, since where hardly any flare is
+predicted the scene was seen. The difference to the frame's own clean estimate is the residual flare, which is added to
+the prediction. That makes the clean frames steady, too: a network that sees single frames predicts a little more in one
+and a little less in the next.
 
-Whether the network is believed (`odds`) is one for the frames about a place in a shot, too: where most of them plainly
-have a flare, it does not go out on the others. Which frames are of one shot, their details say (`of_one_shot`);
-`sequences` finds them among files.
+Only the smooth part of the residual is used, since a frame has detail of its own, and its magnitude is bounded by the
+flare predicted about a place: where there is no flare, a light that turns on changes nothing. Places that no
+neighbouring frame shows keep the prediction.
+
+The confidence (`confidence`) is that of the shot: a flare that is plain in most frames does not vanish in the others.
+Frames belong to one shot by their detail (`shot_similarity`). `neighbours` finds them among the files and calls
+`filter_in_time`.
 """
 from __future__ import annotations
 
@@ -24,157 +26,153 @@ from numpy.typing import NDArray
 
 from ...colour.srgb import Pixels
 from . import optical_flow
-from .remover import CLIPPED, Told
-from .test_time_views import Views, believed, worth_of
+from .filters import blur, downsample, upsample
+from .plate_light import CLIPPING_LEVEL
+from .prediction import FlarePrediction, TtaPrediction
+from .test_time_augmentation import merge_flare, shot_confidence
 
-FAINT = 0.03
-"""What a flare adds to display values where a frame counts half of what it counts where there is none."""
-SMOOTH, WITHIN = 2.5, 4.0
-"""Pixels of the flow: standard deviations of the blurs of what is put right, and of what was told about there, by which
-it is bounded."""
-DETAIL = 0.7
-"""Pixels of the flow: that finer than which the scene is not compared."""
-WITNESSES, HARDLY_FOUND = 2.0, 0.1
-"""Frames that a place has to be found again in for all of what they say to be put right; with fewer, less. Part of
-those below which what is put right fades, where none of the places about it is found."""
-BLACK, BARE = 0.05, 0.02
-"""Display value from which on frames' exposures are compared, and the part of a frame that has to be without flare for
-that."""
-BLUR, COARSE, STEP = 0.01, 0.08, 4
-"""Of the long side, deviations of the blurs between which what counts as detail lies; pixels from one that is looked at
-to the next."""
-ANOTHER_SHOT, SAME_SHOT = 0.2, 0.4
-"""Correlation of two frames' detail up to which they do not count for each other, and from which on they do: of 120
-pairs of unrelated photographs it is 0.22 at most, of frames that follow each other 0.3 at least."""
-NO_DETAIL = 1e-6
-"""Mean square of detail that is none: that of a quarter of an 8 bit code."""
+HALF_WEIGHT_FLARE = 0.03
+"""Predicted flare, in display values, at which a frame has half the weight that it has without flare."""
+RESIDUAL_SIGMA, BOUND_SIGMA = 2.5, 4.0
+"""Standard deviations of the blurs of the residual and of the flare that bounds it, pixels of the flow."""
+SCENE_SIGMA = 0.7
+"""Standard deviation of the blur that the scene is compared after, pixels of the flow."""
+FULL_SUPPORT, SUPPORT_FLOOR = 2.0, 0.1
+"""Sum of flow confidences over the neighbouring frames from which on the residual counts fully; and the support below
+which the blurred residual fades out."""
+MIN_EXPOSURE_LEVEL, MIN_EXPOSURE_AREA = 0.05, 0.02
+"""Least display value of pixels that the exposures of two frames are compared by, and the least share of the frame that
+these need to be."""
+FINE_SIGMA, COARSE_SIGMA, DETAIL_STRIDE = 0.01, 0.08, 4
+"""The detail of a frame is a difference of Gaussians: their standard deviations relative to the long side, and the
+stride in pixels that it is sampled with."""
+SIMILARITY_RAMP = (0.2, 0.4)
+"""Correlation of the detail of two frames at which they are of different shots and of the same: of 120 pairs of
+unrelated photographs it is 0.22 at most, of consecutive frames 0.3 at least."""
+MIN_DETAIL_POWER = 1e-6
+"""Mean square of the detail of a frame without any: that of a quarter of an 8 bit code."""
 
 
-class Guide(NamedTuple):
-    """By what frames are compared: what the network is shown of one, the same as it is followed (`motion.grey`), and
-    its detail."""
+class FrameFeatures(NamedTuple):
+    """What frames are compared and aligned by: the network's input (h, w, 3), its grey codes for the flow, and its
+    detail."""
 
     display: Pixels
     grey: NDArray[np.uint8]
     detail: Pixels
 
 
-class Sighting(NamedTuple):
-    """A frame's guide, and what was told of it in its views."""
+class FramePrediction(NamedTuple):
+    """A frame's features, and the prediction for it alone."""
 
-    guide: Guide
-    views: Views
+    features: FrameFeatures
+    prediction: TtaPrediction
 
 
 class Neighbour(NamedTuple):
-    """A frame about another: how far it counts for it (`of_one_shot`), and the flow from that one to it and back."""
+    """A neighbouring frame: its weight 0..1 (`shot_similarity`), the flow from the filtered frame to it and back."""
 
-    sighting: Sighting
-    share: np.float32
-    there: Pixels
-    back: Pixels
-
-
-def guide(display: Pixels) -> Guide:
-    """Of what the network is shown of a frame."""
-    few = np.ascontiguousarray(_blurred(display, BLUR * max(display.shape[:2]))[::STEP, ::STEP])
-    return Guide(display, optical_flow.grey(display), few - _blurred(few, COARSE * max(display.shape[:2]) / STEP))
+    frame: FramePrediction
+    weight: np.float32
+    flow_forward: Pixels
+    flow_backward: Pixels
 
 
-def of_one_shot(one: Guide, other: Guide) -> np.float32:
-    """How far two frames count for each other, 0..1; not at all where their shapes differ."""
-    if one.display.shape != other.display.shape:
+def frame_features(display: Pixels) -> FrameFeatures:
+    """Compute the features of the network's input."""
+    long_side = max(display.shape[:2])
+    fine = np.ascontiguousarray(blur(display, FINE_SIGMA * long_side)[::DETAIL_STRIDE, ::DETAIL_STRIDE])
+    detail = fine - blur(fine, COARSE_SIGMA * long_side / DETAIL_STRIDE)
+    return FrameFeatures(display, optical_flow.to_grey_codes(display), detail)
+
+
+def shot_similarity(first: FrameFeatures, second: FrameFeatures) -> np.float32:
+    """Return how far two frames are of one shot, 0..1; 0 where their sizes differ."""
+    if first.display.shape != second.display.shape:
         return np.float32(0)
-    a, b = one.detail, other.detail
-    alike = ((a * b).mean() + NO_DETAIL) / (np.sqrt(np.square(a).mean() * np.square(b).mean()) + NO_DETAIL)
-    return np.float32(np.clip((alike - ANOTHER_SHOT) / (SAME_SHOT - ANOTHER_SHOT), 0, 1))
+    a, b = first.detail, second.detail
+    correlation = (((a * b).mean() + MIN_DETAIL_POWER)
+                   / (np.sqrt(np.square(a).mean() * np.square(b).mean()) + MIN_DETAIL_POWER))
+    low, high = SIMILARITY_RAMP
+    return np.float32(np.clip((correlation - low) / (high - low), 0, 1))
 
 
-def steadied(here: Sighting, about: Sequence[Neighbour]) -> Told:
-    """What was told of `here`, put right by the frames about it."""
-    display = here.guide.display
-    worth = worth_of([(here.views, 1.0), *((other.sighting.views, float(other.share)) for other in about)])
-    added = np.minimum(believed(here.views), display)
-    if not about:
-        return Told(display, added, worth, here.views.glow)
-    own = _seen(here)
-    missed = _missed(own, [_found_again(own, other) for other in about])
-    added = np.clip(added + _finer(missed, display), 0, display)
-    return Told(display, added, worth, here.views.glow)
+def filter_in_time(frame: FramePrediction, neighbours: Sequence[Neighbour]) -> FlarePrediction:
+    """Return the prediction for a frame, corrected with those for its neighbours."""
+    display, prediction = frame.features.display, frame.prediction
+    confidence = shot_confidence([(prediction, 1.0), *((neighbour.frame.prediction, float(neighbour.weight))
+                                                       for neighbour in neighbours)])
+    flare = np.minimum(merge_flare(prediction), display)
+    if neighbours:
+        own = _clean_estimate(frame)
+        residual = _residual_flare(own, [_warped_neighbour(own, neighbour) for neighbour in neighbours])
+        flare = np.clip(flare + upsample(residual, display), 0, display)
+    return FlarePrediction(display, flare, confidence, prediction.glow_fraction)
 
 
-class _Seen(NamedTuple):
-    """Of a frame, at the flow's size: what is left of it without its flare and its detail (h, w, 3), the most that the
-    flare adds to a channel (h, w), and how far a place of it can be relied on to be the one that is looked at (h, w).
-    """
+class _CleanEstimate(NamedTuple):
+    """A frame at the size of the flow: the scene without flare and fine detail (h, w, 3), the greatest flare of a
+    channel (h, w), and the confidence that each pixel shows the same place as the filtered frame, 0..1 (h, w)."""
 
     scene: Pixels
-    told: Pixels
-    sure: Pixels
+    flare: Pixels
+    flow_confidence: Pixels
 
     @property
     def weights(self) -> Pixels:
-        """The less flare, the more of the scene was seen."""
-        return self.sure / (1 + np.square(self.told / np.float32(FAINT)))
+        """Weights in the median, (h, w): less where there is more flare."""
+        return self.flow_confidence / (1 + np.square(self.flare / np.float32(HALF_WEIGHT_FLARE)))
 
 
-def _seen(frame: Sighting) -> _Seen:
-    added = optical_flow.coarser(believed(frame.views))
-    scene = _blurred(optical_flow.coarser(frame.guide.display) - added, DETAIL)
-    told: Pixels = added.max(-1)
-    return _Seen(scene, told, np.ones_like(told))
+def _clean_estimate(frame: FramePrediction) -> _CleanEstimate:
+    flare = downsample(merge_flare(frame.prediction))
+    scene = blur(downsample(frame.features.display) - flare, SCENE_SIGMA)
+    greatest: Pixels = flare.max(-1)
+    return _CleanEstimate(scene, greatest, np.ones_like(greatest))
 
 
-def _found_again(own: _Seen, other: Neighbour) -> _Seen:
-    """Of a frame what it shows of the places of `own`, laid where those are, as bright as it is there."""
-    scene, told, _ = _seen(other.sighting)
-    laid = optical_flow.brought(np.dstack([scene, told]), other.there)
-    found = _Seen(laid[..., :3], laid[..., 3], other.share * optical_flow.followed(other.there, other.back))
-    return found._replace(scene=found.scene * _exposure(own, found))
+def _warped_neighbour(own: _CleanEstimate, neighbour: Neighbour) -> _CleanEstimate:
+    """Return the estimate of a neighbour, warped to the filtered frame and at its exposure."""
+    scene, flare, _ = _clean_estimate(neighbour.frame)
+    warped = optical_flow.warp(np.dstack([scene, flare]), neighbour.flow_forward)
+    flow_confidence = optical_flow.forward_backward_confidence(neighbour.flow_forward, neighbour.flow_backward)
+    estimate = _CleanEstimate(warped[..., :3], warped[..., 3], neighbour.weight * flow_confidence)
+    return estimate._replace(scene=estimate.scene * _exposure_ratio(own, estimate))
 
 
-def _exposure(own: _Seen, found: _Seen) -> np.float32:
-    """How many times as bright the one is as the other: the median over what both show without a flare, neither black
-    nor clipped. Else a camera that changes its exposure, or a fade, would pass for a flare."""
-    here, there = own.scene.mean(-1), found.scene.mean(-1)
-    both = np.minimum(here, there) > BLACK
-    both &= np.maximum(own.scene.max(-1), found.scene.max(-1)) < CLIPPED
-    both &= np.maximum(own.told, found.told) < FAINT
-    sure = found.sure[both]
-    if sure.sum() < BARE * both.size:
+def _exposure_ratio(own: _CleanEstimate, other: _CleanEstimate) -> np.float32:
+    """Return the exposure of a frame relative to another: the median over pixels that both show without flare, neither
+    black nor clipped.
+
+    Without it a camera that changes its exposure, or a fade, would pass for a flare. 1 where there are too few pixels.
+    """
+    own_level, other_level = own.scene.mean(-1), other.scene.mean(-1)
+    comparable = np.minimum(own_level, other_level) > MIN_EXPOSURE_LEVEL
+    comparable &= np.maximum(own.scene.max(-1), other.scene.max(-1)) < CLIPPING_LEVEL
+    comparable &= np.maximum(own.flare, other.flare) < HALF_WEIGHT_FLARE
+    weights = other.flow_confidence[comparable]
+    if weights.sum() < MIN_EXPOSURE_AREA * comparable.size:
         return np.float32(1)
-    return np.float32(_weighted_median(here[both] / there[both], sure))
+    return np.float32(_weighted_median(own_level[comparable] / other_level[comparable], weights))
 
 
-def _missed(own: _Seen, found: Sequence[_Seen]) -> Pixels:
-    """What there is more of a flare than was told of `own` (h, w, 3), by what was found of its places elsewhere; below
-    0 where too much was told."""
-    seen = [own, *found]
-    scene = _weighted_median(np.stack([one.scene for one in seen]), np.stack([one.weights for one in seen])[..., None])
-    sure = np.minimum(np.sum([one.sure for one in found], 0) / np.float32(WITNESSES), 1)
-    smooth = _blurred((own.scene - scene) * sure[..., None], SMOOTH)
-    smooth /= (_blurred(sure, SMOOTH) + np.float32(HARDLY_FOUND))[..., None]
-    bound = _blurred(np.max([own.told, *(one.sure * one.told for one in found)], 0), WITHIN)[..., None]
+def _residual_flare(own: _CleanEstimate, others: Sequence[_CleanEstimate]) -> Pixels:
+    """Return the flare that the prediction for a frame misses, (h, w, 3), by the warped neighbours; below 0 where it
+    is too great."""
+    estimates = [own, *others]
+    scene = _weighted_median(np.stack([estimate.scene for estimate in estimates]),
+                             np.stack([estimate.weights for estimate in estimates])[..., None])
+    support = np.minimum(np.sum([other.flow_confidence for other in others], 0) / np.float32(FULL_SUPPORT), 1)
+    smooth = blur((own.scene - scene) * support[..., None], RESIDUAL_SIGMA)
+    smooth /= (blur(support, RESIDUAL_SIGMA) + np.float32(SUPPORT_FLOOR))[..., None]
+    greatest = np.max([own.flare, *(other.flow_confidence * other.flare for other in others)], 0)
+    bound = blur(greatest, BOUND_SIGMA)[..., None]
     return np.clip(smooth, -bound, bound)
 
 
 def _weighted_median(values: Pixels, weights: Pixels) -> Pixels:
-    """Over the first axis; of a shape that the weights' broadcasts to."""
+    """Return the weighted median over the first axis; weights broadcast to the values."""
     order = np.argsort(values, 0)
     sums = np.cumsum(np.take_along_axis(np.broadcast_to(weights, values.shape), order, 0), 0)
     middle = (sums >= sums[-1:] / 2).argmax(0)[None]
     return np.take_along_axis(values, np.take_along_axis(order, middle, 0), 0)[0]
-
-
-def _blurred(values: Pixels, deviation: float) -> Pixels:
-    import cv2
-
-    return np.asarray(cv2.GaussianBlur(values, (0, 0), deviation), np.float32)
-
-
-def _finer(values: Pixels, display: Pixels) -> Pixels:
-    """Brought to a frame's size."""
-    import cv2
-
-    height, width = display.shape[:2]
-    return np.asarray(cv2.resize(values, (width, height), interpolation=cv2.INTER_LINEAR), np.float32)

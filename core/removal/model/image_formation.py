@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Image formation: how flare comes into a picture, and how much of the frame a flare covers.
+"""Image formation: how flare adds to a frame, and how much of the frame a flare covers.
 
-A flare adds in light. A plate in scene-linear light is I = S + F; a display picture is formed with a gamma
-between 1.8 and 2.2 (Yenamandra et al., "Lens Flare Removal"): I = (S^g + F^g)^(1/g), clipped as the camera
-clips. Layers here are linear light, float32 (height, width, 3), so that g enters where display pictures
-become light and where light becomes display.
+Flare adds in linear light: a scene-linear plate is I = S + F. A display picture is formed with a gamma between 1.8 and
+2.2 (Yenamandra et al., "Lens Flare Removal"): I = (S^g + F^g)^(1/g), clipped as the camera clips. Layers here are
+linear light, float32 (height, width, 3), so that g only enters between display values and light.
+
+`training.pairs` composes frames with it; `inference` converts predictions with it.
 """
 from __future__ import annotations
 
@@ -12,33 +13,38 @@ import numpy as np
 
 from ...colour.srgb import Pixels
 
-GAMMAS = (1.8, 2.2)
+GAMMA_RANGE = (1.8, 2.2)
+"""Least and greatest gamma that frames of a training are formed with."""
 GAMMA = 2
-"""Of the light that flares are taken from display values in: the middle of what pictures are formed with, and cheap."""
+"""Gamma at which inference converts display values to light: the middle of GAMMA_RANGE, and cheap."""
 
 
-def display(linear: Pixels, gamma: float) -> Pixels:
-    """Linear light as display values, clipped to 0..1."""
+def to_display(linear: Pixels, gamma: float) -> Pixels:
+    """Convert linear light to display values, clipped to 0..1."""
     return np.power(np.clip(linear, 0, 1), np.float32(1 / gamma)).astype(np.float32)
 
 
-def under_shoulder(scene: Pixels, flare: Pixels, bend: float) -> Pixels:
-    """Linear light as a camera develops it whose curve f(x) = (1 - exp(-bend x)) / bend bends towards white:
-    f(f^-1(scene) + flare), where `scene` is 0..1 as that camera shows it. A flare adds less where the scene is bright;
-    a bend of 1 is what compositors call screen."""
-    through = np.exp(-np.float32(bend) * flare)
-    return np.asarray(np.clip(scene, 0, 1) * through + (1 - through) / np.float32(bend), np.float32)
+def add_under_shoulder(scene: Pixels, flare: Pixels, strength: float) -> Pixels:
+    """Add a flare to a scene under a tone curve with a shoulder, f(x) = (1 - exp(-strength x)) / strength:
+    f(f^-1(scene) + flare), linear light.
+
+    scene: 0..1, after the curve. A flare adds less where the scene is bright; a strength of 1 is the compositing
+    operation "screen".
+    """
+    transmitted = np.exp(-np.float32(strength) * flare)
+    return np.asarray(np.clip(scene, 0, 1) * transmitted + (1 - transmitted) / np.float32(strength), np.float32)
 
 
-def flare_light(display: Pixels, added: Pixels) -> Pixels:
-    """Linear flare (of GAMMA): what the frame's light has more than that of the clean display values."""
-    return np.asarray(display**GAMMA - np.maximum(display - added, 0) ** GAMMA, np.float32)
+def flare_to_linear(display: Pixels, flare: Pixels) -> Pixels:
+    """Return the linear flare (by GAMMA) that accounts for what a flare adds to display values: the frame's light minus
+    the clean frame's."""
+    return np.asarray(display**GAMMA - np.maximum(display - flare, 0) ** GAMMA, np.float32)
 
 
-def coverage(flare: Pixels, share: float = 0.9) -> float:
-    """Fraction of the frame that holds `share` of a flare layer's energy; 0 for an empty layer."""
+def coverage(flare: Pixels, energy_share: float = 0.9) -> float:
+    """Return the smallest fraction of the frame that holds this share of a flare's energy; 0 for an empty layer."""
     energy = np.sort(np.asarray(flare, np.float64).sum(-1).ravel())[::-1]
     total = float(energy.sum())
     if total <= 0:
         return 0.0
-    return float(np.searchsorted(np.cumsum(energy), share * total) + 1) / energy.size
+    return float(np.searchsorted(np.cumsum(energy), energy_share * total) + 1) / energy.size

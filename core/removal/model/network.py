@@ -1,15 +1,17 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The network in the box: tells the flare of a frame from the whole frame.
+"""The removal network: predicts the flare of a frame from the whole frame.
 
-A U-Net of residual blocks. A flare is known by what it does over long ways: a veil lifts the darkest values of
-the whole frame, and ghosts lie on the line from a light through the principal point. So it is given, beside the
-frame, on every level the means, the darkest values and the over-exposure of what a place covers, the same turned
-by 180 degrees about the middle, where a light's mirrored ghosts fall, and where on the frame the place is; and on
-the two coarsest levels every place attends to every other, after every second of the first blocks and in the end.
+A U-Net of residual blocks. A flare has long-range structure: a veil lifts the darkest values of the whole frame, and
+ghosts lie on the line from a light through the principal point. So every level gets, beside the features of the level
+above, the mean, the minimum and the over-exposure of the pixels under each position; the same rotated by 180 degrees
+about the centre, where the mirrored ghosts of a light fall; and the position itself. On the two coarsest levels every
+position attends to every other, after every second of the first residual blocks and after the last.
 
-It tells what the flare adds to the frame's display values, of which `gentle` is the part that is not the glow
-round the lights. The clean picture is the frame less that, and the flare the difference of the two in light:
-what the network does not call flare, the source of light among it, is the frame's own.
+The network predicts what the flare adds to the frame's display values, and how much of that is not glow about the
+lights. The clean frame is the frame minus the prediction, and the flare is their difference in linear light. What the
+network does not predict as flare, such as the light disc, stays in the frame.
+
+`weights` reads and builds it, `inference.remover` runs it on a frame, `training.trainer` trains it.
 """
 from __future__ import annotations
 
@@ -21,170 +23,178 @@ import torch
 import torch.nn.functional as F  # noqa: N812 - its name everywhere
 from torch import Tensor, nn
 
-CELL = 2
-"""Pixels a side of what the finest level sees as one place."""
+SHUFFLE_FACTOR = 2
+"""Pixels a side of a position of the finest level (pixel unshuffle)."""
 LEVELS = 5
-MULTIPLE = CELL * 2 ** (LEVELS - 1)
-"""Height and width that the network takes are multiples of this."""
+SIZE_MULTIPLE = SHUFFLE_FACTOR * 2 ** (LEVELS - 1)
+"""The network's input has a height and a width that are multiples of this, in pixels."""
 
 
-class Prediction(NamedTuple):
-    """(n, 3, h, w) what the flare adds to display values, and the same without the glow round the lights.
+class NetworkOutput(NamedTuple):
+    """What the flare adds to display values, and the same without the glow about the lights, each (n, 3, h, w).
 
-    Below 0 where the network is in doubt the other way; who uses it counts that as none.
+    Unclamped: values below 0 count as no flare.
     """
 
     flare: Tensor
-    gentle: Tensor
+    flare_without_glow: Tensor
 
 
-def seen(display: Tensor) -> list[Tensor]:
-    """What each level is shown of whole frames (n, 3, h, w) of display values 0..1, the principal point in the
-    middle; h and w multiples of MULTIPLE. The finest, at h / CELL, the frame's own pixels; every one its means,
-    darkest values and over-exposure, the same turned, and the place."""
-    over = ((display.amin(1, keepdim=True) - 0.9) * 10).clamp(0, 1)
-    mean, dark, bright = torch.cat([display, over], 1), display, over
-    shown = []
+def pyramid_inputs(display: Tensor) -> list[Tensor]:
+    """Return the input of each level, finest first, (n, INPUT_CHANNELS, h / side, w / side); the finest has the pixels
+    of the frame besides (pixel unshuffle).
+
+    display: whole frames (n, 3, h, w), values 0..1, principal point in the centre; h and w multiples of SIZE_MULTIPLE.
+    """
+    exposure = ((display.amin(1, keepdim=True) - 0.9) * 10).clamp(0, 1)
+    mean, minimum, over_exposure = torch.cat([display, exposure], 1), display, exposure
+    inputs = []
     for level in range(LEVELS):
-        side = CELL if level == 0 else 2
-        mean, dark = F.avg_pool2d(mean, side), -F.max_pool2d(-dark, side)
-        bright = F.max_pool2d(bright, side)
-        here = torch.cat([mean, dark, bright], 1)
-        n, _, height, width = here.shape
-        shown.append(torch.cat([here, torch.flip(here, (2, 3)),
-                                _place(display, height, width).expand(n, 3, height, width)], 1))
-    shown[0] = torch.cat([F.pixel_unshuffle(display, CELL), shown[0]], 1)
-    return shown
+        side = SHUFFLE_FACTOR if level == 0 else 2
+        mean, minimum = F.avg_pool2d(mean, side), -F.max_pool2d(-minimum, side)
+        over_exposure = F.max_pool2d(over_exposure, side)
+        pooled = torch.cat([mean, minimum, over_exposure], 1)
+        n, _, height, width = pooled.shape
+        inputs.append(torch.cat([pooled, torch.flip(pooled, (2, 3)),
+                                 _position_channels(display, height, width).expand(n, 3, height, width)], 1))
+    inputs[0] = torch.cat([F.pixel_unshuffle(display, SHUFFLE_FACTOR), inputs[0]], 1)
+    return inputs
 
 
-def _place(like: Tensor, height: int, width: int) -> Tensor:
-    """(3, height, width): x, y and their squares' sum, of which the corners have 1."""
-    half = (height**2 + width**2) ** 0.5 / 2
-    y = (torch.arange(height, dtype=like.dtype, device=like.device) + 0.5 - height / 2) / half
-    x = (torch.arange(width, dtype=like.dtype, device=like.device) + 0.5 - width / 2) / half
+def _position_channels(like: Tensor, height: int, width: int) -> Tensor:
+    """Return (3, height, width): x, y and x^2 + y^2, which is 1 at the corners."""
+    half_diagonal = (height**2 + width**2) ** 0.5 / 2
+    y = (torch.arange(height, dtype=like.dtype, device=like.device) + 0.5 - height / 2) / half_diagonal
+    x = (torch.arange(width, dtype=like.dtype, device=like.device) + 0.5 - width / 2) / half_diagonal
     x, y = torch.broadcast_tensors(x[None, :], y[:, None])
     return torch.stack([x, y, x * x + y * y])
 
 
-SHOWN = 2 * (4 + 3 + 1) + 3
-"""Planes of `seen` that every level has."""
+INPUT_CHANNELS = 2 * (4 + 3 + 1) + 3
+"""Channels of `pyramid_inputs` that every level has: mean of RGB and exposure, minimum of RGB and maximum of the
+exposure, the same rotated, and the position."""
 
 
-class Norm(nn.LayerNorm):
-    """LayerNorm over the planes of each place."""
+class ChannelNorm(nn.LayerNorm):
+    """LayerNorm over the channels of each position."""
 
     def forward(self, x: Tensor) -> Tensor:
         return super().forward(x.permute(0, 2, 3, 1)).permute(0, 3, 1, 2)
 
 
-class Block(nn.Module):
-    """x + what two convolutions make of it, which is nothing before training."""
+class ResidualBlock(nn.Module):
+    """Two 3 x 3 convolutions with a skip connection; the identity before training."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
-        self.norm = Norm(width)
-        self.first = nn.Conv2d(width, width, 3, padding=1)
-        self.second = nn.Conv2d(width, width, 3, padding=1)
-        nn.init.zeros_(self.second.weight)
-        nn.init.zeros_(self.second.bias)  # type: ignore[arg-type]
+        self.norm = ChannelNorm(width)
+        self.conv1 = nn.Conv2d(width, width, 3, padding=1)
+        self.conv2 = nn.Conv2d(width, width, 3, padding=1)
+        nn.init.zeros_(self.conv2.weight)
+        nn.init.zeros_(self.conv2.bias)  # type: ignore[arg-type]
 
     def forward(self, x: Tensor) -> Tensor:
-        return x + self.second(F.relu(self.first(self.norm(x))))
+        return x + self.conv2(F.relu(self.conv1(self.norm(x))))
 
 
-WAVES = 4
-"""Octaves of the waves by which layers of attention between blocks tell places from each other."""
+POSITION_OCTAVES = 4
+"""Octaves of the positional encoding of the attention layers between blocks."""
 
 
 class Attention(nn.Module):
-    """x + what each place takes from every other, by likeness and by where the two are.
+    """Multi-head self-attention over positions with a skip connection; the identity before training.
 
-    waves: octaves of sines and cosines of the place, without which only what changes slowly over the frame can be
-    asked of it: a ghost lies where it lies to within its width.
+    octaves: of sines and cosines of the position. Without them a query can select only what changes slowly over the
+    frame, and a ghost has to be located to within its width.
     """
 
-    def __init__(self, width: int, heads: int, waves: int = 0) -> None:
+    def __init__(self, width: int, heads: int, octaves: int = 0) -> None:
         super().__init__()
-        self.heads, self.waves = heads, waves
-        self.norm = Norm(width)
-        self.place = nn.Conv2d(5 + 4 * waves, width, 1)
-        self.asked = nn.Conv2d(width, 3 * width, 1)
-        self.told = nn.Conv2d(width, width, 1)
-        nn.init.zeros_(self.told.weight)
-        nn.init.zeros_(self.told.bias)  # type: ignore[arg-type]
+        self.heads, self.octaves = heads, octaves
+        self.norm = ChannelNorm(width)
+        self.pos_embed = nn.Conv2d(5 + 4 * octaves, width, 1)
+        self.qkv = nn.Conv2d(width, 3 * width, 1)
+        self.proj = nn.Conv2d(width, width, 1)
+        nn.init.zeros_(self.proj.weight)
+        nn.init.zeros_(self.proj.bias)  # type: ignore[arg-type]
 
     def forward(self, x: Tensor) -> Tensor:
         n, width, rows, columns = x.shape
-        place = _place(x, rows, columns)
-        told = [place, place[:2] / (place[2:].sqrt() + 0.1)]  # with the direction from the middle
-        for octave in range(self.waves):
-            phase = place[:2] * (math.pi * 2**octave)
-            told += [phase.sin(), phase.cos()]
-        place = torch.cat(told)[None]
-        parts = self.asked(self.norm(x) + self.place(place)).flatten(2)
-        query, key, value = parts.reshape(n, 3, self.heads, width // self.heads, rows * columns).mT.unbind(1)
-        return x + self.told(_attended(query, key, value).mT.reshape(n, width, rows, columns))
+        position = _position_channels(x, rows, columns)
+        encoding = [position, position[:2] / (position[2:].sqrt() + 0.1)]  # with the direction from the centre
+        for octave in range(self.octaves):
+            phase = position[:2] * (math.pi * 2**octave)
+            encoding += [phase.sin(), phase.cos()]
+        embedded = self.pos_embed(torch.cat(encoding)[None])
+        qkv = self.qkv(self.norm(x) + embedded).flatten(2)
+        query, key, value = qkv.reshape(n, 3, self.heads, width // self.heads, rows * columns).mT.unbind(1)
+        return x + self.proj(_attend(query, key, value).mT.reshape(n, width, rows, columns))
 
 
-WRITTEN_OUT = 1024
-"""Places up to which attention is written out on a processor, which then takes a third of the time of torch's own;
-beyond, the weights of all pairs would not fit memory."""
+MAX_EXPLICIT_POSITIONS = 1024
+"""Positions up to which attention is written out on a CPU, where that takes a third of the time of torch's own; for
+more, the weights of all pairs would not fit into memory."""
 
 
-def _attended(query: Tensor, key: Tensor, value: Tensor) -> Tensor:
-    """What each place takes from every other; all (n, heads, places, planes)."""
-    if query.device.type != "cpu" or query.shape[-2] > WRITTEN_OUT:
+def _attend(query: Tensor, key: Tensor, value: Tensor) -> Tensor:
+    """Return the scaled dot-product attention; all (n, heads, positions, channels)."""
+    if query.device.type != "cpu" or query.shape[-2] > MAX_EXPLICIT_POSITIONS:
         return F.scaled_dot_product_attention(query, key, value)
     return torch.softmax(query * query.shape[-1] ** -0.5 @ key.mT, -1) @ value
 
 
 class RemovalNetwork(nn.Module):
-    """widths: planes of each of the LEVELS levels, from the finest; the coarsest two are multiples of HEADS.
-    blocks: of each level on the way down; one each on the way up.
-    attention: layers of it between the blocks of the coarsest two, one after every second block, beside the one after
-    all of them."""
+    """The U-Net.
+
+    widths: channels of each of the LEVELS levels, from the finest; those of the coarsest two are multiples of HEADS.
+    blocks: residual blocks of each level of the encoder; the decoder has one for each level.
+    attention: attention layers between the blocks of the coarsest two levels, one after every second block; there is
+    one after the last block besides.
+    """
 
     HEADS = 4
 
     def __init__(self, widths: tuple[int, ...], blocks: tuple[int, ...], attention: tuple[int, ...]) -> None:
         super().__init__()
-        planes = (3 * CELL**2 + SHOWN, *(SHOWN for _ in widths[1:]))
-        self.see = nn.ModuleList(nn.Conv2d(a, b, 3, padding=1) for a, b in zip(planes, widths, strict=True))
+        channels = (3 * SHUFFLE_FACTOR**2 + INPUT_CHANNELS, *(INPUT_CHANNELS for _ in widths[1:]))
+        self.input_convs = nn.ModuleList(nn.Conv2d(a, b, 3, padding=1)
+                                         for a, b in zip(channels, widths, strict=True))
         self.down = nn.ModuleList(nn.Conv2d(a, b, 2, stride=2) for a, b in pairwise(widths))
         self.up = nn.ModuleList(nn.Conv2d(b, a, 1) for a, b in pairwise(widths))
-        self.enter = nn.ModuleList(nn.Sequential(*(Block(width) for _ in range(count)))
-                                   for width, count in zip(widths, blocks, strict=True))
-        self.leave = nn.ModuleList(Block(width) for width in widths)
-        self.between = nn.ModuleList(nn.ModuleList(Attention(width, self.HEADS, WAVES) for _ in range(count))
-                                     for width, count in zip(widths[-2:], attention, strict=True))
+        self.encoder = nn.ModuleList(nn.Sequential(*(ResidualBlock(width) for _ in range(count)))
+                                     for width, count in zip(widths, blocks, strict=True))
+        self.decoder = nn.ModuleList(ResidualBlock(width) for width in widths)
+        self.inner_attention = nn.ModuleList(
+            nn.ModuleList(Attention(width, self.HEADS, POSITION_OCTAVES) for _ in range(count))
+            for width, count in zip(widths[-2:], attention, strict=True))
         self.attention = nn.ModuleList(Attention(width, self.HEADS) for width in widths[-2:])
-        self.head = nn.Conv2d(widths[0], 6 * CELL**2, 1)
+        self.head = nn.Conv2d(widths[0], 6 * SHUFFLE_FACTOR**2, 1)
         nn.init.normal_(self.head.weight, std=1e-3)
         nn.init.zeros_(self.head.bias)  # type: ignore[arg-type]
 
-    def forward(self, display: Tensor) -> Prediction:
-        """display: whole frames (n, 3, h, w), values 0..1, the principal point in the middle; h and w multiples of
-        MULTIPLE."""
-        shown = [self.see[level](part) for level, part in enumerate(seen(display))]
-        x, kept = shown[0], []
+    def forward(self, display: Tensor) -> NetworkOutput:
+        """Predict the flare of whole frames (n, 3, h, w), display values 0..1, principal point in the centre; h and w
+        multiples of SIZE_MULTIPLE."""
+        features = [self.input_convs[level](part) for level, part in enumerate(pyramid_inputs(display))]
+        x, skips = features[0], []
         for level in range(LEVELS):
             if level:
-                kept.append(x)
-                x = self.down[level - 1](x) + shown[level]
-            x = self._entered(x, level)
+                skips.append(x)
+                x = self.down[level - 1](x) + features[level]
+            x = self._encode_level(x, level)
         for level in reversed(range(LEVELS)):
-            x = self.leave[level](x)
+            x = self.decoder[level](x)
             if level:
-                x = F.interpolate(self.up[level - 1](x), scale_factor=2, mode="nearest") + kept.pop()
-        out = F.pixel_shuffle(self.head(x), CELL).float()
-        return Prediction(out[:, :3], out[:, :3] * torch.sigmoid(out[:, 3:] * 4))
+                x = F.interpolate(self.up[level - 1](x), scale_factor=2, mode="nearest") + skips.pop()
+        out = F.pixel_shuffle(self.head(x), SHUFFLE_FACTOR).float()
+        return NetworkOutput(out[:, :3], out[:, :3] * torch.sigmoid(out[:, 3:] * 4))
 
-    def _entered(self, x: Tensor, level: int) -> Tensor:
-        """Through the blocks of a level on the way down, and what attention it has."""
+    def _encode_level(self, x: Tensor, level: int) -> Tensor:
+        """Apply the encoder's residual blocks of a level, and its attention layers."""
         coarse = level - (LEVELS - 2)
-        between = list(cast(nn.ModuleList, self.between[coarse])) if coarse >= 0 else []
-        for number, block in enumerate(cast(nn.Sequential, self.enter[level])):
+        inner = list(cast(nn.ModuleList, self.inner_attention[coarse])) if coarse >= 0 else []
+        for number, block in enumerate(cast(nn.Sequential, self.encoder[level])):
             x = block(x)
-            if number % 2 and number // 2 < len(between):
-                x = between[number // 2](x)
+            if number % 2 and number // 2 < len(inner):
+                x = inner[number // 2](x)
         return cast(Tensor, self.attention[coarse](x)) if coarse >= 0 else x

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Weights on disk: safetensors with their recipe in the header, and the network that comes of them."""
+"""Reads and writes weights of the removal network: safetensors with their recipe in the header.
+
+`training.run` writes them, `inference.remover` loads the network from them.
+"""
 from __future__ import annotations
 
 import json
@@ -11,59 +14,72 @@ from typing import NamedTuple
 from torch import Tensor
 
 from ...errors import RunError
-from ...system import tensor_files as on_disk
+from ...system import tensor_files
 from .network import RemovalNetwork
 
 IN_THE_BOX = Path(__file__).parents[1] / "box" / "removal.safetensors"
+"""The weights that come with the program."""
+
+RETIRED_NAMES = {"see": "input_convs", "enter": "encoder", "leave": "decoder", "between": "inner_attention",
+                 "first": "conv1", "second": "conv2", "place": "pos_embed", "asked": "qkv", "told": "proj",
+                 "begun": "initial"}
+"""Parts of tensor names in files of format 0, and their present names."""
 
 
-def write(path: Path | str, tensors: Mapping[str, Tensor], about: Mapping[str, str]) -> None:
-    """Tensors and text about them, whole or not at all."""
-    on_disk.write(path, tensors, about)
+def write(path: Path | str, tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> None:
+    """Write tensors, and text in the header, atomically."""
+    tensor_files.write(path, tensors, metadata)
 
 
 def read(path: Path | str) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """(tensors, what is said about them). Raises RunError where the file is missing or damaged."""
+    """Return the tensors under their present names, and the text of the header. Raises RunError where the file is
+    missing or damaged."""
     if not Path(path).is_file():
         raise RunError(f"{path} is missing; train it with train-removal, or install the program again.")
     try:
-        return on_disk.read(path)
+        tensors, metadata = tensor_files.read(path)
     except (OSError, ValueError) as problem:
         raise RunError(f"{path} is damaged ({problem}); get it again.") from problem
+    return {_present_name(name): value for name, value in tensors.items()}, metadata
 
 
-class Form(NamedTuple):
-    """What RemovalNetwork is made with."""
+def _present_name(name: str) -> str:
+    return ".".join(RETIRED_NAMES.get(part, part) for part in name.split("."))
+
+
+class Architecture(NamedTuple):
+    """The arguments of RemovalNetwork."""
 
     widths: tuple[int, ...]
     blocks: tuple[int, ...]
     attention: tuple[int, ...]
 
 
-def form(path: Path | str, about: Mapping[str, str]) -> Form:
-    """Of the recipe in the header of a file, the rest of which may be of an older program. Raises RunError."""
+def read_architecture(path: Path | str, metadata: Mapping[str, str]) -> Architecture:
+    """Return the architecture in the recipe of a file's header. It does not need the recipe's other settings, which may
+    be those of another version. Raises RunError."""
     try:
-        recipe = json.loads(about["recipe"])
-        # Recipes of before had none between blocks.
-        return Form(tuple(recipe["widths"]), tuple(recipe["blocks"]), tuple(recipe.get("attention", (0, 0))))
+        recipe = json.loads(metadata["recipe"])
+        # Without the setting a network has no attention between blocks.
+        return Architecture(tuple(recipe["widths"]), tuple(recipe["blocks"]), tuple(recipe.get("attention", (0, 0))))
     except (KeyError, ValueError, TypeError) as problem:
-        raise _foreign(path) from problem
+        raise _not_weights(path) from problem
 
 
-def _foreign(path: Path | str) -> RunError:
+def _not_weights(path: Path | str) -> RunError:
     return RunError(f"{path} holds no weights of the removal network; train it with train-removal.")
 
 
 @lru_cache(maxsize=2)
 def load(path: Path = IN_THE_BOX) -> RemovalNetwork:
-    """The network of a weights file, on the processor, ready to tell flares. Raises RunError."""
-    tensors, about = read(path)
+    """Load the network of a weights file on the CPU, in evaluation mode. Raises RunError."""
+    tensors, metadata = read(path)
     if not all(bool(value.isfinite().all()) for value in tensors.values()):
         raise RunError(f"{path} holds weights that are no finite numbers; get it again, or train it anew.")
-    made_with = form(path, about)
+    architecture = read_architecture(path, metadata)
     try:
-        network = RemovalNetwork(*made_with)
+        network = RemovalNetwork(*architecture)
         network.load_state_dict({name: value.float() for name, value in tensors.items()})
     except (RuntimeError, TypeError, ValueError) as problem:
-        raise _foreign(path) from problem
+        raise _not_weights(path) from problem
     return network.eval()

@@ -1,0 +1,98 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Upsamples a flare from the working size to the plate.
+
+A flare lies over the scene and does not follow its edges, so it is interpolated. Where the plate is clipped, though,
+only the visible part of the flare is predicted, and that ends where the clipping does: there a guided filter (He et al.
+2013, in the fast form of He and Sun 2015) follows the plate, flare = gain * plate + offset, with smooth gain and offset
+that are fitted at the working size and applied to the plate's own pixels.
+"""
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...colour.srgb import Pixels
+from ...images.picture import Encoding
+from .plate_light import CLIPPING_LEVEL, STRIP_ROWS, to_display, to_linear
+
+RADIUS, EPSILON = 1, 1e-3
+"""Of the guided filter: radius of its window at the working size, pixels, and regularisation."""
+MAX_GAIN = 4
+REMAP_COLUMNS = 16384
+"""Columns of a plate that are interpolated at a time; OpenCV counts coordinates in 16 bits."""
+
+
+@dataclass(frozen=True)
+class GuidedFilterMaps:
+    """A flare at the working size: flare = gain * display + offset, (h, w, 3) each."""
+
+    gain: Pixels
+    offset: Pixels
+
+    @property
+    def is_empty(self) -> bool:
+        """True if there is no flare at all."""
+        return not (self.gain.any() or self.offset.any())
+
+
+def fit_guided_filter(display: Pixels, flare: Pixels) -> GuidedFilterMaps:
+    """Fit the maps to a flare in linear light, both (h, w, 3) at the working size: the flare itself as the offset, but
+    about clipped pixels the guided filter, channel by channel.
+
+    Its maps are box means over a window, averaged over the windows about a pixel in which those with an edge weigh
+    more.
+    """
+    import cv2
+
+    if not flare.any():
+        return GuidedFilterMaps(np.zeros_like(flare), np.zeros_like(flare))
+    window = (2 * RADIUS + 1, 2 * RADIUS + 1)
+
+    def mean(values: Pixels) -> Pixels:
+        return np.asarray(cv2.blur(values, window, borderType=cv2.BORDER_REFLECT), np.float32)
+
+    reach = (4 * RADIUS + 1, 4 * RADIUS + 1)  # as far as a clipped pixel affects the two means
+    clipped = cv2.dilate((display.max(-1) > CLIPPING_LEVEL).astype(np.uint8), np.ones(reach, np.uint8))
+    guidance = mean(clipped.astype(np.float32))[..., None]
+    mean_display, mean_flare = mean(display), mean(flare)
+    covariance = mean(display * flare) - mean_display * mean_flare
+    variance = np.maximum(mean(display * display) - mean_display**2, 0)
+    gain = np.clip(covariance / (variance + np.float32(EPSILON)), -MAX_GAIN, MAX_GAIN)
+    # Running sums leave rounding errors where there is no flare at all.
+    near_flare = cv2.dilate((flare > 0).any(-1).astype(np.uint8), np.ones(window, np.uint8))[..., None]
+    offset = mean_flare - gain * mean_display
+    guidance = guidance * cv2.dilate(near_flare, np.ones(window, np.uint8))[..., None]
+    # Windows with an edge count: their fit holds on both of its sides.
+    weight = (variance + np.float32(EPSILON)) * near_flare
+    total = mean(variance + np.float32(EPSILON))
+    gain, offset = mean(gain * weight) / total, mean(offset * weight) / total
+    return GuidedFilterMaps(guidance * gain, guidance * offset + (1 - guidance) * flare)
+
+
+def upsample_flare(maps: GuidedFilterMaps, codes: NDArray[Any], encoding: Encoding,
+                   max_code: float) -> Iterator[tuple[slice, Pixels]]:
+    """Yield (rows, linear flare of those rows (n, width, 3)) for a plate's codes (height, width, 3), top to bottom."""
+    import cv2
+
+    height, width = codes.shape[:2]
+    map_height, map_width = maps.gain.shape[:2]
+    x = ((np.arange(width, dtype=np.float32) + 0.5) * (map_width / width) - 0.5)[None, :]
+    for first in range(0, height, STRIP_ROWS):
+        rows = slice(first, min(first + STRIP_ROWS, height))
+        y = ((np.arange(first, rows.stop, dtype=np.float32) + 0.5) * (map_height / height) - 0.5)[:, None]
+        low = max(int(y[0, 0]) - 2, 0)
+        high = min(int(y[-1, 0]) + 4, map_height)
+        map_x, map_y = np.broadcast_to(x, (len(y), width)), np.broadcast_to(y - low, (len(y), width))
+        gain, offset = (np.concatenate([
+            cv2.remap(np.ascontiguousarray(part[low:high]), np.ascontiguousarray(map_x[:, left:left + REMAP_COLUMNS]),
+                      np.ascontiguousarray(map_y[:, left:left + REMAP_COLUMNS]), cv2.INTER_LINEAR,
+                      borderMode=cv2.BORDER_REPLICATE) for left in range(0, width, REMAP_COLUMNS)], 1)
+            for part in (maps.gain, maps.offset))
+        light = to_linear(codes[rows], encoding, max_code)
+        display = codes[rows].astype(np.float32) / np.float32(max_code) if encoding == "srgb" else to_display(light)
+        flare = gain * display + offset
+        yield rows, np.minimum(np.maximum(flare, 0), np.maximum(light, 0))

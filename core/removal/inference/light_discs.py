@@ -1,0 +1,159 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Keeps the light discs of a scene, and part of the glow about them at night, when a flare is removed.
+
+A light disc clips, and so does the glow in front of it: nobody can tell how much of the clipped light is glow. A
+network that removes part of it turns lights grey, in photographs of streets at night most lights that are not the
+brightest. So a small region as bright as the sensor goes, which still has contrast to its surroundings when the flare
+is removed, counts as a light disc. What was removed from it is kept, the more the brighter the pixel was left: its
+centre entirely, little of its rim. A bright wall under a veil has little contrast, and a ghost disappears. Of some
+light discs nothing with contrast is left; but a glow about a white region comes from a light in its centre.
+
+At night no lens is so clean that a light has no glow, and the flare adds to that glow. One frame does not show which
+is which, and the network, whose training flares lie over lights without glow, removes both. So in dark scenes a part
+of the glow is kept near a light disc. Of streaks, starbursts and ghosts nothing is kept, and nothing in bright scenes,
+where a light exceeds the rest by less.
+
+`remover.Remover.linear_flare` calls `retained_fraction`.
+"""
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...colour.srgb import Pixels
+
+MIN_DISC_BRIGHTNESS = 0.9
+"""Least mean of the three display values of a pixel of a light disc."""
+RIM_RAMP = (0.8, 0.95)
+"""The same mean, as filmed, at which nothing and all of what belongs to a light disc is kept."""
+DISC_AREA_RAMP = (0.01, 0.02)
+"""Share of the frame up to which a bright region may be a light disc, and from which on it is none."""
+MIN_DISC_PIXELS = 3
+"""Least pixels of a light disc, at the working size."""
+CONTRAST_RAMP = (0.15, 0.3)
+"""Display value of a region above its surroundings, without the flare, at which it is no light disc and is one."""
+RIM_SIZE, SURROUND_SIZE = 3, 7
+"""Sides of the squares that a region is dilated by to its rim and to its surroundings, pixels."""
+BRIGHTNESS_EXPONENT = 4
+"""Power of a pixel's brightness, relative to the brightest of its light disc, by which it is kept."""
+SURROUND_GLOW_RAMP = (0.5, 0.8)
+"""Fraction of glow in the flare about a region at which that says nothing of a light disc, and at which there is one in
+its centre: the pixels at least half as far from the region's edge as its innermost."""
+OBSERVED_CONTRAST_RAMP = (0.05, 0.15)
+"""Display value of such a region above its surroundings, as filmed, at which it is no light disc and is one."""
+MAX_GLOW_KEPT, GLOW_FALLOFF = 0.5, 0.05
+"""Fraction of the glow that is kept at a light disc, and the distance, relative to the frame's long side, at which it
+has fallen to 1 / e of that."""
+DARK_SCENE_RAMP = (0.2, 0.3)
+"""Median display value of the frame without the flare, which may light all of it, at which glow is kept and is not."""
+DISC_PEAK_RAMP = (0.9, 0.97)
+"""Display value of the brightest pixel of a light disc at which it keeps no glow and all of its share."""
+DISTANCE_LEVELS = 4
+"""Levels in which a region's certainty of being a light disc counts for the glow about it."""
+
+
+class _LightDiscs(NamedTuple):
+    """Bright regions that may be light discs.
+
+    labels: (h, w), 0 outside. The others have one value a label, (count,): how far the region is a light disc by its
+    contrast and by the glow about it, 0..1, and its greatest brightness, as filmed and without the flare.
+    """
+
+    labels: NDArray[np.int32]
+    by_contrast: NDArray[Any]
+    by_glow: NDArray[Any]
+    peak_observed: NDArray[Any]
+    peak_clean: NDArray[Any]
+
+
+def retained_fraction(display: Pixels, flare: Pixels, glow_fraction: Pixels, *, keep_glow: bool = True) -> Pixels:
+    """Return the fraction of a predicted flare that stays in the frame, 0..1, (h, w, 3).
+
+    display: display values 0..1. flare: what the flare adds to them. glow_fraction: of the flare that is glow about
+    lights, 0..1. All (h, w, 3). keep_glow: keep part of the glow about light discs, not the discs alone.
+    """
+    observed, clean = display.mean(-1), np.maximum(display - flare, 0).mean(-1)
+    discs = _find_light_discs(observed, clean, flare.mean(-1), (flare * glow_fraction).mean(-1))
+    glow_kept = (_retained_glow(discs, clean)[..., None] * glow_fraction if keep_glow
+                 else np.zeros_like(glow_fraction))
+    return np.asarray(np.maximum(_retained_discs(discs, observed, clean)[..., None], glow_kept), np.float32)
+
+
+def _retained_discs(discs: _LightDiscs, observed: Pixels, clean: Pixels) -> NDArray[Any]:
+    """Return the fraction of the flare that is kept on the light discs themselves, 0..1, (h, w)."""
+    with_rim = _dilate_labels(discs.labels, RIM_SIZE)
+    by_contrast = (discs.by_contrast[with_rim]
+                   * np.clip(clean / discs.peak_clean[with_rim], 0, 1) ** BRIGHTNESS_EXPONENT)
+    by_glow = discs.by_glow[discs.labels] * _centre_weight(discs.labels)
+    return np.asarray(np.interp(observed, RIM_RAMP, (0, 1)) * np.maximum(by_contrast, by_glow))
+
+
+def _retained_glow(discs: _LightDiscs, clean: Pixels) -> NDArray[Any]:
+    """Return the fraction of the glow that is kept, (h, w): greatest at the light discs, falling off with distance."""
+    import cv2
+
+    certainty = np.maximum(discs.by_contrast, discs.by_glow) * np.interp(discs.peak_observed, DISC_PEAK_RAMP, (0, 1))
+    certainty = certainty[discs.labels]
+    falloff = np.float32(GLOW_FALLOFF * max(certainty.shape))
+    proximity = np.zeros(certainty.shape, np.float32)
+    for level in range(DISTANCE_LEVELS):
+        outside = (certainty <= (level + 0.5) / DISTANCE_LEVELS).astype(np.uint8)
+        if not outside.all():
+            distance = cv2.distanceTransform(outside, cv2.DIST_L2, cv2.DIST_MASK_5)
+            proximity += np.exp(-distance / falloff) / DISTANCE_LEVELS
+    return np.asarray(MAX_GLOW_KEPT * np.interp(np.median(clean), DARK_SCENE_RAMP, (1, 0)) * proximity)
+
+
+def _find_light_discs(observed: Pixels, clean: Pixels, flare: Pixels, glow: Pixels) -> _LightDiscs:
+    """Find light discs by the brightness as filmed and without the flare, and by the flare and its glow; each (h, w).
+    """
+    import cv2
+
+    count, components = cv2.connectedComponents((observed > MIN_DISC_BRIGHTNESS).astype(np.uint8))
+    labels = np.asarray(components, np.int32)
+    surround = np.where(_dilate_labels(labels, RIM_SIZE) > 0, 0, _dilate_labels(labels, SURROUND_SIZE))
+    core = np.where(observed >= _label_means(observed, labels, count)[labels], labels, 0)
+    contrast, observed_contrast = (_label_means(brightness, core, count) - _label_means(brightness, surround, count)
+                                   for brightness in (clean, observed))
+    glow_fraction = _label_means(glow, surround, count) / np.maximum(_label_means(flare, surround, count), 1e-6)
+    pixels = np.bincount(labels.ravel(), minlength=count)
+    is_small = np.interp(pixels / observed.size, DISC_AREA_RAMP, (1, 0))
+    is_small[pixels < MIN_DISC_PIXELS] = 0
+    is_small[0] = 0  # the label of what is outside
+    return _LightDiscs(
+        labels, is_small * np.interp(contrast, CONTRAST_RAMP, (0, 1)),
+        is_small * np.interp(glow_fraction, SURROUND_GLOW_RAMP, (0, 1))
+        * np.interp(observed_contrast, OBSERVED_CONTRAST_RAMP, (0, 1)),
+        _label_maxima(observed, core, count), _label_maxima(clean, core, count))
+
+
+def _centre_weight(labels: NDArray[np.int32]) -> Pixels:
+    """Return the distance of each pixel from its region's edge, relative to half of the greatest there, 0..1, (h, w).
+    """
+    import cv2
+
+    depth = cv2.distanceTransform((labels > 0).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
+    greatest = _label_maxima(np.asarray(depth), labels, int(labels.max()) + 1)
+    return np.asarray(np.clip(depth / greatest[labels] * 2, 0, 1), np.float32)
+
+
+def _dilate_labels(labels: NDArray[np.int32], side: int) -> NDArray[np.int32]:
+    """Dilate labelled regions (h, w) by a square; where two meet, the greater label counts."""
+    import cv2
+
+    return np.asarray(cv2.dilate(labels.astype(np.float32), np.ones((side, side), np.uint8)), np.int32)
+
+
+def _label_maxima(values: Pixels, labels: NDArray[np.int32], count: int) -> NDArray[Any]:
+    """Return the maximum over each label, (count,); 1e-6 for one without pixels."""
+    maxima = np.full(count, 1e-6)
+    np.maximum.at(maxima, labels, values)
+    return maxima
+
+
+def _label_means(values: Pixels, labels: NDArray[np.int32], count: int) -> NDArray[Any]:
+    """Return the mean over each label, (count,); 0 for one without pixels."""
+    totals = np.bincount(labels.ravel(), values.ravel(), minlength=count)
+    return totals / np.maximum(np.bincount(labels.ravel(), minlength=count), 1)

@@ -1,0 +1,80 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Converts between the codes of a plate, linear light and display values, and subtracts a flare from codes.
+
+Linear light is that of `image_formation.GAMMA`, in which the network's training frames are composed, for plates of
+either encoding; a fit's layers are by the sRGB curve (`jobs.fitted`).
+"""
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...colour.srgb import Pixels, linear_from_srgb
+from ...images.picture import Encoding
+from ...images.plates import finite_light
+from ..model import image_formation
+from ..model.image_formation import GAMMA
+
+CLIPPING_LEVEL = 0.97
+"""Display value from which on a pixel counts as clipped."""
+STRIP_ROWS = 256
+"""Rows of a plate that are converted at a time, which bounds the memory."""
+MAX_FLOAT16 = 65504
+"""Greatest finite value of a flare as it is written."""
+
+_LINEAR_FROM_UINT8 = np.power(np.arange(256, dtype=np.float32) / 255, np.float32(GAMMA)).astype(np.float32)
+
+
+def to_linear(codes: NDArray[Any], encoding: Encoding, max_code: float) -> Pixels:
+    """Convert codes to linear light."""
+    if encoding == "srgb":
+        if codes.dtype == np.uint8:
+            return _LINEAR_FROM_UINT8[codes]
+        return np.power(codes.astype(np.float32) / np.float32(max_code), np.float32(GAMMA))
+    return finite_light(codes)
+
+
+def to_display(light: Pixels) -> Pixels:
+    """Convert linear light to display values, clipped to 0..1."""
+    return image_formation.to_display(light, GAMMA)
+
+
+def downscale_linear(codes: NDArray[Any], encoding: Encoding, max_code: float, width: int, height: int) -> Pixels:
+    """Downscale a plate by area in linear light clipped to 0..1, as a lens would, (height, width, 3).
+
+    Works in strips of whole result rows: the floats of the whole plate might not fit into memory.
+    """
+    import cv2
+
+    rows = codes.shape[0]
+    result = np.zeros((height, width, 3), np.float32)
+    step = max(height * STRIP_ROWS // rows, 1)
+    for start in range(0, height, step):
+        stop = min(start + step, height)
+        first, last = start * rows // height, max(-(-stop * rows // height), start * rows // height + 1)
+        strip = np.clip(to_linear(codes[first:last], encoding, max_code), 0, 1)
+        result[start:stop] = cv2.resize(strip, (width, stop - start), interpolation=cv2.INTER_AREA)
+    return result
+
+
+def subtract_flare(codes: NDArray[Any], flare: Pixels, encoding: Encoding, max_code: float) -> NDArray[Any]:
+    """Return the codes with a linear flare subtracted; exactly the same where the flare is 0 or a code is not finite.
+    """
+    light = to_linear(codes, encoding, max_code) - flare
+    if encoding == "srgb":
+        clean = (to_display(light) * np.float32(max_code) + np.float32(0.5)).astype(codes.dtype)
+    else:
+        clean = light.astype(codes.dtype)
+    return np.where((flare > 0) & np.isfinite(codes), clean, codes)
+
+
+def removed_light(codes: NDArray[Any], clean: NDArray[Any], flare: Pixels, encoding: Encoding,
+                  max_code: float) -> Pixels:
+    """Return the flare to write, in scene-linear light: the difference of codes and clean codes, of display codes by
+    the sRGB curve."""
+    if encoding == "linear":
+        return np.minimum(flare, MAX_FLOAT16)
+    before, after = (linear_from_srgb(part.astype(np.float32) / np.float32(max_code)) for part in (codes, clean))
+    return np.where(flare > 0, before - after, 0)

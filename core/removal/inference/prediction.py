@@ -1,0 +1,49 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What a removal model predicts for one frame: `TtaPrediction` is what the network returns, `FlarePrediction` what a
+clean frame is made with."""
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ...colour.srgb import Pixels
+from .confidence import FlareFeatures
+
+
+class TtaPrediction(NamedTuple):
+    """The flare of a frame as predicted with test-time augmentation; flares are what is added to display values.
+
+    mean: over the augmentations, (h, w, 3).
+    per_channel: predicted from each channel alone, shown as a grey frame, (h, w, 3).
+    per_channel_weight: how far that counts where it exceeds the mean, 0..1.
+    glow_fraction: of the mean that is glow about lights, 0..1, (h, w, 3).
+    features: what the confidence is computed from; None where the mean is too faint to need one.
+    """
+
+    mean: Pixels
+    per_channel: Pixels
+    per_channel_weight: np.float32
+    glow_fraction: Pixels
+    features: FlareFeatures | None = None
+
+
+class FlarePrediction(NamedTuple):
+    """The flare of a frame, ready to be removed.
+
+    display: the network's input, display values 0..1, (h, w, 3).
+    flare: what a flare adds to them, if there is one, (h, w, 3).
+    confidence: that it is a flare, not the scene or its grade, 0..1.
+    glow_fraction: of the flare that is glow about lights, 0..1, (h, w, 3).
+    """
+
+    display: Pixels
+    flare: Pixels
+    confidence: np.float32
+    glow_fraction: Pixels
+
+
+def single_prediction(flare: Pixels) -> TtaPrediction:
+    """Return the prediction of a model that ran once, without test-time augmentation; none of it is glow."""
+    none = np.zeros_like(flare)
+    return TtaPrediction(flare, none, np.float32(0), none)

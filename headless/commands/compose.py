@@ -49,7 +49,7 @@ def compose_frames(folder: Path, out: Path, progress: Progress, *, wanted: str |
     layers = LayerFolder.open(folder)
     if not 0 <= intensity < float("inf"):
         raise SettingsError(f"The intensity {intensity} is not a number of 0 or more.")
-    colour = LookEdits.parse([f"flare.tint={tint}"], ["flare"]).light("flare").tint
+    colour = LookEdits.parse([f"flare.tint={tint}"], ["flare"]).light_edit("flare").tint
     known = [NumberedFrame("", number, str(path)) for number, path in layers.files.items()]
     numbers = [frame.number for frame in frames.select(known, wanted, progress)]
 

@@ -37,6 +37,7 @@ def is_sentence(text: str) -> bool:
 
 
 def test_an_empty_scene_offers_what_can_be_done_alone(said: Any) -> None:
+    """Block of broken.py: "nothing there yet"."""
     possible = {name for name, can in said["polls of an empty scene"].items() if can}
     assert possible == {"import_capture", "add_light", "open_flare"}
 
@@ -47,15 +48,19 @@ def test_an_empty_scene_offers_what_can_be_done_alone(said: Any) -> None:
                                   "library name", "bake on a full disk", "save on a full disk", "fit on a full disk",
                                   "no room for the last words"])
 def test_what_cannot_be_done_is_one_sentence(said: Any, what: str) -> None:
+    """Blocks of broken.py: "nothing there yet", ".flare files", "a full disk, and an engine that dies while it bakes",
+    "cameras and scenes", "the rest"."""
     assert is_sentence(said[what]), said[what]
 
 
 def test_refusals_leave_nothing_behind(said: Any) -> None:
+    """Blocks of broken.py: "nothing there yet", ".flare files"."""
     assert said["objects after refusals"] == 0
     assert said["edits survive a refusal"] == 1
 
 
 def test_without_an_engine_the_button_says_so(said: Any) -> None:
+    """Blocks of broken.py: "nothing there yet", "engines that are none, or die"."""
     assert said["no engine"]
     assert said["engine named, not there"] == [False, False]
     why = "The engine named by FIT_FLARE_ENGINE is missing: gone."
@@ -64,6 +69,7 @@ def test_without_an_engine_the_button_says_so(said: Any) -> None:
 
 
 def test_every_panel_says_what_is_missing(said: Any) -> None:
+    """Blocks of broken.py: "nothing there yet", "engines that are none, or die", "cameras and scenes"."""
     capture, lights, fit, look, bake, transfer = said["panels of an empty scene"]
     assert "Footage with a camera solve" in capture
     assert "No lights yet" in lights
@@ -76,6 +82,7 @@ def test_every_panel_says_what_is_missing(said: Any) -> None:
 
 
 def test_a_full_disk_is_told_and_what_is_finished_is_kept(said: Any) -> None:
+    """Block of broken.py: "a full disk, and an engine that dies while it bakes"."""
     broken, filled, again = said["bakes"]
     assert "ended without a result" in broken[0]
     assert "disk is full" in filled[0]
@@ -93,6 +100,7 @@ def test_a_full_disk_is_told_and_what_is_finished_is_kept(said: Any) -> None:
 
 
 def test_what_is_made_and_cannot_be_shown_is_told(said: Any) -> None:
+    """Block of broken.py: "a full disk, and an engine that dies while it bakes"."""
     state, fit, bake = said["done, and not shown"]
     assert state == "done"
     assert "It cannot be shown." in fit
@@ -100,6 +108,7 @@ def test_what_is_made_and_cannot_be_shown_is_told(said: Any) -> None:
 
 
 def test_an_engine_that_dies_is_told(said: Any) -> None:
+    """Block of broken.py: "engines that are none, or die"."""
     fits = said["fits"]
     assert "out of memory" in fits["dies"]
     assert fits["refuses"] == "The frames are not there; put them back."
@@ -111,24 +120,29 @@ def test_an_engine_that_dies_is_told(said: Any) -> None:
 
 
 def test_a_stop_before_the_engine_listens_is_a_stop(said: Any) -> None:
+    """Block of broken.py: "engines that are none, or die"."""
     assert said["stopped before it listened"] == ["stopped", "Stopped before it began."]
 
 
 def test_an_engine_that_cannot_be_executed_is_not_the_folders_fault(said: Any) -> None:
+    """Block of broken.py: "engines that are none, or die"."""
     assert "python cannot be started (" in said["cannot be executed"]
     assert said["cannot be executed"].endswith("; set up the engine in the preferences.")
 
 
 def test_a_fit_that_ends_well_shows_its_flare(said: Any) -> None:
+    """Block of broken.py: "engines that are none, or die"."""
     assert said["a fit that ends well"] == ["", "finished", True]
 
 
 def test_the_engine_says_what_it_is(said: Any) -> None:
+    """Block of broken.py: "engines that are none, or die"."""
     assert said["test of another engine"]
     assert said["test"] == ["", {"version": "1", "torch": "2", "device": "a sham"}]
 
 
 def test_work_is_found_again_and_can_be_cancelled(said: Any) -> None:
+    """Block of broken.py: "work that goes on while Blender is closed, found again and cancelled"."""
     assert said["found again"] == ["running", "fit", 40, 100]
     assert said["state of the found"] == "running"
     assert said["cancelled"] == ["stopped", "Stopped during fit as asked; what is done is kept."]
@@ -137,11 +151,14 @@ def test_work_is_found_again_and_can_be_cancelled(said: Any) -> None:
 
 
 def test_paths_keep_the_name_that_a_drive_has(said: Any) -> None:
+    """Block of broken.py: "paths"."""
     assert said["written on Windows"]
     assert said["a linked drive"]
 
 
 def test_folders_that_went_are_told(said: Any) -> None:
+    """Blocks of broken.py: "work that goes on while Blender is closed, found again and cancelled", "a capture that
+    moved"."""
     assert said["run folder deleted"] == ["lost", True, False]
     assert said["capture moved"] == [False, False]
     assert "does not exist any more: start a new fit" in said["panel of a lost run"]
@@ -152,6 +169,7 @@ def test_folders_that_went_are_told(said: Any) -> None:
 
 
 def test_panels_stand_a_name_that_is_too_long_for_the_disk(said: Any) -> None:
+    """Block of broken.py: "places that cannot be looked at"."""
     told = {name: panels for name, *panels in said["a name too long for the disk"]}
     assert "does not exist any more" in told["capture"][0]
     assert "does not exist any more: start a new fit" in told["run"][2]
@@ -159,6 +177,7 @@ def test_panels_stand_a_name_that_is_too_long_for_the_disk(said: Any) -> None:
 
 
 def test_cameras_lights_and_scenes(said: Any) -> None:
+    """Blocks of broken.py: ".flare files", "cameras and scenes"."""
     assert said["camera deleted"] == [False, True]
     known, told = said["light taken out of the scene"]
     assert known and "No flare has a light object" in told
@@ -169,15 +188,18 @@ def test_cameras_lights_and_scenes(said: Any) -> None:
 
 
 def test_every_operator_is_one_undo_step(said: Any) -> None:
+    """Block of broken.py: "undo after each operator"."""
     assert [name for name, good in said["undone"].items() if not good] == []
 
 
 def test_nothing_is_downloaded_without_leave(said: Any) -> None:
+    """Block of broken.py: "the rest"."""
     online, offered = said["online"]
     assert offered == online
 
 
 def test_uninstalled_leaves_nothing(said: Any) -> None:
+    """Block of broken.py: "the rest"."""
     assert said["after disabling"] == [False, False]
     assert said["left behind"] == []
     assert not said["modules left"]
@@ -185,6 +207,7 @@ def test_uninstalled_leaves_nothing(said: Any) -> None:
 
 @pytest.mark.skipif(not Path("/proc/self/mem").exists(), reason="wants a file that may not be read")
 def test_of_logs_the_end_is_shown_or_why_there_is_none(said: Any) -> None:
+    """Block of broken.py: "the rest"."""
     finished, text = said["shows logs"]
     assert finished == "FINISHED"
     assert "cannot be read" in text

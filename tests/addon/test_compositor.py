@@ -96,30 +96,35 @@ def test_the_flare_output_is_premultiplied_with_its_matte(made: Made) -> None:
 
 
 def test_the_group_has_its_sockets(made: Made) -> None:
+    """Block of composite.py: "the graph as it comes, rendered and saved"."""
     assert made.facts["inputs"] == ["Scene", "flare_key_light", "flare_lamp", "Intensity", "Tint",
                                     "flare_key_light Gain", "flare_lamp Gain"]
     assert made.facts["outputs"] == ["Image", "Flare"]
 
 
 def test_setting_up_again_changes_nothing(made: Made) -> None:
+    """Block of composite.py: "set up again: nothing doubles, the sliders stay"."""
     before, after = made.facts["doubled"]
     assert before == after
     np.testing.assert_allclose([made.facts["sliders"][0], *made.facts["sliders"][1]], [INTENSITY, *TINT, 1])
 
 
 def test_the_flare_can_go_over_the_present_image(made: Made) -> None:
+    """Block of composite.py: "over what is there: a plain colour in place of the baked scene, twice"."""
     assert made.facts["plate stays"]
     plate = np.array([0.25, 0.5, 0.75], np.float32)
     assert_half_equal(rgb(made.out / "over" / "0.exr"), plate + baked(made, 0).flare)
 
 
 def test_nothing_is_left_of_lights_that_other_layers_are_without(made: Made) -> None:
+    """Block of composite.py: "pointed at layers of fewer lights"."""
     assert made.facts["fewer"] == ["Scene", "flare_key_light"]
     layers = read_layers(made.layers.parent / "fewer" / "layers.0000.exr")
     assert_half_equal(rgb(made.out / "fewer" / "0.exr"), layers.scene + layers.flare)
 
 
 def test_scenes_that_share_a_tree_do_not_change_each_other(made: Made) -> None:
+    """Block of composite.py: "two scenes of one tree"."""
     if "two scenes of one tree" not in made.facts:
         pytest.skip("before 5.0 every scene has a tree of its own")
     assert made.facts["two scenes of one tree"] == [True, True, True]
@@ -128,11 +133,13 @@ def test_scenes_that_share_a_tree_do_not_change_each_other(made: Made) -> None:
 
 
 def test_a_picture_without_layers_is_refused_where_there_were_layers(made: Made) -> None:
+    """Block of composite.py: "pointed at layers of fewer lights"."""
     assert "holds no scene and flare layers" in made.facts.get("no layers", "")
 
 
 @pytest.mark.parametrize(("name", "factor"), [("over at 50", 0.5), ("over at 200", 2), ("plain at 50", 0.5)])
 def test_layers_are_brought_to_the_size_that_is_rendered(made: Made, name: str, factor: float) -> None:
+    """Block of composite.py: "beginning"."""
     layers, image = baked(made, 0), rgb(made.out / name / "0.exr")
     assert image.shape[:2] == (SIZE[0] * factor, SIZE[1] * factor)
     expected = layers.flare if name.startswith("over") else layers.composite
@@ -145,6 +152,7 @@ def test_layers_are_brought_to_the_size_that_is_rendered(made: Made, name: str, 
 
 
 def test_layers_in_another_space_and_of_wide_pixels_are_composed_as_they_are(made: Made) -> None:
+    """Block of composite.py: "the command, of layers of wide pixels in ACEScg"."""
     assert made.facts["aces"] == ["", 2.0, 1.0]
     exact = random_layers(0)
     np.testing.assert_allclose(rgb(made.out / "aces" / "frame.0000.exr"),
@@ -152,6 +160,7 @@ def test_layers_in_another_space_and_of_wide_pixels_are_composed_as_they_are(mad
 
 
 def test_what_the_camera_goes_by_stays(made: Made) -> None:
+    """Block of composite.py: "wide pixels stay; a region that is cut out is refused, and leaves nothing"."""
     assert made.facts["pixel aspect"] == 2
     sentence, nothing = made.facts["cropped"]
     assert "switch Crop to Render Region off" in sentence
@@ -159,6 +168,7 @@ def test_what_the_camera_goes_by_stays(made: Made) -> None:
 
 
 def test_a_scene_that_is_given_the_layers_frames_stands_on_one(made: Made) -> None:
+    """Block of composite.py: "the graph as it comes, rendered and saved"."""
     assert made.facts["stands at"] == NUMBERS[0]
 
 
@@ -180,6 +190,7 @@ def test_the_saved_file_shows_the_same_elsewhere_and_without_us(made: Made, blen
 
 @pytest.mark.skipif(sys.platform != "linux", reason="files are kept from growing in another way elsewhere")
 def test_a_file_that_does_not_fit_the_disk_is_told_and_not_left(made: Made) -> None:
+    """Block of composite.py: "a disk that fills up"."""
     refused, left = made.facts["full"]
     assert [sentence.startswith("Blender could not write a complete file to ") for sentence in refused] == [True, True]
     assert left == []

@@ -21,6 +21,7 @@ def facts(blender: Blender, package: Path, tmp_path_factory: pytest.TempPathFact
 
 
 def test_work_of_another_machine_goes_by_what_it_tells(facts: Any) -> None:
+    """Block of jobs.py: "another machine"."""
     assert facts["ended elsewhere"] == "done"
     assert facts["goes on elsewhere"] == ["running", 4]
     assert facts["asked elsewhere"] == [True, "stopping"]
@@ -32,6 +33,7 @@ def test_work_of_another_machine_goes_by_what_it_tells(facts: Any) -> None:
 
 
 def test_what_goes_wrong_with_one_ends_the_watching_of_no_other(facts: Any) -> None:
+    """Block of jobs.py: "what is done in the scenes with one goes wrong"."""
     again, state, error, is_traced, other = facts["ends badly"]
     assert again and other == "running"
     assert state == "done"
@@ -40,17 +42,20 @@ def test_what_goes_wrong_with_one_ends_the_watching_of_no_other(facts: Any) -> N
 
 
 def test_another_process_of_the_number_is_left_alone(facts: Any) -> None:
+    """Block of jobs.py: "this machine"."""
     assert facts["the stranger lives"] and facts["asked by the file alone"]
     assert facts["its number is an older process's"] == "failed"
     assert facts["written by the version before"] == ["running", True]
 
 
 def test_work_that_no_scene_names_can_be_seen(facts: Any) -> None:
+    """Block of jobs.py: "of this scene, and of none"."""
     assert facts["of the scene"] == ["own"]
     assert facts["of none"] == ["other", "layers"]
 
 
 def test_escape_stops_what_this_scene_does_unless_it_plays(facts: Any) -> None:
+    """Block of jobs.py: "of this scene, and of none"."""
     assert not facts["ESC while it plays"]
     assert facts["ESC"]
     assert facts["stopped by ESC"] == [True, False, False]

@@ -33,28 +33,34 @@ def facts(blender: Blender, package: Path, tmp_path_factory: pytest.TempPathFact
 
 
 def test_a_flare_keeps_its_layer_under_another_name(facts: Any) -> None:
+    """Block of flares.py: "renamed"."""
     assert facts["both"] == SCENE + LAMP + KEY
     assert facts["renamed"] == [SCENE + 2 * LAMP + KEY, True]
     assert facts["renamed, set up again"] == [SCENE + 2 * LAMP + KEY, True, True]
 
 
 def test_a_layer_without_a_flare_shows_as_it_was_baked(facts: Any) -> None:
+    """Block of flares.py: "renamed"."""
     assert facts["unknown now"] == [SCENE + KEY, SCENE + LAMP + KEY]
 
 
 def test_the_others_stay_live_when_a_flare_is_removed(facts: Any) -> None:
+    """Block of flares.py: "removed"."""
     assert facts["removed"] == [SCENE + LAMP + 3 * KEY, True, SCENE + LAMP + KEY]
 
 
 def test_a_file_of_an_earlier_version_keeps_its_wires(facts: Any) -> None:
+    """Block of flares.py: "drivers of an earlier version"."""
     assert facts["of an earlier version"] == [SCENE + 2 * LAMP + KEY, True] * 2
 
 
 def test_wires_that_lead_nowhere_are_told(facts: Any) -> None:
+    """Block of flares.py: "dead drivers are told"."""
     assert "set it up again" in facts["dead"]
 
 
 def test_keys_and_drivers_stay_with_their_flare(facts: Any) -> None:
+    """Block of flares.py: "keyed"."""
     lamp, rim, added = facts["keyed"]
     assert lamp == ["lamp", 1, 1]
     assert rim == ["rim", 5, 2]
@@ -62,19 +68,23 @@ def test_keys_and_drivers_stay_with_their_flare(facts: Any) -> None:
 
 
 def test_keys_and_links_stay_with_their_slider_of_the_node(facts: Any) -> None:
+    """Block of flares.py: "keyed"."""
     flare, more = (LAMP + KEY) / 2, (LAMP + KEY + RIM) / 2
     assert facts["keyed node"] == [SCENE + 4 * flare, SCENE + 4 * more, SCENE + more]
 
 
 def test_an_artists_still_of_a_layer_stays_one(facts: Any) -> None:
+    """Block of flares.py: "a layer that an artist looks at as a still"."""
     assert facts["still"] == ["FILE", "SEQUENCE"]
 
 
 def test_a_frame_that_was_baked_again_is_shown(facts: Any) -> None:
+    """Block of flares.py: "a frame that is shown is baked again"."""
     assert facts["baked again"] == [SCENE + LAMP + KEY, SCENE + RIM + KEY]
 
 
 def test_frames_without_layers_are_told_and_without_flare(facts: Any) -> None:
+    """Block of flares.py: "what is told of frames without layers and of animated sliders"."""
     assert facts["all frames"] == []
     (told,) = facts["too few"]
     assert "The scene has the frames 0-6, and there are no layers of 0,4-6," in told
@@ -94,16 +104,19 @@ def test_frames_without_layers_are_told_and_without_flare(facts: Any) -> None:
     ("transparent", "The film is transparent, and PNG files lose the flare"),
 ])
 def test_renders_that_would_not_show_the_composite_are_told(facts: Any, case: str, sentence: str) -> None:
+    """Block of flares.py: "what is told of renders that would not show the composite as it is"."""
     (told,) = facts[case]
     assert sentence in told
 
 
 @pytest.mark.parametrize("case", ["muted", "no alpha"])
 def test_of_renders_that_show_it_nothing_is_told(facts: Any, case: str) -> None:
+    """Block of flares.py: "what is told of renders that would not show the composite as it is"."""
     assert facts[case] == []
 
 
 def test_animated_sliders_that_a_farm_would_not_have_are_told(facts: Any) -> None:
+    """Block of flares.py: "what is told of frames without layers and of animated sliders"."""
     assert facts["scale keyed"] == []
     (told,) = facts["intensity keyed"]
     assert "without this extension, as on a farm, they do not move" in told

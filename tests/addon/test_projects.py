@@ -15,30 +15,36 @@ def facts(told_by: Callable[[str, int], Any]) -> Any:
 
 @pytest.mark.parametrize("how", ["under other numbers", "over others"])
 def test_plates_are_not_replaced_by_those_of_a_capture(facts: Any, how: str) -> None:
+    """Block of projects.py: "plates in the folder that a capture is to go to"."""
     said, whole = facts[how]
     assert "exists already and would be replaced by" in said and "choose another folder" in said
     assert whole
 
 
 def test_plates_may_be_the_captures_own(facts: Any) -> None:
+    """Block of projects.py: "plates in the folder that a capture is to go to"."""
     assert facts["under their own"] == ["", True]
 
 
 def test_a_capture_is_made_again_but_not_of_itself(facts: Any) -> None:
+    """Block of projects.py: "plates in the folder that a capture is to go to"."""
     assert facts["made again"] == 6
     assert "would be replaced by" in facts["of its own pictures"]
 
 
 def test_a_capture_that_was_begun_is_finished(facts: Any) -> None:
+    """Block of projects.py: "plates in the folder that a capture is to go to"."""
     assert facts["begun before"] == ""
 
 
 def test_pictures_of_another_shape_are_told_at_once(facts: Any) -> None:
+    """Block of projects.py: "plates in the folder that a capture is to go to"."""
     assert facts["of another shape"].endswith("is 64 x 40 pixels and the scene renders 1920 x 40, which is another "
                                               "aspect ratio; set the scene's resolution to that of the pictures.")
 
 
 def test_a_camera_that_is_mirrored_or_skewed_is_refused_before_anything_is_written(facts: Any) -> None:
+    """Block of projects.py: "plates in the folder that a capture is to go to"."""
     mirrored, skewed, written = facts["mirrored"]
     for said in (mirrored, skewed):
         assert said == ("The camera 'Camera' is mirrored or skewed at frame 1; apply the scale of it and of its "
@@ -47,32 +53,41 @@ def test_a_camera_that_is_mirrored_or_skewed_is_refused_before_anything_is_writt
 
 
 def test_plates_that_are_links_are_the_captures_as_pictures(facts: Any) -> None:
+    """Block of projects.py: "plates that are links"."""
+    if facts["links"] is None:
+        pytest.skip("symbolic links cannot be made here")
     assert facts["links"] == [6, 6]
 
 
 def test_plates_of_a_linked_camera_are_found_beside_its_file(facts: Any) -> None:
+    """Block of projects.py: "a camera that is linked from another folder's .blend"."""
     assert facts["linked camera"]
 
 
 def test_an_appended_scene_keeps_its_places(facts: Any) -> None:
+    """Block of projects.py: "a scene that is appended to another project"."""
     if facts["appended"] == [False, True] and not facts["tells of imports"]:
         pytest.skip("this Blender says nothing of what was appended")
     assert facts["appended"] == [True, True]
 
 
 def test_footage_goes_with_its_project(facts: Any) -> None:
+    """Block of projects.py: "a capture imported into a project that moves"."""
     assert facts["footage after a move"]
     assert facts["stills and sequences"] == [["FILE", 1], ["SEQUENCE", 1]]
 
 
 def test_lights_follow_a_fit_in_a_scene_that_no_window_shows(facts: Any) -> None:
+    """Block of projects.py: "a fit that ends while its scene is not the one in the window"."""
     assert facts["moved unseen"] < 1e-4
 
 
 def test_the_chosen_flare_of_the_library_stays_chosen(facts: Any) -> None:
+    """Block of projects.py: "another flare is saved into the library while one is chosen"."""
     assert facts["chosen"] == "zed"
 
 
 def test_where_no_flare_of_the_library_is_chosen_it_is_the_first(facts: Any) -> None:
+    """Block of projects.py: "another flare is saved into the library while one is chosen"."""
     assert facts["chosen at first"] == "mid"
     assert facts["chosen is gone"] == "aaa"

@@ -14,6 +14,7 @@ def facts(told_by: Callable[[str, int], Any]) -> Any:
 
 
 def test_another_capture_has_its_own_run_and_lights(facts: Any) -> None:
+    """Block of shots.py: "one capture after the other"."""
     assert facts["imported again"] == [True, "images", 1, 1]
     assert facts["another imported"] == ["", "none", 0]
     assert facts["shown of clean frames"], "whatever the suffix, as fits find them"
@@ -23,6 +24,7 @@ def test_another_capture_has_its_own_run_and_lights(facts: Any) -> None:
 
 
 def test_footage_changes_where_it_is_chosen_alone(facts: Any) -> None:
+    """Block of shots.py: "footage that an artist's own nodes and another scene show too"."""
     assert facts["shared footage"] == [
         ["removed", "images", "removed", "images"], ["removed", "removed", "removed", "images"],
         ["images", "removed", "images", "images"], ["images"] * 4], "the artist's own node shows what it showed"
@@ -30,10 +32,12 @@ def test_footage_changes_where_it_is_chosen_alone(facts: Any) -> None:
 
 
 def test_a_capture_from_a_camera_has_the_plates_of_now(facts: Any) -> None:
+    """Block of shots.py: "a newer plate, from where pictures are linked and from where they have to be copied"."""
     assert facts["newer plates"] == [[True, True, ["000001.png"]]] * 2
 
 
 def test_baked_frames_do_not_go_unasked(facts: Any) -> None:
+    """Block of shots.py: "frames of another bake"."""
     assert facts["as it was baked"] == ["", 1]
     said, begun, live = facts["colours no longer live"]
     assert "has layers of 4 frames from 1 to 4 that were baked" in said
@@ -44,11 +48,13 @@ def test_baked_frames_do_not_go_unasked(facts: Any) -> None:
 
 
 def test_what_is_edited_of_a_flare_without_a_light_is_not_baked(facts: Any) -> None:
+    """Block of shots.py: "an edited flare without a light"."""
     (light,), words = facts["edits"]
     assert words == [f"{light}.intensity=2"]
 
 
 def test_each_chosen_camera_has_a_folder_even_alone(facts: Any) -> None:
+    """Block of shots.py: "chosen cameras"."""
     assert facts["one chosen"] == [facts["one chosen, read again"]] == ["Camera"]
     assert facts["the scene's own"] == [""]
     assert "has no layers of the camera 'Other', only of 'Camera'" in facts["renamed since"]
@@ -57,12 +63,14 @@ def test_each_chosen_camera_has_a_folder_even_alone(facts: Any) -> None:
 
 
 def test_a_project_finds_its_files_wherever_it_goes(facts: Any) -> None:
+    """Block of shots.py: "a project that is saved for the first time, moved, and linked from elsewhere"."""
     assert facts["saved as a copy"], "the file that is open has no place yet"
     assert facts["saved first and moved"]
     assert facts["linked"]
 
 
 def test_a_linked_scene_is_not_changed(facts: Any) -> None:
+    """Block of shots.py: "a project that is saved for the first time, moved, and linked from elsewhere"."""
     why, engine = facts["changed when linked"]
     assert "The scene is linked from another file" in why
     assert not engine

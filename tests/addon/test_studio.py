@@ -71,6 +71,7 @@ def test_layers_keep_their_colours(blender: Blender, package: Path, tmp_path: Pa
 
 
 def test_what_a_configuration_lacks_is_told(blender: Blender, package: Path, tmp_path: Path) -> None:
+    """Block of studio.py: "beginning"."""
     facts, _ = run(blender, package, tmp_path, CONFIGURATION.replace("VIEW", "Log"))
     assert facts["import"] == [["FINISHED"], "ACES 1.0 - SDR Video"]
     assert "no space of linear Rec. 709" in facts["misread"]

@@ -19,42 +19,56 @@ def facts(blender: Blender, package: Path, tmp_path_factory: pytest.TempPathFact
 
 @pytest.mark.parametrize("how", ["as solved", "set to the floor", "on a dolly"])
 def test_points_of_the_tracker_lie_on_their_tracks(facts: Any, how: str) -> None:
-    """In frames with the lens's own distortion; without it they are 5 pixels off."""
+    """In frames with the lens's own distortion; without it they are 5 pixels off.
+
+    Block of tracked.py: "beginning".
+    """
     assert facts["solve error"] < 0.01
     assert facts[how] < 0.05
 
 
 def test_distortion_is_that_of_the_clip_alone(facts: Any) -> None:
+    """Block of tracked.py: "beginning"."""
     assert facts["frames from elsewhere"] == {}
     assert "solve it with the model Polynomial" in facts["another model"]
 
 
 def test_a_clip_with_an_offset_shows_its_own_frames(facts: Any) -> None:
+    """Block of tracked.py: "beginning"."""
     assert facts["offset"] == ["0004.png", "0005.png"]
 
 
 def test_sizes_are_rounded_as_blender_does(facts: Any) -> None:
+    """Block of tracked.py: "sizes"."""
     assert facts["size at 35 %"] == [448, 252]
 
 
 def test_a_sun_is_a_direction_wherever_it_is_put(facts: Any) -> None:
+    """Block of tracked.py: "a sun, and what hides it"."""
     assert len(facts["sun"]) == 3, "for a fit, a shot of a .blend, and the panel"
     assert max(facts["sun"]) < 1e-5
 
 
 def test_a_solve_needs_no_lights(facts: Any) -> None:
-    """A tracked file has its first lamp, switched off; lights are found later, in the frames."""
+    """A tracked file has its first lamp, switched off; lights are found later, in the frames.
+
+    Block of tracked.py: "a sun, and what hides it".
+    """
     assert facts["no lights"] == ["images", "points.ply", "transforms.json"]
 
 
 def test_a_shot_with_cuts_is_one_whatever_part_of_it_is_asked_for(facts: Any) -> None:
+    """Block of tracked.py: "a sun, and what hides it"."""
     whole, part, same = facts["cut"]
     assert whole == part == [""]
     assert same, "so a farm's chunks are those of the whole"
 
 
 def test_a_light_or_a_camera_that_is_nowhere_is_told(facts: Any) -> None:
-    """As drivers leave them: not as a defect of ours, when the shot is written down."""
+    """As drivers leave them: not as a defect of ours, when the shot is written down.
+
+    Block of tracked.py: "a sun, and what hides it".
+    """
     (light, of_light), *of_cameras = facts["nowhere"]
     assert light == "CaptureError" and of_light.startswith("The place of the light 'Nowhere' is not finite at frame 1;")
     assert len(of_cameras) == 2
@@ -63,11 +77,13 @@ def test_a_light_or_a_camera_that_is_nowhere_is_told(facts: Any) -> None:
 
 
 def test_what_renders_do_not_show_hides_nothing(facts: Any) -> None:
+    """Block of tracked.py: "a sun, and what hides it"."""
     assert facts["behind a wall"] == 0
     assert facts["that renders do not show"] == pytest.approx(1)
     assert facts["that cameras do not see"] == pytest.approx(1)
 
 
 def test_a_lamp_does_not_hide_itself_as_an_instance(facts: Any) -> None:
+    """Block of tracked.py: "a lamp that is an instance of an asset"."""
     assert facts["in its own asset"] == pytest.approx(1)
     assert facts["behind another lamp of its asset"] == 0

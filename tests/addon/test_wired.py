@@ -44,21 +44,25 @@ def test_it_goes_without_a_trace(facts: Any, before: str, over: str) -> None:
 @pytest.mark.parametrize(("name", "gain"), [
     ("plain", (1, 1, 1)), ("graded", (3, 1.5, 0.75)), ("muted", (0, 0, 0)), ("animated", (3, 1.5, 0.75))])
 def test_the_panels_sliders_act_on_the_render(facts: Any, name: str, gain: tuple[float, ...]) -> None:
+    """Block of wired.py: "driven: the panel's sliders, animated too, in rendered pixels"."""
     assert facts["valid"]
     picture = read_picture(facts["files"][name]).pixels
     np.testing.assert_allclose(picture, SCENE + FLARE * np.array(gain, np.float32), rtol=1e-5)
 
 
 def test_a_worker_without_the_extension_has_the_sliders_as_they_were_saved(facts: Any) -> None:
+    """Block of wired.py: "driven: the panel's sliders, animated too, in rendered pixels"."""
     picture = read_picture(facts["files"]["on a worker"]).pixels
     np.testing.assert_allclose(picture, SCENE + FLARE * np.array((3, 1.5, 0.75), np.float32), rtol=1e-5)
 
 
 def test_sliders_whose_flare_is_gone_are_known(facts: Any) -> None:
+    """Block of wired.py: "rendered where the extension is not, after a save"."""
     assert facts["complete"] == [True, True, False]
 
 
 @pytest.mark.parametrize(("name", "gain"), [
     ("many", 60), ("many, two solo", 3 + 1), ("many, one solo in a copy", 3), ("many, none solo", 3 + 59)])
 def test_many_flares_stay_live(facts: Any, name: str, gain: float) -> None:
+    """Block of wired.py: "driven: the panel's sliders, animated too, in rendered pixels"."""
     np.testing.assert_allclose(read_picture(facts["files"][name]).pixels, SCENE + gain * FLARE, rtol=1e-5)

@@ -56,6 +56,7 @@ def facts(made: tuple[Any, Path]) -> Any:
 
 
 def test_frames_are_cleaned_by_the_network_or_by_a_finished_fit(made: tuple[Any, Path]) -> None:
+    """Block of work.py: "clean frames"."""
     facts, base = made
     images, removed = str(Path("capture") / "images"), str(Path("capture") / "removed")
     assert facts["cleaned by the network"] == ["remove", images, "--out", removed, "--all-glow"]
@@ -63,6 +64,7 @@ def test_frames_are_cleaned_by_the_network_or_by_a_finished_fit(made: tuple[Any,
 
 
 def test_frames_are_cleaned_by_a_matte_and_otherwise_again(made: tuple[Any, Path]) -> None:
+    """Block of work.py: "clean frames"."""
     facts, base = made
     images, removed = str(Path("capture") / "images"), str(Path("capture") / "removed")
     by_matte = ["remove", images, "--out", removed, "--matte", str(base / "roto")]
@@ -74,6 +76,7 @@ def test_frames_are_cleaned_by_a_matte_and_otherwise_again(made: tuple[Any, Path
 
 
 def test_a_moved_project_goes_on_with_its_capture_where_it_is_now(made: tuple[Any, Path]) -> None:
+    """Block of work.py: "a project that was moved, its capture with it"."""
     facts, base = made
     resumed, cleaned, moved = facts["moved"]
     assert Path(resumed) == Path(moved).resolve()
@@ -82,41 +85,51 @@ def test_a_moved_project_goes_on_with_its_capture_where_it_is_now(made: tuple[An
 
 
 def test_clean_frames_that_were_made_again_are_shown(facts: Any) -> None:
+    """Block of work.py: "clean frames that are made again"."""
     assert facts["clean frames"] == [0, 1]
 
 
 def test_a_fit_goes_by_clean_frames_of_someone_s_own_and_takes_others_for_estimates(facts: Any) -> None:
+    """Block of work.py: "what a fit goes by"."""
     assert facts["goes by"] == ["default", "estimated", "estimated", "estimated"]
     assert facts["says that a fit knows no matte"] == [False, True]
 
 
 def test_a_bake_follows_the_cuts_of_the_timeline(facts: Any) -> None:
+    """Block of work.py: "cuts by markers"."""
     names, *off = facts["cut"]
     assert names == ["Camera"] and [far < 1e-4 for far in off] == [False, False, True], off
 
 
 def test_a_folder_without_layers_leaves_no_trace(facts: Any) -> None:
+    """Block of work.py: "a folder that holds no layers"."""
     said, untouched, images = facts["no layers"]
     assert "no scene and flare layers" in said and untouched and not images, images
 
 
 def test_a_blend_below_a_linked_folder_finds_its_files(facts: Any) -> None:
+    """Block of work.py: "a .blend below a linked folder"."""
     assert facts["through a link"] == ["//", True]
 
 
 def test_a_blend_saved_elsewhere_finds_its_files(facts: Any) -> None:
+    """Block of work.py: "a .blend below a linked folder"."""
     assert facts["after a copy"], "the file that is open is where it was"
     assert facts["saved elsewhere"] == [["//..", True], True, True]
 
 
 @pytest.mark.parametrize("kind", ["animated", "each"])
 def test_cameras_see_points_where_the_footage_has_them(facts: Any, kind: str) -> None:
-    """Off-centre principal point, turned and scaled root; by the matrices Blender renders with."""
+    """Off-centre principal point, turned and scaled root; by the matrices Blender renders with.
+
+    Block of work.py: "import".
+    """
     assert facts[f"pixels off, {kind}"] < 0.002
 
 
 @pytest.mark.parametrize("kind", ["animated", "each"])
 def test_cameras_are_exposed_as_a_fit_has_found_the_frames(facts: Any, kind: str) -> None:
+    """Block of work.py: "import"."""
     assert facts[f"exposed, {kind}"] == [0.5, 1.5, 2.5, 3.5, 4.5]
     assert facts[f"as usual, {kind}"] == [1.0, 1.0]
     assert facts[f"own run, {kind}"] == 4.0
@@ -124,6 +137,7 @@ def test_cameras_are_exposed_as_a_fit_has_found_the_frames(facts: Any, kind: str
 
 
 def test_an_import_is_whole(facts: Any) -> None:
+    """Block of work.py: "import"."""
     assert facts["objects, animated"] == ["Camera", "Points", "capture Root", "lamp"]
     assert facts["objects, each"] == ["0000", "0001", "0002", "0003", "0004", "Points", "capture Root", "lamp"]
     assert facts["background, animated"] == ["SEQUENCE", "STRETCH", "0000.png"]
@@ -135,12 +149,14 @@ def test_an_import_is_whole(facts: Any) -> None:
 
 
 def test_an_import_is_one_undo_step(facts: Any) -> None:
+    """Block of work.py: "one undo step"."""
     count, after, capture = facts["undo"]
     assert count > 3
     assert (after, capture) == (0, "")
 
 
 def test_lights_of_the_scene_are_those_of_the_fit(facts: Any) -> None:
+    """Block of work.py: "lights"."""
     assert facts["lights now"] == ["Bulb", "key", "lamp"]
     assert facts["bulb stays"]
     assert list(facts["lights.json"]) == ["key", "lamp"]
@@ -149,23 +165,27 @@ def test_lights_of_the_scene_are_those_of_the_fit(facts: Any) -> None:
 
 
 def test_lights_follow_a_fit_that_has_moved_them_unless_the_artist_has(facts: Any) -> None:
+    """Block of work.py: "lights"."""
     assert facts["followed"] == {"key": False, "lamp": True}
     np.testing.assert_allclose(facts["followed back"], LIGHT + 1, atol=1e-4)  # lights.json has it elsewhere
 
 
 def test_a_flare_finds_its_light(facts: Any) -> None:
+    """Block of work.py: "look"."""
     assert facts["open"] == ["FINISHED"]
     assert facts["flares"] == [["lamp", "lamp", "lamp", True]]
     assert facts["native"]
 
 
 def test_a_flare_over_frames_that_have_their_own_is_told(facts: Any) -> None:
+    """Block of work.py: "look"."""
     as_filmed, without = facts["look says"]
     assert "The frames behind the camera contain their own flare" in as_filmed
     assert "their own flare" not in without
 
 
 def test_sliders_can_be_animated_driven_and_reset(facts: Any) -> None:
+    """Block of work.py: "look"."""
     assert facts["animated"] == pytest.approx(1.5)
     assert facts["driven"] == pytest.approx(2.0)
     assert "lamp.intensity=1.5" in facts["words"]
@@ -176,13 +196,17 @@ def test_sliders_can_be_animated_driven_and_reset(facts: Any) -> None:
 
 
 def test_the_overlay_draws_what_the_look_defines(facts: Any) -> None:
-    """The GPU's quads and levels, drawn by numpy: what drawing small costs, whole and zoomed in."""
+    """The GPU's quads and levels, drawn by numpy: what drawing small costs, whole and zoomed in.
+
+    Block of work.py: "look".
+    """
     assert facts["overlay off"] < 0.015
     assert facts["cropped off"] < 0.015
     assert facts["outside"]
 
 
 def test_what_is_shown_and_baked_is_as_bright_as_the_camera_is_exposed(made: tuple[Any, Path], tmp_path: Path) -> None:
+    """Block of work.py: "look"."""
     facts, base = made
     off, brightest = facts["brighter"]
     assert off < 1e-6 < brightest
@@ -197,6 +221,7 @@ def test_what_is_shown_and_baked_is_as_bright_as_the_camera_is_exposed(made: tup
 
 
 def test_a_shot_has_the_captures_own_numbers(facts: Any) -> None:
+    """Block of work.py: "a shot, and the same by hand"."""
     assert facts["pose off"] < 1e-5
     assert facts["place off"] < 1e-5
     assert facts["moved root off"] < 1e-5
@@ -204,6 +229,7 @@ def test_a_shot_has_the_captures_own_numbers(facts: Any) -> None:
 
 
 def test_a_wall_hides_a_light_softly(facts: Any) -> None:
+    """Block of work.py: "occlusion: a wall slides before the light"."""
     shares = facts["fades"]
     assert shares[0] == pytest.approx(1)
     assert shares[-1] == pytest.approx(0)
@@ -212,15 +238,18 @@ def test_a_wall_hides_a_light_softly(facts: Any) -> None:
 
 
 def test_a_light_behind_the_camera_gives_no_flare(facts: Any) -> None:
+    """Block of work.py: "behind the camera"."""
     assert facts["behind"] == []
 
 
 def test_a_file_remembers_and_so_does_a_disabled_extension(facts: Any) -> None:
+    """Block of work.py: "save, reload"."""
     assert facts["reloaded"] == ["lamp.flare", "lamp", [1.0, 0.5, 0.25], "capture Root"]
     assert facts["enabled again"] == [1.0, 0.5, 0.25]
 
 
 def test_the_library_keeps_flares(facts: Any) -> None:
+    """Block of work.py: "library and transfer"."""
     saved, again = facts["saved"]
     assert saved == ["FINISHED"]
     assert "already" in again
@@ -233,24 +262,30 @@ def test_the_library_keeps_flares(facts: Any) -> None:
 
 
 def test_a_flare_goes_on_to_another_camera_and_light(facts: Any) -> None:
+    """Block of work.py: "library and transfer"."""
     assert facts["applied"] == ["FINISHED"]
     assert facts["applied to"] == ["Spot"]
     assert facts["transferred"] == [False, 1, True]
 
 
 def test_a_light_is_picked_in_a_single_picture(facts: Any) -> None:
+    """Block of work.py: "a single picture, the light picked in it"."""
     assert facts["picture"] == [["FINISHED"], 96, 64]
     np.testing.assert_allclose(facts["picked"], [0.25, 0.3], atol=1e-4)
 
 
 def test_an_upright_picture_is_by_a_turned_camera(facts: Any) -> None:
-    """As `transfer` takes it: across its long side lies what lay across the source's."""
+    """As `transfer` takes it: across its long side lies what lay across the source's.
+
+    Block of work.py: "a single picture, the light picked in it".
+    """
     found, expected, wide = facts["upright"]
     assert wide
     assert found == pytest.approx(expected, rel=1e-5)
 
 
 def test_blenders_own_camera_becomes_a_capture(facts: Any) -> None:
+    """Block of work.py: "a capture of Blender's own camera"."""
     assert facts["exported"] == ["FINISHED"]
     assert facts["export off"] < 1e-5
     assert facts["export lens off"] < 1e-3

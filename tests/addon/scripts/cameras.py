@@ -24,7 +24,7 @@ data = bpy.data.cameras.new("Camera")
 camera = bpy.data.objects.new("Camera", data)
 scene.collection.objects.link(camera)
 
-# Every way to fit the sensor, frame and pixels: fx, fy, cx and cy by Blender's own matrix, and by ours.
+# ---- every way to fit the sensor ------------------------------------------------------------------
 facts["intrinsics"] = {}
 for fit, (width, height), (x, y) in itertools.product(
         ("AUTO", "HORIZONTAL", "VERTICAL"), ((64, 40), (40, 64)), ((1, 1), (1, 1.4), (2, 1))):
@@ -39,7 +39,7 @@ for fit, (width, height), (x, y) in itertools.product(
     facts["intrinsics"][f"{fit} {width}x{height} {x}:{y}"] = [list(map(float, blenders)),
                                                               list(map(float, cameras.intrinsics_of(data, render)))]
 
-# A camera of the core with other pixels than square, into Blender and back.
+# ---- a camera of the core with other pixels than square, into Blender and back --------------------
 facts["back"] = []
 for fx, fy in ((70.0, 50.0), (50.0, 70.0)):
     one = part("core.capture").Camera(64, 40, fx, fy, 33.0, 19.5, np.eye(4))
@@ -50,18 +50,18 @@ for fx, fy in ((70.0, 50.0), (50.0, 70.0)):
     data.lens, data.shift_x, data.shift_y = cameras.lens_of(one, 36.0, aspect)
     facts["back"].append([[fx, fy, 33.0, 19.5], list(map(float, cameras.intrinsics_of(data, render)))])
 
-# What a scene has one of.
+# ---- what a scene has one of ----------------------------------------------------------------------
 Camera = part("core.capture").Camera
 facts["unlike"] = [list(part("flare_addon.capture.importer").camera_differences(
     [Camera(64, 40, 70.0, 70.0, 32, 20, np.eye(4)), Camera(64, height, 70.0, fy, 32, 20, np.eye(4))]))
     for height, fy in ((40, 70.1), (44, 70.0), (40, 71.4))]
 
-# What was up in the capture is up in Blender.
+# ---- what was up in the capture is up in Blender --------------------------------------------------
 axes = part("flare_addon.capture.importer").UP_ROTATIONS
 facts["up"] = {name: list(np.array(Euler(axes[name]).to_matrix()) @ up)
                for name, up in (("Z", (0, 0, 1)), ("-Y", (0, -1, 0)), ("Y", (0, 1, 0)))}
 
-# Frames: of a custom range, and which file of a sequence a frame of the scene shows.
+# ---- frames ---------------------------------------------------------------------------------------
 custom = SimpleNamespace(bake_range="custom", bake_first=3, bake_last=5)
 facts["custom"] = list(shots.frames_to_bake(SimpleNamespace(fit_flare=custom)))
 sequence = SimpleNamespace(source="SEQUENCE", library=None, filepath="/s/plate.1001.exr")
@@ -71,11 +71,11 @@ filmed = part("flare_addon.capture.exporter").footage_of(
     SimpleNamespace(type="CAMERA", data=SimpleNamespace(background_images=[behind])))
 facts["footage"] = filmed.path(3).name
 
-# What the compositor does live is not baked too.
+# ---- what the compositor does live is not baked too -----------------------------------------------
 edits = part("core.look").LookEdits.parse(["*.mute=1", "lamp.solo=1", "key.mute=1", "lamp.scale=2"], ["lamp", "key"])
 facts["baked edits"] = list(shots.without_live_edits(edits).texts())
 
-# A light that was moved from where it was learned shows its flare as the source does, not as its capture did.
+# ---- a light that was moved from where it was learned shows its flare as the source does ----------
 facts["query"] = [looks.query_of(SimpleNamespace(root=1, native=native)) for native in (True, False)]
 root, lamp = bpy.data.objects.new("Root", None), bpy.data.objects.new("Lamp", None)
 for thing in (root, lamp):
@@ -86,7 +86,8 @@ facts["native"] = []
 for away in (0, 5):
     lamp.location = (away, 0, 0)
     depsgraph = part("flare_addon.objects").depsgraph_of(scene)
-    facts["native"].append([bool(looks._was_learned_here(learned, SimpleNamespace(root=its, capture=capture), {"lamp": lamp},
+    facts["native"].append([bool(looks._was_learned_here(learned, SimpleNamespace(root=its, capture=capture),
+                                                         {"lamp": lamp},
                                               depsgraph))
                             for its, capture in ((root, "//capture"), (None, "//of this camera"), (None, ""))])
 leave(facts)

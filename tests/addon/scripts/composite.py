@@ -45,7 +45,7 @@ def render(scene: bpy.types.Scene, name: str, frames: list[int]) -> None:
 
 facts: dict[str, object] = {"version": bpy.app.version_string}
 
-# The graph as it comes, rendered and saved.
+# ---- the graph as it comes, rendered and saved ----------------------------------------------------
 scene = empty()
 facts["stands at"] = scene.frame_current
 node = setup.set_up(scene, layers)
@@ -53,23 +53,23 @@ facts["inputs"] = [socket.name for socket in node.inputs]
 facts["outputs"] = [socket.name for socket in node.outputs]
 render(scene, "plain", sorted(layers.files))
 
-# With the sliders moved.
+# ---- with the sliders moved -----------------------------------------------------------------------
 node.inputs["Intensity"].default_value = INTENSITY
 node.inputs["Tint"].default_value = TINT
 render(scene, "changed", sorted(layers.files))
 render_settings.save_blend(out / "scene" / "compositor.blend")
 
-# Set up again: nothing doubles, the sliders stay.
+# ---- set up again: nothing doubles, the sliders stay ----------------------------------------------
 count = len(flare_node.tree_of(scene).nodes), len(bpy.data.node_groups)
 again = setup.set_up(scene, layers)
 facts["doubled"] = [count, (len(flare_node.tree_of(scene).nodes), len(bpy.data.node_groups))]
 facts["sliders"] = [again.inputs["Intensity"].default_value, list(again.inputs["Tint"].default_value)]
 
-# The flare alone.
+# ---- the flare alone ------------------------------------------------------------------------------
 flare_node.tree_of(scene).links.new(again.outputs["Flare"], setup._output_input(flare_node.tree_of(scene)))
 render(scene, "flare", sorted(layers.files)[:1])
 
-# Over what is there: a plain colour in place of the baked scene, twice.
+# ---- over what is there: a plain colour in place of the baked scene, twice ------------------------
 scene = empty()
 tree = setup._new_tree(scene, keep_image=False)
 plate = tree.nodes.new("CompositorNodeRGB")
@@ -80,7 +80,7 @@ for _ in range(2):
 facts["plate stays"] = plate.name in tree.nodes
 render(scene, "over", sorted(layers.files)[:1])
 
-# At other percentages of the size than it was baked for: the baked scene, and over a plain colour.
+# ---- at other percentages of the size than it was baked for ---------------------------------------
 for percentage in (50, 200):
     scene.render.resolution_percentage = percentage
     render(scene, f"over at {percentage}", sorted(layers.files)[:1])
@@ -89,7 +89,7 @@ setup.set_up(scene, layers)
 scene.render.resolution_percentage = 50
 render(scene, "plain at 50", sorted(layers.files)[:1])
 
-# Pointed at layers of fewer lights, and at a picture without layers, which is refused.
+# ---- pointed at layers of fewer lights ------------------------------------------------------------
 scene = empty()
 setup.set_up(scene, layers)
 node = setup.set_up(scene, LayerFolder.open(fewer))
@@ -100,7 +100,7 @@ except FrameError as problem:
 facts["fewer"] = [socket.name for socket in node.inputs if socket.is_linked]
 render(scene, "fewer", [layers.first])
 
-# Two scenes of one tree: what is set up and removed in the second leaves the first as it is.
+# ---- two scenes of one tree -----------------------------------------------------------------------
 if flare_node.GROUPS_ARE_TREES:
     scene = empty()
     setup.set_up(scene, layers)
@@ -124,7 +124,7 @@ if flare_node.GROUPS_ARE_TREES:
                                        flare_node.find_node(second) is None, flare_node.find_node(third) is None]
     render(scene, "of one tree", sorted(layers.files)[:1])
 
-# Wide pixels stay; a region that is cut out is refused, and leaves nothing.
+# ---- wide pixels stay; a region that is cut out is refused, and leaves nothing --------------------
 scene = empty()
 scene.render.pixel_aspect_x = 2
 render_settings.match_scene(scene, layers, layers.size())
@@ -135,12 +135,12 @@ try:
 except FrameError as problem:
     facts["cropped"] = [str(problem), flare_node.find_node(scene) is None]
 
-# The command, of layers of wide pixels in ACEScg.
+# ---- the command, of layers of wide pixels in ACEScg ----------------------------------------------
 compose.compose_frames(aces, out / "aces", Progress())
 scene = bpy.context.scene
 facts["aces"] = [setup.colour_space_warning(scene), scene.render.pixel_aspect_x, scene.render.pixel_aspect_y]
 
-# A disk that fills up, which Blender does not tell of: files may not grow beyond a limit.
+# ---- a disk that fills up -------------------------------------------------------------------------
 if sys.platform == "linux":
     import resource
     import signal

@@ -57,7 +57,7 @@ def shown(scene, frame=1):
 def said(scene):
     """What the panel says of the compositor."""
     layout = MagicMock()
-    panels.FITFLARE_PT_bake._compositor(None, layout, scene)
+    panels.FITFLARE_PT_bake._draw_compositor(None, layout, scene)
     return " ".join(call.kwargs["text"] for call in layout.mock_calls if call[0].endswith(".label"))
 
 

@@ -165,7 +165,7 @@ for how in ("linked", "overridden"):
 
 # ---- a click in the picture -------------------------------------------------------------------------
 library = part("flare_addon.operators.library")
-frame_in, library.overlay.frame_in = overlay.camera_frame, lambda *_words: overlay.CameraFrame(100, 50, 200, 100)
+frame_in, library.overlay.camera_frame = overlay.camera_frame, lambda *_words: overlay.CameraFrame(100, 50, 200, 100)
 view, panel = (SimpleNamespace(type=kind, x=left, y=0, width=width, height=300)
                for kind, left, width in (("WINDOW", 10, 500), ("UI", 260, 250)))
 area = SimpleNamespace(as_pointer=lambda: 7, regions=[view, panel],
@@ -267,7 +267,8 @@ path.write_text(json.dumps({"lights": [*only, {"name": "later", "xyz": [1, 2, 3]
 job = part("flare_addon.jobs").Job("lights", capture / "lights", 0, None)
 job.state = "done"
 fits.on_lights_found(job)
-facts["of each scene"] = {one.name: [lights.light_name(item) for item in lights.scene_lights(one)] for one in bpy.data.scenes}
+facts["of each scene"] = {one.name: [lights.light_name(item) for item in lights.scene_lights(one)]
+                          for one in bpy.data.scenes}
 bpy.ops.scene.new(type="NEW")
 scene = bpy.context.scene
 scene.collection.children.link(root.users_collection[0])

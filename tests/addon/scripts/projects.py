@@ -91,16 +91,20 @@ facts["mirrored"] += [refusal(lambda: ops.capture_from_camera(directory=str(out 
 # ---- plates that are links ---------------------------------------------------------------------------
 links = out / "links"
 links.mkdir()
+facts["links"] = None
 try:
     for path in sorted(first.parent.iterdir()):
         (links / path.name).symlink_to(Path("..") / "beside" / "images" / path.name)
+except OSError:
+    can_link = False  # the system, or the user's rights, permit no symbolic links
+else:
+    can_link = True
+if can_link:
     filmed(links / first.name)
     ops.capture_from_camera(directory=str(out / "linked"))
-    facts["links"] = len(loaded.open(out / "linked").views)
+    count = len(loaded.open(out / "linked").views)
     shutil.rmtree(links)
-    facts["links"] = [facts["links"], len([path for path in (out / "linked" / "images").iterdir() if path.is_file()])]
-except OSError:
-    facts["links"] = [len(pictures), len(pictures)]  # a system that lets nobody make them
+    facts["links"] = [count, len([path for path in (out / "linked" / "images").iterdir() if path.is_file()])]
 
 # ---- a camera that is linked from another folder's .blend -------------------------------------------
 asset = plates_in(out / "assets" / "plates")

@@ -71,7 +71,7 @@ for make in (bare, grey, unused):
         after = dump(scene)
         facts[f"{make.__name__}, {over}"] = [changed, after == before, "" if after == before else f"{before} {after}"]
 
-# Driven: the panel's sliders, animated too, in rendered pixels.
+# ---- driven: the panel's sliders, animated too, in rendered pixels --------------------------------
 def shot():
     """A scene with a camera and the flare, that renders as many pixels as the layers have."""
     scene = empty()
@@ -124,7 +124,7 @@ files["animated"] = rendered("animated")
 facts["files"] = files
 facts["valid"] = all(curve.driver.is_valid for curve in flare_node.tree_of(scene).animation_data.drivers)
 
-# As many flares as a driver's expression could not name.
+# ---- as many flares as a driver's expression could not name ---------------------------------------
 scene = shot()
 state = scene.fit_flare
 for number in range(1, 60):
@@ -147,7 +147,7 @@ scene.fit_flare.lights[1].solo = False
 ops.set_up_baked()
 files["many, none solo"] = rendered("many, none solo")
 
-# Rendered where the extension is not, after a save.
+# ---- rendered where the extension is not, after a save --------------------------------------------
 scene = shot()
 scene.fit_flare.layers = layers
 ops.set_up_baked()

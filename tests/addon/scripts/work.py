@@ -66,7 +66,8 @@ for kind, up, scale in (("animated", "Z", 1.0), ("each", "-Y", 2.5)):
     for frame in frames:
         scene.frame_set(frame.number)
         camera = scene.camera if kind == "animated" else scene.objects[Path(frame.view).stem]
-        found.append(shots.shot_frame(scene, bpy.context.evaluated_depsgraph_get(), camera, frame.number).camera.exposure)
+        found.append(shots.shot_frame(scene, bpy.context.evaluated_depsgraph_get(), camera,
+                                      frame.number).camera.exposure)
     facts[f"exposed, {kind}"] = found
     # A run of this capture exposes cameras that are imported later, too; one of another does not.
     fits = part("flare_addon.fits")
@@ -107,7 +108,7 @@ given, again = [str(word) for word in fits.cleaning_args(scene, fits.capture_fol
 find, start = fits.jobs.find, fits.engine.run
 fits.engine.run = lambda _kind, _folder, words: again.append(words[-1] == "--overwrite")
 for state, words in (("none", None), ("done", given), ("stopped", given), ("stopped", given[:-1])):
-    made = None if words is None else SimpleNamespace(state=state, words=words)
+    made = None if words is None else SimpleNamespace(state=state, args=words)
     fits.jobs.find = lambda _, made=made: made
     fits.clean_frames(scene)
 fits.jobs.find, fits.engine.run = find, start
@@ -200,7 +201,8 @@ bpy.context.view_layer.update()
 lights.move_to_fit(scene, places, Path(capture))
 bpy.context.view_layer.update()
 depsgraph = part("flare_addon.objects").depsgraph_of(scene)
-facts["followed"] = {name: bool(np.allclose(lights.capture_position(item, scene.fit_flare.root, depsgraph), places[name],
+facts["followed"] = {name: bool(np.allclose(lights.capture_position(item, scene.fit_flare.root, depsgraph),
+                                            places[name],
                                             atol=1e-4))
                      for name in places for item in lights.scene_lights(scene) if lights.light_name(item) == name}
 lights.move_to_fit(scene, {light.name: light.xyz for light in written}, Path(capture))
@@ -248,7 +250,8 @@ facts["reset"] = looks.edits_of(state).is_neutral or looks.edits_of(state).texts
 look = looks.look_of(scene)
 scene.frame_set(2)
 state.occlusion = False
-gaussians = overlay.concatenate(list(looks.evaluate_flares(scene, bpy.context.evaluated_depsgraph_get(), scene.camera).values()))
+gaussians = overlay.concatenate(list(looks.evaluate_flares(scene, bpy.context.evaluated_depsgraph_get(),
+                                                           scene.camera).values()))
 evaluated = scene.camera.evaluated_get(bpy.context.evaluated_depsgraph_get())
 core = cameras.core_camera(evaluated.data, evaluated.matrix_world, scene.render)
 
@@ -295,7 +298,8 @@ def far_off(picture, expected):
     return float(np.sqrt(((picture - expected) ** 2).sum() / (expected**2).sum()))
 
 
-whole = overlay.drawn_region(overlay.CameraFrame(0, 0, 3 * core.width, 3 * core.height), (3 * core.width, 3 * core.height), core)
+whole = overlay.drawn_region(overlay.CameraFrame(0, 0, 3 * core.width, 3 * core.height), (3 * core.width,
+                                                                                          3 * core.height), core)
 large = core.scaled(3 * core.width, 3 * core.height)
 expected = drawing.draw([gaussians], large.intrinsics, *large.size, look.blend, look.pixel_grid)
 facts["overlay off"] = far_off(drawn(whole), expected)
@@ -307,7 +311,8 @@ facts["outside"] = overlay.drawn_region(overlay.CameraFrame(500, 0, 64, 40), (10
 
 # What is shown and what is baked are as bright as the frame was exposed.
 scene.camera.fit_flare.exposure = 2.0
-brighter = overlay.concatenate(list(looks.evaluate_flares(scene, bpy.context.evaluated_depsgraph_get(), scene.camera).values()))
+brighter = overlay.concatenate(list(looks.evaluate_flares(scene, bpy.context.evaluated_depsgraph_get(),
+                                                          scene.camera).values()))
 facts["brighter"] = [far_off(brighter.colours, 2 * gaussians.colours), float(np.abs(gaussians.colours).max())]
 exposed_shot = shots.scene_shot(scene, [scene.camera], [2], Path(flare), None)
 exposed_shot.write(Path(out) / "exposed.json")

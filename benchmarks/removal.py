@@ -58,7 +58,7 @@ set_thread_environment()
 
 import numpy as np
 
-from benchmarks.resident import held_at_most
+from benchmarks.resident import peak_memory
 from core.images.plates import read_plate
 from core.images.read import read_picture
 from core.images.write import write_exr, write_png
@@ -96,7 +96,7 @@ def one(plate: Path, size: int = WORKING_SIZE, weights: Path | None = None) -> N
     first = time.perf_counter()
     remove_all([plate], plate.parent / "out", remover, Progress(), overwrite=True)
     print(json.dumps({"load_s": loaded - began, "first_s": first - loaded, "again_s": time.perf_counter() - first,
-                      "peak_mb": held_at_most()}))
+                      "peak_mb": peak_memory()}))
 
 
 def speed(weights: Path | None = None) -> None:
@@ -272,7 +272,7 @@ def confidence(folders: list[Path], lenses: Path | None = None, weights: Path | 
         applied = np.array([confidence_from_log_odds(value) for value in log_odds])
         print(f"{name}: area under the curve {area:.3f}; applied of {flares.sum()} useful predictions "
               f"{applied[flares].mean():.1%}, of {(~flares).sum()} harmful ones {applied[~flares].mean():.1%}; the "
-              f"useful ones gain {gains[flares].mean():.2f} dB, of which {(gains * applied)[flares].mean():.2f} dB remain")
+              f"useful ones gain {gains[flares].mean():.2f} dB, applied {(gains * applied)[flares].mean():.2f} dB")
 
 
 def _draw_features(remover: Remover, seed: int, count: int, backgrounds: Any, lenses: Any) -> tuple[Any, Any]:

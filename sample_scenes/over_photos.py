@@ -36,7 +36,7 @@ from sample_scenes.flares import LENS_SETUPS, LensSetup, render_flare
 def add_flares(capture: Capture, out: Path, setup: LensSetup, light: NDArray[np.float64], colour: tuple[float, ...],
                intensity: float, width: int, progress: Progress) -> None:
     """Write the new capture; views that exist already are kept. light: world coordinates (3,)."""
-    capture = capture.with_exposures(metering.found(capture, Frames(capture, width)))
+    capture = capture.with_exposures(metering.measure_exposures(capture, Frames(capture, width)))
     progress.stage("flares", len(capture.views))
     for view in capture.views:
         stem = Path(view.name).stem

@@ -25,7 +25,7 @@ from ..images.contact_sheet import add_label, side_by_side
 from ..images.listing import pictures_in
 from ..images.picture import same_aspect
 from ..images.read import read_picture
-from ..metrics.evaluation import cell
+from ..metrics.evaluation import format_cell
 from ..metrics.pictures import Perceptual, flip, psnr, ssim
 from ..system.progress import Progress
 from .synthesis.prescription import Prescription, built_in_lenses
@@ -103,7 +103,7 @@ def _case_reader(path: Path, truth: Path, mask: Path | None) -> Callable[[], tup
         frame, clean = read_picture(path), read_picture(truth)
         if frame.size != clean.size:
             raise FrameError(f"{path} is {frame.size[0]} x {frame.size[1]} pixels and {truth} {clean.size[0]} x "
-                             f"{clean.size[1]}; make them one size.")
+                             f"{clean.size[1]}; make them the same size.")
         mask_picture = read_picture(mask) if mask else None
         if mask_picture and not same_aspect(mask_picture.size, frame.size):
             raise FrameError(f"{mask} is {mask_picture.size[0]} x {mask_picture.size[1]} pixels, another shape than "
@@ -187,10 +187,10 @@ def format_table(scores: dict[str, Any]) -> str:
     lines = [f"{'category':24}{'n':>5}{'PSNR':>16}{'gain':>7}{'SSIM':>18}{'LPIPS':>8}{'FLIP':>8}{'worse':>7}"]
     for name, part in [*scores["categories"].items(), ("all", scores["mean"])]:
         after, before = part["result"], part["input"]
-        levels = f"{cell(after['psnr'], 2)} ({cell(before['psnr'], 2)})"
-        likeness = f"{cell(after['ssim'], 4)} ({cell(before['ssim'], 4)})"
-        lines.append(f"{name:24.24}{part['count']:>5}{levels:>16}{cell(part['gain_db'], 2):>7}{likeness:>18}"
-                     f"{cell(after['lpips'], 4):>8}{cell(after['flip'], 4):>8}{part['made_worse']:>7.1%}")
+        levels = f"{format_cell(after['psnr'], 2)} ({format_cell(before['psnr'], 2)})"
+        likeness = f"{format_cell(after['ssim'], 4)} ({format_cell(before['ssim'], 4)})"
+        lines.append(f"{name:24.24}{part['count']:>5}{levels:>16}{format_cell(part['gain_db'], 2):>7}{likeness:>18}"
+                     f"{format_cell(after['lpips'], 4):>8}{format_cell(after['flip'], 4):>8}{part['made_worse']:>7.1%}")
     return "\n".join(lines)
 
 
@@ -205,10 +205,10 @@ def worst_sheet(cases: Sequence[Case], clean: Callable[[Pixels], Pixels], scores
         case, gain = by_name[row["category"], row["name"]], row["gain_db"]
         frame, truth, _ = case.read()
         result = clean(frame)
-        taken = np.clip((frame - result) * 2, 0, 1)
+        removed = np.clip((frame - result) * 2, 0, 1)
         height = int(np.clip(round(width * frame.shape[0] / frame.shape[1]), 1, MAX_TILE_ASPECT * width))
         parts = [np.asarray(cv2.resize(part, (width, height), interpolation=cv2.INTER_AREA), np.float32)
-                 for part in (frame, result, truth, taken)]
+                 for part in (frame, result, truth, removed)]
         text = f"{case.category} / {case.name}: {gain:+.2f} dB   input | result | truth | taken away x2"
         strips.append(add_label(text, side_by_side(parts)))
     return np.concatenate(strips) if strips else np.zeros((20, 4 * width, 3), np.float32)

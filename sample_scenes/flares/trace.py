@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 COATING_INDEX = 1.38
 """Refractive index of magnesium fluoride."""
 
-# What a traced ray holds.
+# Indices of a traced ray's numbers.
 SENSOR_X, SENSOR_Y, STRAY, WEIGHT = 0, 1, 2, 3
 STOP_X, STOP_Y = 4, 5
 FIELDS = 10
@@ -60,7 +60,7 @@ def reflectance(cosine: float, n0: float, n2: float, wavelength: float, coating:
             r12 = (n2 * c1 - n1 * c2) / (n2 * c1 + n1 * c2)
         both = r01 * r12
         total += (r01 * r01 + r12 * r12 + 2.0 * both * wave) / (1.0 + both * both + 2.0 * both * wave)
-    return max(0.5 * total, 0.0)  # where the two waves cancel, rounding falls on either side of nothing
+    return max(0.5 * total, 0.0)  # where the two waves cancel, rounding may fall below zero
 
 
 @njit(cache=True)

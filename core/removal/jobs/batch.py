@@ -48,7 +48,7 @@ def collect_plates(inputs: Iterable[Path], exclude: Iterable[Path | None] = ()) 
             files = [(path, path.relative_to(item)) for path in pictures_below(item)
                      if excluded_paths.isdisjoint(_self_and_parents(path))]
             if not files:
-                raise SettingsError(f"{item} holds no pictures, or results alone; give a folder with PNG, JPEG, "
+                raise SettingsError(f"{item} holds no pictures besides results; give a folder with PNG, JPEG, "
                                     "TIFF or EXR files.")
         else:
             files = [(item, Path(item.name))]
@@ -56,7 +56,7 @@ def collect_plates(inputs: Iterable[Path], exclude: Iterable[Path | None] = ()) 
             key = name.as_posix().casefold()
             if key in plates:
                 raise SettingsError(f"{plates[key][0]} and {path} would be written to the same file, on Windows and "
-                                    "macOS at least; remove them apart.")
+                                    "macOS at least; clean them in separate runs.")
             plates[key] = path, name
     return list(plates.values())
 
@@ -70,7 +70,7 @@ def collect_with_neighbours(inputs: Sequence[Path], exclude: Iterable[Path | Non
     plates = dict.fromkeys(path for path, _ in collect_plates(inputs, excluded))
     for folder in dict.fromkeys(item.parent for item in inputs if not item.is_dir()):
         others = _excluded_paths(folder, excluded)
-        with contextlib.suppress(OSError):  # a plate may be read out of a folder that may not be
+        with contextlib.suppress(OSError):  # a plate may be readable in a folder that is not
             plates.update(dict.fromkeys(path for path in pictures_in(folder) if path.resolve() not in others))
     return list(plates)
 
@@ -114,7 +114,7 @@ def remove_all(inputs: Sequence[Path], folder: Path, remover: Remover, progress:
     """
     for place in (folder, flare_folder):
         if place is not None and (other := _blocking_path(place)):
-            raise SettingsError(f"{other} is no folder, and results are to go into {place}; name another.")
+            raise SettingsError(f"{other} is not a folder, so {place} cannot be written to; choose another folder.")
     excluded = [folder, flare_folder, mattes.source if mattes else None]
     plates = collect_plates(inputs, excluded)
     results = {name: [folder / name, *([flare_folder / name.with_suffix(".exr")] if flare_folder else [])]

@@ -52,17 +52,17 @@ def clean_capture(capture: Capture, remover: Remover, progress: Progress) -> Pat
     try:
         write_clean_frames(frames, Manifest(work), progress, digest=digest, clean=clean, keep_finished=True,
                            overwrite=True)
-        # In this order: what is missing because another has just renamed its folder is in `target` by then.
+        # In this order: if another fit has just renamed the folder, `target` exists by the second test.
         if not all(frame.results[0].is_file() for frame in frames) and not target.exists():
-            raise CaptureError(f"Another fit cleans the frames of {capture.folder} in another way at the same time; "
-                               "wait for it, and start this one again.")
+            raise CaptureError(f"Another fit is cleaning the frames of {capture.folder} with other settings; wait "
+                               "for it, and start this one again.")
         retry_while_locked(work.rename, target)
     except OSError as problem:
-        if target.is_dir():  # another fit of this capture was first
+        if target.is_dir():  # another fit of this capture has finished first
             shutil.rmtree(work, ignore_errors=True)
             return target
-        raise CaptureError(f"{work} cannot be written ({problem.strerror or problem}); copy the capture to where it "
-                           "can, or fit it without clean frames (--mode split).") from problem
+        raise CaptureError(f"{work} cannot be written ({problem.strerror or problem}); copy the capture to a "
+                           "writable folder, or fit it without clean frames (--mode split).") from problem
     return target
 
 

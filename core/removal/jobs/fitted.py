@@ -109,14 +109,14 @@ def _clean_view(renderer: Renderer, capture: Capture, view: View,
     """Return a view's plate, the codes of its clean frame, the removed flare in linear light, and each light's gain."""
     plate = read_plate(capture.frame_path(view))
     height, width = plate.codes.shape[:2]
-    window = read_data_window(capture.frame_path(view))  # an EXR's pixels may be more than those of the frame, or fewer
+    window = read_data_window(capture.frame_path(view))  # an EXR may have overscan or be cropped
     camera = view.camera if view.camera.size == window.frame else view.camera.scaled(*window.frame)
     camera = camera if window.is_frame else camera.cropped(*window.origin, *window.size)
     layers = renderer.render(camera)
     flare = np.zeros((height, width, 3), np.float32)
     fitted_part = plate.picture_area.slices  # the borders were not fitted, and stay
     flares, scene = layers.flare_by_light, layers.scene
-    if plate.encoding == "linear":  # the fit was shown Rec. 709
+    if plate.encoding == "linear":  # the fit was given Rec. 709
         flares = {light: plate.space.from_linear(pixels) for light, pixels in flares.items()}
         scene = plate.space.from_linear(scene)
     flares = {light: plate.to_plate_channels(pixels) for light, pixels in flares.items()}
@@ -143,11 +143,11 @@ def _fit_flare_gains(plate: Plate, scene: Pixels, flares: Mapping[str, Pixels]) 
         return {}
     part = plate.picture_area.slices
     step = max(round(math.sqrt(math.prod(plate.codes.shape[:2]) / MAX_SAMPLES)), 1)
-    observed, *layers = (one[part][::step, ::step] for one in (_linear_light(plate), scene, *flares.values()))
+    observed, *layers = (pixels[part][::step, ::step] for pixels in (_linear_light(plate), scene, *flares.values()))
     clipped = linear_from_srgb(np.array(CLIPPING_LEVEL)) if plate.encoding == "srgb" else np.inf
     unclipped = (observed < clipped).all(-1)
     light = observed[unclipped].ravel().astype(np.float64)
-    columns = np.stack([one[unclipped].ravel() for one in layers], 1).astype(np.float64)
+    columns = np.stack([pixels[unclipped].ravel() for pixels in layers], 1).astype(np.float64)
     low, high = np.array([[1 / MAX_SCENE_GAIN, MAX_SCENE_GAIN], *len(flares) * [[0.0, 1.0]]]).T
     gains, weights = np.ones(len(layers)), np.ones(len(light))
     prior = PRIOR_WEIGHT * max(len(light), 1) * np.eye(len(layers))  # alone decides where the whole plate is clipped

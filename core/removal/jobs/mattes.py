@@ -41,10 +41,10 @@ class Mattes:
         """Return the matte of the plate of that name below its folder. Raises FrameError where it has none."""
         if self._by_name is None:
             return self.source
-        found = self._by_name.get(name.with_suffix(""))
-        if found is None:
-            raise FrameError(f"{name} has no matte in {self.source}; add one (black, where no flare is to be taken).")
-        return found
+        matte = self._by_name.get(name.with_suffix(""))
+        if matte is None:
+            raise FrameError(f"{name} has no matte in {self.source}; add one, all black to remove nothing.")
+        return matte
 
     def read(self, name: Path, plate: DataWindow, orientation: int = UPRIGHT) -> NDArray[np.float32]:
         """Return the plate's matte as the plate is stored: (height, width), 0..1, its brightest channel times its
@@ -59,9 +59,9 @@ class Mattes:
         oriented = undo_orientation(apply_orientation(values, read_exif(path)[0]), orientation)
         size = oriented.shape[1], oriented.shape[0]
         if window.is_frame and _is_same_aspect(size, plate.frame):
-            # Painted on the plate as viewers show it; else on its pixels, by a program that knows nothing of Exif.
+            # Painted on the plate as viewers show it; otherwise on its stored pixels, by a program that ignores Exif.
             window, values = DataWindow(size, (0, 0), size), oriented
-        if window.is_frame and window.size == plate.size:  # painted on the very pixels of the plate, overscan and all
+        if window.is_frame and window.size == plate.size:  # painted on the plate's stored pixels, with its overscan
             return np.clip(values, 0, 1)
         (columns, rows), (width, height) = window.frame, plate.frame
         if not _is_same_aspect(window.frame, plate.frame):
@@ -91,17 +91,17 @@ def _read_matte_values(path: Path) -> NDArray[np.float32]:
     if exr_alpha is None:
         return values
     alpha = np.nan_to_num(np.asarray(exr_alpha, np.float32), nan=0.0, posinf=1.0)
-    if values.any():  # multiplied by alpha, as an EXR should be, or white beside it
+    if values.any():  # premultiplied, as an EXR should be, or white outside the alpha
         return np.minimum(values, alpha)
-    return alpha if (alpha < 1).any() else values  # a roto may be in alpha alone
+    return alpha if (alpha < 1).any() else values  # a roto may be in the alpha alone
 
 
 def _index_by_name(folder: Path) -> dict[Path, Path]:
     """Return every matte of the folder by its name there without the suffix."""
-    found: dict[Path, Path] = {}
+    mattes: dict[Path, Path] = {}
     for path in pictures_below(folder):
         name = path.relative_to(folder).with_suffix("")
-        if name in found:
-            raise SettingsError(f"{found[name]} and {path} are both mattes for {name}; keep one of them.")
-        found[name] = path
-    return found
+        if name in mattes:
+            raise SettingsError(f"{mattes[name]} and {path} are both mattes for {name}; keep one of them.")
+        mattes[name] = path
+    return mattes

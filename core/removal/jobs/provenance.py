@@ -26,9 +26,9 @@ def check_clean_frames_current(capture: Capture) -> None:
     no manifest lists are someone's own and pass."""
     folder, sources = capture.folder / REMOVED, _frames_by_clean_name(capture)
     if others := Manifest(folder).changed_sources(sources):
-        raise CaptureError(f"{len(others)} of the {len(sources)} flare-free frames in {folder} were made from other "
-                           f"frames than the capture has now ({others[0].as_posix()} first); remove that folder, and "
-                           "they are made again.")
+        raise CaptureError(f"{len(others)} of the {len(sources)} clean frames in {folder} were made from other frames "
+                           f"than the capture has now ({others[0].as_posix()} first); delete that folder to make them "
+                           "again.")
 
 
 def _frames_by_clean_name(capture: Capture) -> dict[Path, Path]:

@@ -18,15 +18,15 @@ VIDEO_MANIFEST = "video.json"
 def expand_videos(inputs: Iterable[Path], folder: Path, progress: Progress) -> tuple[list[Path], list[str]]:
     """Return `inputs` with each video replaced by the folder of its frames below `folder`, and messages about videos
     that cannot be read. Raises FrameError if no input is left."""
-    found, failures = list[Path](), list[str]()
+    paths, failures = list[Path](), list[str]()
     for path in inputs:
         try:
-            found.append(extract_frames(path, folder, progress) if path.is_file() and is_video(path) else path)
+            paths.append(extract_frames(path, folder, progress) if path.is_file() and is_video(path) else path)
         except FrameError as problem:
             failures.append(str(problem))
-    if failures and not found:
+    if failures and not paths:
         raise FrameError(join_failures(failures))
-    return found, failures
+    return paths, failures
 
 
 def extract_frames(video: Path, folder: Path, progress: Progress) -> Path:
@@ -43,11 +43,11 @@ def extract_frames(video: Path, folder: Path, progress: Progress) -> Path:
                 _decode_frames(video, temporary, progress)
                 write_json(temporary / VIDEO_MANIFEST, {"content": content})
         except OSError:
-            if not frames.exists():  # another task of a farm may have made it meanwhile
+            if not frames.exists():  # another task of a farm may have extracted them meanwhile
                 raise
     if read_json(frames / VIDEO_MANIFEST, SettingsError).get("content") != content:
         raise SettingsError(f"{frames} holds the frames of another video of that name; choose another folder for the "
-                            "clean plates, or remove it.")
+                            "clean frames, or delete it.")
     return frames
 
 

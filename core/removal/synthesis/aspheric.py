@@ -57,7 +57,7 @@ def draw_light_ghosts(random: Random, light: Point, size: int) -> Array:
     """Return (size, size, 3), the ghosts of one light; evenly lit ones have a brightness of 0.1 to 1."""
     layer = np.zeros((size, size, 3), np.float32)
     texture = _draw_texture(random)
-    contrast = log_uniform(random, 0.1, 1.0)  # how much of it is to be seen, about
+    contrast = log_uniform(random, 0.1, 1.0)  # of the texture, about
     for _ in range(int(random.integers(1, 6))):
         along = -random.uniform(0.1, 1.4) if random.random() < 0.75 else random.uniform(0.2, 1.2)
         centre = np.array(light) * along + random.normal(0, 0.02, 2)
@@ -90,7 +90,7 @@ def _draw_ghost(random: Random, centre: Array, radius: float, texture: Array, si
 
 def _draw_aberrations(random: Random) -> Aberrations:
     """Draw a ghost's aberrations; many ghosts have nearly none."""
-    strength = random.random() ** 2 * 1.2  # many are nearly flat
+    strength = random.random() ** 2 * 1.2  # many ghosts are nearly free of aberrations
     spread, spread_of_rim = random.normal(0, 0.04), random.normal(0, 0.1)
     return Aberrations(1 + spread * CHANNEL_OFFSETS, strength * random.normal(0, 0.5) + spread_of_rim * CHANNEL_OFFSETS,
                        strength * random.normal(0, 0.4), strength * random.normal(0, 0.25),

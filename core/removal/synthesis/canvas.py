@@ -46,7 +46,7 @@ def log_uniform(random: Random, low: float, high: float) -> float:
     return float(math.exp(random.uniform(math.log(low), math.log(high))))
 
 
-@njit(fastmath=True)  # not cached: a cache is of one name of this package, and the commands give it another
+@njit(fastmath=True)  # not cached: numba caches by module name, and the commands import this one under another
 def draw_ghost(layer: Array, centre: Array, radius: Array, clip_centre: Array, clip_radius: Array,
                second_centre: Array, second_radius: Array, weight: Array, blades: int, turn: float, roundness: float,
                soft: float, rim: float, rim_width: float, hollow: float, slope: float) -> None:

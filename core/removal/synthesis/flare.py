@@ -51,7 +51,7 @@ def synthesise_flare(seed: int | Sequence[int], size: int, lenses: Sequence[Pres
     rest, glow, light = (np.zeros((size, size, 3), np.float32) for _ in range(3))
     count = 1 if random.random() < 0.7 else int(random.integers(2, 4))
     positions = []
-    lens_seed = int(random.integers(1 << 31))  # several lights shine through one lens
+    lens_seed = int(random.integers(1 << 31))  # all lights of a picture have one lens
     for number in range(count):
         position = _draw_light_position(random, kind)
         positions.append(position)
@@ -69,9 +69,9 @@ def synthesise_flare(seed: int | Sequence[int], size: int, lenses: Sequence[Pres
     return SynthesisedFlare(kind, tuple(positions), rest, glow, light)
 
 
-def add_aspheric_ghosts(one: SynthesisedFlare, seed: Sequence[int]) -> SynthesisedFlare:
+def add_aspheric_ghosts(flare: SynthesisedFlare, seed: Sequence[int]) -> SynthesisedFlare:
     """Return the flare with the ghosts of a lens of moulded aspheres, that of a seed, added."""
-    return replace(one, rest=one.rest + aspheric.draw_ghosts(seed, one.lights, one.rest.shape[0]))
+    return replace(flare, rest=flare.rest + aspheric.draw_ghosts(seed, flare.lights, flare.rest.shape[0]))
 
 
 def _draw_light_position(random: Random, kind: str) -> Point:

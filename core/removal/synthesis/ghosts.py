@@ -103,7 +103,7 @@ def draw_freehand(random: Random, light: Point, size: int) -> Array:
     middle, of random positions and colours."""
     layer = np.zeros((size, size, 3), np.float32)
     blades, turn = int(random.integers(5, 10)), random.uniform(0, 2 * math.pi)
-    one_shape = random.random() < 0.6  # all of one shape, or each its own
+    one_shape = random.random() < 0.6  # all of one shape, or each of another
     roundness = random.choice([0.0, 0.5, 1.0])
     base = log_uniform(random, 0.02, 0.25)
     for _ in range(int(random.integers(1, 14))):

@@ -30,7 +30,7 @@ from ...errors import SettingsError
 
 Array = NDArray[np.float64]
 
-LINE_F, LINE_D, LINE_C = 0.4861, 0.5876, 0.6563  # Fraunhofer lines, micrometres
+LINE_F, LINE_D, LINE_C = 0.4861, 0.5876, 0.6563
 """Fraunhofer lines, micrometres."""
 CHANNEL_WAVELENGTHS = (0.61, 0.54, 0.46)
 """Of the red, green and blue channel, micrometres."""
@@ -190,13 +190,13 @@ def parse_prescription(text: str, name: str, where: str = "The lens") -> Prescri
     stop = -1
     for number, line in enumerate(text.splitlines(), 1):
         content = line.split("#")[0]
-        words = content.split()
-        if not words or ":" in content:
+        columns = content.split()
+        if not columns or ":" in content:
             continue
-        if words[0] == "stop":
-            stop, words[0] = len(rows), "0"
+        if columns[0] == "stop":
+            stop, columns[0] = len(rows), "0"
         try:
-            row = [float(word) for word in words[:5]]
+            row = [float(column) for column in columns[:5]]
         except ValueError:
             row = []
         if len(row) < 5 or not all(map(math.isfinite, row)) or row[2] < 0.9 or row[4] <= 0:
@@ -233,7 +233,7 @@ def read_lenses(folder: Path | str, max_count: int = 0) -> list[Prescription]:
     return lenses
 
 
-# Numbers that patents publish, at the d line: radius, thickness, index, Abbe number, clear diameter.
+# As patents publish them, at the d line: radius, thickness, index, Abbe number, clear diameter.
 _PATENTS = {
     "FR 1 066 698": "19.655 5.15 1.67786 55.5 19.8 | 0 3.05 1 0 19.8 | -35.52 1.45 1.612 37.2 17.4 | "
                     "16.8175 2.445 1 0 14.5 | stop 1.28 1 0 14.4 | 381.775 1.195 1.5738 42.5 16.6 | "

@@ -13,7 +13,8 @@ import numpy as np
 
 from .canvas import Array, Point, Random, log_uniform, spectral_colour
 
-STOP_SAMPLES = 256  # samples across the transform's plane; the stop fills about half of it
+STOP_SAMPLES = 256
+"""Samples across the plane of the stop, which fills about half of it."""
 
 
 def starburst(random: Random, light: Point, size: int) -> Array:
@@ -24,7 +25,7 @@ def starburst(random: Random, light: Point, size: int) -> Array:
     phase = _draw_phase(random)
     plane = np.fft.fftshift(np.fft.fft2(stop * np.exp(1j * phase), (2 * STOP_SAMPLES, 2 * STOP_SAMPLES)))
     raw = (np.abs(plane) ** 2).astype(np.float32)
-    blur = log_uniform(random, 0.5, 2.0)  # lights are no points, and no camera resolves the fringes
+    blur = log_uniform(random, 0.5, 2.0)  # lights have an extent, and no camera resolves the fringes
     power = np.asarray(cv2.GaussianBlur(raw / raw.max(), (0, 0), blur), np.float32)
     power /= power.max()
     reach = log_uniform(random, 0.5, 4.0)
@@ -32,7 +33,7 @@ def starburst(random: Random, light: Point, size: int) -> Array:
     waves = np.linspace(0.41, 0.69, 10)
     colours = spectral_colour(waves)
     colours /= colours.sum(0)
-    spread = random.uniform(0.3, 1.0)  # of the colours; the eye of a sensor mixes them
+    spread = random.uniform(0.3, 1.0)  # of the colours; sensors mix wavelengths
     for wave, colour in zip(waves, colours.astype(np.float32), strict=True):
         zoom = reach * (1 + spread * (wave / 0.55 - 1)) * size / (2 * STOP_SAMPLES)
         x, y = (light[0] + 1) * size / 2, (light[1] + 1) * size / 2

@@ -33,8 +33,8 @@ def require_ximgproc() -> None:
     import cv2
 
     if not hasattr(cv2, "ximgproc"):
-        raise EngineError("A training needs OpenCV's extra modules, which the OpenCV of this Python has not; remove "
-                          "every opencv package there and install opencv-contrib-python-headless alone.")
+        raise EngineError("A training needs OpenCV's extra modules, which the OpenCV of this Python lacks; uninstall "
+                          "every opencv package there, and install opencv-contrib-python-headless alone.")
 
 
 def augment(random: Random, draw_view: DrawView, width: int, height: int) -> Pixels:
@@ -80,7 +80,7 @@ def _random_pose(random: Random, draw_view: DrawView, width: int, height: int) -
 def _random_defocus(random: Random, scene: Pixels) -> Pixels:
     """Blur the scene as a lens that is focused nearer does: lights become discs or polygons."""
     radius = math.hypot(*scene.shape[:2]) * log_uniform(random, 0.004, 0.04)
-    blades = int(random.integers(5, 9)) if random.random() < 0.4 else 48  # so many that it looks round
+    blades = int(random.integers(5, 9)) if random.random() < 0.4 else 48  # enough to look round
     at = np.arange(blades) * (2 * math.pi / blades) + random.uniform(0, 2 * math.pi)
     side = 2 * math.ceil(radius) + 1
     return defocus(scene, _draw_polygon(np.stack([np.cos(at), np.sin(at)], -1) * radius + side // 2, side, side))
@@ -91,7 +91,7 @@ def defocus(scene: Pixels, aperture: Pixels) -> Pixels:
     import cv2
 
     blurred = cv2.filter2D(scene, -1, aperture / aperture.sum(), borderType=cv2.BORDER_REFLECT)
-    return np.asarray(np.maximum(blurred, 0), np.float32)  # by Fourier transform, which rounds to either side
+    return np.asarray(np.maximum(blurred, 0), np.float32)  # OpenCV filters by FFT, whose rounding may be negative
 
 
 def _add_dead_leaves(random: Random, scene: Pixels, draw_view: DrawView) -> Pixels:
@@ -112,9 +112,9 @@ def _add_dead_leaves(random: Random, scene: Pixels, draw_view: DrawView) -> Pixe
     return scene
 
 
-def _blend(one: Pixels, other: Pixels, weight: Pixels) -> Pixels:
+def _blend(first: Pixels, second: Pixels, weight: Pixels) -> Pixels:
     """Mix two pictures by the weight 0..1 of the other; light that rounding leaves below zero becomes zero."""
-    return np.asarray(np.maximum(one + (other - one) * weight, 0), np.float32)
+    return np.asarray(np.maximum(first + (second - first) * weight, 0), np.float32)
 
 
 def _draw_leaf(random: Random, width: int, height: int) -> Pixels:
@@ -125,7 +125,7 @@ def _draw_leaf(random: Random, width: int, height: int) -> Pixels:
     if kind == 0:
         shape = _draw_blob(random, width, height)
     else:
-        corners = int(random.integers(3, 8)) if kind == 1 else 48  # so many that it looks round
+        corners = int(random.integers(3, 8)) if kind == 1 else 48  # enough to look round
         at = np.sort(random.uniform(0, 2 * math.pi, corners)) if kind == 1 else np.linspace(0, 2 * math.pi, corners)
         reach = random.uniform(0.5, 1, (corners, 1)) if kind == 1 else 0.95
         shape = _draw_polygon((np.stack([np.cos(at), np.sin(at)], -1) * reach + 1) / 2 * (width, height), width, height)
@@ -169,19 +169,19 @@ def _grade(random: Random, scene: Pixels) -> Pixels:
     return np.asarray(scene, np.float32)
 
 
-def _join(random: Random, scene: Pixels, other: Pixels) -> Pixels:
+def _join(random: Random, scene: Pixels, second: Pixels) -> Pixels:
     """Put one scene beside the other, with a sharp or soft edge between them, or mix them as a reflection in a pane of
     glass."""
     height, width = scene.shape[:2]
     if random.random() < 0.3:
         share = np.float32(random.uniform(0.2, 0.8))
-        return scene * share + other * (1 - share)
+        return scene * share + second * (1 - share)
     angle, softness = random.uniform(0, 2 * math.pi), log_uniform(random, 0.005, 0.3)
     x = np.linspace(-1, 1, width, dtype=np.float32)[None, :]
     y = np.linspace(-1, 1, height, dtype=np.float32)[:, None]
     distance = x * np.float32(math.cos(angle)) + y * np.float32(math.sin(angle)) - random.uniform(-0.7, 0.7)
     weight = (1 / (1 + np.exp(-np.clip(distance / softness, -30, 30)))).astype(np.float32)[..., None]
-    return _blend(scene, other, weight)
+    return _blend(scene, second, weight)
 
 
 def _add_haze(random: Random, scene: Pixels) -> Pixels:

@@ -32,7 +32,7 @@ PHOTO_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff"})
 MAP_SUFFIXES = frozenset({".hdr", ".exr"})
 MIN_SIDE = 64
 """Pixels of a photograph's shorter side."""
-HELD_OUT_ONE_IN = 10  # one in so many, by name, is kept for tests
+HELD_OUT_ONE_IN = 10
 """One picture or lens in so many, by name, is kept out of training."""
 
 
@@ -132,8 +132,8 @@ def shared_backgrounds(folders: Iterable[Path | str], part: Part = "all", longes
             photos = SharedArrays(Path(folder) / "photos", backgrounds.photos)
             maps = SharedArrays(Path(folder) / "maps", backgrounds.maps)
         except OSError as problem:
-            raise RunError(f"The clean pictures cannot be laid down in {tempfile.gettempdir()} ({problem.strerror}); "
-                           "make room there, or name another folder in TMPDIR.") from problem
+            raise RunError(f"The clean pictures cannot be written to {tempfile.gettempdir()} ({problem.strerror}); "
+                           "free space there, or set TMPDIR to another folder.") from problem
         backgrounds = Backgrounds(photos, maps, augmented, backgrounds.unusable)
         try:
             yield backgrounds

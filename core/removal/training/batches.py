@@ -50,18 +50,18 @@ class Batches:
     def __getitem__(self, iteration: int) -> Batch:
         random = np.random.default_rng((self.recipe.seed, iteration))
         count, width, height = self.recipe.draw_batch_shape(random, iteration)
-        mine = [self.draw_pair(iteration, number, width, height)
+        pairs = [self.draw_pair(iteration, number, width, height)
                 for number in range(self._worker.rank, count, self._worker.count)]
         none = np.zeros((0, height, width, 3), np.float32)
         frame, scene, scene_with_glow = (
-            torch.from_numpy(np.stack([getattr(one, part) for one in mine]) if mine else none).permute(0, 3, 1, 2)
+            torch.from_numpy(np.stack([getattr(pair, part) for pair in pairs]) if pairs else none).permute(0, 3, 1, 2)
             for part in ("frame", "scene", "scene_with_glow"))
-        return Batch(frame, scene, scene_with_glow, len(mine) / count)
+        return Batch(frame, scene, scene_with_glow, len(pairs) / count)
 
     def draw_pair(self, iteration: int, number: int, width: int, height: int) -> Pair:
         """Return one frame of an iteration in that size."""
         self._synthesis_bank.renew(self.recipe.bank_size + iteration // self.recipe.renew_every, iteration)
-        random = np.random.default_rng((self.recipe.seed, iteration, number + 1))  # to numpy, (1, 2) is (1, 2, 0)
+        random = np.random.default_rng((self.recipe.seed, iteration, number + 1))  # seeds (1, 2) and (1, 2, 0) are one
         recipe = self.recipe
         pair = make_pair(random, self._bank, self._backgrounds, width, height, clean_share=recipe.clean_share,
                          against_light_share=recipe.against_light_share, shoulder_share=recipe.shoulder_share,

@@ -76,19 +76,20 @@ class SynthesisBank:
                                light=_to_float32(layers.light))
 
     def _synthesise(self, serial: int) -> FlareLayers:
-        one = synthesise_flare((self._seed, serial), self._size, self._lenses)
+        synthesised = synthesise_flare((self._seed, serial), self._size, self._lenses)
         random = np.random.default_rng((self._seed, serial, 2))
         colour = draw_saturated_colour(random) if random.random() < self._coloured else WHITE
         if random.random() < self._aspheric:
-            one = add_aspheric_ghosts(one, (self._seed, serial, 3))
-        rest, glow, light = (np.minimum(layer, 6e4).astype(np.float16) for layer in (one.rest, one.glow, one.light))
-        return FlareLayers(rest, glow, light, one.lights, colour)
+            synthesised = add_aspheric_ghosts(synthesised, (self._seed, serial, 3))
+        rest, glow, light = (np.minimum(layer, 6e4).astype(np.float16)
+                             for layer in (synthesised.rest, synthesised.glow, synthesised.light))
+        return FlareLayers(rest, glow, light, synthesised.lights, colour)
 
 
 def draw_saturated_colour(random: Random) -> NDArray[np.float32]:
     """Return (3,), the colour of a saturated light: one channel 1, little in one or both of the others."""
-    least, middle = np.sort(random.uniform(0, 1, 2) ** 2)
-    return random.permutation(np.array([1, middle, least * 0.3], np.float32))
+    low, middle = np.sort(random.uniform(0, 1, 2) ** 2)
+    return random.permutation(np.array([1, middle, low * 0.3], np.float32))
 
 
 def _to_float32(half: NDArray[Any]) -> NDArray[np.float32]:
@@ -117,7 +118,7 @@ class UserFlares:
     def __init__(self, folder: Path | str, size: int) -> None:
         """Raises SettingsError where the folder holds neither pictures nor videos, or none that can be read."""
         folder = Path(folder)
-        # Beside the folder of its flares, as Flare7K++ has them: another set may have flares of the same names.
+        # By the folder beside it, as in Flare7K++: another set may have flares of the same names.
         lights = {(path.parent.parent, path.stem): path for path in folder.glob("**/Light_Source/*")
                   if path.suffix.lower() in SUFFIXES}
         self._size = size
@@ -129,7 +130,7 @@ class UserFlares:
                 continue
             self._files.append((path, lights.get((path.parent.parent, path.stem))))
         if not self._files:
-            raise SettingsError(f"{folder} holds no flare layers; give pictures or clips of flares on black.")
+            raise SettingsError(f"{folder} holds no flare layers; give pictures or videos of flares on black.")
         self.unreadable: list[str] = []
         """What is wrong with those that cannot be read, a sentence each, among about `LOOKED_AT` that are looked at."""
         self._drop_unreadable()
@@ -205,11 +206,11 @@ def _read_random_frame(path: Path, random: Random) -> NDArray[np.float32]:
     with Video(path) as clip:
         clip.seek(int(random.integers(max(clip.length, 1))))
         frame = next(iter(clip), None)
-    if frame is None:  # past its end: files whose sound is longer claim more frames than they have
+    if frame is None:  # past the end: a file with longer sound claims more frames than it has
         with Video(path) as clip:
             frame = next(iter(clip), None)
     if frame is None:
-        raise FrameError(f"{path} is no clip that can be read; convert it to pictures.")
+        raise FrameError(f"{path} cannot be read as a video; convert it to pictures.")
     return np.asarray(linear_from_srgb(frame_to_display(frame)), np.float32)
 
 

@@ -36,7 +36,7 @@ class MuonAdamW:
         self._matrices = {name: _as_matrix(weight.detach()) for name, weight in self._parameters.items()
                           if weight.ndim > 1 and not any(part in name for part in INPUT_AND_OUTPUT_LAYERS)}
         if any(rows.data_ptr() != self._parameters[name].data_ptr() for name, rows in self._matrices.items()):
-            raise ValueError("The network's weights do not lie channels last.")
+            raise ValueError("The network's weights are not channels last in memory.")
         self._momenta = {name: torch.zeros_like(rows) for name, rows in self._matrices.items()}
         others = [weight for name, weight in self._parameters.items() if name not in self._matrices]
         self._adam = torch.optim.AdamW(others, weight_decay=decay, fused=True)
@@ -83,9 +83,9 @@ class MuonAdamW:
                 continue
             if moment == "momentum":
                 self._momenta[name].copy_(value)
-            elif name not in self._matrices:  # AdamW had all of them once
+            elif name not in self._matrices:  # old checkpoints have AdamW's moments of all of them
                 parameter = self._parameters[name]
-                # Laid as the parameter is: a fused step goes through both as they lie in memory.
+                # In the parameter's memory layout: a fused step walks through both in memory order.
                 self._adam.state[parameter][moment] = (
                     torch.empty_like(parameter, requires_grad=False).copy_(value) if value.shape == parameter.shape
                     else value.to(parameter.device, copy=True))

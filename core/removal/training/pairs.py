@@ -89,7 +89,7 @@ def make_pair(random: Random, bank: FlareSource, backgrounds: Backgrounds, width
     if without_flare:
         rest, glow, light = rest * 0, glow * 0, light * float(random.random() < 0.5)
     scene = scene + light
-    if graininess := random_cameras.draw_grain(random):  # the same in both pictures, since removal is no denoising
+    if graininess := random_cameras.draw_grain(random):  # the same in all pictures, since removal does not denoise
         grain = np.sqrt(np.maximum(scene, 0) * SHOT_NOISE + READ_NOISE).astype(np.float32) * graininess * GRAIN
         scene = np.maximum(scene + grain * random.standard_normal(scene.shape, np.float32), 0)
     if shoulder_share > 0 and random.random() < shoulder_share:
@@ -109,9 +109,10 @@ def make_pair(random: Random, bank: FlareSource, backgrounds: Backgrounds, width
     return Pair(_quantise(random, frame), clean_scene, scene_with_glow)
 
 
-def to_grey(one: Pair, channel: int) -> Pair:
+def to_grey(pair: Pair, channel: int) -> Pair:
     """Return the pair as a grey picture of one channel: there a coloured light saturates as a white one does."""
-    return Pair(*(np.repeat(part[..., channel, None], 3, -1) for part in (one.frame, one.scene, one.scene_with_glow)))
+    return Pair(*(np.repeat(picture[..., channel, None], 3, -1)
+                  for picture in (pair.frame, pair.scene, pair.scene_with_glow)))
 
 
 def _place_against_bright_scene(random: Random, layers: FlareLayers, matrix: NDArray[Any],
@@ -162,7 +163,7 @@ def _warp_to_frame(layers: FlareLayers, appearance: random_cameras.FlareAppearan
         near = np.maximum(near, np.exp(-((x - at[0]) ** 2 + (y - at[1]) ** 2) / np.float32((LIGHT_RADIUS * half) ** 2)))
     red, green, blue = np.moveaxis(rest + glow, -1, 0)
     min_channel = np.minimum(np.minimum(red, green), blue)
-    # What a camera clips, and be it in a light's own colour alone, is clipped with flare and without.
+    # What a camera clips, even in one channel of a coloured light, is clipped with flare and without.
     clipped = np.clip((min_channel * near - CLIP_START) / CLIP_RANGE, 0, 1)[..., None]
     clipped = clipped * clipped * (3 - 2 * clipped)
     clipped_light: Pixels = np.maximum(light, (rest + glow) * clipped)

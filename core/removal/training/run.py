@@ -33,7 +33,8 @@ from .trainer import METRICS, RemovalTrainer, device
 from .workers import SINGLE_WORKER, Worker, worker_group
 
 CHECKPOINT, WEIGHTS, LOG = "checkpoint.safetensors", "removal.safetensors", "training.jsonl"
-GAIN = "gain_db"  # of a check: in the log, and in the header of the weights that were kept for it
+GAIN = "gain_db"
+"""Key of a validation gain in the log, and in the header of the weights that were written for it."""
 VALIDATE_EVERY = 1000
 VALIDATION_SEED = 20_000
 VALIDATION_PAIRS = 64
@@ -67,7 +68,7 @@ def read_recipe(folder: Path | str) -> Recipe | None:
     if not path.exists():
         return None
     _, metadata = weights.read(path)
-    weights.read_architecture(path, metadata)  # or it is none of ours
+    weights.read_architecture(path, metadata)  # raises for a foreign file
     return from_dict(json.loads(metadata["recipe"]))
 
 
@@ -93,9 +94,9 @@ def train(recipe: Recipe, folder: Path | str, backgrounds: Backgrounds, lenses: 
     with folder_lock(folder):
         path = folder / CHECKPOINT
         if path.exists() and not resume:
-            raise RunError(f"{folder} holds a training already; go on with --resume, or choose another folder.")
+            raise RunError(f"{folder} holds a training already; resume it with --resume, or choose another folder.")
         setup = TrainingSetup(recipe, path if path.exists() else start, path.exists(), backgrounds, lenses, user_flares)
-        trainer = setup.trainer(SINGLE_WORKER)  # before others are asked: it may refuse
+        trainer = setup.trainer(SINGLE_WORKER)  # before other processes start: it may raise
         with worker_group(processes if trainer.device.type == "cpu" else 1, _run_worker, setup) as worker:
             trainer.worker = worker
             pairs = make_validation_pairs(*validation) if validation else {}
@@ -168,7 +169,7 @@ def _run_to_end(trainer: RemovalTrainer, batches: Iterator[Batch], folder: Path,
         while trainer.iteration < iterations:
             metrics = trainer.step(next(batches))
             if not math.isfinite(metrics["loss"]):
-                raise RunError(f"Iteration {trainer.iteration} of the training came to no number; go on from the last "
+                raise RunError(f"The loss of iteration {trainer.iteration} is not finite; continue from the last "
                                f"checkpoint in {folder} with --resume and a lower learning_rate.")
             sums = {name: value + metrics[name] for name, value in sums.items()}
             iteration = trainer.iteration
@@ -183,7 +184,7 @@ def _run_to_end(trainer: RemovalTrainer, batches: Iterator[Batch], folder: Path,
                     if keeps_best:
                         best = _write_weights_if_better(trainer, folder, line[GAIN]["mean"], best)
                 log.append(line)
-                write_text(folder / LOG, "".join(json.dumps(one) + "\n" for one in log))
+                write_text(folder / LOG, "".join(json.dumps(entry) + "\n" for entry in log))
             if time.monotonic() - saved > save_every_s:
                 _save_checkpoint(trainer, folder, best)
                 saved = time.monotonic()
@@ -215,7 +216,7 @@ def _read_log(path: Path, iteration: int) -> list[dict[str, Any]]:
     checkpoint and are logged again."""
     lines: list[dict[str, Any]] = []
     for text in path.read_text(encoding="utf-8", errors="replace").splitlines() if path.is_file() else ():
-        with contextlib.suppress(ValueError):  # cut off by an earlier program
+        with contextlib.suppress(ValueError):  # truncated by an earlier program
             lines.append(json.loads(text))
     return [line for line in lines if line.get("iteration", math.inf) <= iteration]
 

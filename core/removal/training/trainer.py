@@ -53,14 +53,14 @@ class RemovalTrainer:
         self.device = device()
         torch.manual_seed(recipe.seed)
         self.network = RemovalNetwork(recipe.widths, recipe.blocks, recipe.attention).to(self.device)
-        self.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # twice as fast here
+        self.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # twice as fast on CPUs
         self.optimiser = MuonAdamW(self.network, recipe.weight_decay)
         self.averaged_weights = {name: value.detach().clone() for name, value in self.network.state_dict().items()}
         self.initial_weights: dict[str, Tensor] = {}
         self._graphed_gradients = {phase: GraphedFunction(partial(self._gradients, phase)) for phase in (False, True)}
         self._pending_metrics: AsyncCopy | None = None
         if self.device.type == "cuda":
-            torch.backends.cudnn.benchmark, torch.backends.cudnn.benchmark_limit = True, 4  # a minute for five shapes
+            torch.backends.cudnn.benchmark, torch.backends.cudnn.benchmark_limit = True, 4  # a minute for 5 shapes
             torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.allow_tf32 = True
 
     def step(self, batch: Batch) -> dict[str, float]:

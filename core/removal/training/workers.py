@@ -49,8 +49,7 @@ class SharedBuffers:
             path = Path(self._folder) / f"{count}x{length}"
             path.touch()
             with open(path, "r+b") as file:
-                # By each of them: what is there stays, and what another has mapped is not made shorter, which Windows
-                # refuses.
+                # Every worker opens it: never shorten a file that another has mapped, which Windows refuses.
                 if os.fstat(file.fileno()).st_size < 4 * count * length:
                     file.truncate(4 * count * length)
             memory = np.memmap(path, np.float32, "r+", shape=(count, length))
@@ -90,7 +89,7 @@ class Worker:
         for row in rows[1:]:
             for tensor, part in _buffer_slices(tensors, row):
                 tensor.add_(part)
-        self.buffers.wait()  # before anyone lays down anew
+        self.buffers.wait()  # before anyone writes again
 
     def is_responsible_for(self, number: int) -> bool:
         """Return whether this worker does a piece of shared work."""
@@ -176,7 +175,7 @@ def _worker_main(rank: int, count: int, folder: str, barrier: Barrier, threads: 
         _abort_when_any_ends([first.sentinel], barrier)
     _limit_threads(threads, count)
     run_worker(Worker(rank, count, SharedBuffers(folder, barrier)), *args)
-    if first is not None:  # which may not have woken from their last meeting: an end here would break that up
+    if first is not None:  # it may still be in their last barrier, which an exit here would break
         wait([first.sentinel], EXIT_GRACE_S)
 
 

@@ -122,7 +122,7 @@ class Pools:
 
         An iteration that samples the place at that moment sees parts of both.
         """
-        with torch.cuda.stream(self._stream):  # of None: nothing
+        with torch.cuda.stream(self._stream):  # a no-op for None
             values = torch.from_numpy(drawn)
             if item.kind == SCENE:
                 pool = self._scenes[item.shape]
@@ -135,7 +135,7 @@ class Pools:
                 self._flares[index].copy_(values.view(self._flares.shape[1:]))
                 self._flare_metadata[index].copy_(torch.from_numpy(item.metadata))
         if self._stream is not None:
-            self._stream.synchronize()  # before the slot is drawn to again
+            self._stream.synchronize()  # before the slot is reused
         if item.kind == SCENE:
             self.scenes_stored[item.shape] += SCENES_PER_BLOCK
         else:
@@ -210,7 +210,7 @@ def _wait_until_ready(ready: threading.Event, processes_drawing: Sequence[BasePr
             return
         if not all(process.is_alive() for process in processes_drawing):
             break
-    raise RunError("The processes that draw pictures for the training ended or drew none; where memory is short, give "
+    raise RunError("The processes that draw pictures for the training ended or drew none; if memory is short, give "
                    "fewer --processes.")
 
 
@@ -244,7 +244,7 @@ def _draw_scenes(seed: tuple[int, int], path: Path, shape: tuple[int, int], free
     random = np.random.default_rng((*seed, SCENE))
     while True:
         slot = free.get()
-        number = int(random.choice(len(shapes), p=[one.share for one in shapes]))
+        number = int(random.choice(len(shapes), p=[shape.share for shape in shapes]))
         width, height = shapes[number].width, shapes[number].height
         gammas = random.uniform(*GAMMA_RANGE, SCENES_PER_BLOCK).astype(np.float32)
         block = memory[slot, :SCENES_PER_BLOCK * 3 * height * width].reshape(SCENES_PER_BLOCK, 3, height, width)

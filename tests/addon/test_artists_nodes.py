@@ -24,7 +24,7 @@ def facts(blender: Blender, tmp_path_factory: pytest.TempPathFactory) -> Any:
     return blender.run(SCRIPT, base / "layers", base / "out", user=base / "user")
 
 
-def test_what_was_built_round_it_stays_when_it_goes(facts: Any) -> None:
+def test_nodes_of_the_artist_stay_when_the_compositor_is_removed(facts: Any) -> None:
     """Block of artists_nodes.py: "taken away from a composite that an artist has built round it"."""
     assert facts["with our own tree"] == 2 * (PLATE + FLARE)
     assert facts["our own tree, removed"] == [2 * PLATE, ["Grade", "Sky"]]
@@ -34,30 +34,30 @@ def test_what_was_built_round_it_stays_when_it_goes(facts: Any) -> None:
 
 
 @pytest.mark.parametrize(("over", "below"), [("present", PLATE), ("scene", SCENE)])
-def test_nodes_behind_it_stay_when_it_is_set_up_again_or_goes(facts: Any, over: str, below: float) -> None:
+def test_nodes_after_the_flare_stay_when_it_is_set_up_again_or_removed(facts: Any, over: str, below: float) -> None:
     """Block of artists_nodes.py: "nodes behind the flare"."""
     assert facts[f"graded, {over}"] == [2 * (below + FLARE)] * 2
     assert facts[f"graded, {over}, removed"] == [2 * PLATE, ["Grade", "Plate"]]
 
 
-def test_a_cycle_of_an_earlier_set_up_is_put_right(facts: Any) -> None:
+def test_a_cycle_from_an_earlier_set_up_is_repaired(facts: Any) -> None:
     """Block of artists_nodes.py: "nodes behind the flare"."""
     assert facts["a cycle"] is None
     assert facts["no cycle"] == PLATE + FLARE
 
 
-def test_the_present_image_is_found_again_after_the_baked_scene(facts: Any) -> None:
+def test_the_present_image_returns_after_the_baked_scene(facts: Any) -> None:
     """Block of artists_nodes.py: "over the baked scene, and back"."""
     graded = 2 * PLATE
     assert facts["over"] == [graded + FLARE, SCENE + FLARE, graded + FLARE, graded]
 
 
-def test_the_output_that_counts_gets_the_flare(facts: Any) -> None:
+def test_the_active_output_gets_the_flare(facts: Any) -> None:
     """Block of artists_nodes.py: "two outputs, of which the second counts"."""
     assert facts["two outputs"] == [*2 * [PLATE + FLARE, ["Plate", "Fit Flare"]], PLATE]
 
 
-def test_it_is_shown_and_goes_where_a_slider_was_renamed(facts: Any) -> None:
+def test_a_group_with_a_renamed_slider_is_shown_and_removed(facts: Any) -> None:
     """Block of artists_nodes.py: "a slider of the group that has another name"."""
     assert facts["renamed in the panel"] == ["Tint"]
     assert facts["renamed sockets"] == [PLATE, ["Plate"]]

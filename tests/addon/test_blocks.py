@@ -6,7 +6,7 @@ import ast
 from pathlib import Path
 
 import pytest
-from blocks import SCRIPTS, blocks_for, blocks_of, named_blocks, fact_tests
+from blocks import SCRIPTS, blocks_for, blocks_of, fact_tests, named_blocks
 
 HERE = Path(__file__).parent
 MODULES = sorted(path.name for path in HERE.glob("test_*.py") if any(fact_tests(path)))

@@ -47,7 +47,7 @@ def test_an_empty_scene_offers_what_can_be_done_alone(said: Any) -> None:
                                   "bake of a deleted flare", "log of nothing", "folder of nothing", "layers of nothing",
                                   "library name", "bake on a full disk", "save on a full disk", "fit on a full disk",
                                   "no room for the last words"])
-def test_what_cannot_be_done_is_one_sentence(said: Any, what: str) -> None:
+def test_refused_actions_report_one_sentence(said: Any, what: str) -> None:
     """Blocks of broken.py: "nothing there yet", ".flare files", "a full disk, and an engine that dies while it bakes",
     "cameras and scenes", "the rest"."""
     assert is_sentence(said[what]), said[what]
@@ -81,7 +81,7 @@ def test_every_panel_says_what_is_missing(said: Any) -> None:
     assert "no camera" in said["panel without a camera"]
 
 
-def test_a_full_disk_is_told_and_what_is_finished_is_kept(said: Any) -> None:
+def test_a_full_disk_is_reported_and_finished_files_are_kept(said: Any) -> None:
     """Block of broken.py: "a full disk, and an engine that dies while it bakes"."""
     broken, filled, again = said["bakes"]
     assert "ended without a result" in broken[0]
@@ -99,7 +99,7 @@ def test_a_full_disk_is_told_and_what_is_finished_is_kept(said: Any) -> None:
     assert said["its engine is not left alone"]
 
 
-def test_what_is_made_and_cannot_be_shown_is_told(said: Any) -> None:
+def test_results_that_cannot_be_shown_are_reported(said: Any) -> None:
     """Block of broken.py: "a full disk, and an engine that dies while it bakes"."""
     state, fit, bake = said["done, and not shown"]
     assert state == "done"
@@ -107,7 +107,7 @@ def test_what_is_made_and_cannot_be_shown_is_told(said: Any) -> None:
     assert "It cannot be shown." in bake
 
 
-def test_an_engine_that_dies_is_told(said: Any) -> None:
+def test_an_engine_that_dies_is_reported(said: Any) -> None:
     """Block of broken.py: "engines that are none, or die"."""
     fits = said["fits"]
     assert "out of memory" in fits["dies"]
@@ -119,29 +119,29 @@ def test_an_engine_that_dies_is_told(said: Any) -> None:
     assert {fits[f"{how}, state"] for how in ("dies", "refuses", "chatters", "ends")} == {"none"}
 
 
-def test_a_stop_before_the_engine_listens_is_a_stop(said: Any) -> None:
+def test_a_stop_during_the_start_of_the_engine_counts_as_a_stop(said: Any) -> None:
     """Block of broken.py: "engines that are none, or die"."""
     assert said["stopped before it listened"] == ["stopped", "Stopped before it began."]
 
 
-def test_an_engine_that_cannot_be_executed_is_not_the_folders_fault(said: Any) -> None:
+def test_an_engine_that_cannot_start_is_not_reported_as_a_folder_error(said: Any) -> None:
     """Block of broken.py: "engines that are none, or die"."""
     assert "python cannot be started (" in said["cannot be executed"]
     assert said["cannot be executed"].endswith("; set up the engine in the preferences.")
 
 
-def test_a_fit_that_ends_well_shows_its_flare(said: Any) -> None:
+def test_a_successful_fit_shows_its_flare(said: Any) -> None:
     """Block of broken.py: "engines that are none, or die"."""
     assert said["a fit that ends well"] == ["", "finished", True]
 
 
-def test_the_engine_says_what_it_is(said: Any) -> None:
+def test_the_engine_test_reports_its_version(said: Any) -> None:
     """Block of broken.py: "engines that are none, or die"."""
     assert said["test of another engine"]
     assert said["test"] == ["", {"version": "1", "torch": "2", "device": "a sham"}]
 
 
-def test_work_is_found_again_and_can_be_cancelled(said: Any) -> None:
+def test_jobs_of_an_earlier_blender_are_found_and_cancelled(said: Any) -> None:
     """Block of broken.py: "work that goes on while Blender is closed, found again and cancelled"."""
     assert said["found again"] == ["running", "fit", 40, 100]
     assert said["state of the found"] == "running"
@@ -150,13 +150,13 @@ def test_work_is_found_again_and_can_be_cancelled(said: Any) -> None:
     assert said["asked by a file too"]
 
 
-def test_paths_keep_the_name_that_a_drive_has(said: Any) -> None:
+def test_paths_keep_the_letter_of_a_drive(said: Any) -> None:
     """Block of broken.py: "paths"."""
     assert said["written on Windows"]
     assert said["a linked drive"]
 
 
-def test_folders_that_went_are_told(said: Any) -> None:
+def test_missing_folders_are_reported(said: Any) -> None:
     """Blocks of broken.py: "work that goes on while Blender is closed, found again and cancelled", "a capture that
     moved"."""
     assert said["run folder deleted"] == ["lost", True, False]
@@ -168,7 +168,7 @@ def test_folders_that_went_are_told(said: Any) -> None:
     assert all(text and "Traceback" not in text for text in said["operators of a moved capture"])
 
 
-def test_panels_stand_a_name_that_is_too_long_for_the_disk(said: Any) -> None:
+def test_panels_accept_a_name_that_is_too_long_for_the_disk(said: Any) -> None:
     """Block of broken.py: "places that cannot be looked at"."""
     told = {name: panels for name, *panels in said["a name too long for the disk"]}
     assert "does not exist any more" in told["capture"][0]
@@ -176,7 +176,7 @@ def test_panels_stand_a_name_that_is_too_long_for_the_disk(said: Any) -> None:
     assert len(told) == 6
 
 
-def test_cameras_lights_and_scenes(said: Any) -> None:
+def test_deleted_cameras_and_lights_are_reported_and_scenes_stay_apart(said: Any) -> None:
     """Blocks of broken.py: ".flare files", "cameras and scenes"."""
     assert said["camera deleted"] == [False, True]
     known, told = said["light taken out of the scene"]
@@ -192,13 +192,13 @@ def test_every_operator_is_one_undo_step(said: Any) -> None:
     assert [name for name, good in said["undone"].items() if not good] == []
 
 
-def test_nothing_is_downloaded_without_leave(said: Any) -> None:
+def test_set_up_is_disabled_without_online_access(said: Any) -> None:
     """Block of broken.py: "the rest"."""
     online, offered = said["online"]
     assert offered == online
 
 
-def test_uninstalled_leaves_nothing(said: Any) -> None:
+def test_uninstalling_leaves_nothing(said: Any) -> None:
     """Block of broken.py: "the rest"."""
     assert said["after disabling"] == [False, False]
     assert said["left behind"] == []
@@ -206,7 +206,7 @@ def test_uninstalled_leaves_nothing(said: Any) -> None:
 
 
 @pytest.mark.skipif(not Path("/proc/self/mem").exists(), reason="wants a file that may not be read")
-def test_of_logs_the_end_is_shown_or_why_there_is_none(said: Any) -> None:
+def test_logs_show_their_end_or_why_they_cannot_be_read(said: Any) -> None:
     """Block of broken.py: "the rest"."""
     finished, text = said["shows logs"]
     assert finished == "FINISHED"

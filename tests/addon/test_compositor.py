@@ -12,7 +12,7 @@ import pytest
 from blenders import Blender
 
 from core.bake.exr import read_layers, write_layers
-from core.bake.layers import FrameLayers, matte
+from core.bake.layers import FrameLayers, flare_alpha
 from core.colour import colour_space
 from core.colour.srgb import srgb_from_linear
 from core.images.exr import read_exr
@@ -92,7 +92,7 @@ def test_the_flare_output_is_premultiplied_with_its_matte(made: Made) -> None:
     channels = read_exr(made.out / "flare" / "0.exr")
     flare = INTENSITY * TINT * baked(made, 0).flare
     assert_half_equal(np.stack([channels[name] for name in "RGB"], -1), flare)
-    assert_half_equal(channels["A"], matte(flare))
+    assert_half_equal(channels["A"], flare_alpha(flare))
 
 
 def test_the_group_has_its_sockets(made: Made) -> None:
@@ -159,7 +159,7 @@ def test_layers_in_another_space_and_of_wide_pixels_are_composed_as_they_are(mad
                                exact.scene + exact.flares["lamp"] + exact.flares["key light"], rtol=2e-3, atol=2e-3)
 
 
-def test_what_the_camera_goes_by_stays(made: Made) -> None:
+def test_pixel_aspect_and_render_region_of_the_scene_stay(made: Made) -> None:
     """Block of composite.py: "wide pixels stay; a region that is cut out is refused, and leaves nothing"."""
     assert made.facts["pixel aspect"] == 2
     sentence, nothing = made.facts["cropped"]
@@ -167,7 +167,7 @@ def test_what_the_camera_goes_by_stays(made: Made) -> None:
     assert nothing
 
 
-def test_a_scene_that_is_given_the_layers_frames_stands_on_one(made: Made) -> None:
+def test_a_scene_matched_to_layers_goes_to_one_of_their_frames(made: Made) -> None:
     """Block of composite.py: "the graph as it comes, rendered and saved"."""
     assert made.facts["stands at"] == NUMBERS[0]
 
@@ -189,7 +189,7 @@ def test_the_saved_file_shows_the_same_elsewhere_and_without_us(made: Made, blen
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="files are kept from growing in another way elsewhere")
-def test_a_file_that_does_not_fit_the_disk_is_told_and_not_left(made: Made) -> None:
+def test_an_incomplete_file_on_a_full_disk_is_reported_and_removed(made: Made) -> None:
     """Block of composite.py: "a disk that fills up"."""
     refused, left = made.facts["full"]
     assert [sentence.startswith("Blender could not write a complete file to ") for sentence in refused] == [True, True]

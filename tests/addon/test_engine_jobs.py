@@ -20,7 +20,7 @@ def facts(blender: Blender, package: Path, tmp_path_factory: pytest.TempPathFact
     return blender.run(SCRIPTS / "jobs.py", package, base / "out", user=base / "user")
 
 
-def test_work_of_another_machine_goes_by_what_it_tells(facts: Any) -> None:
+def test_the_state_of_a_remote_job_follows_from_its_events(facts: Any) -> None:
     """Block of jobs.py: "another machine"."""
     assert facts["ended elsewhere"] == "done"
     assert facts["goes on elsewhere"] == ["running", 4]
@@ -32,7 +32,7 @@ def test_work_of_another_machine_goes_by_what_it_tells(facts: Any) -> None:
     assert facts["silent on a Mac"].startswith("The engine on studio-mac has reported nothing")
 
 
-def test_what_goes_wrong_with_one_ends_the_watching_of_no_other(facts: Any) -> None:
+def test_an_exception_for_one_job_does_not_stop_the_polling_of_others(facts: Any) -> None:
     """Block of jobs.py: "what is done in the scenes with one goes wrong"."""
     again, state, error, is_traced, other = facts["ends badly"]
     assert again and other == "running"
@@ -41,20 +41,20 @@ def test_what_goes_wrong_with_one_ends_the_watching_of_no_other(facts: Any) -> N
     assert is_traced
 
 
-def test_another_process_of_the_number_is_left_alone(facts: Any) -> None:
+def test_another_process_with_the_same_number_is_not_stopped(facts: Any) -> None:
     """Block of jobs.py: "this machine"."""
     assert facts["the stranger lives"] and facts["asked by the file alone"]
     assert facts["its number is an older process's"] == "failed"
     assert facts["written by the version before"] == ["running", True]
 
 
-def test_work_that_no_scene_names_can_be_seen(facts: Any) -> None:
+def test_jobs_without_a_scene_are_shown(facts: Any) -> None:
     """Block of jobs.py: "of this scene, and of none"."""
     assert facts["of the scene"] == ["own"]
     assert facts["of none"] == ["other", "layers"]
 
 
-def test_escape_stops_what_this_scene_does_unless_it_plays(facts: Any) -> None:
+def test_escape_stops_the_jobs_of_the_scene_unless_an_animation_plays(facts: Any) -> None:
     """Block of jobs.py: "of this scene, and of none"."""
     assert not facts["ESC while it plays"]
     assert facts["ESC"]

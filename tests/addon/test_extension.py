@@ -40,7 +40,7 @@ def test_the_package_holds_the_program_and_nothing_else(package: Path) -> None:
     assert strangers == []
 
 
-def test_it_installs_and_registers(facts: Any) -> None:
+def test_the_extension_installs_and_registers(facts: Any) -> None:
     """Block of install.py: "beginning"."""
     assert facts["enabled"]
     classes = {"FITFLARE_OT_set_up_compositor", "FITFLARE_PT_bake", "FITFLARE_PT_look", "FITFLARE_AP_preferences"}
@@ -52,14 +52,14 @@ def test_the_preferences_name_the_engine(facts: Any) -> None:
     assert facts["engine"] == ["", facts["python"]]
 
 
-def test_its_button_works_and_refuses_in_words(facts: Any) -> None:
+def test_set_up_compositor_works_and_refuses_with_a_sentence(facts: Any) -> None:
     """Block of install.py: "beginning"."""
     assert facts["set up"] == ["FINISHED"]
     assert facts["size"] == [16, 8, 7, 7]
     assert "holds no baked layers" in facts["refusal"]
 
 
-def test_it_leaves_blender_as_it_was(facts: Any) -> None:
+def test_disabling_the_extension_restores_blender(facts: Any) -> None:
     """Block of install.py: "beginning"."""
     assert facts["sys.path"] == []
     assert facts["strays"] == []

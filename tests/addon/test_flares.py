@@ -49,12 +49,12 @@ def test_the_others_stay_live_when_a_flare_is_removed(facts: Any) -> None:
     assert facts["removed"] == [SCENE + LAMP + 3 * KEY, True, SCENE + LAMP + KEY]
 
 
-def test_a_file_of_an_earlier_version_keeps_its_wires(facts: Any) -> None:
+def test_a_file_of_an_earlier_version_keeps_its_drivers(facts: Any) -> None:
     """Block of flares.py: "drivers of an earlier version"."""
     assert facts["of an earlier version"] == [SCENE + 2 * LAMP + KEY, True] * 2
 
 
-def test_wires_that_lead_nowhere_are_told(facts: Any) -> None:
+def test_drivers_without_a_flare_are_reported(facts: Any) -> None:
     """Block of flares.py: "dead drivers are told"."""
     assert "set it up again" in facts["dead"]
 
@@ -83,7 +83,7 @@ def test_a_frame_that_was_baked_again_is_shown(facts: Any) -> None:
     assert facts["baked again"] == [SCENE + LAMP + KEY, SCENE + RIM + KEY]
 
 
-def test_frames_without_layers_are_told_and_without_flare(facts: Any) -> None:
+def test_frames_without_layers_are_reported_and_show_no_flare(facts: Any) -> None:
     """Block of flares.py: "what is told of frames without layers and of animated sliders"."""
     assert facts["all frames"] == []
     (told,) = facts["too few"]
@@ -103,19 +103,19 @@ def test_frames_without_layers_are_told_and_without_flare(facts: Any) -> None:
     ("square", "The layers have 16 x 8 pixels and the scene renders 8 x 8, another aspect ratio"),
     ("transparent", "The film is transparent, and PNG files lose the flare"),
 ])
-def test_renders_that_would_not_show_the_composite_are_told(facts: Any, case: str, sentence: str) -> None:
+def test_renders_that_would_not_show_the_composite_give_a_warning(facts: Any, case: str, sentence: str) -> None:
     """Block of flares.py: "what is told of renders that would not show the composite as it is"."""
     (told,) = facts[case]
     assert sentence in told
 
 
 @pytest.mark.parametrize("case", ["muted", "no alpha"])
-def test_of_renders_that_show_it_nothing_is_told(facts: Any, case: str) -> None:
+def test_renders_that_show_the_composite_give_no_warning(facts: Any, case: str) -> None:
     """Block of flares.py: "what is told of renders that would not show the composite as it is"."""
     assert facts[case] == []
 
 
-def test_animated_sliders_that_a_farm_would_not_have_are_told(facts: Any) -> None:
+def test_animated_live_sliders_give_a_warning_for_farms(facts: Any) -> None:
     """Block of flares.py: "what is told of frames without layers and of animated sliders"."""
     assert facts["scale keyed"] == []
     (told,) = facts["intensity keyed"]

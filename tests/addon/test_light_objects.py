@@ -14,24 +14,24 @@ def facts(told_by: Callable[[str, int], Any]) -> Any:
 
 
 @pytest.mark.parametrize("how", ["visible", "disabled", "excluded"])
-def test_a_light_that_is_switched_off_goes_with_its_parent(facts: Any, how: str) -> None:
+def test_a_disabled_light_follows_its_parent(facts: Any, how: str) -> None:
     """Block of lights.py: "switched off in the viewport"."""
     assert facts[f"on a car, {how}"] == [[0, 1, 0], [10, 1, 0]]
     assert facts[f"written, {how}"] == [10, 1, 0]
 
 
-def test_one_that_is_animated_and_stands_still_is_not_refused(facts: Any) -> None:
+def test_a_disabled_light_with_animated_brightness_is_accepted(facts: Any) -> None:
     """Block of lights.py: "switched off in the viewport"."""
     assert facts["blinking"] == [[0, 1, 0], [10, 1, 0]]
 
 
-def test_one_that_is_moved_by_itself_is_refused(facts: Any) -> None:
+def test_a_disabled_light_with_animated_position_is_refused(facts: Any) -> None:
     """Block of lights.py: "switched off in the viewport"."""
     assert facts["moved by itself"].startswith("'Headlamp' is disabled in the viewport")
 
 
 @pytest.mark.parametrize("how", ["excluded", "disabled"])
-def test_lights_of_a_capture_that_is_switched_off_stay_where_they_are(facts: Any, how: str) -> None:
+def test_lights_of_a_disabled_capture_keep_their_positions(facts: Any, how: str) -> None:
     """Though Blender does not say where that is once the file is opened again.
 
     Block of lights.py: "the whole capture switched off, and the file opened again".
@@ -42,18 +42,18 @@ def test_lights_of_a_capture_that_is_switched_off_stay_where_they_are(facts: Any
     assert native
 
 
-def test_a_light_parented_where_it_stood_stays_there(facts: Any) -> None:
+def test_a_light_keeps_its_position_when_it_is_parented(facts: Any) -> None:
     """Block of lights.py: "parented where it stood"."""
     assert facts["parented, brought back"] == [True, True, True]
 
 
 @pytest.mark.parametrize("how", ["open", "closed"])
-def test_lights_follow_a_fit_however_it_is_taken_in(facts: Any, how: str) -> None:
+def test_lights_move_to_a_fit_whether_the_file_was_open_or_closed(facts: Any, how: str) -> None:
     """Block of lights.py: "a fit that has ended while the .blend was closed"."""
     assert facts[f"fitted, {how}"] == [True, True], "where it was learned, and known to be of this capture"
 
 
-def test_found_lights_are_kept_until_they_are_used_or_taken_out(facts: Any) -> None:
+def test_found_lights_are_kept_until_they_are_used_or_removed(facts: Any) -> None:
     """Block of lights.py: "lights that were found while the .blend was closed"."""
     assert "found" in facts["found"]
     assert facts["kept"] == [{"name": "found", "xyz": [1, 2, 3], "score": 0.5}]
@@ -64,7 +64,7 @@ def test_found_lights_are_kept_until_they_are_used_or_taken_out(facts: Any) -> N
     assert "found" not in facts["of the version before"]
 
 
-def test_what_was_moved_or_renamed_while_lights_were_looked_for_stays_so(facts: Any) -> None:
+def test_lights_moved_or_renamed_during_a_search_stay_so(facts: Any) -> None:
     """Block of lights.py: "lights that were found while the .blend was closed"."""
     names, off, error = facts["found meanwhile"]
     assert {"desk lamp", "more"} <= set(names)
@@ -73,7 +73,7 @@ def test_what_was_moved_or_renamed_while_lights_were_looked_for_stays_so(facts: 
     assert not error
 
 
-def test_a_scene_that_has_no_light_left_gets_all_that_are_found(facts: Any) -> None:
+def test_a_scene_without_lights_gets_all_that_are_found(facts: Any) -> None:
     """Block of lights.py: "lights that were found while the .blend was closed"."""
     assert set(facts["found with none left"]) >= {"lamp", "more"}
 
@@ -85,7 +85,7 @@ def test_each_scene_with_the_capture_has_lights_of_its_own(facts: Any) -> None:
     assert facts["beside a linked root"] == ["", True]
 
 
-def test_only_an_empty_that_was_made_for_a_light_goes_with_it(facts: Any) -> None:
+def test_removing_a_light_deletes_only_an_empty_made_for_it(facts: Any) -> None:
     """Block of lights.py: "an empty of one's own"."""
     assert facts["left by X"] == [True, False]
 
@@ -95,18 +95,18 @@ def test_lamps_that_are_not_rendered_do_not_flare(facts: Any) -> None:
     assert facts["lamps"] == ["Lamp On"]
 
 
-def test_an_empty_is_no_camera(facts: Any) -> None:
+def test_an_empty_as_the_active_camera_is_refused(facts: Any) -> None:
     """Block of lights.py: "an empty as the camera, and another file"."""
     assert not facts["no camera"]
     assert facts["an empty"].startswith("The scene's active camera is not a camera object")
 
 
-def test_another_file_begins_anew(facts: Any) -> None:
+def test_loading_a_file_clears_the_caches(facts: Any) -> None:
     """Block of lights.py: "an empty as the camera, and another file"."""
     assert facts["another file"] == ["", 0]
 
 
-def test_a_light_is_picked_in_the_picture_alone(facts: Any) -> None:
+def test_a_light_can_be_picked_only_inside_the_picture(facts: Any) -> None:
     """And whatever ends it, cursor and status line are as they were.
 
     Block of lights.py: "a click in the picture".
@@ -120,6 +120,6 @@ def test_a_light_is_picked_in_the_picture_alone(facts: Any) -> None:
         assert clicks[gone] == [["CANCELLED"], True]
 
 
-def test_lamps_of_a_linked_asset_are_lights_by_an_override(facts: Any) -> None:
+def test_lamps_of_a_linked_asset_become_lights_with_an_override(facts: Any) -> None:
     """Block of lights.py: "lamps of a linked asset"."""
     assert facts["linked"] == {"linked": [False, []], "overridden": [True, ["Streetlamp"]]}

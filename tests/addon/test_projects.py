@@ -21,23 +21,23 @@ def test_plates_are_not_replaced_by_those_of_a_capture(facts: Any, how: str) -> 
     assert whole
 
 
-def test_plates_may_be_the_captures_own(facts: Any) -> None:
+def test_plates_in_the_folder_of_the_capture_are_used_in_place(facts: Any) -> None:
     """Block of projects.py: "plates in the folder that a capture is to go to"."""
     assert facts["under their own"] == ["", True]
 
 
-def test_a_capture_is_made_again_but_not_of_itself(facts: Any) -> None:
+def test_a_capture_can_be_written_again_but_not_from_its_own_pictures(facts: Any) -> None:
     """Block of projects.py: "plates in the folder that a capture is to go to"."""
     assert facts["made again"] == 6
     assert "would be replaced by" in facts["of its own pictures"]
 
 
-def test_a_capture_that_was_begun_is_finished(facts: Any) -> None:
+def test_an_interrupted_capture_is_finished(facts: Any) -> None:
     """Block of projects.py: "plates in the folder that a capture is to go to"."""
     assert facts["begun before"] == ""
 
 
-def test_pictures_of_another_shape_are_told_at_once(facts: Any) -> None:
+def test_plates_of_another_aspect_ratio_are_refused(facts: Any) -> None:
     """Block of projects.py: "plates in the folder that a capture is to go to"."""
     assert facts["of another shape"].endswith("is 64 x 40 pixels and the scene renders 1920 x 40, which is another "
                                               "aspect ratio; set the scene's resolution to that of the pictures.")
@@ -52,7 +52,7 @@ def test_a_camera_that_is_mirrored_or_skewed_is_refused_before_anything_is_writt
     assert not written
 
 
-def test_plates_that_are_links_are_the_captures_as_pictures(facts: Any) -> None:
+def test_linked_plates_become_pictures_of_the_capture(facts: Any) -> None:
     """Block of projects.py: "plates that are links"."""
     if facts["links"] is None:
         pytest.skip("symbolic links cannot be made here")
@@ -64,14 +64,14 @@ def test_plates_of_a_linked_camera_are_found_beside_its_file(facts: Any) -> None
     assert facts["linked camera"]
 
 
-def test_an_appended_scene_keeps_its_places(facts: Any) -> None:
+def test_an_appended_scene_keeps_its_paths(facts: Any) -> None:
     """Block of projects.py: "a scene that is appended to another project"."""
     if facts["appended"] == [False, True] and not facts["tells of imports"]:
         pytest.skip("this Blender says nothing of what was appended")
     assert facts["appended"] == [True, True]
 
 
-def test_footage_goes_with_its_project(facts: Any) -> None:
+def test_footage_moves_with_its_project(facts: Any) -> None:
     """Block of projects.py: "a capture imported into a project that moves"."""
     assert facts["footage after a move"]
     assert facts["stills and sequences"] == [["FILE", 1], ["SEQUENCE", 1]]

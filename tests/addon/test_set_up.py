@@ -36,7 +36,7 @@ def set_up(folder: Path, *wanted: Path) -> tuple[int, list[dict[str, Any]]]:
     return done.returncode, [json.loads(line) for line in done.stdout.splitlines()]
 
 
-def test_it_makes_an_environment_and_fills_it(tmp_path: Path) -> None:
+def test_set_up_makes_an_environment_and_installs_packages(tmp_path: Path) -> None:
     (tmp_path / "engine").mkdir()
     (tmp_path / "engine" / "pyvenv.cfg").touch()
     (tmp_path / "engine" / "left").write_text("by a set-up that was stopped")
@@ -49,7 +49,7 @@ def test_it_makes_an_environment_and_fills_it(tmp_path: Path) -> None:
     assert not (tmp_path / "engine" / "left").exists()
 
 
-def test_a_failure_is_told_and_leaves_nothing(tmp_path: Path) -> None:
+def test_a_failed_set_up_is_reported_and_leaves_nothing(tmp_path: Path) -> None:
     status, events = set_up(tmp_path / "engine", tmp_path / "nowhere-1.0-py3-none-any.whl")
     assert status == 1
     assert "could not be installed (" in events[-1]["text"]
@@ -57,7 +57,7 @@ def test_a_failure_is_told_and_leaves_nothing(tmp_path: Path) -> None:
     assert not (tmp_path / "engine").exists()
 
 
-def test_a_folder_that_holds_something_else_is_left_alone(tmp_path: Path) -> None:
+def test_a_folder_with_other_files_is_left_alone(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("mine")
     status, events = set_up(tmp_path, tmp_path / "nowhere-1.0-py3-none-any.whl")
     assert status == 1 and "is not a virtual environment" in events[-1]["text"]
@@ -92,7 +92,7 @@ def test_a_blender_without_ensurepip_takes_another_python(tmp_path: Path, monkey
 
 @pytest.mark.skipif(os.name == "nt", reason="signals")
 @pytest.mark.parametrize("how", ["by a file", "by a signal", "by a signal that was ignored before"])
-def test_a_stop_ends_what_it_started_and_leaves_nothing(how: str, tmp_path: Path) -> None:
+def test_a_stopped_set_up_ends_its_processes_and_leaves_nothing(how: str, tmp_path: Path) -> None:
     sleeper = tmp_path / "slow-1.0-py3-none-any.whl"
     os.mkfifo(sleeper)
     command = [sys.executable, "-I", str(SCRIPT), str(tmp_path / "engine"), str(sleeper)]
@@ -117,7 +117,8 @@ def test_a_stop_ends_what_it_started_and_leaves_nothing(how: str, tmp_path: Path
 
 @pytest.mark.parametrize(("machine", "version", "why"), [
     ("x86_64", "15.1", "Intel processors"), ("arm64", "13.6.1", "macOS 14 or later"), ("arm64", "14.0", "")])
-def test_macs_without_torch(machine: str, version: str, why: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_macs_without_a_torch_build_are_refused(machine: str, version: str, why: str,
+                                                monkeypatch: pytest.MonkeyPatch) -> None:
     script = module()
     assert script.unsupported_reason() == ""
     monkeypatch.setattr(sys, "platform", "darwin")
@@ -127,7 +128,7 @@ def test_macs_without_torch(machine: str, version: str, why: str, monkeypatch: p
     assert bool(why) == bool(script.unsupported_reason())
 
 
-def test_a_network_that_is_down_is_told_as_one() -> None:
+def test_a_network_failure_is_reported_as_one() -> None:
     said = "print('WARNING: Retrying (Retry(total=4)) after connection broken'); print('ERROR: No matching'); exit(1)"
     assert module().run_logged([sys.executable, "-c", said]) == "the network could not be reached"
     assert module().run_logged([sys.executable, "-c", "print('ERROR: No room left.'); exit(1)"]) == "No room left"
@@ -135,8 +136,9 @@ def test_a_network_that_is_down_is_told_as_one() -> None:
 
 
 @pytest.mark.parametrize(("windows", "cure"), [(True, "vc_redist.x64"), (False, "look at the log")])
-def test_an_engine_that_does_not_load_is_none(windows: bool, cure: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-                                              capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_engine_that_cannot_be_loaded_is_removed(windows: bool, cure: str, tmp_path: Path,
+                                                    monkeypatch: pytest.MonkeyPatch,
+                                                    capsys: pytest.CaptureFixture[str]) -> None:
     """Everything can be installed where Windows lacks what torch's libraries want."""
     script, ran = module(), []
 
@@ -157,12 +159,12 @@ def test_an_engine_that_does_not_load_is_none(windows: bool, cure: str, tmp_path
                                                                                "Installing numpy"]
 
 
-def test_what_the_engine_is_tested_by_loads_here() -> None:
+def test_the_import_test_passes_in_this_environment() -> None:
     assert module().run_logged([sys.executable, "-c", module().IMPORT_TEST]) == ""
 
 
-def test_an_engine_in_use_is_left_as_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-                                           capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_engine_in_use_is_not_changed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+                                         capsys: pytest.CaptureFixture[str]) -> None:
     """Half of it would stay on Windows, and be taken for a folder of somebody's."""
     (tmp_path / "engine").mkdir()
     (tmp_path / "engine" / "pyvenv.cfg").touch()

@@ -23,7 +23,7 @@ def test_another_capture_has_its_own_run_and_lights(facts: Any) -> None:
     assert facts["exported"] == ["", 2], "without a root all lights of the scene are where they stand"
 
 
-def test_footage_changes_where_it_is_chosen_alone(facts: Any) -> None:
+def test_footage_changes_only_in_its_own_scene(facts: Any) -> None:
     """Block of shots.py: "footage that an artist's own nodes and another scene show too"."""
     assert facts["shared footage"] == [
         ["removed", "images", "removed", "images"], ["removed", "removed", "removed", "images"],
@@ -31,12 +31,12 @@ def test_footage_changes_where_it_is_chosen_alone(facts: Any) -> None:
     assert facts["images of it"] == [3, 5], "no more than show different things, each of all frames"
 
 
-def test_a_capture_from_a_camera_has_the_plates_of_now(facts: Any) -> None:
+def test_a_capture_from_a_camera_gets_the_newest_plates(facts: Any) -> None:
     """Block of shots.py: "a newer plate, from where pictures are linked and from where they have to be copied"."""
     assert facts["newer plates"] == [[True, True, ["000001.png"]]] * 2
 
 
-def test_baked_frames_do_not_go_unasked(facts: Any) -> None:
+def test_baked_frames_are_not_deleted_without_confirmation(facts: Any) -> None:
     """Block of shots.py: "frames of another bake"."""
     assert facts["as it was baked"] == ["", 1]
     said, begun, live = facts["colours no longer live"]
@@ -47,13 +47,13 @@ def test_baked_frames_do_not_go_unasked(facts: Any) -> None:
     assert "4 frames from 1 to 4" in facts["renamed"]
 
 
-def test_what_is_edited_of_a_flare_without_a_light_is_not_baked(facts: Any) -> None:
+def test_edits_of_a_flare_without_a_light_are_not_baked(facts: Any) -> None:
     """Block of shots.py: "an edited flare without a light"."""
     (light,), words = facts["edits"]
     assert words == [f"{light}.intensity=2"]
 
 
-def test_each_chosen_camera_has_a_folder_even_alone(facts: Any) -> None:
+def test_every_selected_camera_bakes_to_its_own_folder(facts: Any) -> None:
     """Block of shots.py: "chosen cameras"."""
     assert facts["one chosen"] == [facts["one chosen, read again"]] == ["Camera"]
     assert facts["the scene's own"] == [""]
@@ -62,7 +62,7 @@ def test_each_chosen_camera_has_a_folder_even_alone(facts: Any) -> None:
     assert facts["none chosen"] == "No camera is selected; select those to bake from."
 
 
-def test_a_project_finds_its_files_wherever_it_goes(facts: Any) -> None:
+def test_a_moved_project_finds_its_files(facts: Any) -> None:
     """Block of shots.py: "a project that is saved for the first time, moved, and linked from elsewhere"."""
     assert facts["saved as a copy"], "the file that is open has no place yet"
     assert facts["saved first and moved"]

@@ -70,7 +70,8 @@ def test_layers_keep_their_colours(blender: Blender, package: Path, tmp_path: Pa
     np.testing.assert_allclose(shown, np.broadcast_to(RED_IN_ACESCG, shown.shape), atol=1e-3)
 
 
-def test_what_a_configuration_lacks_is_told(blender: Blender, package: Path, tmp_path: Path) -> None:
+def test_a_colour_space_missing_from_the_configuration_is_reported(blender: Blender, package: Path,
+                                                                   tmp_path: Path) -> None:
     """Block of studio.py: "beginning"."""
     facts, _ = run(blender, package, tmp_path, CONFIGURATION.replace("VIEW", "Log"))
     assert facts["import"] == [["FINISHED"], "ACES 1.0 - SDR Video"]

@@ -27,7 +27,7 @@ def test_points_of_the_tracker_lie_on_their_tracks(facts: Any, how: str) -> None
     assert facts[how] < 0.05
 
 
-def test_distortion_is_that_of_the_clip_alone(facts: Any) -> None:
+def test_distortion_applies_to_frames_of_the_clip_only(facts: Any) -> None:
     """Block of tracked.py: "beginning"."""
     assert facts["frames from elsewhere"] == {}
     assert "solve it with the model Polynomial" in facts["another model"]
@@ -43,7 +43,7 @@ def test_sizes_are_rounded_as_blender_does(facts: Any) -> None:
     assert facts["size at 35 %"] == [448, 252]
 
 
-def test_a_sun_is_a_direction_wherever_it_is_put(facts: Any) -> None:
+def test_a_sun_is_a_direction_independent_of_its_position(facts: Any) -> None:
     """Block of tracked.py: "a sun, and what hides it"."""
     assert len(facts["sun"]) == 3, "for a fit, a shot of a .blend, and the panel"
     assert max(facts["sun"]) < 1e-5
@@ -57,14 +57,14 @@ def test_a_solve_needs_no_lights(facts: Any) -> None:
     assert facts["no lights"] == ["images", "points.ply", "transforms.json"]
 
 
-def test_a_shot_with_cuts_is_one_whatever_part_of_it_is_asked_for(facts: Any) -> None:
+def test_a_shot_with_cuts_has_one_name_for_every_range(facts: Any) -> None:
     """Block of tracked.py: "a sun, and what hides it"."""
     whole, part, same = facts["cut"]
     assert whole == part == [""]
     assert same, "so a farm's chunks are those of the whole"
 
 
-def test_a_light_or_a_camera_that_is_nowhere_is_told(facts: Any) -> None:
+def test_a_light_or_camera_without_a_finite_position_is_reported(facts: Any) -> None:
     """As drivers leave them: not as a defect of ours, when the shot is written down.
 
     Block of tracked.py: "a sun, and what hides it".
@@ -76,7 +76,7 @@ def test_a_light_or_a_camera_that_is_nowhere_is_told(facts: Any) -> None:
         assert kind == "CaptureError" and said.startswith("The camera 'Second' is scaled to nothing, or its place is")
 
 
-def test_what_renders_do_not_show_hides_nothing(facts: Any) -> None:
+def test_objects_hidden_in_renders_hide_no_light(facts: Any) -> None:
     """Block of tracked.py: "a sun, and what hides it"."""
     assert facts["behind a wall"] == 0
     assert facts["that renders do not show"] == pytest.approx(1)

@@ -35,7 +35,7 @@ def facts(blender: Blender, package: Path, tmp_path_factory: pytest.TempPathFact
 
 @pytest.mark.parametrize("before", ["bare", "grey", "unused"])
 @pytest.mark.parametrize("over", ["present", "scene"])
-def test_it_goes_without_a_trace(facts: Any, before: str, over: str) -> None:
+def test_the_compositor_is_removed_without_a_trace(facts: Any, before: str, over: str) -> None:
     changed, same, difference = facts[f"{before}, {over}"]
     assert changed
     assert same, difference
@@ -56,7 +56,7 @@ def test_a_worker_without_the_extension_has_the_sliders_as_they_were_saved(facts
     np.testing.assert_allclose(picture, SCENE + FLARE * np.array((3, 1.5, 0.75), np.float32), rtol=1e-5)
 
 
-def test_sliders_whose_flare_is_gone_are_known(facts: Any) -> None:
+def test_drivers_of_a_removed_flare_are_detected(facts: Any) -> None:
     """Block of wired.py: "rendered where the extension is not, after a save"."""
     assert facts["complete"] == [True, True, False]
 

@@ -75,7 +75,7 @@ def test_frames_are_cleaned_by_a_matte_and_otherwise_again(made: tuple[Any, Path
     assert not first and not stopped
 
 
-def test_a_moved_project_goes_on_with_its_capture_where_it_is_now(made: tuple[Any, Path]) -> None:
+def test_a_moved_project_resumes_with_its_moved_capture(made: tuple[Any, Path]) -> None:
     """Block of work.py: "a project that was moved, its capture with it"."""
     facts, base = made
     resumed, cleaned, moved = facts["moved"]
@@ -84,12 +84,12 @@ def test_a_moved_project_goes_on_with_its_capture_where_it_is_now(made: tuple[An
     assert "put it back" in facts["another's"]
 
 
-def test_clean_frames_that_were_made_again_are_shown(facts: Any) -> None:
+def test_clean_frames_are_reloaded_after_they_are_made_again(facts: Any) -> None:
     """Block of work.py: "clean frames that are made again"."""
     assert facts["clean frames"] == [0, 1]
 
 
-def test_a_fit_goes_by_clean_frames_of_someone_s_own_and_takes_others_for_estimates(facts: Any) -> None:
+def test_own_clean_frames_count_as_exact_and_others_as_estimates(facts: Any) -> None:
     """Block of work.py: "what a fit goes by"."""
     assert facts["goes by"] == ["default", "estimated", "estimated", "estimated"]
     assert facts["says that a fit knows no matte"] == [False, True]
@@ -136,7 +136,7 @@ def test_cameras_are_exposed_as_a_fit_has_found_the_frames(facts: Any, kind: str
     assert facts[f"other run, {kind}"] == 1.0
 
 
-def test_an_import_is_whole(facts: Any) -> None:
+def test_an_import_has_cameras_points_lights_and_frames(facts: Any) -> None:
     """Block of work.py: "import"."""
     assert facts["objects, animated"] == ["Camera", "Points", "capture Root", "lamp"]
     assert facts["objects, each"] == ["0000", "0001", "0002", "0003", "0004", "Points", "capture Root", "lamp"]
@@ -164,7 +164,7 @@ def test_lights_of_the_scene_are_those_of_the_fit(facts: Any) -> None:
     np.testing.assert_allclose(facts["lights.json"]["lamp"], LIGHT, atol=1e-5)
 
 
-def test_lights_follow_a_fit_that_has_moved_them_unless_the_artist_has(facts: Any) -> None:
+def test_lights_move_to_a_fit_unless_the_artist_moved_them(facts: Any) -> None:
     """Block of work.py: "lights"."""
     assert facts["followed"] == {"key": False, "lamp": True}
     np.testing.assert_allclose(facts["followed back"], LIGHT + 1, atol=1e-4)  # lights.json has it elsewhere
@@ -177,7 +177,7 @@ def test_a_flare_finds_its_light(facts: Any) -> None:
     assert facts["native"]
 
 
-def test_a_flare_over_frames_that_have_their_own_is_told(facts: Any) -> None:
+def test_a_flare_over_frames_with_their_own_flare_is_reported(facts: Any) -> None:
     """Block of work.py: "look"."""
     as_filmed, without = facts["look says"]
     assert "The frames behind the camera contain their own flare" in as_filmed
@@ -205,7 +205,7 @@ def test_the_overlay_draws_what_the_look_defines(facts: Any) -> None:
     assert facts["outside"]
 
 
-def test_what_is_shown_and_baked_is_as_bright_as_the_camera_is_exposed(made: tuple[Any, Path], tmp_path: Path) -> None:
+def test_overlay_and_bake_follow_the_exposure_of_the_camera(made: tuple[Any, Path], tmp_path: Path) -> None:
     """Block of work.py: "look"."""
     facts, base = made
     off, brightest = facts["brighter"]
@@ -242,7 +242,7 @@ def test_a_light_behind_the_camera_gives_no_flare(facts: Any) -> None:
     assert facts["behind"] == []
 
 
-def test_a_file_remembers_and_so_does_a_disabled_extension(facts: Any) -> None:
+def test_settings_survive_a_reload_and_a_disabled_extension(facts: Any) -> None:
     """Block of work.py: "save, reload"."""
     assert facts["reloaded"] == ["lamp.flare", "lamp", [1.0, 0.5, 0.25], "capture Root"]
     assert facts["enabled again"] == [1.0, 0.5, 0.25]
@@ -261,7 +261,7 @@ def test_the_library_keeps_flares(facts: Any) -> None:
     assert facts["items"] == [["Desk lamp", "1 lights, 60 Gaussians. 35 mm"]]
 
 
-def test_a_flare_goes_on_to_another_camera_and_light(facts: Any) -> None:
+def test_a_flare_is_applied_to_another_camera_and_light(facts: Any) -> None:
     """Block of work.py: "library and transfer"."""
     assert facts["applied"] == ["FINISHED"]
     assert facts["applied to"] == ["Spot"]
@@ -274,7 +274,7 @@ def test_a_light_is_picked_in_a_single_picture(facts: Any) -> None:
     np.testing.assert_allclose(facts["picked"], [0.25, 0.3], atol=1e-4)
 
 
-def test_an_upright_picture_is_by_a_turned_camera(facts: Any) -> None:
+def test_an_upright_picture_uses_a_turned_camera(facts: Any) -> None:
     """As `transfer` takes it: across its long side lies what lay across the source's.
 
     Block of work.py: "a single picture, the light picked in it".

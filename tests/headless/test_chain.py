@@ -23,7 +23,7 @@ import numpy as np
 import pytest
 
 from core.bake.exr import read_layers, write_layers
-from core.bake.layers import layers_of
+from core.bake.layers import to_layers
 from core.capture import Capture
 from core.colour.srgb import srgb_from_linear
 from core.fit.run import Run
@@ -107,7 +107,7 @@ def test_a_stop_is_clean(stopped: Ended, out: Path, finished: Ended) -> None:
     assert not [path for path in out.rglob(".*") if path.is_file()], "nothing is left half written"
 
 
-def test_everything_is_there(finished: Ended, out: Path, capture: Path) -> None:
+def test_the_demo_writes_all_its_files(finished: Ended, out: Path, capture: Path) -> None:
     assert finished.stages()[:3] == ["fit", "eval", "bake"]
     assert any("no flare is removed here" in event.get("text", "") for event in finished.events)
     assert sorted(path.name for path in out.iterdir() if path.is_dir()) == ["frames", "layers", "run"]
@@ -129,10 +129,10 @@ def test_layers_add_up_to_the_fitted_picture(blend: Any, out: Path, capture: Pat
     """Whatever the fit puts together in display space, the linear layers sum to."""
     made, camera = Run.open(out / "run"), Capture.open(capture).views[4].camera
     made.settings = replace(made.settings, blend=blend)
-    write_layers(tmp_path / "a.exr", layers_of(made.render(camera)))
+    write_layers(tmp_path / "a.exr", to_layers(made.render(camera)))
     baked = read_layers(tmp_path / "a.exr")
     shown = np.clip(srgb_from_linear(baked.scene + baked.flare), 0, 1)
-    np.testing.assert_allclose(shown, made.view(camera).composite.numpy(), atol=1e-3)
+    np.testing.assert_allclose(shown, made.render_view(camera).composite.numpy(), atol=1e-3)
     assert np.abs(baked.flare).max() > 0.01, "there is a flare to speak of"
 
 
@@ -184,14 +184,14 @@ def test_the_same_from_a_real_blender(words: list[object], out: Path) -> None:
 
 
 @pytest.mark.usefixtures("finished")
-def test_other_settings_do_not_go_on_with_this_run(words: list[object]) -> None:
+def test_a_run_is_not_resumed_with_other_settings(words: list[object]) -> None:
     ended = run([sys.executable, str(RUN)], *words[:-1], 13)
     assert ended.status == 1
     assert "other settings" in ended.events[-1]["text"]
 
 
 @pytest.mark.usefixtures("finished")
-def test_without_blender_the_rest_is_done_and_the_lack_is_told(words: list[object]) -> None:
+def test_without_blender_the_other_steps_run_and_a_message_says_so(words: list[object]) -> None:
     """In a Python without bpy and with no Blender named: the chain, and one sentence."""
     code = ("import importlib.util, runpy, sys\n"
             "find = importlib.util.find_spec\n"

@@ -63,15 +63,15 @@ def test_runs_whose_names_differ_by_case_alone_are_two_on_every_disk(tmp_path: P
     assert named == [Path("runs/001_Lamp"), Path("runs/002_lamp"), Path("runs/desk")]
 
 
-def test_a_capture_that_may_not_be_written_to_is_told_before_lights_are_looked_for(
-        tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_read_only_capture_is_reported_before_the_search_for_lights(tmp_path: Path,
+                                                                      monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "access", lambda path, mode: (Path(path), mode) != (tmp_path, os.W_OK))
     monkeypatch.setattr("fit_flare.core.lights.find_lights", lambda *_: pytest.fail("it looked"))
     with pytest.raises(CaptureError, match=r"cannot be written, and lights\.json belongs there"):
         lights.with_lights(Capture(tmp_path, (), PointCloud.empty()), Progress())
 
 
-def test_a_file_in_the_place_of_the_pictures_of_lights_is_told_before_they_are_looked_for(
+def test_a_file_in_place_of_the_sheets_is_reported_before_the_search_for_lights(
         tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "lights").touch()
     monkeypatch.setattr("fit_flare.core.lights.find_lights", lambda *_: pytest.fail("it looked"))
@@ -79,8 +79,8 @@ def test_a_file_in_the_place_of_the_pictures_of_lights_is_told_before_they_are_l
         lights.with_lights(Capture(tmp_path, (), PointCloud.empty()), Progress())
 
 
-def test_lights_and_clean_frames_that_are_made_leave_the_room_for_pictures_as_it_was(
-        tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_making_lights_and_clean_frames_keeps_the_size_of_the_picture_cache(tmp_path: Path,
+                                                                            monkeypatch: pytest.MonkeyPatch) -> None:
     """A fit keeps few pictures decoded here, since it has its own."""
     capture = Capture.open(make_capture(tmp_path / "c"), cache_bytes=100_000)
     monkeypatch.setattr(lights, "_find_and_record",
@@ -92,7 +92,7 @@ def test_lights_and_clean_frames_that_are_made_leave_the_room_for_pictures_as_it
         assert (made.folder, made.cache_bytes) == (capture.folder, 100_000)
 
 
-def test_a_compositor_of_before_is_kept(tmp_path: Path) -> None:
+def test_an_earlier_compositor_file_is_backed_up(tmp_path: Path) -> None:
     blend = tmp_path / "compositor.blend"
     compose._back_up(blend, Progress())
     assert not list(tmp_path.iterdir())
@@ -103,7 +103,7 @@ def test_a_compositor_of_before_is_kept(tmp_path: Path) -> None:
     assert [path.read_text() for path in sorted(tmp_path.iterdir())] == ["first", "second"]
 
 
-def test_the_list_of_commands(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_help_lists_every_command(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "200")  # a narrow terminal breaks names at their hyphens
     assert cli.main(["--help"]) == 0
     told = capsys.readouterr().out
@@ -151,7 +151,7 @@ def test_failures_are_status_1_and_one_line(words: list[str], capture: Path, tmp
     *(["fit", "{capture}", "--out", "{tmp}/o", "--set", change] for change in (
         "flare.form.latent=65", "flare.form.levels=0", "flare.form.base=300", "preview_every=0", "scene.sh_every=0",
         "scene.reorder_every=0", "scene.classic.every=0", "flare.visibility.radius=0", "flare.rates.position=0",
-        "flare.rates.settled=-1", "scene.rates.position=-1", "flare.count=100000000000", "seed=" + "9" * 26,
+        "flare.rates.final_ratio=-1", "scene.rates.position=-1", "flare.count=100000000000", "seed=" + "9" * 26,
         "seed=" + "9" * 5000, "seed=0x" + "f" * 5000, "ssim_share=" + "9" * 400, "holdout=" + "9" * 5000,
         "seed=" + "[" * 5000)),
     ["fit", "{capture}", "--out", "{tmp}/o", "--list", "{capture}/split.json"],
@@ -301,7 +301,7 @@ def test_events_have_standard_output_for_themselves(monkeypatch: pytest.MonkeyPa
 
 
 @pytest.mark.parametrize("closed", [(1,), (2,), (0, 1, 2)])
-def test_streams_that_are_closed_are_not_missed(closed: tuple[int, ...]) -> None:
+def test_commands_run_with_closed_streams(closed: tuple[int, ...]) -> None:
     """Daemons and schedulers start programs so."""
     for extra in ([], ["--progress", "json"]):
         words = [sys.executable, str(cli.hand_off.RUN_SCRIPT), "engine", *extra]
@@ -314,14 +314,14 @@ def test_streams_that_are_closed_are_not_missed(closed: tuple[int, ...]) -> None
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="only Linux has a disk that is always full")
 @pytest.mark.parametrize(("options", "full"), [("", "2"), ("--progress json", "1"),
                                                ("--progress openjd", "1")])
-def test_a_full_disk_under_the_log_is_no_failure(options: str, full: str) -> None:
+def test_a_full_disk_for_the_output_is_not_a_failure(options: str, full: str) -> None:
     run = f"'{sys.executable}' '{cli.hand_off.RUN_SCRIPT}'"
     done = subprocess.run(f"{run} engine {options} {full}>/dev/full", shell=True, capture_output=True, check=False)
     assert (done.returncode, done.stderr) == (0, b"")
     assert subprocess.run(f"{run} fly {options} {full}>/dev/full", shell=True, check=False).returncode == 2
 
 
-def test_a_torch_that_does_not_load_is_no_refusal_of_a_disk(tmp_path: Path) -> None:
+def test_a_torch_that_cannot_be_loaded_is_not_reported_as_a_disk_error(tmp_path: Path) -> None:
     """As Windows says that a library of its own is missing."""
     (tmp_path / "torch").mkdir()
     (tmp_path / "torch" / "__init__.py").write_text("raise OSError(126, 'The specified module could not be found')")
@@ -349,7 +349,7 @@ def test_an_option_may_end_with_an_equals_sign(capture: Path, tmp_path: Path,
     assert cli.main(["fit", str(capture), "--out", str(tmp_path / "o"), "--set=flare.count="]) == 2
 
 
-def test_a_farm_is_told_names_of_any_script(tmp_path: Path) -> None:
+def test_farm_messages_are_written_as_utf8(tmp_path: Path) -> None:
     words = [sys.executable, str(cli.hand_off.RUN_SCRIPT), "bake", str(tmp_path / "写真"), "--out",
              str(tmp_path / "out"), "--progress", "openjd"]
     done = subprocess.run(words, capture_output=True, env={**os.environ, "PYTHONIOENCODING": "cp1252"}, check=False)
@@ -363,7 +363,7 @@ def test_a_farm_is_told_names_of_any_script(tmp_path: Path) -> None:
 # ---- the pieces -----------------------------------------------------------------------------------
 
 
-def test_settings_on_the_command_line() -> None:
+def test_settings_are_parsed_from_name_and_value() -> None:
     assert fit.parse_setting("flare.count=400") == ("flare.count", 400)
     assert fit.parse_setting("flare.rates.network=1e-3") == ("flare.rates.network", 1e-3)
     assert fit.parse_setting("detection = false") == ("detection", False)
@@ -378,7 +378,7 @@ def test_a_holdout_is_a_number_or_a_file(tmp_path: Path, monkeypatch: pytest.Mon
     assert fit.parse_holdout("split.json") == str(tmp_path / "split.json")
 
 
-def test_sizes() -> None:
+def test_sizes_are_parsed_from_width_and_height() -> None:
     assert layers.parse_size(None) == (None, None)
     assert layers.parse_size("960") == (960, None)
     assert layers.parse_size("100x30") == (100, 30)
@@ -387,7 +387,7 @@ def test_sizes() -> None:
             layers.parse_size(text)
 
 
-def test_a_blender_that_cannot_be_loaded_is_a_sentence(tmp_path: Path) -> None:
+def test_a_blender_that_cannot_be_loaded_is_reported_in_one_line(tmp_path: Path) -> None:
     (tmp_path / "bpy.py").write_text("raise ImportError('libXrender.so.1: cannot open shared object file')")
     done = subprocess.run([sys.executable, str(ROOT / "headless" / "run.py"), "compose", str(tmp_path), "--out",
                            str(tmp_path / "frames"), "--step", "compose"], capture_output=True, text=True, check=False,
@@ -397,8 +397,8 @@ def test_a_blender_that_cannot_be_loaded_is_a_sentence(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("light", [0.5, float("nan")])
-def test_an_engine_that_splats_wrong_is_found_out(light: float, monkeypatch: pytest.MonkeyPatch,
-                                                  capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_engine_that_rasterises_wrongly_is_refused(light: float, monkeypatch: pytest.MonkeyPatch,
+                                                      capsys: pytest.CaptureFixture[str]) -> None:
     """It is what the preferences' button asks for."""
     assert cli.main(["engine"]) == 0
     wrong = SimpleNamespace(colour=torch.full((16, 16, 3), light))
@@ -407,7 +407,7 @@ def test_an_engine_that_splats_wrong_is_found_out(light: float, monkeypatch: pyt
     assert "rasterises wrongly" in capsys.readouterr().err
 
 
-def test_a_python_without_numpy_hands_over_to_the_engine(tmp_path: Path) -> None:
+def test_a_python_without_numpy_runs_the_engine_instead(tmp_path: Path) -> None:
     bare = tmp_path / "bare"
     venv.create(bare, with_pip=False, symlinks=os.name != "nt")
     python = next(path for path in (bare / "bin" / "python", bare / "Scripts" / "python.exe") if path.is_file())
@@ -425,7 +425,7 @@ def test_a_python_without_numpy_hands_over_to_the_engine(tmp_path: Path) -> None
     assert (status, told.count("\n")) == (1, 1) and "is not a Python with torch" in told, told
 
 
-def test_reading_the_words_needs_numpy_alone() -> None:
+def test_parsing_arguments_needs_numpy_only() -> None:
     """As in Blender's own Python: every module of ours but the engine's comes in without these."""
     code = (f"import importlib, runpy, sys\n"
             f"sys.modules.update(dict.fromkeys(('torch', 'cv2', 'OpenEXR', 'numba', 'safetensors', 'tqdm')))\n"

@@ -15,7 +15,7 @@ from core.bake.exr import read_layers
 from core.capture import Capture
 from core.colour.srgb import linear_from_srgb, srgb_from_linear
 from core.fit import Run, fit, preset
-from core.fit.settings import changed
+from core.fit.settings import override_settings
 from core.gaussians.ply import read_ply
 from core.images.read import read_picture
 from core.images.write import write_png
@@ -30,7 +30,8 @@ def runs(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path,
     shutil.copytree(capture, base / "capture", ignore=shutil.ignore_patterns("removed", "truth"))
     frame = base / "capture" / "images" / "0001.png"
     write_png(frame, srgb_from_linear(linear_from_srgb(read_picture(frame).pixels) / TIMES))
-    settings = changed(preset("draft", iterations=60, mode="split"), {"flare.count": 60, "flare.occlusion": False,
+    settings = override_settings(preset("draft", iterations=60, mode="split"), {"flare.count": 60,
+                                                                                "flare.occlusion": False,
                                                                       "holdout": 4})
     before = torch.get_num_threads()
     torch.set_num_threads(1)
@@ -105,19 +106,19 @@ def test_a_preset_does_not_replace_its_flare(runs: tuple[Path, Path], tmp_path: 
     assert flare.read_bytes() == before
 
 
-def test_a_fit_goes_on_in_the_mode_it_was_begun_in(runs: tuple[Path, Path], tmp_path: Path) -> None:
+def test_a_fit_resumes_in_its_own_mode(runs: tuple[Path, Path], tmp_path: Path) -> None:
     """Whatever is asked for now: nobody waits for frames to be cleaned that the fit has no use for."""
     folder = tmp_path / "capture"
     shutil.copytree((runs[0] / "capture.txt").read_text().strip(), folder)
     words = ["fit", str(folder), "--out", str(tmp_path / "run"), "--resume", "--set", "iterations=2"]
-    run = Run.create(tmp_path / "run", changed(Run.open(runs[0]).settings, {"iterations": 2}), folder)
+    run = Run.create(tmp_path / "run", override_settings(Run.open(runs[0]).settings, {"iterations": 2}), folder)
     assert not run.finished
     assert cli.main([*words, "--mode", "default"]) == 0
     assert Run.open(tmp_path / "run").settings.mode == "split"
     assert not list(folder.glob("removed*"))
 
 
-def test_transfer_on_to_the_run(runs: tuple[Path, Path], tmp_path: Path) -> None:
+def test_transfer_to_a_run(runs: tuple[Path, Path], tmp_path: Path) -> None:
     for run in runs:
         assert cli.main(["transfer", str(runs[0] / "flare.flare"), "--to", str(run), "--out", str(tmp_path / run.name),
                          "--frames", "1-2", "--float"]) == 0

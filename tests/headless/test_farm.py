@@ -19,10 +19,10 @@ import pytest
 import torch
 from fit_flare.headless import cli
 
-from core.bake.bake import read_record
+from core.bake.bake import read_manifest
 from core.capture import Capture
 from core.fit import fit, preset
-from core.fit.settings import changed
+from core.fit.settings import override_settings
 from core.look import PlacedLight, read
 from core.look.shot import Shot, ShotFrame
 from core.removal.jobs.manifest import MANIFEST
@@ -39,7 +39,7 @@ openjd = pytest.importorskip("openjd.cli", reason="openjd-cli is not installed")
 @pytest.fixture(scope="module")
 def made(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run, hardly fitted, of the tiny capture."""
-    settings = changed(preset("draft", iterations=3), {"flare.count": 20, "holdout": 0})
+    settings = override_settings(preset("draft", iterations=3), {"flare.count": 20, "holdout": 0})
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     folder = fit(Capture.open(capture), settings, tmp_path_factory.mktemp("run") / "run").folder
@@ -121,7 +121,7 @@ def test_several_processes_share_the_frames(capture: Path, made: Path, whole: Pa
     assert cli.main(["bake", str(made), "--capture", str(capture), "--out", str(tmp_path / "out"), "--set",
                      "*.intensity=1", "--jobs", "2"]) == 0
     assert contents(tmp_path / "out") == contents(whole)
-    assert len(read_record(tmp_path / "out")["frames"]) == 9
+    assert len(read_manifest(tmp_path / "out")["frames"]) == 9
 
 
 def test_a_job_that_fails_says_why_and_stops_the_others(capture: Path, made: Path, tmp_path: Path,
@@ -159,7 +159,7 @@ def test_a_transfer_in_chunks(capture: Path, made: Path, tmp_path: Path) -> None
     shot.write(tmp_path / "shot.json")
     job("transfer.yaml", "Record", "--run-dependencies", Flare=flare, To=tmp_path / "shot.json", Out=tmp_path / "out",
         Frames="1-4", FramesPerTask=2, Query="blend", Set="")
-    record = read_record(tmp_path / "out")
+    record = read_manifest(tmp_path / "out")
     assert [entry["frame"] for entry in record["frames"]] == [1, 2, 3, 4]
     assert not list((tmp_path / "out").rglob(".*"))
 

@@ -86,7 +86,7 @@ def test_the_engine_is_looked_for_in_order(bare: Path, monkeypatch: pytest.Monke
     assert hand_off.engine_command(sys.executable) == HERE
 
 
-def test_an_engine_that_is_named_must_be_one(bare: Path, torchless: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_named_engine_must_have_torch(bare: Path, torchless: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for place in (torchless, bare / "nowhere"):
         with pytest.raises(EngineError, match="--engine names"):
             hand_off.engine_command(str(place))
@@ -127,7 +127,7 @@ def test_a_blender_in_a_folder_with_spaces(on_windows: bool, tmp_path: Path, mon
         hand_off.blender_command(f'"{program} --threads 2')
 
 
-def test_a_process_is_one_side() -> None:
+def test_a_process_has_one_side() -> None:
     assert hand_off.current_side() == "engine"
     assert "bpy" not in sys.modules
 
@@ -142,7 +142,7 @@ def child(tmp_path: Path, code: str) -> list[str]:
     return [sys.executable, str(script)]
 
 
-def test_events_of_the_other_process_become_ours(tmp_path: Path) -> None:
+def test_events_of_the_child_are_forwarded(tmp_path: Path) -> None:
     heard = Heard()
     code = ("print('Blender 9.9')\n"
             "tell(type='stage', name='bake', total=5, done=2)\n"
@@ -156,32 +156,33 @@ def test_events_of_the_other_process_become_ours(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("status", "error"), [(1, FitFlareError), (2, SettingsError), (130, Cancelled)])
-def test_its_error_is_ours(tmp_path: Path, status: int, error: type[FitFlareError]) -> None:
+def test_the_error_of_the_child_is_raised(tmp_path: Path, status: int, error: type[FitFlareError]) -> None:
     code = f"tell(type='error', text='The lamp is broken.')\nsys.exit({status})"
     with pytest.raises(FitFlareError, match=r"^The lamp is broken\.$") as problem:
         hand_off.run_in_child(child(tmp_path, code), [], "x", Heard())
     assert type(problem.value) is error
 
 
-def test_options_stand_before_what_ends_them(tmp_path: Path) -> None:
+def test_options_are_added_before_the_end_of_options(tmp_path: Path) -> None:
     """Behind "--" all words are names of files."""
     code = "tell(type='result', data={'words': sys.argv[1:]})\n"
     result = hand_off.run_in_child(child(tmp_path, code), ["remove", "--out", "o", "--", "-a.png"], "remove", Heard())
     assert result["words"] == ["remove", "--out", "o", "--step", "remove", "--progress", "json", "--", "-a.png"]
 
 
-def test_its_crash_is_told_with_its_last_words(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_crash_of_the_child_is_reported_with_the_end_of_its_log(tmp_path: Path,
+                                                                  capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(EngineError, match="status 9"):
         hand_off.run_in_child(child(tmp_path, "print('boom', file=sys.stderr)\nsys.exit(9)"), [], "x", Heard())
     assert "boom" in capsys.readouterr().err
 
 
-def test_a_program_that_cannot_start_is_a_sentence(tmp_path: Path) -> None:
+def test_a_program_that_cannot_start_is_reported_in_one_line(tmp_path: Path) -> None:
     with pytest.raises(EngineError, match="cannot be started"):
         hand_off.run_in_child([str(tmp_path / "nothing")], [], "x", Heard())
 
 
-def test_who_waits_for_an_event_hears_a_stop_meanwhile(tmp_path: Path) -> None:
+def test_waiting_for_an_event_can_be_stopped(tmp_path: Path) -> None:
     """On Windows no signal gets through to who reads from a pipe."""
     event_queue: EventQueue = queue.Queue()
     code = ("import signal\nsignal.signal(signal.SIGINT, signal.default_int_handler)\n"  # also where it is ignored here
@@ -199,7 +200,7 @@ def test_who_waits_for_an_event_hears_a_stop_meanwhile(tmp_path: Path) -> None:
 @pytest.mark.skipif(os.name == "nt", reason="signals to oneself end the process on Windows")
 @pytest.mark.parametrize("numbers", [["SIGTERM"], ["SIGHUP", "SIGHUP"], ["SIGTERM", "SIGHUP"]])
 @pytest.mark.usefixtures("hangups_are_heard")
-def test_a_stop_reaches_the_other_process_which_ends_by_itself(tmp_path: Path, numbers: list[str]) -> None:
+def test_a_stop_reaches_the_child_which_ends_by_itself(tmp_path: Path, numbers: list[str]) -> None:
     """Once: a second one would end it before it has saved."""
     code = ("def stop(*_):\n"
             "    signal.signal(signal.SIGINT, signal.SIG_DFL)\n"
@@ -228,7 +229,7 @@ def test_a_stop_reaches_the_other_process_which_ends_by_itself(tmp_path: Path, n
 
 
 @pytest.mark.skipif(os.name == "nt", reason="the test looks for the process by its number")
-def test_no_process_is_left_behind_when_ours_fails(tmp_path: Path) -> None:
+def test_no_child_is_left_when_the_parent_fails(tmp_path: Path) -> None:
     class Failing(Heard):
         def say(self, text: str) -> None:
             raise BrokenPipeError(text)

@@ -56,7 +56,7 @@ def run(*frames: str) -> None:
 @pytest.mark.parametrize(("numbers", "count", "expected"), [
     ([5, 1, 2, 3], 2, ["1-2", "3,5"]), ([4, 4], 3, ["4"]), ([], 2, []),
 ])
-def test_shares(numbers: list[int], count: int, expected: list[str]) -> None:
+def test_frames_are_split_into_contiguous_ranges(numbers: list[int], count: int, expected: list[str]) -> None:
     assert jobs.split_frames(numbers, count) == expected
     with pytest.raises(SettingsError, match="--jobs 0"):
         jobs.split_frames(numbers, 0)
@@ -64,8 +64,8 @@ def test_shares(numbers: list[int], count: int, expected: list[str]) -> None:
 
 @pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="the system gives no process a part of its cores")
 @pytest.mark.usefixtures("program")
-def test_processes_share_the_cores_that_are_theirs(monkeypatch: pytest.MonkeyPatch,
-                                                   capfd: pytest.CaptureFixture[str]) -> None:
+def test_processes_share_the_available_cores(monkeypatch: pytest.MonkeyPatch,
+                                             capfd: pytest.CaptureFixture[str]) -> None:
     """Of a large machine a farm's slot is a part, and threads for all of it would wait for each other."""
     monkeypatch.setattr(os, "cpu_count", lambda: 64)
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(4)))
@@ -75,7 +75,7 @@ def test_processes_share_the_cores_that_are_theirs(monkeypatch: pytest.MonkeyPat
 
 
 @pytest.mark.usefixtures("program")
-def test_names_behind_two_dashes_stay_names() -> None:
+def test_names_after_the_end_of_options_stay_names() -> None:
     words = argparse.Namespace(argv=["remove", "--", "bad", "--frames"])
     jobs.run_parts(words, "remove", [["--frames", "told"]], 1, 1, Progress(), continue_on_failure=True)
     told = json.loads(Path(f"{hand_off.RUN_SCRIPT}.json").read_text(encoding="utf-8"))
@@ -83,7 +83,7 @@ def test_names_behind_two_dashes_stay_names() -> None:
 
 
 @pytest.mark.usefixtures("program")
-def test_every_failed_process_is_told_those_without_a_reason_too(capfd: pytest.CaptureFixture[str]) -> None:
+def test_every_failed_process_is_reported_also_without_a_message(capfd: pytest.CaptureFixture[str]) -> None:
     run("fine", "fine")
     with pytest.raises(FitFlareError) as problem:
         run("bad", "fine", "bad")
@@ -102,16 +102,15 @@ def test_every_failed_process_is_told_those_without_a_reason_too(capfd: pytest.C
     (["status 2", "status 1"], FitFlareError),
 ])
 @pytest.mark.usefixtures("program")
-def test_what_several_processes_could_not_do_is_the_error_that_one_would_end_with(
-        frames: list[str], error: type[FitFlareError]) -> None:
+def test_several_failed_processes_raise_the_error_of_one(frames: list[str], error: type[FitFlareError]) -> None:
     with pytest.raises(FitFlareError, match=r"^The words are no good\.$") as problem:
         run(*frames)
     assert type(problem.value) is error
 
 
 @pytest.mark.usefixtures("program")
-def test_processes_are_led_to_no_modules_of_this_one(monkeypatch: pytest.MonkeyPatch,
-                                                     capfd: pytest.CaptureFixture[str]) -> None:
+def test_children_do_not_import_modules_of_this_process(monkeypatch: pytest.MonkeyPatch,
+                                                        capfd: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setenv("PYTHONPATH", "/of/blender")
     with pytest.raises(EngineError):
         run("home")
@@ -119,14 +118,14 @@ def test_processes_are_led_to_no_modules_of_this_one(monkeypatch: pytest.MonkeyP
 
 
 @pytest.mark.usefixtures("program")
-def test_a_python_that_cannot_be_started_is_a_sentence(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_python_that_cannot_start_is_reported_in_one_line(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(jobs.sys, "executable", str(tmp_path / "python"))
     with pytest.raises(EngineError, match="cannot be started"):
         run("fine", "fine")
 
 
 @pytest.mark.usefixtures("program")
-def test_one_that_fails_stops_the_others(tmp_path: Path) -> None:
+def test_a_failed_process_stops_the_others(tmp_path: Path) -> None:
     words, began = argparse.Namespace(argv=["bake"]), time.monotonic()
     with pytest.raises(FitFlareError, match=r"^Frame 7 is damaged\.$"):
         jobs.run_parts(words, "bake", [["--frames", "sleep"], ["--frames", "bad"]], 2, 2, Progress())

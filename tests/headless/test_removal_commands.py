@@ -32,8 +32,8 @@ def backgrounds(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_training_is_stopped_by_its_length_and_goes_on(backgrounds: Path, tmp_path: Path,
-                                                       capsys: pytest.CaptureFixture[str]) -> None:
+def test_training_stops_at_its_length_and_resumes(backgrounds: Path, tmp_path: Path,
+                                                  capsys: pytest.CaptureFixture[str]) -> None:
     torch.set_num_threads(1)
     words = ["train-removal", "--backgrounds", str(backgrounds), "--out", str(tmp_path / "made"), *SMALL]
     subprocess.run([sys.executable, RUN, *words, "--iterations", "2"], check=True)  # as many processes as is usual
@@ -54,8 +54,8 @@ def test_training_is_stopped_by_its_length_and_goes_on(backgrounds: Path, tmp_pa
     assert "speed" in capsys.readouterr().err
 
 
-def test_a_training_tells_what_it_cannot_read(backgrounds: Path, tmp_path: Path,
-                                              capsys: pytest.CaptureFixture[str]) -> None:
+def test_training_reports_unreadable_files(backgrounds: Path, tmp_path: Path,
+                                           capsys: pytest.CaptureFixture[str]) -> None:
     folder = tmp_path / "pictures"
     shutil.copytree(backgrounds, folder)
     (folder / "0_bad.png").write_bytes(b"no picture")
@@ -77,8 +77,8 @@ def test_bad_plates_are_listed_at_the_end(backgrounds: Path, tmp_path: Path,
     assert {path.name for path in (tmp_path / "clean").iterdir()} == {"a.png", "b.png", "remove.json"}
 
 
-def test_a_video_that_cannot_be_read_is_left_out_for_one_reason(backgrounds: Path, tmp_path: Path,
-                                                                capfd: pytest.CaptureFixture[str]) -> None:
+def test_an_unreadable_video_is_reported_once(backgrounds: Path, tmp_path: Path,
+                                              capfd: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "take.mov").touch()
     words = ["remove", str(backgrounds / "a.png"), str(tmp_path / "take.mov"), "--out", str(tmp_path / "clean"),
              "--progress", "json"]
@@ -91,9 +91,9 @@ def test_a_video_that_cannot_be_read_is_left_out_for_one_reason(backgrounds: Pat
 
 
 @pytest.mark.parametrize(("more", "status"), [(["--frames", "1-2"], 0), (["--jobs", "2"], 1)])
-def test_a_video_that_cannot_be_read_fails_no_share_of_the_frames(more: list[str], status: int, backgrounds: Path,
-                                                                  tmp_path: Path,
-                                                                  capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_unreadable_video_does_not_fail_a_range_of_frames(more: list[str], status: int, backgrounds: Path,
+                                                             tmp_path: Path,
+                                                             capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "take.mov").touch()
     for number in (1, 2):
         shutil.copyfile(backgrounds / "a.png", tmp_path / f"f{number}.png")
@@ -119,8 +119,8 @@ def test_bad_plates_do_not_stop_other_processes(backgrounds: Path, tmp_path: Pat
         "f2.png", "f3.png", "f5.png", "f6.png", "remove.json"]
 
 
-def test_diffusion_without_a_base_or_its_packages(backgrounds: Path, tmp_path: Path,
-                                                  capsys: pytest.CaptureFixture[str]) -> None:
+def test_diffusion_needs_a_base_and_its_packages(backgrounds: Path, tmp_path: Path,
+                                                 capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["remove", str(backgrounds), "--out", str(tmp_path), "--model", "diffusion"]) == 1
     told = capsys.readouterr().err
     assert "--base" in told or "needs diffusers" in told
@@ -141,8 +141,8 @@ def test_scores_of_pairs(tmp_path: Path, backgrounds: Path, capsys: pytest.Captu
     assert len(json.loads((tmp_path / "made" / "eval.json").read_text(encoding="utf-8"))["categories"]) == 8
 
 
-def test_pairs_that_cannot_be_read_do_not_cost_the_others_their_scores(tmp_path: Path, backgrounds: Path,
-                                                                       capsys: pytest.CaptureFixture[str]) -> None:
+def test_unreadable_pairs_do_not_stop_the_scores_of_others(tmp_path: Path, backgrounds: Path,
+                                                           capsys: pytest.CaptureFixture[str]) -> None:
     pairs = tmp_path / "pairs"
     for kind in ("input", "gt"):
         shutil.copytree(backgrounds, pairs / kind)
@@ -162,8 +162,8 @@ def test_pairs_that_cannot_be_read_do_not_cost_the_others_their_scores(tmp_path:
         assert said in capsys.readouterr().err
 
 
-def test_fit_does_without_flare_free_frames_where_it_is_asked_to(capture: Path, tmp_path: Path,
-                                                                  capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_fit_in_mode_split_makes_no_clean_frames(capture: Path, tmp_path: Path,
+                                                   capsys: pytest.CaptureFixture[str]) -> None:
     bare, run = tmp_path / "bare", tmp_path / "run"
     shutil.copytree(capture, bare, ignore=shutil.ignore_patterns("removed", "truth"))
     assert cli.main(["fit", str(bare), "--out", str(run), "--iterations", "2", "--mode", "split"]) == 0
@@ -180,8 +180,7 @@ def test_fit_does_without_flare_free_frames_where_it_is_asked_to(capture: Path, 
         assert "--run" in capsys.readouterr().err
 
 
-def test_fit_takes_the_flare_out_where_nobody_did(capture: Path, tmp_path: Path,
-                                                  capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_fit_makes_missing_clean_frames(capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     bare = tmp_path / "bare"
     shutil.copytree(capture, bare, ignore=shutil.ignore_patterns("removed", "truth"))
     words = ["fit", str(bare), "--out", str(tmp_path / "run"), "--iterations", "2"]

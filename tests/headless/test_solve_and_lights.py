@@ -49,7 +49,7 @@ def test_lights_and_keep(tmp_path: Path) -> None:
     assert [light.name for light in Capture.open(folder).lights] == ["lamp"]
 
 
-def test_lights_by_hand_are_not_written_over(tmp_path: Path) -> None:
+def test_lights_edited_by_hand_are_not_overwritten(tmp_path: Path) -> None:
     folder = lit_capture(tmp_path / "c", 8, [(0.4, -0.5, 0.3)])
     assert run("lights", folder)[0] == run("lights", folder)[0] == 0, "what was found may be found again"
     file = folder / "lights.json"
@@ -71,7 +71,7 @@ def test_lights_by_hand_are_not_written_over(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("words", [("solve", "nowhere", "--out", "c"), ("lights", "nowhere"),
                                    ("lights", "nowhere", "--threshold", "3")])
-def test_a_clear_sentence_and_a_status(tmp_path: Path, words: tuple[str, ...]) -> None:
+def test_a_failed_solve_has_a_message_and_a_status(tmp_path: Path, words: tuple[str, ...]) -> None:
     rest = [tmp_path / word if word == "c" else word for word in words[2:]]
     status, events = run(words[0], tmp_path / words[1], *rest)
     assert status == 1 and [event["type"] for event in events] == ["error"]

@@ -18,7 +18,7 @@ from fit_flare.headless import cli
 from core.bake.exr import read_description, read_layers
 from core.capture import Capture
 from core.fit import fit, preset
-from core.fit.settings import changed
+from core.fit.settings import override_settings
 from core.flare.file import FlareFile
 from core.flare.file import save as save_flare
 from core.gaussians.ply import read_ply
@@ -37,7 +37,7 @@ def made(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run, hardly fitted: its flare is there, whatever it looks like."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
-    settings = changed(preset("draft", iterations=3), {"flare.count": 40, "holdout": 0})
+    settings = override_settings(preset("draft", iterations=3), {"flare.count": 40, "holdout": 0})
     folder = fit(Capture.open(capture), settings, tmp_path_factory.mktemp("run") / "run").folder
     torch.set_num_threads(before)
     return folder
@@ -59,7 +59,7 @@ def run(capfd: pytest.CaptureFixture[str]) -> Run:
     return go
 
 
-def test_on_to_a_picture(run: Run, made: Path, tmp_path: Path) -> None:
+def test_transfer_to_a_picture(run: Run, made: Path, tmp_path: Path) -> None:
     write_png(tmp_path / "plate.png", np.full((54, 96, 3), 0.3))
     run("transfer", made, "--to", tmp_path / "plate.png", "--light", "sun=60,10", "--out", tmp_path / "out", "--set",
         "sun.intensity=3")
@@ -71,7 +71,8 @@ def test_on_to_a_picture(run: Run, made: Path, tmp_path: Path) -> None:
     assert "No light was found in" in problem["text"]
 
 
-def test_options_that_a_target_has_no_use_for_are_refused(run: Run, made: Path, capture: Path, tmp_path: Path) -> None:
+def test_options_that_do_not_apply_to_the_target_are_refused(run: Run, made: Path, capture: Path,
+                                                             tmp_path: Path) -> None:
     write_png(tmp_path / "plate.png", np.full((54, 96, 3), 0.3))
     for target, *words in ((tmp_path / "plate.png", "--light", "9,9", "--scene", "x.ply"),
                            (tmp_path / "plate.png", "--light", "9,9", "--plates", tmp_path),
@@ -86,7 +87,7 @@ def test_options_that_a_target_has_no_use_for_are_refused(run: Run, made: Path, 
     assert not (tmp_path / "none").exists()
 
 
-def test_on_to_a_folder_of_plates_of_which_one_shows_no_light(run: Run, made: Path, tmp_path: Path) -> None:
+def test_transfer_to_plates_skips_one_without_a_light(run: Run, made: Path, tmp_path: Path) -> None:
     lit = np.full((54, 96, 3), 0.1)
     lit[20:25, 40:45] = 1
     write_png(tmp_path / "plates" / "f.0001.png", lit)
@@ -98,7 +99,7 @@ def test_on_to_a_folder_of_plates_of_which_one_shows_no_light(run: Run, made: Pa
     assert read_layers(tmp_path / "out" / "layers.0001.exr").flare.any()
 
 
-def test_plates_that_are_not_written_are_told(run: Run, made: Path, tmp_path: Path) -> None:
+def test_plates_that_are_not_written_are_reported(run: Run, made: Path, tmp_path: Path) -> None:
     write_png(tmp_path / "plate.png", np.full((54, 96, 3), 0.3))
     events = run("transfer", made, "--to", tmp_path / "plate.png", "--light", "60,10", "--size", "48", "--out",
                  tmp_path / "out")
@@ -185,7 +186,7 @@ def blend(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_on_to_a_blend_its_objects_hide_the_light(run: Run, made: Path, blend: Path, tmp_path: Path) -> None:
+def test_transfer_to_a_blend_whose_objects_hide_the_light(run: Run, made: Path, blend: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     run("transfer", made, "--to", blend, "--out", out, "--frames", "1-9", "--jobs", "2", "--float")
     shot = Shot.read(out / "shot.1-9.json")
@@ -206,7 +207,7 @@ def test_on_to_a_blend_its_objects_hide_the_light(run: Run, made: Path, blend: P
     assert (tmp_path / "part" / "layers.0004.exr").read_bytes() == (out / "layers.0004.exr").read_bytes()
 
 
-def test_a_shot_of_frames_that_are_no_file_s_name_has_one(run: Run, made: Path, blend: Path, tmp_path: Path) -> None:
+def test_a_range_of_frames_that_is_no_file_name_gets_one(run: Run, made: Path, blend: Path, tmp_path: Path) -> None:
     """Steps have a colon, and a long list is longer than a name may be."""
     names = set()
     for number, frames in enumerate(("1-9:8", ",".join(map(str, [1, 9] * 60)))):
@@ -227,7 +228,7 @@ def test_a_bare_flare_is_baked_for_a_blend(run: Run, made: Path, blend: Path, tm
     assert "no object 'moon'" in problem["text"]
 
 
-def test_words_are_looked_at_before_a_blend(run: Run, made: Path, blend: Path, tmp_path: Path) -> None:
+def test_arguments_are_checked_before_a_blend_is_read(run: Run, made: Path, blend: Path, tmp_path: Path) -> None:
     """Which may take minutes to look through; nothing is left behind either."""
     for more, said in ((["--radius", "nan"], "--radius"), (["--light", "3,4"], "--light"), (["--jobs", "0"], "--jobs"),
                        (["--size", "0"], "--size"), (["--smooth", "-1"], "--smooth")):
@@ -241,14 +242,14 @@ def test_words_are_looked_at_before_a_blend(run: Run, made: Path, blend: Path, t
     assert not (tmp_path / "o").exists()
 
 
-def test_a_target_that_is_missing_may_have_been_anything(run: Run, made: Path, tmp_path: Path) -> None:
+def test_a_missing_target_lists_the_kinds_of_target(run: Run, made: Path, tmp_path: Path) -> None:
     for name in ("none", "none.png"):
         text = run("transfer", made, "--to", tmp_path / name, "--out", tmp_path / "o", status=1)[-1]["text"]
         assert text.endswith("is missing; name what the flare goes on to: pictures, a capture, a run, a .blend, a PLY "
                              "or a shot.")
 
 
-def test_a_target_of_no_kind_is_told_as_what_it_is(run: Run, made: Path, tmp_path: Path) -> None:
+def test_a_target_of_an_unsupported_kind_is_reported(run: Run, made: Path, tmp_path: Path) -> None:
     for name, told in (("a.mov", "a.mov is a video; take its frames out first"), ("a.txt", "a.txt is not a picture")):
         (tmp_path / name).touch()
         text = run("transfer", made, "--to", tmp_path / name, "--light", "9,9", "--out", tmp_path / "o", status=1)[-1]

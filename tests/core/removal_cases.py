@@ -42,21 +42,21 @@ def write_codes(path: Path, codes: NDArray[np.generic]) -> Path:
     return path
 
 
-def with_no_glow(added: NDArray[np.float32]) -> NDArray[np.float32]:
+def with_no_glow(flare: NDArray[np.float32]) -> NDArray[np.float32]:
     """As `Remover._forward` returns it."""
-    return np.concatenate([added, np.zeros_like(added)], -1)
+    return np.concatenate([flare, np.zeros_like(flare)], -1)
 
 
-def lit_street(lamp: int, left: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """(160, 240, 3) each: a dark street with a white lamp `lamp` pixels a side in a glow, and as a flare the glow and
-    of the lamp what leaves it at the display value `left`, a third of that in its rim of a pixel."""
-    display, added = np.full((160, 240, 3), 0.1, np.float32), np.zeros((160, 240, 3), np.float32)
+def lit_street(size: int, level: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """(160, 240, 3) each: a dark street with a white light disc of `size` pixels a side in a glow; and the flare, which
+    is the glow and what leaves the disc at the display value `level`, its rim of one pixel at a third of that."""
+    display, flare = np.full((160, 240, 3), 0.1, np.float32), np.zeros((160, 240, 3), np.float32)
     first = 60
-    glow, rim = slice(first - 12, first + lamp + 12), slice(first, first + lamp)
-    display[glow, glow], added[glow, glow] = 0.5, 0.35
-    display[rim, rim], added[rim, rim] = 1, 1 - left / 3
-    added[first + 1:first + lamp - 1, first + 1:first + lamp - 1] = 1 - left
-    return display, added
+    glow, rim = slice(first - 12, first + size + 12), slice(first, first + size)
+    display[glow, glow], flare[glow, glow] = 0.5, 0.35
+    display[rim, rim], flare[rim, rim] = 1, 1 - level / 3
+    flare[first + 1:first + size - 1, first + 1:first + size - 1] = 1 - level
+    return display, flare
 
 
 def write_tiff(path: Path, codes: NDArray[np.generic], tags: dict[int, tiff.Tag]) -> Path:

@@ -42,8 +42,8 @@ def test_colour_tags_of_a_jpeg_are_copied(tmp_path: Path) -> None:
     codes = picture()
     write_codes(tmp_path / "a.jpg", codes)
     data = (tmp_path / "a.jpg").read_bytes()
-    told = ((0xE1, b"http://ns.adobe.com/xap/1.0/\0<x:xmpmeta/>"), (0xE2, b"ICC_PROFILE\0\x01\x01" + b"profile" * 3))
-    segments = b"".join(jpeg.make_segment(*one) for one in told)
+    tags = ((0xE1, b"http://ns.adobe.com/xap/1.0/\0<x:xmpmeta/>"), (0xE2, b"ICC_PROFILE\0\x01\x01" + b"profile" * 3))
+    segments = b"".join(jpeg.make_segment(*one) for one in tags)
     (tmp_path / "a.jpg").write_bytes(data[:2] + segments + data[2:])
     plate = read_plate(tmp_path / "a.jpg")
     write_plate(tmp_path / "b.jpg", plate, plate.codes // 2)
@@ -160,8 +160,8 @@ def test_unsupported_pictures_are_refused_by_name(tmp_path: Path) -> None:
         read_plate(tmp_path / "deep.jpg")
     _, still = cv2.imencode(".png", codes)
     for frames in (1, 2):
-        told = png.make_chunk(b"acTL", frames.to_bytes(4, "big") + bytes(4))
-        (tmp_path / f"{frames}.png").write_bytes(still.tobytes()[:33] + told + still.tobytes()[33:])
+        chunk = png.make_chunk(b"acTL", frames.to_bytes(4, "big") + bytes(4))
+        (tmp_path / f"{frames}.png").write_bytes(still.tobytes()[:33] + chunk + still.tobytes()[33:])
     assert read_plate(tmp_path / "1.png").codes.shape == codes.shape
     with pytest.raises(FrameError, match=r"2\.png is an animated PNG; export its frames"):
         read_plate(tmp_path / "2.png")

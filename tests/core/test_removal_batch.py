@@ -41,10 +41,10 @@ def write_bad_files(folder: Path) -> list[Path]:
 def test_unreadable_plates_do_not_stop_the_others(tmp_path: Path, flare_everywhere: Path) -> None:
     bad = write_bad_files(tmp_path / "in")
     write_codes(tmp_path / "in" / "good.png", picture())
-    with pytest.raises(FrameError) as told:
+    with pytest.raises(FrameError) as error:
         remove_all([tmp_path / "in"], tmp_path / "out", Remover(flare_everywhere, working_size=64), Progress())
-    assert f"{len(bad)} of {len(bad) + 1} plates" in str(told.value)
-    assert all(path.name in str(told.value) for path in bad)
+    assert f"{len(bad)} of {len(bad) + 1} plates" in str(error.value)
+    assert all(path.name in str(error.value) for path in bad)
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["good.png", MANIFEST]
 
 
@@ -75,7 +75,7 @@ def test_a_broken_link_is_reported_as_a_missing_plate(tmp_path: Path, flare_ever
 
 @pytest.mark.parametrize("place", ["file", "file/below"])
 def test_results_are_refused_where_a_file_is(tmp_path: Path, flare_everywhere: Path, place: str) -> None:
-    """Which is said once, before the network is asked about every plate."""
+    """Before the network runs on any plate."""
     source = write_codes(tmp_path / "in" / "a.png", picture())
     (tmp_path / "file").touch()
     for folders in ({"folder": tmp_path / place}, {"folder": tmp_path / "out", "flare_folder": tmp_path / place}):
@@ -94,7 +94,7 @@ def test_a_link_to_itself_does_not_stop_the_others(tmp_path: Path, flare_everywh
 
 
 def test_a_full_disk_ends_the_batch(tmp_path: Path, no_flare: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """None of the others would fit; what else the system refuses is told in its own sentence."""
+    """Other refusals of the system are reported for each plate."""
     for name in ("a", "b", "c"):
         write_codes(tmp_path / "in" / f"{name}.png", picture())
     tried: list[str] = []
@@ -225,7 +225,7 @@ def test_clean_plates_of_an_earlier_run_are_no_plates_of_the_next(tmp_path: Path
 
 
 def test_a_long_shot_with_results_below_it_is_searched_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    names, asked = [f"{number:04d}.png" for number in range(40)], 0
+    names, resolved = [f"{number:04d}.png" for number in range(40)], 0
     (tmp_path / "clean").mkdir()
     for name in names:
         for folder in (tmp_path, tmp_path / "clean"):
@@ -234,13 +234,13 @@ def test_a_long_shot_with_results_below_it_is_searched_once(tmp_path: Path, monk
     resolve = Path.resolve
 
     def counted(path: Path, strict: bool = False) -> Path:
-        nonlocal asked
-        asked += 1
+        nonlocal resolved
+        resolved += 1
         return resolve(path, strict)
 
     monkeypatch.setattr(Path, "resolve", counted)
     assert len(collect_plates([tmp_path])) == 40
-    assert asked < 4 * len(names)
+    assert resolved < 4 * len(names)
 
 
 def test_flares_of_an_earlier_run_are_no_plates_of_the_next(tmp_path: Path, flare_everywhere: Path) -> None:

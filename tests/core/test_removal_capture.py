@@ -26,14 +26,14 @@ from tests.core.removal_cases import lit_street
 
 def test_a_capture_is_cleaned_as_its_remover_says(tmp_path: Path, flare_everywhere: Path,
                                                   monkeypatch: pytest.MonkeyPatch) -> None:
-    """Those of one that takes all of a glow have none, and are kept by whoever makes them in the same way."""
-    display, added = (one[:, :224] for one in lit_street(10, left=0.7))  # as the network is shown it
+    """A remover of all glow leaves none, and a later run with the same settings keeps its clean frames."""
+    display, flare = (one[:, :224] for one in lit_street(10, level=0.7))  # as the network is shown it
     capture = Capture.open(make_capture(tmp_path / "capture", views=3))
     shutil.rmtree(capture.folder / "removed", ignore_errors=True)
     frames = [capture.frame_path(view) for view in capture.views]
     for frame in frames:
         cv2.imwrite(str(frame), (display * 255 + 0.5).astype(np.uint8))
-    views = single_prediction(added)._replace(glow_fraction=np.ones_like(added))
+    views = single_prediction(flare)._replace(glow_fraction=np.ones_like(flare))
     monkeypatch.setattr(Remover, "predict_with_tta", lambda *_: views)
     whole = Remover(flare_everywhere, working_size=224, glow="taken")
     remove_all(frames, tmp_path / "plates", Remover(flare_everywhere, working_size=224), Progress())
@@ -57,7 +57,7 @@ def test_clean_frames_of_changed_frames_are_refused(by_the_fit: bool, tmp_path: 
     check_clean_frames_current(Capture.open(capture.folder))
     frame = capture.frame_path(capture.views[2])
     cv2.imwrite(str(frame), 255 - cv2.imread(str(frame)))
-    with pytest.raises(CaptureError, match=rf"1 of the 4 flare-free frames .*\({frame.stem}"):
+    with pytest.raises(CaptureError, match=rf"1 of the 4 clean frames .*\({frame.stem}"):
         check_clean_frames_current(Capture.open(capture.folder))
     (removed / "remove.json").unlink()  # someone's own
     check_clean_frames_current(Capture.open(capture.folder))
@@ -108,7 +108,7 @@ def test_two_fits_clean_one_capture_at_once(tmp_path: Path, flare_everywhere: Pa
 
 
 def test_a_stopped_cleaning_of_a_capture_resumes(tmp_path: Path, flare_everywhere: Path) -> None:
-    """A capture's removed/ says what made it, as every folder of clean plates does; a stopped one is gone on with."""
+    """Finished frames are kept, and `remove` continues the folder by its manifest."""
     capture = Capture.open(make_capture(tmp_path / "capture", views=3))
     remover = Remover(flare_everywhere, working_size=64)
     shutil.rmtree(capture.folder / "removed", ignore_errors=True)
@@ -152,7 +152,7 @@ def test_frames_without_leading_zeros_are_predicted_once_each(
 
 def test_frames_that_differ_only_in_suffix_are_refused_at_once(
         tmp_path: Path, flare_everywhere: Path) -> None:
-    """Both would have one clean picture, and the second would be taken for what the first is without its flare."""
+    """Both would have the same clean frame."""
     folder = make_capture(tmp_path / "capture", views=3)
     model, frames = folder / "sparse" / "0" / "images.txt", folder / "images"
     model.write_text(model.read_text().replace(" 0001.png", " 0000.jpg"))

@@ -36,15 +36,15 @@ def predict_lifted_darks(_: Remover, view: NDArray[np.float32]) -> NDArray[np.fl
     return with_no_glow(np.broadcast_to(np.maximum(darks, 0), view.shape).astype(np.float32))
 
 
-@pytest.mark.parametrize(("in_two", "worth"), [(0.0, 1), (0.15, 1), (0.9, 0)])
+@pytest.mark.parametrize(("in_two", "expected"), [(0.0, 1), (0.15, 1), (0.9, 0)])
 def test_disagreement_of_the_augmentations_lowers_the_confidence(
-        flare_everywhere: Path, monkeypatch: pytest.MonkeyPatch, in_two: float, worth: float) -> None:
-    """Of the four views two tell one in the frame's right half, and all of them one in its left. Two more are of the
-    frame graded back."""
+        flare_everywhere: Path, monkeypatch: pytest.MonkeyPatch, in_two: float, expected: float) -> None:
+    """Of the four augmentations two predict a flare in the right half of the frame, all of them one in its left half.
+    Two more are of the frame with its black point stretched."""
     share = 1 / (1 + 0.8**2)  # of its two views, by their pixels
     shown: list[tuple[int, ...]] = []
 
-    def told(_: Remover, view: NDArray[np.float32]) -> NDArray[np.float32]:
+    def predict(_: Remover, view: NDArray[np.float32]) -> NDArray[np.float32]:
         upright, middle = len(shown) % 2 == 0, view.shape[1] // 2
         added = np.zeros_like(view)
         added[:, :middle] = 0.1
@@ -53,25 +53,25 @@ def test_disagreement_of_the_augmentations_lowers_the_confidence(
         shown.append(view.shape)
         return with_no_glow(added if upright else added[::-1, ::-1])
 
-    monkeypatch.setattr(Remover, "_forward", told)
+    monkeypatch.setattr(Remover, "_forward", predict)
     made = Remover(flare_everywhere).predict(np.full((160, 320, 3), (0.5, 0.6, 0.7), np.float32))  # no dark frame
     assert shown == [(160, 320, 3)] * 2 + [(128, 256, 3)] * 2 + [(160, 320, 3)] * 2
-    assert made.flare.shape == (160, 320, 3) and made.confidence == worth
+    assert made.flare.shape == (160, 320, 3) and made.confidence == expected
     np.testing.assert_allclose(made.flare[:, :158], 0.1, rtol=1e-4)
     np.testing.assert_allclose(made.flare[:, 162:], in_two * share, rtol=0.02, atol=1e-6)
 
 
 def test_features_of_a_spot_on_a_broad_light() -> None:
-    """A spot on a broad light: by how much it stands out, and how much of what is told is narrower than a patch."""
-    told = np.full((160, 240, 3), 0.1, np.float32)
-    told[70:78, 100:108] += 0.4
-    mean, spot = told.mean(), 0.4 * 64 / (160 * 240)
-    *logarithms, patchy = confidence.extract_features(np.full_like(told, 0.5), told, 0.2 * told, 0.5 * told)
+    """The peak is that of the spot, the fine fraction its share."""
+    flare = np.full((160, 240, 3), 0.1, np.float32)
+    flare[70:78, 100:108] += 0.4
+    mean, spot = flare.mean(), 0.4 * 64 / (160 * 240)
+    *logarithms, fine_fraction = confidence.extract_features(np.full_like(flare, 0.5), flare, 0.2 * flare, 0.5 * flare)
     np.testing.assert_allclose(np.exp(logarithms), [
-        0.5 + confidence.REGRADED_FLOOR, flare_to_linear(np.full_like(told, 0.5), told).mean() + 0.002,
+        0.5 + confidence.REGRADED_FLOOR, flare_to_linear(np.full_like(flare, 0.5), flare).mean() + 0.002,
         0.2 + confidence.DISAGREEMENT_FLOOR, 0.5 / mean],
         rtol=1e-3)
-    np.testing.assert_allclose(patchy, spot / mean, rtol=1e-3)
+    np.testing.assert_allclose(fine_fraction, spot / mean, rtol=1e-3)
 
 
 def test_a_lifted_black_is_no_flare(flare_everywhere: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -79,7 +79,7 @@ def test_a_lifted_black_is_no_flare(flare_everywhere: Path, monkeypatch: pytest.
     remover = Remover(flare_everywhere)
     grade, veil = remover.predict(graded_dusk(black=0.04)), remover.predict(graded_dusk(veil=0.1))
     assert grade.flare.mean() > 0.02 and remover.linear_flare(grade).max() == 0
-    assert remover.linear_flare(grade, inside_matte=True).max() > 0.01  # whoever marks it has seen a flare
+    assert remover.linear_flare(grade, inside_matte=True).max() > 0.01  # an artist has seen a flare there
     assert veil.confidence == 1 and remover.linear_flare(veil).mean() > 0.05
 
 
@@ -104,14 +104,14 @@ def test_the_log_says_that_a_flare_may_be_a_grade(flare_everywhere: Path, tmp_pa
 
 
 def test_the_confidence_is_that_of_the_shot(flare_everywhere: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What is doubted of a frame is believed in a shot whose other frames have a flare, by their shares."""
+    """A doubtful prediction is trusted in a shot whose other frames have a flare; weights count."""
     monkeypatch.setattr(Remover, "_forward", predict_lifted_darks)
     remover = Remover(flare_everywhere)
     grade, veil = remover.predict_with_tta(graded_dusk(black=0.04)), remover.predict_with_tta(graded_dusk(veil=0.1))
     faint = single_prediction(np.full_like(grade.mean, 0.001))
     assert shot_confidence([(grade, 1)]) == 0 and shot_confidence([(faint, 1)]) == 1
     assert shot_confidence([(grade, 1), (veil, 1), (veil, 1)]) == 1
-    assert shot_confidence([(grade, 1), (faint, 1)]) == 0  # nothing was asked of the other
+    assert shot_confidence([(grade, 1), (faint, 1)]) == 0  # the other has no features
 
 
 @pytest.mark.parametrize("display", [np.zeros((96, 96, 3), np.float32), np.ones((96, 96, 3), np.float32),

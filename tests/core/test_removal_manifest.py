@@ -100,8 +100,8 @@ def test_a_foreign_file_is_not_overwritten_by_a_flare(tmp_path: Path, flare_ever
 
 
 def test_a_clean_plate_of_another_process_stays(tmp_path: Path) -> None:
-    """A farm may give a task again while its first worker lives: what it makes in the same way is neither taken away
-    nor taken for someone's work."""
+    """A farm may restart a task while its first worker runs: a clean plate made in the same way is neither deleted nor
+    taken for an edited one."""
     plate = write_codes(tmp_path / "out" / "b.png", picture())
     plate.unlink()
     source = write_codes(tmp_path / "in" / "b.png", picture())
@@ -128,7 +128,7 @@ def test_a_clean_plate_of_an_earlier_revision_is_made_again(tmp_path: Path, flar
 
 
 def test_a_clean_plate_that_was_begun_is_made(tmp_path: Path, flare_everywhere: Path) -> None:
-    """A kill after the record, before the plate: what an earlier way made there is not taken for it."""
+    """A kill after the manifest, before the plate: an earlier clean plate is not taken for it."""
     source, remover = write_codes(tmp_path / "in" / "a.png", picture()), Remover(flare_everywhere, working_size=64)
     remove_all([source], tmp_path / "out", remover, Progress())
     other = Remover(flare_everywhere, working_size=96)
@@ -140,14 +140,14 @@ def test_a_clean_plate_that_was_begun_is_made(tmp_path: Path, flare_everywhere: 
 
 def test_a_clean_plate_whose_hash_a_kill_prevented_is_kept_once_edited(
          tmp_path: Path, flare_everywhere: Path, no_flare: Path) -> None:
-    """A kill after the plate, before the record tells what was written: a later call tells it."""
+    """A kill after the plate, before its hash is in the manifest: a later call adds it."""
     source, remover = write_codes(tmp_path / "in" / "a.png", picture()), Remover(flare_everywhere, working_size=64)
-    clean, told = tmp_path / "out" / "a.png", tmp_path / "out" / MANIFEST
+    clean, manifest = tmp_path / "out" / "a.png", tmp_path / "out" / MANIFEST
     remove_all([source], tmp_path / "out", remover, Progress())
-    as_it_ended = told.read_text()
-    told.write_text(json.dumps({**json.loads(as_it_ended), "written": {}}))
+    complete = manifest.read_text()
+    manifest.write_text(json.dumps({**json.loads(complete), "written": {}}))
     assert remove_all([source], tmp_path / "out", remover, Progress())["kept"] == 1
-    assert json.loads(told.read_text()) == json.loads(as_it_ended)
+    assert json.loads(manifest.read_text()) == json.loads(complete)
     work = write_codes(clean, picture() // 2).read_bytes()
     assert remove_all([source], tmp_path / "out", Remover(no_flare, working_size=64), Progress())["kept"] == 1
     assert clean.read_bytes() == work
@@ -179,8 +179,7 @@ def test_a_flare_of_an_outdated_clean_plate_is_made_again(tmp_path: Path, flare_
 
 
 def test_an_edited_clean_plate_is_kept(tmp_path: Path, flare_everywhere: Path) -> None:
-    """An artist has retouched one: it is kept when plates are made otherwise, until it is asked to go; and told when it
-    shows what the frame no longer is."""
+    """It is kept when settings change, unless `overwrite`; one whose plate has changed is refused."""
     for name in ("a", "b"):
         write_codes(tmp_path / "in" / f"{name}.png", picture())
     one, other = (Remover(flare_everywhere, working_size=size) for size in (64, 96))

@@ -57,7 +57,7 @@ def test_a_matte_has_the_orientation_of_its_plate(tmp_path: Path, orientation: i
     stored = np.zeros((60, 90), np.uint8)
     stored[:10, :20] = 255
     if painted == "on the pixels" and orientation == 3:
-        pytest.skip("that cannot be told from one that was painted as shown")
+        pytest.skip("it cannot be distinguished from one painted as shown")
     values = apply_orientation(stored, orientation) if painted == "as shown" else stored
     raw = cv2.imencode(".jpg", values, [cv2.IMWRITE_JPEG_QUALITY, 100])[1].tobytes()
     segment = exif_segment("MM", orientation, 27) if painted == "as the plate" else b""
@@ -91,10 +91,10 @@ def test_a_matte_follows_the_windows_of_its_file_and_of_the_plate(tmp_path: Path
 def test_a_premultiplied_matte_is_not_multiplied_again(tmp_path: Path) -> None:
     painted = np.full((60, 90, 4), 128, np.uint8)
     encoded = cv2.imencode(".tif", painted)[1].tobytes()
-    for kind, told in ((tiff.ASSOCIATED, 128 / 255), (tiff.UNASSOCIATED, (128 / 255) ** 2)):
+    for kind, expected in ((tiff.ASSOCIATED, 128 / 255), (tiff.UNASSOCIATED, (128 / 255) ** 2)):
         (tmp_path / "matte.tif").write_bytes(tiff.with_tags(encoded, {tiff.EXTRA_SAMPLES: tiff.short(kind)}))
         found = Mattes(tmp_path / "matte.tif").read(Path("a.png"), full_window(90, 60))
-        np.testing.assert_allclose(found, told, atol=1e-3)
+        np.testing.assert_allclose(found, expected, atol=1e-3)
 
 
 def test_a_matte_painted_on_transparency_is_its_alpha(tmp_path: Path) -> None:

@@ -37,8 +37,8 @@ def test_every_level_gets_the_minima_and_the_frame_rotated_about_its_centre() ->
 
 @pytest.mark.parametrize("size", [(32, 32), (64, 128)])
 def test_the_network_is_fully_convolutional(size: tuple[int, int]) -> None:
-    told = RemovalNetwork(TINY.widths, TINY.blocks, TINY.attention)(torch.rand(2, 3, *size))
-    assert told.flare.shape == told.flare_without_glow.shape == (2, 3, *size)
+    output = RemovalNetwork(TINY.widths, TINY.blocks, TINY.attention)(torch.rand(2, 3, *size))
+    assert output.flare.shape == output.flare_without_glow.shape == (2, 3, *size)
 
 
 def test_the_prediction_depends_on_the_opposite_corner() -> None:

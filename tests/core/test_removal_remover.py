@@ -78,13 +78,13 @@ def test_a_plate_without_a_predicted_flare_is_unchanged(no_flare: Path) -> None:
 def test_a_rotated_frame_has_the_same_prediction(flare_everywhere: Path) -> None:
     display = picture(64, 96, 1, np.float32)
     upright = Remover(flare_everywhere).predict(display).flare
-    told = Remover(flare_everywhere).predict(np.ascontiguousarray(display[::-1, ::-1])).flare
+    rotated = Remover(flare_everywhere).predict(np.ascontiguousarray(display[::-1, ::-1])).flare
     assert np.ptp(upright) > 1e-3
-    np.testing.assert_allclose(told[::-1, ::-1], upright, atol=1e-5)
+    np.testing.assert_allclose(rotated[::-1, ::-1], upright, atol=1e-5)
 
 
 def test_the_glow_fraction_is_what_stays_with_glow_kept(flare_everywhere: Path) -> None:
-    """In every view, in the mean over them by what each tells."""
+    """In the mean over the augmentations."""
     display = picture(64, 96, 1, np.float32)
     removed, kept = (Remover(flare_everywhere, glow=glow).predict(display) for glow in ("kept at lamps", "kept"))
     assert 0.01 < removed.glow_fraction.mean() < 0.99 and kept.glow_fraction.max() == 0
@@ -101,12 +101,12 @@ def test_the_per_channel_prediction_counts_for_one_colour_in_the_dark(
          flare_everywhere: Path, monkeypatch: pytest.MonkeyPatch, frame: tuple[float, ...], lit: tuple[float, ...],
         alone: float, counts: float) -> None:
     """As the glow of a red light does."""
-    def told(_: Remover, view: NDArray[np.float32]) -> NDArray[np.float32]:
+    def predict(_: Remover, view: NDArray[np.float32]) -> NDArray[np.float32]:
         is_grey = view[0, 0, 0] == view[0, 0, 1]
         lights = is_grey and np.isclose(view[0, 0, 0], lit, atol=1e-3).any()
         return with_no_glow(np.full_like(view, alone if lights else 0.02))
 
-    monkeypatch.setattr(Remover, "_forward", told)
+    monkeypatch.setattr(Remover, "_forward", predict)
     added = Remover(flare_everywhere).predict(np.full((160, 320, 3), frame, np.float32)).flare
     expected = 0.02 + (alone - 0.02) * counts * np.isclose(frame, lit[0])
     np.testing.assert_allclose(added[80, 160], expected, rtol=1e-3)

@@ -253,6 +253,7 @@ def cleaning_job(capture: Path) -> Job | None:
 
 
 def _cleaning_folder(capture: Path) -> Path:
+    """Return the folder of the job that makes the clean frames of a capture."""
     return capture / "removal"
 
 

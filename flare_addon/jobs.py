@@ -157,6 +157,7 @@ class Job:
             self.error = str(event["text"])
 
     def _is_alive(self) -> bool:
+        """Return whether the process of the job is running."""
         if self._process is not None:
             return self._process.poll() is None
         if self.host != HOST:
@@ -166,6 +167,7 @@ class Job:
         return self.pid > 0 and processes.is_running(self.pid)
 
     def _is_silent(self) -> bool:
+        """Return whether a job on another machine has written no event for SILENCE_LIMIT_S."""
         try:
             return time.time() - (self.folder / EVENTS).stat().st_mtime > SILENCE_LIMIT_S
         except OSError:
@@ -311,6 +313,7 @@ def running() -> list[Job]:
 
 
 def _key(folder: Path) -> str:
+    """Return the key of a folder in `_jobs`."""
     return os.path.normcase(folder.absolute())
 
 
@@ -330,6 +333,7 @@ def _watch() -> None:
 
 
 def _tick() -> float | None:
+    """Poll the running jobs; return the seconds to the next call, None to stop the timer."""
     news = [_poll_safely(job) for job in running()]
     if any(news):
         _redraw_bars()

@@ -190,22 +190,23 @@ def _move_to(light: Any, xyz: ArrayLike) -> None:
     light.location = light.matrix_parent_inverse.inverted_safe() @ Vector(np.asarray(xyz).tolist())
 
 
-def move_to_fit(scene: Any, places: Mapping[str, ArrayLike], capture: Path | None) -> None:
+def move_to_fit(scene: Any, fitted: Mapping[str, ArrayLike], capture: Path | None) -> None:
     """Move lights to the positions (3,) from a fit, by name, in the capture's coordinates.
 
     Only lights at their position in the capture's lights.json are moved, the one that the fit started from, and none
     that is animated.
     """
     path = None if capture is None else capture / LIGHTS
-    given = {} if path is None or not path.is_file() else {light.name: light.xyz for light in read_lights(path)}
+    fitted_from = {} if path is None or not path.is_file() else {light.name: light.xyz for light in read_lights(path)}
     depsgraph = depsgraph_of(scene)
     for item in scene_lights(scene):
         name = light_name(item)
-        if name in places and name in given and item.parent == scene.fit_flare.root and item.animation_data is None:
+        is_still = item.parent == scene.fit_flare.root and item.animation_data is None
+        if name in fitted and name in fitted_from and is_still:
             try:
                 where = capture_position(item, scene.fit_flare.root, depsgraph)
             except CaptureError:  # it is disabled, and its position is unknown
                 continue
-            if np.allclose(where, given[name], atol=1e-4) and not np.allclose(where, places[name], atol=1e-4):
-                _move_to(item, places[name])
+            if np.allclose(where, fitted_from[name], atol=1e-4) and not np.allclose(where, fitted[name], atol=1e-4):
+                _move_to(item, fitted[name])
     view_layer_of(scene).update()

@@ -185,12 +185,14 @@ def quads_by_level(gaussians: PlaneGaussians, window: DrawnRegion, look: Look) -
 
 
 def _shader(name: str) -> Any:
+    """Return a compiled shader, "gaussian" or "sum"."""
     if name not in _shaders:
         _shaders[name] = _gaussian_shader() if name == "gaussian" else _sum_shader()
     return _shaders[name]
 
 
 def _gaussian_shader() -> Any:
+    """Compile the shader that draws the quads of Gaussians."""
     import gpu
 
     flow = gpu.types.GPUStageInterfaceInfo("fit_flare_gaussian")
@@ -224,6 +226,7 @@ def _gaussian_shader() -> Any:
 
 
 def _sum_shader() -> Any:
+    """Compile the shader that adds the levels up."""
     import gpu
 
     flow = gpu.types.GPUStageInterfaceInfo("fit_flare_sum")
@@ -269,6 +272,7 @@ def _sum_shader() -> Any:
 
 
 def _offscreen(divisor: int, width: int, height: int) -> Any:
+    """Return the buffer of a level for a region of this size; one of another size is freed."""
     import gpu
 
     size = max(-(-width // divisor), 1), max(-(-height // divisor), 1)
@@ -281,6 +285,7 @@ def _offscreen(divisor: int, width: int, height: int) -> Any:
 
 
 def _batch(vertices: Quads) -> Any:
+    """Upload quads to the GPU."""
     import gpu
 
     form = gpu.types.GPUVertFormat()
@@ -339,6 +344,7 @@ def composite(drawn: list[Any], box: tuple[float, float, float, float], blend: s
 
 
 def _draw() -> None:
+    """Draw the overlay in the current 3D view; an error is stored in `last_error`."""
     global last_error
     context = bpy.context
     scene, space = context.scene, context.space_data

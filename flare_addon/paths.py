@@ -41,6 +41,7 @@ def is_file(path: Path) -> bool:
 
 
 def _relative(path: Path, blend: str) -> str:
+    """Return a path relative to a .blend as Blender writes it, or absolute where that is impossible."""
     if not blend:
         return os.fspath(path)
     try:

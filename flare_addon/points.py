@@ -15,6 +15,7 @@ _handle: Any = None
 
 
 def _batch(mesh: Any) -> Any:
+    """Return the shader and the GPU batch of a point cloud, cached by mesh and size."""
     from gpu_extras.batch import batch_for_shader
 
     key = (mesh.name, len(mesh.vertices))
@@ -34,12 +35,14 @@ def _batch(mesh: Any) -> Any:
 
 
 def _shader() -> Any:
+    """Return Blender's shader for coloured points."""
     import gpu
 
     return gpu.shader.from_builtin("POINT_FLAT_COLOR" if bpy.app.version >= (4, 5, 0) else "FLAT_COLOR")
 
 
 def _draw() -> None:
+    """Draw the point clouds in the current 3D view."""
     import gpu
 
     context = bpy.context

@@ -96,10 +96,12 @@ def _incomplete_file(path: Path) -> FrameError:
 
 
 def _render_result() -> Any:
+    """Return the image of the last render."""
     return next(image for image in bpy.data.images if image.type == "RENDER_RESULT")
 
 
 def _set_format(settings: Any, suffix: str) -> None:
+    """Set the image format for files with this suffix."""
     if hasattr(settings, "media_type"):
         settings.media_type = "IMAGE"
     settings.file_format = "OPEN_EXR" if suffix == ".exr" else "PNG"

@@ -170,7 +170,7 @@ def camera_folder(layers: Path, camera: Any) -> Path:
 def _baked_folders(layers: Path) -> dict[str, str]:
     """Return the subfolder of each camera in a folder of layers, also of cameras of earlier bakes."""
     try:
-        entries = bakes.read_record(layers)["frames"]
+        entries = bakes.read_manifest(layers)["frames"]
     except RunError:
         return {}
     return {entry["view"].rpartition("/")[0]: entry["file"].rpartition("/")[0] for entry in entries
@@ -184,7 +184,7 @@ def frames_to_replace(scene: Any, camera_objects: Sequence[Any]) -> list[int]:
     FitFlareError.
     """
     folder, frames = layers_folder(scene), frames_to_bake(scene)
-    if not scene.fit_flare.layers or not (folder / bakes.RECORD).exists():
+    if not scene.fit_flare.layers or not (folder / bakes.MANIFEST).exists():
         return []
     shot = _panel_shot(scene, camera_objects, frames[:1])  # one frame has all lights and cameras
     files = {layers_file(inner, frame) for inner in shot.folders.values() for frame in frames}
@@ -193,7 +193,7 @@ def frames_to_replace(scene: Any, camera_objects: Sequence[Any]) -> list[int]:
         run = shot.run
         return shot.fingerprint("" if run is None else hash_files(run / name for name in (SCENE, FLARE)))
 
-    return bakes.replaced(folder, fingerprint, shot.lights, files)
+    return bakes.frames_to_delete(folder, fingerprint, shot.lights, files)
 
 
 def replacement_warning(folder: Path, frames: Sequence[int]) -> str:

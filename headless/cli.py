@@ -136,6 +136,7 @@ def _current_options(argv: Sequence[str]) -> tuple[list[str], dict[str, str]]:
 
 
 def _exit_status(argv: Sequence[str], progress: Progress) -> int:
+    """Run the command, report its result or error, and return the exit status."""
     arguments = argparse.Namespace(argv=list(argv))
     try:
         if "" in argv:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What a command consists of: its arguments on the command line, and its steps with the side that each one runs on.
+"""The parts of a command: its arguments on the command line, and its steps with the side that each one runs on.
 
 A step of the "engine" side needs torch, one of the "blender" side needs bpy, and no process ever has both (see
 `hand_off`). Steps pass data on through files. What a step returns (paths and figures, serialisable as JSON) becomes

@@ -20,7 +20,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def glow_mode(args: argparse.Namespace) -> Glow:
     """Return the remover's setting; lamps keep a part of their glow without either option."""
-    return "kept" if args.keep_glow else "taken" if args.all_glow else "kept at lamps"
+    return "keep" if args.keep_glow else "remove" if args.all_glow else "keep at lights"
 
 
 def is_set(args: argparse.Namespace) -> bool:

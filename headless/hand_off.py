@@ -85,6 +85,7 @@ def _addon_environments() -> list[Path]:
 
 
 def _has_torch(python: Path) -> bool:
+    """Return whether a Python has torch, without loading it."""
     code = "import importlib.util, sys; sys.exit(importlib.util.find_spec('torch') is None)"
     try:
         return subprocess.run([str(python), "-c", code], env=child_environment(), capture_output=True,
@@ -127,6 +128,7 @@ def _split_command_line(text: str) -> list[str]:
 
 
 def _default_locations() -> Iterator[str]:
+    """Yield the programs where the system's installers put Blender."""
     if sys.platform == "darwin":
         yield "/Applications/Blender.app/Contents/MacOS/Blender"
     elif WINDOWS:

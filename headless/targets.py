@@ -9,9 +9,12 @@ import argparse
 import hashlib
 import math
 import re
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+from ..core.choices import Follows
 from ..core.errors import CaptureError, RunError, SettingsError
 from ..core.images.listing import SUFFIXES, pictures_in
 from ..core.images.unsupported import unsupported_file
@@ -28,20 +31,51 @@ TARGET_OPTIONS = {"picture": ("light", "focal", "centre"), ".blend": ("lights", 
 """The options that apply to a kind of target only, by that kind."""
 
 
-def is_blend(args: argparse.Namespace) -> bool:
+@dataclass(frozen=True)
+class TargetOptions:
+    """The options of `transfer` that describe a target and how its flare is evaluated, with their defaults."""
+
+    to: tuple[Path, ...]
+    out: Path
+    frames: str | None = None
+    shot: Path | None = None
+    query: Follows = "blend"
+    use: tuple[str, ...] = ()
+    light: tuple[str, ...] = ()
+    lights: str | None = None
+    smooth: int = 1
+    radius: float = 0.0
+    scale: float = 1.0
+    cameras: Path | None = None
+    scene: Path | None = None
+    focal: float | None = None
+    centre: str | None = None
+    plates: Path | None = None
+    plate_space: str = "auto"
+
+    @classmethod
+    def of_transfer(cls, args: argparse.Namespace) -> TargetOptions:
+        """Return the options in the arguments of `transfer`."""
+        values: dict[str, Any] = {entry.name: getattr(args, entry.name) for entry in fields(cls)}
+        for name, value in values.items():
+            values[name] = tuple(value) if isinstance(value, list) else value
+        return cls(**values)
+
+
+def is_blend(args: argparse.Namespace | TargetOptions) -> bool:
     """Return whether the target is a .blend, whose cameras and lights Blender has to read."""
     return bool(args.to[0].suffix.lower() == ".blend")
 
 
-def shot_path(args: argparse.Namespace) -> Path:
+def shot_path(options: TargetOptions) -> Path:
     """Return the file that the Blender step writes the shot to; each range of frames has its own."""
-    if args.shot:
-        return Path(args.shot)
-    part = args.frames or ""
+    if options.shot:
+        return options.shot
+    part = options.frames or ""
     if not re.fullmatch(r"[\d,-]{0,60}", part):  # not a valid file name on every system
         part = hashlib.sha256(part.encode()).hexdigest()[:8]
     part = f".{part.replace(',', '_')}" if part else ""
-    return Path(args.out) / f"shot{part}.json"
+    return options.out / f"shot{part}.json"
 
 
 def _target_kind(target: Path) -> str:
@@ -56,10 +90,10 @@ def _target_kind(target: Path) -> str:
     return suffix if suffix in TARGET_OPTIONS else "run" if (target / CONFIG).is_file() else "capture"
 
 
-def check_options(args: argparse.Namespace, kind: str) -> None:
+def check_options(options: TargetOptions, kind: str) -> None:
     """Raise SettingsError for an option that has no effect on this kind of target."""
     for name in dict.fromkeys(name for names in TARGET_OPTIONS.values() for name in names):
-        if getattr(args, name) and name not in TARGET_OPTIONS[kind]:
+        if getattr(options, name) and name not in TARGET_OPTIONS[kind]:
             raise SettingsError(f"--{name} does not apply to a {kind} as the target; leave it out.")
 
 
@@ -74,7 +108,7 @@ def find_flare(args: argparse.Namespace) -> tuple[Path, list[Floats] | None]:
     if flare.is_dir():
         run_ = Run.open(flare)
         if not (flare / FLARE).is_file():
-            raise RunError(run_.without_flare)
+            raise RunError(run_.missing_flare_message)
         flare, holdout = flare / FLARE, run_.settings.holdout
         capture = capture or (run_.capture_folder if run_.capture_folder.is_dir() else None)
     if capture is None:
@@ -83,7 +117,7 @@ def find_flare(args: argparse.Namespace) -> tuple[Path, list[Floats] | None]:
     return flare, [view.camera.world_to_camera for view in views]
 
 
-def open_target(args: argparse.Namespace, flare: Path, training: list[Floats] | None = None) -> Target:
+def open_target(options: TargetOptions, flare: Path, training: list[Floats] | None = None) -> Target:
     """Open the target that --to names. training: poses of training views, for a .flare that does not store its own.
 
     Raises SettingsError, CaptureError, FrameError and RunError.
@@ -100,7 +134,7 @@ def open_target(args: argparse.Namespace, flare: Path, training: list[Floats] | 
     from ..core.transfer.sources import parse_assignments
     from ..core.transfer.target import capture_target, picture_target, shot_target
 
-    look, to, sources = read(flare), args.to, parse_assignments(args.use)
+    look, to, sources = read(flare), list(options.to), parse_assignments(options.use)
     if len(to) > 1 and not all(path.suffix.lower() in SUFFIXES for path in to):
         raise SettingsError("Several targets at once have to be pictures.")
     if missing := next((path for path in to if not path.exists()), None):
@@ -109,32 +143,33 @@ def open_target(args: argparse.Namespace, flare: Path, training: list[Floats] | 
     if len(to) == 1 and _target_kind(to[0]) == "capture" and _is_plate_folder(to[0]):
         to = pictures_in(to[0])
     kind = _target_kind(to[0])
-    check_options(args, kind)
+    check_options(options, kind)
     if kind == "picture":
-        seen = training_views(flare, look.lights, training)
-        distances = {light.name: _median_distance(light, seen.get(light.name)) for light in look.lights}
-        detector: Detector | None = None if args.light else ExposureDetector()
-        return picture_target(to, look, _parse_lights(args.light), sources, distances, detector=detector,
-                              focal=args.focal, centre=_parse_point(args.centre) if args.centre else None, seen=seen)
+        views = training_views(flare, look.lights, training)
+        distances = {light.name: _median_distance(light, views.get(light.name)) for light in look.lights}
+        detector: Detector | None = None if options.light else ExposureDetector()
+        centre = _parse_point(options.centre) if options.centre else None
+        return picture_target(to, look, _parse_lights(options.light), sources, distances, detector=detector,
+                              focal=options.focal, centre=centre, training=views)
     if kind in (".blend", ".json"):
-        path = shot_path(args) if kind == ".blend" else to[0]
+        path = shot_path(options) if kind == ".blend" else to[0]
         shot = Shot.read(path)
         numbers = [NumberedFrame("", number, "") for number in sorted({one.frame for one in shot.frames})]
-        return shot_target(shot, look, sources, plates=args.plates, scene=args.scene,
-                       wanted_frames={frame.number for frame in select_frames(numbers, args.frames)})
-    lights = Path(args.lights) if args.lights else None
+        return shot_target(shot, look, sources, plates=options.plates, scene=options.scene,
+                           required_frames={frame.number for frame in select_frames(numbers, options.frames)})
+    lights = Path(options.lights) if options.lights else None
     if kind == ".ply":
-        if args.cameras is None:
+        if options.cameras is None:
             raise SettingsError(f"{to[0]} is a scene without cameras; name a capture that has them with --cameras.")
-        return capture_target(Capture.open(args.cameras, need_frames=False), look, sources, lights=lights, scene=to[0],
-                          shown=True)
+        return capture_target(Capture.open(options.cameras, need_frames=False), look, sources, lights=lights,
+                              scene=to[0], shown=True)
     if kind == "run":
-        capture = (Capture.open(args.cameras, need_frames=False) if args.cameras else
+        capture = (Capture.open(options.cameras, need_frames=False) if options.cameras else
                    Run.open(to[0]).capture(need_frames=False))
-        return capture_target(capture, look, sources, lights=lights, scene=args.scene or to[0] / SCENE, shown=True)
+        return capture_target(capture, look, sources, lights=lights, scene=options.scene or to[0] / SCENE, shown=True)
     if to[0].is_dir() and not any(to[0].iterdir()):
         raise CaptureError(f"{to[0]} is empty: neither pictures nor a capture; name a target for the flare.")
-    return capture_target(Capture.open(to[0]), look, sources, lights=lights, scene=args.scene)
+    return capture_target(Capture.open(to[0]), look, sources, lights=lights, scene=options.scene)
 
 
 def _is_plate_folder(folder: Path) -> bool:
@@ -153,7 +188,7 @@ def _median_distance(light: LightLook, seen: TrainingViews | None) -> float:
     return float(np.linalg.norm((reach.camera_low + reach.camera_high) / 2 - light.xyz)) or 1.0
 
 
-def _parse_lights(texts: list[str]) -> dict[str, tuple[float, float]]:
+def _parse_lights(texts: Sequence[str]) -> dict[str, tuple[float, float]]:
     """Parse each "[name=]x,y"; return the pixels by name. Raises SettingsError."""
     places: dict[str, tuple[float, float]] = {}
     for number, text in enumerate(texts, 1):

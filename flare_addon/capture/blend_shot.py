@@ -86,6 +86,7 @@ def _find_lights(scene: Any, names: Sequence[str]) -> list[Any]:
 
 
 def _place_light(scene: Any, depsgraph: Any, obj: Any, eye: Any, radius: float) -> PlacedLight:
+    """Return a light with its position and visibility."""
     where = _light_position(depsgraph, obj, eye)
     item = SimpleNamespace(target=obj, radius=radius or _lamp_radius(obj))
     visibility = occlusion.visibility(scene, depsgraph, eye, item)

@@ -177,6 +177,7 @@ def camera_differences(all_cameras: Sequence[Camera]) -> Iterator[str]:
 
 
 def _add_camera(collection: Any, root: Any, name: str, view: View, aspect: tuple[float, float], size: float) -> Any:
+    """Add a camera object with the intrinsics and the pose of a view; return it."""
     data = bpy.data.cameras.new(name)
     data.sensor_fit, data.sensor_width = "HORIZONTAL", SENSOR
     data.lens, data.shift_x, data.shift_y = cameras.lens_of(view.camera, SENSOR, aspect)
@@ -273,7 +274,7 @@ def show_footage(scene: Any, which: str) -> int:
     if root is None or not folder:
         return 0
     base = absolute(folder, scene.library)
-    twins = PictureIndex(base / which) if (base / which).is_dir() else None
+    pictures = PictureIndex(base / which) if (base / which).is_dir() else None
     showing: dict[Any, list[Any]] = {}
     for user in (*_background_images(root), *footage_nodes(scene)):
         showing.setdefault(user.image, []).append(user)
@@ -284,9 +285,9 @@ def show_footage(scene: Any, which: str) -> int:
                       if path.is_relative_to((base / name).resolve())), None)
         if inner is None:
             continue
-        twin = twins.of(inner) if twins is not None else None
-        if twin is not None and (base / which / twin).resolve() != path:
-            _own_image(image, users).filepath = blend_relative(base / which / twin)
+        match = pictures.find(inner) if pictures is not None else None
+        if match is not None and (base / which / match).resolve() != path:
+            _own_image(image, users).filepath = blend_relative(base / which / match)
             changed += 1
     return changed
 

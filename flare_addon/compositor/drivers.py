@@ -166,6 +166,7 @@ def _count_solos(scene: Any, node: Any, numbers: Sequence[int]) -> tuple[Any, st
 
 
 def _drive(node: Any, name: str, index: int, expression: str, variables: dict[str, tuple[Any, str]]) -> None:
+    """Drive an input of the node, or a channel of it, by an expression of these variables."""
     if name not in node.inputs:  # it was renamed
         return
     driver = node.inputs[name].driver_add("default_value", index).driver

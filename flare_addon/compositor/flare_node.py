@@ -147,6 +147,7 @@ def _mix(tree: Any, blend: str, a: Any, b: Any, column: float, row: float) -> An
 
 
 def _math(tree: Any, operation: str, a: Any, b: Any, column: float, *, clamp: bool = False) -> Any:
+    """Add a math node of a and b; return its output socket."""
     node = new_node(tree, _MATH, column, -3)
     node.operation, node.use_clamp = operation, clamp
     tree.links.new(a, node.inputs[0])

@@ -14,6 +14,7 @@ from . import transfer
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the command's arguments to a parser."""
     parser.add_argument("run", type=Path, metavar="RUN_OR_FLARE",
                         help="a run, the folder that `fit` writes; or a .flare, with --capture or --blend; or a shot, "
                              "the JSON file of cameras and lights by frame that the add-on writes "
@@ -66,7 +67,7 @@ def read_blend(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     """Blender step of a bake for a .blend: writes its cameras and lights as a shot."""
     if args.run.suffix.lower() != ".flare":
         raise SettingsError("--blend is for a .flare; name the run's flare.flare.")
-    return transfer.read_blend(_as_transfer(args), progress)
+    return transfer.write_shot(args, _target_options(args), args.run, progress)
 
 
 def run_flare(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
@@ -80,22 +81,20 @@ def run_flare(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
                             "--blend.")
     if args.lights and args.blend is None:
         raise SettingsError("--lights names objects of a .blend; give it with --blend.")
-    transfer_args = _as_transfer(args)
+    options = _target_options(args)
     if args.blend is not None:
-        target = targets.open_target(transfer_args, args.run)
+        target = targets.open_target(options, args.run)
     else:
         target = cameras_target(Capture.open(args.capture, need_frames=False), read(args.run), args.scene)
-    return transfer.make_layers(transfer_args, "bake", target, args.run, None, progress)
+    return transfer.make_layers(args, options, "bake", target, args.run, None, progress)
 
 
-def _as_transfer(args: argparse.Namespace) -> argparse.Namespace:
-    """What is asked of a .flare, in transfer's words. Raises SettingsError where two things name cameras."""
+def _target_options(args: argparse.Namespace) -> targets.TargetOptions:
+    """Return the options of the target of a .flare. Raises SettingsError if two options name cameras."""
     if args.blend is not None and args.capture is not None:
         raise SettingsError("--capture and --blend each name cameras for the flare; give one of them.")
-    parser = argparse.ArgumentParser()
-    transfer.arguments(parser)
-    defaults = parser.parse_args([str(args.run), "--to", str(args.blend or args.capture), "--out", str(args.out)])
-    return argparse.Namespace(**{**vars(defaults), **vars(args)})
+    return targets.TargetOptions((args.blend or args.capture,), args.out, args.frames, args.shot, lights=args.lights,
+                                 scene=args.scene)
 
 
 def run_shot(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
@@ -115,7 +114,7 @@ def run_shot(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     if args.jobs != 1:
         jobs.run_jobs(args, "bake", [frame.number for frame in selected], progress)
     record = bake_shot(shot, args.out, half=not args.float, overwrite=args.overwrite, progress=progress,
-                       wanted={frame.number for frame in selected}, space=args.space, config=args.ocio)
+                       frame_numbers={frame.number for frame in selected}, space=args.space, config=args.ocio)
     return layers.report_layers(selected, args.out, len(record["frames"]), progress)
 
 

@@ -18,6 +18,7 @@ BLEND = "compositor.blend"
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the command's arguments to a parser."""
     parser.add_argument("layers", type=Path, metavar="LAYERS", help="folder that `bake` wrote")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help=f"folder for the frames and {BLEND}")
     frames.add_option(parser)

@@ -30,6 +30,7 @@ SHEET_ROWS = 6
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the command's arguments to a parser."""
     parser.add_argument("--out", type=Path, default=ROOT / "build" / "demo", metavar="DIR",
                         help="folder for all results (default build/demo in the repository)")
     parser.add_argument("--capture", type=Path, metavar="CAPTURE",
@@ -121,13 +122,13 @@ def _describe_supervision(capture: Capture, mode: Mode) -> str:
 
 def _write_sheet(capture: Capture, holdout: str | int | None, out: Path) -> None:
     """Write the contact sheet of up to SHEET_ROWS held-out views (of all views where none is held out)."""
-    from ...core.bake.bake import read_record
+    from ...core.bake.bake import read_manifest
     from ...core.bake.exr import read_layers
     from ...core.bake.sheet import contact_sheet
 
     views = capture.split(holdout)[1] or capture.views
     step = max(len(views) // SHEET_ROWS, 1)
-    files = {entry["view"]: out / "layers" / entry["file"] for entry in read_record(out / "layers")["frames"]}
+    files = {entry["view"]: out / "layers" / entry["file"] for entry in read_manifest(out / "layers")["frames"]}
     contact_sheet(out / SHEET, ((view.name, capture.frame(view), read_layers(files[view.name]))
                                 for view in views[::step][:SHEET_ROWS]))
 

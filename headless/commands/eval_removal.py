@@ -21,6 +21,7 @@ SEED, SIZE = 7, (960, 640)
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the command's arguments to a parser."""
     parser.add_argument("pairs", type=Path, nargs="?", metavar="PAIRS",
                         help="folder with input/ and gt/ (and mask/), or a folder of such folders")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help=f"folder for {SCORES} and {SHEET}")

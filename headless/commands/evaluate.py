@@ -14,6 +14,7 @@ VIEWS = ("held-out", "train", "all")
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the command's arguments to a parser."""
     parser.add_argument("run", type=Path, metavar="RUN", help="a run, the folder that `fit` writes")
     parser.add_argument("--views", choices=VIEWS, default="held-out", help="which views to score (default held-out)")
     parser.add_argument("--capture", type=Path, metavar="CAPTURE", help="the capture, if it was moved")
@@ -32,7 +33,7 @@ def score_run(folder: Path, progress: Progress, *, which: str = "held-out",
     from ...core.conventions.run_files import EVALUATION
     from ...core.fit.frames import Frames
     from ...core.fit.run import Run
-    from ...core.metrics.evaluation import evaluate, table, worse_than_none
+    from ...core.metrics.evaluation import evaluate, format_table, is_worse_than_empty
     from ...core.system.files import write_json
 
     perceptual = None
@@ -49,8 +50,8 @@ def score_run(folder: Path, progress: Progress, *, which: str = "held-out",
     frames = Frames(capture, run_.settings.width)
     scores = evaluate(run_, capture, {view: frames.camera(view) for view in views}, progress, frames.picture_area,
                       perceptual)
-    progress.say(table(scores))  # first, since the folder may be read-only
-    if worse_than_none(scores):
+    progress.say(format_table(scores))  # first, since the folder may be read-only
+    if is_worse_than_empty(scores):
         progress.say("This flare matches the frames worse than no flare would: look at preview.png before you use it. "
                      "docs/handbook/first_fit.md describes the footage that a fit needs.")
     write_json(run_.folder / EVALUATION, scores)

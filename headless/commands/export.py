@@ -16,6 +16,7 @@ KINDS = ("preset", "ply")
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the command's arguments to a parser."""
     parser.add_argument("flare", type=Path, metavar="RUN_OR_FLARE",
                         help="a run, the folder that `fit` writes; or a .flare")
     parser.add_argument("--as", choices=KINDS, required=True, dest="kind",
@@ -43,7 +44,7 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     if args.flare.is_dir():
         folder = Run.open(args.flare).find_capture(folder)
         if not (args.flare / FLARE).is_file():
-            raise RunError(Run.open(args.flare).without_flare)
+            raise RunError(Run.open(args.flare).missing_flare_message)
     if not args.flare.exists():
         raise RunError(f"{args.flare} is missing; name a .flare, or the folder of a run.")
     if folder is None:

@@ -24,6 +24,7 @@ DECODED_CACHE_BYTES = 1 << 26
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the command's arguments to a parser."""
     parser.add_argument("capture", type=Path, metavar="CAPTURE", nargs="?",
                         help="folder with images/, sparse/0/ (or transforms.json), lights.json, and removed/ or "
                              "truth/scene/; a missing lights.json is made from the frames")
@@ -98,7 +99,7 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
 
 def fit_settings(args: argparse.Namespace, capture: Capture, progress: Progress) -> FitSettings:
     """Return the settings from the arguments. Raises SettingsError."""
-    from ...core.fit.settings import changed, preset
+    from ...core.fit.settings import override_settings, preset
 
     overrides = {"model": args.model} if args.model else {}
     mode = args.mode or default_mode(capture, args.freeze_scene, progress)
@@ -110,13 +111,13 @@ def fit_settings(args: argparse.Namespace, capture: Capture, progress: Progress)
         changes["scene.start"] = str(args.scene.resolve())
     changes["scene.frozen"] = args.freeze_scene or None
     changes = {name: value for name, value in changes.items() if value is not None}
-    return changed(settings, {**changes, **dict(map(parse_setting, args.changes))})
+    return override_settings(settings, {**changes, **dict(map(parse_setting, args.changes))}, progress)
 
 
 def with_supervision(capture: Capture, settings: FitSettings, progress: Progress) -> Capture:
     """Return the capture with the clean frames that a fit with these settings needs; they are made where missing."""
     exact = settings.supervised and capture.has_truth
-    needed = settings.looks_at_removed and not settings.scene.frozen and not exact
+    needed = settings.needs_clean_frames and not settings.scene.frozen and not exact
     return with_removed(capture, progress) if needed else capture
 
 

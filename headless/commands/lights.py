@@ -21,6 +21,7 @@ METHODS = ("exposure", "grounded")
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the command's arguments to a parser."""
     parser.add_argument("capture", type=Path, metavar="CAPTURE", help="folder with images/ and a camera solve")
     parser.add_argument("--keep", action="store_true",
                         help="keep the entries of lights.json, with what was renamed, moved, added or removed by hand; "

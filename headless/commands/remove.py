@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the command's arguments to a parser."""
     parser.add_argument("plates", type=Path, nargs="*", metavar="PLATE",
                         help="pictures (PNG, JPEG, TIFF, EXR), folders of them (plates that `remove` wrote are left "
                              "out), or videos, whose frames are extracted to DIR/NAME.frames")
@@ -92,7 +93,7 @@ def _remove_fitted_flare(args: argparse.Namespace, progress: Progress) -> dict[s
                             "--overwrite go with it.")
     fitted = Run.open(args.run)
     if fitted.settings.mode == "3dgs":
-        raise RunError(fitted.without_flare)
+        raise RunError(fitted.missing_flare_message)
     capture = fitted.capture(args.capture)
     chosen = frames.select(number_views([view.name for view in capture.views]), args.frames, progress)
     wanted = {frame.view for frame in chosen}
@@ -133,7 +134,7 @@ def with_removed(capture: Capture, progress: Progress) -> Capture:
         check_clean_frames_current(capture)
         return capture
     progress.say(f"{capture.folder} has no removed/; making clean frames there.")
-    clean_capture(capture, Remover(glow="taken"), progress)
+    clean_capture(capture, Remover(glow="remove"), progress)
     return capture.reopen()
 
 

@@ -23,6 +23,7 @@ MAX_LENSES = 180
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the command's arguments to a parser."""
     parser.add_argument("--backgrounds", type=Path, nargs="+", required=True, metavar="DIR",
                         help="clean photographs and environment maps (.hdr, or .exr twice as wide as high)")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR",

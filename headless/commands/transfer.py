@@ -12,6 +12,7 @@ from ...core.errors import SettingsError
 from ...core.system.progress import Progress
 from .. import frames, jobs, layers, targets
 from ..command import Command, Step, check_at_least_one
+from ..targets import TargetOptions
 
 if TYPE_CHECKING:
     from ...core.capture.camera import Floats
@@ -21,6 +22,7 @@ MAX_SMOOTH = 1000  # frames
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the command's arguments to a parser."""
     parser.add_argument("flare", type=Path, metavar="FLARE", help="a .flare, or the folder of a run")
     parser.add_argument("--to", type=Path, nargs="+", required=True, metavar="TARGET",
                         help="the footage: pictures, a capture, a run (its scene is rendered), a 3DGS PLY with "
@@ -74,42 +76,51 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 def read_blend(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     """Blender step: write the camera, the lights and their visibility of a .blend as a shot for the engine."""
+    _check_ranges(args)
+    return write_shot(args, TargetOptions.of_transfer(args), args.flare, progress)
+
+
+def write_shot(args: argparse.Namespace, options: TargetOptions, flare: Path, progress: Progress) -> dict[str, Any]:
+    """Write the cameras, the lights and their visibility of the target, a .blend, as a shot.
+
+    args: of the command, with --size and --jobs. flare: a .flare, or the folder of a run."""
     from ...core.conventions.frame_numbers import NumberedFrame, select_frames
     from ...core.conventions.run_files import FLARE
     from ...core.look import read
     from ...flare_addon.capture.blend_shot import open_blend, read_shot
 
-    if len(args.to) > 1:
+    if len(options.to) > 1:
         raise SettingsError("The target can be one .blend at a time.")
-    _check_ranges(args)
-    targets.check_options(args, ".blend")
+    targets.check_options(options, ".blend")
     layers.parse_size(args.size)
     check_at_least_one("--jobs", args.jobs)
-    flare = args.flare.resolve()
+    flare = flare.resolve()
     if flare.is_dir():
         flare /= FLARE
     read(flare)
-    scene = open_blend(args.to[0])
+    scene = open_blend(options.to[0])
     every = range(scene.frame_start, scene.frame_end + 1)
     # Neighbours too: visibility is smoothed over them, and a chunk of frames must give the result of the whole range.
     selected = {frame.number for frame in select_frames([NumberedFrame("", number, "") for number in every],
-                                                         args.frames)}
-    around = range(-2 * args.smooth, 2 * args.smooth + 1)
+                                                         options.frames)}
+    around = range(-2 * options.smooth, 2 * options.smooth + 1)
     numbers = [number for number in every if any(number + step in selected for step in around)]
-    if args.query == "source":
+    if options.query == "source":
         numbers = list(every)  # the middle one selects the training view
-    names = [name.strip() for name in (args.lights or "").split(",") if name.strip()]
+    names = [name.strip() for name in (options.lights or "").split(",") if name.strip()]
     progress.stage("read the .blend", len(numbers))
-    shot = read_shot(scene, flare, names, numbers, radius=args.radius, done=progress.advance)
-    shot.write(targets.shot_path(args))
-    return {"shot": str(targets.shot_path(args))}
+    shot = read_shot(scene, flare, names, numbers, radius=options.radius, done=progress.advance)
+    shot.write(targets.shot_path(options))
+    return {"shot": str(targets.shot_path(options))}
 
 
 def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     """Engine step: render the layers of the flare for the target."""
     _check_ranges(args)
     flare, training = targets.find_flare(args)
-    return make_layers(args, "transfer", targets.open_target(args, flare, training), flare, training, progress)
+    options = TargetOptions.of_transfer(args)
+    target = targets.open_target(options, flare, training)
+    return make_layers(args, options, "transfer", target, flare, training, progress)
 
 
 def _check_ranges(args: argparse.Namespace) -> None:
@@ -122,9 +133,12 @@ def _check_ranges(args: argparse.Namespace) -> None:
         raise SettingsError(f"--radius {args.radius} is not a length of 0 or more.")
 
 
-def make_layers(args: argparse.Namespace, step: str, target: Target, flare: Path, training: list[Floats] | None,
-                progress: Progress) -> dict[str, Any]:
-    """Of a target, under a command's step of that name. training: as of `targets.target_of`."""
+def make_layers(args: argparse.Namespace, options: TargetOptions, step: str, target: Target, flare: Path,
+                training: list[Floats] | None, progress: Progress) -> dict[str, Any]:
+    """Render the layers of a flare for a target, as a step of `transfer` or `bake`.
+
+    args: of the command, with the options of layers, --frames, --size and --jobs. training: see
+    `targets.open_target`."""
     from ...core.transfer.target import resized
     from ...core.transfer.transfer import Transfer, TransferSettings
 
@@ -135,11 +149,11 @@ def make_layers(args: argparse.Namespace, step: str, target: Target, flare: Path
     if unwritten := sum(one.plate_with_flare_path(args.out) is None for one in plates):
         progress.say(f"For {unwritten} of {len(plates)} plates only the layers are written: the plates have another "
                      "size than is rendered, or lens distortion.")
-    settings = TransferSettings(args.query, args.scale, args.smooth, args.plate_space)
+    settings = TransferSettings(options.query, options.scale, options.smooth, options.plate_space)
     transfer = Transfer(flare, target, settings, training, args.ocio)
     selected = frames.select([one.frame for one in target.frames], args.frames, progress)
     if args.jobs != 1:
-        extra = ["--shot", str(targets.shot_path(args))] if targets.is_blend(args) else []
+        extra = ["--shot", str(targets.shot_path(options))] if targets.is_blend(options) else []
         jobs.run_jobs(args, step, [frame.number for frame in selected], progress, extra)
     record = transfer.bake(args.out, selected, layers.bake_settings(args), progress, overwrite=args.overwrite)
     return layers.report_layers(selected, args.out, len(record["frames"]), progress)

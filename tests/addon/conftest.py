@@ -34,9 +34,11 @@ def package(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def told_by(blender: Blender, package: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, int], Any]:
-    """What a script of `scripts` tells, by its name, with the package, a capture of so many frames, a .flare of its
-    light, and a folder."""
+def run_script(blender: Blender, package: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, int], Any]:
+    """Return a function that runs a script of `scripts` in Blender and returns its facts.
+
+    The script gets the package, a capture of so many frames, a .flare of the capture's light, and a folder.
+    """
     from test_work import a_flare
 
     from tests.core.flared import flared_capture

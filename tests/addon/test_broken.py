@@ -91,7 +91,7 @@ def test_a_full_disk_is_reported_and_finished_files_are_kept(said: Any) -> None:
         assert text.split(" (")[0].split("; ")[0] in panel
         assert layers == ["layers.0001.exr"]
     assert again[0] == ""
-    assert "2 frames of layers are baked." in again[1]
+    assert "Layers of 2 frames are baked." in again[1]
     assert again[2] == ["layers.0001.exr", "layers.0002.exr"]
     for what in ("bake on a full disk", "save on a full disk", "fit on a full disk", "no room for the last words"):
         assert "full" in said[what]

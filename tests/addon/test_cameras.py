@@ -28,7 +28,7 @@ def test_cameras_of_different_size_or_pixel_aspect_give_a_warning(facts: Any) ->
     """Block of cameras.py: "what a scene has one of"."""
     alike, of_another_size, of_other_pixels = facts["unlike"]
     assert alike == []
-    assert of_another_size == ["The frames differ in size, and a scene has one: it is that of the first frame."]
+    assert of_another_size == ["The frames differ in size; the scene has the size of the first frame."]
     assert ["others are up to 2.0% too wide" in note for note in of_other_pixels] == [True]
 
 

@@ -9,8 +9,8 @@ import pytest
 
 
 @pytest.fixture(scope="session")
-def facts(told_by: Callable[[str, int], Any]) -> Any:
-    return told_by("lights", 5)
+def facts(run_script: Callable[[str, int], Any]) -> Any:
+    return run_script("lights", 5)
 
 
 @pytest.mark.parametrize("how", ["visible", "disabled", "excluded"])

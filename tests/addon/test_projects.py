@@ -9,8 +9,8 @@ import pytest
 
 
 @pytest.fixture(scope="session")
-def facts(told_by: Callable[[str, int], Any]) -> Any:
-    return told_by("projects", 6)
+def facts(run_script: Callable[[str, int], Any]) -> Any:
+    return run_script("projects", 6)
 
 
 @pytest.mark.parametrize("how", ["under other numbers", "over others"])

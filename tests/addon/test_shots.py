@@ -9,8 +9,8 @@ import pytest
 
 
 @pytest.fixture(scope="session")
-def facts(told_by: Callable[[str, int], Any]) -> Any:
-    return told_by("shots", 5)
+def facts(run_script: Callable[[str, int], Any]) -> Any:
+    return run_script("shots", 5)
 
 
 def test_another_capture_has_its_own_run_and_lights(facts: Any) -> None:

@@ -75,4 +75,4 @@ def test_a_colour_space_missing_from_the_configuration_is_reported(blender: Blen
     """Block of studio.py: "beginning"."""
     facts, _ = run(blender, package, tmp_path, CONFIGURATION.replace("VIEW", "Log"))
     assert facts["import"] == [["FINISHED"], "ACES 1.0 - SDR Video"]
-    assert "no space of linear Rec. 709" in facts["misread"]
+    assert "no space for linear Rec. 709" in facts["misread"]

@@ -70,10 +70,11 @@ def test_a_light_or_camera_without_a_finite_position_is_reported(facts: Any) -> 
     Block of tracked.py: "a sun, and what hides it".
     """
     (light, of_light), *of_cameras = facts["nowhere"]
-    assert light == "CaptureError" and of_light.startswith("The place of the light 'Nowhere' is not finite at frame 1;")
+    assert light == "CaptureError" and of_light.startswith("The position of the light 'Nowhere' is not finite at frame "
+                                                           "1;")
     assert len(of_cameras) == 2
     for kind, said in of_cameras:
-        assert kind == "CaptureError" and said.startswith("The camera 'Second' is scaled to nothing, or its place is")
+        assert kind == "CaptureError" and said.startswith("The camera 'Second' is scaled to zero, or its position is")
 
 
 def test_objects_hidden_in_renders_hide_no_light(facts: Any) -> None:

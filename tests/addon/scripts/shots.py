@@ -30,7 +30,7 @@ def recorded(shot: object, numbers: range) -> None:
         "version": 1, "made_from": {"renderer": shot.fingerprint(), "half": True, "edits": [], "size": [None, None]},
         "layers": names, "frames": [{"file": f"layers.{number:04d}.exr", "frame": number, "view": "", "width": 8,
                                      "height": 8} for number in numbers]})
-    assert made.read_record(folder)["frames"]
+    assert made.read_manifest(folder)["frames"]
 
 
 # ---- one capture after the other --------------------------------------------------------------------

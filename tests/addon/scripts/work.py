@@ -231,7 +231,7 @@ item.keyframe_insert("intensity", frame=1)
 item.intensity = 1.5
 item.keyframe_insert("intensity", frame=3)
 scene.frame_set(3)
-facts["animated"] = looks.edits_of(state).light(item.name).intensity
+facts["animated"] = looks.edits_of(state).light_edit(item.name).intensity
 driver = state.master.driver_add("scale").driver
 driver.type = "SCRIPTED"
 driver.expression = "frame / 2"

@@ -109,7 +109,7 @@ def test_a_stop_is_clean(stopped: Ended, out: Path, finished: Ended) -> None:
 
 def test_the_demo_writes_all_its_files(finished: Ended, out: Path, capture: Path) -> None:
     assert finished.stages()[:3] == ["fit", "eval", "bake"]
-    assert any("no flare is removed here" in event.get("text", "") for event in finished.events)
+    assert any("the removal network does not run" in event.get("text", "") for event in finished.events)
     assert sorted(path.name for path in out.iterdir() if path.is_dir()) == ["frames", "layers", "run"]
     views = len(list((capture / "images").iterdir()))
     assert len(list((out / "layers").glob("layers.*.exr"))) == views
@@ -202,5 +202,5 @@ def test_without_blender_the_other_steps_run_and_a_message_says_so(words: list[o
                 FIT_FLARE_BLENDER="")
     assert ended.status == 0, ended.errors
     said = [event["text"] for event in ended.events if event["type"] == "say"]
-    assert any(text.startswith("Left out: frames.") and "--blender" in text for text in said)
+    assert any(text.startswith("Skipped: frames.") and "--blender" in text for text in said)
     assert "blender" not in ended.result

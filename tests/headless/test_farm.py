@@ -129,7 +129,7 @@ def test_a_job_that_fails_says_why_and_stops_the_others(capture: Path, made: Pat
     (tmp_path / "out").write_text("a file where the folder should be")
     assert cli.main(["bake", str(made), "--capture", str(capture), "--out", str(tmp_path / "out"), "--jobs", "2",
                      "--progress", "openjd"]) == 1
-    assert "openjd_fail: There is a file where a folder is to be" in capfd.readouterr().out
+    assert "openjd_fail: The path of a folder to create is a file" in capfd.readouterr().out
 
 
 def test_fits_over_a_list_of_captures(capture: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:

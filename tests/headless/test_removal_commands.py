@@ -130,7 +130,7 @@ def test_scores_of_pairs(tmp_path: Path, backgrounds: Path, capsys: pytest.Captu
     for kind in ("input", "gt"):
         shutil.copytree(backgrounds, tmp_path / "pairs" / kind)
     assert cli.main(["eval-removal", str(tmp_path / "pairs"), "--out", str(tmp_path / "eval")]) == 0
-    assert "LPIPS is left out" in capsys.readouterr().err
+    assert "LPIPS is not computed" in capsys.readouterr().err
     scores = json.loads((tmp_path / "eval" / "eval.json").read_text(encoding="utf-8"))
     assert scores["mean"]["count"] == 2
     assert (tmp_path / "eval" / "worst.png").exists()
@@ -149,7 +149,7 @@ def test_unreadable_pairs_do_not_stop_the_scores_of_others(tmp_path: Path, backg
     words = ["--out", str(tmp_path / "eval")]
     (pairs / "gt" / "b.png").write_bytes((pairs / "gt" / "b.png").read_bytes()[:60])
     assert cli.main(["eval-removal", str(pairs), *words]) == 1
-    assert "1 of 2 pairs could not be read, the scores of the others are in" in capsys.readouterr().err
+    assert "1 of 2 pairs could not be read; the scores of the others are in" in capsys.readouterr().err
     scores = json.loads((tmp_path / "eval" / "eval.json").read_text(encoding="utf-8"))
     assert [row["name"] for row in scores["pictures"]] == ["a"] and "b.png" in scores["failed"][0]
     (pairs / "gt" / "a.png").write_bytes(b"none")
@@ -186,7 +186,7 @@ def test_a_fit_makes_missing_clean_frames(capture: Path, tmp_path: Path, capsys:
     words = ["fit", str(bare), "--out", str(tmp_path / "run"), "--iterations", "2"]
     assert cli.main(words) == 0
     said = capsys.readouterr().err
-    assert "has no removed/" in said and "mode estimated" in said
+    assert "has no removed/" in said and "the mode is estimated" in said
     frames = {path.stem: path for path in (bare / "images").iterdir()}
     made = {path.stem: path for path in (bare / "removed").glob("*.png")}
     assert frames.keys() == made.keys()
@@ -195,7 +195,7 @@ def test_a_fit_makes_missing_clean_frames(capture: Path, tmp_path: Path, capsys:
     shutil.rmtree(tmp_path / "run")
     assert cli.main(words) == 0
     said = capsys.readouterr().err
-    assert "has no removed/" not in said and "mode estimated" in said, "they are kept, and known for estimates"
+    assert "has no removed/" not in said and "the mode is estimated" in said, "they are kept, and known for estimates"
     assert 'mode = "estimated"' in (tmp_path / "run" / "config.toml").read_text(encoding="utf-8")
     by_hand = ["remove", str(bare / "images"), "--out", str(bare / "removed"), "--all-glare"]
     assert cli.main(by_hand) == 0

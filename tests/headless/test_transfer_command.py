@@ -103,7 +103,7 @@ def test_plates_that_are_not_written_are_reported(run: Run, made: Path, tmp_path
     write_png(tmp_path / "plate.png", np.full((54, 96, 3), 0.3))
     events = run("transfer", made, "--to", tmp_path / "plate.png", "--light", "60,10", "--size", "48", "--out",
                  tmp_path / "out")
-    assert any("1 of 1 plates are not written with their flare" in event.get("text", "") for event in events)
+    assert any("For 1 of 1 plates only the layers are written" in event.get("text", "") for event in events)
     assert not (tmp_path / "out" / "frames").exists()
 
 
@@ -238,14 +238,14 @@ def test_arguments_are_checked_before_a_blend_is_read(run: Run, made: Path, blen
     text = run("transfer", made, "--to", bad, "--out", tmp_path / "o", status=1)[-1]["text"]
     assert "\n" not in text and "bad.blend cannot be opened by Blender" in text
     text = run("solve", blend, "--plates", tmp_path, "--out", tmp_path / "o", "--frames", "3", status=2)[-1]["text"]
-    assert text.startswith("--frames goes with frames or a video")
+    assert text.startswith("--frames is only for frames or a video")
     assert not (tmp_path / "o").exists()
 
 
 def test_a_missing_target_lists_the_kinds_of_target(run: Run, made: Path, tmp_path: Path) -> None:
     for name in ("none", "none.png"):
         text = run("transfer", made, "--to", tmp_path / name, "--out", tmp_path / "o", status=1)[-1]["text"]
-        assert text.endswith("is missing; name what the flare goes on to: pictures, a capture, a run, a .blend, a PLY "
+        assert text.endswith("is missing; name a target for the flare: pictures, a capture, a run, a .blend, a PLY "
                              "or a shot.")
 
 

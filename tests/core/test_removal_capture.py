@@ -35,7 +35,7 @@ def test_a_capture_is_cleaned_as_its_remover_says(tmp_path: Path, flare_everywhe
         cv2.imwrite(str(frame), (display * 255 + 0.5).astype(np.uint8))
     views = single_prediction(flare)._replace(glow_fraction=np.ones_like(flare))
     monkeypatch.setattr(Remover, "predict_with_tta", lambda *_: views)
-    whole = Remover(flare_everywhere, working_size=224, glow="taken")
+    whole = Remover(flare_everywhere, working_size=224, glow="remove")
     remove_all(frames, tmp_path / "plates", Remover(flare_everywhere, working_size=224), Progress())
     ours, plates = (cv2.imread(str(folder / frames[0].name)) for folder in
                     (clean_capture(capture, whole, Progress()), tmp_path / "plates"))

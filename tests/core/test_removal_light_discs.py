@@ -81,7 +81,7 @@ def test_a_dimmer_light_disc_keeps_less_glow(white: float, part: float) -> None:
     assert stays == pytest.approx(part * light_discs.MAX_GLOW_KEPT * np.exp(-2 / 12), rel=0.05, abs=0.03)
 
 
-@pytest.mark.parametrize(("glow", "inside_matte"), [("kept at lamps", True), ("taken", False)])
+@pytest.mark.parametrize(("glow", "inside_matte"), [("keep at lights", True), ("remove", False)])
 def test_no_glow_stays_inside_a_matte_or_with_all_glow(flare_everywhere: Path, glow: Glow, inside_matte: bool) -> None:
     """The light disc does."""
     display, flare = lit_street(10, level=0.15)

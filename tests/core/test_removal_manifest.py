@@ -41,8 +41,8 @@ def test_a_clean_plate_is_made_again_for_other_weights_options_or_mattes(
     first = Remover(flare_everywhere, working_size=64)
     assert [made(first), made(first)] == [2, 0]
     for remover in (Remover(no_flare, working_size=64), Remover(flare_everywhere, working_size=96),
-                    Remover(flare_everywhere, working_size=64, glow="kept"),
-                    Remover(flare_everywhere, working_size=64, glow="taken"), first):
+                    Remover(flare_everywhere, working_size=64, glow="keep"),
+                    Remover(flare_everywhere, working_size=64, glow="remove"), first):
         assert [made(remover), made(remover)] == [2, 0]
     assert [made(first, "left"), made(first, "left"), made(first, "right"), made(first),
             made(first, independent=True)] == [2, 0, 2, 2, 2]
@@ -93,7 +93,7 @@ def test_a_foreign_file_is_not_overwritten_by_a_flare(tmp_path: Path, flare_ever
     with pytest.raises(FrameError, match=r"a\.exr exists and is not listed in .*remove\.json"):
         remove_all([source], tmp_path / "out", remover, Progress(), flare_folder=render.parent)
     assert render.read_bytes() == work
-    for another in (remover, Remover(flare_everywhere, working_size=64, glow="kept")):
+    for another in (remover, Remover(flare_everywhere, working_size=64, glow="keep")):
         remove_all([source], tmp_path / "out", another, Progress(), flare_folder=tmp_path / "flares")
     remove_all([source], tmp_path / "out", remover, Progress(), flare_folder=render.parent, overwrite=True)
     assert render.read_bytes() != work

@@ -68,3 +68,15 @@ def test_weights_keep_their_recipe_and_damaged_files_are_refused(tmp_path: Path,
     weights.write(tmp_path / "nan.safetensors", tensors, about)
     with pytest.raises(RunError, match="no finite numbers"):
         weights.load(tmp_path / "nan.safetensors")
+
+
+def test_weights_are_read_under_the_tensor_names_of_format_0(tmp_path: Path, flare_everywhere: Path) -> None:
+    tensors, metadata = weights.read(flare_everywhere)
+    retired = {present: name for name, present in weights.RETIRED_NAMES.items()}
+    renamed = {".".join(retired.get(part, part) for part in name.split(".")): value for name, value in tensors.items()}
+    assert "enter.1.0.first.weight" in renamed and "attention.0.asked.weight" in renamed
+    weights.write(tmp_path / "format_0.safetensors", renamed, metadata)
+    assert weights.read(tmp_path / "format_0.safetensors")[0].keys() == tensors.keys()
+    frame = torch.rand(1, 3, 64, 96)
+    assert torch.equal(weights.load(tmp_path / "format_0.safetensors")(frame).flare,
+                       weights.load(flare_everywhere)(frame).flare)

@@ -86,7 +86,7 @@ def test_a_rotated_frame_has_the_same_prediction(flare_everywhere: Path) -> None
 def test_the_glow_fraction_is_what_stays_with_glow_kept(flare_everywhere: Path) -> None:
     """In the mean over the augmentations."""
     display = picture(64, 96, 1, np.float32)
-    removed, kept = (Remover(flare_everywhere, glow=glow).predict(display) for glow in ("kept at lamps", "kept"))
+    removed, kept = (Remover(flare_everywhere, glow=glow).predict(display) for glow in ("keep at lights", "keep"))
     assert 0.01 < removed.glow_fraction.mean() < 0.99 and kept.glow_fraction.max() == 0
     np.testing.assert_allclose(removed.flare * (1 - removed.glow_fraction), kept.flare, atol=1e-4)
 
@@ -135,7 +135,7 @@ def test_keeping_glow_removes_no_more(flare_everywhere: Path) -> None:
     codes = picture()
     with_glow, without_glow = (
         np.asarray(clean_codes(Remover(flare_everywhere, working_size=96, glow=glow), codes)).astype(int)
-        for glow in ("kept", "kept at lamps"))
+        for glow in ("keep", "keep at lights"))
     assert (with_glow >= without_glow - 1).mean() > 0.98
     assert with_glow.mean() > without_glow.mean()
 

@@ -196,7 +196,7 @@ class WaveringRemover(Remover):
     cache_key = "wavering"
 
     def __init__(self) -> None:
-        self.working_size, self.glow, self.runs = 64, "kept at lamps", 0
+        self.working_size, self.glow, self.runs = 64, "keep at lights", 0
 
     def to_network_input(self, plate: Plate) -> Pixels:
         display = super().to_network_input(plate)

@@ -205,7 +205,7 @@ class DiffusionRemover(Remover):
 
     def __init__(self, base: Path | str, lora: Path | str, *, working_size: int = WORKING_SIZE) -> None:
         """lora: the file that `DiffusionRemoval.save` wrote. Raises EngineError, RunError."""
-        self.working_size, self.glow = working_size, "taken"
+        self.working_size, self.glow = working_size, "remove"
         self.model = DiffusionRemoval(base, read_rank(lora))
         self.model.load(lora)
         self.model.eval()

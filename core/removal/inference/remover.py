@@ -36,10 +36,11 @@ MIN_MEAN_FLARE = 0.0005
 """Gate (`gate_by_mean`) of the network's predictions, display values: it predicts small flares where there are none."""
 REVISION = 3
 """Raised whenever the same plate, weights and settings give another result, so that existing results are made again."""
-Glow = Literal["kept", "kept at lamps", "taken"]
-"""What becomes of the glow about lights: it is kept; the part is kept that lights at night have with a clean lens, too
-(`light_discs`); or all of it is removed, as a fit needs it, to which it is flare. The values are part of the cache key.
-"""
+Glow = Literal["keep", "keep at lights", "remove"]
+"""What to do with the glow about lights: keep it; keep the part that lights at night have with a clean lens, too
+(`light_discs`); or remove it all, as a fit needs it, to which it is flare."""
+_GLOW_IN_CACHE_KEY = {"keep": "kept", "keep at lights": "kept at lamps", "remove": "taken"}
+"""Text of each mode in cache keys. It never changes, so that existing results stay valid."""
 
 
 class Remover:
@@ -51,13 +52,14 @@ class Remover:
     """Text that changes whenever results would."""
 
     def __init__(self, weights: Path | None = None, *, working_size: int = WORKING_SIZE,
-                 glow: Glow = "kept at lamps") -> None:
+                 glow: Glow = "keep at lights") -> None:
         """weights: None for those that come with the program. Raises RunError, SettingsError."""
         if not 64 <= working_size <= 8192:
             raise SettingsError(f"A working size of {working_size} pixels is outside 64 to 8192.")
         self.network: RemovalNetwork = load(weights or IN_THE_BOX)
         self.working_size, self.glow = working_size, glow
-        self.cache_key = compute_cache_key("network", weights or IN_THE_BOX, working_size, glow)
+        self.cache_key = compute_cache_key("network", weights or IN_THE_BOX, working_size,
+                                           _GLOW_IN_CACHE_KEY[glow])
 
     def remove(self, plate: Plate, matte: Pixels | None = None, prediction: FlarePrediction | None = None
                ) -> tuple[NDArray[Any], NDArray[np.float16]]:
@@ -120,7 +122,7 @@ class Remover:
         """Run the network once (`test_time_augmentation.PredictFn`); glow that is kept is left out."""
         output = self.network(torch.from_numpy(np.ascontiguousarray(display.transpose(2, 0, 1)))[None])
         flare, without_glow = output.flare[0].clamp(min=0), output.flare_without_glow[0].clamp(min=0)
-        parts = ([without_glow, torch.zeros_like(without_glow)] if self.glow == "kept"
+        parts = ([without_glow, torch.zeros_like(without_glow)] if self.glow == "keep"
                  else [flare, flare - without_glow])
         return np.asarray(torch.cat(parts).permute(1, 2, 0).numpy())
 
@@ -134,7 +136,7 @@ class Remover:
             # A ramp from nothing to the whole, so that a faint flare has no visible edge.
             flare = flare * np.clip((flare - MIN_FLARE) / MIN_FLARE, 0, 1)
             flare = gate_by_mean(flare, self.min_mean_flare) * prediction.confidence
-        keep_glow = self.glow == "kept at lamps" and not inside_matte
+        keep_glow = self.glow == "keep at lights" and not inside_matte
         flare = flare * (1 - retained_fraction(prediction.display, flare, prediction.glow_fraction,
                                                keep_glow=keep_glow))
         return np.where(flare > 0, flare_to_linear(prediction.display, flare), np.float32(0))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Blenders to run scripts in, always as processes of their own, so that the tests' process never has bpy."""
+"""The Blenders that tests run scripts in, each as a process of its own, so that the tests never import bpy."""
 from __future__ import annotations
 
 import importlib.util

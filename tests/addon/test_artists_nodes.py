@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The compositor among an artist's own nodes: they stay, wherever they are and whatever is pressed."""
+"""The compositor set-up keeps an artist's own nodes, in every state and after every button."""
 from __future__ import annotations
 
 from pathlib import Path

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Broken things end in one readable sentence, never in a traceback, and nothing is lost."""
+"""Broken input and failures end in one readable sentence, never in a traceback, and nothing is lost."""
 from __future__ import annotations
 
 import os

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Cameras, axes and frame numbers, between the core and Blender."""
+"""Cameras, axes and frame numbers convert between the core and Blender."""
 from __future__ import annotations
 
 from pathlib import Path

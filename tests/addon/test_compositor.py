@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The compositor's pixels against the layers they come from, on every Blender that is set up here."""
+"""The compositor's pixels equal the sum of the layers, on every Blender that is set up here."""
 from __future__ import annotations
 
 import shutil

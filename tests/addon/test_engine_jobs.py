@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Work of the engine that others have begun: known for what it is, and nobody else's process is ended for it."""
+"""Jobs that another machine or Blender started: their state is right, and no other process is stopped."""
 from __future__ import annotations
 
 import os

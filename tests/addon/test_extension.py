@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The extension as a user gets it: packed by Blender's own packer, installed, used, disabled."""
+"""The built extension: packed by Blender's packer, installed, used, disabled."""
 from __future__ import annotations
 
 import tomllib

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Flares renamed, removed and animated: their sliders act on their own layers, and their keys stay their own."""
+"""Flares that are renamed, removed and animated keep their layers, sliders and keys."""
 from __future__ import annotations
 
 from pathlib import Path

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Lights are where they stand, whatever is switched off, and where a fit puts them; none is lost."""
+"""Light objects have the right positions, also when disabled or moved by a fit, and none is lost."""
 from __future__ import annotations
 
 from collections.abc import Callable

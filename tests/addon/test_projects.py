@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Nothing of a project is lost to another part of it, and all of it is found where it goes."""
+"""The files of a project are not overwritten, and are found after it moves."""
 from __future__ import annotations
 
 from collections.abc import Callable

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The engine's set-up by one click, with a package made on the spot in place of torch."""
+"""Setting up the engine, with a package made for the test in place of torch."""
 from __future__ import annotations
 
 import importlib.util

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What was made for one shot is not taken for another's, and does not go by the way."""
+"""Data of one shot or capture is not used for another, and is not deleted by accident."""
 from __future__ import annotations
 
 from collections.abc import Callable

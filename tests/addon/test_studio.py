@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Under a studio's colour configuration, as ACES' is: nothing fails, and layers keep their colours."""
+"""With a studio's colour configuration, such as ACES, nothing fails and layers keep their colours."""
 from __future__ import annotations
 
 from pathlib import Path

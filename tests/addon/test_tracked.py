@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What Blender's motion tracker found comes out as a capture; suns are directions; what renders show hides lights."""
+"""Captures from the motion tracker; suns are directions; objects that renders show hide lights."""
 from __future__ import annotations
 
 from pathlib import Path

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The compositor that the panel sets up: its drivers in rendered pixels, and that it goes without a trace."""
+"""The panel's sliders drive the compositor, in rendered pixels, and its removal leaves no trace."""
 from __future__ import annotations
 
 from pathlib import Path

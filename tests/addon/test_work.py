@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""An artist's work in Blender, against the core: import, lights, look, overlay, occlusion, transfer."""
+"""An artist's work in Blender, compared with the core: import, lights, look, overlay, occlusion, transfer."""
 from __future__ import annotations
 
 import itertools

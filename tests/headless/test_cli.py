@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The command line: help, misuse, bad input, and the status each ends with."""
+"""The command line: help, invalid arguments, errors, and exit statuses."""
 from __future__ import annotations
 
 import argparse

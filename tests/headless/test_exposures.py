@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Every command that shows the views of a run shows them as the fit found them exposed."""
+"""Every command that renders the views of a run applies the exposures that the fit found."""
 from __future__ import annotations
 
 import json

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Who is asked, in what order, and what crosses between two processes."""
+"""The order in which engine and Blender are searched, and what is forwarded between two processes."""
 from __future__ import annotations
 
 import os

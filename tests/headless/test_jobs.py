@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Shares of the frames, and what is told of processes that failed."""
+"""Splitting frames among processes, and the errors of processes that failed."""
 from __future__ import annotations
 
 import argparse

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The commands remove, train-removal, eval-removal, and what fit makes of a capture without flare-free frames."""
+"""The commands remove, train-removal, eval-removal, and fit for a capture without clean frames."""
 from __future__ import annotations
 
 import json

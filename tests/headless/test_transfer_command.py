@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""transfer, export and bake of a bare .flare as they are started, on to a picture, a capture and a .blend."""
+"""The commands transfer, export and bake for a .flare: to a picture, a capture and a .blend."""
 from __future__ import annotations
 
 import importlib.util

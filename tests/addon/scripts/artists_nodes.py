@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Inside Blender: the compositor among an artist's own nodes. Words: the layers' folder, a folder to write."""
+"""Inside Blender: the compositor among an artist's own nodes. Arguments: the layers' folder, a folder to write."""
 from __future__ import annotations
 
 import importlib.util

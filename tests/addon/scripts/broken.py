@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Inside Blender: everything that can be broken. Words: the zip, a capture, a .flare of it, a folder, a sham engine."""
+"""Inside Blender: broken input and failing engines.
+
+Arguments: the zip, a capture, a .flare of it, a folder, a sham engine.
+"""
 from __future__ import annotations
 
 import contextlib

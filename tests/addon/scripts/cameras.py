@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Inside Blender: cameras of every fit, axes, frame numbers and edits, as numbers against Blender's own. Word: zip."""
+"""Inside Blender: cameras of every fit, axes, frame numbers and edits, as numbers against Blender's own.
+
+Arguments: zip.
+"""
 from __future__ import annotations
 
 import itertools

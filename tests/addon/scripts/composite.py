@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Inside Blender: build, rebuild, render. Words: folders of layers, of layers of fewer lights, of a picture without
+"""Inside Blender: build, rebuild, render. Arguments: folders of layers, of layers of fewer lights, of a picture without
 layers, of wide pixels in ACEScg, and the folder to write."""
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Inside Blender: flares renamed, removed and animated while the compositor shows their layers. Words: the zip, a
+"""Inside Blender: flares renamed, removed and animated while the compositor shows their layers. Arguments: the zip, a
 .flare, a folder of layers and live.json, one of a layer more, a folder to write."""
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Inside Blender: install the built extension, use it, remove it. Words: the zip, a folder of layers."""
+"""Inside Blender: install the built extension, use it, remove it. Arguments: the zip, a folder of layers."""
 from __future__ import annotations
 
 import importlib

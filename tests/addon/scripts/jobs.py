@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Inside Blender: work that other machines, files and scenes have begun. Words: the zip, a folder."""
+"""Inside Blender: jobs that other machines, files and scenes started. Arguments: the zip, a folder."""
 from __future__ import annotations
 
 import contextlib

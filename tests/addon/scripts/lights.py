@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Inside Blender: lights that are switched off, parented, found, moved by a fit. Words: the zip, a capture, a .flare of
+"""Inside Blender: lights that are disabled, parented, found, moved by a fit. Arguments: the zip, a capture, a .flare of
 it, a folder."""
 from __future__ import annotations
 

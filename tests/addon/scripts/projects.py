@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Inside Blender: what belongs to a project stays whole, and is found again where the project goes. Words: the zip, a
+"""Inside Blender: the files of a project, before and after it moves. Arguments: the zip, a
 capture, a .flare, a folder."""
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Inside a Blender without Fit Flare: open a .blend, render its frames. Words: .blend, folder, numbers."""
+"""Inside a Blender without Fit Flare: open a .blend, render its frames. Arguments: .blend, folder, numbers."""
 from __future__ import annotations
 
 import json

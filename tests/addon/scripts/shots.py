@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Inside Blender: layers of one shot after the other into one folder, and a second capture in a scene. Words: the zip,
-a capture, a .flare of it, a folder."""
+"""Inside Blender: layers of one shot after the other into one folder, and a second capture in a scene. Arguments: the
+zip, a capture, a .flare of it, a folder."""
 from __future__ import annotations
 
 import os

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What the scripts inside Blender share: the built extension installed, an empty scene, refusals as text."""
+"""Functions that the scripts share: install the extension, make an empty scene, return refusals as text."""
 from __future__ import annotations
 
 import contextlib

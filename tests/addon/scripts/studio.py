@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Inside Blender, under a studio's colour configuration. Words: zip, capture, .flare, layers, a folder to write."""
+"""Inside Blender, under a studio's colour configuration. Arguments: zip, capture, .flare, layers, a folder to write."""
 from __future__ import annotations
 
 import sys

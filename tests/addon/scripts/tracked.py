@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Inside Blender: a shot that its motion tracker solved, as a capture; suns; what hides lights. Words: the zip, a
+"""Inside Blender: a shot that its motion tracker solved, as a capture; suns; what hides lights. Arguments: the zip, a
 folder.
 
 The tracks are those of points that a distorted lens sees from a path, so that the solve is exact.

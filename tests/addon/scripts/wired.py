@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Inside Blender: the compositor wired to the panel, rendered, and taken away. Words: zip, .flare, layers,
+"""Inside Blender: the compositor driven by the panel, rendered, and removed. Arguments: zip, .flare, layers,
 those of many flares, folder."""
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Inside Blender: an artist's work, operator by operator. Words: the zip, a capture, a .flare of it, a folder."""
+"""Inside Blender: an artist's work, operator by operator. Arguments: the zip, a capture, a .flare of it, a folder."""
 from __future__ import annotations
 
 import json

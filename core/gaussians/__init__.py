@@ -1,17 +1,17 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Gaussian splatting: rendering with gradients, on every machine.
+"""Gaussian splatting: differentiable rendering on every machine.
 
-`rasterization` renders 3D Gaussians, `splat` lays 2D ones on a picture; both run on the fastest kernels at
-hand, and every kernel set gives the picture that `reference.py` defines. `SceneGaussians` is a scene to
-optimise, `l1_ssim` and `Adam` what optimises it.
+`rasterization` renders 3D Gaussians, `splat` rasterizes 2D ones; both use the fastest kernel set that is installed, and
+every kernel set renders the picture that `reference.py` defines. `SceneGaussians` holds the parameters of a scene;
+`l1_ssim` and `Adam` optimise them.
 """
 from __future__ import annotations
 
 import numpy as np
 import torch
 
-# Values fade through the denormal range all the time here, where arithmetic is up to 40 times slower.
-# numpy measures its denormals when first asked, and warns if there are none: it is asked before.
+# Values often fade into the denormal range, where arithmetic is up to 40 times slower; denormals are flushed to zero.
+# numpy measures its denormals at the first finfo and warns if there are none, so finfo is called before.
 for _kind in (np.float32, np.float64):
     np.finfo(_kind)
 torch.set_flush_denormal(True)

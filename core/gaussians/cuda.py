@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The kernels for NVIDIA GPUs: projection, colours and lists in torch, tiles by Warp, which needs neither a CUDA
-toolkit nor a compiler (`pip install warp-lang`).
+"""The kernel set for NVIDIA GPUs: projection, colours and tile lists in torch, tiles by Warp (`pip install warp-lang`),
+which needs neither a CUDA toolkit nor a compiler.
 
-On a GPU they pass the comparison with the definition. Small pictures spend their time in torch's calls, so the CPU
-kernels are faster there (docs/results/rasterizer.md).
+Small pictures spend their time in torch's calls, so the CPU kernels are faster there (docs/results/rasterizer.md).
 """
 from __future__ import annotations
 

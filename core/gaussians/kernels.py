@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Kernel sets, and which one to use.
+"""Kernel sets and their selection.
 
-A kernel set is a module with the functions of `KernelSet`. All of them compute the picture that
-`reference.py` defines; they differ in speed and in where they run:
+A kernel set is a module with the functions of `KernelSet`. All kernel sets render the picture that
+`reference.py` defines; they differ in speed and device:
 
     torch   reference.py   the definition; any device, any precision
-    tiles   tiles.py       torch, tile by tile, analytic gradients; where there is nothing faster
+    tiles   tiles.py       torch, tile by tile, analytic gradients; the fallback
     cpu     cpu/           numba with explicit SIMD; float32
     cuda    cuda.py        NVIDIA; float32
 """
@@ -32,8 +32,8 @@ log = logging.getLogger(__name__)
 
 @runtime_checkable
 class KernelSet(Protocol):
-    """Arguments as the functions of the same purpose in `rasterizer.py` take them, checked there; arcs (n, 3), as
-    `levelled` of `rendering.py` makes them."""
+    """The functions of a kernel set, with the arguments of `rasterization` and `splat`, which check them; arcs (n, 3)
+    come from `rendering.normalise_arcs`."""
 
     def rasterize_scene(
         self, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, sh: Tensor,
@@ -56,53 +56,53 @@ def _load(name: str) -> KernelSet | ImportError:
     return module if isinstance(module, KernelSet) else ImportError(f"{module.__name__} is incomplete")
 
 
-def available(name: str) -> bool:
-    """Whether this kernel set can be imported here."""
+def is_available(name: str) -> bool:
+    """Return whether this kernel set can be imported."""
     return not isinstance(_load(name), ImportError)
 
 
 @cache
-def _say_once(sentence: str) -> None:
+def _warn_once(sentence: str) -> None:
     log.warning(sentence)
 
 
-class Offers(Protocol):
-    """Steps that a backward pass may take, and the names of the parameters whose steps it took."""
+class StepsInBackward(Protocol):
+    """Steps that a backward pass may make; claimed: names of the parameters whose steps it made."""
 
-    taken: set[str]
+    claimed: set[str]
 
 
 class FusedKernels(Protocol):
-    """What the CPU kernels have beside those of a kernel set; a step is `Step` for all but themselves."""
+    """Functions of the CPU kernels beyond a kernel set; a step is made by `AdamStep` and otherwise opaque."""
 
     def l1_ssim(self, image: Tensor, target: Tensor, lam: float) -> Tensor: ...
     def over(self, colour: Tensor, t: Tensor, behind: Tensor) -> Tensor | None: ...
-    def enlarged(
+    def upsample(
         self, colour: Tensor, t: Tensor, factor: int, width: int, height: int
     ) -> tuple[Tensor, Tensor] | None: ...
-    def Step(
+    def AdamStep(
         self, parameter: Tensor, gradient: Tensor | None, first: Tensor, second: Tensor, step: int,
         rate: float | Tensor,
     ) -> Any: ...  # fmt: skip
     def adam_steps(self, steps: Sequence[Any], *, beta1: float, beta2: float, epsilon: float) -> None: ...
-    def offered(
+    def steps_in_backward(
         self, steps: Mapping[str, Any], *, beta1: float, beta2: float, epsilon: float
-    ) -> AbstractContextManager[Offers]: ...
+    ) -> AbstractContextManager[StepsInBackward]: ...
 
 
-def fused(like: Tensor) -> FusedKernels | None:
-    """The CPU kernels if they can take tensors such as `like`, else None: for the loss and the optimiser,
-    which have a plain torch form of their own."""
+def fused_kernels(like: Tensor) -> FusedKernels | None:
+    """Return the CPU kernels if they support tensors such as `like`, else None; for the loss, the optimiser and layers,
+    which have a torch version too."""
     if not like.is_cpu or like.dtype != torch.float32:
         return None
     kernels = _load("cpu")
     return None if isinstance(kernels, ImportError) else cast(FusedKernels, kernels)
 
 
-def choose(name: str, like: Tensor) -> KernelSet:
-    """The kernel set of this name, or the fastest for tensors such as `like` if the name is "auto".
+def select_kernels(name: str, like: Tensor) -> KernelSet:
+    """Return the kernel set of this name; for "auto", the fastest for tensors such as `like`.
 
-    Raises SettingsError for an unknown name, EngineError for one that is not installed here.
+    Raises SettingsError for an unknown name, EngineError for a kernel set that is not installed.
     """
     if name == "auto":
         name = _fastest(like)
@@ -119,11 +119,11 @@ def choose(name: str, like: Tensor) -> KernelSet:
 
 
 def _fastest(like: Tensor) -> str:
-    wanted = {"cuda": "cuda", "cpu": "cpu"}.get(like.device.type, "tiles")
+    preferred = {"cuda": "cuda", "cpu": "cpu"}.get(like.device.type, "tiles")
     if like.dtype != torch.float32:
         return "tiles"
-    reason = _load(wanted)
+    reason = _load(preferred)
     if isinstance(reason, ImportError):
-        _say_once(f"The {wanted} kernels cannot be used here ({reason}); slower torch ones take their place.")
+        _warn_once(f"The {preferred} kernels cannot be used here ({reason}); slower torch ones take their place.")
         return "tiles"
-    return wanted
+    return preferred

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""How far a picture is from its target: L1 and structural similarity.
+"""The photometric loss between a picture and its target: L1 and structural similarity.
 
 SSIM (Wang et al. 2004) compares local means, variances and covariance under a Gaussian window:
 
@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from ..errors import SettingsError
-from .kernels import fused
+from .kernels import fused_kernels
 
 WINDOW = 11
 SIGMA = 1.5
@@ -25,13 +25,13 @@ C2 = 0.03**2
 
 
 def l1_ssim(image: Tensor, target: Tensor, lam: float, *, kernels: Literal["auto", "torch"] = "auto") -> Tensor:
-    """lam * mean|image - target| + (1 - lam) * (1 - SSIM(image, target)), a scalar.
+    """Return lam * mean|image - target| + (1 - lam) * (1 - SSIM(image, target)), a scalar.
 
-    image, target: (h, w, 3), 0..1. Differentiable by the image; the target is taken as constant.
-    lam: weight of L1 (the paper: 0.9; 3DGS: 0.8). Raises SettingsError where the sizes differ.
+    image, target: (h, w, 3), 0..1. Differentiable by the image; the target is a constant.
+    lam: weight of L1 (the paper: 0.9; 3DGS: 0.8). Raises SettingsError for different sizes.
     """
     _check(image, target)
-    cpu = fused(image) if kernels == "auto" else None
+    cpu = fused_kernels(image) if kernels == "auto" else None
     if cpu is not None:
         return cpu.l1_ssim(image, target, lam)
     target = target.detach()
@@ -39,7 +39,7 @@ def l1_ssim(image: Tensor, target: Tensor, lam: float, *, kernels: Literal["auto
 
 
 def ssim(image: Tensor, target: Tensor) -> Tensor:
-    """Mean structural similarity of two (h, w, 3) pictures, a scalar, 1 where they are the same."""
+    """Return the mean structural similarity of two (h, w, 3) pictures, a scalar, 1 for equal pictures."""
     _check(image, target)
     a, b = image.permute(2, 0, 1), target.permute(2, 0, 1)
     mu_a, mu_b, aa, bb, ab = _blur(torch.cat([a, b, a * a, b * b, a * b])).split(3)
@@ -50,14 +50,14 @@ def ssim(image: Tensor, target: Tensor) -> Tensor:
 
 
 def window(like: Tensor) -> Tensor:
-    """The (11,) weights of the window along one axis; they sum to 1."""
+    """Return the (11,) weights of the window along one axis; they sum to 1."""
     x = torch.arange(WINDOW, dtype=like.dtype, device=like.device) - WINDOW // 2
     weights = torch.exp(-(x * x) / (2 * SIGMA * SIGMA))
     return weights / weights.sum()
 
 
 def _blur(planes: Tensor) -> Tensor:
-    """(c, h, w) under the window, one axis at a time, zeros outside."""
+    """Blur (c, h, w) by the window, one axis at a time, with zero padding."""
     weights = window(planes)
     planes = torch.nn.functional.conv2d(planes[:, None], weights.view(1, 1, 1, -1), padding=(0, WINDOW // 2))
     return torch.nn.functional.conv2d(planes, weights.view(1, 1, -1, 1), padding=(WINDOW // 2, 0))[:, 0]

@@ -1,21 +1,21 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Flares at mixed resolution: what is soft against the pixel is drawn small and enlarged.
+"""Splatting at mixed resolution: Gaussians that are large relative to the pixel are drawn reduced and upsampled.
 
-Bilinear interpolation on a grid of f px misses a picture by at most f²/8 times the sum of its second
-derivatives along the axes, and a cusp of slope m by at most m f / sqrt(2). With s the smaller standard
-deviation, px, and in shares of the peak:
+Bilinear interpolation on a grid of f px has an error of at most f²/8 times the sum of the picture's second
+derivatives along the axes, and at a cusp of slope m an error of at most m f / sqrt(2). With s the smaller standard
+deviation, px, and relative to the peak:
 
     Gaussian    |d²G| <= 1/s² along each axis
     ring        1/(w s)² likewise; at its centre a cusp of slope r0 / (w² s) exp(-r0² / (2 w²))
-    arc         those of the ring, with exp(-(r0 + w² beta)² / (2 w²)) for the height of the cusp: G = exp f, b·d adds
-                nothing to f's second derivatives, and whitened, -f = w² |grad f|² / 2 + beta r0 (1 - c), no less than
-                for the ring, holds down what the gradient adds to G's
+    arc         as for the ring, with exp(-(r0 + w² beta)² / (2 w²)) for the height of the cusp. For G = exp f, b·d adds
+                nothing to f's second derivatives. Whitened, -f = w² |grad f|² / 2 + beta r0 (1 - c) is no less than
+                for the ring and bounds the gradient's contribution to the second derivatives of G
 
-The largest f of 4, 2, 1 at which that comes to no more than TOLERANCE of the peak is taken: a plain Gaussian
-is drawn at 1/4 size from s = 11.3 px, at 1/2 from 5.7 px. To the error comes the step at which a profile is
-cut off (1/255 or 1/4096). Flares are made of many faint Gaussians, of which few are close to the limit.
+A Gaussian is drawn at the largest reduction f of 4, 2, 1 whose error is at most TOLERANCE of the peak: a plain one at
+1/4 size from s = 11.3 px, at 1/2 from 5.7 px. The step at which a profile is cut off (1/255 or 1/4096) adds to the
+error. Flares consist of many faint Gaussians, few of which are close to the limit.
 
-"over" then also changes the order: full size in front, then 1/2, then 1/4.
+With "over" the order changes as well: full size in front, then 1/2, then 1/4.
 """
 from __future__ import annotations
 
@@ -24,37 +24,37 @@ from torch import Tensor
 
 from ..choices import Blend
 from .kernels import KernelSet
-from .layers import enlarged, over
+from .layers import over, upsample_layer
 from .rendering import Splats, arc_strengths
 
 TOLERANCE = 1 / 32
-"""Largest error of a Gaussian drawn small, as a share of its peak."""
+"""Largest error of a Gaussian that is drawn at reduced size, relative to its peak."""
 REDUCTIONS = (1, 2, 4)
 
 
 @torch.no_grad()
 def error_bounds(covariances: Tensor, rings: Tensor | None, arcs: Tensor | None) -> Tensor:
-    """(3, n) largest error of each Gaussian at each of REDUCTIONS, as a share of its peak; see above."""
+    """Return (3, n) error bounds of each Gaussian at each of REDUCTIONS, relative to its peak; see the module head."""
     xx, xy, yy = covariances.unbind(-1)
-    larger = (xx + yy) / 2 + (((xx - yy) / 2) ** 2 + xy * xy).sqrt()
-    smaller = ((xx * yy - xy * xy) / larger).clamp(min=1e-12)  # without cancellation
-    curvature = 2 / smaller
-    slope = torch.zeros_like(smaller)
+    major = (xx + yy) / 2 + (((xx - yy) / 2) ** 2 + xy * xy).sqrt()
+    minor = ((xx * yy - xy * xy) / major).clamp(min=1e-12)  # without cancellation
+    curvature = 2 / minor
+    slope = torch.zeros_like(minor)
     if rings is not None:
         r0, w = rings.unbind(-1)
         curvature = curvature / (w * w).clamp(max=1)
-        brightest = r0 if arcs is None else r0 + w * w * arc_strengths(covariances, arcs).to(r0.dtype)
-        slope = r0.abs() / (w * w) * torch.exp(-((brightest / w) ** 2) / 2) * smaller.rsqrt()
+        peak_radius = r0 if arcs is None else r0 + w * w * arc_strengths(covariances, arcs).to(r0.dtype)
+        slope = r0.abs() / (w * w) * torch.exp(-((peak_radius / w) ** 2) / 2) * minor.rsqrt()
     return torch.stack([factor**2 / 8 * curvature + factor / 2**0.5 * slope for factor in REDUCTIONS])
 
 
 @torch.no_grad()
-def reductions(covariances: Tensor, rings: Tensor | None, arcs: Tensor | None) -> Tensor:
-    """(n,) 1, 2 or 4: at which share of the size each Gaussian is drawn."""
+def choose_reductions(covariances: Tensor, rings: Tensor | None, arcs: Tensor | None) -> Tensor:
+    """Return (n,) the factor by which each Gaussian's picture is reduced: 1, 2 or 4."""
     bounds = error_bounds(covariances, rings, arcs)
     chosen = torch.ones(len(covariances), dtype=torch.int64, device=covariances.device)
-    for place, factor in enumerate(REDUCTIONS[1:], 1):
-        chosen.masked_fill_(bounds[place] <= TOLERANCE, factor)
+    for bound, factor in zip(bounds[1:], REDUCTIONS[1:], strict=True):
+        chosen.masked_fill_(bound <= TOLERANCE, factor)
     return chosen
 
 
@@ -62,8 +62,8 @@ def splat_mixed(
     kernels: KernelSet, centres: Tensor, covariances: Tensor, opacities: Tensor, colours: Tensor,
     width: int, height: int, *, rings: Tensor | None, arcs: Tensor | None, blend: Blend,
 ) -> Splats:  # fmt: skip
-    """`splat` with resolution "mixed"."""
-    factors = reductions(covariances, rings, arcs)
+    """Rasterize as `splat` of the package does with resolution "mixed"."""
+    factors = choose_reductions(covariances, rings, arcs)
     picture = None
     for factor in REDUCTIONS:  # front to back
         index = torch.nonzero(factors == factor)[:, 0]
@@ -78,8 +78,8 @@ def splat_mixed(
             arcs=None if arcs is None else _rows(arcs, index) * arcs.new_tensor([factor, factor, 1]), blend=blend,
         )  # fmt: skip
         if factor > 1:
-            layer = enlarged(layer, factor, width, height)
-        picture = layer if picture is None else _behind(picture, layer, blend)
+            layer = upsample_layer(layer, factor, width, height)
+        picture = layer if picture is None else _merge_layers(picture, layer, blend)
     if picture is None:
         return kernels.splat(
             centres, covariances, opacities, colours, width, height, rings=rings, arcs=arcs, blend=blend
@@ -88,12 +88,12 @@ def splat_mixed(
 
 
 def _rows(tensor: Tensor, index: Tensor) -> Tensor:
-    """tensor[index], which is ascending: the tensor itself if that is all of it."""
+    """Return tensor[index] for ascending indices; the tensor itself if they are all of its rows."""
     return tensor if len(index) == len(tensor) else tensor[index]
 
 
-def _behind(front: Splats, back: Splats, blend: Blend) -> Splats:
-    """Two layers as one."""
+def _merge_layers(front: Splats, back: Splats, blend: Blend) -> Splats:
+    """Merge two layers into one."""
     if blend == "add":
         return Splats(front.colour + back.colour, front.transmittance)
     return Splats(over(front, back.colour), front.transmittance * back.transmittance)

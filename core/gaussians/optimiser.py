@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Adam (Kingma & Ba 2015) for parameters whose rows come and go.
+"""Adam (Kingma & Ba 2015) for parameters whose rows are added, removed and reordered.
 
-The same steps as torch.optim.Adam, with three additions: a rate of its own for each parameter, or for each
-column of one (the degrees of spherical harmonics); rows that are kept, re-ordered or appended together
-with their moments, as densification asks; and the fused CPU kernel where there is one.
+Makes the steps of torch.optim.Adam, with three additions: a learning rate for each parameter, or for each column of one
+(the degrees of spherical harmonics); rows that are selected, reordered or appended together with their moments, for
+densification; and the fused CPU kernel where it is available.
 
     m = b1 m + (1 - b1) g        v = b2 v + (1 - b2) g²
     p = p - rate / (1 - b1^t) * m / (sqrt(v) / sqrt(1 - b2^t) + epsilon)
@@ -20,12 +20,12 @@ from torch import Tensor
 from torch.nn import Parameter
 
 from ..errors import RunError, SettingsError
-from .kernels import FusedKernels, fused
+from .kernels import FusedKernels, fused_kernels
 
 Rate = float | Tensor
 
 BETA1, BETA2 = 0.9, 0.999
-"""How much of the running means stays with each step, of the gradient and of its square."""
+"""Decay of the running means of the gradient and of its square."""
 
 
 class Moments(NamedTuple):
@@ -38,10 +38,10 @@ class Moments(NamedTuple):
 class Adam:
     """Optimises named parameters.
 
-    parameters  by name; the objects stay the same, whatever happens to their rows
-    rates       one for all, or by name; a float, or a tensor of the shape of one row. `self.rates` may be
-                changed between steps; a name that is missing there does not move
-    kernels     "torch" leaves the fused CPU kernel unused
+    parameters  by name; the Parameter objects stay the same when their rows change
+    rates       learning rate of all parameters, or by name; a float, or a tensor of the shape of one row. `self.rates`
+                may be changed between steps; a parameter without a rate is not stepped
+    kernels     "torch" disables the fused CPU kernel
     """
 
     def __init__(
@@ -64,40 +64,41 @@ class Adam:
         return {"beta1": BETA1, "beta2": BETA2, "epsilon": self.epsilon}
 
     @contextmanager
-    def stepping(self) -> Iterator[None]:
-        """Within it the backward pass may step the parameters of a scene itself, all of them together, as soon as it
-        has their gradients, which then need not be written. The CPU kernels do so.
+    def step_in_backward(self) -> Iterator[None]:
+        """Let the backward pass within the context step all parameters of a scene, as soon as it has their gradients,
+        which then need not be written. The CPU kernels do so.
 
-        The steps are the same; those gradients stay None, and `step` is for what is left. Only for a scene that gets
-        its whole gradient from one `rasterization`: raises RunError if more comes after the steps.
+        The steps are the same; the gradients of stepped parameters stay None, and `step` makes the other steps. Only
+        for a scene whose whole gradient comes from one `rasterization`: raises RunError if a parameter gets a gradient
+        after its step.
         """
-        cpu: FusedKernels | None = None
+        fused: FusedKernels | None = None
         steps: dict[str, Any] = {}
         for name, rate in self.rates.items():
             parameter = self.parameters[name]
-            if found := self._kernels_for(parameter):
-                cpu = found
-                steps[name] = found.Step(parameter, None, *self.moments[name], self.steps[name] + 1, rate)
-        if cpu is None:
+            if kernels := self._kernels_for(parameter):
+                fused = kernels
+                steps[name] = kernels.AdamStep(parameter, None, *self.moments[name], self.steps[name] + 1, rate)
+        if fused is None:
             yield
             return
-        with cpu.offered(steps, **self._options) as offers:
+        with fused.steps_in_backward(steps, **self._options) as offer:
             yield
-        for name in offers.taken:
+        for name in offer.claimed:
             self.steps[name] += 1
             if self.parameters[name].grad is not None:
                 raise RunError(f"{name} got a gradient after its step: the scene was rendered twice.")
 
     def _kernels_for(self, parameter: Tensor) -> FusedKernels | None:
-        """The fused kernels if they can step this parameter, else None."""
-        return fused(parameter) if self.kernels == "auto" and parameter.is_contiguous() else None
+        """Return the fused kernels if they can step this parameter, else None."""
+        return fused_kernels(parameter) if self.kernels == "auto" and parameter.is_contiguous() else None
 
     @torch.no_grad()
     def step(self) -> None:
-        """Moves every parameter that has a gradient and a rate."""
+        """Step every parameter that has a gradient and a rate."""
         options = self._options
-        cpu: FusedKernels | None = None
-        together: list[Any] = []
+        fused: FusedKernels | None = None
+        fused_steps: list[Any] = []
         for name, rate in self.rates.items():
             parameter = self.parameters[name]
             if parameter.grad is None or parameter.numel() == 0:
@@ -105,25 +106,25 @@ class Adam:
             self.steps[name] += 1
             data = parameter.data
             values = (data, parameter.grad.contiguous(), *self.moments[name], self.steps[name], rate)
-            found = self._kernels_for(data)
-            if found is None:
+            kernels = self._kernels_for(data)
+            if kernels is None:
                 adam_step(*values, **options)
             else:
-                cpu = found
-                together.append(found.Step(*values))
-        if cpu is not None:
-            cpu.adam_steps(together, **options)
+                fused = kernels
+                fused_steps.append(kernels.AdamStep(*values))
+        if fused is not None:
+            fused.adam_steps(fused_steps, **options)
 
     def zero_grad(self) -> None:
-        """Forgets the gradients."""
+        """Set all gradients to None."""
         for parameter in self.parameters.values():
             parameter.grad = None
 
     @torch.no_grad()
-    def keep(self, index: Tensor, names: Iterable[str] | None = None) -> None:
-        """Keeps the rows of this index (a boolean mask, or row numbers: also a new order), moments included.
+    def keep_rows(self, index: Tensor, names: Iterable[str] | None = None) -> None:
+        """Select rows by a boolean mask or by row numbers, which may be a new order, together with their moments.
 
-        names: which parameters; all by default. Their gradients are forgotten.
+        names: of the parameters; all by default. Sets their gradients to None.
         """
         for name in self.parameters if names is None else names:
             parameter, moments = self.parameters[name], self.moments[name]
@@ -131,8 +132,8 @@ class Adam:
             self.moments[name] = Moments(moments.first[index], moments.second[index])
 
     @torch.no_grad()
-    def append(self, rows: Mapping[str, Tensor]) -> None:
-        """Appends rows, by name of the parameter, with moments of zero; gradients are forgotten."""
+    def append_rows(self, rows: Mapping[str, Tensor]) -> None:
+        """Append rows, by name of the parameter, with zero moments; sets the gradients to None."""
         for name, new in rows.items():
             parameter, moments = self.parameters[name], self.moments[name]
             new = new.to(parameter)
@@ -140,22 +141,22 @@ class Adam:
             self.moments[name] = Moments(*(torch.cat([m, torch.zeros_like(new)]) for m in moments))
 
     @torch.no_grad()
-    def forget(self, name: str, index: Tensor | None = None) -> None:
-        """Sets the moments of a parameter to zero, of all rows or of those of the index."""
+    def reset_moments(self, name: str, index: Tensor | None = None) -> None:
+        """Set the moments of a parameter to zero, for all rows or those of the index."""
         for moment in self.moments[name]:
             moment[slice(None) if index is None else index] = 0
 
     def state_dict(self) -> dict[str, Any]:
-        """Tensors by "name.first" and "name.second", and the step counts under "steps"."""
+        """Return the moments as "name.first" and "name.second", and the step counts as "steps"."""
         state: dict[str, Any] = {"steps": dict(self.steps)}
         for name, moments in self.moments.items():
             state[f"{name}.first"], state[f"{name}.second"] = moments
         return state
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Takes up what state_dict gave; the parameters themselves are restored by their owner first.
+        """Restore a `state_dict`, after the parameters themselves have been restored.
 
-        Raises RunError if it does not fit the parameters.
+        Raises RunError for a state that does not fit the parameters.
         """
         for name, parameter in self.parameters.items():
             loaded = [state[key] for key in (f"{name}.first", f"{name}.second") if key in state]
@@ -180,7 +181,7 @@ def adam_step(
     parameter: Tensor, gradient: Tensor, first: Tensor, second: Tensor, step: int, rate: Rate,
     *, beta1: float, beta2: float, epsilon: float,
 ) -> None:  # fmt: skip
-    """One step in place, in torch; `step` counts from 1, `rate` is a float or has the shape of a row."""
+    """Make one step in place, in torch; `step` counts from 1, `rate` is a float or has the shape of a row."""
     first.lerp_(gradient, 1 - beta1)
     second.mul_(beta2).addcmul_(gradient, gradient, value=1 - beta2)
     root = (second.sqrt() / math.sqrt(1 - beta2**step)).add_(epsilon)

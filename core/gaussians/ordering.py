@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Order in space: Morton codes, and the nearest neighbours that they make easy to find.
+"""Spatial order: Morton codes, and a search for nearest neighbours that uses them.
 
-Gaussians that lie near each other in space are met together by the same tiles. Kept in Morton order
-(Morton 1966: the bits of the three coordinates interleaved), they lie near each other in memory too.
+Gaussians near each other in space belong to the same tiles. In Morton order (Morton 1966: the interleaved bits of the
+three coordinates) they are near each other in memory too.
 """
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from torch import Tensor
 BITS = 20
 """Bits of a code for each axis."""
 BLOCK = 128
-"""Points to a block in the search for neighbours."""
+"""Points of a block in the search for neighbours."""
 
 
 def morton_codes(points: Tensor) -> Tensor:
-    """(n,) int64 codes of (n, 3) finite points, relative to their bounding box."""
+    """Return (n,) int64 codes of (n, 3) finite points, relative to their bounding box."""
     if len(points) == 0:
         return torch.zeros(0, dtype=torch.int64, device=points.device)
     low, high = points.aminmax(dim=0)
@@ -32,16 +32,16 @@ def morton_codes(points: Tensor) -> Tensor:
 
 
 def morton_order(points: Tensor) -> Tensor:
-    """(n,) row numbers that put (n, 3) points in Morton order; stable, so that it does not change twice."""
+    """Return (n,) row numbers that put (n, 3) points in Morton order; stable, so a second application changes
+    nothing."""
     return torch.argsort(morton_codes(points.detach()), stable=True)
 
 
 def nearest_distances(points: Tensor, neighbours: int = 3) -> Tensor:
-    """(n, k) distances from each of (n, 3) points to its k nearest others, ascending; exact.
+    """Return (n, k) distances from each of (n, 3) points to its k nearest others, ascending; exact.
 
-    k is `neighbours`, or n - 1 where there are fewer points. Blocks of points along the Morton curve are
-    compact: a block is compared with those alone whose bounding box is nearer than the k-th neighbour
-    found so far.
+    k is `neighbours`, or n - 1 for fewer points. Blocks of points along the Morton curve are compact: a block is
+    compared only with blocks whose bounding box is nearer than an upper bound on the distance of the k-th neighbour.
     """
     points = points.detach()
     k = min(neighbours, len(points) - 1)
@@ -53,11 +53,11 @@ def nearest_distances(points: Tensor, neighbours: int = 3) -> Tensor:
     blocks = [points[order[start : start + BLOCK]] for start in starts]
     lows = torch.stack([block.amin(0) for block in blocks])
     highs = torch.stack([block.amax(0) for block in blocks])
-    reach = BLOCK + 2 * k
-    for number, (start, block) in enumerate(zip(starts, blocks, strict=True)):
-        around = points[order[max(0, start - reach) : start + reach]]  # at least k + 1 points
+    half_width = BLOCK + 2 * k
+    for block_number, (start, block) in enumerate(zip(starts, blocks, strict=True)):
+        around = points[order[max(0, start - half_width) : start + half_width]]  # at least k + 1 points
         bound = _kth(block, around, k)[:, -1].amax()
-        gaps = (lows - highs[number]).clamp(min=0) + (lows[number] - highs).clamp(min=0)
+        gaps = (lows - highs[block_number]).clamp(min=0) + (lows[block_number] - highs).clamp(min=0)
         near = torch.nonzero(torch.linalg.vector_norm(gaps, dim=-1) <= bound)[:, 0].tolist()
         found = _kth(block, torch.cat([blocks[other] for other in near]), k)
         result[order[start : start + BLOCK]] = found
@@ -65,6 +65,6 @@ def nearest_distances(points: Tensor, neighbours: int = 3) -> Tensor:
 
 
 def _kth(queries: Tensor, points: Tensor, k: int) -> Tensor:
-    """(q, k) distances to the nearest points, the query itself left out: it is among them, at distance 0."""
+    """Return (q, k) distances to the nearest points, without the query itself, which is among them at distance 0."""
     distances = torch.cdist(queries, points, compute_mode="donot_use_mm_for_euclid_dist")
     return distances.topk(min(k + 1, len(points)), largest=False).values[:, 1:]

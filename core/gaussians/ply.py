@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Scenes as PLY files, in the layout of the 3DGS authors, which viewers and editors read.
+"""Reads and writes scenes as PLY files, in the layout of the 3DGS authors, which viewers and editors read.
 
 One binary element `vertex` of float32: x y z, nx ny nz (unused), f_dc_0..2 (degree 0, by channel),
 f_rest_0..44 (the 15 others, all of one channel before the next), opacity (logit), scale_0..2 (log),
-rot_0..3 (w x y z). Fewer f_rest (0, 9, 24) mean a lower degree. Compressed forms are read too: see
-`compressed`.
+rot_0..3 (w x y z). Fewer f_rest (0, 9, 24) mean a lower degree. `compressed` reads compressed files.
 """
 from __future__ import annotations
 
@@ -18,20 +17,20 @@ import torch
 from numpy.typing import NDArray
 
 from .. import ply
-from ..conventions.pixel_grid import Sampling
+from ..conventions.pixel_grid import PixelGrid
 from ..errors import FlareFileError
 from ..system.files import atomic_path
 from .compressed import is_compressed, read_compressed
 from .rendering import NEAR
 from .scene import COEFFICIENTS, SceneGaussians
 
-HEADER_MAX = 1 << 16
-NEAR_WORD, WHITE_WORD, FOCAL_WORD = "near", "white", "focal_lengths"
-"""Comments of ours: the scene's `near` and `display_white`, where they are not the usual ones, each a number, and the
-two of its `sampling`, where that is known."""
-WHITE_MOST = 107.0
-"""Display value, somewhat above that of the brightest half float."""
-ORDERS = {form: order for form, order in ply.ORDERS.items() if form != "ascii"}
+MAX_HEADER_BYTES = 1 << 16
+NEAR_COMMENT, WHITE_COMMENT, FOCAL_COMMENT = "near", "white", "focal_lengths"
+"""Header comments of this package: the scene's `near` and `display_white`, a number each, unless they have their
+defaults, and the two focal lengths of its `pixel_grid`, if it has one."""
+MAX_WHITE = 107.0
+"""Largest display white in a file: somewhat above the display value of the largest half float."""
+ORDERS = {form: order for form, order in ply.BYTE_ORDERS.items() if form != "ascii"}
 POSITION = ("x", "y", "z")
 NORMAL = ("nx", "ny", "nz")
 DC = tuple(f"f_dc_{i}" for i in range(3))
@@ -39,19 +38,19 @@ SCALE = tuple(f"scale_{i}" for i in range(3))
 ROTATION = tuple(f"rot_{i}" for i in range(4))
 
 
-def _rest(number: int) -> tuple[str, ...]:
+def _rest_names(number: int) -> tuple[str, ...]:
     return tuple(f"f_rest_{i}" for i in range(number))
 
 
 def write_ply(path: Path | str, scene: SceneGaussians, *, extra: Mapping[str, NDArray[np.float32]] | None = None,
               comments: Sequence[str] = ()) -> None:
-    """Writes a scene; every parameter comes back bit by bit.
+    """Write a scene; `read_ply` restores every parameter exactly.
 
-    extra: further properties by name, (n,) each, which readers that do not know them leave alone. comments:
-    lines of ASCII for the header.
+    extra: further properties by name, (n,) each, which other readers ignore. comments: lines of ASCII for the header.
     """
     extra = extra or {}
-    names = POSITION + NORMAL + DC + _rest(3 * (COEFFICIENTS - 1)) + ("opacity",) + SCALE + ROTATION + tuple(extra)
+    rest_names = _rest_names(3 * (COEFFICIENTS - 1))
+    names = POSITION + NORMAL + DC + rest_names + ("opacity",) + SCALE + ROTATION + tuple(extra)
     n = len(scene)
     means, log_scales, quaternions, opacities, sh = (
         parameter.detach().cpu().numpy().astype("<f4")
@@ -64,10 +63,11 @@ def write_ply(path: Path | str, scene: SceneGaussians, *, extra: Mapping[str, ND
         [means, np.zeros((n, 3), "<f4"), sh[:, 0], rest, opacities[:, None], log_scales, quaternions,
          *(np.asarray(column, "<f4")[:, None] for column in extra.values())], 1
     )
-    own = ((NEAR_WORD, scene.near, NEAR), (WHITE_WORD, scene.display_white, 1.0))
-    comments = [*comments, *(f"{word} {number:.9g}" for word, number, usual in own if number != usual)]
-    if scene.sampling is not None:
-        comments.append(f"{FOCAL_WORD} {scene.sampling.least:.9g} {scene.sampling.most:.9g}")
+    scene_comments = ((NEAR_COMMENT, scene.near, NEAR), (WHITE_COMMENT, scene.display_white, 1.0))
+    comments = [*comments, *(f"{word} {number:.9g}" for word, number, usual in scene_comments if number != usual)]
+    if scene.pixel_grid is not None:
+        grid = scene.pixel_grid
+        comments.append(f"{FOCAL_COMMENT} {grid.min_focal_length:.9g} {grid.max_focal_length:.9g}")
     lines = ["ply", "format binary_little_endian 1.0", *(f"comment {line}" for line in comments),
              f"element vertex {n}"]
     lines += [f"property float {name}" for name in names] + ["end_header"]
@@ -77,7 +77,7 @@ def write_ply(path: Path | str, scene: SceneGaussians, *, extra: Mapping[str, ND
 
 
 def read_ply(path: Path | str) -> SceneGaussians:
-    """Reads a scene; any order of properties, and others besides, are taken in.
+    """Read a scene; properties may have any order, and unknown ones are ignored.
 
     Raises FlareFileError for a file that is no PLY of Gaussians, is cut short, or holds NaN or infinity.
     """
@@ -86,7 +86,7 @@ def read_ply(path: Path | str) -> SceneGaussians:
         if is_compressed(path):
             return read_compressed(path)
         with open(path, "rb") as file:
-            header = _header(path, file.read(HEADER_MAX))
+            header = _header(path, file.read(MAX_HEADER_BYTES))
             n, row = header.vertices, header.row
             if path.stat().st_size - header.start < n * row.itemsize:
                 raise FlareFileError(f"{path} is cut short: it announces {n} Gaussians; copy it again.")
@@ -96,7 +96,7 @@ def read_ply(path: Path | str) -> SceneGaussians:
         raise FlareFileError(f"{path} cannot be read: {problem.strerror or problem}.") from problem
 
     present = set(row.names or ())
-    rest_names = _rest(sum(name.startswith("f_rest_") for name in present))
+    rest_names = _rest_names(sum(name.startswith("f_rest_") for name in present))
     if len(rest_names) not in (0, 9, 24, 45):
         raise FlareFileError(
             f"{path} has {len(rest_names)} f_rest properties, where Gaussians have 0, 9, 24 or 45; export it again."
@@ -120,28 +120,28 @@ def read_ply(path: Path | str) -> SceneGaussians:
     scene = SceneGaussians(
         columns(POSITION), columns(SCALE), columns(ROTATION), columns(("opacity",))[:, 0].clone(), sh
     )
-    scene.near, scene.display_white, scene.sampling = header.near, header.display_white, header.sampling
+    scene.near, scene.display_white, scene.pixel_grid = header.near, header.display_white, header.pixel_grid
     return scene
 
 
 class _Header(NamedTuple):
-    """Number of vertices, what a row of them is, where the rows start, and what our comments say."""
+    """Number of vertices, type and offset of their rows, and the values of this package's comments."""
 
     vertices: int
     row: np.dtype[Any]
     start: int
     near: float
     display_white: float
-    sampling: Sampling | None
+    pixel_grid: PixelGrid | None
 
 
 def _header(path: Path, head: bytes) -> _Header:
-    told = ply.read_header(head)
-    if told is None:
+    parsed = ply.read_header(head)
+    if parsed is None:
         raise FlareFileError(f"{path} is not a PLY file; name one of a scene of Gaussians.")
-    if told.form and told.form not in ORDERS:
-        raise FlareFileError(f"{path} is a PLY file in the format {told.form}; export it as binary.")
-    vertices = told.elements[0] if told.elements else ply.Element("vertex", 0, [])
+    if parsed.format and parsed.format not in ORDERS:
+        raise FlareFileError(f"{path} is a PLY file in the format {parsed.format}; export it as binary.")
+    vertices = parsed.elements[0] if parsed.elements else ply.Element("vertex", 0, [])
     if vertices.name != "vertex" or vertices.rows < 0:
         raise FlareFileError(f"{path} does not begin with its vertices; export it again.")
     try:
@@ -149,16 +149,16 @@ def _header(path: Path, head: bytes) -> _Header:
     except ValueError as problem:
         raise FlareFileError(f"{path} has the property {problem}, not a plain number; export it without "
                              "that.") from problem
-    if not told.form or not names or len(set(names)) < len(names):
+    if not parsed.format or not names or len(set(names)) < len(names):
         raise FlareFileError(f"{path} is not a PLY file of Gaussians; export the scene as one.")
-    near, display_white, sampling = NEAR, 1.0, None
-    for words in told.comments:
+    near, display_white, pixel_grid = NEAR, 1.0, None
+    for words in parsed.comments:
         with contextlib.suppress(ValueError):
             match words:
-                case [word, number] if word == NEAR_WORD:
+                case [word, number] if word == NEAR_COMMENT:
                     near = float(number) if 0 < float(number) < NEAR else NEAR
-                case [word, number] if word == WHITE_WORD:
-                    display_white = float(number) if 1 < float(number) < WHITE_MOST else 1.0
-                case [word, least, most] if word == FOCAL_WORD:
-                    sampling = Sampling(float(least), float(most))
-    return _Header(vertices.rows, vertices.row(ORDERS[told.form]), told.start, near, display_white, sampling)
+                case [word, number] if word == WHITE_COMMENT:
+                    display_white = float(number) if 1 < float(number) < MAX_WHITE else 1.0
+                case [word, least, most] if word == FOCAL_COMMENT:
+                    pixel_grid = PixelGrid(float(least), float(most))
+    return _Header(vertices.rows, vertices.row(ORDERS[parsed.format]), parsed.start, near, display_white, pixel_grid)

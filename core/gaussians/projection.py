@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""From 3D Gaussians to 2D: elliptical weighted averaging (Zwicker et al. 2001; Kerbl et al. 2023, eq. 5, 6).
+"""Projects 3D Gaussians to 2D by EWA splatting (Zwicker et al. 2001; Kerbl et al. 2023, eq. 5, 6).
 
-A Gaussian of rotation R and scales S has the covariance R S S^T R^T. Seen by a camera with rotation W, and
-with the perspective map linearised at the mean (J), its picture has the covariance T T^T with T = J W R S,
-a 2 x 3 matrix. `dilation` on the diagonal stands for the pixel's own width.
+A Gaussian of rotation R and scales S has the covariance R S S^T R^T. In the picture of a camera with rotation W, with
+the perspective map linearised at the mean (J), its covariance is T T^T with T = J W R S, a 2 x 3 matrix. `dilation` on
+the diagonal is the low-pass filter of the pixel.
 """
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ import torch
 from torch import Tensor
 
 QUATERNION_MIN = 1e-8
-"""Norms below this count as this: a zero quaternion becomes no rotation, not NaN."""
+"""Smallest norm that quaternions are divided by, so that a zero quaternion does not give NaN."""
 FRUSTUM_MARGIN = 0.3
-"""J is taken at most this share of tan(half field of view) outside of the frame: further out the linear
-map bears no likeness to the perspective one."""
+"""Distance outside the frame at which J is clamped, relative to tan(half field of view): further out the linear map
+does not approximate the perspective one."""
 
 
 class Projected(NamedTuple):
@@ -30,7 +30,7 @@ class Projected(NamedTuple):
 
 
 def rotation_matrices(quaternions: Tensor) -> Tensor:
-    """(n, 3, 3) rotations of (n, 4) quaternions w, x, y, z of any length."""
+    """Return (n, 3, 3) rotations of (n, 4) quaternions w, x, y, z of any length."""
     w, x, y, z = (
         quaternions / torch.linalg.vector_norm(quaternions, dim=-1, keepdim=True).clamp(min=QUATERNION_MIN)
     ).unbind(-1)
@@ -45,12 +45,12 @@ def rotation_matrices(quaternions: Tensor) -> Tensor:
 
 
 def camera_position(world_to_camera: Tensor) -> Tensor:
-    """(3,) world coordinates of the camera: -R^T t."""
+    """Return (3,) world coordinates of the camera: -R^T t."""
     return -world_to_camera[:3, :3].T @ world_to_camera[:3, 3]
 
 
 def frustum_limits(intrinsics: Tensor, width: int, height: int) -> tuple[Tensor, Tensor]:
-    """Lower and upper bounds (2,) of (x/z, y/z) inside which J is taken; constants, not differentiated."""
+    """Return lower and upper bounds (2,) to which (x/z, y/z) are clamped for J; not differentiated."""
     focal, principal = intrinsics.detach().diagonal()[:2], intrinsics.detach()[:2, 2]
     size = torch.tensor([width, height], dtype=focal.dtype, device=focal.device)
     margin = FRUSTUM_MARGIN * size / (2 * focal)
@@ -61,7 +61,7 @@ def project(
     means: Tensor, quats: Tensor, scales: Tensor, world_to_camera: Tensor, intrinsics: Tensor,
     width: int, height: int, near: float, dilation: float,
 ) -> Projected:  # fmt: skip
-    """Projects (n, 3) means, (n, 4) quaternions, (n, 3) scales; differentiable by all of them and by the
+    """Project (n, 3) means, (n, 4) quaternions, (n, 3) scales; differentiable by all of them and by the
     camera's (4, 4) world_to_camera and (3, 3) intrinsics (no skew)."""
     rotation, translation = world_to_camera[:3, :3], world_to_camera[:3, 3]
     positions = means @ rotation.T + translation
@@ -88,20 +88,20 @@ def project(
 
 
 def determinants(covariances: Tensor) -> Tensor:
-    """(n,) determinants of (n, 3) covariances xx, xy, yy."""
+    """Return (n,) determinants of (n, 3) covariances xx, xy, yy."""
     xx, xy, yy = covariances.unbind(-1)
     return xx * yy - xy * xy
 
 
 def half_sizes(covariances: Tensor, radii: Tensor) -> Tensor:
-    """Half width and height (n, 2) px of the box around the ellipse at these Mahalanobis radii (n,)."""
+    """Return half width and height (n, 2), px, of the bounding boxes of ellipses at Mahalanobis radii (n,)."""
     return radii[:, None] * covariances[:, ::2].clamp(min=0).sqrt()
 
 
 def visible_radii(
     centres: Tensor, covariances: Tensor, radii: Tensor, width: int, height: int
 ) -> Tensor:
-    """(n,) 3 sigma of the longer axis, px; 0 where the box at Mahalanobis radius `radii` misses the frame."""
+    """Return (n,) 3 sigma of the longer axis, px; 0 where the box at Mahalanobis radius `radii` misses the frame."""
     half = half_sizes(covariances, radii)
     frame = torch.tensor([width, height], dtype=centres.dtype, device=centres.device)
     inside = ((centres + half > 0) & (centres - half < frame)).all(-1) & (radii > 0)

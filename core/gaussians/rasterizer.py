@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The door: 3D Gaussians seen by a camera, and 2D Gaussians laid on a picture."""
+"""The public functions: `rasterization` of 3D Gaussians seen by a camera, and `splat` of 2D Gaussians on a picture.
+
+Both check their arguments and pass them to a kernel set (`kernels.py`).
+"""
 from __future__ import annotations
 
 from typing import Literal
@@ -9,9 +12,9 @@ from torch import Tensor
 from ..choices import Blend, Kernels
 from ..conventions.pixel_grid import DILATION
 from ..errors import SettingsError
-from .kernels import choose
+from .kernels import select_kernels
 from .mixed import splat_mixed
-from .rendering import NEAR, Rendering, Splats, levelled
+from .rendering import NEAR, Rendering, Splats, normalise_arcs
 from .spherical_harmonics import degree_of
 
 Resolution = Literal["full", "mixed"]
@@ -46,21 +49,21 @@ def rasterization(
     EngineError for kernels that are not installed.
     """
     n = _count(means, 3, "means")
-    _expect(quats, (n, 4), "quats")
-    _expect(scales, (n, 3), "scales")
-    _expect(opacities, (n,), "opacities")
-    _expect(sh, (n, sh.shape[1] if sh.ndim == 3 else 1, 3), "sh")
-    _expect(world_to_camera, (4, 4), "world_to_camera")
-    _expect(intrinsics, (3, 3), "intrinsics")
+    _check_shape(quats, (n, 4), "quats")
+    _check_shape(scales, (n, 3), "scales")
+    _check_shape(opacities, (n,), "opacities")
+    _check_shape(sh, (n, sh.shape[1] if sh.ndim == 3 else 1, 3), "sh")
+    _check_shape(world_to_camera, (4, 4), "world_to_camera")
+    _check_shape(intrinsics, (3, 3), "intrinsics")
     if background is not None:
-        _expect(background, (3,), "background")
+        _check_shape(background, (3,), "background")
     _check_size(width, height)
     degree = degree_of(sh.shape[1])
     if sh_degree is not None:
         if not 0 <= sh_degree <= degree:
             raise SettingsError(f"sh_degree is {sh_degree}, but sh holds degrees 0 to {degree}.")
         degree = sh_degree
-    return choose(kernels, means).rasterize_scene(
+    return select_kernels(kernels, means).rasterize_scene(
         means, quats, scales, opacities, sh, world_to_camera, intrinsics, width, height,
         background=background, sh_degree=degree, near=near, dilation=dilation, depth=depth, raw=raw,
     )  # fmt: skip
@@ -89,21 +92,21 @@ def splat(
     EngineError for kernels that are not installed.
     """
     n = _count(centres, 2, "centres")
-    _expect(covariances, (n, 3), "covariances")
-    _expect(opacities, (n,), "opacities")
-    _expect(colours, (n, 3), "colours")
+    _check_shape(covariances, (n, 3), "covariances")
+    _check_shape(opacities, (n,), "opacities")
+    _check_shape(colours, (n, 3), "colours")
     if rings is not None:
-        _expect(rings, (n, 2), "rings")
+        _check_shape(rings, (n, 2), "rings")
     if arcs is not None:
-        _expect(arcs, (n, 2), "arcs")
+        _check_shape(arcs, (n, 2), "arcs")
     _check_size(width, height)
     if blend not in ("over", "add"):
         raise SettingsError(f"Flares are not laid on a picture by the blend {blend!r}; choose over or add.")
     if resolution not in ("full", "mixed"):
         raise SettingsError(f"Flares are not laid on a picture at the resolution {resolution!r}; choose full or mixed.")
     if arcs is not None:
-        arcs = levelled(arcs, covariances, rings)
-    chosen = choose(kernels, centres)
+        arcs = normalise_arcs(arcs, covariances, rings)
+    chosen = select_kernels(kernels, centres)
     if resolution == "mixed":
         return splat_mixed(
             chosen, centres, covariances, opacities, colours, width, height,
@@ -120,7 +123,7 @@ def _count(tensor: Tensor, width: int, name: str) -> int:
     return tensor.shape[0]
 
 
-def _expect(tensor: Tensor, shape: tuple[int, ...], name: str) -> None:
+def _check_shape(tensor: Tensor, shape: tuple[int, ...], name: str) -> None:
     if tensor.shape != shape:
         raise SettingsError(f"{name} has the shape {tuple(tensor.shape)}, but must be {shape}.")
 

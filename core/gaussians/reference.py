@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The definition of the picture, in plain torch: every Gaussian at every pixel, differentiated by autograd.
+"""The definition of the picture, in plain torch: evaluates every Gaussian at every pixel, differentiated by autograd.
 
-Any device, float32 or float64; slow. All other kernel sets are measured against this one.
+Any device, float32 or float64; slow. Tests compare all other kernel sets with this one.
 
 At a pixel centre (x + 1/2, y + 1/2), with d its offset from a Gaussian's centre:
 
@@ -9,7 +9,7 @@ At a pixel centre (x + 1/2, y + 1/2), with d its offset from a Gaussian's centre
     G = exp(-q / 2)                                               the plain profile, or
     G = exp(-(sqrt(q) - r0)² / (2 w²))                            a ring (ours: r0 = 0, w = 1 is plain)
     G = G * exp(b·d - m)                                          an arc of either: brighter towards b, px^-1, where
-    m = beta r0 + beta² w² / 2,  beta² = b^T covariance b         makes its peak 1 (see `levelled` of `rendering.py`)
+    m = beta r0 + beta² w² / 2,  beta² = b^T covariance b         sets its peak to 1 (see `rendering.normalise_arcs`)
 
     over:  alpha_i = min(opacity_i, 0.99) G_i, or 0 if that is below 1/255
            T_i = prod_{j before i} (1 - alpha_j)
@@ -33,20 +33,20 @@ from .rendering import (
     TRANSMITTANCE_MIN,
     Rendering,
     Splats,
-    activated,
+    activate,
     extent,
     record_gradient,
 )
 from .spherical_harmonics import colours as colours_of
 
 RADIUS_MIN = 1e-6
-"""Distances are not told apart below this, where the direction of their gradient has no meaning."""
+"""Smallest Mahalanobis distance of rings; below it the gradient has no direction."""
 CHUNK = 1 << 18
-"""Pairs of Gaussian and pixel at a time; what bounds the memory, and small enough for the cache."""
+"""Pairs of Gaussian and pixel that are evaluated at a time; bounds the memory, and fits the cache."""
 
 
 def pixel_centres(width: int, height: int, like: Tensor) -> Tensor:
-    """(height * width, 2) coordinates x, y of the pixel centres, row by row."""
+    """Return (height * width, 2) coordinates x, y of the pixel centres, row by row."""
     x, y = (torch.arange(size, dtype=like.dtype, device=like.device) + 0.5 for size in (width, height))
     return torch.cartesian_prod(y, x).flip(-1)
 
@@ -54,7 +54,7 @@ def pixel_centres(width: int, height: int, like: Tensor) -> Tensor:
 def profiles(
     pixels: Tensor, centres: Tensor, covariances: Tensor, rings: Tensor | None, arcs: Tensor | None
 ) -> Tensor:
-    """G of n Gaussians at p pixels: (n, p), 0..1. arcs: (n, 3) b and m."""
+    """Return G of n Gaussians at p pixels: (n, p), 0..1. arcs: (n, 3) b and m."""
     dx, dy = (pixels[None] - centres[:, None]).unbind(-1)
     xx, xy, yy = covariances[:, :, None].unbind(1)
     q = (yy * dx * dx - 2 * xy * dx * dy + xx * dy * dy) / determinants(covariances)[:, None]
@@ -69,26 +69,26 @@ def profiles(
     return log_g.exp()
 
 
-def over(g: Tensor, opacities: Tensor) -> tuple[Tensor, Tensor]:
-    """Alphas and the transmittances before them, both (n, p), from profiles (n, p), front to back."""
+def alphas_over(g: Tensor, opacities: Tensor) -> tuple[Tensor, Tensor]:
+    """Return alphas and the transmittances in front of them, both (n, p), from profiles (n, p), front to back."""
     alpha = opacities.clamp(max=OPACITY_MAX)[:, None] * g
     alpha = torch.where(alpha >= ALPHA_MIN, alpha, 0)
     return alpha, torch.cat([torch.ones_like(alpha[:1]), torch.cumprod(1 - alpha, 0)[:-1]])
 
 
 def weights_over(g: Tensor, opacities: Tensor) -> Tensor:
-    """Shares (n, p) of the Gaussians in the colour of the pixels."""
-    alpha, transmittance = over(g, opacities)
+    """Return weights (n, p) of the Gaussians in the colours of the pixels, for the blend "over"."""
+    alpha, transmittance = alphas_over(g, opacities)
     return torch.where(transmittance >= TRANSMITTANCE_MIN, alpha * transmittance, 0)
 
 
 def weights_add(g: Tensor, opacities: Tensor) -> Tensor:
-    """The same where light adds."""
+    """Return weights (n, p) of the Gaussians in the colours of the pixels, for the blend "add"."""
     return opacities[:, None] * torch.where(g >= PROFILE_MIN, g, 0)
 
 
-def _in_chunks(pixels: Tensor, count: int, shade: Callable[[Tensor], Tensor]) -> Tensor:
-    """shade(pixels) in parts of bounded size, whose intermediates are computed anew in backward."""
+def _map_chunks(pixels: Tensor, count: int, shade: Callable[[Tensor], Tensor]) -> Tensor:
+    """Return shade(pixels), computed in chunks of bounded size, whose intermediates are recomputed in backward."""
     parts = pixels.split(max(1, CHUNK // max(count, 1)))
     if len(parts) == 1 or not torch.is_grad_enabled():
         return torch.cat([shade(part) for part in parts])
@@ -100,8 +100,8 @@ def rasterize_scene(
     world_to_camera: Tensor, intrinsics: Tensor, width: int, height: int,
     *, background: Tensor | None, sh_degree: int, near: float, dilation: float, depth: bool, raw: bool,
 ) -> Rendering:  # fmt: skip
-    """See `rasterization`."""
-    scales, opacities = activated(scales, opacities, raw)
+    """Render as `rasterization` of the package does."""
+    scales, opacities = activate(scales, opacities, raw)
     seen = project(means, quats, scales, world_to_camera, intrinsics, width, height, near, dilation)
     order = torch.argsort(seen.depths, stable=True)
     index, centres, covariances, depths = (part[order] for part in seen)
@@ -116,19 +116,21 @@ def rasterize_scene(
         return torch.cat([weights.T @ values, weights.sum(0)[:, None]], -1)
 
     def median(pixels: Tensor) -> Tensor:
-        alpha, before = over(profiles(pixels, centres, covariances, None, None), opacities)
+        alpha, before = alphas_over(profiles(pixels, centres, covariances, None, None), opacities)
         passed = (before * (1 - alpha) >= 0.5).sum(0)
         return torch.cat([depths, depths.new_zeros(1)])[passed]
 
     pixels = pixel_centres(width, height, means)
     with torch.no_grad():
-        median_depth = _in_chunks(pixels, len(index), median).reshape(height, width) if depth else means.new_empty(0, 0)
+        median_depth = (
+            _map_chunks(pixels, len(index), median).reshape(height, width) if depth else means.new_empty(0, 0)
+        )
         all_centres = torch.zeros_like(means[:, :2]).index_copy_(0, index, centres)
         reach = extent(opacities.clamp(max=OPACITY_MAX))
         radii = torch.zeros_like(means[:, 0]).index_copy_(
             0, index, visible_radii(centres, covariances, reach, width, height)
         )
-    picture = _in_chunks(pixels, len(index), shade).reshape(height, width, 5)
+    picture = _map_chunks(pixels, len(index), shade).reshape(height, width, 5)
     alpha = picture[..., 4]
     colour = picture[..., :3]
     if background is not None:
@@ -141,7 +143,7 @@ def splat(
     centres: Tensor, covariances: Tensor, opacities: Tensor, colours: Tensor, width: int, height: int,
     *, rings: Tensor | None, arcs: Tensor | None, blend: Blend,
 ) -> Splats:  # fmt: skip
-    """See `splat` of the package; full resolution."""
+    """Rasterize as `splat` of the package does at full resolution."""
     index = torch.nonzero(determinants(covariances) > 0)[:, 0]  # a degenerate ellipse covers nothing
     centres, covariances, opacities, colours = (
         part[index] for part in (centres, covariances, opacities, colours)
@@ -153,6 +155,6 @@ def splat(
         weights = weigh(profiles(pixels, centres, covariances, rings, arcs), opacities)
         return torch.cat([weights.T @ colours, weights.sum(0)[:, None]], -1)
 
-    picture = _in_chunks(pixel_centres(width, height, centres), len(index), shade).reshape(height, width, 4)
+    picture = _map_chunks(pixel_centres(width, height, centres), len(index), shade).reshape(height, width, 4)
     colour, alpha = picture[..., :3], picture[..., 3]
     return Splats(colour, 1 - alpha if blend == "over" else torch.ones_like(alpha))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What a rasterizer returns, and the numbers that every kernel set agrees on."""
+"""Results of a rasterizer, and the thresholds and formulas that all kernel sets share."""
 from __future__ import annotations
 
 import math
@@ -14,26 +14,26 @@ from ..conventions.splatting import OPACITY_MAX as OPACITY_MAX
 from ..conventions.splatting import PROFILE_MIN as PROFILE_MIN
 
 TRANSMITTANCE_MIN = 1e-4
-"""A pixel is finished once its transmittance has fallen below this: later Gaussians do not count."""
+"""Transmittance below which a pixel is finished: Gaussians behind are skipped."""
 STRENGTH2_MIN = 1e-16
-"""Arcs whose squared strength is below this have no direction, nor a gradient by it."""
+"""Squared strength of an arc below which it has no direction and no gradient by it."""
 NEAR = 0.2
-"""Gaussians at this camera depth or nearer are culled."""
+"""Camera depth up to which Gaussians are culled, world units."""
 
 
 @dataclass(frozen=True)
 class Rendering:
-    """A scene seen by one camera. h, w: the picture; n: the Gaussians, in the caller's order.
+    """A scene seen by one camera. h, w: size of the picture; n: number of Gaussians, in the caller's order.
 
     colour            (h, w, 3)  background included; in the units of the colours
     alpha             (h, w)     0..1, one minus the transmittance left behind all Gaussians
     depth             (h, w)     mean camera depth, weighted by contribution; 0 where alpha is 0
-    median_depth      (h, w)     depth of the Gaussian at which transmittance falls below 1/2, 0 where
-                                 none does; not differentiable. Both (0, 0) if not asked for
-    centres           (n, 2)     projected centres, px; 0 for those culled; detached
-    radii             (n,)       3 sigma of the longer axis, px; 0 for those that touch no pixel; detached
+    median_depth      (h, w)     depth of the Gaussian at which transmittance falls below 1/2, 0 if none
+                                 does; not differentiable. Both depths are (0, 0) with depth=False
+    centres           (n, 2)     projected centres, px; 0 for culled Gaussians; detached
+    radii             (n,)       3 sigma of the longer axis, px; 0 for Gaussians that touch no pixel; detached
     centre_gradients  (n, 2)     zero until backward, which adds the gradient of the loss by the centres,
-                                 px^-1 (the statistic that densification goes by)
+                                 px^-1 (the statistic of densification)
     """
 
     colour: Tensor
@@ -47,22 +47,22 @@ class Rendering:
 
 @dataclass(frozen=True)
 class Splats:
-    """2D Gaussians on a picture: colour (h, w, 3) and the transmittance (h, w) they leave to what lies
-    behind (ones where light is added), so that the whole picture is colour + transmittance * behind."""
+    """Rasterized 2D Gaussians: colour (h, w, 3) and transmittance (h, w), which is one for the blend "add". The
+    composite over a background is colour + transmittance * background."""
 
     colour: Tensor
     transmittance: Tensor
 
 
-def activated(scales: Tensor, opacities: Tensor, raw: bool) -> tuple[Tensor, Tensor]:
-    """Standard deviations (n, 3) and opacities (n,) from what `rasterization` was given: if raw, logs and logits."""
+def activate(scales: Tensor, opacities: Tensor, raw: bool) -> tuple[Tensor, Tensor]:
+    """Return standard deviations (n, 3) and opacities (n,); raw: the arguments are logarithms and logits."""
     return (scales.exp(), opacities.sigmoid()) if raw else (scales, opacities)
 
 
 def arc_strengths(covariances: Tensor, arcs: Tensor) -> Tensor:
-    """(n,) beta = sqrt(b^T covariance b) of arcs (n, 2 or more) that begin with b, px^-1; at least sqrt(STRENGTH2_MIN).
+    """Return (n,) beta = sqrt(b^T covariance b), at least sqrt(STRENGTH2_MIN); arcs (n, 2 or more): b first, px^-1.
 
-    In double precision where there is any: on needles the terms of the sum cancel.
+    In double precision if the device has it, since the terms cancel for needles.
     """
     wide = torch.float32 if arcs.device.type == "mps" else torch.float64
     xx, xy, yy = covariances.to(wide).unbind(-1)
@@ -70,14 +70,16 @@ def arc_strengths(covariances: Tensor, arcs: Tensor) -> Tensor:
     return (xx * x * x + 2 * xy * x * y + yy * y * y).clamp(min=STRENGTH2_MIN).sqrt()
 
 
-def levelled(arcs: Tensor, covariances: Tensor, rings: Tensor | None) -> Tensor:
-    """(n, 3) b and m from b (n, 2), px^-1: kernels take m = beta r0 + beta² w² / 2 off b·d, so that profiles peak at 1.
+def normalise_arcs(arcs: Tensor, covariances: Tensor, rings: Tensor | None) -> Tensor:
+    """Return (n, 3) b and m from b (n, 2), px^-1; kernels subtract m = beta r0 + beta² w² / 2 from b·d, so that
+    profiles have a peak of 1.
 
-    In every direction the profile is highest somewhere on a ray, with c the cosine from that of the peak:
+    Along a ray at an angle of cosine c to the direction of the peak, the logarithm of the profile is
 
         -(r - r0)² / (2 w²) + beta r c - m  =  -(r - r0 - w² beta)² / (2 w²) - beta r (1 - c)
 
-    So it is nowhere above a ring of radius r0 + w² beta and width w, which `extent` goes by, and meets it at c = 1.
+    so the profile is nowhere above a ring of radius r0 + w² beta and width w, which `extent` uses, and equals it at
+    c = 1.
     """
     beta = arc_strengths(covariances, arcs)
     r0, w = (0.0, 1.0) if rings is None else rings.to(beta.dtype).unbind(-1)
@@ -87,10 +89,10 @@ def levelled(arcs: Tensor, covariances: Tensor, rings: Tensor | None) -> Tensor:
 def extent(
     peaks: Tensor, blend: Blend = "over", rings: Tensor | None = None, strengths: Tensor | None = None
 ) -> Tensor:
-    """(n,) Mahalanobis radius beyond which a Gaussian, or a ring (n, 2), or an arc of this strength (n,) of either, is
-    skipped; 0 if all of it is.
+    """Return (n,) the Mahalanobis radius beyond which a Gaussian is not drawn; 0 if it is not drawn at all.
 
-    peaks: (n,) opacities, already clamped. Solves peak * exp(-r²/2) = threshold for r; arcs: see `levelled`.
+    peaks: (n,) clamped opacities; rings: (n, 2); strengths: (n,) of arcs. Solves peak * exp(-r²/2) = threshold for r;
+    for arcs see `normalise_arcs`.
     """
     if blend == "add":
         reach = torch.full_like(peaks, math.sqrt(-2 * math.log(PROFILE_MIN)))
@@ -105,7 +107,7 @@ def extent(
 
 
 def record_gradient(centres: Tensor, index: Tensor, n: int) -> Tensor:
-    """(n, 2) zeros, to which backward will add the gradient by the centres (m, 2) of the Gaussians `index`."""
+    """Return (n, 2) zeros, to which backward adds the gradients by the centres (m, 2) of the Gaussians `index`."""
     gradients = torch.zeros(n, 2, dtype=torch.float32, device=centres.device)
 
     def record(gradient: Tensor) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The scene as 3D Gaussians: what is optimised, in the form in which nothing needs to be constrained."""
+"""The scene as 3D Gaussians, with the unconstrained parameters that a fit optimises."""
 from __future__ import annotations
 
 import numpy as np
@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from ..capture import Camera, PointCloud
 from ..choices import Kernels
-from ..conventions.pixel_grid import Sampling, dilation
+from ..conventions.pixel_grid import PixelGrid, dilation
 from ..errors import SettingsError
 from . import spherical_harmonics
 from .ordering import nearest_distances
@@ -17,14 +17,14 @@ from .rendering import NEAR, Rendering
 
 COEFFICIENTS = (spherical_harmonics.MAX_DEGREE + 1) ** 2
 INITIAL_OPACITY = 0.1
-DISTANCE_MIN = 1e-7 ** 0.5
-"""The least size of a Gaussian that a point makes (3DGS), where that is small against the others."""
-SMALL = 0.1
-"""Of the median size: the least one in worlds whose unit is so large that DISTANCE_MIN is not small in them."""
+MIN_SIZE = 1e-7 ** 0.5
+"""Smallest initial standard deviation (3DGS), unless the world's unit is so large that MIN_SIZE_RATIO is smaller."""
+MIN_SIZE_RATIO = 0.1
+"""Smallest initial standard deviation relative to the median one, in worlds of a large unit."""
 
 
 class SceneGaussians(nn.Module):
-    """n Gaussians. Parameters, in 3DGS's own form:
+    """n Gaussians, with the parameters of 3DGS:
 
     means           (n, 3) world coordinates
     log_scales      (n, 3) log of the standard deviations
@@ -43,18 +43,18 @@ class SceneGaussians(nn.Module):
         self.opacity_logits = nn.Parameter(opacity_logits)
         self.sh = nn.Parameter(sh)
         self.display_white = 1.0
-        """Display value at which pictures of the scene are clipped: above 1 where its frames went on above white."""
+        """Display value at which pictures of the scene are clipped; above 1 for frames with values above white."""
         self.near = NEAR
-        """Camera depth at which Gaussians are culled, world units: less in a world of small units."""
-        self.sampling: Sampling | None = None
-        """The grid of the frames that it was fitted to, where that is known: it looks alike at every size then."""
+        """Camera depth up to which Gaussians are culled, world units; smaller in a world of a large unit."""
+        self.pixel_grid: PixelGrid | None = None
+        """Pixel grid of the frames that the scene was fitted to, or None if unknown; see `conventions.pixel_grid`."""
 
     @classmethod
     def from_points(cls, points: PointCloud) -> SceneGaussians:
-        """A Gaussian at each point, as 3DGS starts: round, as large as the root mean square distance to the
-        three nearest neighbours, opacity 0.1, of the point's colour from everywhere.
+        """Initialise a Gaussian at each point as 3DGS does: isotropic, as large as the root mean square distance to the
+        three nearest neighbours, opacity 0.1, the point's colour in all directions.
 
-        Raises SettingsError where there are no points.
+        Raises SettingsError without points.
         """
         if len(points.xyz) == 0:
             raise SettingsError("The capture has no points to start the scene from; solve it again.")
@@ -63,14 +63,14 @@ class SceneGaussians(nn.Module):
         n = len(means)
         distances = nearest_distances(means)
         size = distances.square().mean(-1).sqrt() if distances.shape[1] else torch.ones(n)
-        least = min(DISTANCE_MIN, SMALL * float(size.median()) or DISTANCE_MIN)
+        min_size = min(MIN_SIZE, MIN_SIZE_RATIO * float(size.median()) or MIN_SIZE)
         sh = torch.zeros(n, COEFFICIENTS, 3)
         sh[:, 0] = spherical_harmonics.dc_from_colour(colours)
         quaternions = torch.zeros(n, 4)
         quaternions[:, 0] = 1
         return cls(
             means,
-            size.clamp(min=least).log()[:, None].repeat(1, 3),
+            size.clamp(min=min_size).log()[:, None].repeat(1, 3),
             quaternions,
             torch.logit(torch.full((n,), INITIAL_OPACITY)),
             sh,
@@ -78,7 +78,7 @@ class SceneGaussians(nn.Module):
 
     @classmethod
     def empty(cls, n: int = 0) -> SceneGaussians:
-        """n Gaussians of zeros."""
+        """Return n Gaussians whose parameters are zero."""
         return cls(*(torch.zeros(n, *shape) for shape in ((3,), (3,), (4,), (), (COEFFICIENTS, 3))))
 
     def __len__(self) -> int:
@@ -98,11 +98,11 @@ class SceneGaussians(nn.Module):
         self, camera: Camera, sh_degree: int | None = None, background: Tensor | None = None,
         *, kernels: Kernels = "auto", depth: bool = True,
     ) -> Rendering:  # fmt: skip
-        """The scene as the camera sees it; see `rasterization`. Differentiable by the Gaussians."""
+        """Render the scene for a camera; see `rasterization`. Differentiable by the Gaussians."""
         return rasterization(
             self.means, self.quaternions, self.log_scales, self.opacity_logits, self.sh,
             torch.as_tensor(camera.world_to_camera).to(self.means),
             torch.as_tensor(camera.intrinsics).to(self.means),
             camera.width, camera.height, background=background, sh_degree=sh_degree, kernels=kernels,
-            near=self.near, dilation=dilation(self.sampling, camera.focal_length), depth=depth, raw=True,
+            near=self.near, dilation=dilation(self.pixel_grid, camera.focal_length), depth=depth, raw=True,
         )  # fmt: skip

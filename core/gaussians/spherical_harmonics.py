@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Real spherical harmonics up to degree 3: colour as a function of the direction it is seen from.
+"""Real spherical harmonics up to degree 3, for colour as a function of the viewing direction.
 
 The basis, its signs and its order are those of 3DGS (and of its PLY files): for each degree l the orders
 m = -l..l, Condon-Shortley phase included. A colour is max(sum_k basis_k(direction) sh_k + 1/2, 0).
@@ -16,7 +16,7 @@ MAX_DEGREE = 3
 
 
 def degree_of(coefficients: int) -> int:
-    """Degree of a set of 1, 4, 9 or 16 coefficients.
+    """Return the degree of a set of 1, 4, 9 or 16 coefficients.
 
     Raises SettingsError for any other count.
     """
@@ -29,7 +29,7 @@ def degree_of(coefficients: int) -> int:
 
 
 def basis(directions: Tensor, degree: int) -> Tensor:
-    """The (n, (degree + 1)²) basis functions at (n, 3) unit directions."""
+    """Return the (n, (degree + 1)²) basis functions at (n, 3) unit directions."""
     x, y, z = directions.unbind(-1)
     functions = [torch.full_like(x, C0)]
     if degree >= 1:
@@ -57,7 +57,7 @@ def basis(directions: Tensor, degree: int) -> Tensor:
 
 
 def colours(offsets: Tensor, sh: Tensor, degree: int) -> Tensor:
-    """Colours (n, 3) >= 0 of Gaussians seen along `offsets` (n, 3), camera position to mean, any length.
+    """Return colours (n, 3) >= 0 of Gaussians seen along `offsets` (n, 3), camera position to mean, of any length.
 
     sh: (n, k, 3) with k >= (degree + 1)²; only that many are used (Kerbl et al. 2023, section 5.1).
     """
@@ -67,5 +67,5 @@ def colours(offsets: Tensor, sh: Tensor, degree: int) -> Tensor:
 
 
 def dc_from_colour(colour: Tensor) -> Tensor:
-    """The degree 0 coefficients that show this colour (any shape) from everywhere."""
+    """Return the degree 0 coefficients of a colour (any shape) that is the same in all directions."""
     return (colour - 0.5) / C0

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Rasterization by tiles: all but the drawing of a tile, which `tiles.py` and `warp_kernels.py` have.
+"""Rasterization by tiles, for the kernel sets `tiles` and `cuda`, whose modules draw the tiles.
 
-The frame is cut into tiles; each has the list of the Gaussians that reach it, front to back (`bin_tiles`). A
-Gaussian enters whitened: with covariance = M M^T, M lower triangular, and W = M^-1, the squared Mahalanobis
-distance is u² + v², (u, v) = W d, which loses far fewer digits on needles than the quadratic form. Geometry per
-Gaussian is in double precision where there is any, for the same reason.
+The frame is cut into tiles, each with a list of the Gaussians that reach it, front to back (`bin_tiles`). Gaussians are
+whitened: with covariance = M M^T, M lower triangular, and W = M^-1, the squared Mahalanobis distance is u² + v²,
+(u, v) = W d, which loses far fewer digits for needles than the quadratic form. For the same reason the geometry of a
+Gaussian is computed in double precision if the device has it.
 
-A drawing goes through the lists. Its gradient does so in the same order: with g_i = dL/dcolour . values_i,
-transmittance T_i before entry i, and S_i = sum_{j > i} alpha_j T_j g_j, what is left of the whole sum,
+The forward pass walks through the lists, and the backward pass does so in the same order: with g_i = dL/dcolour .
+values_i, transmittance T_i in front of entry i, and S_i = sum_{j > i} alpha_j T_j g_j, the remainder of the whole sum,
 
     dL/dalpha_i = T_i g_i - S_i / (1 - alpha_i)
 """
@@ -26,22 +26,22 @@ from .rendering import (
     OPACITY_MAX,
     Rendering,
     Splats,
-    activated,
+    activate,
     arc_strengths,
     extent,
     record_gradient,
 )
 from .spherical_harmonics import colours as colours_of
 
-ENTRIES_MAX = 1 << 24
-"""Entries of all lists at a time; what bounds the memory that they take."""
-MARGIN = 1e-3
-"""By how much lists reach further than the last contribution, so that rounding cannot lose one."""
+MAX_ENTRIES = 1 << 24
+"""Most entries of all lists at a time; bounds the memory."""
+REACH_MARGIN = 1e-3
+"""Margin of the lists beyond the last contribution, relative and absolute, so that rounding cannot lose one."""
 
 
-class Lists(NamedTuple):
-    """Gaussians of each tile. entries (m,) row numbers, tile by tile, in row order; starts (tiles + 1,) where
-    each tile's begin; columns and rows: of tiles; size: of a tile, px."""
+class TileLists(NamedTuple):
+    """Gaussians of each tile. entries (m,): row numbers, tile by tile, in row order; starts (tiles + 1,): offset of
+    each tile; columns, rows: number of tiles; size: of a tile, px."""
 
     entries: Tensor
     starts: Tensor
@@ -50,10 +50,10 @@ class Lists(NamedTuple):
     size: int
 
 
-class Gaussians(NamedTuple):
-    """What is drawn. places (n, 5): centres x, y and whitening W xx, yx, yy; values (n, 1 + c): peaks, and what
-    is blended (where light adds, peaks are 1 and opacity is in the values); rings; arcs (n, 3) whitened: what b·d is
-    of u and of v, and m."""
+class WhitenedGaussians(NamedTuple):
+    """2D Gaussians in whitened form. places (n, 5): centres x, y and whitening W xx, yx, yy; values (n, 1 + c): peaks,
+    and the blended channels (for "add", peaks are 1 and the opacity is multiplied into the values); rings (n, 2); arcs
+    (n, 3): the coefficients of u and v in b·d, and m."""
 
     places: Tensor
     values: Tensor
@@ -61,29 +61,31 @@ class Gaussians(NamedTuple):
     arcs: Tensor | None
 
 
-Draw = Callable[[Lists, Blend, bool, Gaussians], tuple[Tensor, Tensor]]
-"""draw(lists, blend, median, gaussians): the pictures of the tiles, (tiles, size², c), sums of the values by their
-weights; and the row of the Gaussian at which transmittance falls below 1/2, or -1, (tiles, size²), if `median`.
+DrawTiles = Callable[[TileLists, Blend, bool, WhitenedGaussians], tuple[Tensor, Tensor]]
+"""draw(lists, blend, median, gaussians) returns the pictures of the tiles, (tiles, size², c), the weighted sums of the
+values; and, if `median`, (tiles, size²) rows of the Gaussians at which transmittance falls below 1/2, or -1.
 Differentiable by the Gaussians."""
 
 
 def whitening(covariances: Tensor) -> Tensor:
-    """(n, 3) elements xx, yx, yy of the inverse Cholesky factors of (n, 3) covariances."""
+    """Return (n, 3) elements xx, yx, yy of the inverse Cholesky factors of (n, 3) covariances."""
     xx, xy, yy = covariances.unbind(-1)
     w_xx = xx.rsqrt()
     w_yy = (yy - xy * xy / xx).rsqrt()
     return torch.stack([w_xx, -xy / xx * w_yy, w_yy], -1)
 
 
-def whitened_arcs(arcs: Tensor, whitening: Tensor) -> Tensor:
-    """(n, 3) a_u, a_v and m from b and m, with b·d = a_u u + a_v v: a = M^T b."""
+def whiten_arcs(arcs: Tensor, whitening: Tensor) -> Tensor:
+    """Return (n, 3) a_u, a_v and m from b and m, with b·d = a_u u + a_v v: a = M^T b."""
     w_xx, w_yx, w_yy = whitening.unbind(-1)
     b_x, b_y, m = arcs.to(whitening.dtype).unbind(-1)
     return torch.stack([(b_x - b_y * w_yx / w_yy) / w_xx, b_y / w_yy, m], -1)
 
 
-def _span(centres: Tensor, half: Tensor, radii: Tensor, columns: int, rows: int, size: int) -> tuple[Tensor, Tensor]:
-    """First tile x, y (n, 2) of the boxes of half size `half` (n, 2) px, and how many they span (n, 2)."""
+def _tile_span(
+    centres: Tensor, half: Tensor, radii: Tensor, columns: int, rows: int, size: int
+) -> tuple[Tensor, Tensor]:
+    """Return the first tile x, y (n, 2) of boxes of half size `half` (n, 2), px, and their size in tiles (n, 2)."""
     low = ((centres - half) / size).floor().clamp(min=-1, max=2**30).long().clamp(min=0)
     high = ((centres + half) / size).floor().clamp(min=-1, max=2**30).long()
     high = torch.minimum(high, torch.tensor([columns - 1, rows - 1], device=centres.device))
@@ -93,30 +95,30 @@ def _span(centres: Tensor, half: Tensor, radii: Tensor, columns: int, rows: int,
 @torch.no_grad()
 def bin_tiles(
     centres: Tensor, whitening: Tensor, half: Tensor, radii: Tensor, width: int, height: int, size: int
-) -> Lists:
-    """Lists of the tiles that the ellipses of Mahalanobis radius `radii` (n,), inside boxes of half size
-    `half` (n, 2) px, touch."""
+) -> TileLists:
+    """Return the lists of tiles that ellipses of Mahalanobis radius `radii` (n,) touch; half (n, 2): half size of their
+    bounding boxes, px."""
     columns, rows = -(-width // size), -(-height // size)
-    low, span = _span(centres, half, radii, columns, rows, size)
+    low, span = _tile_span(centres, half, radii, columns, rows, size)
     counts = span.prod(-1)
 
-    # One entry for each tile of each box, then without those that the ellipse inside the box misses.
+    # One entry for each tile of each box, then drop those that the ellipse inside the box misses.
     entries = torch.repeat_interleave(counts)
     number = torch.arange(len(entries), device=centres.device) - (counts.cumsum(0) - counts)[entries]
     across = span[entries, 0]
     x, y = low[entries, 0] + number % across, low[entries, 1] + number // across
-    near = _nearest(centres[entries], whitening[entries], torch.stack([x, y], -1) * size, size)
-    hit = near <= (radii * (1 + MARGIN) + MARGIN)[entries] ** 2
+    distances = _min_squared_distance(centres[entries], whitening[entries], torch.stack([x, y], -1) * size, size)
+    hit = distances <= (radii * (1 + REACH_MARGIN) + REACH_MARGIN)[entries] ** 2
     tiles, entries = (y * columns + x)[hit], entries[hit]
 
     order = torch.argsort(tiles, stable=True)
     starts = torch.searchsorted(tiles[order], torch.arange(columns * rows + 1, device=centres.device))
-    return Lists(entries[order], starts, columns, rows, size)
+    return TileLists(entries[order], starts, columns, rows, size)
 
 
-def _nearest(centres: Tensor, whitening: Tensor, corners: Tensor, size: int) -> Tensor:
-    """(m,) least squared Mahalanobis distance to tiles with these upper left corners: at the centre if that
-    is inside, else on one of the two edges that face it."""
+def _min_squared_distance(centres: Tensor, whitening: Tensor, corners: Tensor, size: int) -> Tensor:
+    """Return (m,) the smallest squared Mahalanobis distance to tiles with these upper left corners: 0 if the centre is
+    inside, else attained on one of the two edges that face it."""
     low = corners - centres
     high = low + size
     bx, by = torch.zeros_like(low).clamp(low, high).unbind(-1)
@@ -133,68 +135,68 @@ def _nearest(centres: Tensor, whitening: Tensor, corners: Tensor, size: int) -> 
 
 
 def draw_tiles(
-    draw: Draw, size: int, drawn: Gaussians, radii: Tensor, half: Tensor, width: int, height: int,
+    draw: DrawTiles, size: int, gaussians: WhitenedGaussians, radii: Tensor, half: Tensor, width: int, height: int,
     *, blend: Blend, median: bool = False,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """(height, width, c) sums of the values, by their weights, and (height, width) rows, see `Draw`.
+    """Return (height, width, c) weighted sums of the values, and (height, width) rows, see `DrawTiles`.
 
-    radii (n,): Mahalanobis distance up to which each Gaussian is drawn; half (n, 2): of the box around it, px;
+    radii (n,): Mahalanobis distance up to which each Gaussian is drawn; half (n, 2): half size of its bounding box, px;
     size: of a tile, px."""
-    centres = drawn.places.detach()[:, :2]
+    centres = gaussians.places.detach()[:, :2]
     columns, rows = -(-width // size), -(-height // size)
-    entries = int(_span(centres, half, radii, columns, rows, size)[1].prod(-1).sum())
-    if entries > ENTRIES_MAX and rows > 1:  # too many for one go: the upper half of the picture, then the lower
+    entries = int(_tile_span(centres, half, radii, columns, rows, size)[1].prod(-1).sum())
+    if entries > MAX_ENTRIES and rows > 1:  # too many at a time: the upper half of the picture, then the lower
         middle = rows // 2 * size
-        down = drawn.places.new_tensor([0, middle, 0, 0, 0])
+        shifted = gaussians._replace(places=gaussians.places - gaussians.places.new_tensor([0, middle, 0, 0, 0]))
         halves = [
             draw_tiles(draw, size, part, radii, half, width, part_height, blend=blend, median=median)
-            for part, part_height in ((drawn, middle), (drawn._replace(places=drawn.places - down), height - middle))
+            for part, part_height in ((gaussians, middle), (shifted, height - middle))
         ]
-        return torch.cat([picture for picture, _ in halves]), torch.cat([which for _, which in halves])
-    lists = bin_tiles(centres, drawn.places.detach()[:, 2:], half, radii, width, height, size)
-    picture, which = (_assembled(part, lists)[:height, :width] for part in draw(lists, blend, median, drawn))
-    return picture, which
+        return torch.cat([picture for picture, _ in halves]), torch.cat([median_rows for _, median_rows in halves])
+    lists = bin_tiles(centres, gaussians.places.detach()[:, 2:], half, radii, width, height, size)
+    picture, median_rows = (_assemble(part, lists)[:height, :width] for part in draw(lists, blend, median, gaussians))
+    return picture, median_rows
 
 
-def _assembled(parts: Tensor, lists: Lists) -> Tensor:
-    """(rows * size, columns * size, ...) from (tiles, size², ...)."""
+def _assemble(parts: Tensor, lists: TileLists) -> Tensor:
+    """Assemble tiles (tiles, size², ...) to a picture (rows * size, columns * size, ...)."""
     parts = parts.reshape(lists.rows, lists.columns, lists.size, lists.size, *parts.shape[2:]).transpose(1, 2)
     return parts.reshape(lists.rows * lists.size, lists.columns * lists.size, *parts.shape[4:])
 
 
-def _geometry(tensor: Tensor) -> Tensor:
-    """In double precision, where the device has it."""
+def _to_double(tensor: Tensor) -> Tensor:
+    """Convert to double precision if the device has it."""
     return tensor if tensor.device.type == "mps" else tensor.double()
 
 
 def rasterize_scene(
-    draw: Draw, size: int,
+    draw: DrawTiles, size: int,
     means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, sh: Tensor,
     world_to_camera: Tensor, intrinsics: Tensor, width: int, height: int,
     *, background: Tensor | None, sh_degree: int, near: float, dilation: float, depth: bool, raw: bool,
 ) -> Rendering:  # fmt: skip
-    """See `rasterization`; with this drawing, in tiles of this size."""
-    scales, opacities = activated(scales, opacities, raw)
+    """Render as `rasterization` does, by a drawing of tiles; size: of a tile, px."""
+    scales, opacities = activate(scales, opacities, raw)
     dtype = means.dtype
-    seen = project(
-        _geometry(means), _geometry(quats), _geometry(scales), _geometry(world_to_camera),
-        _geometry(intrinsics), width, height, near, dilation,
+    projected = project(
+        _to_double(means), _to_double(quats), _to_double(scales), _to_double(world_to_camera),
+        _to_double(intrinsics), width, height, near, dilation,
     )  # fmt: skip
     with torch.no_grad():
-        reach = extent(opacities[seen.indices].clamp(max=OPACITY_MAX))
-        visible = visible_radii(seen.centres, seen.covariances, reach, width, height)
-        order = torch.argsort(seen.depths, stable=True)
+        reach = extent(opacities[projected.indices].clamp(max=OPACITY_MAX))
+        visible = visible_radii(projected.centres, projected.covariances, reach, width, height)
+        order = torch.argsort(projected.depths, stable=True)
         order = order[visible[order] > 0]
-        all_centres = torch.zeros_like(means[:, :2]).index_copy_(0, seen.indices, seen.centres.to(dtype))
-        radii = torch.zeros_like(means[:, 0]).index_copy_(0, seen.indices, visible.to(dtype))
-    index, centres, covariances, depths = (part[order] for part in seen)
+        all_centres = torch.zeros_like(means[:, :2]).index_copy_(0, projected.indices, projected.centres.to(dtype))
+        radii = torch.zeros_like(means[:, 0]).index_copy_(0, projected.indices, visible.to(dtype))
+    index, centres, covariances, depths = (part[order] for part in projected)
     depths = depths.to(dtype)
     colours = colours_of((means - camera_position(world_to_camera))[index], sh[index], sh_degree)
     values = torch.cat([colours, depths[:, None], torch.ones_like(depths)[:, None]], -1)
 
     gradients = record_gradient(centres, index, len(means))
 
-    drawn = Gaussians(
+    gaussians = WhitenedGaussians(
         torch.cat([centres, whitening(covariances)], -1),
         torch.cat([opacities[index].clamp(max=OPACITY_MAX)[:, None], values], -1),
         None,
@@ -202,7 +204,7 @@ def rasterize_scene(
     )
     reach = reach[order]
     half = half_sizes(covariances.detach(), reach)
-    picture, rows = draw_tiles(draw, size, drawn, reach, half, width, height, blend="over", median=depth)
+    picture, rows = draw_tiles(draw, size, gaussians, reach, half, width, height, blend="over", median=depth)
     alpha = picture[..., 4]
     colour = picture[..., :3]
     if background is not None:
@@ -216,12 +218,12 @@ def rasterize_scene(
 
 
 def splat(
-    draw: Draw, size: int,
+    draw: DrawTiles, size: int,
     centres: Tensor, covariances: Tensor, opacities: Tensor, colours: Tensor, width: int, height: int,
     *, rings: Tensor | None, arcs: Tensor | None, blend: Blend,
 ) -> Splats:  # fmt: skip
-    """See `splat` of the package; at full resolution, with this drawing, in tiles of this size."""
-    centres, covariances = _geometry(centres), _geometry(covariances)
+    """Rasterize as `splat` of the package does at full resolution, by a drawing of tiles; size: of a tile, px."""
+    centres, covariances = _to_double(centres), _to_double(covariances)
     index = torch.nonzero(determinants(covariances) > 0)[:, 0]
     centres, covariances, opacities, colours = (
         part[index] for part in (centres, covariances, opacities, colours)
@@ -235,11 +237,11 @@ def splat(
     with torch.no_grad():
         reach = extent(peaks, blend, rings, None if arcs is None else arc_strengths(covariances, arcs))
     values = torch.cat([peaks[:, None], colours, torch.ones_like(colours[:, :1])], -1)
-    white = whitening(covariances)
+    whitening_factors = whitening(covariances)
     if arcs is not None:
-        arcs = whitened_arcs(arcs, white).to(values.dtype)
-    drawn = Gaussians(torch.cat([centres, white], -1), values, rings, arcs)
+        arcs = whiten_arcs(arcs, whitening_factors).to(values.dtype)
+    gaussians = WhitenedGaussians(torch.cat([centres, whitening_factors], -1), values, rings, arcs)
     half = half_sizes(covariances.detach(), reach)
-    picture, _ = draw_tiles(draw, size, drawn, reach, half, width, height, blend=blend)
+    picture, _ = draw_tiles(draw, size, gaussians, reach, half, width, height, blend=blend)
     alpha = picture[..., 3]
     return Splats(picture[..., :3], 1 - alpha if blend == "over" else torch.ones_like(alpha))

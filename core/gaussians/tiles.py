@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Tiles drawn in torch, with analytic gradients: for machines without a faster kernel set.
+"""The kernel set `tiles`: draws tiles in torch, with analytic gradients, on machines without a faster kernel set.
 
-Tiles whose lists are about as long are worked on together, a chunk of their lists at a time, as tensors of
+Tiles with lists of similar length are processed together, a chunk of their lists at a time, as tensors of
 tiles x pixels x entries; (u, v) of `tiled.py` are matrix products of the pixels with the Gaussians.
 """
 from __future__ import annotations
@@ -18,32 +18,32 @@ from ..choices import Blend
 from . import tiled
 from .reference import RADIUS_MIN
 from .rendering import ALPHA_MIN, OPACITY_MAX, PROFILE_MIN, TRANSMITTANCE_MIN
-from .tiled import Gaussians, Lists
+from .tiled import TileLists, WhitenedGaussians
 
 TILE = 8
-CHUNK = 128
-"""Entries of a list at a time."""
-GROUP = 32
-"""Tiles at a time; with the above, what bounds the memory: half a dozen tensors of 1 MiB."""
-AFTER_MIN = TRANSMITTANCE_MIN * (1 - OPACITY_MAX) / 2
-"""Below the transmittance behind anything that counts."""
+ENTRIES_PER_CHUNK = 128
+"""Entries of a list that are evaluated at a time."""
+TILES_PER_GROUP = 32
+"""Tiles that are evaluated at a time; together with ENTRIES_PER_CHUNK it bounds the memory to some tensors of 1 MiB."""
+MIN_TRANSMITTANCE = TRANSMITTANCE_MIN * (1 - OPACITY_MAX) / 2
+"""A lower bound on the transmittance behind any entry that contributes."""
 
 
 def _pixels(like: Tensor) -> Tensor:
-    """(TILE², 3) pixel centres of a tile from its middle, and ones: x, y, 1."""
+    """Return (TILE², 3) pixel centres relative to the middle of a tile, and ones: x, y, 1."""
     along = torch.arange(TILE, dtype=like.dtype, device=like.device) + 0.5 - TILE / 2
     grid = torch.cartesian_prod(along, along).flip(-1)
     return torch.cat([grid, torch.ones_like(grid[:, :1])], -1)
 
 
-def _groups(lists: Lists, filler: int) -> Iterator[tuple[Tensor, Tensor]]:
-    """Tiles that are worked on together: (b,) tile numbers and their (b, longest) entries, `filler` where a
-    list is shorter."""
+def _groups(lists: TileLists, filler: int) -> Iterator[tuple[Tensor, Tensor]]:
+    """Yield groups of tiles that are processed together: (b,) tile numbers and (b, longest) entries, padded with
+    `filler`."""
     lengths = lists.starts.diff()
     order = torch.argsort(lengths, descending=True, stable=True)
     busy = int((lengths > 0).sum())
-    for first in range(0, busy, GROUP):
-        tiles = order[first : min(first + GROUP, busy)]
+    for first in range(0, busy, TILES_PER_GROUP):
+        tiles = order[first : min(first + TILES_PER_GROUP, busy)]
         place = torch.arange(int(lengths[tiles[0]]), device=tiles.device)
         inside = place < lengths[tiles, None]
         entries = lists.entries[(lists.starts[tiles, None] + place) * inside]
@@ -51,122 +51,122 @@ def _groups(lists: Lists, filler: int) -> Iterator[tuple[Tensor, Tensor]]:
 
 
 class _Chunk:
-    """Some entries of some tiles, evaluated: tensors are (b, pixels, k) unless said otherwise."""
+    """A chunk of k entries of b tiles, evaluated at all pixels; tensors are (b, pixels, k) unless stated otherwise."""
 
-    def __init__(self, drawn: Gaussians, index: Tensor, origins: Tensor, pixels: Tensor) -> None:
-        """index (b, k) rows of `drawn`; origins (b, 2) middles of the tiles, px; pixels as `_pixels`."""
-        self.drawn, self.pixels = drawn, pixels
-        places = drawn.places[index]
+    def __init__(self, gaussians: WhitenedGaussians, index: Tensor, origins: Tensor, pixels: Tensor) -> None:
+        """index (b, k): rows of `gaussians`; origins (b, 2): middles of the tiles, px; pixels: see `_pixels`."""
+        self.gaussians, self.pixels = gaussians, pixels
+        places = gaussians.places[index]
         places[..., :2] -= origins[:, None]
         # (b, k), from the middle of the tile
         self.cx, self.cy, self.w_xx, self.w_yx, self.w_yy = places.to(pixels.dtype).unbind(-1)
-        values = drawn.values[index]
+        values = gaussians.values[index]
         self.peaks, self.values = values[:, None, :, 0], values[..., 1:]  # (b, 1, k), (b, k, c)
         self.u = self._linear(self.w_xx, torch.zeros_like(self.w_xx))
         self.v = self._linear(self.w_yx, self.w_yy)
         q = (self.u * self.u).addcmul_(self.v, self.v)
-        if drawn.rings is None:
+        if gaussians.rings is None:
             log_g = q.mul_(-0.5)
         else:
-            r0, self.w = drawn.rings[index][:, None].unbind(-1)
+            r0, self.w = gaussians.rings[index][:, None].unbind(-1)
             self.r = q.clamp_(min=RADIUS_MIN**2).sqrt_()
             self.t = (self.r - r0) / self.w
             log_g = self.t.square() * -0.5
-        if drawn.arcs is not None:
-            self.a_u, self.a_v, m = drawn.arcs[index][:, None].unbind(-1)
+        if gaussians.arcs is not None:
+            self.a_u, self.a_v, m = gaussians.arcs[index][:, None].unbind(-1)
             log_g = log_g + (self.a_u * self.u + self.a_v * self.v - m)
         self.g = log_g.exp_()
 
     def _linear(self, along_x: Tensor, along_y: Tensor) -> Tensor:
-        """a (x - cx) + b (y - cy) at all pixels, from (b, k) a and b."""
+        """Return a (x - cx) + b (y - cy) at all pixels, from (b, k) a and b."""
         offset = -(along_x * self.cx + along_y * self.cy)
         return self.pixels @ torch.stack([along_x, along_y, offset], 1)
 
     def backward(self, h: Tensor) -> list[Tensor]:
-        """From h = dL/dlog g, the gradients (b, k): five of the places, then those of the ring and the arc."""
+        """Return the gradients (b, k) from h = dL/dlog g: five of the places, then those of ring and arc."""
         extras = []
-        pull = h  # -2 dL/dq
-        if self.drawn.rings is not None:
+        scaled = h  # -2 dL/dq
+        if self.gaussians.rings is not None:
             dr = h * self.t / self.w  # dL/dr0
             extras += [dr.sum(1), (dr * self.t).sum(1)]
-            pull = dr / self.r
-        pull_u, pull_v = pull * self.u, pull * self.v  # -dL/du, -dL/dv
-        if self.drawn.arcs is not None:
+            scaled = dr / self.r
+        scaled_u, scaled_v = scaled * self.u, scaled * self.v  # -dL/du, -dL/dv
+        if self.gaussians.arcs is not None:
             extras += [(h * self.u).sum(1), (h * self.v).sum(1), -h.sum(1)]
-            pull_u, pull_v = pull_u - h * self.a_u, pull_v - h * self.a_v
+            scaled_u, scaled_v = scaled_u - h * self.a_u, scaled_v - h * self.a_v
         # Sums over the pixels, times x, y, 1.
-        sx_u, _, s_u = (self.pixels.T @ pull_u).unbind(1)
-        sx_v, sy_v, s_v = (self.pixels.T @ pull_v).unbind(1)
+        sx_u, _, s_u = (self.pixels.T @ scaled_u).unbind(1)
+        sx_v, sy_v, s_v = (self.pixels.T @ scaled_v).unbind(1)
         d_cx, d_cy = self.w_xx * s_u + self.w_yx * s_v, self.w_yy * s_v
         d_whitening = [self.cx * s_u - sx_u, self.cx * s_v - sx_v, self.cy * s_v - sy_v]
         return [d_cx, d_cy, *d_whitening, *extras]
 
 
-def _origins(tiles: Tensor, columns: int) -> Tensor:
-    """(b, 2) middles of the tiles, px."""
+def _tile_centres(tiles: Tensor, columns: int) -> Tensor:
+    """Return (b, 2) middles of the tiles, px."""
     return torch.stack([tiles % columns, tiles // columns], -1) * TILE + TILE / 2
 
 
-def _with_nothing(drawn: Gaussians) -> Gaussians:
-    """One row more, of a Gaussian that shows nothing, which fills up lists."""
-    return Gaussians(*(  # type: ignore[arg-type]
+def _append_empty(gaussians: WhitenedGaussians) -> WhitenedGaussians:
+    """Append an invisible Gaussian, which pads the lists."""
+    return WhitenedGaussians(*(  # type: ignore[arg-type]
         None if part is None else torch.cat([part, part.new_full((1, part.shape[1]), fill)])
-        for part, fill in zip(drawn, (0.0, 0.0, 1.0, 0.0), strict=True)
+        for part, fill in zip(gaussians, (0.0, 0.0, 1.0, 0.0), strict=True)
     ))  # fmt: skip
 
 
-class _Draw(torch.autograd.Function):
-    """See `tiled.Draw`."""
+class _DrawTiles(torch.autograd.Function):
+    """Draws tiles; see `tiled.DrawTiles`."""
 
     @staticmethod
-    def forward(ctx: Any, lists: Lists, blend: Blend, median: bool, *parts: Tensor | None) -> Any:
+    def forward(ctx: Any, lists: TileLists, blend: Blend, median: bool, *parts: Tensor | None) -> Any:
         ctx.lists, ctx.blend = lists, blend
-        drawn = _with_nothing(Gaussians(*parts))  # type: ignore[arg-type]
-        n, channels = len(drawn.values) - 1, drawn.values.shape[1] - 1
-        pixels = _pixels(drawn.values)
-        picture = drawn.values.new_zeros(lists.columns * lists.rows, TILE * TILE, channels)
-        halves = torch.full(picture.shape[:2], -1, dtype=torch.int64, device=picture.device)
+        gaussians = _append_empty(WhitenedGaussians(*parts))  # type: ignore[arg-type]
+        n, channels = len(gaussians.values) - 1, gaussians.values.shape[1] - 1
+        pixels = _pixels(gaussians.values)
+        picture = gaussians.values.new_zeros(lists.columns * lists.rows, TILE * TILE, channels)
+        median_rows = torch.full(picture.shape[:2], -1, dtype=torch.int64, device=picture.device)
         for tiles, entries in _groups(lists, n):
             total = torch.zeros_like(picture[tiles])
             before = torch.ones_like(total[..., :1])
-            for index in entries.split(CHUNK, 1):
-                chunk = _Chunk(drawn, index, _origins(tiles, lists.columns), pixels)
-                weights, after = _weigh(chunk, blend, before)
+            for index in entries.split(ENTRIES_PER_CHUNK, 1):
+                chunk = _Chunk(gaussians, index, _tile_centres(tiles, lists.columns), pixels)
+                weights, after = _blend_weights(chunk, blend, before)
                 total.baddbmm_(weights, chunk.values)
                 if blend == "add":
                     continue
                 if median:
-                    halves[tiles] = torch.maximum(halves[tiles], _half_lost(before, after, index))
+                    median_rows[tiles] = torch.maximum(median_rows[tiles], _median_rows(before, after, index))
                 before = after[..., -1:]
                 if float(before.max()) < TRANSMITTANCE_MIN:
                     break
             picture[tiles] = total
         ctx.save_for_backward(picture, *parts)
-        ctx.mark_non_differentiable(halves)
-        return picture, halves
+        ctx.mark_non_differentiable(median_rows)
+        return picture, median_rows
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor, _: Tensor) -> Any:
         picture, *parts = ctx.saved_tensors
-        lists: Lists = ctx.lists
-        drawn = _with_nothing(Gaussians(*parts))
-        columns = [0 if part is None else part.shape[1] for part in (drawn.values, *drawn[:1], *drawn[2:])]
-        sums = drawn.values.new_zeros(len(drawn.values), sum(columns))
-        pixels = _pixels(drawn.values)
-        for tiles, entries in _groups(lists, len(drawn.values) - 1):
+        lists: TileLists = ctx.lists
+        gaussians = _append_empty(WhitenedGaussians(*parts))
+        columns = [0 if part is None else part.shape[1] for part in (gaussians.values, *gaussians[:1], *gaussians[2:])]
+        sums = gaussians.values.new_zeros(len(gaussians.values), sum(columns))
+        pixels = _pixels(gaussians.values)
+        for tiles, entries in _groups(lists, len(gaussians.values) - 1):
             upstream = gradient[tiles]
-            left = (upstream * picture[tiles]).sum(-1, keepdim=True)  # of the sum, behind the entry
-            before = torch.ones_like(left)
-            for index in entries.split(CHUNK, 1):
-                chunk = _Chunk(drawn, index, _origins(tiles, lists.columns), pixels)
-                weights, after = _weigh(chunk, ctx.blend, before)
+            remaining = (upstream * picture[tiles]).sum(-1, keepdim=True)  # of the sum, behind the entry
+            before = torch.ones_like(remaining)
+            for index in entries.split(ENTRIES_PER_CHUNK, 1):
+                chunk = _Chunk(gaussians, index, _tile_centres(tiles, lists.columns), pixels)
+                weights, after = _blend_weights(chunk, ctx.blend, before)
                 h = upstream @ chunk.values.transpose(1, 2)
                 h *= weights
                 if ctx.blend == "over":
-                    behind = left - h.cumsum(-1)
+                    behind = remaining - h.cumsum(-1)
                     # alpha / (1 - alpha), or 0 if the entry did not count
-                    h.addcmul_(weights / after.clamp(min=AFTER_MIN), behind, value=-1)
-                    left, before = behind[..., -1:], after[..., -1:]
+                    h.addcmul_(weights / after.clamp(min=MIN_TRANSMITTANCE), behind, value=-1)
+                    remaining, before = behind[..., -1:], after[..., -1:]
                 d_peaks = h.sum(1) / chunk.peaks[:, 0].clamp(min=ALPHA_MIN)
                 d_values = weights.transpose(1, 2) @ upstream
                 found = torch.stack([d_peaks, *d_values.unbind(-1), *chunk.backward(h)], -1)
@@ -175,14 +175,14 @@ class _Draw(torch.autograd.Function):
                     break
         values, places, rings, arcs = sums[:-1].split(columns, 1)
         return (
-            None, None, None, places.to(drawn.places.dtype), values,
-            None if drawn.rings is None else rings, None if drawn.arcs is None else arcs,
+            None, None, None, places.to(gaussians.places.dtype), values,
+            None if gaussians.rings is None else rings, None if gaussians.arcs is None else arcs,
         )  # fmt: skip
 
 
-def _weigh(chunk: _Chunk, blend: Blend, before: Tensor) -> tuple[Tensor, Tensor]:
-    """Weights (b, pixels, k) of the entries, and the transmittances after them, from those before the chunk
-    (b, pixels, 1)."""
+def _blend_weights(chunk: _Chunk, blend: Blend, before: Tensor) -> tuple[Tensor, Tensor]:
+    """Return weights (b, pixels, k) of the entries and the transmittances behind them; before (b, pixels, 1): the
+    transmittance in front of the chunk."""
     if blend == "add":
         return threshold(chunk.g, PROFILE_MIN, 0.0), before
     alpha = threshold(chunk.peaks * chunk.g, ALPHA_MIN, 0.0)
@@ -191,17 +191,17 @@ def _weigh(chunk: _Chunk, blend: Blend, before: Tensor) -> tuple[Tensor, Tensor]
     return alpha.mul_(threshold(reaching, TRANSMITTANCE_MIN, 0.0)), after
 
 
-def _half_lost(before: Tensor, after: Tensor, index: Tensor) -> Tensor:
-    """(b, pixels) the row whose contribution takes the transmittance below 1/2, -1 where none of `index` does."""
+def _median_rows(before: Tensor, after: Tensor, index: Tensor) -> Tensor:
+    """Return (b, pixels) the row at which the transmittance falls below 1/2, -1 if at none of `index`."""
     limit = torch.full_like(before, -0.5)
-    place = torch.searchsorted(after.neg(), limit, right=True)[..., 0]  # in ascending order, as it must be
+    place = torch.searchsorted(after.neg(), limit, right=True)[..., 0]  # negated, since it needs ascending order
     crosses = (place < index.shape[1]) & (before[..., 0] >= 0.5)
     return torch.where(crosses, index.gather(1, place.clamp(max=index.shape[1] - 1)), -1)
 
 
-def draw(lists: Lists, blend: Blend, median: bool, drawn: Gaussians) -> tuple[Tensor, Tensor]:
-    """See `tiled.Draw`."""
-    return _Draw.apply(lists, blend, median, *drawn)
+def draw(lists: TileLists, blend: Blend, median: bool, gaussians: WhitenedGaussians) -> tuple[Tensor, Tensor]:
+    """Draw tiles; see `tiled.DrawTiles`."""
+    return _DrawTiles.apply(lists, blend, median, *gaussians)
 
 
 rasterize_scene = partial(tiled.rasterize_scene, draw, TILE)

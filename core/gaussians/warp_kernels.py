@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Tiles drawn by NVIDIA Warp, which compiles these kernels where they run, with a compiler of its own.
+"""Draws tiles with NVIDIA Warp, which compiles these kernels at run time with its own compiler; for the set `cuda`.
 
-One thread for each pixel, one block for each tile: all threads of a block read the same Gaussian at the same
-time. In the backward pass a block sums each gradient over its pixels before it adds it to memory. The order of
-those last additions is not fixed on a GPU: gradients of one picture differ by rounding from run to run.
+Each pixel has a thread and each tile a block: all threads of a block read the same Gaussian at the same time. In the
+backward pass a block sums each gradient over its pixels and then adds it to memory atomically. The order of these
+additions is not fixed on a GPU: gradients of one picture differ by rounding from run to run.
 
-On Warp's CPU device, which has a thread and blocks of one, the same kernels can be tested without a GPU.
+Warp's CPU device, with one thread and blocks of one thread, runs the same kernels in tests without a GPU.
 """
 # Kernels are written in Warp's language, not Python's: no static types, and no postponed annotations.
 # mypy: ignore-errors
@@ -20,7 +20,7 @@ from torch import Tensor
 from ..choices import Blend
 from . import rendering
 from .reference import RADIUS_MIN
-from .tiled import Gaussians, Lists
+from .tiled import TileLists, WhitenedGaussians
 
 wp.config.log_level = logging.WARNING
 wp.init()
@@ -28,7 +28,7 @@ wp.init()
 TILE = 16
 BLOCK = TILE * TILE
 PLACES, SHAPES = 5, 5
-"""Columns of a Gaussian's place (centre and whitening) and of its shape (ring and arc)."""
+"""Number of columns of a Gaussian's place (centre and whitening) and of its shape (ring and arc)."""
 
 _Place = wp.types.vector(length=PLACES, dtype=wp.float32)
 _Shape = wp.types.vector(length=SHAPES, dtype=wp.float32)
@@ -36,13 +36,13 @@ _ALPHA_MIN = wp.constant(rendering.ALPHA_MIN)
 _PROFILE_MIN = wp.constant(rendering.PROFILE_MIN)
 _TRANSMITTANCE_MIN = wp.constant(rendering.TRANSMITTANCE_MIN)
 _RADIUS2_MIN = wp.constant(RADIUS_MIN**2)
-_CHECK = wp.constant(32)
-"""Entries between two looks at whether all pixels of a tile are finished."""
+_CHECK_INTERVAL = wp.constant(32)
+"""Entries between two checks whether all pixels of a tile are finished."""
 
 
 @wp.func
 def _profile(dx: float, dy: float, place: _Place, shape: _Shape, rings: bool, arcs: bool) -> float:
-    """G of `reference.py` at the offset dx, dy."""
+    """Return G of `reference.py` at the offset dx, dy."""
     u = place[2] * dx
     v = place[3] * dx + place[4] * dy
     q = u * u + v * v
@@ -57,17 +57,17 @@ def _profile(dx: float, dy: float, place: _Place, shape: _Shape, rings: bool, ar
 
 @functools.cache
 def _kernels(channels: int) -> tuple[Any, Any]:
-    """Forward and backward for pictures of so many channels."""
+    """Return the forward and backward kernel for pictures with this number of channels."""
     Values = wp.types.vector(length=channels, dtype=wp.float32)
     Gradients = wp.types.vector(length=1 + channels + PLACES + SHAPES, dtype=wp.float32)
-    VALUES, PLACE, SHAPE = 1, 1 + channels, 1 + channels + PLACES  # where they begin in Gradients
+    VALUES, PLACE, SHAPE = 1, 1 + channels, 1 + channels + PLACES  # offsets in Gradients
 
     @wp.kernel(enable_backward=False, module="unique")
     def forward(
         entries: wp.array(dtype=wp.int32), starts: wp.array(dtype=wp.int32), columns: int,
         places: wp.array(dtype=_Place), peaks: wp.array(dtype=wp.float32), values: wp.array(dtype=Values),
         shapes: wp.array(dtype=_Shape), rings: bool, arcs: bool, add: bool,
-        picture: wp.array(dtype=Values), halves: wp.array(dtype=wp.int32),
+        picture: wp.array(dtype=Values), median_rows: wp.array(dtype=wp.int32),
     ):  # fmt: skip
         i = wp.tid()
         tile, pixel = i // BLOCK, i % BLOCK
@@ -75,7 +75,7 @@ def _kernels(channels: int) -> tuple[Any, Any]:
         y = float((tile // columns) * TILE + pixel // TILE) + 0.5
         total = Values()
         transmittance = wp.float32(1.0)
-        half = wp.int32(-1)
+        median_row = wp.int32(-1)
         for j in range(starts[tile], starts[tile + 1]):
             row = entries[j]
             place = places[row]
@@ -88,12 +88,12 @@ def _kernels(channels: int) -> tuple[Any, Any]:
                 if alpha >= _ALPHA_MIN:
                     total += alpha * transmittance * values[row]
                     if transmittance >= 0.5 and transmittance * (1.0 - alpha) < 0.5:
-                        half = row
+                        median_row = row
                     transmittance *= 1.0 - alpha
                     if transmittance < _TRANSMITTANCE_MIN:
                         break
         picture[i] = total
-        halves[i] = half
+        median_rows[i] = median_row
 
     @wp.kernel(enable_backward=False, module="unique")
     def backward(
@@ -106,13 +106,13 @@ def _kernels(channels: int) -> tuple[Any, Any]:
         tile, pixel = i // BLOCK, i % BLOCK
         x = float((tile % columns) * TILE + pixel % TILE) + 0.5
         y = float((tile // columns) * TILE + pixel // TILE) + 0.5
-        above = upstream[i]
-        left = float(wp.dot(above, picture[i]))  # of the sum, behind the entry
+        upstream_here = upstream[i]
+        remaining = float(wp.dot(upstream_here, picture[i]))  # of the sum, behind the entry
         transmittance = wp.float32(1.0)
         start = starts[tile]
-        # Every thread of a block goes through the whole loop: they sum together.
+        # Every thread of a block runs the whole loop, since the block sums together.
         for j in range(start, starts[tile + 1]):
-            if (j - start) % _CHECK == _CHECK - 1:
+            if (j - start) % _CHECK_INTERVAL == _CHECK_INTERVAL - 1:
                 alive = wp.where(transmittance >= _TRANSMITTANCE_MIN, 1.0, 0.0)
                 if wp.tile_extract(wp.tile_sum(wp.tile(alive)), 0) == 0.0:
                     break
@@ -120,69 +120,68 @@ def _kernels(channels: int) -> tuple[Any, Any]:
             place, shape = places[row], shapes[row]
             dx, dy = x - place[0], y - place[1]
             g = _profile(dx, dy, place, shape, rings, arcs)
-            seen = wp.dot(above, values[row])
+            dot = wp.dot(upstream_here, values[row])
             weight = wp.float32(0.0)
             h = wp.float32(0.0)  # dL/dlog g
             d_peak = wp.float32(0.0)
             if add:
                 if g >= _PROFILE_MIN:
                     weight = g
-                    h = g * seen
+                    h = g * dot
             else:
                 alpha = peaks[row] * g
                 if alpha >= _ALPHA_MIN and transmittance >= _TRANSMITTANCE_MIN:
                     weight = alpha * transmittance
-                    left -= weight * seen
-                    h = weight * seen - left * alpha / (1.0 - alpha)
+                    remaining -= weight * dot
+                    h = weight * dot - remaining * alpha / (1.0 - alpha)
                     d_peak = h / peaks[row]
                     transmittance *= 1.0 - alpha
-            found = Gradients()
-            found[0] = d_peak
+            gradient_row = Gradients()
+            gradient_row[0] = d_peak
             for c in range(channels):
-                found[VALUES + c] = weight * above[c]
+                gradient_row[VALUES + c] = weight * upstream_here[c]
             u = place[2] * dx
             v = place[3] * dx + place[4] * dy
-            pull = float(h)  # -2 dL/dq
+            scaled = float(h)  # -2 dL/dq
             if rings:
                 r = wp.sqrt(wp.max(u * u + v * v, _RADIUS2_MIN))
                 t = (r - shape[0]) / shape[1]
-                found[SHAPE] = h * t / shape[1]
-                found[SHAPE + 1] = found[SHAPE] * t
-                pull = found[SHAPE] / r
-            pull_u, pull_v = pull * u, pull * v
+                gradient_row[SHAPE] = h * t / shape[1]
+                gradient_row[SHAPE + 1] = gradient_row[SHAPE] * t
+                scaled = gradient_row[SHAPE] / r
+            scaled_u, scaled_v = scaled * u, scaled * v
             if arcs:
-                found[SHAPE + 2] = h * u
-                found[SHAPE + 3] = h * v
-                found[SHAPE + 4] = -h
-                pull_u -= h * shape[2]
-                pull_v -= h * shape[3]
-            found[PLACE] = place[2] * pull_u + place[3] * pull_v
-            found[PLACE + 1] = place[4] * pull_v
-            found[PLACE + 2] = -pull_u * dx
-            found[PLACE + 3] = -pull_v * dx
-            found[PLACE + 4] = -pull_v * dy
-            wp.tile_atomic_add(sums, wp.tile_sum(wp.tile(found, preserve_type=True)), offset=(row,))
+                gradient_row[SHAPE + 2] = h * u
+                gradient_row[SHAPE + 3] = h * v
+                gradient_row[SHAPE + 4] = -h
+                scaled_u -= h * shape[2]
+                scaled_v -= h * shape[3]
+            gradient_row[PLACE] = place[2] * scaled_u + place[3] * scaled_v
+            gradient_row[PLACE + 1] = place[4] * scaled_v
+            gradient_row[PLACE + 2] = -scaled_u * dx
+            gradient_row[PLACE + 3] = -scaled_v * dx
+            gradient_row[PLACE + 4] = -scaled_v * dy
+            wp.tile_atomic_add(sums, wp.tile_sum(wp.tile(gradient_row, preserve_type=True)), offset=(row,))
 
     return forward, backward
 
 
-class _Draw(torch.autograd.Function):
-    """See `tiled.Draw`."""
+class _DrawTiles(torch.autograd.Function):
+    """Draws tiles; see `tiled.DrawTiles`."""
 
     @staticmethod
-    def forward(ctx: Any, lists: Lists, blend: Blend, *parts: Tensor | None) -> Any:
+    def forward(ctx: Any, lists: TileLists, blend: Blend, *parts: Tensor | None) -> Any:
         ctx.lists, ctx.blend = lists, blend
         _, values, _, _ = parts
         assert values is not None
         channels = values.shape[1] - 1
         picture = values.new_empty(lists.rows * lists.columns, BLOCK, channels)
-        halves = torch.empty(picture.shape[:2], dtype=torch.int32, device=picture.device)
-        _launch(
-            _kernels(channels)[0], lists, blend, parts, [_rows(picture.view(-1, channels)), _rows(halves.view(-1))]
-        )
+        median_rows = torch.empty(picture.shape[:2], dtype=torch.int32, device=picture.device)
+        outputs = [_as_warp_array(picture.view(-1, channels)), _as_warp_array(median_rows.view(-1))]
+        _launch(_kernels(channels)[0], lists, blend, parts, outputs)
         ctx.save_for_backward(picture, *parts)
-        ctx.mark_non_differentiable(halves)
-        return picture, halves
+        ctx.mark_non_differentiable(median_rows)
+        return picture, median_rows
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor, _: Tensor) -> Any:
@@ -190,8 +189,8 @@ class _Draw(torch.autograd.Function):
         places, values, rings, arcs = parts
         channels = values.shape[1] - 1
         sums = values.new_zeros(len(values), 1 + channels + PLACES + SHAPES)
-        arrays = [_rows(part.contiguous().view(-1, channels)) for part in (picture, gradient)]
-        _launch(_kernels(channels)[1], ctx.lists, ctx.blend, parts, [*arrays, _rows(sums)])
+        arrays = [_as_warp_array(part.contiguous().view(-1, channels)) for part in (picture, gradient)]
+        _launch(_kernels(channels)[1], ctx.lists, ctx.blend, parts, [*arrays, _as_warp_array(sums)])
         d_values, d_places, d_rings, d_arcs = sums.split([1 + channels, PLACES, 2, 3], 1)
         return (
             None, None, d_places.to(places.dtype), d_values,
@@ -199,15 +198,15 @@ class _Draw(torch.autograd.Function):
         )  # fmt: skip
 
 
-def _rows(tensor: Tensor) -> Any:
-    """A Warp array of a tensor's rows, without a copy."""
+def _as_warp_array(tensor: Tensor) -> Any:
+    """Return a Warp array of a tensor's rows, without a copy."""
     if tensor.ndim == 1:
         return wp.from_torch(tensor.detach(), requires_grad=False)
     kind = wp.types.vector(length=tensor.shape[1], dtype=wp.float32)
     return wp.from_torch(tensor.detach(), dtype=kind, requires_grad=False)
 
 
-def _launch(kernel: Any, lists: Lists, blend: Blend, parts: Any, more: list[Any]) -> None:
+def _launch(kernel: Any, lists: TileLists, blend: Blend, parts: Any, more: list[Any]) -> None:
     places, values, rings, arcs = parts
     shapes = values.new_zeros(len(values), SHAPES)
     if rings is not None:
@@ -216,9 +215,10 @@ def _launch(kernel: Any, lists: Lists, blend: Blend, parts: Any, more: list[Any]
         shapes[:, 2:] = arcs
     device = wp.device_from_torch(values.device)
     inputs = [
-        _rows(lists.entries.int()), _rows(lists.starts.int()), lists.columns,
-        _rows(places.float().contiguous()), _rows(values[:, 0].contiguous()), _rows(values[:, 1:].contiguous()),
-        _rows(shapes), rings is not None, arcs is not None, blend == "add", *more,
+        _as_warp_array(lists.entries.int()), _as_warp_array(lists.starts.int()), lists.columns,
+        _as_warp_array(places.float().contiguous()), _as_warp_array(values[:, 0].contiguous()),
+        _as_warp_array(values[:, 1:].contiguous()), _as_warp_array(shapes), rings is not None, arcs is not None,
+        blend == "add", *more,
     ]  # fmt: skip
     stream = wp.stream_from_torch(values.device) if device.is_cuda else None
     wp.launch(
@@ -226,6 +226,8 @@ def _launch(kernel: Any, lists: Lists, blend: Blend, parts: Any, more: list[Any]
     )
 
 
-def draw(lists: Lists, blend: Blend, median: bool, drawn: Gaussians) -> tuple[Tensor, Tensor]:  # noqa: ARG001
-    """See `tiled.Draw`."""
-    return _Draw.apply(lists, blend, *drawn)
+def draw(
+    lists: TileLists, blend: Blend, median: bool, gaussians: WhitenedGaussians  # noqa: ARG001
+) -> tuple[Tensor, Tensor]:  # fmt: skip
+    """Draw tiles; see `tiled.DrawTiles`."""
+    return _DrawTiles.apply(lists, blend, *gaussians)

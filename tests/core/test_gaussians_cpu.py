@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The CPU kernels as a piece of machinery: the same result on every machine, thread count and start."""
+"""The CPU kernels: the same result on every machine and thread count, compilation cache, threads and memory."""
 from __future__ import annotations
 
 import errno
@@ -26,7 +26,7 @@ pytest.importorskip("numba")
 from core.gaussians import loss as definition
 from core.gaussians import optimiser as plain_optimiser
 from core.gaussians import rasterization, splat
-from core.gaussians.cpu import Step, adam_steps, binning, buffers, compilation, l1_ssim, layout, threads
+from core.gaussians.cpu import AdamStep, adam_steps, binning, buffers, compilation, l1_ssim, layout, threads
 from core.gaussians.cpu import scene as rendering
 from core.gaussians.cpu.tiles import bin_gaussians
 
@@ -98,7 +98,7 @@ def test_equal_depths_are_drawn_in_the_order_given(planes: int) -> None:
             assert torch.equal(a, b), count
 
 
-def test_what_is_not_a_number_is_not_drawn() -> None:
+def test_gaussians_with_nan_are_not_drawn() -> None:
     """In the raw form too: exponential and sigmoid must not turn NaN into a size and an opacity."""
     arguments = scene()  # type: ignore[operator]
     kept = torch.arange(len(arguments["means"])) % 7 != 0
@@ -111,7 +111,7 @@ def test_what_is_not_a_number_is_not_drawn() -> None:
         assert torch.equal(rasterization(**{**arguments, name: spoiled}).colour, without)
 
 
-def test_splats_without_a_place_are_nowhere() -> None:
+def test_splats_with_a_nan_centre_are_not_drawn() -> None:
     g = torch.Generator().manual_seed(2)
     centres, covariances = torch.rand(60, 2, generator=g) * 70, torch.tensor([90.0, 20, 60]).repeat(60, 1)
     opacities, colours = torch.rand(60, generator=g), torch.rand(60, 3, generator=g)
@@ -164,23 +164,24 @@ def test_wide_and_narrow_gaussians_lose_no_tile(opacity: float) -> None:
 
 
 @pytest.mark.parametrize("count", [1, 2, 4])
-def test_plan_shares_the_work_and_leaves_nothing_out(count: int) -> None:
+def test_parts_are_balanced_and_cover_all_gaussians(count: int) -> None:
     rng = np.random.default_rng(0)
     keys = rng.uniform(2, 10, 20_000).astype(np.float32).view(np.uint32)
-    keys[::5] = binning.NOWHERE
-    bounds = np.where(keys < binning.NOWHERE, rng.integers(1, 6, len(keys)), 0).astype(np.int32)
+    keys[::5] = binning.CULLED_KEY
+    bounds = np.where(keys < binning.CULLED_KEY, rng.integers(1, 6, len(keys)), 0).astype(np.int32)
     chunk_bounds = np.add.reduceat(bounds, np.arange(0, len(keys), 1024)).astype(np.int64)
-    for some in (keys, np.full_like(keys, binning.NOWHERE), np.full_like(keys, 7)):
+    for some in (keys, np.full_like(keys, binning.CULLED_KEY), np.full_like(keys, 7)):
         starts, cuts = np.empty(len(chunk_bounds), np.int64), np.empty(count + 1, np.int64)
-        room = binning.plan(some, bounds, chunk_bounds, 3, np.empty(binning.CLASSES, np.int64), starts, cuts)
-        assert room == bounds.sum() and (starts == np.cumsum(chunk_bounds) - chunk_bounds).all()
-        assert cuts[0] == 0 and cuts[-1] == binning.NOWHERE and (np.diff(cuts) >= 0).all()
+        work = np.empty(binning.HISTOGRAM_BINS, np.int64)
+        capacity = binning.plan_parts(some, bounds, chunk_bounds, 3, work, starts, cuts)
+        assert capacity == bounds.sum() and (starts == np.cumsum(chunk_bounds) - chunk_bounds).all()
+        assert cuts[0] == 0 and cuts[-1] == binning.CULLED_KEY and (np.diff(cuts) >= 0).all()
         if some is keys:
             shares = [bounds[(keys >= a) & (keys < b)].sum() for a, b in pairwise(cuts)]
             assert max(shares) < 1.2 * min(shares)
 
 
-def test_two_renderings_may_wait_for_their_gradients() -> None:
+def test_two_renderings_keep_their_states_until_backward() -> None:
     alone = gradients(2)
     torch.set_num_threads(2)
     pairs = []
@@ -201,7 +202,7 @@ def test_without_gradients_the_picture_is_the_same() -> None:
     assert torch.equal(result.colour, gradients(1)[0])
 
 
-def test_nothing_to_see() -> None:
+def test_a_scene_without_visible_gaussians_renders_the_background() -> None:
     arguments = scene(n=20)  # type: ignore[operator]
     arguments["means"] = arguments["means"] * torch.tensor([1.0, 1.0, -1.0])
     arguments["means"].requires_grad_()
@@ -235,7 +236,7 @@ def test_all_instruction_sets_give_the_same_picture(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kernel", ["raster_forward", "raster_backward"])
-def test_arm_gets_vectors_and_no_calls(kernel: str) -> None:
+def test_arm_code_has_vectors_and_no_library_calls(kernel: str) -> None:
     import importlib
     import re
 
@@ -265,9 +266,9 @@ def test_arm_gets_vectors_and_no_calls(kernel: str) -> None:
 COMPILE = """
     import numpy as np
     from core.gaussians.cpu import binning, compilation
-    binning.deal(np.ones((2, 3), np.int32), np.zeros(4, np.int64))
+    binning.scan_tile_counts(np.ones((2, 3), np.int32), np.zeros(4, np.int64))
     print(compilation.CACHE_FOLDER)
-    print(sum(binning.deal.stats.cache_hits.values()))
+    print(sum(binning.scan_tile_counts.stats.cache_hits.values()))
 """
 
 
@@ -280,7 +281,7 @@ def _compile_elsewhere(environment: dict[str, str]) -> tuple[Path, int]:
     return Path(folder), int(hits)
 
 
-def test_kernels_are_kept_where_they_are_told_to_be(tmp_path: Path) -> None:
+def test_the_kernel_cache_lies_in_the_configured_folder(tmp_path: Path) -> None:
     environment = {"FIT_FLARE_CACHE": str(tmp_path)}
     folder, hits = _compile_elsewhere(environment)
     assert folder.is_relative_to(tmp_path) and hits == 0
@@ -288,14 +289,14 @@ def test_kernels_are_kept_where_they_are_told_to_be(tmp_path: Path) -> None:
     assert _compile_elsewhere(environment) == (folder, 1)
 
 
-def test_a_folder_that_cannot_be_used_is_no_obstacle(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unusable_cache_folder_is_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("FIT_FLARE_CACHE", str(tmp_path / "file"))
     folder = compilation._cache_folder()
     assert not folder.is_relative_to(tmp_path) and os.access(folder, os.W_OK)
 
 
-def test_a_folder_of_its_own_is_gone_with_the_process(tmp_path: Path) -> None:
+def test_a_temporary_cache_folder_is_deleted_at_exit(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     (tmp_path / "temporary").mkdir()
     unusable = {"FIT_FLARE_CACHE": str(tmp_path / "file"), "TMPDIR": str(tmp_path / "temporary")}
@@ -304,7 +305,7 @@ def test_a_folder_of_its_own_is_gone_with_the_process(tmp_path: Path) -> None:
     assert not list((tmp_path / "temporary").glob("fit_flare_*"))
 
 
-def test_a_full_disk_under_the_kernels_is_no_obstacle(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_kernels_run_when_their_cache_cannot_be_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(*_: object) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
@@ -319,7 +320,7 @@ def doubled(value: float) -> float:
     return 2 * value
 
 
-def test_a_user_without_a_home_is_no_obstacle(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_user_without_a_home_gets_a_cache_folder(monkeypatch: pytest.MonkeyPatch) -> None:
     def none() -> Path:
         raise RuntimeError("Could not determine home directory.")
 
@@ -343,7 +344,7 @@ def test_an_error_in_any_thread_reaches_the_caller() -> None:
     gradients(2)  # the threads are still there
 
 
-def test_calls_reach_threads_that_sleep_and_threads_that_spin() -> None:
+def test_calls_reach_sleeping_and_spinning_threads() -> None:
     """Also from several callers at once, and when fewer threads are asked than before."""
     def call(times: int, pause: float) -> None:
         for number in range(times):
@@ -358,11 +359,11 @@ def test_calls_reach_threads_that_sleep_and_threads_that_spin() -> None:
             done.result(60)
 
 
-def test_memory_is_used_again_but_never_while_in_use() -> None:
-    size = buffers.SMALL  # numbers of 4 bytes: a block of its own
+def test_memory_is_reused_only_after_its_last_reference() -> None:
+    size = buffers.MIN_POOLED_BYTES  # numbers of 4 bytes: a block of its own
     first = buffers.empty(size)
     place = first.ctypes.data
-    assert place % buffers.LINE == 0
+    assert place % buffers.CACHE_LINE == 0
     view = torch.from_numpy(first)[3:].view(-1, 1)
     del first
     other = buffers.empty(size)
@@ -371,24 +372,24 @@ def test_memory_is_used_again_but_never_while_in_use() -> None:
     assert buffers.empty(size - 1).ctypes.data == place
 
 
-def test_memory_kept_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(buffers, "KEPT", 8 * buffers.SMALL)
+def test_the_memory_pool_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(buffers, "MAX_FREE_BYTES", 8 * buffers.MIN_POOLED_BYTES)
     for _ in range(3):
-        held = [buffers.empty(buffers.SMALL * step // 4) for step in (1, 2, 3)] + [buffers.empty(buffers.SMALL)]
+        held = [buffers.empty(buffers.MIN_POOLED_BYTES * step // 4) for step in (1, 2, 3, 4)]
         del held
-    kept = sum(size * len(blocks) for size, blocks in buffers._shelf.items())
-    assert kept == buffers._stored <= 8 * buffers.SMALL
+    free = sum(size * len(blocks) for size, blocks in buffers._free_blocks.items())
+    assert free == buffers._free_bytes <= 8 * buffers.MIN_POOLED_BYTES
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.int32, np.int64])
-def test_small_memory_is_aligned_too(dtype: type) -> None:
+def test_small_arrays_are_aligned(dtype: type) -> None:
     for count in (1, 100, 5000):
         array = buffers.empty(count, dtype)
-        assert array.size == count and array.dtype == dtype and array.ctypes.data % buffers.LINE == 0
+        assert array.size == count and array.dtype == dtype and array.ctypes.data % buffers.CACHE_LINE == 0
 
 
 @pytest.mark.parametrize("size", [(5, 6), (37, 53), (64, 48), (11, 2)])
-def test_loss_and_its_gradient(size: tuple[int, int]) -> None:
+def test_the_fused_loss_and_its_gradient_equal_the_definition(size: tuple[int, int]) -> None:
     g = torch.Generator().manual_seed(0)
     image = torch.rand(*size, 3, generator=g).requires_grad_()
     target = (image.detach() + 0.2 * torch.randn(*size, 3, generator=g)).clamp(0, 1)
@@ -403,7 +404,7 @@ def test_loss_and_its_gradient(size: tuple[int, int]) -> None:
         assert torch.linalg.vector_norm(image.grad - exact.grad) < 1e-5 * torch.linalg.vector_norm(exact.grad)
 
 
-def test_loss_notices_a_target_that_changes() -> None:
+def test_the_loss_sees_a_target_that_was_changed_in_place() -> None:
     image, target = torch.rand(20, 30, 3), torch.rand(20, 30, 3)
     before = l1_ssim(image, target, 0.5)
     target.copy_(image)
@@ -415,7 +416,7 @@ def test_loss_notices_a_target_that_changes() -> None:
     [((1001, 3), 0.01), ((1001, 16, 3), torch.linspace(0.1, 1, 48).reshape(16, 3)), ((7,), 0.1),
      ((50, 3), torch.tensor([1.0, 2, 3]))],
 )  # fmt: skip
-def test_adam(shape: tuple[int, ...], rate: float | Tensor) -> None:
+def test_fused_adam_steps_equal_the_definition(shape: tuple[int, ...], rate: float | Tensor) -> None:
     g = torch.Generator().manual_seed(0)
     values = torch.rand(shape, generator=g)
     moments = [torch.zeros(shape) for _ in range(2)]
@@ -425,8 +426,8 @@ def test_adam(shape: tuple[int, ...], rate: float | Tensor) -> None:
     for step in range(1, 5):
         gradient = torch.randn(shape, generator=g)
         constants = {"beta1": 0.9, "beta2": 0.999, "epsilon": 1e-15}
-        others = Step(other, torch.ones(40_000), *other_moments, 1, 0.5)
-        adam_steps([Step(values, gradient, *moments, step, rate), others], **constants)
+        others = AdamStep(other, torch.ones(40_000), *other_moments, 1, 0.5)
+        adam_steps([AdamStep(values, gradient, *moments, step, rate), others], **constants)
         plain_optimiser.adam_step(exact, gradient.double(), *exact_moments, step, exact_rate, **constants)
         for moment in other_moments:
             moment.zero_()
@@ -453,7 +454,7 @@ def test_ellipses_far_larger_than_the_picture_are_listed_within_their_rows(monke
         assert (tiles[few & two] + grid.tiles_x < grid.tiles).all()
         bins = bin_gaussians(*given)
         met = np.flatnonzero(few)
-        assert (bins.counts <= bounds)[given[1] < binning.NOWHERE].all()
+        assert (bins.counts <= bounds)[given[1] < binning.CULLED_KEY].all()
         return bins
 
     monkeypatch.setattr(rendering, "bin_gaussians", listed)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The vector layer against numpy."""
+"""The vector layer compared with numpy."""
 from __future__ import annotations
 
 from collections.abc import Callable
@@ -20,13 +20,13 @@ B = np.random.default_rng(1).normal(0, 3, 16).astype(np.float32)
 
 
 def run(body: Callable[..., Any], *arrays: np.ndarray, size: int = 16) -> np.ndarray:
-    """What a kernel body(out, *arrays) writes."""
+    """Return the array that a kernel body(out, *arrays) writes."""
     out = np.zeros(size, np.float32)
     numba.njit(**OPTIONS)(body)(out, *arrays)
     return out
 
 
-def test_arithmetic() -> None:
+def test_operators_equal_numpy() -> None:
     def body(out, a, b):  # type: ignore[no-untyped-def]
         x, y = v.load(a, 0), v.load(b, 0)
         v.store(out, 0, x + y * 2 - 1)
@@ -42,7 +42,7 @@ def test_arithmetic() -> None:
     np.testing.assert_allclose(found, [a + b * 2 - 1, -a / b, a * b + 0.5, 0.5 - a * b], rtol=1e-5, atol=2e-6)
 
 
-def test_choices_and_masks() -> None:
+def test_comparisons_and_selects_equal_numpy() -> None:
     def body(out, a, b):  # type: ignore[no-untyped-def]
         x, y = v.load(a, 0), v.load(b, 0)
         v.store(out, 0, v.where((x < y) & (x > -1), x, 7))
@@ -62,12 +62,12 @@ def test_choices_and_masks() -> None:
     assert found[80] == 0 and found[81] == 1
 
 
-def test_integers() -> None:
+def test_integer_operations_and_conversions_equal_numpy() -> None:
     def body(out, a):  # type: ignore[no-untyped-def]
         n = v.to_ints(v.load(a, 0))
         v.store(out, 0, v.to_floats(((n << 3) + 1 - (n >> 1)) & 0xFF | 2))
         v.store(out, 16, v.as_floats(v.as_ints(v.load(a, 0))))
-        v.store(out, 32, v.lanes())
+        v.store(out, 32, v.lane_index())
         v.store(out, 48, v.splat(2.5))
 
     found = run(body, A, size=64).reshape(4, 16)
@@ -75,7 +75,7 @@ def test_integers() -> None:
     np.testing.assert_array_equal(found, [((n << 3) + 1 - (n >> 1)) & 0xFF | 2, A, np.arange(16), np.full(16, 2.5)])
 
 
-def test_rows() -> None:
+def test_transpose_and_interleave_permute_lanes() -> None:
     def body(out, a):  # type: ignore[no-untyped-def]
         rows = v.transpose(v.load_rows(a, 1, 20))
         v.store_rows(out, 0, 16, rows)
@@ -86,19 +86,20 @@ def test_rows() -> None:
 
     a = np.random.default_rng(2).normal(size=400).astype(np.float32)
     found = run(body, a, size=448)
-    turned = a[1:321].reshape(16, 20)[:, :16].T
-    np.testing.assert_array_equal(found[:256].reshape(16, 16), turned)
-    np.testing.assert_array_equal(found[256:304].reshape(3, 16), turned[:3].reshape(16, 3).T)
-    np.testing.assert_array_equal(found[304:352], turned[:3].T.reshape(-1))
-    np.testing.assert_array_equal(found[352:384], turned[3:5].T.reshape(-1))
-    np.testing.assert_array_equal(found[384:448].reshape(4, 16), turned[:4])
+    transposed = a[1:321].reshape(16, 20)[:, :16].T
+    np.testing.assert_array_equal(found[:256].reshape(16, 16), transposed)
+    np.testing.assert_array_equal(found[256:304].reshape(3, 16), transposed[:3].reshape(16, 3).T)
+    np.testing.assert_array_equal(found[304:352], transposed[:3].T.reshape(-1))
+    np.testing.assert_array_equal(found[352:384], transposed[3:5].T.reshape(-1))
+    np.testing.assert_array_equal(found[384:448].reshape(4, 16), transposed[:4])
 
 
-def test_shifts_and_products() -> None:
+def test_align_lanes_and_multiply_each_equal_numpy() -> None:
     def body(out, a, b):  # type: ignore[no-untyped-def]
         x, y = v.load(a, 0), v.load(b, 0)
-        v.store_rows(out, 0, 16, (v.shifted(x, y, 0), v.shifted(x, y, 5), v.shifted(x, y, 15), v.shifted(x, y, 16)))
-        v.store_rows(out, 64, 16, v.products((x, y, x), (y, y, x)))
+        v.store_rows(out, 0, 16, (v.align_lanes(x, y, 0), v.align_lanes(x, y, 5)))
+        v.store_rows(out, 32, 16, (v.align_lanes(x, y, 15), v.align_lanes(x, y, 16)))
+        v.store_rows(out, 64, 16, v.multiply_each((x, y, x), (y, y, x)))
 
     found = run(body, A, B, size=112).reshape(7, 16)
     both = np.concatenate([A, B])
@@ -107,9 +108,9 @@ def test_shifts_and_products() -> None:
 
 
 @pytest.mark.parametrize("count", [1, 2, 7, 8, 9, 10, 16])
-def test_sums_of_many_vectors_at_once(count: int) -> None:
+def test_reduce_add_each_sums_every_vector(count: int) -> None:
     vectors = "".join(f"v.load(a, {16 * i}), " for i in range(count))
-    text = f"def body(out, a):\n    v.store(out, 0, v.totals(({vectors})))"
+    text = f"def body(out, a):\n    v.store(out, 0, v.reduce_add_each(({vectors})))"
     namespace = {"v": v}
     exec(text, namespace)
     a = np.random.default_rng(3).normal(size=(count, 16)).astype(np.float32)
@@ -117,25 +118,25 @@ def test_sums_of_many_vectors_at_once(count: int) -> None:
     np.testing.assert_allclose(found[:count], a.astype(np.float64).sum(1), rtol=1e-5, atol=1e-5)
 
 
-def test_sum_and_single_values() -> None:
+def test_reduce_add_and_load_scalar_equal_numpy() -> None:
     def body(out, a):  # type: ignore[no-untyped-def]
-        out[0] = v.total(v.load(a, 0))
-        out[1] = v.get(a, 5)
+        out[0] = v.reduce_add(v.load(a, 0))
+        out[1] = v.load_scalar(a, 5)
         for i in range(0, 4, v.opaque(2)):
             out[2] += i
 
     np.testing.assert_allclose(run(body, A)[:3], [A.astype(np.float64).sum(), A[5], 2], rtol=1e-5)
 
 
-def test_counter() -> None:
+def test_the_counter_is_incremented_once_per_call() -> None:
     def body(out, counter):  # type: ignore[no-untyped-def]
         for i in range(16):
-            out[i] = v.take_number(counter)
+            out[i] = v.atomic_increment(counter)
 
     np.testing.assert_array_equal(run(body, np.zeros(1, np.int64)), np.arange(16))
 
 
-def test_elementary_functions() -> None:
+def test_exponentials_and_logarithm_are_within_their_error_bounds() -> None:
     x = np.linspace(-140, 130, 16 * 4000).astype(np.float32)
     positive = np.exp(np.linspace(-80, 80, 16 * 4000)).astype(np.float32)
     small = np.linspace(-3, 0.5, 16 * 4000).astype(np.float32)
@@ -144,17 +145,17 @@ def test_elementary_functions() -> None:
         for i in range(0, a.size, 16):
             v.store(out, i, v.exp2(v.load(a, i)))
             v.store(out, i + a.size, v.log2(v.load(b, i)))
-            v.store(out, i + 2 * a.size, v.exp2_less_one(v.load(c, i)))
+            v.store(out, i + 2 * a.size, v.exp2m1(v.load(c, i)))
 
-    exp2, log2, less = run(body, x, positive, small, size=3 * x.size).reshape(3, -1)
+    exp2, log2, exp2m1 = run(body, x, positive, small, size=3 * x.size).reshape(3, -1)
     inside = (x >= -126) & (x <= 126)
     np.testing.assert_allclose(exp2[inside], np.exp2(x[inside].astype(np.float64)), rtol=3e-7)
     assert (exp2[x < -126] <= 1.2e-38).all() and (exp2[x > 127] >= 2**126).all()
     np.testing.assert_allclose(log2, np.log2(positive.astype(np.float64)), rtol=3e-7, atol=3e-7)
-    np.testing.assert_allclose(less, np.expm1(small.astype(np.float64) * np.log(2)), rtol=4e-7, atol=1e-30)
+    np.testing.assert_allclose(exp2m1, np.expm1(small.astype(np.float64) * np.log(2)), rtol=4e-7, atol=1e-30)
 
 
-def test_activations() -> None:
+def test_exp_and_sigmoid_are_accurate_and_keep_nan() -> None:
     x = np.linspace(-20, 20, 16 * 4000).astype(np.float32)
     x[:3] = np.nan, np.inf, -np.inf
 

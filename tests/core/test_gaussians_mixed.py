@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Flares at mixed resolution: how far they may be from the full one."""
+"""Splatting at mixed resolution: errors against full resolution, upsampling and compositing."""
 from __future__ import annotations
 
 import math
@@ -26,7 +26,7 @@ def ellipses(n: int, smallest: float, largest: float, seed: int) -> tuple[Tensor
 
 
 @pytest.mark.parametrize("what", ["plain", "rings", "arcs"])
-def test_each_is_within_its_bound(what: str) -> None:
+def test_each_reduced_gaussian_is_within_its_error_bound(what: str) -> None:
     n = 60
     centres, covariances = ellipses(n, 4, 40, 1)
     generator = torch.Generator().manual_seed(2)
@@ -36,7 +36,7 @@ def test_each_is_within_its_bound(what: str) -> None:
     if what == "arcs":
         slopes = torch.randn(n, 2, generator=generator)
         arcs = slopes * (3 * torch.rand(n, generator=generator) / arc_strengths(covariances, slopes)).float()[:, None]
-    factors = mixed.reductions(covariances, rings, arcs)
+    factors = mixed.choose_reductions(covariances, rings, arcs)
     assert (factors == 1).any() and (factors == 2).any() and (factors == 4).any()
     largest = 0.0
     for i in range(n):
@@ -57,7 +57,7 @@ def test_each_is_within_its_bound(what: str) -> None:
 
 
 @pytest.mark.parametrize(("blend", "limit"), [("over", 6e-3), ("add", 1e-3)])
-def test_a_flare_of_many(blend: str, limit: float) -> None:
+def test_a_flare_at_mixed_resolution_is_close_to_the_full_one(blend: str, limit: float) -> None:
     """Faint Gaussians end in a step of 1/255 when blended, large against their peak: so "over" is off by more."""
     n = 300
     centres, covariances = ellipses(n, 2, 60, 3)
@@ -71,7 +71,7 @@ def test_a_flare_of_many(blend: str, limit: float) -> None:
     assert (fast.transmittance - full.transmittance).square().mean().sqrt() < limit
 
 
-def test_gradients_are_those_of_the_full_picture() -> None:
+def test_gradients_at_mixed_resolution_are_close_to_the_full_ones() -> None:
     centres, covariances = ellipses(20, 8, 40, 5)
     found = []
     for resolution in ("full", "mixed"):
@@ -84,7 +84,7 @@ def test_gradients_are_those_of_the_full_picture() -> None:
         assert torch.linalg.vector_norm(fast - full) < 0.02 * torch.linalg.vector_norm(full)
 
 
-def test_the_border_is_no_special_place() -> None:
+def test_upsampled_gaussians_have_no_artefacts_at_the_border() -> None:
     """A ramp that runs off the frame: without neighbours outside, the outermost pixels would be level."""
     inputs = (torch.tensor([[-20.0, 10.0]]), torch.tensor([[900.0, 0, 900.0]]), torch.ones(1), torch.ones(1, 3))
     full = splat(*inputs, 50, 30, blend="add", kernels="torch").colour
@@ -93,18 +93,18 @@ def test_the_border_is_no_special_place() -> None:
 
 
 @pytest.mark.parametrize("factor", [2, 4])
-def test_enlarging_is_torchs(factor: int) -> None:
+def test_upsampling_equals_torch_interpolation(factor: int) -> None:
     generator = torch.Generator().manual_seed(0)
     small = torch.rand(7, 5, 4, dtype=torch.float64, generator=generator, requires_grad=True)
     planes = small.permute(2, 0, 1)[None]
     expected = torch.nn.functional.interpolate(planes, scale_factor=factor, mode="bilinear")[0].permute(1, 2, 0)
-    assert torch.allclose(layers.enlarge(small, factor), expected[factor:-factor, factor:-factor])
-    assert torch.autograd.gradcheck(lambda s: layers.enlarge(s, factor), small)
+    assert torch.allclose(layers.upsample(small, factor), expected[factor:-factor, factor:-factor])
+    assert torch.autograd.gradcheck(lambda s: layers.upsample(s, factor), small)
 
 
 @pytest.mark.parametrize("factor", [2, 4])
 @pytest.mark.parametrize("size", [(150, 111), (64, 32), (17, 1), (5, 3)])
-def test_layers_in_single_precision(factor: int, size: tuple[int, int]) -> None:
+def test_fused_layers_equal_the_torch_layers(factor: int, size: tuple[int, int]) -> None:
     """The fused kernels, pictures that no vector and no small pixel divides, and those too small for them."""
     width, height = size
     small = (-(-height // factor) + 2, -(-width // factor) + 2)
@@ -114,7 +114,7 @@ def test_layers_in_single_precision(factor: int, size: tuple[int, int]) -> None:
     found = []
     for dtype in (torch.float64, torch.float32):
         colour, t, behind = inputs = [v.to(dtype, copy=True).requires_grad_() for v in values]
-        layer = layers.enlarged(Splats(colour, t), factor, width, height)
+        layer = layers.upsample_layer(Splats(colour, t), factor, width, height)
         picture = over(layer, behind)
         (picture * pattern).sum().backward()
         found.append([picture.detach(), layer.transmittance.detach(), *(v.grad for v in inputs)])
@@ -122,14 +122,14 @@ def test_layers_in_single_precision(factor: int, size: tuple[int, int]) -> None:
         assert torch.allclose(fast.double(), exact, atol=1e-5)
 
 
-def test_layers_whose_transmittance_no_one_asks_for() -> None:
+def test_upsampling_needs_no_gradient_by_the_transmittance() -> None:
     colour, t = torch.rand(20, 30, 3, requires_grad=True), torch.rand(20, 30, requires_grad=True)
-    layers.enlarged(Splats(colour, t), 2, 50, 33).colour.sum().backward()
+    layers.upsample_layer(Splats(colour, t), 2, 50, 33).colour.sum().backward()
     assert colour.grad is not None and colour.grad.sum() == pytest.approx(3 * 50 * 33, rel=1e-5)
     assert t.grad is None or not t.grad.any()
 
 
-def test_nothing_is_nothing() -> None:
+def test_no_gaussians_at_mixed_resolution_render_an_empty_picture() -> None:
     inputs = (torch.zeros(0, 2), torch.zeros(0, 3), torch.zeros(0), torch.zeros(0, 3))
     laid = splat(*inputs, 5, 3, resolution="mixed")
     assert laid.colour.shape == (3, 5, 3) and not laid.colour.any() and (laid.transmittance == 1).all()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Scenes as PLY files: what goes out comes back, and what is no such file is refused."""
+"""Scenes as PLY files: exact round trips, foreign files, and errors."""
 from __future__ import annotations
 
 from pathlib import Path
@@ -30,7 +30,7 @@ def header(text: str, n: int, rest: int = 45, form: str = "binary_little_endian"
 
 
 @pytest.mark.parametrize("n", [0, 1, 7])
-def test_every_bit_comes_back(tmp_path: Path, n: int) -> None:
+def test_a_scene_is_restored_exactly(tmp_path: Path, n: int) -> None:
     first = scene(n)
     write_ply(tmp_path / "a.ply", first)
     again = read_ply(tmp_path / "a.ply")
@@ -47,7 +47,7 @@ def test_every_bit_comes_back(tmp_path: Path, n: int) -> None:
         ("comment white 3.5", 3.5), ("comment white 0.5", 1.0), ("comment white 1e9", 1.0),
         ("comment white nan", 1.0))),
 ])
-def test_what_a_scene_is_shown_with_comes_back(kept: str, number: float, said: str, read: float,
+def test_near_white_and_pixel_grid_are_restored(kept: str, number: float, said: str, read: float,
                                                tmp_path: Path) -> None:
     """Near depth and white."""
     first = scene()
@@ -61,7 +61,7 @@ def test_what_a_scene_is_shown_with_comes_back(kept: str, number: float, said: s
     assert getattr(read_ply(tmp_path / "b.ply"), kept) == read
 
 
-def test_the_layout_is_that_of_3dgs(tmp_path: Path) -> None:
+def test_the_layout_equals_that_of_3dgs(tmp_path: Path) -> None:
     """Column by column, from the bytes."""
     s = scene(3)
     write_ply(tmp_path / "a.ply", s)
@@ -82,7 +82,7 @@ def test_the_layout_is_that_of_3dgs(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("rest", [0, 9, 24])
 @pytest.mark.parametrize("order", ["<", ">"])
-def test_lower_degrees_and_byte_orders(tmp_path: Path, rest: int, order: str) -> None:
+def test_lower_degrees_and_big_endian_files_are_read(tmp_path: Path, rest: int, order: str) -> None:
     form = "binary_little_endian" if order == "<" else "binary_big_endian"
     table = np.arange(2 * (17 + rest), dtype=np.float32).reshape(2, -1)
     lines = header("comment from elsewhere", 2, rest, form)
@@ -96,7 +96,7 @@ def test_lower_degrees_and_byte_orders(tmp_path: Path, rest: int, order: str) ->
     assert np.array_equal(s.quaternions.detach().numpy(), table[:, -4:])
 
 
-def test_other_properties_and_elements_do_no_harm(tmp_path: Path) -> None:
+def test_unknown_properties_and_elements_are_ignored(tmp_path: Path) -> None:
     s = scene(4)
     write_ply(tmp_path / "a.ply", s)
     head, body = (tmp_path / "a.ply").read_bytes().split(b"end_header\n", 1)
@@ -143,7 +143,7 @@ def broken() -> list[tuple[str, bytes, str]]:
 
 
 @pytest.mark.parametrize(("what", "data", "message"), broken(), ids=[what for what, _, _ in broken()])
-def test_broken_files_are_refused(tmp_path: Path, what: str, data: bytes, message: str) -> None:
+def test_broken_files_raise(tmp_path: Path, what: str, data: bytes, message: str) -> None:
     path = tmp_path / "scene.ply"
     path.write_bytes(data)
     with pytest.raises(FlareFileError, match=message) as error:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What optimises a scene: loss, Adam, densification, order in space."""
+"""Optimisation of a scene: loss, Adam, densification, Morton order."""
 from __future__ import annotations
 
 import math
@@ -18,7 +18,7 @@ from core.errors import RunError, SettingsError
 from core.fit.optimisers import Optimisers
 from core.fit.settings import FitSettings
 from core.gaussians import Adam, Rendering, SceneGaussians, kernels, l1_ssim, ssim
-from core.gaussians.densification import Classic, ClassicSettings, Mcmc, McmcSettings, shared
+from core.gaussians.densification import Classic, ClassicSettings, Mcmc, McmcSettings, relocated_opacity_and_scale
 from core.gaussians.ordering import morton_order, nearest_distances
 
 
@@ -31,7 +31,7 @@ def pictures(height: int, width: int, seed: int = 0) -> tuple[Tensor, Tensor]:
 # Loss
 
 
-def test_ssim_by_another_way() -> None:
+def test_ssim_equals_scipy_filters() -> None:
     """Against the formula, windowed by scipy in double precision."""
     image, target = (p.double().numpy() for p in pictures(23, 31))
     x = np.arange(11) - 5
@@ -49,7 +49,7 @@ def test_ssim_by_another_way() -> None:
 
 @pytest.mark.parametrize("size", [(1, 1), (5, 40), (33, 47)])
 @pytest.mark.parametrize("lam", [0.0, 0.8, 1.0])
-def test_loss_in_single_precision(size: tuple[int, int], lam: float) -> None:
+def test_the_loss_in_single_precision_equals_double_precision(size: tuple[int, int], lam: float) -> None:
     """Whichever kernels are at hand, against plain torch in double precision."""
     image, target = pictures(*size)
     exact_image = image.double().requires_grad_()
@@ -63,12 +63,12 @@ def test_loss_in_single_precision(size: tuple[int, int], lam: float) -> None:
     assert error <= 1e-4 * torch.linalg.vector_norm(exact_image.grad)
 
 
-def test_loss_of_the_same_picture_is_nothing() -> None:
+def test_the_loss_of_equal_pictures_is_zero() -> None:
     _, target = pictures(20, 20)
     assert l1_ssim(target.clone(), target, 0.8).item() == pytest.approx(0, abs=1e-6)
 
 
-def test_loss_refuses_other_sizes() -> None:
+def test_the_loss_raises_for_different_sizes() -> None:
     with pytest.raises(SettingsError, match="must both be"):
         l1_ssim(torch.zeros(4, 5, 3), torch.zeros(5, 4, 3), 0.8)
 
@@ -76,7 +76,7 @@ def test_loss_refuses_other_sizes() -> None:
 # Adam
 
 
-def test_adam_is_torchs() -> None:
+def test_adam_steps_equal_torch() -> None:
     generator = torch.Generator().manual_seed(0)
     start = {"a": torch.randn(7, 3, generator=generator), "b": torch.randn(5, generator=generator)}
     ours = {name: torch.nn.Parameter(value.clone()) for name, value in start.items()}
@@ -97,7 +97,7 @@ def test_adam_is_torchs() -> None:
         assert torch.allclose(ours[name], theirs[name], rtol=1e-5, atol=1e-6)
 
 
-def test_adam_with_rates_by_column() -> None:
+def test_adam_rates_by_column_equal_separate_parameters() -> None:
     rows = torch.nn.Parameter(torch.zeros(4, 2, 3))
     rate = torch.zeros(2, 3)
     rate[0], rate[1, 2] = 0.1, 0.5
@@ -107,7 +107,7 @@ def test_adam_with_rates_by_column() -> None:
     assert torch.allclose(rows, (-rate).expand_as(rows), atol=1e-6)
 
 
-def test_adam_rows_keep_their_moments() -> None:
+def test_adam_selects_rows_with_their_moments() -> None:
     """Rows that move take along all that decides how they go on."""
     generator = torch.Generator().manual_seed(1)
     start, gradients = torch.randn(6, 2, generator=generator), torch.randn(10, 6, 2, generator=generator)
@@ -117,7 +117,7 @@ def test_adam_rows_keep_their_moments() -> None:
         optimiser = Adam({"rows": rows}, 0.1)
         for step, gradient in enumerate(gradients):
             if step == 5 and order is not None:
-                optimiser.keep(order)
+                optimiser.keep_rows(order)
             rows.grad = gradient[order] if step >= 5 and order is not None else gradient.clone()
             optimiser.step()
         return rows.detach()
@@ -126,20 +126,20 @@ def test_adam_rows_keep_their_moments() -> None:
     assert torch.equal(run(order), run(None)[order])
 
 
-def test_adam_appends_and_forgets() -> None:
+def test_adam_appends_rows_and_resets_moments() -> None:
     rows, other = torch.nn.Parameter(torch.zeros(2, 3)), torch.nn.Parameter(torch.zeros(1))
     optimiser = Adam({"rows": rows, "other": other}, 0.1)
     rows.grad = torch.ones(2, 3)
     optimiser.step()
-    optimiser.append({"rows": torch.full((1, 3), 7.0)})
+    optimiser.append_rows({"rows": torch.full((1, 3), 7.0)})
     assert rows.shape == (3, 3) and rows.grad is None and (rows[2] == 7).all()
     assert (optimiser.moments["rows"].first[:2] > 0).all() and (optimiser.moments["rows"].first[2] == 0).all()
-    optimiser.forget("rows", torch.tensor([0]))
+    optimiser.reset_moments("rows", torch.tensor([0]))
     assert (optimiser.moments["rows"].second[0] == 0).all() and (optimiser.moments["rows"].second[1] > 0).all()
     assert (other == 0).all()  # no gradient, no step
 
 
-def test_adam_goes_on_from_its_state() -> None:
+def test_adam_resumes_from_its_state() -> None:
     rows = torch.nn.Parameter(torch.zeros(3))
     optimiser = Adam({"rows": rows}, 0.1)
     for _ in range(3):
@@ -161,7 +161,7 @@ def test_adam_goes_on_from_its_state() -> None:
 # Scene and order
 
 
-def test_a_scene_from_points() -> None:
+def test_points_become_gaussians_of_3dgs_size_and_colour() -> None:
     rng = np.random.default_rng(0)
     xyz = rng.normal(size=(400, 3)).astype(np.float32)
     rgb = rng.integers(0, 256, (400, 3)).astype(np.uint8)
@@ -180,7 +180,7 @@ def test_a_scene_from_points() -> None:
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 500])
-def test_nearest_distances(n: int) -> None:
+def test_nearest_distances_equal_brute_force(n: int) -> None:
     generator = torch.Generator().manual_seed(n)
     points = torch.randn(n, 3, generator=generator)
     points[n // 2 :, 0] += 100  # two clusters, far apart
@@ -190,7 +190,7 @@ def test_nearest_distances(n: int) -> None:
     assert torch.allclose(found.double(), expected, atol=1e-4)
 
 
-def test_morton_order_brings_neighbours_together() -> None:
+def test_morton_order_keeps_neighbours_together() -> None:
     generator = torch.Generator().manual_seed(0)
     points = torch.rand(4096, 3, generator=generator)
     order = morton_order(points)
@@ -202,11 +202,11 @@ def test_morton_order_brings_neighbours_together() -> None:
 
 
 def of_scene(scene: SceneGaussians, extent: float = 1.0, iterations: int = 100) -> Optimisers:
-    """What steps a scene in a fit without a flare."""
+    """Return the optimisers of a scene in a fit without a flare."""
     return Optimisers(scene, None, FitSettings(iterations=iterations), extent, display_white=1.0)
 
 
-def test_schedules() -> None:
+def test_the_rate_decays_exponentially() -> None:
     optimisers = of_scene(SceneGaussians.empty(2), extent=2.0)
     for iteration, expected in ((0, 3.2e-4), (50, 3.2e-5), (100, 3.2e-6)):
         optimisers.set_rates(iteration)
@@ -217,7 +217,7 @@ CAMERA = Camera(36, 28, 40.0, 40.0, 18.0, 14.0, np.array([[1.0, 0, 0, 0], [0, 1,
 
 
 @pytest.mark.parametrize("n", [10, 60, 1029, 1060, 2100])
-def test_steps_during_the_backward_pass_are_the_same(n: int) -> None:
+def test_steps_in_backward_equal_separate_steps(n: int) -> None:
     """Chunks of Gaussians of which the last is short, and numbers too few for a vector, which are not stepped there."""
     target = torch.rand(28, 36, 3, generator=torch.Generator().manual_seed(1))
 
@@ -226,7 +226,7 @@ def test_steps_during_the_backward_pass_are_the_same(n: int) -> None:
         optimiser.zero_grad()
         for degree in (1, 3, 3):
             loss = l1_ssim(scene.render(CAMERA, degree).colour, target, 0.8)
-            with optimiser.stepping() if early else nullcontext():
+            with optimiser.step_in_backward() if early else nullcontext():
                 loss.backward()
             optimiser.step()
             optimiser.zero_grad()
@@ -241,17 +241,17 @@ def test_steps_during_the_backward_pass_are_the_same(n: int) -> None:
             assert torch.allclose(a, b, rtol=1e-4, atol=1e-9), name
 
 
-@pytest.mark.skipif(not kernels.available("cpu"), reason="the CPU kernels step early")
-def test_a_gradient_after_its_step_is_refused() -> None:
+@pytest.mark.skipif(not kernels.is_available("cpu"), reason="the CPU kernels step early")
+def test_a_gradient_after_its_step_raises() -> None:
     scene, optimiser = some_scene(100)
     optimiser.zero_grad()
-    with optimiser.stepping():
+    with optimiser.step_in_backward():
         scene.render(CAMERA).colour.sum().backward()
     assert all(parameter.grad is None for parameter in scene.parameters())
     before = scene.means.clone()
     optimiser.step()  # has nothing left to do
     assert torch.equal(scene.means, before)
-    with pytest.raises(RunError, match="rendered twice"), optimiser.stepping():
+    with pytest.raises(RunError, match="rendered twice"), optimiser.step_in_backward():
         (scene.render(CAMERA).colour.sum() + scene.render(CAMERA).colour.sum()).backward()
 
 
@@ -309,7 +309,7 @@ def test_classic_clones_splits_and_prunes() -> None:
         assert (moments.first[:8] != 0).any() and not moments.first[8:].any()
 
 
-def test_classic_holds_its_cap_by_score() -> None:
+def test_classic_densifies_the_highest_scores_up_to_its_cap() -> None:
     scene, optimiser = some_scene(20)
     with torch.no_grad():
         scene.opacity_logits.fill_(0.0)
@@ -333,7 +333,7 @@ def test_classic_resets_opacities() -> None:
     assert optimiser.moments["means"].first.any()
 
 
-def test_classic_resets_no_opacities_at_its_end() -> None:
+def test_classic_resets_no_opacities_in_its_last_iteration() -> None:
     scene, optimiser = some_scene()
     strategy = Classic(scene, optimiser, 1.0, torch.Generator(), ClassicSettings(start=10, stop=10, reset_every=5))
     before = scene.opacities.detach().clone()
@@ -341,7 +341,7 @@ def test_classic_resets_no_opacities_at_its_end() -> None:
     assert torch.equal(scene.opacities, before)
 
 
-def test_classic_waits_for_its_time() -> None:
+def test_classic_refines_only_between_start_and_stop() -> None:
     scene, optimiser = some_scene()
     strategy = Classic(scene, optimiser, 1.0, torch.Generator(), ClassicSettings(start=500, stop=700, every=100))
     strategy.observe(seen(60, torch.ones(60)))
@@ -350,10 +350,10 @@ def test_classic_waits_for_its_time() -> None:
 
 
 @pytest.mark.parametrize("copies", [1, 2, 3, 10, 51])
-def test_copies_look_as_one(copies: int) -> None:
+def test_relocated_copies_render_as_one_gaussian(copies: int) -> None:
     """The double sum of the paper's equation 8, term by term."""
     for opacity in (0.01, 0.3, 0.9, 0.99):
-        new, factor = shared(torch.tensor([opacity], dtype=torch.float64), torch.tensor([copies]))
+        new, factor = relocated_opacity_and_scale(torch.tensor([opacity], dtype=torch.float64), torch.tensor([copies]))
         assert (1 - float(new)) ** copies == pytest.approx(1 - opacity, rel=1e-9)
         total = sum(
             math.comb(i - 1, k) * (-1) ** k * float(new) ** (k + 1) / math.sqrt(k + 1)
@@ -363,7 +363,7 @@ def test_copies_look_as_one(copies: int) -> None:
         assert float(factor) == pytest.approx(opacity / total, rel=1e-6)
 
 
-def test_mcmc_moves_the_dead_and_grows_to_its_cap() -> None:
+def test_mcmc_relocates_dead_gaussians_and_grows_to_its_cap() -> None:
     scene, optimiser = some_scene(100)
     with torch.no_grad():
         scene.opacity_logits.fill_(0.5)
@@ -381,7 +381,7 @@ def test_mcmc_moves_the_dead_and_grows_to_its_cap() -> None:
     assert (scene.opacities > 0.005).all()
 
 
-def test_mcmc_lets_only_the_faint_wander() -> None:
+def test_mcmc_injects_noise_into_faint_gaussians_only() -> None:
     scene, optimiser = some_scene()
     with torch.no_grad():
         scene.opacity_logits.fill_(2.0)
@@ -396,7 +396,7 @@ def test_mcmc_lets_only_the_faint_wander() -> None:
 
 
 @pytest.mark.parametrize("kind", ["classic", "mcmc"])
-def test_the_seed_decides(kind: str) -> None:
+def test_a_run_is_determined_by_its_seed(kind: str) -> None:
     def run(seed: int, interrupted: bool) -> Tensor:
         scene, optimiser = some_scene()
         generator = torch.Generator().manual_seed(seed)
@@ -416,7 +416,7 @@ def test_the_seed_decides(kind: str) -> None:
                 current.load_state_dict(state)
             current.update(iteration)
             order = morton_order(scene.means)
-            optimiser.keep(order)
+            optimiser.keep_rows(order)
             current.reorder(order)
         return scene.means.detach()
 
@@ -426,7 +426,7 @@ def test_the_seed_decides(kind: str) -> None:
     assert a.shape != b.shape or not torch.equal(a, b)
 
 
-def test_training_finds_a_picture() -> None:
+def test_training_fits_a_picture() -> None:
     """The parts together: a scene learns another one's pictures, and grows on the way."""
     truth, _ = some_scene(40, seed=3)
     with torch.no_grad():
@@ -464,7 +464,7 @@ def test_training_finds_a_picture() -> None:
 
 
 @pytest.mark.parametrize("unit", [1.0, 1e-5])
-def test_points_make_gaussians_of_their_distances_in_worlds_of_any_unit(unit: float) -> None:
+def test_initial_sizes_scale_with_the_unit_of_the_world(unit: float) -> None:
     """Two that coincide have the floor's size, which lies below that of the others."""
     xyz = np.random.default_rng(0).uniform(-1, 1, (200, 3))
     xyz[1] = xyz[2] = xyz[3] = xyz[0]

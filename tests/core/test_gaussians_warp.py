@@ -29,7 +29,7 @@ def _as_cuda(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("_as_cuda")
 @pytest.mark.parametrize("part", range(4))
-def test_against_the_definition(part: int) -> None:
+def test_warp_kernels_equal_the_definition(part: int) -> None:
     cases = [scene_case(seed) for seed in range(part, 80, 4)] + [splat_case(seed) for seed in range(part, 40, 4)]
     wrong = [line for case in cases for line in differences(case, "cuda")]
     assert not wrong, "\n".join(wrong)
@@ -37,7 +37,7 @@ def test_against_the_definition(part: int) -> None:
 
 @pytest.mark.skipif(not wp.get_cuda_toolkit_version(), reason="this build of Warp has no CUDA compiler")
 @pytest.mark.parametrize("arch", [75, 90])
-def test_compiles_for_a_gpu(arch: int, tmp_path: Path) -> None:
+def test_warp_kernels_compile_for_a_gpu(arch: int, tmp_path: Path) -> None:
     for kernel in warp_kernels._kernels(5):
         kernel.module.options["block_dim"] = warp_kernels.BLOCK
         written = wp.compile_aot_module(kernel.module, arch=arch, module_dir=tmp_path, strip_hash=False)
@@ -47,12 +47,12 @@ def test_compiles_for_a_gpu(arch: int, tmp_path: Path) -> None:
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs an NVIDIA GPU")
 @pytest.mark.parametrize("part", range(4))
 @pytest.mark.parametrize("name", ["cuda", "tiles"])
-def test_on_a_gpu(name: str, part: int) -> None:
+def test_cuda_kernels_equal_the_definition_on_a_gpu(name: str, part: int) -> None:
     cases = [scene_case(seed) for seed in range(part, 200, 4)] + [splat_case(seed) for seed in range(part, 100, 4)]
     wrong = [line for case in cases for line in differences(case, name, "cuda")]
     assert not wrong, "\n".join(wrong)
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs an NVIDIA GPU")
-def test_a_gpu_takes_these() -> None:
+def test_auto_selects_cuda_kernels_on_a_gpu() -> None:
     assert kernels._fastest(torch.zeros(1, device="cuda")) == "cuda"

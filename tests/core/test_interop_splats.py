@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Scenes of other tools: gsplat's own export and reference, and the compressed form."""
+"""Scenes of other tools: gsplat's export and reference, and compressed PLY."""
 from __future__ import annotations
 
 import warnings
@@ -75,7 +75,7 @@ def write_compressed(path: Path, scene: SceneGaussians) -> None:
     path.write_bytes("\n".join(lines).encode() + body)
 
 
-def test_the_compressed_form_is_read(tmp_path: Path) -> None:
+def test_a_compressed_ply_is_read(tmp_path: Path) -> None:
     """Quantised, so alike and not the same: each within a step of its chunk's range."""
     first = scene()
     write_compressed(tmp_path / "a.compressed.ply", first)
@@ -91,7 +91,7 @@ def test_the_compressed_form_is_read(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kept", [2000, 300])
-def test_a_damaged_compressed_file_is_refused(tmp_path: Path, kept: int) -> None:
+def test_a_damaged_compressed_ply_raises(tmp_path: Path, kept: int) -> None:
     write_compressed(tmp_path / "a.ply", scene(40))
     (tmp_path / "cut.ply").write_bytes((tmp_path / "a.ply").read_bytes()[:kept])
     with pytest.raises(FlareFileError, match=r"cut\.ply is"):
@@ -102,7 +102,7 @@ def test_a_damaged_compressed_file_is_refused(tmp_path: Path, kept: int) -> None
                                   "property uint packed_position\n",
                                   f"element chunk {'9' * 20}\nproperty float min_x\n"
                                   "element vertex 1\nproperty uint packed_position\n"])
-def test_a_compressed_file_whose_header_makes_no_sense_is_refused(tmp_path: Path, head: str) -> None:
+def test_a_compressed_ply_with_an_invalid_header_raises(tmp_path: Path, head: str) -> None:
     text = f"ply\nformat binary_little_endian 1.0\n{head}end_header\n"
     (tmp_path / "odd.ply").write_bytes(text.encode() + bytes(99))
     with pytest.raises(FlareFileError, match=r"odd\.ply is a damaged compressed PLY"):
@@ -118,7 +118,7 @@ def gsplat_parts() -> tuple[Any, Any]:
     return exporter, reference
 
 
-def test_what_gsplat_exports_loads_bit_by_bit_and_renders_as_its_reference(tmp_path: Path) -> None:
+def test_an_export_of_gsplat_loads_exactly_and_renders_as_its_reference(tmp_path: Path) -> None:
     """Projection and spherical harmonics by gsplat's torch reference; its compositing written out, since
     that part of the reference wants CUDA: alpha at most 0.999, left out below 1/255, front to back."""
     exporter, reference = gsplat_parts()

@@ -1,17 +1,18 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The kernels for CPUs: numba with explicit SIMD, on all threads of torch.
 
-From the bottom up: `compilation` and `threads` (machine code, and who runs it), `buffers` (memory), `vector` (16
-lanes as a type), then each kernel with its mathematics in its head: `spherical_harmonics`, `projection`,
-`binning`, `raster_forward`, `raster_backward`; `scene` strings them together for autograd.
+From the bottom up: `compilation` and `threads` (machine code and the threads that run it), `buffers` (memory),
+`vector` (16 lanes as a type), then the kernels, each with its mathematics in its module head: `spherical_harmonics`,
+`projection`, `binning`, `raster_forward`, `raster_backward`. `scene` runs them in order as one autograd function.
+`flare` and `splats` do the same for 2D Gaussians.
 """
 from __future__ import annotations
 
-from .layers import enlarged, over
+from .layers import over, upsample
 from .loss import l1_ssim
-from .optimiser import Step, adam_steps
+from .optimiser import AdamStep, adam_steps
 from .scene import rasterize_scene
 from .splats import splat
-from .stepping import offered
+from .stepping import steps_in_backward
 
-__all__ = ["Step", "adam_steps", "enlarged", "l1_ssim", "offered", "over", "rasterize_scene", "splat"]
+__all__ = ["AdamStep", "adam_steps", "l1_ssim", "over", "rasterize_scene", "splat", "steps_in_backward", "upsample"]

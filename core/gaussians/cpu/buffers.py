@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Memory that is used again.
+"""A pool of memory blocks for the kernels' arrays.
 
-An iteration asks for the same large arrays each time. Fresh from the system each page of them costs a
-fault, more than the kernels take to fill it. So a block goes back to a shelf when the last array or tensor
-that looks at it is gone, and the next request of about its size gets it.
+Each iteration allocates the same large arrays. Memory fresh from the system costs a fault for each page, which takes
+longer than the kernels take to fill it. So a block returns to the pool when the last array or tensor that refers to it
+is freed, and serves the next request of about its size.
 """
 from __future__ import annotations
 
@@ -18,99 +18,99 @@ from torch import Tensor
 
 Array = npt.NDArray[Any]
 
-LINE = 64
-"""Bytes of a cache line; where arrays start."""
-SMALL = 1 << 15
-"""Bytes below which the system's own memory is as good."""
-KEPT = 1 << 30
-"""Bytes kept on the shelves at most; those unused for longest go first."""
+CACHE_LINE = 64
+"""Bytes of a cache line, to which arrays are aligned."""
+MIN_POOLED_BYTES = 1 << 15
+"""Size in bytes from which arrays come from the pool; smaller ones come from the system."""
+MAX_FREE_BYTES = 1 << 30
+"""Most bytes in the pool; the blocks that are unused for longest are freed first."""
 
-_shelf: OrderedDict[int, list[Array]] = OrderedDict()
-_loans: dict[int, _Loan] = {}
-_stored = 0
+_free_blocks: OrderedDict[int, list[Array]] = OrderedDict()
+_references: dict[int, _BlockReference] = {}
+_free_bytes = 0
 
 
-class _Loan(weakref.ref[Array]):
-    """Watches an array; its block returns to the shelf with it."""
+class _BlockReference(weakref.ref[Array]):
+    """A weak reference to an array, which returns the array's block to the pool when the array is freed."""
 
     __slots__ = ("block",)
     block: Array
 
 
-def _give_back(loan: weakref.ref[Array]) -> None:
-    global _stored
-    assert isinstance(loan, _Loan)
-    del _loans[id(loan)]
-    size = loan.block.size
-    _shelf.setdefault(size, []).append(loan.block)
-    _shelf.move_to_end(size)
-    _stored += size
-    while _stored > KEPT:
-        oldest, blocks = next(iter(_shelf.items()))
+def _release(reference: weakref.ref[Array]) -> None:
+    global _free_bytes
+    assert isinstance(reference, _BlockReference)
+    del _references[id(reference)]
+    size = reference.block.size
+    _free_blocks.setdefault(size, []).append(reference.block)
+    _free_blocks.move_to_end(size)
+    _free_bytes += size
+    while _free_bytes > MAX_FREE_BYTES:
+        oldest, blocks = next(iter(_free_blocks.items()))
         blocks.pop()
-        _stored -= oldest
+        _free_bytes -= oldest
         if not blocks:
-            del _shelf[oldest]
+            del _free_blocks[oldest]
 
 
 def _capacity(size: int) -> int:
-    """The next of 8 steps to each power of two."""
+    """Round a size in bytes up to one of 8 sizes per power of two."""
     step = 1 << (size.bit_length() - 4)
     return -(-size // step) * step
 
 
-def _at_line(size: int) -> Array:
-    array = np.empty(size + LINE, np.uint8)
-    first = -array.__array_interface__["data"][0] % LINE
+def _allocate_aligned(size: int) -> Array:
+    array = np.empty(size + CACHE_LINE, np.uint8)
+    first = -array.__array_interface__["data"][0] % CACHE_LINE
     return array[first : first + size]
 
 
-def _block(capacity: int) -> Array:
-    global _stored
-    blocks = _shelf.get(capacity)
+def _take_block(capacity: int) -> Array:
+    global _free_bytes
+    blocks = _free_blocks.get(capacity)
     if not blocks:
-        return _at_line(capacity)
-    _stored -= capacity
+        return _allocate_aligned(capacity)
+    _free_bytes -= capacity
     block = blocks.pop()
     if not blocks:
-        del _shelf[capacity]
+        del _free_blocks[capacity]
     return block
 
 
 def empty(count: int, dtype: npt.DTypeLike = np.float32) -> Array:
-    """A flat array of undefined contents that starts at a cache line."""
+    """Return a flat, uninitialised array that starts at a cache line."""
     dtype = np.dtype(dtype)
     size = count * dtype.itemsize
-    if size < SMALL:
-        return _at_line(size).view(dtype)
-    block = _block(_capacity(size))
-    # frombuffer: an array that others refer to as their base, so that the block is free after all of them
+    if size < MIN_POOLED_BYTES:
+        return _allocate_aligned(size).view(dtype)
+    block = _take_block(_capacity(size))
+    # frombuffer: views refer to this array as their base, so the block is released after all of them
     array = np.frombuffer(block.data, dtype, count)
-    loan = _Loan(array, _give_back)
-    loan.block = block
-    _loans[id(loan)] = loan
+    reference = _BlockReference(array, _release)
+    reference.block = block
+    _references[id(reference)] = reference
     return array
 
 
-def empties(*wanted: tuple[int, type[np.generic]]) -> list[Array]:
-    """Several flat arrays, of counts and types, that are given back together: one loan is cheaper than many."""
-    sizes = [-(-count * np.dtype(kind).itemsize // LINE) * LINE for count, kind in wanted]
+def empty_many(*requests: tuple[int, type[np.generic]]) -> list[Array]:
+    """Return several flat, uninitialised arrays of (count, type) in one block: one reference is cheaper than many."""
+    sizes = [-(-count * np.dtype(kind).itemsize // CACHE_LINE) * CACHE_LINE for count, kind in requests]
     block, arrays, first = empty(sum(sizes), np.uint8), [], 0
-    for (count, kind), size in zip(wanted, sizes, strict=True):
+    for (count, kind), size in zip(requests, sizes, strict=True):
         arrays.append(block[first : first + size].view(kind)[:count])
         first += size
     return arrays
 
 
 def zeros(count: int) -> Array:
-    """The same, filled with zeros."""
+    """Return a flat float32 array of zeros that starts at a cache line."""
     array = empty(count)
     array.fill(0)
     return array
 
 
-def pair(*shape: int) -> tuple[Tensor, Array]:
-    """A float32 tensor of undefined contents, and the same memory as a flat array."""
+def tensor_and_array(*shape: int) -> tuple[Tensor, Array]:
+    """Return an uninitialised float32 tensor, and the same memory as a flat array."""
     count = 1
     for extent in shape:
         count *= extent

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Compiles kernels on their first call and keeps the machine code on disk for the next start.
+"""Compiles kernels on their first call and caches the machine code on disk for the next start.
 
-The folder is one of the user's own, so that the package itself may be read-only; the environment variable
-FIT_FLARE_CACHE names another. Its last part is a fingerprint of all sources of this package, since numba looks
-for changes only in the file that a kernel stands in, not in those that it calls; and of the package's full name,
-which is another inside Blender, and which numba stores.
+The cache lies in a folder of the user, so that the package itself may be read-only; the environment variable
+FIT_FLARE_CACHE names another folder. The folder's last part is a fingerprint of all sources of this package, since
+numba detects changes only in the file of a kernel and not in the files it calls, and of the package's full name, which
+numba stores and which differs inside Blender.
 """
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ OPTIONS: dict[str, Any] = {
 
 
 def _user_folder() -> Path:
-    """Where this platform keeps what can be computed again."""
+    """Return the platform's folder for caches."""
     if sys.platform == "win32":
         base = os.environ.get("LOCALAPPDATA") or str(Path.home() / "AppData" / "Local")
     elif sys.platform == "darwin":
@@ -50,18 +50,18 @@ def _fingerprint() -> str:
 
 
 def _cache_folder() -> Path:
-    """A folder that can be written to, by this user only: machine code is loaded from it. Where there is none,
-    one for this process alone."""
+    """Return a folder that only this user can write to, since machine code is loaded from it; a temporary folder of
+    this process if there is none."""
     try:
         folder = Path(os.environ.get("FIT_FLARE_CACHE") or _user_folder()) / "kernels" / _fingerprint()
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-    except (OSError, RuntimeError):  # of a user without a home
-        return _own_folder()
-    return folder if os.access(folder, os.W_OK) else _own_folder()
+    except (OSError, RuntimeError):  # RuntimeError: the user has no home
+        return _temporary_folder()
+    return folder if os.access(folder, os.W_OK) else _temporary_folder()
 
 
-def _own_folder() -> Path:
-    """Of this process alone, gone with it."""
+def _temporary_folder() -> Path:
+    """Return a new folder, deleted at the end of the process."""
     folder = tempfile.mkdtemp(prefix="fit_flare_")
     atexit.register(shutil.rmtree, folder, True)
     return Path(folder)
@@ -71,28 +71,29 @@ CACHE_FOLDER = _cache_folder()
 
 
 def kernel(function: Callable[..., Any]) -> Any:
-    """A function called from Python; runs without the interpreter's lock."""
-    config: Any = numba.config  # numba asks for the folder here, when a function is declared
+    """Declare a function that Python calls; it runs without the interpreter's lock."""
+    config: Any = numba.config  # numba reads the folder here, when a function is declared
     before, config.CACHE_DIR = config.CACHE_DIR, str(CACHE_FOLDER)
     try:
-        made = numba.njit(nogil=True, cache=True, **OPTIONS)(function)
+        dispatcher = numba.njit(nogil=True, cache=True, **OPTIONS)(function)
     finally:
         config.CACHE_DIR = before
-    if hasattr(made, "_cache"):  # not where numba is told to compile nothing
-        made._cache.save_overload = _where_there_is_room(made._cache.save_overload)
-    return made
+    if hasattr(dispatcher, "_cache"):  # missing where NUMBA_DISABLE_JIT is set
+        dispatcher._cache.save_overload = _ignore_os_errors(dispatcher._cache.save_overload)
+    return dispatcher
 
 
-def _where_there_is_room(save: Callable[..., None]) -> Callable[..., None]:
-    """A folder that is full, or that the system refuses, costs the next start its time, not this one its work."""
-    def saved(*words: Any) -> None:
+def _ignore_os_errors(save: Callable[..., None]) -> Callable[..., None]:
+    """Wrap `save` so that a full or unwritable disk only means compiling again at the next start."""
+
+    def save_if_possible(*arguments: Any) -> None:
         with contextlib.suppress(OSError):
-            save(*words)
+            save(*arguments)
 
-    return saved
+    return save_if_possible
 
 
 def inlined(function: Callable[..., Any]) -> Any:
-    """A part of a kernel, with a name of its own and no cost."""
+    """Declare a function that is inlined into the kernels that call it."""
     options: dict[str, Any] = {"forceinline": True, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
     return numba.njit(**options, **OPTIONS)(function)

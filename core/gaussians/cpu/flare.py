@@ -1,22 +1,22 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""2D Gaussians laid on a picture: the flare's rasterizer.
+"""Kernels that rasterize 2D Gaussians, called by `splats`.
 
-The definition is `..reference`: plain Gaussians, rings and arcs; "over" in the order given, or "add". Records,
-tiles and moments are those of the scene (`projection`, `binning`), so that plain Gaussians "over" need no
-kernel of their own: they are a scene that is already projected. What else there is, a row at a time:
+The definition is `..reference`: plain Gaussians, rings and arcs, blended by "over" in the given order or by "add".
+Records, tiles and moments are the scene's (`projection`, `binning`), so plain Gaussians blended by "over" use the
+scene's kernels: they are a projected scene. The other profiles, one row at a time:
 
     r = sqrt(-2 ln 2 (A u² + D d_y²))      Mahalanobis distance
     ring      G = 2^-(s (r - r0)²),         s = 1 / (2 ln 2 w²)
     arc       G = G exp(b·d - m),             b·d = b_x u + b_s d_y,   b_s = b_y - k b_x
     add       picture = sum opacity colour G:   no order, no transmittance; its tiles are sums
 
-Backward, g = dL / d ln alpha as in the scene. A profile acts on centre and covariance through q alone, as the plain
-one does with g replaced by
+In the backward pass g = dL / d ln alpha, as in the scene. A profile depends on centre and covariance through q alone,
+so its gradients are those of the plain one with g replaced by
 
     h = -2 g d ln G / dq = g (r - r0) / (w² r)
 
-and an arc on the centre through b·d, too: d ln G = -b. Its own gradients are sums of g u, g d_y and g, since d_x is
-u - k d_y.
+and an arc depends on the centre through b·d as well: d ln G = -b. The gradients of b and m are sums of g u, g d_y and
+g, since d_x is u - k d_y.
 """
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ import math
 import numpy as np
 
 from .. import rendering
-from .binning import NOWHERE, number_slots
+from .binning import CULLED_KEY, exclusive_sum
 from .compilation import inlined, kernel
 from .layout import (
     ALPHA_MIN,
@@ -73,20 +73,20 @@ from .layout import (
     X,
     Y,
 )
-from .projection import MARGIN, RUN_MAX, RUN_POWERS
+from .projection import MARGIN, RUN_LOG2_RANGE, RUN_MAX
 from .raster_backward import EDGE, SCRATCH, V_BLUE, V_GREEN, V_RED, load_tile, moments, row_gradient
 from .raster_backward import ROW as ROW_BACKWARD
 from .raster_backward import STATE as STATE_BACKWARD
 from .raster_forward import (
-    AHEAD,
     BLUE_PLANE,
+    CHECK_INTERVAL,
     GREEN_PLANE,
-    PAUSE,
+    PREFETCH_DISTANCE,
     RED_PLANE,
     ROW,
     blend_row,
     falloff,
-    finished,
+    is_finished,
     is_needle,
     needle_offsets,
     next_entry,
@@ -98,25 +98,25 @@ from .raster_forward import (
 )
 from .vector import (
     any_of,
+    atomic_increment,
     exp2,
     fma,
-    get,
-    lanes,
+    lane_index,
     load,
+    load_scalar,
     maximum,
     opaque,
     prefetch,
+    reduce_add_each,
     splat,
     sqrt,
     store,
-    take_number,
-    totals,
     where,
 )
 
-# Places in a shape: ring and arc of a Gaussian. SHARP: s above; LIMIT: the
-# power of two below which nothing is drawn; ARC_U, ARC_Y, LEVEL: b_x, b_s and m, over ln 2.
-R0, SHARP, WIDTH, LIMIT, ARC_U, ARC_Y, LEVEL = range(7)
+# Offsets in a shape: ring and arc of a Gaussian. SHARPNESS: s above; CUTOFF: the largest -log2 G that is drawn; ARC_U,
+# ARC_Y, ARC_NORM: b_x, b_s and m, over ln 2.
+R0, SHARPNESS, WIDTH, CUTOFF, ARC_U, ARC_Y, ARC_NORM = range(7)
 SHAPE = 8
 
 PROFILE_MIN = np.float32(rendering.PROFILE_MIN)
@@ -129,15 +129,15 @@ RADIUS2_MIN = np.float32(1e-12)
 
 
 @inlined
-def _powers(opacity, add):
-    """How many times a peak can be halved until nothing is drawn; negative if nothing is at all."""
+def _cutoff_log2(opacity, add):
+    """Return log2 of the peak over the smallest value that is drawn; negative if even the peak is below it."""
     share = 4096.0 if add else opacity * 255.0
     return math.log(share) / math.log(2.0) if share >= 1.0 else -1.0
 
 
 @inlined
-def _strength(arcs, i, xx, xy, yy):
-    """beta of `arc_strengths` of `..rendering`, or 0 where there are no arcs."""
+def _arc_strength(arcs, i, xx, xy, yy):
+    """Return beta, see `arc_strengths` of `..rendering`; 0 without arcs."""
     if arcs.size == 0:
         return 0.0
     x, y = np.float64(arcs[3 * i]), np.float64(arcs[3 * i + 1])
@@ -146,19 +146,19 @@ def _strength(arcs, i, xx, xy, yy):
 
 @inlined
 def _tiles(centre, half, size, shift):
-    """How many tiles centre - half .. centre + half meets, along one axis."""
+    """Return the number of tiles that centre - half .. centre + half touches along one axis."""
     return (int(min(centre + half, size - 1.0)) >> shift) - (int(max(centre - half, 0.0)) >> shift) + 1
 
 
 @kernel
-def prepare(
+def prepare_records(
     centres, covariances, opacities, colours, rings, arcs, width, height, add,
     records, shapes, keys, bounds, firsts, chunk_bounds,
 ):  # fmt: skip
-    """Writes record, shape and bound on the number of tiles of each Gaussian; in float64, for needles. The key is its
-    number; firsts, chunk_bounds: see `binning`.
+    """Write record, shape, and an upper bound on the number of tiles of each Gaussian; in float64, for needles.
 
-    rings, arcs: empty where there are none. Where light adds, the opacity goes into the colour.
+    The key is the Gaussian's index; firsts, chunk_bounds: see `binning`. rings, arcs: empty if there are none. With the
+    blend "add" the opacity is multiplied into the colour.
     """
     half = -0.5 / math.log(2.0)
     for i in range(opacities.size):
@@ -168,16 +168,17 @@ def prepare(
         determinant = xx * yy - xy * xy
         opacity = np.float64(opacities[i]) if add else min(np.float64(opacities[i]), rendering.OPACITY_MAX)
         r0, w = (np.float64(rings[2 * i]), np.float64(rings[2 * i + 1])) if rings.size > 0 else (0.0, 1.0)
-        powers = _powers(opacity, add)
-        # Mahalanobis; see `levelled` and `extent` of `..rendering`.
-        reach = r0 + w * w * _strength(arcs, i, xx, xy, yy) + abs(w) * math.sqrt(2.0 * math.log(2.0) * max(powers, 0.0))
-        keys[i], bounds[i] = NOWHERE, 0
-        if not (determinant > 0 and xx > 0 and powers >= 0 and reach >= 0):
+        cutoff = _cutoff_log2(opacity, add)
+        # Mahalanobis; see `normalise_arcs` and `extent` of `..rendering`.
+        plain_reach = math.sqrt(2.0 * math.log(2.0) * max(cutoff, 0.0))
+        reach = r0 + w * w * _arc_strength(arcs, i, xx, xy, yy) + abs(w) * plain_reach
+        keys[i], bounds[i] = CULLED_KEY, 0
+        if not (determinant > 0 and xx > 0 and cutoff >= 0 and reach >= 0):
             continue
         x, y, k = np.float64(centres[2 * i]), np.float64(centres[2 * i + 1]), -xy / yy
         major, minor = half * yy / determinant, half / yy
         half_x, half_y = reach * math.sqrt(xx), reach * math.sqrt(yy)
-        # Asked so that a centre that is no number is nowhere: it would be listed in tiles that are not there.
+        # Negated so that a NaN centre is culled: it would be listed in tiles that do not exist.
         if not (x + half_x > 0 and y + half_y > 0 and x - half_x < width and y - half_y < height):
             continue
         gain = opacity if add else 1.0
@@ -187,56 +188,56 @@ def prepare(
         records[at + K_REST] = k - np.float64(records[at + K])
         records[at + OPACITY] = 1.0 if add else opacity
         records[at + STEP] = math.expm1(2.0 * bend * math.log(2.0))
-        records[at + RUN] = min(math.sqrt(RUN_POWERS / -bend), np.float64(RUN_MAX))
+        records[at + RUN] = min(math.sqrt(RUN_LOG2_RANGE / -bend), np.float64(RUN_MAX))
         records[at + RED], records[at + GREEN] = gain * colours[3 * i], gain * colours[3 * i + 1]
         records[at + BLUE], records[at + DEPTH] = gain * colours[3 * i + 2], 0.0
         records[at + REACH] = half * reach * reach - MARGIN
         records[at + HALF_X], records[at + HALF_Y] = half_x, half_y
-        _write_shape(shapes, i, r0, w, powers, k, arcs)
+        _write_shape(shapes, i, r0, w, cutoff, k, arcs)
         columns = _tiles(x, half_x + 0.5, width, TILE_SHIFT_X)
         keys[i], bounds[i] = i, columns * _tiles(y, half_y + 0.5, height, TILE_SHIFT_Y)
     for chunk in range(chunk_bounds.size):
         end = min(chunk * CHUNK + CHUNK, bounds.size)
-        chunk_bounds[chunk] = number_slots(bounds, chunk * CHUNK, end, firsts)
+        chunk_bounds[chunk] = exclusive_sum(bounds, chunk * CHUNK, end, firsts)
 
 
 @inlined
-def _write_shape(shapes, i, r0, w, powers, k, arcs):
+def _write_shape(shapes, i, r0, w, cutoff, k, arcs):
     at = i * SHAPE
     shapes[at + R0], shapes[at + WIDTH] = r0, w
-    shapes[at + SHARP] = 0.5 / (math.log(2.0) * w * w)
-    shapes[at + LIMIT] = powers + MARGIN
+    shapes[at + SHARPNESS] = 0.5 / (math.log(2.0) * w * w)
+    shapes[at + CUTOFF] = cutoff + MARGIN
     if arcs.size > 0:
         x, y, m = np.float64(arcs[3 * i]), np.float64(arcs[3 * i + 1]), np.float64(arcs[3 * i + 2])
         shapes[at + ARC_U], shapes[at + ARC_Y] = x / math.log(2.0), (y - k * x) / math.log(2.0)
-        shapes[at + LEVEL] = m / math.log(2.0)
+        shapes[at + ARC_NORM] = m / math.log(2.0)
 
 
 # --- profiles --------------------------------------------------------------------------------------------
 
 
 @inlined
-def _start(records, at, left, y):
-    """u of lane 0 and d_y in the pixel row y, and k, which is what u grows by from row to row; all float64."""
-    dy = y + 0.5 - np.float64(get(records, at + Y))
-    k = np.float64(get(records, at + K)) + np.float64(get(records, at + K_REST))
-    return left + 0.5 - np.float64(get(records, at + X)) + k * dy, dy, k
+def _row_start(records, at, left, y):
+    """Return u of lane 0 and d_y in the pixel row y, and k, the step of u from row to row; all float64."""
+    dy = y + 0.5 - np.float64(load_scalar(records, at + Y))
+    k = np.float64(load_scalar(records, at + K)) + np.float64(load_scalar(records, at + K_REST))
+    return left + 0.5 - np.float64(load_scalar(records, at + X)) + k * dy, dy, k
 
 
 @inlined
 def _distance(records, at, u, dy):
-    """r, Mahalanobis."""
-    power = fma(u * get(records, at + A), u, get(records, at + D) * dy * dy)
+    """Return the Mahalanobis distance r."""
+    power = fma(u * load_scalar(records, at + A), u, load_scalar(records, at + D) * dy * dy)
     return sqrt(maximum(power * -TWO_LN2, RADIUS2_MIN))
 
 
 @inlined
-def _halvings(shapes, shape, z, u, dy, arcs):
-    """-log2 G, z = r - r0."""
+def _negative_log2_profile(shapes, shape, z, u, dy, arcs):
+    """Return -log2 G; z = r - r0."""
     if not arcs:
-        return z * z * get(shapes, shape + SHARP)
-    level = get(shapes, shape + LEVEL) - get(shapes, shape + ARC_Y) * dy
-    return fma(z * z, get(shapes, shape + SHARP), level - u * get(shapes, shape + ARC_U))
+        return z * z * load_scalar(shapes, shape + SHARPNESS)
+    level = load_scalar(shapes, shape + ARC_NORM) - load_scalar(shapes, shape + ARC_Y) * dy
+    return fma(z * z, load_scalar(shapes, shape + SHARPNESS), level - u * load_scalar(shapes, shape + ARC_U))
 
 
 # --- forward ---------------------------------------------------------------------------------------------
@@ -244,17 +245,17 @@ def _halvings(shapes, shape, z, u, dy, arcs):
 
 @inlined
 def _add_row(state, at, e, records, record):
-    """Adds one row of a Gaussian."""
+    """Add one row of a Gaussian to the sums of a tile."""
     e = where(e >= PROFILE_MIN, e, ZERO)
-    store(state, at + RED_PLANE, fma(e, get(records, record + RED), load(state, at + RED_PLANE)))
-    store(state, at + GREEN_PLANE, fma(e, get(records, record + GREEN), load(state, at + GREEN_PLANE)))
-    store(state, at + BLUE_PLANE, fma(e, get(records, record + BLUE), load(state, at + BLUE_PLANE)))
+    store(state, at + RED_PLANE, fma(e, load_scalar(records, record + RED), load(state, at + RED_PLANE)))
+    store(state, at + GREEN_PLANE, fma(e, load_scalar(records, record + GREEN), load(state, at + GREEN_PLANE)))
+    store(state, at + BLUE_PLANE, fma(e, load_scalar(records, record + BLUE), load(state, at + BLUE_PLANE)))
 
 
 @inlined
 def _add_plain(state, records, at, left, top, first, end, start):
-    """A plain Gaussian, rows first .. end; by the recurrence unless it is a needle (see `raster_forward`)."""
-    step, one = get(records, at + STEP), opaque(1)
+    """Add a plain Gaussian to rows first .. end, by the recurrence unless it is a needle (see `raster_forward`)."""
+    step, one = load_scalar(records, at + STEP), opaque(1)
     needle, run = is_needle(records, at, end - first), run_length(records, at)
     e, r, _ = start
     row, stop = first, first if needle else min(first + run, end)
@@ -273,19 +274,19 @@ def _add_plain(state, records, at, left, top, first, end, start):
 
 @inlined
 def _draw_shaped(state, records, at, shapes, shape, left, top, first, end, arcs, add):
-    """A ring or arc, rows first .. end; rows that it does not reach cost little."""
-    start, y, k = _start(records, at, left, top + first)
-    r0, limit = get(shapes, shape + R0), get(shapes, shape + LIMIT)
+    """Draw a ring or arc in rows first .. end; rows that it does not reach cost little."""
+    start, y, k = _row_start(records, at, left, top + first)
+    r0, cutoff = load_scalar(shapes, shape + R0), load_scalar(shapes, shape + CUTOFF)
     row, one = first, opaque(1)
     while row < end:
-        dy, u = np.float32(y), lanes() + np.float32(start)
-        power = _halvings(shapes, shape, _distance(records, at, u, dy) - r0, u, dy, arcs)
-        if any_of(power <= limit):
+        dy, u = np.float32(y), lane_index() + np.float32(start)
+        power = _negative_log2_profile(shapes, shape, _distance(records, at, u, dy) - r0, u, dy, arcs)
+        if any_of(power <= cutoff):
             e = exp2(-power)
             if add:
                 _add_row(state, row * ROW, e, records, at)
             else:
-                blend_row(state, row * ROW, e * get(records, at + OPACITY), records, at, False)
+                blend_row(state, row * ROW, e * load_scalar(records, at + OPACITY), records, at, False)
         row += one
         start += k
         y += 1.0
@@ -293,24 +294,24 @@ def _draw_shaped(state, records, at, shapes, shape, left, top, first, end, arcs,
 
 @inlined
 def _draw_plain(entries, begin, end, records, left, top, state):
-    """All entries of a tile, plain Gaussians whose light adds."""
+    """Draw all entries of a tile: plain Gaussians, blend "add"."""
     if begin == end:
         return
-    coming = next_entry(entries, begin, end, records, left, top)
+    upcoming = next_entry(entries, begin, end, records, left, top)
     for e in range(begin, end):
-        at, first, last, start = coming
-        coming = next_entry(entries, e + 1, end, records, left, top)
+        at, first, last, start = upcoming
+        upcoming = next_entry(entries, e + 1, end, records, left, top)
         _add_plain(state, records, at, left, top, first, last, start)
 
 
 @inlined
 def _draw_tile(entries, begin, end, records, shapes, left, top, state, arcs, add):
-    """All entries of a tile, rings or arcs, or those up to where all pixels are done; returns the end of them."""
+    """Draw the entries of a tile, rings or arcs, until all pixels are finished; return the end of the drawn ones."""
     for e in range(begin, end):
-        if not add and (e - begin) & (PAUSE - 1) == PAUSE - 1 and finished(state):
+        if not add and (e - begin) & (CHECK_INTERVAL - 1) == CHECK_INTERVAL - 1 and is_finished(state):
             return e
-        i = get(entries, e * ENTRY + GAUSSIAN)
-        first, last = get(entries, e * ENTRY + FIRST_ROW), get(entries, e * ENTRY + END_ROW)
+        i = load_scalar(entries, e * ENTRY + GAUSSIAN)
+        first, last = load_scalar(entries, e * ENTRY + FIRST_ROW), load_scalar(entries, e * ENTRY + END_ROW)
         _draw_shaped(state, records, i * RECORD, shapes, i * SHAPE, left, top, first, last, arcs, add)
     return end
 
@@ -320,11 +321,12 @@ def raster(
     counter, state, entries, starts, records, shapes, background, width, height, tiles_x, shaped, arcs, add,
     image, alphas, ends,
 ):  # fmt: skip
-    """Colour (h w 3) and alpha (h w), flat; ends (tiles,): where each tile stopped. shaped, arcs: whether
-    rings (or arcs) are drawn, or plain Gaussians; these only where light adds."""
+    """Write colour (h w 3) and alpha (h w), flat; ends (tiles,): the end of each tile's drawn entries.
+
+    shaped: there are rings or arcs, else plain Gaussians, which this kernel draws with the blend "add" only."""
     no_depth = np.bool_(False)
     while True:
-        tile = take_number(counter)
+        tile = atomic_increment(counter)
         if tile >= ends.size:
             break
         left, top = (tile % tiles_x) * TILE_WIDTH, (tile // tiles_x) * TILE_HEIGHT
@@ -345,15 +347,16 @@ def raster(
 
 @inlined
 def _add_gradient(state, at, e, records, record):
-    """g and w where light adds: each Gaussian by itself."""
+    """Return g and w for the blend "add", where Gaussians are independent."""
     w = where(e >= PROFILE_MIN, e, ZERO)
-    vc = load(state, at + V_RED) * get(records, record + RED)
-    vc = fma(load(state, at + V_GREEN), get(records, record + GREEN), vc)
-    return w * fma(load(state, at + V_BLUE), get(records, record + BLUE), vc), w
+    vc = load(state, at + V_RED) * load_scalar(records, record + RED)
+    vc = fma(load(state, at + V_GREEN), load_scalar(records, record + GREEN), vc)
+    return w * fma(load(state, at + V_BLUE), load_scalar(records, record + BLUE), vc), w
 
 
 @inlined
 def _add_colours(state, at, w, colours):
+    """Add w v to the sums for red, green and blue."""
     return (
         fma(w, load(state, at + V_RED), colours[0]),
         fma(w, load(state, at + V_GREEN), colours[1]),
@@ -363,14 +366,14 @@ def _add_colours(state, at, w, colours):
 
 @inlined
 def _add_moments(sums, h, u, dy):
-    """Adds h times u, d_y, u², u d_y, d_y²."""
+    """Add h times u, d_y, u², u d_y, d_y² to the sums."""
     hu, hy = h * u, h * dy
     return sums[0] + hu, sums[1] + hy, fma(hu, u, sums[2]), fma(hu, dy, sums[3]), fma(hy, dy, sums[4])
 
 
 @inlined
 def _needle_backward(state, records, at, left, top, first, end):
-    """The row of gradients of a plain Gaussian whose light adds, an exponential for each row."""
+    """Return the gradient row of a plain Gaussian with the blend "add", with an exponential for each row."""
     zero = splat(ZERO)
     sums, colours = (zero, zero, zero, zero, zero), (zero, zero, zero)
     row, one = first, opaque(1)
@@ -380,13 +383,13 @@ def _needle_backward(state, records, at, left, top, first, end):
         colours = _add_colours(state, row * ROW_BACKWARD, w, colours)
         sums = _add_moments(sums, g, u, dy)
         row += one
-    return totals((sums[0], sums[1], sums[2], sums[3], sums[4], zero, colours[0], colours[1], colours[2]))
+    return reduce_add_each((sums[0], sums[1], sums[2], sums[3], sums[4], zero, colours[0], colours[1], colours[2]))
 
 
 @inlined
 def _plain_backward(state, records, at, left, top, first, end, start):
-    """The same by the recurrence and by three sums a lane (see `raster_backward`)."""
-    step, one, run = get(records, at + STEP), opaque(1), run_length(records, at)
+    """Return the same gradient row by the recurrence and three sums a lane (see `raster_backward`)."""
+    step, one, run = load_scalar(records, at + STEP), opaque(1), run_length(records, at)
     zero = splat(ZERO)
     m0, m1, m2, colours = zero, zero, zero, (zero, zero, zero)
     e, r, dy = start
@@ -406,29 +409,29 @@ def _plain_backward(state, records, at, left, top, first, end, start):
         e, r, dy = start_run(records, at, left, top + row)
         stop = min(row + run, end)
     mu, my, muu, muy, myy = moments(records, at, left, m0, m1, m2)
-    return totals((mu, my, muu, muy, myy, zero, colours[0], colours[1], colours[2]))
+    return reduce_add_each((mu, my, muu, muy, myy, zero, colours[0], colours[1], colours[2]))
 
 
 @inlined
 def _shaped_backward(state, records, at, shapes, shape, left, top, first, end, arcs, add):
-    """The row of gradients of a ring or arc."""
-    start, y, k = _start(records, at, left, top + first)
-    r0, limit = get(shapes, shape + R0), get(shapes, shape + LIMIT)
+    """Return the gradient row of a ring or arc."""
+    start, y, k = _row_start(records, at, left, top + first)
+    r0, cutoff = load_scalar(shapes, shape + R0), load_scalar(shapes, shape + CUTOFF)
     zero = splat(ZERO)
     sums, colours, mass = (zero, zero, zero, zero, zero), (zero, zero, zero), zero
     d_r0, d_w, arc_u, arc_y = zero, zero, zero, zero
     row, one = first, opaque(1)
     while row < end:
-        dy, u = np.float32(y), lanes() + np.float32(start)
+        dy, u = np.float32(y), lane_index() + np.float32(start)
         r = _distance(records, at, u, dy)
         z = r - r0
-        power = _halvings(shapes, shape, z, u, dy, arcs)
-        if any_of(power <= limit):
+        power = _negative_log2_profile(shapes, shape, z, u, dy, arcs)
+        if any_of(power <= cutoff):
             e = exp2(-power)
             if add:
                 g, w = _add_gradient(state, row * ROW_BACKWARD, e, records, at)
             else:
-                e = e * get(records, at + OPACITY)
+                e = e * load_scalar(records, at + OPACITY)
                 g, w = row_gradient(state, row * ROW_BACKWARD, e, records, at, False)
             colours = _add_colours(state, row * ROW_BACKWARD, w, colours)
             mass = mass + g
@@ -440,42 +443,42 @@ def _shaped_backward(state, records, at, shapes, shape, left, top, first, end, a
         row += one
         start += k
         y += 1.0
-    slope = get(shapes, shape + SHARP) * TWO_LN2  # 1 / w²
-    return totals((
+    slope = load_scalar(shapes, shape + SHARPNESS) * TWO_LN2  # 1 / w²
+    return reduce_add_each((
         sums[0] * slope, sums[1] * slope, sums[2] * slope, sums[3] * slope, sums[4] * slope, mass,
-        colours[0], colours[1], colours[2], d_r0 * slope, d_w * (slope / get(shapes, shape + WIDTH)),
+        colours[0], colours[1], colours[2], d_r0 * slope, d_w * (slope / load_scalar(shapes, shape + WIDTH)),
         arc_u, arc_y,
     ))  # fmt: skip
 
 
 @inlined
 def _tile_backward_plain(entries, begin, end, records, left, top, state, gradients):
-    """Plain Gaussians whose light adds."""
+    """Write the gradient rows of a tile's entries: plain Gaussians, blend "add"."""
     if begin == end:
         return
-    coming = next_entry(entries, begin, end, records, left, top)
+    upcoming = next_entry(entries, begin, end, records, left, top)
     for e in range(begin, end):
-        at, first, last, start = coming
-        coming = next_entry(entries, e + 1, end, records, left, top)
-        prefetch(gradients, get(entries, min(e + AHEAD, end - 1) * ENTRY + SLOT) * RECORD)
+        at, first, last, start = upcoming
+        upcoming = next_entry(entries, e + 1, end, records, left, top)
+        prefetch(gradients, load_scalar(entries, min(e + PREFETCH_DISTANCE, end - 1) * ENTRY + SLOT) * RECORD)
         if is_needle(records, at, last - first):
             row = _needle_backward(state, records, at, left, top, first, last)
         else:
             row = _plain_backward(state, records, at, left, top, first, last, start)
-        store(gradients, get(entries, e * ENTRY + SLOT) * RECORD, row)
+        store(gradients, load_scalar(entries, e * ENTRY + SLOT) * RECORD, row)
 
 
 @inlined
 def _tile_backward(entries, begin, used, end, records, shapes, left, top, state, arcs, add, gradients):
-    """Rings or arcs."""
+    """Write the gradient rows of a tile's entries: rings or arcs."""
     for e in range(begin, used):
-        prefetch(gradients, get(entries, min(e + AHEAD, end - 1) * ENTRY + SLOT) * RECORD)
-        i = get(entries, e * ENTRY + GAUSSIAN)
-        first, last = get(entries, e * ENTRY + FIRST_ROW), get(entries, e * ENTRY + END_ROW)
+        prefetch(gradients, load_scalar(entries, min(e + PREFETCH_DISTANCE, end - 1) * ENTRY + SLOT) * RECORD)
+        i = load_scalar(entries, e * ENTRY + GAUSSIAN)
+        first, last = load_scalar(entries, e * ENTRY + FIRST_ROW), load_scalar(entries, e * ENTRY + END_ROW)
         row = _shaped_backward(state, records, i * RECORD, shapes, i * SHAPE, left, top, first, last, arcs, add)
-        store(gradients, get(entries, e * ENTRY + SLOT) * RECORD, row)
+        store(gradients, load_scalar(entries, e * ENTRY + SLOT) * RECORD, row)
     for e in range(used, end):
-        store(gradients, get(entries, e * ENTRY + SLOT) * RECORD, splat(ZERO))
+        store(gradients, load_scalar(entries, e * ENTRY + SLOT) * RECORD, splat(ZERO))
 
 
 @kernel
@@ -483,11 +486,11 @@ def raster_backward(
     counter, scratch, entries, starts, ends, records, shapes, background, width, height, tiles_x, shaped, arcs, add,
     image, alphas, d_image, d_alphas, gradients,
 ):  # fmt: skip
-    """gradients: the row of each slot."""
+    """Write the gradient row of each slot to `gradients`."""
     state, edge = scratch[:STATE_BACKWARD], scratch[STATE_BACKWARD:SCRATCH].reshape(6, EDGE)
     no_depth = np.bool_(False)
     while True:
-        tile = take_number(counter)
+        tile = atomic_increment(counter)
         if tile >= ends.size:
             break
         left, top = (tile % tiles_x) * TILE_WIDTH, (tile // tiles_x) * TILE_HEIGHT
@@ -506,6 +509,7 @@ def raster_backward(
 
 @inlined
 def _add_rows(gradients, first, count, row):
+    """Write the sum of `count` gradient rows to `row`."""
     total = splat(ZERO)
     for slot in range(first, first + count):
         total = total + load(gradients, slot * RECORD)
@@ -513,12 +517,13 @@ def _add_rows(gradients, first, count, row):
 
 
 @kernel
-def finish(
+def sum_gradients(
     row, covariances, opacities, colours, arcs, gradients, firsts, counts, add,
     d_centres, d_covariances, d_opacities, d_colours, d_rings, d_arcs,
 ):  # fmt: skip
-    """Gradients of the inputs from the rows; see `projection` for the moments. d_rings, d_arcs may be empty.
-    row: workspace of 16."""
+    """Write the gradients of the inputs from the gradient rows; see `projection` for the moments.
+
+    d_rings, d_arcs may be empty. row: workspace of 16."""
     for i in range(opacities.size):
         _add_rows(gradients, firsts[i], counts[i], row)
         xx, xy = np.float64(covariances[3 * i]), np.float64(covariances[3 * i + 1])
@@ -540,8 +545,8 @@ def finish(
                 d_opacities[i] += light[c] * colours[3 * i + c]
                 d_colours[3 * i + c] = light[c] * opacities[i]
         else:
-            free = ALPHA_MIN <= opacities[i] <= OPACITY_MAX
-            d_opacities[i] = row[G] / opacities[i] if free else ZERO
+            is_unclamped = ALPHA_MIN <= opacities[i] <= OPACITY_MAX
+            d_opacities[i] = row[G] / opacities[i] if is_unclamped else ZERO
             for c in range(3):
                 d_colours[3 * i + c] = light[c]
         if d_rings.size > 0:

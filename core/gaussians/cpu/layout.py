@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Where things lie: what the kernels hand on to each other."""
+"""Layout of the arrays that kernels pass on to each other: records, gradient rows and entries of tiles."""
 from __future__ import annotations
 
 import numpy as np
@@ -10,12 +10,12 @@ from .. import rendering
 TILE_SHIFT_X, TILE_SHIFT_Y = 4, 6
 TILE_WIDTH, TILE_HEIGHT = 1 << TILE_SHIFT_X, 1 << TILE_SHIFT_Y
 
-# A record of 16 float32, a cache line, for each Gaussian; `projection` says what its fields are.
+# A record of 16 float32, a cache line, for each Gaussian; `projection` defines its fields.
 X, Y, A, K, D, OPACITY, STEP, RUN, RED, GREEN, BLUE, DEPTH, REACH, HALF_X, HALF_Y, K_REST = range(16)
 RECORD = 16
 
 CHUNK = 1024
-"""Gaussians to a piece of work."""
+"""Gaussians that a thread processes at a time."""
 
 # A row of gradients for each pair of Gaussian and tile: sums of g u, g d_y, g u², g u d_y, g d_y², g; then those of
 # colour and depth, or of ring and arc (`flare`).

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""L1 and SSIM with their gradient in one go (the definition is `..loss`).
+"""L1 and SSIM with their gradient in one pass; the definition is `..loss`.
 
-A picture row is 3 w numbers, red, green, blue by turns, and neighbours in x are 3 apart: no need to take the colours
-apart. With the window's means E[.], mu = E[x], s_x = E[xx] - mu², s_xy = E[xy] - mu mu_y and
+A picture row is 3 w interleaved numbers (red, green, blue), and neighbours in x are 3 numbers apart, so colours need no
+deinterleaving. With the window's means E[.], mu = E[x], s_x = E[xx] - mu², s_xy = E[xy] - mu mu_y and
 
     S = A1 A2 / (B1 B2),   A1 = 2 mu mu_y + C1,  A2 = 2 s_xy + C2,  B1 = mu² + mu_y² + C1,  B2 = s_x + s_y + C2
 
@@ -11,12 +11,13 @@ the derivatives of the sum of S by the three means are maps of their own,
     by E[xx]: -S / B2      by E[xy]: 2 A1 / (B1 B2)
     by mu:    2 mu_y (A2 - A1) / (B1 B2) + 2 mu S (1 / B2 - 1 / B1)
 
-and as the window is symmetric, dS/dx is E[by mu] + 2 x E[by E[xx]] + y E[by E[xy]]. Both ways the window goes down the
-columns into rows of scratch, then along these. mu_y and s_y depend on the target alone and are kept (`describe`).
+and as the window is symmetric, dS/dx is E[by mu] + 2 x E[by E[xx]] + y E[by E[xy]]. In both directions the window is
+applied down the columns into rows of scratch, then along these rows. mu_y and s_y depend on the target alone and are
+cached (`target_moments_kernel`).
 
-A thread takes a piece of the picture from top to bottom, by bands of a few rows. Once it has the maps of a band, it has
-all that the gradient of the band before needs, and the maps of three bands are all that there are: in the thread's
-cache. Bands where two pieces meet are compared for each of them.
+A thread processes a part of the picture from top to bottom, in bands of a few rows. The gradient of a band needs the
+maps of that band and of the two beside it, so three bands of maps suffice, which stay in the thread's cache. The bands
+where two parts meet are computed for both.
 """
 from __future__ import annotations
 
@@ -36,18 +37,18 @@ from .tiles import EMPTY, flat
 from .vector import (
     LANES,
     absolute,
+    align_lanes,
+    atomic_add,
+    atomic_increment,
     fma,
-    lanes,
+    lane_index,
     load,
     load_rows,
+    multiply_each,
     prefetch,
-    products,
-    shifted,
+    reduce_add,
     splat,
     store,
-    take,
-    take_number,
-    total,
     where,
 )
 
@@ -55,7 +56,7 @@ HALO = definition.WINDOW // 2
 PAD = LANES  # zeros on both sides of a scratch row, at least 3 HALO
 STEP = 3
 BAND = LANES - 2 * HALO
-"""Rows to a piece of work: with those that their windows see, as many as there are vectors in a tuple of rows."""
+"""Rows of a band: together with those that their windows cover, as many as there are vectors in a tuple of rows."""
 WEIGHTS = definition.window(torch.zeros(1)).numpy().astype(np.float32)
 W0, W1, W2, W3, W4, W5 = (WEIGHTS[HALO + i] for i in range(HALO + 1))
 C1, C2 = np.float32(definition.C1), np.float32(definition.C2)
@@ -63,8 +64,8 @@ ZERO, ONE, TWO = np.float32(0), np.float32(1), np.float32(2)
 
 
 @inlined
-def _weighted(v):
-    """The window over 11 vectors."""
+def _apply_window(v):
+    """Return the window's weighted sum of 11 vectors."""
     s = v[5] * W0
     s = fma(v[4] + v[6], W1, s)
     s = fma(v[3] + v[7], W2, s)
@@ -74,37 +75,38 @@ def _weighted(v):
 
 
 @inlined
-def _along(row, at):
-    """The window along a row of scratch. Its neighbours are shifted out of three vectors: to load them takes twice the
-    time, since nearly all lie across two cache lines."""
+def _window_along_row(row, at):
+    """Apply the window along a row of scratch. Neighbours are shuffled out of three vectors: unaligned loads take twice
+    the time, since nearly all of them cross a cache line."""
     at += PAD
     a, b, c = load(row, at - LANES), load(row, at), load(row, at + LANES)
-    return _weighted((
-        shifted(a, b, 1), shifted(a, b, 4), shifted(a, b, 7), shifted(a, b, 10), shifted(a, b, 13), b,
-        shifted(b, c, 3), shifted(b, c, 6), shifted(b, c, 9), shifted(b, c, 12), shifted(b, c, 15),
+    return _apply_window((
+        align_lanes(a, b, 1), align_lanes(a, b, 4), align_lanes(a, b, 7), align_lanes(a, b, 10),
+        align_lanes(a, b, 13), b, align_lanes(b, c, 3),
+        align_lanes(b, c, 6), align_lanes(b, c, 9), align_lanes(b, c, 12), align_lanes(b, c, 15),
     ))  # fmt: skip
 
 
 @inlined
 def _store_band(v, rows, at):
-    """The windows down the columns of the rows of a band, of which v has 5 more on both sides, into scratch."""
-    store(rows[0], PAD + at, _weighted(v[:11]))
-    store(rows[1], PAD + at, _weighted(v[1:12]))
-    store(rows[2], PAD + at, _weighted(v[2:13]))
-    store(rows[3], PAD + at, _weighted(v[3:14]))
-    store(rows[4], PAD + at, _weighted(v[4:15]))
-    store(rows[5], PAD + at, _weighted(v[5:]))
+    """Apply the window down the columns of a band into scratch; v: the band's rows and 5 more on both sides."""
+    store(rows[0], PAD + at, _apply_window(v[:11]))
+    store(rows[1], PAD + at, _apply_window(v[1:12]))
+    store(rows[2], PAD + at, _apply_window(v[2:13]))
+    store(rows[3], PAD + at, _apply_window(v[3:14]))
+    store(rows[4], PAD + at, _apply_window(v[4:15]))
+    store(rows[5], PAD + at, _apply_window(v[5:]))
 
 
 @inlined
-def _is_inside(band, height):
-    """Whether the windows of a band lie within the picture."""
+def _is_interior(band, height):
+    """Return whether the windows of a band lie within the picture."""
     return HALO <= band <= height - BAND - HALO
 
 
 @inlined
-def _down_moments(x, y, row, at, length, height):
-    """E[x], E[xx] and E[xy] down the columns."""
+def _column_moments(x, y, row, at, length, height):
+    """Return E[x], E[xx] and E[xy] down the columns."""
     m, xx, xy = splat(ZERO), splat(ZERO), splat(ZERO)
     for k in range(max(-HALO, -row), min(HALO + 1, height - row)):
         a = load(x, (row + k) * length + at)
@@ -115,30 +117,30 @@ def _down_moments(x, y, row, at, length, height):
 
 @inlined
 def _columns_of_moments(x, y, band, end, length, height, rows):
-    """The same for the rows of a band, into scratch: what they look at is loaded once for all of them."""
+    """Write the column moments of the rows of a band to scratch; loads the rows of all windows once."""
     for block in range(0, length, LANES):
         at = min(block, length - LANES)
-        if _is_inside(band, height):
+        if _is_interior(band, height):
             top = (band - HALO) * length + at
             a, b = load_rows(x, top, length), load_rows(y, top, length)
             _store_band(a, rows[0], at)
-            _store_band(products(a, a), rows[1], at)
-            _store_band(products(a, b), rows[2], at)
+            _store_band(multiply_each(a, a), rows[1], at)
+            _store_band(multiply_each(a, b), rows[2], at)
         else:
             for row in range(band, end):
-                m, xx, xy = _down_moments(x, y, row, at, length, height)
+                m, xx, xy = _column_moments(x, y, row, at, length, height)
                 store(rows[0, row - band], PAD + at, m)
                 store(rows[1, row - band], PAD + at, xx)
                 store(rows[2, row - band], PAD + at, xy)
-        for row in range(LANES, LANES + BAND):  # what the next band has that this one has not
+        for row in range(LANES, LANES + BAND):  # the rows that the next band needs in addition
             prefetch(x, (band - HALO + row) * length + at)
             prefetch(y, (band - HALO + row) * length + at)
 
 
 @inlined
 def _columns_of_maps(before, here, after, length, rows):
-    """The window down the columns of each of three maps (3, BAND, length), of which a band, and those before and after
-    it, are given."""
+    """Apply the window down the columns of each of three maps (3, BAND, length), for the band `here`, with the maps of
+    the bands before and after it."""
     for i in range(3):
         a, b, c = before[i], here[i], after[i]
         for block in range(0, length, LANES):
@@ -152,8 +154,8 @@ def _columns_of_maps(before, here, after, length, rows):
 
 
 @inlined
-def _similarity(mu, xx, xy, mu_y, s_y):
-    """S and its derivatives by E[x], E[xx], E[xy]."""
+def _ssim_derivatives(mu, xx, xy, mu_y, s_y):
+    """Return S and its derivatives by E[x], E[xx], E[xy]."""
     cross, squares = mu * mu_y, fma(mu, mu, mu_y * mu_y)
     a1, a2 = fma(cross, TWO, splat(C1)), fma(xy - cross, TWO, splat(C2))
     b1, b2 = squares + C1, xx - mu * mu + s_y + C2
@@ -165,8 +167,8 @@ def _similarity(mu, xx, xy, mu_y, s_y):
 
 
 @inlined
-def _compare(x, y, mu_y, s_y, band, length, height, rows, maps, sums):
-    """The maps (3, BAND, length) of a band, zeros below the picture; sums (h, 2): of |x - y| and of S, by row."""
+def _compute_maps(x, y, mu_y, s_y, band, length, height, rows, maps, sums):
+    """Write the maps (3, BAND, length) of a band, zeros below the picture, and the row sums (h, 2) of |x - y| and S."""
     end = min(band + BAND, height)
     _columns_of_moments(x, y, band, end, length, height, rows)
     if end < band + BAND:
@@ -176,23 +178,24 @@ def _compare(x, y, mu_y, s_y, band, length, height, rows, maps, sums):
         l1, similar = splat(ZERO), splat(ZERO)
         for block in range(0, length, LANES):
             at = min(block, length - LANES)
-            fresh = lanes() >= np.float32(block - at)  # the last block overlaps the one before
+            is_new = lane_index() >= np.float32(block - at)  # the last block overlaps the one before
             i = row * length + at
             prefetch(mu_y, i + length)
             prefetch(s_y, i + length)
-            mu, xx, xy = _along(rows[0, place], at), _along(rows[1, place], at), _along(rows[2, place], at)
-            s, by_mu, by_xx, by_xy = _similarity(mu, xx, xy, load(mu_y, i), load(s_y, i))
+            mu, xx = _window_along_row(rows[0, place], at), _window_along_row(rows[1, place], at)
+            xy = _window_along_row(rows[2, place], at)
+            s, by_mu, by_xx, by_xy = _ssim_derivatives(mu, xx, xy, load(mu_y, i), load(s_y, i))
             store(maps[0, place], at, by_mu)
             store(maps[1, place], at, by_xx)
             store(maps[2, place], at, by_xy)
-            similar = similar + where(fresh, s, ZERO)
-            l1 = l1 + where(fresh, absolute(load(x, i) - load(y, i)), ZERO)
-        sums[row, 0], sums[row, 1] = total(l1), total(similar)
+            similar = similar + where(is_new, s, ZERO)
+            l1 = l1 + where(is_new, absolute(load(x, i) - load(y, i)), ZERO)
+        sums[row, 0], sums[row, 1] = reduce_add(l1), reduce_add(similar)
 
 
 @inlined
 def _gradient(x, y, before, here, after, band, length, height, by_l1, by_similarity, rows, out):
-    """by_l1 sign(x - y) + by_similarity dS/dx of a band, from its maps and those around it."""
+    """Write by_l1 sign(x - y) + by_similarity dS/dx of a band, from its maps and those of the bands beside it."""
     _columns_of_maps(before, here, after, length, rows)
     for row in range(band, min(band + BAND, height)):
         place = row - band
@@ -201,16 +204,18 @@ def _gradient(x, y, before, here, after, band, length, height, by_l1, by_similar
             i = row * length + at
             prefetch(out, i + length)
             vx, vy = load(x, i), load(y, i)
-            g = fma(vx * TWO, _along(rows[1, place], at), _along(rows[0, place], at))
-            g = fma(vy, _along(rows[2, place], at), g) * by_similarity
+            g = fma(vx * TWO, _window_along_row(rows[1, place], at), _window_along_row(rows[0, place], at))
+            g = fma(vy, _window_along_row(rows[2, place], at), g) * by_similarity
             sign = where(vx > vy, splat(by_l1), where(vx < vy, splat(-by_l1), ZERO))
             store(out, i, g + sign)
 
 
 @kernel
-def loss_and_gradient(counter, scratch, x, y, mu_y, s_y, width, height, lam, pieces, done, sums, value, out):
-    """value (1,): the loss; out: its gradient by x, unless empty. pieces: of the picture, each the work of a thread;
-    done (1,): 0, counts them; sums (h, 2): workspace."""
+def loss_and_gradient(counter, scratch, x, y, mu_y, s_y, width, height, lam, parts, done, sums, value, out):
+    """Write the loss to value (1,) and its gradient by x to `out`, unless `out` is empty.
+
+    parts: number of parts of the picture, each the work of a thread; done (1,): 0, counts finished parts; sums (h, 2):
+    workspace."""
     length = STEP * width
     maps = scratch[: 9 * BAND * length].reshape(3, 3, BAND, length)
     rows = scratch[9 * BAND * length :][: 3 * BAND * (length + 2 * PAD)].reshape(3, BAND, length + 2 * PAD)
@@ -218,23 +223,23 @@ def loss_and_gradient(counter, scratch, x, y, mu_y, s_y, width, height, lam, pie
     bands, size = -(-height // BAND), np.float32(x.size)
     by_l1, by_similarity = lam / size, (lam - ONE) / size
     while True:
-        piece = take_number(counter)
-        if piece >= pieces:
+        part = atomic_increment(counter)
+        if part >= parts:
             break
-        first, end = bands * piece // pieces, bands * (piece + 1) // pieces
-        reach = 1 if out.size > 0 else 0  # the gradient asks for the maps of the bands around
-        for number in range(first - reach, end + reach):
+        first, end = bands * part // parts, bands * (part + 1) // parts
+        halo_bands = 1 if out.size > 0 else 0  # the gradient needs the maps of the bands beside
+        for number in range(first - halo_bands, end + halo_bands):
             here = maps[(number + 3) % 3]
             if 0 <= number < bands:
-                _compare(x, y, mu_y, s_y, number * BAND, length, height, rows, here, sums)
+                _compute_maps(x, y, mu_y, s_y, number * BAND, length, height, rows, here, sums)
             else:
                 here[:, :, :] = ZERO
-            if reach > 0 and number > first:
+            if halo_bands > 0 and number > first:
                 before, middle = maps[(number + 1) % 3], maps[(number + 2) % 3]
                 _gradient(
                     x, y, before, middle, here, (number - 1) * BAND, length, height, by_l1, by_similarity, rows, out
                 )
-        if take(done, 0, 1) == pieces - 1:
+        if atomic_add(done, 0, 1) == parts - 1:
             l1, similarity = 0.0, 0.0
             for row in range(height):
                 l1 += sums[row, 0]
@@ -243,68 +248,68 @@ def loss_and_gradient(counter, scratch, x, y, mu_y, s_y, width, height, lam, pie
 
 
 @kernel
-def describe(counter, scratch, y, width, height, mu_y, s_y):
-    """The target's part: means and variances."""
+def target_moments_kernel(counter, scratch, y, width, height, mu_y, s_y):
+    """Write the target's window means and variances."""
     length = STEP * width
     rows = scratch[: 2 * (length + 2 * PAD)].reshape(2, length + 2 * PAD)
     rows[:, :] = ZERO
     while True:
-        row = take_number(counter)
+        row = atomic_increment(counter)
         if row >= height:
             break
         for block in range(0, length, LANES):
             at = min(block, length - LANES)
-            m, yy, _ = _down_moments(y, y, row, at, length, height)
+            m, yy, _ = _column_moments(y, y, row, at, length, height)
             store(rows[0], PAD + at, m)
             store(rows[1], PAD + at, yy)
         for block in range(0, length, LANES):
             at = min(block, length - LANES)
-            mu = _along(rows[0], at)
+            mu = _window_along_row(rows[0], at)
             store(mu_y, row * length + at, mu)
-            store(s_y, row * length + at, _along(rows[1], at) - mu * mu)
+            store(s_y, row * length + at, _window_along_row(rows[1], at) - mu * mu)
 
 
 def _scratch_size(width: int) -> int:
     return 3 * BAND * (STEP * width + 2 * PAD) + 9 * BAND * STEP * width
 
 
-class _Described:
-    """What `describe` says of the targets met last, within a bound on memory."""
+class _TargetMoments:
+    """A cache of the window means and variances of recent targets, of bounded size."""
 
-    LIMIT = 256 << 20
+    MAX_BYTES = 256 << 20
 
     def __init__(self) -> None:
-        self._known: dict[int, tuple[weakref.ref[Tensor], int, Array]] = {}
+        self._entries: dict[int, tuple[weakref.ref[Tensor], int, Array]] = {}
 
     def __call__(self, target: Tensor) -> Array:
         key = id(target)
-        known = self._known.pop(key, None)
-        if known is not None and known[0]() is target and known[1] == target._version:
-            self._known[key] = known  # the latest is last
-            return known[2]
+        entry = self._entries.pop(key, None)
+        if entry is not None and entry[0]() is target and entry[1] == target._version:
+            self._entries[key] = entry  # the latest is last
+            return entry[2]
         height, width, _ = target.shape
-        described = np.empty((2, target.numel()), np.float32)
-        parallel(describe, flat(target), width, height, *described, scratch=_scratch_size(width))
-        self._known[key] = weakref.ref(target, lambda _: self._known.pop(key, None)), target._version, described
-        room = self.LIMIT
-        for name, (_, _, array) in reversed(list(self._known.items())):
-            room -= array.nbytes
-            if room < 0 and name != key:
-                self._known.pop(name, None)
-        return described
+        moments = np.empty((2, target.numel()), np.float32)
+        parallel(target_moments_kernel, flat(target), width, height, *moments, scratch=_scratch_size(width))
+        self._entries[key] = weakref.ref(target, lambda _: self._entries.pop(key, None)), target._version, moments
+        free_bytes = self.MAX_BYTES
+        for name, (_, _, array) in reversed(list(self._entries.items())):
+            free_bytes -= array.nbytes
+            if free_bytes < 0 and name != key:
+                self._entries.pop(name, None)
+        return moments
 
 
-_described = _Described()
+_target_moments = _TargetMoments()
 
 
 class _L1Ssim(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, image: Tensor, target: Tensor, lam: float) -> Tensor:  # type: ignore[override]
         height, width, _ = image.shape
-        mu_y, s_y = _described(target)
+        mu_y, s_y = _target_moments(target)
         value, gradient = np.empty(1, np.float32), EMPTY
         if ctx.needs_input_grad[0]:
-            ctx.gradient, gradient = buffers.pair(height, width, 3)
+            ctx.gradient, gradient = buffers.tensor_and_array(height, width, 3)
         parallel(
             loss_and_gradient, flat(image), flat(target), mu_y, s_y, width, height, np.float32(lam),
             torch.get_num_threads(), np.zeros(1, np.int64), np.empty((height, 2)), value, gradient,
@@ -318,7 +323,7 @@ class _L1Ssim(torch.autograd.Function):
 
 
 def l1_ssim(image: Tensor, target: Tensor, lam: float) -> Tensor:
-    """See `..loss`."""
+    """Return the loss of `l1_ssim` of `..loss`."""
     if STEP * image.shape[1] < LANES:
         return definition.l1_ssim(image, target, lam, kernels="torch")
     return _L1Ssim.apply(image, target.detach() if target.requires_grad else target, lam)

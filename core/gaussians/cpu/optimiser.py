@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Steps of Adam, in one pass over parameters, gradients and moments (the definition is `..optimiser`).
+"""Adam steps in one pass over parameters, gradients and moments; the definition is `..optimiser`.
 
-It takes as long as memory takes to read and write them; `stepping` saves a part of that.
+Memory bandwidth bounds the time; `stepping` saves a part of the traffic.
 """
 from __future__ import annotations
 
@@ -17,24 +17,27 @@ from .buffers import Array
 from .compilation import inlined, kernel
 from .threads import parallel
 from .tiles import flat
-from .vector import LANES, fma, get, load, sqrt, store, take_number
+from .vector import LANES, atomic_increment, fma, load, load_scalar, sqrt, store
 
-PIECE = 1 << 13
-"""Least number of values to a piece of work."""
-CONSTANTS = 7
-"""How many `constants_of` gives."""
+MIN_TASK_SIZE = 1 << 13
+"""Smallest number of values that a thread steps at a time."""
+NUM_CONSTANTS = 7
+"""Number of constants of a step; see `unpack_constants`."""
 
 
 @inlined
-def constants_of(constants):
-    """What `move` needs: beta1, 1 - beta1, beta2, 1 - beta2, 1 / (1 - beta1^t), 1 / sqrt(1 - beta2^t), epsilon."""
+def unpack_constants(constants):
+    """Return beta1, 1 - beta1, beta2, 1 - beta2, 1 / (1 - beta1^t), 1 / sqrt(1 - beta2^t), epsilon as a tuple."""
     c = constants
-    return get(c, 0), get(c, 1), get(c, 2), get(c, 3), get(c, 4), get(c, 5), get(c, 6)
+    return (
+        load_scalar(c, 0), load_scalar(c, 1), load_scalar(c, 2), load_scalar(c, 3), load_scalar(c, 4),
+        load_scalar(c, 5), load_scalar(c, 6),
+    )  # fmt: skip
 
 
 @inlined
-def move(parameter, first, second, at, gradient, rate, constants):
-    """A step of 16 numbers at a flat index."""
+def step_lanes(parameter, first, second, at, gradient, rate, constants):
+    """Step 16 numbers at a flat index."""
     beta1, new1, beta2, new2, scale, root, epsilon = constants
     m = fma(load(first, at), beta1, gradient * new1)
     v = fma(load(second, at), beta2, gradient * gradient * new2)
@@ -44,12 +47,12 @@ def move(parameter, first, second, at, gradient, rate, constants):
 
 
 @inlined
-def move_all(parameter, gradient, first, second, rates, constants):
-    """A step of all numbers of a parameter; rates: repeats along it, a multiple of 16 long."""
+def step_array(parameter, gradient, first, second, rates, constants):
+    """Step all numbers of a parameter; rates: a multiple of 16 numbers, repeated along the parameter."""
     n, period = parameter.size, rates.size
     place, whole = 0, n - n % LANES
     for i in range(0, whole, LANES):
-        move(parameter, first, second, i, load(gradient, i), load(rates, place), constants)
+        step_lanes(parameter, first, second, i, load(gradient, i), load(rates, place), constants)
         place += LANES
         if place == period:
             place = 0
@@ -62,22 +65,23 @@ def move_all(parameter, gradient, first, second, rates, constants):
 
 
 @kernel
-def advance(counter, parameter, gradient, first, second, rates, piece, constants):
-    """All flat. rates: as for `move_all`; piece: a multiple of its length."""
+def adam_kernel(counter, parameter, gradient, first, second, rates, task_size, constants):
+    """Step a parameter on all threads; arrays are flat. rates: see `step_array`; task_size: a multiple of their
+    size."""
     while True:
-        start = take_number(counter) * piece
-        end = min(start + piece, parameter.size)
+        start = atomic_increment(counter) * task_size
+        end = min(start + task_size, parameter.size)
         if start >= end:
             break
-        move_all(
+        step_array(
             parameter[start:end], gradient[start:end], first[start:end], second[start:end], rates,
-            constants_of(constants),
+            unpack_constants(constants),
         )  # fmt: skip
 
 
-class Step(NamedTuple):
-    """What a step of a parameter is made of; see `..optimiser`. Parameter and moments are contiguous float32, and are
-    changed in place. gradient: None if the backward pass takes the step (`stepping`)."""
+class AdamStep(NamedTuple):
+    """One parameter's step; see `..optimiser`. Parameter and moments are contiguous float32 and are changed in place.
+    gradient: None if the backward pass makes the step (`stepping`)."""
 
     parameter: Tensor
     gradient: Tensor | None
@@ -87,21 +91,20 @@ class Step(NamedTuple):
     rate: float | Tensor
 
 
-def adam_steps(steps: Sequence[Step], *, beta1: float, beta2: float, epsilon: float) -> None:
-    """A step of each of some parameters. They do not wait for each other: a thread that finds no more of one goes on
-    with the next."""
-    calls = [_arguments(step, beta1, beta2, epsilon) for step in steps]
-    pieces = sum(-(-call[1].size // call[6]) for call in calls)
-    parallel(_advance_all, calls, limit=pieces if advance.overloads else 1)  # compiled by one thread
+def adam_steps(steps: Sequence[AdamStep], *, beta1: float, beta2: float, epsilon: float) -> None:
+    """Make all steps in one parallel call: a thread that finds no more work on one parameter takes the next."""
+    calls = [_kernel_arguments(step, beta1, beta2, epsilon) for step in steps]
+    tasks = sum(-(-call[1].size // call[6]) for call in calls)
+    parallel(_step_all, calls, limit=tasks if adam_kernel.overloads else 1)  # compiled by one thread
 
 
-def _advance_all(counter: Array, calls: Sequence[tuple[Any, ...]]) -> None:
+def _step_all(counter: Array, calls: Sequence[tuple[Any, ...]]) -> None:
     for number, call in enumerate(calls):
-        advance(call[0] if number else counter, *call[1:])
+        adam_kernel(call[0] if number else counter, *call[1:])
 
 
-def rates_of(rate: float | Tensor) -> Array:
-    """A multiple of 16 numbers that repeat along the parameter."""
+def repeat_rates(rate: float | Tensor) -> Array:
+    """Return a multiple of 16 numbers, to be repeated along the parameter."""
     if not isinstance(rate, Tensor):
         return _constant_rates(rate)
     row = flat(rate)
@@ -114,17 +117,17 @@ def _constant_rates(rate: float) -> Array:
 
 
 @lru_cache(256)
-def constants_for(step: int, beta1: float, beta2: float, epsilon: float) -> tuple[float, ...]:
-    """See `constants_of`; step: from 1."""
+def adam_constants(step: int, beta1: float, beta2: float, epsilon: float) -> tuple[float, ...]:
+    """Return the constants of `unpack_constants`; step: counts from 1."""
     unbiased = 1 / (1 - beta1**step), 1 / math.sqrt(1 - beta2**step)
     return beta1, 1 - beta1, beta2, 1 - beta2, *unbiased, epsilon
 
 
-def _arguments(step: Step, beta1: float, beta2: float, epsilon: float) -> tuple[Any, ...]:
-    """Of `advance`, with a counter of its own."""
+def _kernel_arguments(step: AdamStep, beta1: float, beta2: float, epsilon: float) -> tuple[Any, ...]:
+    """Return the arguments of `adam_kernel`, with a new counter."""
     assert step.gradient is not None
-    rates = rates_of(step.rate)
-    piece = -(-PIECE // rates.size) * rates.size
+    rates = repeat_rates(step.rate)
+    task_size = -(-MIN_TASK_SIZE // rates.size) * rates.size
     arrays = (flat(t) for t in (step.parameter, step.gradient, step.first, step.second))
-    constants = np.array(constants_for(step.step, beta1, beta2, epsilon), np.float32)
-    return np.zeros(1, np.int64), *arrays, rates, piece, constants
+    constants = np.array(adam_constants(step.step, beta1, beta2, epsilon), np.float32)
+    return np.zeros(1, np.int64), *arrays, rates, task_size, constants

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""From 3D Gaussians to records of 64 bytes, and back again with gradients; 16 Gaussians at a time.
+"""Projects 3D Gaussians to records of 64 bytes, and their gradients back; 16 Gaussians at a time. Called by `scene`.
 
 Forward (the definition is `..projection`): p = R m + t; with s = (p_x, p_y) / p_z, u = s held within the
 frustum's margin, and V = R Q the Gaussian's axes seen by the camera, the rows of T = J R Q S are
@@ -12,14 +12,14 @@ xx yy - xy² suffers for needles. For the same reason a record does not hold the
     q / (-2 ln 2) = A (d_x + k d_y)² + D d_y²,   k = -xy / yy,  A = h yy / det,  D = h / yy,  h = -1 / (2 ln 2)
 
 so alpha = opacity 2^(A u² + D d_y²), u = d_x + k d_y. From one pixel row to the next the exponent's second
-difference is 2 C with C = A k² + D; `step` = 2^(2 C) - 1 and `run` = sqrt(-40 / C), the rows over which e falls
-from its peak to 2^-40, serve the recurrence of the rasterizer.
+difference is 2 C with C = A k² + D. The rasterizer's recurrence uses `step` = 2^(2 C) - 1 and `run` = sqrt(-40 / C),
+the number of rows over which e falls from its peak to 2^-40.
 
-Scales and opacities may come as logarithms and logits, the form in which they are optimised (`raw`).
+With `raw`, scales are logarithms and opacities logits, the form in which they are optimised.
 
-Backward: the rasterizer sends moments of g = dL / d ln alpha over the pixels: sums of g, g u, g d_y, g u²,
-g u d_y, g d_y², which give the gradients of centre, covariance and opacity (`_from_moments`), and those of the
-colour and depth as they are.
+In the backward pass the rasterizer provides moments of g = dL / d ln alpha over the pixels: sums of g, g u, g d_y,
+g u², g u d_y, g d_y². They give the gradients of centre, covariance and opacity (`_from_moments`). The gradients of
+colour and depth are sums themselves.
 """
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ import numpy as np
 from .. import rendering
 from ..projection import FRUSTUM_MARGIN
 from . import spherical_harmonics as harmonics
-from .binning import few_tiles, number_slots
+from .binning import exclusive_sum, small_footprints
 from .compilation import inlined, kernel
 from .layout import (
     ALPHA_MIN,
@@ -57,19 +57,20 @@ from .layout import (
     ZERO,
     G,
 )
-from .optimiser import constants_of, move_all
+from .optimiser import step_array, unpack_constants
 from .vector import (
     LANES,
     any_of,
+    atomic_increment,
     deinterleave,
     exp,
-    exp2_less_one,
+    exp2m1,
     fma,
-    get,
     interleave,
-    lanes,
+    lane_index,
     load,
     load_rows,
+    load_scalar,
     log2,
     maximum,
     minimum,
@@ -79,42 +80,41 @@ from .vector import (
     sqrt,
     store,
     store_rows,
-    take_number,
     to_ints,
     transpose,
     where,
 )
 
-# Places in the camera's numbers: rotation 0..8, translation 9..11, then
+# Offsets in the packed camera: rotation 0..8, translation 9..11, then
 FX, FY, CX, CY, LOW_X, HIGH_X, LOW_Y, HIGH_Y, POSITION, NEAR, DILATION = 12, 13, 14, 15, 16, 17, 18, 19, 20, 23, 24
 CAMERA = 25
 # Sums over Gaussians for the camera's gradient: rotation 0..8, translation 9..11, fx fy cx cy, then
 POSITION_SUM, CAMERA_SUMS = 16, 32
 SLOPES = 9
 
-TURNED = harmonics.ROWS * LANES
+TRANSPOSED = harmonics.ROWS * LANES
 SQUARE = LANES * LANES
-SCRATCH = TURNED + SQUARE + CAMERA_SUMS * LANES
-ROOM = CHUNK + LANES
-"""For the Gaussians of a chunk."""
-STEP_SCRATCH = SCRATCH + ROOM * (11 + harmonics.ROWS)
-"""With their gradients: 3 numbers for the mean, 4, 3 and 1 for shape and opacity, and the harmonics'."""
+SCRATCH = TRANSPOSED + SQUARE + CAMERA_SUMS * LANES
+CHUNK_CAPACITY = CHUNK + LANES
+"""Most Gaussians of a chunk, with the remainder of the last one."""
+STEP_SCRATCH = SCRATCH + CHUNK_CAPACITY * (11 + harmonics.ROWS)
+"""Scratch with a chunk's gradients: 3 + 4 + 3 + 1 numbers of mean, quaternion, scale, opacity, and the harmonics."""
 
 H = np.float32(-0.5 / math.log(2))
 TWO_LN2 = np.float32(2 * math.log(2))
 ALPHA_MIN_INVERSE = np.float32(1 / rendering.ALPHA_MIN)
 MARGIN = np.float32(1e-4)
-"""Added to the reach, a power of two: rounding must not lose a pixel at the rim, where alpha is tested anyway."""
+"""Added to the reach, in powers of two, so that rounding loses no pixel at the rim, where alpha is tested again."""
 NORM2_MIN = np.float32(1e-16)
 TINY = np.float32(1e-24)
-LARGEST, INFINITY = np.float32(1e30), np.float32(np.inf)
-RUN_POWERS, RUN_MAX = np.float32(40), np.float32(32)
-"""Powers of two, and rows, over which a recurrence runs (see `raster_forward`): rounding adds up."""
+MAX_DETERMINANT, INFINITY = np.float32(1e30), np.float32(np.inf)
+RUN_LOG2_RANGE, RUN_MAX = np.float32(40), np.float32(32)
+"""Bounds of a run of the recurrence in powers of two and in rows (see `raster_forward`), since rounding accumulates."""
 
 
 @kernel
-def describe_camera(world_to_camera, intrinsics, width, height, near, dilation, camera):
-    """The camera's numbers from the flat matrices (4, 4) and (3, 3)."""
+def pack_camera(world_to_camera, intrinsics, width, height, near, dilation, camera):
+    """Write the packed camera from the flat matrices (4, 4) and (3, 3)."""
     for i in range(3):
         position = 0.0
         for j in range(3):
@@ -138,19 +138,19 @@ def _dot(a, b):
 
 
 @inlined
-def _scaled(s, a):
+def _scale(s, a):
     return a[0] * s, a[1] * s, a[2] * s
 
 
 @inlined
-def _sum(a, s, b):
-    """a + s b."""
+def _add_scaled(a, s, b):
+    """Return a + s b."""
     return fma(s, b[0], a[0]), fma(s, b[1], a[1]), fma(s, b[2], a[2])
 
 
 @inlined
 def _rotation(w, x, y, z):
-    """Rows of the rotation of a unit quaternion."""
+    """Return the rows of the rotation of a unit quaternion."""
     x2, y2, z2 = x * TWO, y * TWO, z * TWO
     xx, yy, zz = x * x2, y * y2, z * z2
     xy, xz, yz = x * y2, x * z2, y * z2
@@ -164,7 +164,7 @@ def _rotation(w, x, y, z):
 
 @inlined
 def _rotation_backward(w, x, y, z, g):
-    """Gradient of the unit quaternion from that of the rotation's rows."""
+    """Return the gradient of the unit quaternion from that of the rotation's rows."""
     s01, s02, s12 = g[0][1] + g[1][0], g[0][2] + g[2][0], g[1][2] + g[2][1]
     d10, d02, d21 = g[1][0] - g[0][1], g[0][2] - g[2][0], g[2][1] - g[1][2]
     return (
@@ -176,15 +176,15 @@ def _rotation_backward(w, x, y, z, g):
 
 
 @inlined
-def _unit(q):
-    """A quaternion at length 1, and the inverse of its length; zero stays zero."""
+def _normalise(q):
+    """Return the quaternion at length 1, and the inverse of its length; zero stays zero."""
     inverse = ONE / sqrt(maximum(fma(q[0], q[0], _dot((q[1], q[2], q[3]), (q[1], q[2], q[3]))), NORM2_MIN))
     return (q[0] * inverse, q[1] * inverse, q[2] * inverse, q[3] * inverse), inverse
 
 
 @inlined
-def _seen(camera, mean):
-    """Camera coordinates of points (x, y, z)."""
+def _to_camera(camera, mean):
+    """Return the camera coordinates of points (x, y, z)."""
     x, y, z = mean
     return (
         fma(x, camera[0], fma(y, camera[1], fma(z, camera[2], splat(camera[9])))),
@@ -194,45 +194,45 @@ def _seen(camera, mean):
 
 
 @inlined
-def _turned(camera, rows):
-    """R Q, by rows."""
+def _rotate(camera, rows):
+    """Return the rows of R Q."""
     q0, q1, q2 = rows
     return (
-        _sum(_sum(_scaled(camera[0], q0), camera[1], q1), camera[2], q2),
-        _sum(_sum(_scaled(camera[3], q0), camera[4], q1), camera[5], q2),
-        _sum(_sum(_scaled(camera[6], q0), camera[7], q1), camera[8], q2),
+        _add_scaled(_add_scaled(_scale(camera[0], q0), camera[1], q1), camera[2], q2),
+        _add_scaled(_add_scaled(_scale(camera[3], q0), camera[4], q1), camera[5], q2),
+        _add_scaled(_add_scaled(_scale(camera[6], q0), camera[7], q1), camera[8], q2),
     )
 
 
 @inlined
-def _turned_back(camera, rows):
-    """R^T G, by rows."""
+def _rotate_back(camera, rows):
+    """Return the rows of R^T G."""
     g0, g1, g2 = rows
     return (
-        _sum(_sum(_scaled(camera[0], g0), camera[3], g1), camera[6], g2),
-        _sum(_sum(_scaled(camera[1], g0), camera[4], g1), camera[7], g2),
-        _sum(_sum(_scaled(camera[2], g0), camera[5], g1), camera[8], g2),
+        _add_scaled(_add_scaled(_scale(camera[0], g0), camera[3], g1), camera[6], g2),
+        _add_scaled(_add_scaled(_scale(camera[1], g0), camera[4], g1), camera[7], g2),
+        _add_scaled(_add_scaled(_scale(camera[2], g0), camera[5], g1), camera[8], g2),
     )
 
 
 @inlined
-def _times(a, s):
+def _multiply(a, s):
     return a[0] * s[0], a[1] * s[1], a[2] * s[2]
 
 
 @inlined
-def _picture_axes(camera, v, scales, slopes, inverse_z):
-    """The rows a and b of T, and the slopes u at which J is taken."""
+def _image_axes(camera, v, scales, slopes, inverse_z):
+    """Return the rows a and b of T, and the slopes u at which J is taken."""
     ux = minimum(maximum(slopes[0], camera[LOW_X]), camera[HIGH_X])
     uy = minimum(maximum(slopes[1], camera[LOW_Y]), camera[HIGH_Y])
-    a = _scaled(inverse_z * camera[FX], _times(_sum(v[0], -ux, v[2]), scales))
-    b = _scaled(inverse_z * camera[FY], _times(_sum(v[1], -uy, v[2]), scales))
+    a = _scale(inverse_z * camera[FX], _multiply(_add_scaled(v[0], -ux, v[2]), scales))
+    b = _scale(inverse_z * camera[FY], _multiply(_add_scaled(v[1], -uy, v[2]), scales))
     return a, b, ux, uy
 
 
 @inlined
 def _covariance(a, b, dilation):
-    """xx, xy, yy and the determinant."""
+    """Return xx, xy, yy and the determinant."""
     aa, bb, ab = _dot(a, a), _dot(b, b), _dot(a, b)
     n = (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
     determinant = _dot(n, n) + (aa + bb + dilation) * dilation
@@ -241,10 +241,10 @@ def _covariance(a, b, dilation):
 
 @inlined
 def _direction(mean, camera):
-    """Unit vectors from the camera to the means, and the inverse distances."""
+    """Return unit vectors from the camera to the means, and the inverse distances."""
     x, y, z = mean[0] - camera[POSITION], mean[1] - camera[POSITION + 1], mean[2] - camera[POSITION + 2]
     inverse = ONE / sqrt(maximum(_dot((x, y, z), (x, y, z)), TINY))
-    return _scaled(inverse, (x, y, z)), inverse
+    return _scale(inverse, (x, y, z)), inverse
 
 
 @inlined
@@ -282,7 +282,7 @@ def _load_opacities(opacities, first, raw):
 
 @inlined
 def _tiles_bound(x, y, half_x, half_y, visible, width, height):
-    """How many tiles the box around each Gaussian meets."""
+    """Return the number of tiles that the box around each Gaussian touches."""
     right, bottom = np.float32(width - 1), np.float32(height - 1)
     x0 = to_ints(minimum(maximum(x - half_x, ZERO), right)) >> TILE_SHIFT_X
     x1 = to_ints(minimum(maximum(x + half_x, ZERO), right)) >> TILE_SHIFT_X
@@ -293,30 +293,30 @@ def _tiles_bound(x, y, half_x, half_y, visible, width, height):
 
 @inlined
 def _project_block(
-    means, quats, scales, opacities, sh, sh_width, degree, raw, camera, width, height, first, turned, basis,
+    means, quats, scales, opacities, sh, sh_width, degree, raw, camera, width, height, first, transposed, basis,
     records, centres, radii, depths, bounds, tiles, tile_rows, slopes_out,
 ):  # fmt: skip
-    """Projects the 16 Gaussians from `first` on. slopes_out: see `project`."""
+    """Project the 16 Gaussians from `first` on. slopes_out: see `project`."""
     mean = _load3(means, first)
-    px, py, pz = _seen(camera, mean)
-    before = pz > camera[NEAR]
+    px, py, pz = _to_camera(camera, mean)
+    in_front = pz > camera[NEAR]
     zero = splat(ZERO)
-    inverse_z = ONE / where(before, pz, ONE)
+    inverse_z = ONE / where(in_front, pz, ONE)
     slopes = (px * inverse_z, py * inverse_z)
-    x = where(before, fma(slopes[0], camera[FX], splat(camera[CX])), ZERO)
-    y = where(before, fma(slopes[1], camera[FY], splat(camera[CY])), ZERO)
+    x = where(in_front, fma(slopes[0], camera[FX], splat(camera[CX])), ZERO)
+    y = where(in_front, fma(slopes[1], camera[FY], splat(camera[CY])), ZERO)
     _store2(centres, first, x, y)
 
-    (qw, qx, qy, qz), _ = _unit(_load4(quats, first))
-    v = _turned(camera, _rotation(qw, qx, qy, qz))
-    a, b, _, _ = _picture_axes(camera, v, _load_scales(scales, first, raw), slopes, inverse_z)
+    (qw, qx, qy, qz), _ = _normalise(_load4(quats, first))
+    v = _rotate(camera, _rotation(qw, qx, qy, qz))
+    a, b, _, _ = _image_axes(camera, v, _load_scales(scales, first, raw), slopes, inverse_z)
     xx, xy, yy, determinant = _covariance(a, b, camera[DILATION])
 
     opacity = minimum(splat(OPACITY_MAX), _load_opacities(opacities, first, raw))  # NaN, as second, stays NaN
     reach = log2(maximum(opacity, ALPHA_MIN) * ALPHA_MIN_INVERSE)  # half the squared radius, over ln 2
     radius2 = reach * TWO_LN2
     half_x, half_y = sqrt(radius2 * xx), sqrt(radius2 * yy)
-    solid = before & (determinant > ZERO) & (determinant < LARGEST) & (opacity >= ALPHA_MIN)
+    solid = in_front & (determinant > ZERO) & (determinant < MAX_DETERMINANT) & (opacity >= ALPHA_MIN)
     inside = (x + half_x > ZERO) & (x - half_x < np.float32(width))
     inside = inside & (y + half_y > ZERO) & (y - half_y < np.float32(height))
     visible = solid & inside & (yy > ZERO)
@@ -331,22 +331,22 @@ def _project_block(
     minor = inverse_y * H
     bend = fma(major * k, k, minor)
     store(bounds, first, _tiles_bound(x, y, half_x + HALF, half_y + HALF, visible, width, height))
-    tile, tile_row = few_tiles(x, y, half_x, half_y, major, k, minor, -(reach + MARGIN), visible, width, height)
+    tile, tile_row = small_footprints(x, y, half_x, half_y, major, k, minor, -(reach + MARGIN), visible, width, height)
     store(tiles, first, tile)
     store(tile_rows, first, tile_row)
 
     red, green, blue = zero, zero, zero
     if any_of(visible):
-        harmonics.gather(sh, first, sh_width, 3 * (degree + 1) * (degree + 1), turned)
+        harmonics.gather(sh, first, sh_width, 3 * (degree + 1) * (degree + 1), transposed)
         direction, inverse = _direction(mean, camera)
-        red, green, blue = harmonics.colours(turned, degree, direction[0], direction[1], direction[2], basis)
+        red, green, blue = harmonics.colours(transposed, degree, direction[0], direction[1], direction[2], basis)
         if slopes_out.size > 0:
-            _colour_slopes(turned, degree, direction, inverse, slopes_out)
+            _colour_slopes(transposed, degree, direction, inverse, slopes_out)
     elif slopes_out.size > 0:
         for i in range(SLOPES):
             store(slopes_out, i * LANES, zero)
     rows = transpose((
-        x, y, major, k, minor, opacity, exp2_less_one(bend * TWO), minimum(sqrt(RUN_POWERS / -bend), RUN_MAX),
+        x, y, major, k, minor, opacity, exp2m1(bend * TWO), minimum(sqrt(RUN_LOG2_RANGE / -bend), RUN_MAX),
         maximum(red, ZERO), maximum(green, ZERO), maximum(blue, ZERO), pz,
         -(reach + MARGIN), half_x, half_y, zero,
     ))  # fmt: skip
@@ -355,16 +355,16 @@ def _project_block(
 
 @inlined
 def _store2(array, first, x, y):
-    """Writes 16 rows of an (n, 2) array."""
+    """Write 16 rows of an (n, 2) array."""
     store_rows(array, 2 * first, LANES, interleave((x, y)))
 
 
 @inlined
-def _colour_slopes(turned, degree, direction, inverse_distance, out):
-    """Writes the gradient of each colour by the mean: what of the slope lies along the sphere of directions."""
+def _colour_slopes(transposed, degree, direction, inverse_distance, out):
+    """Write the gradient of each colour by the mean: the slope's component tangential to the sphere of directions."""
     for channel in range(3):
-        g = harmonics.slope(turned, degree, direction[0], direction[1], direction[2], channel)
-        g = _scaled(inverse_distance, _sum(g, -_dot(g, direction), direction))
+        g = harmonics.slope(transposed, degree, direction[0], direction[1], direction[2], channel)
+        g = _scale(inverse_distance, _add_scaled(g, -_dot(g, direction), direction))
         store_rows(out, 3 * channel * LANES, LANES, g)
 
 
@@ -373,31 +373,32 @@ def project(
     counter, scratch, means, quats, scales, opacities, sh, sh_width, degree, raw, camera, width, height,
     records, centres, radii, depths, bounds, tiles, tile_rows, firsts, chunk_bounds, d_centres, slopes,
 ):  # fmt: skip
-    """Writes a record, the centre, the radius, the depth (infinite for what is not seen), a bound on the number of
-    tiles and what `few_tiles` says of them for each of n >= 16 Gaussians; firsts, chunk_bounds: sums of the bounds
-    within and over chunks (`binning`). d_centres: zeros, until the backward pass.
-    slopes: gradients of the colours by the means, 9 vectors a block of 16; empty where no gradients are wanted.
+    """Write for each of n >= 16 Gaussians its record, centre, radius, depth (infinite for a culled one), an upper bound
+    on the number of its tiles, and the tiles of small ones (`small_footprints`).
+
+    firsts, chunk_bounds: sums of the bounds within and over chunks (`binning`). d_centres: set to zero.
+    slopes: gradients of the colours by the means, 9 vectors a block of 16; empty without gradients.
     raw: scales are logarithms and opacities logits."""
     n = opacities.size
-    turned, basis = scratch[:TURNED], scratch[TURNED : TURNED + SQUARE]
+    transposed, basis = scratch[:TRANSPOSED], scratch[TRANSPOSED : TRANSPOSED + SQUARE]
     while True:
-        chunk = take_number(counter)
+        chunk = atomic_increment(counter)
         start, end = chunk * CHUNK, min(chunk * CHUNK + CHUNK, n)
         if start >= n:
             break
         for block in range(start, end, LANES):
             first = min(block, n - LANES)  # the last block overlaps the one before and writes the same again
             _project_block(
-                means, quats, scales, opacities, sh, sh_width, degree, raw, camera, width, height, first, turned, basis,
-                records, centres, radii, depths, bounds, tiles, tile_rows, slopes[block * SLOPES :],
+                means, quats, scales, opacities, sh, sh_width, degree, raw, camera, width, height, first, transposed,
+                basis, records, centres, radii, depths, bounds, tiles, tile_rows, slopes[block * SLOPES :],
             )  # fmt: skip
-        chunk_bounds[chunk] = number_slots(bounds, start, end, firsts)
+        chunk_bounds[chunk] = exclusive_sum(bounds, start, end, firsts)
         d_centres[2 * start : 2 * end] = ZERO
 
 
 @inlined
 def _from_moments(fields, xy, yy, determinant):
-    """Gradients of the centre and of the covariance (xx, xy counted once for both places, yy).
+    """Return the gradients of the centre and of the covariance xx, xy (which stands for both places), yy.
 
     With e = covariance^-1 d: dL/dcentre = sum g e, dL/dcovariance = sum g e e^T / 2. In terms of u and d_y,
     e = (alpha u, alpha k u + d_y / yy) where alpha = yy / det.
@@ -417,7 +418,7 @@ def _from_moments(fields, xy, yy, determinant):
 
 @inlined
 def _sum_rows(gradients, first_slot, count):
-    """The sum of the gradient rows of one Gaussian."""
+    """Return the sum of the gradient rows of one Gaussian."""
     row, at, end, step = splat(ZERO), first_slot * RECORD, (first_slot + count) * RECORD, opaque(RECORD)
     while at < end:
         row = row + load(gradients, at)
@@ -426,10 +427,10 @@ def _sum_rows(gradients, first_slot, count):
 
 
 @inlined
-def _gathered(gradients, slots, counts, first, rows):
-    """The fields of the gradient rows of 16 Gaussians, one vector a field."""
+def _gather_gradients(gradients, slots, counts, first, rows):
+    """Return the summed gradient rows of 16 Gaussians, one vector a field."""
     for i in range(LANES):
-        store(rows, i * LANES, _sum_rows(gradients, get(slots, first + i), get(counts, first + i)))
+        store(rows, i * LANES, _sum_rows(gradients, load_scalar(slots, first + i), load_scalar(counts, first + i)))
     return transpose(load_rows(rows, 0, LANES))
 
 
@@ -439,73 +440,74 @@ def _add_to(sums, place, value, mask):
 
 
 @inlined
-def _camera_sums(sums, fresh, mean, q, dv, dp, offset, intrinsics):
-    """Adds what 16 Gaussians say about the camera; fresh: lanes that have not been counted yet.
+def _add_camera_gradients(sums, is_new, mean, q, dv, dp, offset, intrinsics):
+    """Add the camera gradients of 16 Gaussians; is_new: lanes that are not counted yet.
 
     V = R Q gives dV Q^T, p = R m + t gives dp m^T, and the position of the camera the opposite of the
     means' part by direction.
     """
     for i in range(3):
-        _add_to(sums, 3 * i, _dot(dv[i], q[0]) + dp[i] * mean[0], fresh)
-        _add_to(sums, 3 * i + 1, _dot(dv[i], q[1]) + dp[i] * mean[1], fresh)
-        _add_to(sums, 3 * i + 2, _dot(dv[i], q[2]) + dp[i] * mean[2], fresh)
-        _add_to(sums, 9 + i, dp[i], fresh)
-        _add_to(sums, POSITION_SUM + i, -offset[i], fresh)
+        _add_to(sums, 3 * i, _dot(dv[i], q[0]) + dp[i] * mean[0], is_new)
+        _add_to(sums, 3 * i + 1, _dot(dv[i], q[1]) + dp[i] * mean[1], is_new)
+        _add_to(sums, 3 * i + 2, _dot(dv[i], q[2]) + dp[i] * mean[2], is_new)
+        _add_to(sums, 9 + i, dp[i], is_new)
+        _add_to(sums, POSITION_SUM + i, -offset[i], is_new)
     for i in range(4):
-        _add_to(sums, 12 + i, intrinsics[i], fresh)
+        _add_to(sums, 12 + i, intrinsics[i], is_new)
 
 
 @inlined
 def _offset_gradient(d_colour, slopes):
-    """Gradient of the offset from the camera to the means, by way of the colours."""
-    result = _scaled(d_colour[0], (load(slopes, 0), load(slopes, 16), load(slopes, 32)))
-    result = _sum(result, d_colour[1], (load(slopes, 48), load(slopes, 64), load(slopes, 80)))
-    return _sum(result, d_colour[2], (load(slopes, 96), load(slopes, 112), load(slopes, 128)))
+    """Return the gradient of the offset from the camera to the means through the colours."""
+    result = _scale(d_colour[0], (load(slopes, 0), load(slopes, 16), load(slopes, 32)))
+    result = _add_scaled(result, d_colour[1], (load(slopes, 48), load(slopes, 64), load(slopes, 80)))
+    return _add_scaled(result, d_colour[2], (load(slopes, 96), load(slopes, 112), load(slopes, 128)))
 
 
 @inlined
 def _project_block_backward(
-    means, quats, scales, opacities, sh_width, degree, raw, camera, records, colour_slopes, first, fresh, fields,
-    turned, rows, d_means, d_quats, d_scales, d_opacities, d_sh, row, soon, d_centres, sums, with_camera,
+    means, quats, scales, opacities, sh_width, degree, raw, camera, records, colour_slopes, first, is_new, fields,
+    transposed, rows, d_means, d_quats, d_scales, d_opacities, d_sh, row, cached, d_centres, sums, with_camera,
 ):  # fmt: skip
-    """Gradients of the 16 Gaussians from `first` on, written from `row` on; soon: those of sh are read soon."""
+    """Write the gradients of the 16 Gaussians from `first` on to rows from `row` on; cached: keep those of sh in the
+    cache, since they are read soon."""
     mean, scale = _load3(means, first), _load_scales(scales, first, raw)
-    px, py, pz = _seen(camera, mean)
-    before = pz > camera[NEAR]
-    inverse_z = ONE / where(before, pz, ONE)
+    px, py, pz = _to_camera(camera, mean)
+    in_front = pz > camera[NEAR]
+    inverse_z = ONE / where(in_front, pz, ONE)
     slopes = (px * inverse_z, py * inverse_z)
-    (qw, qx, qy, qz), inverse_norm = _unit(_load4(quats, first))
+    (qw, qx, qy, qz), inverse_norm = _normalise(_load4(quats, first))
     q = _rotation(qw, qx, qy, qz)
-    v = _turned(camera, q)
-    a, b, ux, uy = _picture_axes(camera, v, scale, slopes, inverse_z)
+    v = _rotate(camera, q)
+    a, b, ux, uy = _image_axes(camera, v, scale, slopes, inverse_z)
     _, xy, yy, determinant = _covariance(a, b, camera[DILATION])
-    usable = before & (determinant > ZERO) & (determinant < LARGEST) & (yy > ZERO)
+    usable = in_front & (determinant > ZERO) & (determinant < MAX_DETERMINANT) & (yy > ZERO)
     yy, determinant = where(usable, yy, ONE), where(usable, determinant, ONE)
     dx, dy, d_xx, d_xy, d_yy = _from_moments(fields, xy, yy, determinant)
     _store2(d_centres, first, dx, dy)
 
     opacity = _load_opacities(opacities, first, raw)
-    free = (opacity <= OPACITY_MAX) & (opacity >= ALPHA_MIN)
+    is_unclamped = (opacity <= OPACITY_MAX) & (opacity >= ALPHA_MIN)
     # G is the gradient by ln opacity; by the logit it is 1 - opacity times as large
-    d_opacity = fields[G] * (ONE - opacity) if raw else fields[G] / where(free, opacity, ONE)
-    store(d_opacities, row, where(free, d_opacity, ZERO))
+    d_opacity = fields[G] * (ONE - opacity) if raw else fields[G] / where(is_unclamped, opacity, ONE)
+    store(d_opacities, row, where(is_unclamped, d_opacity, ZERO))
 
     # covariance -> a, b -> V, scales, slopes, depth
-    da = _sum(_scaled(d_xx * TWO, a), d_xy, b)
-    db = _sum(_scaled(d_yy * TWO, b), d_xy, a)
+    da = _add_scaled(_scale(d_xx * TWO, a), d_xy, b)
+    db = _add_scaled(_scale(d_yy * TWO, b), d_xy, a)
     a_da, b_db = _dot(a, da), _dot(b, db)
-    na, nb = _scaled(inverse_z * camera[FX], da), _scaled(inverse_z * camera[FY], db)
-    n2 = _sum(_scaled(-ux, na), -uy, nb)
-    v2s = _times(v[2], scale)
+    na, nb = _scale(inverse_z * camera[FX], da), _scale(inverse_z * camera[FY], db)
+    n2 = _add_scaled(_scale(-ux, na), -uy, nb)
+    v2s = _multiply(v[2], scale)
     d_ux, d_uy = -_dot(na, v2s), -_dot(nb, v2s)
     d_scale = (
         fma(na[0], v[0][0], fma(nb[0], v[1][0], n2[0] * v[2][0])),
         fma(na[1], v[0][1], fma(nb[1], v[1][1], n2[1] * v[2][1])),
         fma(na[2], v[0][2], fma(nb[2], v[1][2], n2[2] * v[2][2])),
     )
-    _store3(d_scales, row, _times(d_scale, scale) if raw else d_scale)
-    dv = (_times(na, scale), _times(nb, scale), _times(n2, scale))
-    gw, gx, gy, gz = _rotation_backward(qw, qx, qy, qz, _turned_back(camera, dv))
+    _store3(d_scales, row, _multiply(d_scale, scale) if raw else d_scale)
+    dv = (_multiply(na, scale), _multiply(nb, scale), _multiply(n2, scale))
+    gw, gx, gy, gz = _rotation_backward(qw, qx, qy, qz, _rotate_back(camera, dv))
     along = fma(gw, qw, _dot((gx, gy, gz), (qx, qy, qz)))
     along = where(inverse_norm < np.float32(1e8), along, ZERO)  # shorter quaternions were scaled by a constant
     _store4(d_quats, row, (
@@ -521,15 +523,15 @@ def _project_block_backward(
     dp = (d_sx * inverse_z, d_sy * inverse_z, d_pz)
 
     # colour -> coefficients, direction; rows that are 0 in the record were cut off
-    shown = transpose(load_rows(records, first * RECORD, RECORD))
+    record_fields = transpose(load_rows(records, first * RECORD, RECORD))
     d_colour = (
-        where(shown[RED] > ZERO, fields[G_RED], ZERO),
-        where(shown[GREEN] > ZERO, fields[G_GREEN], ZERO),
-        where(shown[BLUE] > ZERO, fields[G_BLUE], ZERO),
+        where(record_fields[RED] > ZERO, fields[G_RED], ZERO),
+        where(record_fields[GREEN] > ZERO, fields[G_GREEN], ZERO),
+        where(record_fields[BLUE] > ZERO, fields[G_BLUE], ZERO),
     )
     direction, _ = _direction(mean, camera)
-    harmonics.coefficients_backward(degree, direction[0], direction[1], direction[2], d_colour, rows, turned)
-    harmonics.scatter(turned, row, sh_width, d_sh, soon)
+    harmonics.coefficients_backward(degree, direction[0], direction[1], direction[2], d_colour, rows, transposed)
+    harmonics.scatter(transposed, row, sh_width, d_sh, cached)
     offset = _offset_gradient(d_colour, colour_slopes)
     d_mean = (
         fma(dp[0], camera[0], fma(dp[1], camera[3], fma(dp[2], camera[6], offset[0]))),
@@ -539,7 +541,7 @@ def _project_block_backward(
     _store3(d_means, row, d_mean)
     if with_camera:
         intrinsics = (fma(dx, slopes[0], a_da / camera[FX]), fma(dy, slopes[1], b_db / camera[FY]), dx, dy)
-        _camera_sums(sums, fresh, mean, q, dv, dp, offset, intrinsics)
+        _add_camera_gradients(sums, is_new, mean, q, dv, dp, offset, intrinsics)
 
 
 @kernel
@@ -547,28 +549,29 @@ def project_backward(
     counter, scratch, parameters, sh_width, degree, raw, camera, records, slopes, gradients, slots, counts,
     d_parameters, d_centres, d_camera, with_camera, first_moments, second_moments, rates, constants,
 ):  # fmt: skip
-    """Gradients of all inputs from the rasterizer's rows.
+    """Write the gradients of all inputs from the rasterizer's gradient rows.
 
-    parameters: means, quats, scales, opacities and, to be stepped, sh; d_parameters: the gradients of all five. If
-    those are empty, the parameters take a step by them instead (`stepping.Moves`), chunk by chunk.
-    gradients: one row for each pair of Gaussian and tile; those of Gaussian i are counts[i] rows from
-    slots[i] on. d_camera: sums of each chunk, (chunks, CAMERA_SUMS), if with_camera.
+    parameters: means, quats, scales, opacities, and sh if they are stepped; d_parameters: the gradients of all five. If
+    these are empty, the parameters are stepped by their gradients instead (`stepping.StepArrays`), chunk by chunk.
+    gradients: one row for each pair of Gaussian and tile; Gaussian i has counts[i] rows from slots[i] on.
+    d_camera: sums of each chunk, (chunks, CAMERA_SUMS), if with_camera.
     """
     means, quats, scales, opacities, _ = parameters
     n = opacities.size
-    turned, rows, sums = scratch[:TURNED], scratch[TURNED : TURNED + SQUARE], scratch[TURNED + SQUARE : SCRATCH]
+    transposed, rows = scratch[:TRANSPOSED], scratch[TRANSPOSED : TRANSPOSED + SQUARE]
+    sums = scratch[TRANSPOSED + SQUARE : SCRATCH]
     stepping = d_parameters[0].size == 0
-    here = d_parameters
+    targets = d_parameters
     if stepping:
-        room = scratch[SCRATCH:]
-        here = (
-            room[: 3 * ROOM], room[3 * ROOM : 7 * ROOM], room[7 * ROOM : 10 * ROOM], room[10 * ROOM : 11 * ROOM],
-            room[11 * ROOM :],
+        rest, size = scratch[SCRATCH:], CHUNK_CAPACITY
+        targets = (
+            rest[: 3 * size], rest[3 * size : 7 * size], rest[7 * size : 10 * size], rest[10 * size : 11 * size],
+            rest[11 * size :],
         )  # fmt: skip
-    d_means, d_quats, d_scales, d_opacities, d_sh = here
-    chunks = max(1, n // CHUNK + np.int64(n % CHUNK >= LANES))  # fewer than 16 go with those before
-    while True:  # last to first: what is stepped last is what the next iteration asks for first
-        chunk = chunks - 1 - take_number(counter)
+    d_means, d_quats, d_scales, d_opacities, d_sh = targets
+    chunks = max(1, n // CHUNK + np.int64(n % CHUNK >= LANES))  # a remainder below 16 joins the last chunk
+    while True:  # last to first: the next iteration begins with the chunks that are still in the cache
+        chunk = chunks - 1 - atomic_increment(counter)
         if chunk < 0:
             break
         start, end = chunk * CHUNK, (chunk + 1) * CHUNK if chunk < chunks - 1 else n
@@ -577,20 +580,20 @@ def project_backward(
                 store(sums, i, splat(ZERO))
         for block in range(start, end, LANES):
             first = min(block, end - LANES)
-            fields = _gathered(gradients, slots, counts, first, rows)
-            fresh = lanes() >= np.float32(block - first)
+            fields = _gather_gradients(gradients, slots, counts, first, rows)
+            is_new = lane_index() >= np.float32(block - first)
             _project_block_backward(
                 means, quats, scales, opacities, sh_width, degree, raw, camera, records, slopes[block * SLOPES :],
-                first, fresh, fields, turned, rows, d_means, d_quats, d_scales, d_opacities, d_sh,
+                first, is_new, fields, transposed, rows, d_means, d_quats, d_scales, d_opacities, d_sh,
                 first - start if stepping else first, stepping, d_centres, sums, with_camera,
             )  # fmt: skip
         if stepping:
             for i in range(len(parameters)):
                 width = parameters[i].size // n
                 low, high = start * width, end * width
-                move_all(
-                    parameters[i][low:high], here[i], first_moments[i][low:high], second_moments[i][low:high], rates[i],
-                    constants_of(constants[i]),
+                step_array(
+                    parameters[i][low:high], targets[i], first_moments[i][low:high], second_moments[i][low:high],
+                    rates[i], unpack_constants(constants[i]),
                 )  # fmt: skip
         if with_camera:
             for i in range(CAMERA_SUMS):

@@ -3,18 +3,18 @@
 
 With v the gradient of a pixel's colour, one number per pixel and Gaussian matters: vc = v . colour, plus the
 gradient of alpha, plus that of depth times (its depth - the pixel's) / alpha. What lies behind a Gaussian
-contributes S' = sum of w vc over all later ones, which is what is left of the sum over all (known from the
-final picture) as the walk goes on:
+contributes S' = sum of w vc over all later ones: the sum over all, known from the final picture, minus that over the
+Gaussians up to this one:
 
     w = T alpha,   S' = S - w vc,   T' = T - w,   dL/dalpha = T vc - S' / (1 - alpha)
     g = dL / d ln alpha = w vc - S' alpha / (1 - alpha)
 
-Sums of g times 1, u, d_y and their products over the pixels are all that the projection needs. In each lane u
-depends on the row through k d_y alone, so that three sums a lane do, combined after the last row (`moments`).
-Needles (see `raster_forward`) sum the products themselves, which would cancel otherwise.
+The projection needs only sums of g times 1, u, d_y and their products over the pixels. In each lane u depends on the
+row through k d_y alone, so three sums a lane suffice, combined after the last row (`moments`). Needles (see
+`raster_forward`) sum the products themselves, which would cancel otherwise.
 
-Every pair of Gaussian and tile writes a row of its own: no two threads meet, and the sums do not depend on
-the number of threads.
+Every pair of Gaussian and tile writes its own row: no two threads write to the same memory, and the sums do not depend
+on the number of threads.
 """
 from __future__ import annotations
 
@@ -43,8 +43,8 @@ from .layout import (
     X,
 )
 from .raster_forward import (
-    AHEAD,
     DEPTH_ALPHA_MIN,
+    PREFETCH_DISTANCE,
     T_PLANE,
     falloff,
     is_needle,
@@ -55,21 +55,21 @@ from .raster_forward import (
     start_tile,
 )
 from .vector import (
+    atomic_increment,
     deinterleave,
     fma,
-    get,
-    lanes,
+    lane_index,
     load,
+    load_scalar,
     opaque,
     prefetch_to_write,
+    reduce_add_each,
     splat,
     store,
-    take_number,
-    totals,
     where,
 )
 
-# The state of a tile after T: what is left behind, and the gradients of the pixels.
+# The state of a tile after T: S, and the gradients of the pixels.
 S_PLANE, V_RED, V_GREEN, V_BLUE, V_ALPHA, V_DEPTH, MEAN_DEPTH = (i * TILE_WIDTH for i in range(1, 8))
 ROW = 9 * TILE_WIDTH  # an odd number of cache lines, so that rows fall into all sets of the cache
 STATE = ROW * TILE_HEIGHT
@@ -81,7 +81,7 @@ SCRATCH = STATE + 6 * EDGE
 def _load_gradients(
     state, row, pixel, background, image, alphas, depths, d_image, d_alphas, d_depths, with_depth
 ):  # fmt: skip
-    """One row of pixel gradients, and S before the first Gaussian, for 16 pixels from a flat index on."""
+    """Write one row of pixel gradients, and S before the first Gaussian, for 16 pixels from a flat index on."""
     at = row * ROW
     at_colour = 3 * pixel
     colour = deinterleave((load(image, at_colour), load(image, at_colour + 16), load(image, at_colour + 32)))
@@ -103,15 +103,15 @@ def _load_gradients(
 
 @inlined
 def row_gradient(state, at, e, records, record, with_depth):
-    """g and w of one row, and the state after it."""
+    """Return g and w of one row; update T and S."""
     t, s = load(state, at + T_PLANE), load(state, at + S_PLANE)
     counts = (e >= ALPHA_MIN) & (t >= T_MIN)
     w = where(counts, t * e, ZERO)
-    vc = fma(load(state, at + V_RED), get(records, record + RED), load(state, at + V_ALPHA))
-    vc = fma(load(state, at + V_GREEN), get(records, record + GREEN), vc)
-    vc = fma(load(state, at + V_BLUE), get(records, record + BLUE), vc)
+    vc = fma(load(state, at + V_RED), load_scalar(records, record + RED), load(state, at + V_ALPHA))
+    vc = fma(load(state, at + V_GREEN), load_scalar(records, record + GREEN), vc)
+    vc = fma(load(state, at + V_BLUE), load_scalar(records, record + BLUE), vc)
     if with_depth:
-        vc = fma(load(state, at + V_DEPTH), get(records, record + DEPTH) - load(state, at + MEAN_DEPTH), vc)
+        vc = fma(load(state, at + V_DEPTH), load_scalar(records, record + DEPTH) - load(state, at + MEAN_DEPTH), vc)
     wvc = w * vc
     s = s - wvc
     store(state, at + S_PLANE, s)
@@ -121,7 +121,7 @@ def row_gradient(state, at, e, records, record, with_depth):
 
 @inlined
 def _add_colours(state, at, w, sums, with_depth):
-    """Adds w v to the sums for red, green, blue and depth."""
+    """Add w v to the sums for red, green, blue and depth."""
     d_red = fma(w, load(state, at + V_RED), sums[0])
     d_green = fma(w, load(state, at + V_GREEN), sums[1])
     d_blue = fma(w, load(state, at + V_BLUE), sums[2])
@@ -130,15 +130,15 @@ def _add_colours(state, at, w, sums, with_depth):
 
 
 @inlined
-def _needle(state, records, at, left, top, first, end, with_depth):
-    """Sums of g u, g d_y, g u², g u d_y, g d_y², g and colours, each row by its own exponential."""
+def _needle_sums(state, records, at, left, top, first, end, with_depth):
+    """Return sums of g u, g d_y, g u², g u d_y, g d_y², g and colours, with an exponential for each row."""
     zero = splat(ZERO)
     m, mu, my, muu, muy, myy = zero, zero, zero, zero, zero, zero
     colours = (zero, zero, zero, zero)
     row, one = first, opaque(1)
     while row < end:
         u, dy = needle_offsets(records, at, left, top + row)
-        e = falloff(records, at, u, dy) * get(records, at + OPACITY)
+        e = falloff(records, at, u, dy) * load_scalar(records, at + OPACITY)
         g, w = row_gradient(state, row * ROW, e, records, at, with_depth)
         colours = _add_colours(state, row * ROW, w, colours, with_depth)
         gu, gy = g * u, g * dy
@@ -150,21 +150,21 @@ def _needle(state, records, at, left, top, first, end, with_depth):
 
 @inlined
 def moments(records, at, left, m0, m1, m2):
-    """Sums of g times u, d_y, u², u d_y, d_y² in each lane, from m_i = sum g d_y^i. As u = d_x + k d_y,
+    """Return sums of g times u, d_y, u², u d_y, d_y² in each lane, from m_i = sum g d_y^i. With u = d_x + k d_y,
 
     sum g u = d_x m0 + k m1,   sum g u d_y = d_x m1 + k m2,   sum g u² = d_x (d_x m0 + 2 k m1) + k² m2
     """
-    k = get(records, at + K)
-    dx = lanes() + (np.float32(left) + HALF - get(records, at + X))
+    k = load_scalar(records, at + K)
+    dx = lane_index() + (np.float32(left) + HALF - load_scalar(records, at + X))
     mu = fma(dx, m0, m1 * k)
     return mu, m1, fma(dx, fma(m1, k, mu), m2 * (k * k)), fma(dx, m1, m2 * k), m2
 
 
 @inlined
-def _ordinary(state, records, at, left, top, first, end, start, with_depth):
-    """The same by the recurrence, and by three sums a lane: of g over the rows, of the first sum's values, and of the
-    second's, additions alone. A row that is j above the end counts in these 1, j and j (j + 1) / 2 times."""
-    step, one, run = get(records, at + STEP), opaque(1), run_length(records, at)
+def _recurrence_sums(state, records, at, left, top, first, end, start, with_depth):
+    """Return the same sums by the recurrence and three running sums a lane: of g over the rows, of the values of the
+    first sum, and of those of the second. A row j rows above the end counts 1, j and j (j + 1) / 2 times in them."""
+    step, one, run = load_scalar(records, at + STEP), opaque(1), run_length(records, at)
     zero = splat(ZERO)
     m0, m1, m2 = zero, zero, zero
     colours = (zero, zero, zero, zero)
@@ -193,17 +193,19 @@ def _ordinary(state, records, at, left, top, first, end, start, with_depth):
 
 @inlined
 def _gradient_row(state, records, at, left, top, first, end, start, with_depth):
-    """The row of gradients (see `projection`) of one Gaussian in one tile."""
+    """Return the gradient row (see `projection`) of one Gaussian in one tile."""
     if is_needle(records, at, end - first):
-        mu, my, muu, muy, myy, m, colours = _needle(state, records, at, left, top, first, end, with_depth)
+        mu, my, muu, muy, myy, m, colours = _needle_sums(state, records, at, left, top, first, end, with_depth)
     else:
-        mu, my, muu, muy, myy, m, colours = _ordinary(state, records, at, left, top, first, end, start, with_depth)
-    return totals((mu, my, muu, muy, myy, m, colours[0], colours[1], colours[2], colours[3]))
+        mu, my, muu, muy, myy, m, colours = _recurrence_sums(
+            state, records, at, left, top, first, end, start, with_depth
+        )
+    return reduce_add_each((mu, my, muu, muy, myy, m, colours[0], colours[1], colours[2], colours[3]))
 
 
 @inlined
 def _edge_row(edge, pixel, count, image, alphas, depths, d_image, d_alphas, d_depths, with_depth):
-    """Copies what is in the picture of a row that its edge cuts."""
+    """Copy the pixels of a tile row that lie inside the picture to `edge`, zeros beyond."""
     edge[:, :] = ZERO
     lane, one = 0, opaque(1)
     while lane < 3 * count:
@@ -223,7 +225,7 @@ def _edge_row(edge, pixel, count, image, alphas, depths, d_image, d_alphas, d_de
 def load_tile(
     state, left, top, width, height, background, image, alphas, depths, d_image, d_alphas, d_depths, with_depth, edge
 ):  # fmt: skip
-    """The state of a tile before its first Gaussian; edge: workspace for tiles that the picture's edge cuts."""
+    """Write the state of a tile before its first Gaussian; edge: workspace for tiles that the picture's edge cuts."""
     start_tile(state, ROW, left, top, width, height)
     row, one = 0, opaque(1)
     while row < min(TILE_HEIGHT, height - top):
@@ -244,16 +246,18 @@ def load_tile(
 
 @inlined
 def _tile_backward(entries, begin, used, end, records, left, top, state, gradients, with_depth):
+    """Write the gradient rows of a tile's entries; zeros from `used` on, which were not drawn."""
     if begin < used:
-        coming = next_entry(entries, begin, end, records, left, top)
+        upcoming = next_entry(entries, begin, end, records, left, top)
         for e in range(begin, used):
-            at, first, last, start = coming
-            coming = next_entry(entries, e + 1, end, records, left, top)
-            prefetch_to_write(gradients, get(entries, min(e + AHEAD, end - 1) * ENTRY + SLOT) * RECORD)
+            at, first, last, start = upcoming
+            upcoming = next_entry(entries, e + 1, end, records, left, top)
+            far = min(e + PREFETCH_DISTANCE, end - 1)
+            prefetch_to_write(gradients, load_scalar(entries, far * ENTRY + SLOT) * RECORD)
             row = _gradient_row(state, records, at, left, top, first, last, start, with_depth)
-            store(gradients, get(entries, e * ENTRY + SLOT) * RECORD, row)
+            store(gradients, load_scalar(entries, e * ENTRY + SLOT) * RECORD, row)
     for e in range(used, end):
-        store(gradients, get(entries, e * ENTRY + SLOT) * RECORD, splat(ZERO))
+        store(gradients, load_scalar(entries, e * ENTRY + SLOT) * RECORD, splat(ZERO))
 
 
 @kernel
@@ -261,11 +265,11 @@ def raster_backward(
     counter, scratch, entries, starts, ends, records, background, width, height, tiles_x, image, alphas, depths,
     d_image, d_alphas, d_depths, gradients,
 ):  # fmt: skip
-    """gradients: the row of each slot. d_alphas and d_depths may be empty."""
+    """Write the gradient row of each slot to `gradients`. d_alphas and d_depths may be empty."""
     state, edge = scratch[:STATE], scratch[STATE:SCRATCH].reshape(6, EDGE)
     with_depth = d_depths.size > 0
     while True:
-        tile = take_number(counter)
+        tile = atomic_increment(counter)
         if tile >= ends.size:
             break
         left, top = (tile % tiles_x) * TILE_WIDTH, (tile // tiles_x) * TILE_HEIGHT

@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Blends Gaussians front to back, tile by tile.
+"""Rasterizes records front to back, tile by tile; called by `scene` and `splats`.
 
 One vector is a row of a tile. For the rows of an entry, with e = opacity 2^(A u² + D d_y²) (see `projection`):
 
     alpha = e where e >= 1/255 and T >= 1e-4, else 0
     w = T alpha,   C = C + w colour,   T = T - w
 
-From row to row e follows a recurrence instead of an exponential each: e' = e r, r' = r + r step, where
-r = 2^(A (2 u k + k²) + D (2 d_y + 1)) and step = 2^(2 C) - 1, small and exact where rows are many. It starts
-anew after `run` rows, over which e changes by 40 powers of two, so that neither its start is lost below the
-smallest float, nor its precision. Where runs would be too short for it (needles), e is computed for each row.
+From row to row e follows a recurrence instead of an exponential: e' = e r, r' = r + r step, where
+r = 2^(A (2 u k + k²) + D (2 d_y + 1)) and step = 2^(2 C) - 1, which is small and exact for large Gaussians. The
+recurrence restarts after `run` rows, over which e changes by 40 powers of two, so that neither underflow nor rounding
+spoils it. Where runs would be too short (needles), e is computed for each row.
 """
 from __future__ import annotations
 
@@ -47,28 +47,28 @@ from .layout import (
 )
 from .vector import (
     any_of,
+    atomic_increment,
     exp2,
-    exp2_inside,
+    exp2_unclamped,
     fma,
-    get,
     interleave,
-    lanes,
+    lane_index,
     load,
+    load_scalar,
     opaque,
     prefetch,
     splat,
     store,
     store_rows,
-    take_number,
     where,
 )
 
-SHORT = 4
-"""Rows below which a run is not worth its start."""
-PAUSE = 32
-"""Entries between two looks at whether all pixels of the tile are done."""
-AHEAD = 6
-"""Entries ahead of which records are asked for."""
+MIN_RUN = 4
+"""Rows below which a run costs more than an exponential for each row."""
+CHECK_INTERVAL = 32
+"""Entries between two checks whether all pixels of the tile are finished."""
+PREFETCH_DISTANCE = 6
+"""Entries by which records are prefetched ahead."""
 POWER_MIN = np.float32(-126)
 DEPTH_ALPHA_MIN = np.float32(rendering.ALPHA_MIN / 2)
 # The state of a tile, row by row: the vectors of a row.
@@ -79,55 +79,57 @@ STATE = ROW * TILE_HEIGHT
 
 @inlined
 def offsets(records, at, left, y):
-    """u along the pixel row y of the tile, and d_y."""
-    dy = np.float32(y) + HALF - get(records, at + Y)
-    return lanes() + (np.float32(left) + HALF - get(records, at + X)) + get(records, at + K) * dy, dy
+    """Return u along the pixel row y of the tile, and d_y."""
+    dy = np.float32(y) + HALF - load_scalar(records, at + Y)
+    dx = lane_index() + (np.float32(left) + HALF - load_scalar(records, at + X))
+    return dx + load_scalar(records, at + K) * dy, dy
 
 
 @inlined
 def needle_offsets(records, at, left, y):
-    """The same, where the sum of large numbers is small: in float64."""
-    dy = y + 0.5 - np.float64(get(records, at + Y))
-    k = np.float64(get(records, at + K)) + np.float64(get(records, at + K_REST))
-    u = left + 0.5 - np.float64(get(records, at + X)) + k * dy
-    return lanes() + np.float32(u), np.float32(dy)
+    """Return u and d_y computed in float64, for needles, where the sum of large numbers is small."""
+    dy = y + 0.5 - np.float64(load_scalar(records, at + Y))
+    k = np.float64(load_scalar(records, at + K)) + np.float64(load_scalar(records, at + K_REST))
+    u = left + 0.5 - np.float64(load_scalar(records, at + X)) + k * dy
+    return lane_index() + np.float32(u), np.float32(dy)
 
 
 @inlined
 def falloff(records, at, u, dy):
-    """2^(A u² + D d_y²); 0 instead of what is below 2^-126."""
-    power = fma(u * get(records, at + A), u, get(records, at + D) * dy * dy)
-    return where(power > POWER_MIN, exp2_inside(power), ZERO)
+    """Return 2^(A u² + D d_y²), flushed to 0 below 2^-126."""
+    power = fma(u * load_scalar(records, at + A), u, load_scalar(records, at + D) * dy * dy)
+    return where(power > POWER_MIN, exp2_unclamped(power), ZERO)
 
 
 @inlined
 def ratio(records, at, u, dy):
-    """The factor from this row to the next. Its limit only meets rows of zeros."""
-    k, slope = get(records, at + K), get(records, at + A) * get(records, at + K)
-    constant = slope * k + get(records, at + D) * (TWO * dy + ONE)
+    """Return the factor from this row to the next; clamped only where rows are zero."""
+    k, slope = load_scalar(records, at + K), load_scalar(records, at + A) * load_scalar(records, at + K)
+    constant = slope * k + load_scalar(records, at + D) * (TWO * dy + ONE)
     return exp2(fma(u, TWO * slope, constant))
 
 
 @inlined
 def run_length(records, at):
-    return int(get(records, at + RUN))
+    """Return the number of rows of a run."""
+    return int(load_scalar(records, at + RUN))
 
 
 @inlined
 def is_needle(records, at, rows):
-    """Whether rows differ too much for the recurrence."""
+    """Return whether rows differ too much for the recurrence."""
     run = run_length(records, at)
-    return run < rows and run < SHORT
+    return run < rows and run < MIN_RUN
 
 
 @inlined
 def start_tile(state, row_length, left, top, width, height):
-    """Transmittance 1 in the picture and 0 outside, where nothing needs to be done."""
+    """Set transmittance to 1 inside the picture and to 0 outside, so that no work is done there; all else to 0."""
     at, line = 0, opaque(TILE_WIDTH)
     while at < row_length * TILE_HEIGHT:
         store(state, at, splat(ZERO))
         at += line
-    x = lanes() + np.float32(left)
+    x = lane_index() + np.float32(left)
     inside = where(x < np.float32(width), splat(ONE), ZERO)
     row, one = 0, opaque(1)
     while row < TILE_HEIGHT:
@@ -136,28 +138,28 @@ def start_tile(state, row_length, left, top, width, height):
 
 
 @inlined
-def finished(state):
-    """Whether no pixel takes any more light."""
-    most = load(state, T_PLANE)
+def is_finished(state):
+    """Return whether the transmittance of all pixels is below the threshold."""
+    highest = load(state, T_PLANE)
     for row in range(1, TILE_HEIGHT):
         t = load(state, T_PLANE + row * ROW)
-        most = where(t > most, t, most)
-    return not any_of(most >= T_MIN)
+        highest = where(t > highest, t, highest)
+    return not any_of(highest >= T_MIN)
 
 
 @inlined
 def blend_row(state, at, e, records, record, with_depth):
-    """Adds one row of a Gaussian."""
+    """Blend one row of a Gaussian."""
     t = load(state, at + T_PLANE)
     alpha = where((e >= ALPHA_MIN) & (t >= T_MIN), e, ZERO)
     w = t * alpha
     after = t - w
     store(state, at + T_PLANE, after)
-    store(state, at + RED_PLANE, fma(w, get(records, record + RED), load(state, at + RED_PLANE)))
-    store(state, at + GREEN_PLANE, fma(w, get(records, record + GREEN), load(state, at + GREEN_PLANE)))
-    store(state, at + BLUE_PLANE, fma(w, get(records, record + BLUE), load(state, at + BLUE_PLANE)))
+    store(state, at + RED_PLANE, fma(w, load_scalar(records, record + RED), load(state, at + RED_PLANE)))
+    store(state, at + GREEN_PLANE, fma(w, load_scalar(records, record + GREEN), load(state, at + GREEN_PLANE)))
+    store(state, at + BLUE_PLANE, fma(w, load_scalar(records, record + BLUE), load(state, at + BLUE_PLANE)))
     if with_depth:
-        depth = get(records, record + DEPTH)
+        depth = load_scalar(records, record + DEPTH)
         store(state, at + DEPTH_PLANE, fma(w, depth, load(state, at + DEPTH_PLANE)))
         passes = (t >= HALF) & (after < HALF)
         store(state, at + MEDIAN_PLANE, where(passes, depth, load(state, at + MEDIAN_PLANE)))
@@ -165,37 +167,38 @@ def blend_row(state, at, e, records, record, with_depth):
 
 @inlined
 def start_run(records, at, left, y):
-    """e and r in pixel row y of the tile, and d_y."""
+    """Return e and r in pixel row y of the tile, and d_y."""
     u, dy = offsets(records, at, left, y)
-    return falloff(records, at, u, dy) * get(records, at + OPACITY), ratio(records, at, u, dy), dy
+    return falloff(records, at, u, dy) * load_scalar(records, at + OPACITY), ratio(records, at, u, dy), dy
 
 
 @inlined
 def next_entry(entries, e, end, records, left, top):
-    """Entry e of the tile: place of its record, rows, and the start of its run. Taken before the one in front of
-    it is drawn, so that the latency of the exponentials passes meanwhile. After the last: the last again."""
+    """Return offset of the record, rows and start of the run of entry e; of the last entry if e lies beyond it.
+
+    Called before the previous entry is drawn, to hide the latency of the exponentials."""
     at_entry = min(e, end - 1) * ENTRY
-    prefetch(records, get(entries, min(e + AHEAD, end - 1) * ENTRY + GAUSSIAN) * RECORD)
-    at = get(entries, at_entry + GAUSSIAN) * RECORD
-    first = get(entries, at_entry + FIRST_ROW)
-    return at, first, get(entries, at_entry + END_ROW), start_run(records, at, left, top + first)
+    prefetch(records, load_scalar(entries, min(e + PREFETCH_DISTANCE, end - 1) * ENTRY + GAUSSIAN) * RECORD)
+    at = load_scalar(entries, at_entry + GAUSSIAN) * RECORD
+    first = load_scalar(entries, at_entry + FIRST_ROW)
+    return at, first, load_scalar(entries, at_entry + END_ROW), start_run(records, at, left, top + first)
 
 
 @inlined
 def _blend_needle(state, records, at, left, top, first, end, with_depth):
-    """One Gaussian over rows first .. end of the tile, an exponential each."""
+    """Blend a Gaussian into rows first .. end of the tile, with an exponential for each row."""
     row, one = first, opaque(1)
     while row < end:
         u, dy = needle_offsets(records, at, left, top + row)
-        e = falloff(records, at, u, dy) * get(records, at + OPACITY)
+        e = falloff(records, at, u, dy) * load_scalar(records, at + OPACITY)
         blend_row(state, row * ROW, e, records, at, with_depth)
         row += one
 
 
 @inlined
 def _blend(state, records, at, left, top, first, end, start, with_depth):
-    """The same by the recurrence."""
-    step, one, run = get(records, at + STEP), opaque(1), run_length(records, at)
+    """Blend a Gaussian into rows first .. end of the tile by the recurrence."""
+    step, one, run = load_scalar(records, at + STEP), opaque(1), run_length(records, at)
     e, r, _ = start
     row, stop = first, min(first + run, end)
     while True:
@@ -212,7 +215,7 @@ def _blend(state, records, at, left, top, first, end, start, with_depth):
 
 @inlined
 def _copy(source, at, target, to, count):
-    """The first `count` of a vector's numbers, or all."""
+    """Copy the first `count` of a vector's numbers, or all."""
     if count >= TILE_WIDTH:
         store(target, to, load(source, at))
         return
@@ -224,42 +227,42 @@ def _copy(source, at, target, to, count):
 
 @inlined
 def write_tile(image, alphas, depths, medians, state, left, top, width, height, background, with_depth):
-    """The finished tile into the picture. Uses the state as workspace."""
-    seen = width - left
+    """Write the finished tile to the picture; overwrites the state."""
+    visible_columns = width - left
     row, one = 0, opaque(1)
     while row < min(TILE_HEIGHT, height - top):
         at, pixel = row * ROW, (top + row) * width + left
         t = load(state, at + T_PLANE)
         alpha = ONE - t
-        red = fma(t, get(background, 0), load(state, at + RED_PLANE))
-        green = fma(t, get(background, 1), load(state, at + GREEN_PLANE))
-        blue = fma(t, get(background, 2), load(state, at + BLUE_PLANE))
+        red = fma(t, load_scalar(background, 0), load(state, at + RED_PLANE))
+        green = fma(t, load_scalar(background, 1), load(state, at + GREEN_PLANE))
+        blue = fma(t, load_scalar(background, 2), load(state, at + BLUE_PLANE))
         store(state, at + T_PLANE, alpha)
         store_rows(state, at + RED_PLANE, TILE_WIDTH, interleave((red, green, blue)))
-        _copy(state, at + T_PLANE, alphas, pixel, seen)
+        _copy(state, at + T_PLANE, alphas, pixel, visible_columns)
         third = 0
         while third < 3 * TILE_WIDTH:
-            _copy(state, at + RED_PLANE + third, image, 3 * pixel + third, 3 * seen - third)
+            _copy(state, at + RED_PLANE + third, image, 3 * pixel + third, 3 * visible_columns - third)
             third += one * TILE_WIDTH
         if with_depth:
             depth = load(state, at + DEPTH_PLANE) / where(alpha > DEPTH_ALPHA_MIN, alpha, DEPTH_ALPHA_MIN)
             store(state, at + DEPTH_PLANE, depth)
-            _copy(state, at + DEPTH_PLANE, depths, pixel, seen)
-            _copy(state, at + MEDIAN_PLANE, medians, pixel, seen)
+            _copy(state, at + DEPTH_PLANE, depths, pixel, visible_columns)
+            _copy(state, at + MEDIAN_PLANE, medians, pixel, visible_columns)
         row += one
 
 
 @inlined
 def _raster_tile(entries, begin, end, records, left, top, state, with_depth):
-    """Draws a tile; returns the end of the entries it needed."""
+    """Draw a tile; return the end of the drawn entries."""
     if begin == end:
         return end
-    coming = next_entry(entries, begin, end, records, left, top)
+    upcoming = next_entry(entries, begin, end, records, left, top)
     for e in range(begin, end):
-        if (e - begin) & (PAUSE - 1) == PAUSE - 1 and finished(state):
+        if (e - begin) & (CHECK_INTERVAL - 1) == CHECK_INTERVAL - 1 and is_finished(state):
             return e
-        at, first, last, start = coming
-        coming = next_entry(entries, e + 1, end, records, left, top)
+        at, first, last, start = upcoming
+        upcoming = next_entry(entries, e + 1, end, records, left, top)
         if is_needle(records, at, last - first):
             _blend_needle(state, records, at, left, top, first, last, with_depth)
         else:
@@ -271,19 +274,19 @@ def _raster_tile(entries, begin, end, records, left, top, state, with_depth):
 def raster(
     counter, state, entries, starts, records, background, width, height, tiles_x, image, alphas, depths, medians, ends
 ):  # fmt: skip
-    """Colour (h w 3) and alpha (h w), flat; expected and median depth too unless `depths` is empty.
+    """Write colour (h w 3) and alpha (h w), flat; mean and median depth too unless `depths` is empty.
 
-    ends (tiles,): where each tile stopped.
+    ends (tiles,): the end of each tile's drawn entries.
     """
     with_depth = depths.size > 0
     while True:
-        tile = take_number(counter)
+        tile = atomic_increment(counter)
         if tile >= ends.size:
             break
         left, top = (tile % tiles_x) * TILE_WIDTH, (tile // tiles_x) * TILE_HEIGHT
         begin, end = starts[tile], starts[tile + 1]
         start_tile(state, ROW, left, top, width, height)
-        if with_depth:  # LLVM makes two of the loop, and takes out what it needs not ask in each
+        if with_depth:  # two loops for LLVM to specialise
             ends[tile] = _raster_tile(entries, begin, end, records, left, top, state, with_depth)
         else:
             ends[tile] = _raster_tile(entries, begin, end, records, left, top, state, with_depth)

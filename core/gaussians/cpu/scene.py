@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""`rasterize_scene` on the CPU: the kernels in their order, as one function of autograd."""
+"""`rasterize_scene` on the CPU: runs the kernels in order, as one autograd function."""
 from __future__ import annotations
 
 import math
@@ -14,56 +14,57 @@ from ..rendering import Rendering
 from . import buffers, layout, projection, raster_backward, raster_forward, stepping
 from .buffers import Array
 from .threads import parallel
-from .tiles import EMPTY, Grid, bin_gaussians, flat
+from .tiles import EMPTY, TileGrid, bin_gaussians, flat
 from .vector import LANES
 
-_BLACK, _NOTHING = torch.zeros(3), torch.empty(0, 0)
+_BLACK, _NO_DEPTH = torch.zeros(3), torch.empty(0, 0)
 
 
 @dataclass(frozen=True)
-class _Frame(Grid):
-    """What is not differentiated."""
+class _RasterOptions(TileGrid):
+    """Inputs and results that are not differentiated."""
 
     sh_degree: int
     near: float
     dilation: float
     depth: bool
     raw: bool
-    found: list[Tensor] = field(default_factory=list)
-    """Centres and radii, which are not differentiated and so need not pass through autograd."""
+    projected: list[Tensor] = field(default_factory=list)
+    """Centres and radii, which bypass autograd."""
 
 
 class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, sh: Tensor,
-        world_to_camera: Tensor, intrinsics: Tensor, background: Tensor, frame: _Frame, centre_gradients: Tensor,
+        world_to_camera: Tensor, intrinsics: Tensor, background: Tensor, frame: _RasterOptions,
+        centre_gradients: Tensor,
     ) -> tuple[Tensor | None, ...]:  # fmt: skip
         n, w, h = len(means), frame.width, frame.height
         camera = np.empty(projection.CAMERA, np.float32)
-        projection.describe_camera(
+        projection.pack_camera(
             flat(world_to_camera), flat(intrinsics), w, h, frame.near, frame.dilation, camera
         )
-        records, depths_of, bounds, firsts, tiles, tile_rows = buffers.empties(
+        records, depths_of, bounds, firsts, tiles, tile_rows = buffers.empty_many(
             (n * layout.RECORD, np.float32), (n, np.float32), *[(n, np.int32)] * 4
         )
-        centres, centres_flat = buffers.pair(n, 2)
-        radii, radii_flat = buffers.pair(n)
-        given = [flat(t) for t in (means, quats, scales, opacities)]
+        centres, centres_flat = buffers.tensor_and_array(n, 2)
+        radii, radii_flat = buffers.tensor_and_array(n)
+        inputs = [flat(t) for t in (means, quats, scales, opacities)]
         blocks = -(-n // LANES) if any(ctx.needs_input_grad) else 0
         slopes = buffers.empty(blocks * LANES * projection.SLOPES)
         chunk_bounds = np.zeros(-(-n // layout.CHUNK), np.int64)
         parallel(
-            projection.project, *given, flat(sh), sh.shape[1] * 3,
+            projection.project, *inputs, flat(sh), sh.shape[1] * 3,
             frame.sh_degree, frame.raw, camera, w, h, records, centres_flat, radii_flat, depths_of, bounds, tiles,
             tile_rows, firsts, chunk_bounds, flat(centre_gradients), slopes, scratch=projection.SCRATCH,
         )  # fmt: skip
         bins = bin_gaussians(records, depths_of.view(np.uint32), tiles, tile_rows, bounds, firsts, chunk_bounds, frame)
 
-        image, image_flat = buffers.pair(h, w, 3)
-        alpha, alpha_flat = buffers.pair(h, w)
+        image, image_flat = buffers.tensor_and_array(h, w, 3)
+        alpha, alpha_flat = buffers.tensor_and_array(h, w)
         (depth, depth_flat), (median, median_flat) = (
-            (buffers.pair(h, w), buffers.pair(h, w)) if frame.depth else ((None, EMPTY), (None, EMPTY))
+            buffers.tensor_and_array(h, w) if frame.depth else (None, EMPTY) for _ in range(2)
         )
         ends, behind = np.empty(frame.tiles, np.int64), flat(background)
         parallel(
@@ -72,18 +73,18 @@ class _Rasterize(torch.autograd.Function):
         )  # fmt: skip
         ctx.save_for_backward(means, quats, scales, opacities, sh, image, alpha, depth)
         ctx.frame, ctx.bins, ctx.centre_gradients, ctx.first = frame, bins, centre_gradients, True
-        ctx.arrays = records, camera, slopes, ends, behind, given, (image_flat, alpha_flat, depth_flat)
+        ctx.arrays = records, camera, slopes, ends, behind, inputs, (image_flat, alpha_flat, depth_flat)
         ctx.set_materialize_grads(False)
-        frame.found.extend((centres, radii))
+        frame.projected.extend((centres, radii))
         if median is not None:
             ctx.mark_non_differentiable(median)
         return image, alpha, depth, median
 
     @staticmethod
     def backward(ctx: Any, d_image: Tensor | None, d_alpha: Tensor | None, d_depth: Tensor | None, *_: Any) -> Any:
-        means, quats, scales, opacities, sh, _, alpha, _ = ctx.saved_tensors  # asks whether they are as they were
+        means, quats, scales, opacities, sh, _, alpha, _ = ctx.saved_tensors  # raises if they were changed in place
         frame, bins = ctx.frame, ctx.bins
-        records, camera, slopes, ends, behind, given, pictures = ctx.arrays
+        records, camera, slopes, ends, behind, inputs, pictures = ctx.arrays
         n, w, h = len(means), frame.width, frame.height
         v_image = buffers.zeros(h * w * 3) if d_image is None else flat(d_image)
         v_alpha = EMPTY if d_alpha is None else flat(d_alpha)
@@ -94,21 +95,21 @@ class _Rasterize(torch.autograd.Function):
             *pictures, v_image, v_alpha, v_depth, rows, scratch=raster_backward.SCRATCH,
         )  # fmt: skip
         parameters = (means, quats, scales, opacities, sh)
-        moves = stepping.take_offers(parameters)
-        if moves is None:
-            gradients, gradients_flat = zip(*(buffers.pair(*t.shape) for t in parameters), strict=True)
+        steps = stepping.claim_steps(parameters)
+        if steps is None:
+            gradients, gradients_flat = zip(*(buffers.tensor_and_array(*t.shape) for t in parameters), strict=True)
         else:
             gradients, gradients_flat = (None,) * len(parameters), (EMPTY,) * len(parameters)
-        # the first time the kernel writes them where they belong; a second backward adds to them
+        # the first backward writes centre_gradients directly; a second one adds to them
         first, ctx.first = ctx.first, False
         d_centres = flat(ctx.centre_gradients) if first else buffers.empty(2 * n)
         with_camera = ctx.needs_input_grad[5] or ctx.needs_input_grad[6]
         sums = np.zeros((-(-n // layout.CHUNK) if with_camera else 0, projection.CAMERA_SUMS), np.float32)
         parallel(
-            projection.project_backward, (*given, flat(sh) if moves else EMPTY), sh.shape[1] * 3, frame.sh_degree,
+            projection.project_backward, (*inputs, flat(sh) if steps else EMPTY), sh.shape[1] * 3, frame.sh_degree,
             frame.raw, camera, records, slopes, rows, bins.firsts, bins.counts, gradients_flat, d_centres, sums,
-            with_camera, *(moves or stepping.NO_MOVES),
-            scratch=projection.STEP_SCRATCH if moves else projection.SCRATCH,
+            with_camera, *(steps or stepping.NO_STEPS),
+            scratch=projection.STEP_SCRATCH if steps else projection.SCRATCH,
         )  # fmt: skip
         if not first:
             flat(ctx.centre_gradients)[:] += d_centres
@@ -120,7 +121,7 @@ class _Rasterize(torch.autograd.Function):
 
 
 def _camera_gradients(sums: Array, camera: Array) -> tuple[Tensor, Tensor]:
-    """Of world_to_camera (4, 4) and of intrinsics (3, 3), from the sums of all chunks."""
+    """Return the gradients of world_to_camera (4, 4) and intrinsics (3, 3), from the sums of all chunks."""
     total = sums.astype(np.float64).sum(0)
     rotation, translation = camera[:9].reshape(3, 3).astype(np.float64), camera[9:12].astype(np.float64)
     position = total[projection.POSITION_SUM : projection.POSITION_SUM + 3]  # of -R^T t
@@ -138,28 +139,29 @@ def rasterize_scene(
     world_to_camera: Tensor, intrinsics: Tensor, width: int, height: int,
     *, background: Tensor | None, sh_degree: int, near: float, dilation: float, depth: bool, raw: bool,
 ) -> Rendering:  # fmt: skip
-    """See `rasterization`. depth=False leaves depth and median_depth empty (0, 0), and is faster."""
+    """Render as `rasterization` of the package does."""
     n = len(means)
-    inputs = [_single(t) for t in (means, quats, scales, opacities, sh)]
-    if n < LANES:  # the kernels work on 16 at a time; opacity 0 is never seen
-        rest = [0.0, 0.0, 0.0, -math.inf if raw else 0.0, 0.0]
+    inputs = [_to_float32(t) for t in (means, quats, scales, opacities, sh)]
+    if n < LANES:  # the kernels process 16 at a time; pad with Gaussians of opacity 0
+        fill_values = [0.0, 0.0, 0.0, -math.inf if raw else 0.0, 0.0]
         inputs = [
-            torch.cat([t, t.new_full((LANES - n, *t.shape[1:]), value)]) for t, value in zip(inputs, rest, strict=True)
+            torch.cat([t, t.new_full((LANES - n, *t.shape[1:]), value)])
+            for t, value in zip(inputs, fill_values, strict=True)
         ]
     if background is None:
         background = _BLACK
-    centre_gradients, _ = buffers.pair(len(inputs[0]), 2)
-    frame = _Frame(width, height, sh_degree, near, dilation, depth, raw)
+    centre_gradients, _ = buffers.tensor_and_array(len(inputs[0]), 2)
+    frame = _RasterOptions(width, height, sh_degree, near, dilation, depth, raw)
     image, alpha, depths, median = _Rasterize.apply(
-        *inputs, _single(world_to_camera), _single(intrinsics), background, frame, centre_gradients
+        *inputs, _to_float32(world_to_camera), _to_float32(intrinsics), background, frame, centre_gradients
     )
     if not depth:
-        depths, median = _NOTHING, _NOTHING
-    of_gaussians = (*frame.found, centre_gradients)
+        depths, median = _NO_DEPTH, _NO_DEPTH
+    per_gaussian = (*frame.projected, centre_gradients)
     if n < LANES:
-        of_gaussians = tuple(t[:n] for t in of_gaussians)
-    return Rendering(image, alpha, depths, median, *of_gaussians)
+        per_gaussian = tuple(t[:n] for t in per_gaussian)
+    return Rendering(image, alpha, depths, median, *per_gaussian)
 
 
-def _single(tensor: Tensor) -> Tensor:
+def _to_float32(tensor: Tensor) -> Tensor:
     return tensor if tensor.dtype == torch.float32 else tensor.to(torch.float32)

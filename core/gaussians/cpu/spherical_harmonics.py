@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Colour by direction, 16 Gaussians at a time, and its derivatives.
+"""Colours from spherical harmonics, 16 Gaussians at a time, and their derivatives; called by `projection`.
 
     colour_c = sum_k b_k(x, y, z) sh_kc + 1/2
 
-with the basis b of `..spherical_harmonics`. Coefficients come turned: 48 rows (k, c) of 16 Gaussians each, one
-vector a row (`gather`). Backward, with the gradient v_c of the colours:
+with the basis b of `..spherical_harmonics`. Coefficients are transposed to 48 rows (k, c) of 16 Gaussians, one vector a
+row (`gather`). In the backward pass, with the gradient v_c of the colours:
 
     d sh_kc = b_k v_c        d direction = sum_c v_c slope_c,   slope_c = sum_k sh_kc grad b_k
 
-The slopes are taken forward, while the coefficients are at hand: those are most of what there is to read.
+The slopes are computed in the forward pass, while the coefficients, which dominate the memory traffic, are loaded.
 """
 from __future__ import annotations
 
@@ -29,32 +29,32 @@ ZERO, HALF, TWO, THREE, FOUR, EIGHT = (np.float32(number) for number in (0, 0.5,
 
 
 @inlined
-def gather(sh, first, width, used, turned):
-    """Turns `used` of the `width` numbers of 16 Gaussians, from row `first` of sh (n, width) on."""
+def gather(sh, first, width, used, transposed):
+    """Transpose `used` of the `width` numbers of 16 Gaussians, from row `first` of sh (n, width) on."""
     one = opaque(1)
     column = 0
     while column < used:
         if column + LANES <= width:
             rows = load_rows(sh, first * width + column, width)
-            store_rows(turned, column * LANES, LANES, transpose(rows))
+            store_rows(transposed, column * LANES, LANES, transpose(rows))
             column += LANES
         else:
             i = 0
             while i < LANES:
-                turned[column * LANES + i] = sh[(first + i) * width + column]
+                transposed[column * LANES + i] = sh[(first + i) * width + column]
                 i += one
             column += one
 
 
 @inlined
-def scatter(turned, first, width, sh, soon):
-    """The inverse: writes all `width` numbers of 16 Gaussians; past the caches unless they are read soon."""
+def scatter(transposed, first, width, sh, cached):
+    """Invert `gather`: write all `width` numbers of 16 Gaussians to sh, past the caches unless `cached`."""
     one = opaque(1)
     column = 0
     while column < width:
         if column + LANES <= width:
-            rows = load_rows(turned, column * LANES, LANES)
-            if width == ROWS and not soon:
+            rows = load_rows(transposed, column * LANES, LANES)
+            if width == ROWS and not cached:
                 stream_rows(sh, first * width + column, width, transpose(rows))
             else:
                 store_rows(sh, first * width + column, width, transpose(rows))
@@ -62,14 +62,14 @@ def scatter(turned, first, width, sh, soon):
         else:
             i = 0
             while i < LANES:
-                sh[(first + i) * width + column] = turned[column * LANES + i]
+                sh[(first + i) * width + column] = transposed[column * LANES + i]
                 i += one
             column += one
 
 
 @inlined
 def _basis(degree, x, y, z, b):
-    """Writes the basis functions up to this degree, one vector each."""
+    """Write the basis functions up to this degree, one vector each."""
     store(b, 0, splat(C0))
     if degree >= 1:
         store_rows(b, LANES, LANES, (y * -C1, z * C1, x * -C1))
@@ -88,34 +88,34 @@ def _basis(degree, x, y, z, b):
 
 
 @inlined
-def colours(turned, degree, x, y, z, b):
-    """The colours (r, g, b), not yet cut off at 0, along unit directions. b: workspace of 16 vectors."""
+def colours(transposed, degree, x, y, z, b):
+    """Return the colours (r, g, b), not yet clamped at 0, along unit directions. b: workspace of 16 vectors."""
     _basis(degree, x, y, z, b)
     red, green, blue = splat(HALF), splat(HALF), splat(HALF)
     for k in range((degree + 1) * (degree + 1)):
         value, at = load(b, k * LANES), 3 * k * LANES
-        red = fma(value, load(turned, at), red)
-        green = fma(value, load(turned, at + LANES), green)
-        blue = fma(value, load(turned, at + 2 * LANES), blue)
+        red = fma(value, load(transposed, at), red)
+        green = fma(value, load(transposed, at + LANES), green)
+        blue = fma(value, load(transposed, at + 2 * LANES), blue)
     return red, green, blue
 
 
 @inlined
-def coefficients_backward(degree, x, y, z, v, b, turned):
-    """Writes the gradients of the coefficients, turned, from those of the colours."""
+def coefficients_backward(degree, x, y, z, v, b, transposed):
+    """Write the transposed gradients of the coefficients from those of the colours."""
     _basis(degree, x, y, z, b)
     used = (degree + 1) * (degree + 1)
     for k in range(used):
         value = load(b, k * LANES)
-        store_rows(turned, 3 * k * LANES, LANES, (value * v[0], value * v[1], value * v[2]))
+        store_rows(transposed, 3 * k * LANES, LANES, (value * v[0], value * v[1], value * v[2]))
     for row in range(3 * used, ROWS):
-        store(turned, row * LANES, splat(ZERO))
+        store(transposed, row * LANES, splat(ZERO))
 
 
 @inlined
-def slope(turned, degree, x, y, z, channel):
-    """The gradient of a colour by the direction: sum_k sh_k grad b_k, not yet along the sphere."""
-    h, three = turned[channel * LANES :], 3 * LANES
+def slope(transposed, degree, x, y, z, channel):
+    """Return the gradient of a colour by the direction, sum_k sh_k grad b_k, not yet projected on the sphere."""
+    h, three = transposed[channel * LANES :], 3 * LANES
     zero = splat(ZERO)
     dx, dy, dz = zero, zero, zero
     if degree >= 1:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""`splat` on the CPU: the flare's kernels as one function of autograd."""
+"""`splat` on the CPU: runs the kernels of `flare` in order, as one autograd function."""
 from __future__ import annotations
 
 from typing import Any
@@ -12,7 +12,7 @@ from ...choices import Blend
 from ..rendering import Splats
 from . import buffers, flare, layout, raster_backward, raster_forward
 from .threads import parallel
-from .tiles import EMPTY, Grid, bin_gaussians, flat
+from .tiles import EMPTY, TileGrid, bin_gaussians, flat
 
 BLACK = np.zeros(3, np.float32)
 
@@ -21,7 +21,7 @@ class _Splat(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any, centres: Tensor, covariances: Tensor, opacities: Tensor, colours: Tensor,
-        rings: Tensor | None, arcs: Tensor | None, add: bool, grid: Grid,
+        rings: Tensor | None, arcs: Tensor | None, add: bool, grid: TileGrid,
     ) -> tuple[Tensor, Tensor]:  # fmt: skip
         n, h, w = len(centres), grid.height, grid.width
         shaped = rings is not None or arcs is not None
@@ -30,12 +30,12 @@ class _Splat(torch.autograd.Function):
         records, shapes = buffers.empty(n * layout.RECORD), buffers.empty(n * flare.SHAPE)
         keys, bounds, firsts = (buffers.empty(n, kind) for kind in (np.uint32, np.int32, np.int32))
         chunk_bounds = np.empty(-(-n // layout.CHUNK), np.int64)
-        flare.prepare(*inputs, *shape_inputs, w, h, add, records, shapes, keys, bounds, firsts, chunk_bounds)
-        large = np.full(n, -1, np.int32)  # as most flares are
+        flare.prepare_records(*inputs, *shape_inputs, w, h, add, records, shapes, keys, bounds, firsts, chunk_bounds)
+        large = np.full(n, -1, np.int32)  # no small footprints: most flare Gaussians are large
         bins = bin_gaussians(records, keys, large, large, bounds, firsts, chunk_bounds, grid)
 
-        image, image_flat = buffers.pair(h, w, 3)
-        alpha, alpha_flat = buffers.pair(h, w)
+        image, image_flat = buffers.tensor_and_array(h, w, 3)
+        alpha, alpha_flat = buffers.tensor_and_array(h, w)
         ends = np.empty(grid.tiles, np.int64)
         tiles = (bins.entries, bins.starts, records)
         if shaped or add:
@@ -76,7 +76,7 @@ class _Splat(torch.autograd.Function):
                 v_image, v_alpha, EMPTY, rows, scratch=raster_backward.SCRATCH,
             )  # fmt: skip
         gradients = [None if t is None else torch.empty_like(t, memory_format=torch.contiguous_format) for t in inputs]
-        flare.finish(
+        flare.sum_gradients(
             np.empty(layout.RECORD, np.float32), flat(covariances), flat(opacities), flat(colours),
             EMPTY if arcs is None else flat(arcs), rows, bins.firsts, bins.counts, add,
             *(EMPTY if t is None else flat(t) for t in gradients),
@@ -88,8 +88,8 @@ def splat(
     centres: Tensor, covariances: Tensor, opacities: Tensor, colours: Tensor, width: int, height: int,
     *, rings: Tensor | None, arcs: Tensor | None, blend: Blend,
 ) -> Splats:  # fmt: skip
-    """See `splat` of the package; full resolution."""
-    given = (centres, covariances, opacities, colours, rings, arcs)
-    inputs = (None if t is None else t.to(torch.float32) for t in given)
-    colour, alpha = _Splat.apply(*inputs, blend == "add", Grid(width, height))
+    """Rasterize as `splat` of the package does at full resolution."""
+    inputs_or_none = (centres, covariances, opacities, colours, rings, arcs)
+    inputs = (None if t is None else t.to(torch.float32) for t in inputs_or_none)
+    colour, alpha = _Splat.apply(*inputs, blend == "add", TileGrid(width, height))
     return Splats(colour, torch.ones_like(alpha) if blend == "add" else 1 - alpha)

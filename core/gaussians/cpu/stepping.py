@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Steps of Adam that a scene's backward pass takes.
+"""Adam steps fused into a scene's backward pass.
 
-Its gradients come from the projection's backward pass, some Gaussians at a time. Steps that are on offer are taken
-there and then, while the gradients are in the cache, so that those are neither written to memory nor read again.
+The projection's backward pass computes the gradients of some Gaussians at a time. Pending steps are made right there,
+while the gradients are in the cache, so that these are neither written to memory nor read again. `..optimiser.Adam`
+registers the steps (`steps_in_backward`); `scene` claims them (`claim_steps`).
 """
 from __future__ import annotations
 
@@ -14,12 +15,13 @@ import numpy as np
 from torch import Tensor
 
 from .buffers import Array
-from .optimiser import CONSTANTS, Step, constants_for, rates_of
+from .optimiser import NUM_CONSTANTS, AdamStep, adam_constants, repeat_rates
 from .tiles import EMPTY, flat
 
 
-class Moves(NamedTuple):
-    """Steps of some parameters, as kernels take them: flat arrays, and the numbers of `constants_of` by rows."""
+class StepArrays(NamedTuple):
+    """Steps of several parameters as arguments of a kernel: flat arrays, and a row of constants for each
+    (`unpack_constants`)."""
 
     first: tuple[Array, ...]
     second: tuple[Array, ...]
@@ -27,50 +29,55 @@ class Moves(NamedTuple):
     constants: Array
 
 
-_NOTHING = (EMPTY,) * 5  # means, quaternions, scales, opacities, harmonics
-NO_MOVES = Moves(_NOTHING, _NOTHING, _NOTHING, np.empty((len(_NOTHING), CONSTANTS), np.float32))
-"""For a backward pass that writes a scene's gradients."""
+_EMPTY_ARRAYS = (EMPTY,) * 5  # means, quaternions, scales, opacities, harmonics
+NO_STEPS = StepArrays(
+    _EMPTY_ARRAYS, _EMPTY_ARRAYS, _EMPTY_ARRAYS, np.empty((len(_EMPTY_ARRAYS), NUM_CONSTANTS), np.float32)
+)
+"""Arguments of a backward pass that writes the gradients and makes no steps."""
 
 
-class Offers:
-    """Steps that a backward pass may take in place of writing the gradients."""
+class StepsInBackward:
+    """Steps that a backward pass may make instead of writing the gradients; claimed: names of the parameters whose
+    steps were made."""
 
-    def __init__(self, steps: Mapping[str, Step], beta1: float, beta2: float, epsilon: float) -> None:
+    def __init__(self, steps: Mapping[str, AdamStep], beta1: float, beta2: float, epsilon: float) -> None:
         self._steps = {id(step.parameter): (name, step) for name, step in steps.items()}
         self._options = (beta1, beta2, epsilon)
-        self.taken: set[str] = set()
+        self.claimed: set[str] = set()
 
-    def take(self, parameters: Sequence[Tensor]) -> Moves | None:
-        """The steps of these parameters, now the caller's to take; None unless all are on offer."""
+    def claim(self, parameters: Sequence[Tensor]) -> StepArrays | None:
+        """Return the steps of these parameters, which the caller has to make; None unless all are pending."""
         found = [self._steps.get(id(parameter)) for parameter in parameters]
-        if any(entry is None or entry[0] in self.taken for entry in found):
+        if any(entry is None or entry[0] in self.claimed for entry in found):
             return None
-        self.taken.update(entry[0] for entry in found if entry is not None)
+        self.claimed.update(entry[0] for entry in found if entry is not None)
         steps = [entry[1] for entry in found if entry is not None]
-        return Moves(
+        return StepArrays(
             tuple(flat(step.first) for step in steps), tuple(flat(step.second) for step in steps),
-            tuple(rates_of(step.rate) for step in steps),
-            np.array([constants_for(step.step, *self._options) for step in steps], np.float32),
+            tuple(repeat_rates(step.rate) for step in steps),
+            np.array([adam_constants(step.step, *self._options) for step in steps], np.float32),
         )  # fmt: skip
 
 
-_offers: list[Offers] = []
+_pending: list[StepsInBackward] = []
 
 
 @contextmanager
-def offered(steps: Mapping[str, Step], *, beta1: float, beta2: float, epsilon: float) -> Iterator[Offers]:
-    """Within it, a backward pass that finds all gradients of a scene may take the steps."""
-    offers = Offers(steps, beta1, beta2, epsilon)
-    _offers.append(offers)
+def steps_in_backward(
+    steps: Mapping[str, AdamStep], *, beta1: float, beta2: float, epsilon: float
+) -> Iterator[StepsInBackward]:
+    """Within the context, a backward pass that computes all gradients of a scene may make the steps."""
+    offer = StepsInBackward(steps, beta1, beta2, epsilon)
+    _pending.append(offer)
     try:
-        yield offers
+        yield offer
     finally:
-        _offers.remove(offers)
+        _pending.remove(offer)
 
 
-def take_offers(parameters: Sequence[Tensor]) -> Moves | None:
-    """The steps of a scene's parameters if they are on offer, to be taken by the caller."""
-    for offers in _offers:
-        if moves := offers.take(parameters):
-            return moves
+def claim_steps(parameters: Sequence[Tensor]) -> StepArrays | None:
+    """Return the pending steps of a scene's parameters, which the caller has to make, or None."""
+    for offer in _pending:
+        if steps := offer.claim(parameters):
+            return steps
     return None

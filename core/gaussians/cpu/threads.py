@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Runs a kernel on all threads at once.
 
-As many threads as torch uses (`torch.set_num_threads`). Kernels share the work out themselves: each takes the next
-piece from a counter (`vector.take_number`), and what a piece computes does not depend on who takes it.
+The number of threads is torch's (`torch.set_num_threads`). Kernels distribute the work themselves: each thread takes
+the next task from a counter (`vector.atomic_increment`), and the result of a task does not depend on the thread.
 
-An iteration makes a call every few tenths of a millisecond. To wake a thread that sleeps takes 50 microseconds, since
-it then has to wait for the interpreter too. So a worker that is done spins for a moment before it goes to sleep
-(`spin`), until the next call's counter moves: then the caller's kernel is running, and the interpreter is free. In the
-same way the caller spins until the workers say that they are done.
+An iteration makes a call every few tenths of a millisecond. Waking a sleeping thread takes 50 microseconds, since it
+has to wait for the interpreter's lock too. So a finished worker spins for a moment before it sleeps (`spin`), until the
+next call's counter changes: then the caller's kernel is running, and the interpreter's lock is free. In the same way
+the caller spins until the workers are done.
 """
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from . import buffers
 from .buffers import Array
 from .spin import finish_and_spin, spin_until
 
-SPINS = 1 << 14
-"""Looks at a number before a thread sleeps: some tenths of a millisecond."""
-NAP = 1e-4
-"""Seconds that a caller sleeps between two looks at workers that take longer."""
+MAX_SPINS = 1 << 14
+"""Reads of a counter before a thread sleeps: some tenths of a millisecond."""
+POLL_SECONDS = 1e-4
+"""Seconds that a caller sleeps between checks of workers that take longer."""
 
 
 class _Scratch(threading.local):
-    """Memory of a thread for its kernels, at the start of a cache line: vectors across two take twice the time."""
+    """A thread's workspace for kernels, aligned to a cache line: vectors across two lines take twice the time."""
 
     def __init__(self) -> None:
         self._array = buffers.empty(1 << 12)
@@ -46,7 +46,7 @@ _Call = tuple[Callable[..., Any], int, tuple[Any, ...]]
 
 
 class _Worker:
-    """A thread that waits for a call, makes it, and waits for the next."""
+    """A thread that waits for calls and makes them."""
 
     def __init__(self, counters: Array) -> None:
         self._counters = counters
@@ -54,24 +54,24 @@ class _Worker:
         self._number = 0
         self._done = np.zeros(1, np.int64)
         self._error: BaseException | None = None
-        self._asleep = False
+        self._is_asleep = False
         self._state = threading.Lock()  # of _call and _asleep
-        self._alarm = threading.Semaphore(0)
+        self._wakeup = threading.Semaphore(0)
         threading.Thread(target=self._run, name="kernels", daemon=True).start()
 
     def start(self, number: int, call: _Call) -> None:
-        """Hands call `number` over."""
+        """Pass call `number` to the thread."""
         self._number = number
         with self._state:
             self._call = call
-            asleep, self._asleep = self._asleep, False
+            asleep, self._is_asleep = self._is_asleep, False
         if asleep:
-            self._alarm.release()
+            self._wakeup.release()
 
     def wait(self) -> BaseException | None:
-        """Until the call is done; the error that it ended with."""
-        while not spin_until(self._done, self._number, SPINS):
-            time.sleep(NAP)
+        """Wait until the call is done; return the error it raised, or None."""
+        while not spin_until(self._done, self._number, MAX_SPINS):
+            time.sleep(POLL_SECONDS)
         error, self._error = self._error, None
         return error
 
@@ -79,11 +79,11 @@ class _Worker:
         torch.set_flush_denormal(True)  # a register of the thread
         while True:
             number = self._number
-            finish_and_spin(self._done, number, self._counters[(number + 1) % 2], SPINS)
+            finish_and_spin(self._done, number, self._counters[(number + 1) % 2], MAX_SPINS)
             with self._state:
-                asleep = self._asleep = self._call is None
+                asleep = self._is_asleep = self._call is None
             if asleep:
-                self._alarm.acquire()
+                self._wakeup.acquire()
             assert self._call is not None
             call, self._call = self._call, None
             try:
@@ -93,20 +93,20 @@ class _Worker:
             del call
 
 
-class _Team:
-    """The workers of a caller. Calls have numbers; odd and even ones have a counter each."""
+class _ThreadPool:
+    """The workers of one caller. Calls are numbered; odd and even ones alternate between two counters."""
 
     def __init__(self) -> None:
         self._workers: list[_Worker] = []
         self._number = 0
-        self._counters = np.zeros((2, buffers.LINE // 8), np.int64)
+        self._counters = np.zeros((2, buffers.CACHE_LINE // 8), np.int64)
 
     def call(self, function: Callable[..., Any], scratch: int, arguments: tuple[Any, ...], count: int) -> None:
-        """On the caller's thread and count - 1 workers."""
+        """Call on the caller's thread and count - 1 workers."""
         while len(self._workers) < count - 1:
             self._workers.append(_Worker(self._counters))
         self._number += 1
-        self._counters[(self._number + 1) % 2] = 0  # workers look at it once they are done with this one
+        self._counters[(self._number + 1) % 2] = 0  # workers read it once they have finished this call
         call = (function, scratch, (self._counters[self._number % 2], *arguments))
         workers = self._workers[: count - 1]
         for worker in workers:
@@ -120,7 +120,7 @@ class _Team:
                 raise error
 
 
-_idle: list[_Team] = []
+_idle_pools: list[_ThreadPool] = []
 
 
 def _call(function: Callable[..., Any], scratch: int, arguments: tuple[Any, ...]) -> None:
@@ -129,19 +129,19 @@ def _call(function: Callable[..., Any], scratch: int, arguments: tuple[Any, ...]
 
 
 def parallel(function: Callable[..., Any], *arguments: Any, scratch: int = 0, limit: int | None = None) -> None:
-    """Calls function(counter, *arguments) on every thread, on at most `limit` of them, and waits for all.
+    """Call function(counter, *arguments) on every thread, at most `limit` of them, and wait for all.
 
-    counter: an int64 array whose first element is 0 at first, the same for all threads. scratch: how many float32 of
-    memory of its own a thread needs; passed after the counter, unless 0.
+    counter: an int64 array shared by all threads, whose first element starts at 0. scratch: number of float32 values of
+    workspace for each thread, passed after the counter unless 0. Raises the first error of any thread.
     """
     count = torch.get_num_threads() if limit is None else max(1, min(limit, torch.get_num_threads()))
     if not getattr(function, "overloads", True):  # compile here, not on all threads at once
         count = 1
     try:
-        team = _idle.pop()
+        pool = _idle_pools.pop()
     except IndexError:
-        team = _Team()
+        pool = _ThreadPool()
     try:
-        team.call(function, scratch, arguments, count)
+        pool.call(function, scratch, arguments, count)
     finally:
-        _idle.append(team)
+        _idle_pools.append(pool)

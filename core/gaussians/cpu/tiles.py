@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""From records to tiles: what the scene and the flare have in common around the kernels of `binning`."""
+"""Bins records into tiles: runs the kernels of `binning` for `scene` and `splats`."""
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -13,13 +13,13 @@ from .buffers import Array
 from .threads import parallel
 
 EMPTY = np.empty(0, np.float32)
-PARTS_MAX, SAMPLE = 8, 2048
-"""Parts of the Gaussians that are sorted apart, and how many of them are asked where to cut."""
+MAX_PARTS, SAMPLE_SIZE = 8, 2048
+"""Most parts that are sorted separately, and the number of Gaussians sampled to balance them."""
 
 
 @dataclass(frozen=True)
-class Grid:
-    """A picture and its tiles."""
+class TileGrid:
+    """Size of a picture, px, and its number of tiles."""
 
     width: int
     height: int
@@ -45,30 +45,33 @@ class Bins:
 
 
 def flat(tensor: Tensor) -> Array:
-    """The numbers of a float32 tensor, as one contiguous row; the same memory if they are."""
+    """Return the numbers of a float32 tensor as a flat array, without a copy if the tensor is contiguous."""
     return (tensor.detach() if tensor.requires_grad else tensor).numpy().ravel()
 
 
 def bin_gaussians(
     records: Array, keys: Array, tiles: Array, rows: Array, bounds: Array, firsts: Array, chunk_bounds: Array,
-    grid: Grid,
+    grid: TileGrid,
 ) -> Bins:  # fmt: skip
-    """Sorts the n records into tiles, by key; the arguments are those of `binning.list_in_order`, which changes bounds
-    and firsts, and the sums of the bounds over chunks."""
-    n, parts = len(keys), min(torch.get_num_threads(), PARTS_MAX)  # each looks through all keys
+    """Sort n records into tiles, by key; for the arguments see `binning.list_sorted`, which overwrites bounds and
+    firsts.
+
+    chunk_bounds: sums of the bounds over chunks."""
+    n, parts = len(keys), min(torch.get_num_threads(), MAX_PARTS)  # each part scans all keys
     starts_of_chunks, cuts = np.empty(len(chunk_bounds), np.int64), np.empty(parts + 1, np.int64)
-    room = binning.plan(
-        keys, bounds, chunk_bounds, max(1, -(-n // SAMPLE)), np.empty(binning.CLASSES, np.int64), starts_of_chunks, cuts
-    )
-    listed = buffers.empty((room + parts) * binning.LISTED, np.int32)
-    spans, numbers = np.empty((parts, 2), np.int64), np.empty((parts, grid.tiles), np.int32)
+    capacity = binning.plan_parts(
+        keys, bounds, chunk_bounds, max(1, -(-n // SAMPLE_SIZE)), np.empty(binning.HISTOGRAM_BINS, np.int64),
+        starts_of_chunks, cuts,
+    )  # fmt: skip
+    tile_list = buffers.empty((capacity + parts) * binning.LIST_ENTRY, np.int32)
+    spans, tile_counts = np.empty((parts, 2), np.int64), np.empty((parts, grid.tiles), np.int32)
     parallel(
-        binning.list_in_order, records, keys, tiles, rows, bounds, firsts, starts_of_chunks, cuts, grid.width,
+        binning.list_sorted, records, keys, tiles, rows, bounds, firsts, starts_of_chunks, cuts, grid.width,
         grid.height, grid.tiles_x, np.zeros(2, np.int64), np.empty((parts, binning.DIGITS, 1 << 11), np.int32),
-        buffers.empty(2 * (n + parts), np.int64).reshape(2, -1), listed, spans, numbers,
+        buffers.empty(2 * (n + parts), np.int64).reshape(2, -1), tile_list, spans, tile_counts,
     )  # fmt: skip
     starts = np.empty(grid.tiles + 1, np.int64)
-    binning.deal(numbers, starts)
+    binning.scan_tile_counts(tile_counts, starts)
     entries = buffers.empty(int(starts[-1]) * layout.ENTRY, np.int32)
-    parallel(binning.scatter, listed, spans, numbers, entries)
-    return Bins(entries, starts, firsts, bounds, room)
+    parallel(binning.scatter, tile_list, spans, tile_counts, entries)
+    return Bins(entries, starts, firsts, bounds, capacity)

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Sixteen lanes at once: an LLVM vector as a type of numba.
+"""SIMD for numba: LLVM vectors of 16 lanes as numba types, for all kernels of this package.
 
-numba has no vectors of its own, and LLVM does not vectorise loops such as ours by itself. So this module gives
-numba three types (16 float32, 16 int32, 16 truth values), Python's operators on them, and the functions below.
-LLVM makes one zmm register of a vector, two ymm, four xmm or four NEON ones: one source for every machine.
+numba has no vector types, and LLVM does not vectorise loops such as the kernels' by itself. So this module defines
+three numba types (16 float32, 16 int32, 16 bool), Python's operators on them, and the functions below. LLVM maps a
+vector to one zmm register, two ymm, four xmm or four NEON ones: one source for every machine.
 
-Written in kernels as arithmetic is: `alpha = where(e >= 0.5, e * t, 0.0)`. Scalars are spread to all lanes.
+Kernels use them as plain arithmetic: `alpha = where(e >= 0.5, e * t, 0.0)`. Scalars are broadcast to all lanes.
 Products and sums may fuse (one rounding instead of two) where the machine can; nothing else is reordered.
 """
 from __future__ import annotations
@@ -41,40 +41,41 @@ _LLVM = {
     "int32": ir.VectorType(_INT, LANES),
     "bool": ir.VectorType(ir.IntType(1), LANES),
 }
-_FUSE = ("contract",)
+_CONTRACT = ("contract",)
 _PAUSE = "llvm.x86.sse2.pause" if platform.machine().lower() in ("x86_64", "amd64") else ""
-"""What tells the processor that a loop only waits, where it can be told."""
+"""Intrinsic that marks a spin-wait loop; "" where the processor has none."""
 
 
 @register_model(Vector)
 class _VectorModel(models.PrimitiveModel):
-    def __init__(self, manager: Any, of: Vector) -> None:
-        super().__init__(manager, of, _LLVM[of.kind])
+    def __init__(self, manager: Any, vector: Vector) -> None:
+        super().__init__(manager, vector, _LLVM[vector.kind])
 
 
 # --- operators -------------------------------------------------------------------------------------------
 
 
-def _spread(builder: ir.IRBuilder, scalar: ir.Value) -> ir.Value:
-    """The same value in all lanes."""
+def _broadcast(builder: ir.IRBuilder, scalar: ir.Value) -> ir.Value:
+    """Copy a scalar to all lanes."""
     kind = ir.VectorType(scalar.type, LANES)
     first = builder.insert_element(ir.Constant(kind, ir.Undefined), scalar, ir.Constant(_INT, 0))
     zeros = ir.Constant(ir.VectorType(_INT, LANES), [0] * LANES)
     return builder.shuffle_vector(first, ir.Constant(kind, ir.Undefined), zeros)
 
 
-def _as_vector(context: Any, builder: ir.IRBuilder, value: ir.Value, of: types.Type, kind: str) -> ir.Value:
-    if isinstance(of, Vector):
+def _as_vector(context: Any, builder: ir.IRBuilder, value: ir.Value, type_: types.Type, kind: str) -> ir.Value:
+    """Convert a number of `type_` to a vector; return vectors unchanged."""
+    if isinstance(type_, Vector):
         return value
     scalar = {"float32": types.float32, "int32": types.int32, "bool": types.boolean}[kind]
-    value = context.cast(builder, value, of, scalar)
+    value = context.cast(builder, value, type_, scalar)
     if kind == "bool":
         value = builder.trunc(value, ir.IntType(1)) if value.type.width > 1 else value
-    return _spread(builder, value)
+    return _broadcast(builder, value)
 
 
 def _kind_of(args: Sequence[types.Type]) -> str | None:
-    """The common kind of the vectors among two arguments, if the rest are numbers."""
+    """Return the common kind of the vectors among two arguments; None unless the others are numbers."""
     kinds = {a.kind for a in args if isinstance(a, Vector)}
     others = [a for a in args if not isinstance(a, Vector)]
     if len(kinds) != 1 or not all(isinstance(a, (types.Number, types.Boolean)) for a in others):
@@ -83,7 +84,7 @@ def _kind_of(args: Sequence[types.Type]) -> str | None:
 
 
 def _define_operator(symbol: Callable[..., Any], kinds: dict[str, Callable[..., ir.Value]], result: str) -> None:
-    """Gives numba `symbol` for two vectors, or a vector and a number. kinds: how each is emitted."""
+    """Define the operator `symbol` for two vectors, or a vector and a number; kinds: emitter by kind of vector."""
 
     class Typing(AbstractTemplate):
         def generic(self, args: Any, kws: Any) -> Any:  # noqa: ARG002
@@ -104,12 +105,12 @@ def _define_operator(symbol: Callable[..., Any], kinds: dict[str, Callable[..., 
         lower_builtin(symbol, left, right)(lower)
 
 
-def _plain(name: str) -> Callable[..., ir.Value]:
+def _emit(name: str) -> Callable[..., ir.Value]:
     return lambda builder, a, b: getattr(builder, name)(a, b)
 
 
-def _fused(name: str) -> Callable[..., ir.Value]:
-    return lambda builder, a, b: getattr(builder, name)(a, b, flags=_FUSE)
+def _emit_contracted(name: str) -> Callable[..., ir.Value]:
+    return lambda builder, a, b: getattr(builder, name)(a, b, flags=_CONTRACT)
 
 
 def _compare(sign: str) -> dict[str, Callable[..., ir.Value]]:
@@ -120,13 +121,14 @@ def _compare(sign: str) -> dict[str, Callable[..., ir.Value]]:
 
 
 for _symbol, _name in ((operator.add, "add"), (operator.sub, "sub"), (operator.mul, "mul")):
-    _define_operator(_symbol, {"float32": _fused("f" + _name), "int32": _plain(_name)}, "")
-    _define_operator(getattr(operator, "i" + _name), {"float32": _fused("f" + _name), "int32": _plain(_name)}, "")
-_define_operator(operator.truediv, {"float32": _fused("fdiv")}, "")
-_define_operator(operator.lshift, {"int32": _plain("shl")}, "")
-_define_operator(operator.rshift, {"int32": _plain("ashr")}, "")
-_define_operator(operator.and_, {"int32": _plain("and_"), "bool": _plain("and_")}, "")
-_define_operator(operator.or_, {"int32": _plain("or_"), "bool": _plain("or_")}, "")
+    _emitters = {"float32": _emit_contracted("f" + _name), "int32": _emit(_name)}
+    _define_operator(_symbol, _emitters, "")
+    _define_operator(getattr(operator, "i" + _name), _emitters, "")
+_define_operator(operator.truediv, {"float32": _emit_contracted("fdiv")}, "")
+_define_operator(operator.lshift, {"int32": _emit("shl")}, "")
+_define_operator(operator.rshift, {"int32": _emit("ashr")}, "")
+_define_operator(operator.and_, {"int32": _emit("and_"), "bool": _emit("and_")}, "")
+_define_operator(operator.or_, {"int32": _emit("or_"), "bool": _emit("or_")}, "")
 for _symbol, _sign in ((operator.lt, "<"), (operator.le, "<="), (operator.gt, ">"), (operator.ge, ">=")):
     _define_operator(_symbol, _compare(_sign), "bool")
 
@@ -146,20 +148,20 @@ def _negate(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Valu
 
 
 def _call(builder: ir.IRBuilder, name: str, result: ir.Type, args: Sequence[ir.Value], **options: Any) -> ir.Value:
-    """Calls an LLVM intrinsic by its full name."""
-    of = ir.FunctionType(result, [a.type for a in args])
-    return builder.call(cgutils.get_or_insert_function(builder.module, of, name), args, **options)
+    """Call an LLVM intrinsic by its full name."""
+    type_ = ir.FunctionType(result, [a.type for a in args])
+    return builder.call(cgutils.get_or_insert_function(builder.module, type_, name), args, **options)
 
 
-def _address(context: Any, builder: ir.IRBuilder, of: types.Array, array: ir.Value, index: ir.Value) -> ir.Value:
-    """Where element `index` of a C-contiguous array lies, counted flat over all dimensions."""
-    data = context.make_array(of)(context, builder, array).data
+def _address(context: Any, builder: ir.IRBuilder, type_: types.Array, array: ir.Value, index: ir.Value) -> ir.Value:
+    """Return the address of the flat index of a C-contiguous array of `type_`."""
+    data = context.make_array(type_)(context, builder, array).data
     return builder.gep(data, [index])
 
 
 @intrinsic
 def load(typing_context, array, index):  # noqa: ARG001
-    """16 values from the flat index of a contiguous float32 or int32 array on."""
+    """Load 16 values from a flat index of a contiguous float32 or int32 array on."""
     kind = FLOATS if array.dtype == types.float32 else INTS
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
@@ -170,8 +172,8 @@ def load(typing_context, array, index):  # noqa: ARG001
 
 
 @intrinsic
-def get(typing_context, array, index):  # noqa: ARG001
-    """One value at a flat index >= 0 of a contiguous array (array[index] would look for negative ones first)."""
+def load_scalar(typing_context, array, index):  # noqa: ARG001
+    """Load one value at a flat index >= 0 of a contiguous array (array[index] would test for negative indices)."""
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
         return builder.load(_address(context, builder, sig.args[0], *args))
@@ -181,19 +183,19 @@ def get(typing_context, array, index):  # noqa: ARG001
 
 @intrinsic
 def opaque(typing_context, number):  # noqa: ARG001
-    """The same int64, which LLVM cannot know: a loop by such a step is not unrolled into several, each of
-    which would have an end for the processor to guess."""
+    """Return the same int64, hidden from LLVM: a loop with such a step is not unrolled into several loops, each with a
+    branch at its end to predict."""
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:  # noqa: ARG001
-        of = ir.FunctionType(args[0].type, [args[0].type])
-        return builder.call(ir.InlineAsm(of, "", "=r,0"), args)
+        type_ = ir.FunctionType(args[0].type, [args[0].type])
+        return builder.call(ir.InlineAsm(type_, "", "=r,0"), args)
 
     return types.int64(types.int64), emit
 
 
 @intrinsic
 def store(typing_context, array, index, value):  # noqa: ARG001
-    """Writes 16 values from the flat index of a contiguous array on."""
+    """Store 16 values from a flat index of a contiguous array on."""
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
         address = _address(context, builder, sig.args[0], *args[:2])
@@ -205,7 +207,7 @@ def store(typing_context, array, index, value):  # noqa: ARG001
 
 @intrinsic
 def load_rows(typing_context, array, index, stride):  # noqa: ARG001
-    """16 vectors, from the flat index on and each `stride` elements further."""
+    """Load 16 vectors from a flat index on, each `stride` elements after the one before."""
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
         rows = []
@@ -213,14 +215,14 @@ def load_rows(typing_context, array, index, stride):  # noqa: ARG001
             at = builder.add(args[1], builder.mul(args[2], ir.Constant(ir.IntType(64), i)))
             address = _address(context, builder, sig.args[0], args[0], at)
             rows.append(builder.load(builder.bitcast(address, _LLVM["float32"].as_pointer()), align=4))
-        return _pack(context, builder, rows)
+        return _make_tuple(context, builder, rows)
 
     return types.UniTuple(FLOATS, LANES)(array, types.int64, types.int64), emit
 
 
 @intrinsic
 def store_rows(typing_context, array, index, stride, rows):  # noqa: ARG001
-    """Writes a tuple of vectors, from the flat index on and each `stride` elements further."""
+    """Store a tuple of vectors from a flat index on, each `stride` elements after the one before."""
     count = len(rows)
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
@@ -236,7 +238,8 @@ def store_rows(typing_context, array, index, stride, rows):  # noqa: ARG001
 
 @intrinsic
 def stream_rows(typing_context, array, index, stride, rows):  # noqa: ARG001
-    """As store_rows, past the caches: for what is not read soon. All addresses must be those of cache lines."""
+    """Store a tuple of vectors past the caches, for data that is not read soon; see `store_rows`. All addresses must be
+    aligned to cache lines."""
     count = len(rows)
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
@@ -251,7 +254,7 @@ def stream_rows(typing_context, array, index, stride, rows):  # noqa: ARG001
     return types.none(array, types.int64, types.int64, rows), emit
 
 
-def _asks_for(write: bool, purpose: str) -> Any:
+def _make_prefetch(write: bool, purpose: str) -> Any:
     def prefetch(typing_context, array, index):  # noqa: ARG001
         def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
             address = _address(context, builder, sig.args[0], *args)
@@ -262,17 +265,17 @@ def _asks_for(write: bool, purpose: str) -> Any:
 
         return types.none(array, types.int64), emit
 
-    prefetch.__doc__ = f"Asks for the cache line of a flat index, to be {purpose} soon; any index is safe."
+    prefetch.__doc__ = f"Prefetch the cache line of a flat index, which is {purpose} soon; any index is safe."
     return intrinsic(prefetch)
 
 
-prefetch = _asks_for(False, "read")
-prefetch_to_write = _asks_for(True, "written, and so for it to be this core's alone,")
+prefetch = _make_prefetch(False, "read")
+prefetch_to_write = _make_prefetch(True, "written (and so exclusive to this core)")
 
 
 @intrinsic
-def take_number(typing_context, counter):  # noqa: ARG001
-    """Adds one to an int64 array's first element and returns what it was, without two threads getting the same."""
+def atomic_increment(typing_context, counter):  # noqa: ARG001
+    """Atomically add one to the first element of an int64 array; return its value before."""
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
         address = _address(context, builder, sig.args[0], args[0], ir.Constant(ir.IntType(64), 0))
@@ -282,21 +285,20 @@ def take_number(typing_context, counter):  # noqa: ARG001
 
 
 @intrinsic
-def take(typing_context, totals, place, amount):  # noqa: ARG001
-    """Adds an amount to an element of an int64 array and returns what it was: a stretch of one's own, or a place in
-    a row; what those before it had written is seen afterwards."""
+def atomic_add(typing_context, array, index, amount):  # noqa: ARG001
+    """Atomically add an amount to an element of an int64 array, with acquire and release order; return its value
+    before."""
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
         address = _address(context, builder, sig.args[0], args[0], args[1])
         return builder.atomic_rmw("add", address, args[2], "acq_rel")
 
-    return types.int64(totals, types.int64, types.int64), emit
+    return types.int64(array, types.int64, types.int64), emit
 
 
 @intrinsic
 def load_acquire(typing_context, array):  # noqa: ARG001
-    """The first element of an int64 array, which another thread may change meanwhile; what that thread had written
-    before is seen afterwards."""
+    """Load the first element of an int64 array, which another thread may change, with acquire order."""
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
         if _PAUSE:
@@ -309,7 +311,7 @@ def load_acquire(typing_context, array):  # noqa: ARG001
 
 @intrinsic
 def store_release(typing_context, array, number):  # noqa: ARG001
-    """Writes the first element of an int64 array, for `load_acquire`."""
+    """Store the first element of an int64 array with release order, for `load_acquire`."""
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
         address = _address(context, builder, sig.args[0], args[0], ir.Constant(ir.IntType(64), 0))
@@ -321,7 +323,7 @@ def store_release(typing_context, array, number):  # noqa: ARG001
 
 @intrinsic
 def splat(typing_context, value):  # noqa: ARG001
-    """A number in all 16 lanes, as float32."""
+    """Return a number in all 16 lanes, as float32."""
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
         return _as_vector(context, builder, args[0], sig.args[0], "float32")
@@ -330,8 +332,8 @@ def splat(typing_context, value):  # noqa: ARG001
 
 
 @intrinsic
-def lanes(typing_context):  # noqa: ARG001
-    """0, 1, ... 15 as float32."""
+def lane_index(typing_context):  # noqa: ARG001
+    """Return 0, 1, ... 15 as float32."""
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:  # noqa: ARG001
         return ir.Constant(_LLVM["float32"], [float(i) for i in range(LANES)])
@@ -341,7 +343,7 @@ def lanes(typing_context):  # noqa: ARG001
 
 @intrinsic
 def where(typing_context, mask, a, b):  # noqa: ARG001
-    """a where the mask is true, else b; one of them may be a number."""
+    """Select a where the mask is true, else b; one of them may be a number."""
     kind = _kind_of((a, b))
     if mask != MASKS or kind is None:
         return None
@@ -353,8 +355,8 @@ def where(typing_context, mask, a, b):  # noqa: ARG001
     return Vector(kind)(mask, a, b), emit
 
 
-def _smaller_or_larger(sign: str) -> Callable[..., Any]:
-    # A comparison and a choice: one instruction everywhere, where llvm.minnum adds a test for NaN.
+def _make_min_max(sign: str) -> Callable[..., Any]:
+    # A comparison and a select: one instruction everywhere, whereas llvm.minnum adds a test for NaN.
     def define(typing_context, a, b):  # noqa: ARG001
         if _kind_of((a, b)) != "float32":
             return None
@@ -368,13 +370,13 @@ def _smaller_or_larger(sign: str) -> Callable[..., Any]:
     return define
 
 
-minimum = intrinsic(_smaller_or_larger("<"))
-maximum = intrinsic(_smaller_or_larger(">"))
+minimum = intrinsic(_make_min_max("<"))
+maximum = intrinsic(_make_min_max(">"))
 
 
 @intrinsic
 def fma(typing_context, a, b, c):  # noqa: ARG001
-    """a * b + c, rounded once where the machine can (llvm.fma would call a library where it cannot)."""
+    """Return a * b + c, rounded once where the machine can (llvm.fma would call a library where it cannot)."""
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
         values = [_as_vector(context, builder, v, t, "float32") for v, t in zip(args, sig.args, strict=True)]
@@ -385,7 +387,7 @@ def fma(typing_context, a, b, c):  # noqa: ARG001
 
 @intrinsic
 def sqrt(typing_context, a):  # noqa: ARG001
-    """Square roots."""
+    """Return square roots."""
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:  # noqa: ARG001
         return _call(builder, "llvm.sqrt.v16f32", _LLVM["float32"], args)
@@ -395,7 +397,7 @@ def sqrt(typing_context, a):  # noqa: ARG001
 
 @intrinsic
 def absolute(typing_context, a):  # noqa: ARG001
-    """Absolute values."""
+    """Return absolute values."""
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:  # noqa: ARG001
         return _call(builder, "llvm.fabs.v16f32", _LLVM["float32"], args)
@@ -405,7 +407,7 @@ def absolute(typing_context, a):  # noqa: ARG001
 
 @intrinsic
 def any_of(typing_context, mask):  # noqa: ARG001
-    """Whether any lane is true."""
+    """Return whether any lane is true."""
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:  # noqa: ARG001
         bits = builder.bitcast(args[0], ir.IntType(LANES))
@@ -416,7 +418,7 @@ def any_of(typing_context, mask):  # noqa: ARG001
 
 @intrinsic
 def as_ints(typing_context, a):  # noqa: ARG001
-    """The same 32 bits a lane, read as integers."""
+    """Reinterpret the bits of float32 lanes as int32."""
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:  # noqa: ARG001
         return builder.bitcast(args[0], _LLVM["int32"])
@@ -426,7 +428,7 @@ def as_ints(typing_context, a):  # noqa: ARG001
 
 @intrinsic
 def as_floats(typing_context, a):  # noqa: ARG001
-    """The same 32 bits a lane, read as floating point."""
+    """Reinterpret the bits of int32 lanes as float32."""
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:  # noqa: ARG001
         return builder.bitcast(args[0], _LLVM["float32"])
@@ -436,7 +438,7 @@ def as_floats(typing_context, a):  # noqa: ARG001
 
 @intrinsic
 def to_floats(typing_context, a):  # noqa: ARG001
-    """Integers as the floating-point numbers of the same value."""
+    """Convert int32 to float32 of the same value."""
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:  # noqa: ARG001
         return builder.sitofp(args[0], _LLVM["float32"])
@@ -446,7 +448,7 @@ def to_floats(typing_context, a):  # noqa: ARG001
 
 @intrinsic
 def to_ints(typing_context, a):  # noqa: ARG001
-    """Rounded towards zero; must lie within int32."""
+    """Convert float32 to int32, rounded towards zero; values must lie within int32."""
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:  # noqa: ARG001
         return builder.fptosi(args[0], _LLVM["int32"])
@@ -458,25 +460,25 @@ def to_ints(typing_context, a):  # noqa: ARG001
 
 
 def _shuffle(builder: ir.IRBuilder, a: ir.Value, b: ir.Value | None, source: Sequence[int]) -> ir.Value:
-    """Lane i of the result is lane source[i] of a, or of b counted from 16 on."""
+    """Return a vector whose lane i is lane source[i] of a, or of b counted from 16 on."""
     if b is None:
         b = ir.Constant(a.type, ir.Undefined)
     return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(_INT, len(source)), list(source)))
 
 
-def _pack(context: Any, builder: ir.IRBuilder, values: Sequence[ir.Value]) -> ir.Value:
+def _make_tuple(context: Any, builder: ir.IRBuilder, values: Sequence[ir.Value]) -> ir.Value:
     return context.make_tuple(builder, types.UniTuple(FLOATS, len(values)), values)
 
 
-def _halves(builder: ir.IRBuilder, a: ir.Value, b: ir.Value, step: int) -> tuple[ir.Value, ir.Value]:
-    """Of each group of 2 * step lanes, the lower halves of a and b side by side, and the upper ones."""
+def _interleave_halves(builder: ir.IRBuilder, a: ir.Value, b: ir.Value, step: int) -> tuple[ir.Value, ir.Value]:
+    """Return, for each group of 2 * step lanes, the lower halves of a and b side by side, and the upper halves."""
     count = a.type.count
     low = [(i & ~(2 * step - 1)) + (i & (step - 1)) + (count if i & step else 0) for i in range(count)]
     return _shuffle(builder, a, b, low), _shuffle(builder, a, b, [i + step for i in low])
 
 
-def _eight_sums(builder: ir.IRBuilder, vectors: Sequence[ir.Value]) -> ir.Value:
-    """Up to 8 vectors of 16 lanes to 8 lanes with their sums: a transposition that adds at each step."""
+def _reduce_eight(builder: ir.IRBuilder, vectors: Sequence[ir.Value]) -> ir.Value:
+    """Sum up to 8 vectors of 16 lanes to 8 lanes: a transposition that adds at each step."""
     low, high = range(LANES // 2), range(LANES // 2, LANES)
     level: list[ir.Value | None] = [
         builder.fadd(_shuffle(builder, v, None, low), _shuffle(builder, v, None, high)) for v in vectors
@@ -487,15 +489,16 @@ def _eight_sums(builder: ir.IRBuilder, vectors: Sequence[ir.Value]) -> ir.Value:
         following: list[ir.Value | None] = []
         for a, b in zip(level[:half], level[half:], strict=True):
             if a is not None:
-                a = builder.fadd(*_halves(builder, a, ir.Constant(a.type, ir.Undefined) if b is None else b, step))
+                other = ir.Constant(a.type, ir.Undefined) if b is None else b
+                a = builder.fadd(*_interleave_halves(builder, a, other, step))
             following.append(a)
         level = following
     return level[0]
 
 
 @intrinsic
-def total(typing_context, a):  # noqa: ARG001
-    """The sum of all lanes, float32; the same order on every machine."""
+def reduce_add(typing_context, a):  # noqa: ARG001
+    """Return the sum of all lanes, float32; in the same order on every machine."""
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:  # noqa: ARG001
         value = args[0]
@@ -507,21 +510,21 @@ def total(typing_context, a):  # noqa: ARG001
 
 
 @intrinsic
-def totals(typing_context, vectors):  # noqa: ARG001
-    """A vector of the sums of up to 16 vectors, in their order (further lanes: undefined)."""
+def reduce_add_each(typing_context, vectors):  # noqa: ARG001
+    """Return a vector of the sums of up to 16 vectors, in their order (further lanes: undefined)."""
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:  # noqa: ARG001
         values = [builder.extract_value(args[0], i) for i in range(len(vectors))]
-        low = _eight_sums(builder, values[:8])
-        high = _eight_sums(builder, values[8:]) if len(values) > 8 else ir.Constant(low.type, ir.Undefined)
+        low = _reduce_eight(builder, values[:8])
+        high = _reduce_eight(builder, values[8:]) if len(values) > 8 else ir.Constant(low.type, ir.Undefined)
         return _shuffle(builder, low, high, range(LANES))
 
     return FLOATS(vectors), emit
 
 
 @intrinsic(prefer_literal=True)
-def shifted(typing_context, a, b, count):  # noqa: ARG001
-    """The lanes of a from `count` on, a constant within 0 .. 16, and after them the first of b."""
+def align_lanes(typing_context, a, b, count):  # noqa: ARG001
+    """Return the lanes of a from `count` on, a constant within 0 .. 16, followed by the first lanes of b."""
     if not isinstance(count, types.IntegerLiteral):
         return None
 
@@ -533,76 +536,74 @@ def shifted(typing_context, a, b, count):  # noqa: ARG001
 
 
 @intrinsic
-def products(typing_context, a, b):  # noqa: ARG001
-    """The products of two tuples of as many vectors, one by one."""
+def multiply_each(typing_context, a, b):  # noqa: ARG001
+    """Multiply two tuples of the same number of vectors, element by element."""
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:  # noqa: ARG001
         pairs = [[builder.extract_value(side, i) for side in args] for i in range(len(a))]
-        return _pack(context, builder, [builder.fmul(*pair, flags=_FUSE) for pair in pairs])
+        return _make_tuple(context, builder, [builder.fmul(*pair, flags=_CONTRACT) for pair in pairs])
 
     return types.UniTuple(FLOATS, len(a))(a, b), emit
 
 
 @intrinsic
 def transpose(typing_context, vectors):  # noqa: ARG001
-    """16 vectors with rows and columns exchanged: lane j of result i is lane i of argument j."""
+    """Transpose 16 vectors: lane j of result i is lane i of argument j."""
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:  # noqa: ARG001
         rows = [builder.extract_value(args[0], i) for i in range(LANES)]
         for step in (1, 2, 4, 8):
             for i in range(LANES):
                 if not i & step:
-                    rows[i], rows[i + step] = _halves(builder, rows[i], rows[i + step], step)
-        return _pack(context, builder, rows)
+                    rows[i], rows[i + step] = _interleave_halves(builder, rows[i], rows[i + step], step)
+        return _make_tuple(context, builder, rows)
 
     return types.UniTuple(FLOATS, LANES)(vectors), emit
 
 
+def _permute(context: Any, builder: ir.IRBuilder, vectors: ir.Value, count: int, *, invert: bool) -> ir.Value:
+    """Interleave the lanes of a tuple of `count` vectors, or invert that."""
+    parts = [builder.extract_value(vectors, i) for i in range(count)]
+    results = []
+    for k in range(count):
+        if invert:
+            positions = [divmod(i * count + k, LANES) for i in range(LANES)]  # (vector, lane) of each result lane
+        else:
+            positions = [divmod(k * LANES + i, count)[::-1] for i in range(LANES)]
+        value = parts[0]
+        for v in range(1, count):
+            source = [LANES + lane if vector == v else (lane if v == 1 else i)
+                      for i, (vector, lane) in enumerate(positions)]  # fmt: skip
+            value = _shuffle(builder, value, parts[v], source)
+        results.append(value)
+    return _make_tuple(context, builder, results)
+
+
 @intrinsic
 def interleave(typing_context, vectors):  # noqa: ARG001
-    """k vectors a, b, c ... to k vectors that read a0 b0 c0 a1 b1 c1 ... one after the other."""
+    """Interleave k vectors a, b, c ...: k vectors that hold a0 b0 c0 a1 b1 c1 ... in sequence."""
     count = len(vectors)
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:  # noqa: ARG001
-        parts = [builder.extract_value(args[0], i) for i in range(count)]
-        results = []
-        for k in range(count):
-            positions = [divmod(k * LANES + i, count) for i in range(LANES)]  # (lane, vector) of each
-            value = parts[0]
-            for v in range(1, count):
-                source = [LANES + lane if vector == v else (lane if v == 1 else i)
-                          for i, (lane, vector) in enumerate(positions)]  # fmt: skip
-                value = _shuffle(builder, value, parts[v], source)
-            results.append(value)
-        return _pack(context, builder, results)
+        return _permute(context, builder, args[0], count, invert=False)
 
     return types.UniTuple(FLOATS, count)(vectors), emit
 
 
 @intrinsic
 def deinterleave(typing_context, vectors):  # noqa: ARG001
-    """The inverse of `interleave`."""
+    """Invert `interleave`."""
     count = len(vectors)
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:  # noqa: ARG001
-        parts = [builder.extract_value(args[0], i) for i in range(count)]
-        results = []
-        for k in range(count):
-            positions = [divmod(lane * count + k, LANES) for lane in range(LANES)]  # (vector, lane) of each
-            value = parts[0]
-            for v in range(1, count):
-                source = [LANES + lane if vector == v else (lane if v == 1 else i)
-                          for i, (vector, lane) in enumerate(positions)]  # fmt: skip
-                value = _shuffle(builder, value, parts[v], source)
-            results.append(value)
-        return _pack(context, builder, results)
+        return _permute(context, builder, args[0], count, invert=True)
 
     return types.UniTuple(FLOATS, count)(vectors), emit
 
 
 # --- elementary functions --------------------------------------------------------------------------------
 
-# 2^f on [-1/2, 1/2]: the polynomial of least relative error that is exact at 0 (8e-8).
+# 2^f on [-1/2, 1/2]: the minimax polynomial in relative error that is exact at 0 (8e-8).
 _EXP2 = tuple(
     np.float32(c) for c in (1.0, 0.6931470616, 0.2402223532, 0.05550678369, 0.00967196168, 0.001327463337)
 )
@@ -612,8 +613,8 @@ _EXP2_MAX = np.float32(126.5)
 
 
 @inlined
-def exp2_inside(x):
-    """2^x for x within -126 .. 126; anything at all outside."""
+def exp2_unclamped(x):
+    """Return 2^x for x within -126 .. 126; undefined outside."""
     rounded = x + _ROUND
     f = x - (rounded - _ROUND)
     ff = f * f
@@ -624,41 +625,41 @@ def exp2_inside(x):
 
 @inlined
 def exp2(x):
-    """2^x; below -126 as at -126 (1e-38, not zero), from 126.5 on as there."""
-    return exp2_inside(minimum(maximum(x, _EXP2_MIN), _EXP2_MAX))
+    """Return 2^x with x clamped to -126 .. 126.5: never below 1e-38, and not zero."""
+    return exp2_unclamped(minimum(maximum(x, _EXP2_MIN), _EXP2_MAX))
 
 
 _LOG2_E = np.float32(1.4426950408889634)
-_LARGEST, _INFINITY = np.float32(3.4028235e38), np.float32(np.inf)
+_FLOAT_MAX, _INFINITY = np.float32(3.4028235e38), np.float32(np.inf)
 
 
 @inlined
 def exp(x):
-    """e^x, 1.2e-6 relative within -20 .. 20 (half an ulp of x / ln 2); NaN and infinity stay."""
-    return where(x <= _LARGEST, exp2(x * _LOG2_E), x)
+    """Return e^x, 1.2e-6 relative within -20 .. 20 (half an ulp of x / ln 2); NaN and infinity stay."""
+    return where(x <= _FLOAT_MAX, exp2(x * _LOG2_E), x)
 
 
 @inlined
 def sigmoid(x):
-    """1 / (1 + e^-x); NaN stays."""
+    """Return 1 / (1 + e^-x); NaN stays."""
     return where(x <= _INFINITY, np.float32(1) / (exp2(x * -_LOG2_E) + np.float32(1)), x)
 
 
 # (2^f - 1) / f on [-1/2, 1/2].
-_EXP2_LESS_ONE = tuple(
+_EXP2M1 = tuple(
     np.float32(c) for c in (0.6931471807, 0.2402265068, 0.05550358232, 0.009618535704, 0.001339278274, 0.0001527416535)
 )
 
 
 @inlined
-def exp2_less_one(x):
-    """2^x - 1, relative to itself as exact near 0 as elsewhere."""
+def exp2m1(x):
+    """Return 2^x - 1, with the same relative accuracy near 0 as elsewhere."""
     f = minimum(maximum(x, np.float32(-0.5)), np.float32(0.5))
-    p = fma(f, _EXP2_LESS_ONE[5], _EXP2_LESS_ONE[4])
-    p = fma(f, p, _EXP2_LESS_ONE[3])
-    p = fma(f, p, _EXP2_LESS_ONE[2])
-    p = fma(f, p, _EXP2_LESS_ONE[1])
-    p = fma(f, p, _EXP2_LESS_ONE[0])
+    p = fma(f, _EXP2M1[5], _EXP2M1[4])
+    p = fma(f, p, _EXP2M1[3])
+    p = fma(f, p, _EXP2M1[2])
+    p = fma(f, p, _EXP2M1[1])
+    p = fma(f, p, _EXP2M1[0])
     return where(absolute(x) <= np.float32(0.5), f * p, exp2(x) - np.float32(1))
 
 
@@ -669,7 +670,7 @@ _LOG2 = tuple(np.float32(2.8853900817779268 / k) for k in (1, 3, 5, 7, 9))
 
 @inlined
 def log2(x):
-    """log2 x for normal x > 0 (2e-7 absolute near 1)."""
+    """Return log2 x for normal x > 0 (2e-7 absolute near 1)."""
     bits = as_ints(x)
     exponent = to_floats(((bits >> 23) & 255) - 127)
     m = as_floats((bits & 0x007FFFFF) | 0x3F800000)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The door, and the definition behind it: against what can be worked out by hand or in another way."""
+"""The public functions and the definition, compared with formulas and independent computations."""
 from __future__ import annotations
 
 import logging
@@ -17,10 +17,10 @@ from core.gaussians import kernels as registry
 from core.gaussians import rasterization, splat
 from core.gaussians.projection import project, rotation_matrices
 from core.gaussians.reference import profiles
-from core.gaussians.rendering import ALPHA_MIN, OPACITY_MAX, PROFILE_MIN, arc_strengths, extent, levelled
+from core.gaussians.rendering import ALPHA_MIN, OPACITY_MAX, PROFILE_MIN, arc_strengths, extent, normalise_arcs
 from core.gaussians.spherical_harmonics import basis, colours
 
-SETS = [name for name in ("torch", "tiles", "cpu") if registry.available(name)]
+SETS = [name for name in ("torch", "tiles", "cpu") if registry.is_available(name)]
 K = torch.tensor([[40.0, 0, 10], [0, 40.0, 8], [0, 0, 1]])
 SIZE = (20, 16)
 
@@ -39,7 +39,7 @@ def scene(n: int = 3, **changes: Tensor) -> dict[str, Tensor]:
 
 
 @pytest.mark.parametrize("kernels", SETS)
-def test_three_in_a_row(kernels: str) -> None:
+def test_three_gaussians_in_a_row_blend_front_to_back(kernels: str) -> None:
     """Colour, alpha and depths at the middle of the picture, term by term."""
     background = torch.tensor([0.2, 0.4, 0.8])
     order = torch.tensor([2, 0, 1])  # given out of order
@@ -69,7 +69,7 @@ def test_three_in_a_row(kernels: str) -> None:
     assert torch.allclose(r.radii, torch.tensor(expected), atol=1e-4)
 
 
-def test_projection_by_sampling() -> None:
+def test_projection_equals_the_covariance_of_projected_samples() -> None:
     """The mean and covariance of a small Gaussian's points, projected one by one."""
     rng = np.random.default_rng(0)
     quat, scales = rng.normal(size=4), np.array([0.02, 0.05, 0.01])
@@ -120,7 +120,7 @@ def test_colours_are_not_negative() -> None:
 
 
 @pytest.mark.parametrize("kernels", SETS)
-def test_rings_arcs_and_blends_by_hand(kernels: str) -> None:
+def test_rings_arcs_and_blends_equal_their_formulas(kernels: str) -> None:
     centre, covariance = torch.tensor([[10.0, 8.0]]), torch.tensor([[9.0, 0.0, 4.0]])
     opacity, colour = torch.tensor([0.8]), torch.tensor([[1.0, 2.0, 3.0]])
     rings, arcs = torch.tensor([[1.5, 0.4]]), torch.tensor([[0.2, -0.1]])
@@ -143,7 +143,7 @@ def test_rings_arcs_and_blends_by_hand(kernels: str) -> None:
 
 @pytest.mark.parametrize("kernels", SETS)
 def test_an_arc_of_a_plain_gaussian_is_its_shift(kernels: str) -> None:
-    """By covariance b; its peak stays what it was, and an arc of nothing changes nothing at all."""
+    """The shift is covariance b; the peak is unchanged, and an arc of 0 changes nothing."""
     centre, covariance = torch.tensor([[10.0, 8.0]]), torch.tensor([[9.0, 2.0, 4.0]])
     shown = torch.tensor([0.8]), torch.tensor([[1.0, 2.0, 3.0]])
     b = torch.tensor([[0.5, -0.3]])
@@ -159,7 +159,7 @@ def test_an_arc_of_a_plain_gaussian_is_its_shift(kernels: str) -> None:
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_arcs_peak_at_one_and_end_where_they_should(seed: int) -> None:
+def test_arcs_have_a_peak_of_one_and_end_at_their_extent(seed: int) -> None:
     """At the radius r0 + w² beta towards covariance b, and nowhere beyond what `extent` says."""
     rng = np.random.default_rng(seed)
     factor = torch.tensor([[3.0, 0.0], [rng.normal(), rng.uniform(1, 4)]], dtype=torch.float64)
@@ -168,7 +168,7 @@ def test_arcs_peak_at_one_and_end_where_they_should(seed: int) -> None:
     rings = torch.tensor([[rng.uniform(0, 4), rng.uniform(0.2, 2)]], dtype=torch.float64)
     a = torch.tensor(rng.normal(0, 1, 2))
     b = torch.linalg.solve(factor.T, a)[None]
-    arcs = levelled(b, covariance, rings)
+    arcs = normalise_arcs(b, covariance, rings)
     r0, w = rings[0].tolist()
     beta = math.hypot(*a.tolist())
     assert arc_strengths(covariance, b).item() == pytest.approx(beta)
@@ -185,7 +185,7 @@ def test_arcs_peak_at_one_and_end_where_they_should(seed: int) -> None:
         assert at_edge == pytest.approx(least, rel=1e-5)
 
 
-def test_gradients_of_arcs_by_differences() -> None:
+def test_gradients_of_arcs_equal_finite_differences() -> None:
     inputs = [torch.tensor(values, dtype=torch.float64, requires_grad=True) for values in (
         [[7.3, 6.1], [11.0, 9.5]], [[9.0, 2.0, 4.0], [5.0, -1.0, 8.0]], [0.6, 0.8], [[1.0, 2.0, 3.0], [0.5, 1.0, 0.2]],
         [[1.5, 0.6], [0.0, 1.0]], [[0.3, -0.2], [-0.2, 0.1]])]  # fmt: skip
@@ -198,7 +198,7 @@ def test_gradients_of_arcs_by_differences() -> None:
 
 
 @pytest.mark.parametrize("kernels", SETS)
-def test_nothing_is_drawn_of_nothing(kernels: str) -> None:
+def test_empty_inputs_render_an_empty_picture(kernels: str) -> None:
     background = torch.tensor([0.1, 0.2, 0.3], requires_grad=True)
     empty = {name: value[:0] for name, value in scene().items() if name not in ("world_to_camera", "intrinsics")}
     empty["means"].requires_grad_()
@@ -217,7 +217,7 @@ def test_nothing_is_drawn_of_nothing(kernels: str) -> None:
 
 
 @pytest.mark.parametrize("kernels", SETS)
-def test_gradients_stay_finite(kernels: str) -> None:
+def test_gradients_of_degenerate_gaussians_are_finite(kernels: str) -> None:
     """Zero quaternions, scales that vanish or cover all, a centre on a pixel's, an opacity of one."""
     given = scene(
         quats=torch.tensor([[0.0, 0, 0, 0], [1e-20, 0, 0, 0], [0, 0, 0, 1e15]]),
@@ -245,7 +245,7 @@ def test_gradients_stay_finite(kernels: str) -> None:
 
 
 @pytest.mark.parametrize("kernels", SETS)
-def test_degree_and_dilation(kernels: str) -> None:
+def test_sh_degree_and_dilation_take_effect(kernels: str) -> None:
     given = scene(1, sh=torch.cat([scene(1)["sh"], torch.ones(1, 3, 3)], 1))
     flat = rasterization(**given, width=20, height=16, sh_degree=0, kernels=kernels).colour
     full = rasterization(**given, width=20, height=16, kernels=kernels).colour
@@ -257,8 +257,8 @@ def test_degree_and_dilation(kernels: str) -> None:
 
 
 @pytest.mark.parametrize("kernels", SETS)
-def test_without_depth(kernels: str) -> None:
-    """The same picture and the same gradients."""
+def test_depth_can_be_omitted(kernels: str) -> None:
+    """Compares pictures and gradients."""
     found = []
     for depth in (True, False):
         means = scene()["means"].requires_grad_()
@@ -270,7 +270,7 @@ def test_without_depth(kernels: str) -> None:
         assert torch.allclose(full, fast, rtol=1e-5, atol=1e-6)
 
 
-def test_what_does_not_fit_is_refused() -> None:
+def test_invalid_shapes_and_values_raise() -> None:
     good = scene() | {"width": 5, "height": 5}
     for name, value, message in (
         ("means", torch.zeros(3, 2), r"means has the shape \(3, 2\)"),
@@ -299,34 +299,36 @@ def test_what_does_not_fit_is_refused() -> None:
             splat(*flat, **changes)
 
 
-def test_auto_takes_what_there_is(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+def test_auto_selects_the_fastest_available_kernels(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
     single, double = torch.zeros(1), torch.zeros(1, dtype=torch.float64)
-    tiles = registry.choose("tiles", single)
-    if registry.available("cpu"):
-        assert registry.choose("auto", single) is registry.choose("cpu", single)
-    assert registry.choose("auto", double) is tiles  # the CPU kernels would lose half of the digits
+    tiles = registry.select_kernels("tiles", single)
+    if registry.is_available("cpu"):
+        assert registry.select_kernels("auto", single) is registry.select_kernels("cpu", single)
+    assert registry.select_kernels("auto", double) is tiles  # the CPU kernels would lose half of the digits
 
     load = registry._load
     monkeypatch.setattr(registry, "_load", lambda name: ImportError("no numba") if name == "cpu" else load(name))
-    registry._say_once.cache_clear()
+    registry._warn_once.cache_clear()
     with caplog.at_level(logging.WARNING):
-        assert registry.choose("auto", single) is tiles
-        assert registry.choose("auto", single) is tiles
+        assert registry.select_kernels("auto", single) is tiles
+        assert registry.select_kernels("auto", single) is tiles
     assert [record.message for record in caplog.records] == [
         "The cpu kernels cannot be used here (no numba); slower torch ones take their place."
     ]
     with pytest.raises(EngineError, match="no numba"):
-        registry.choose("cpu", single)
-    assert registry.fused(single) is None
+        registry.select_kernels("cpu", single)
+    assert registry.fused_kernels(single) is None
 
 
-def test_without_numba_all_still_works() -> None:
+def test_rendering_works_without_numba() -> None:
     """A Python that cannot import numba renders, and trains, by torch."""
     code = (
         "import sys; sys.modules['numba'] = None\n"
         "import torch\n"
         "from core.gaussians import rasterization, splat, l1_ssim, kernels\n"
-        "assert not kernels.available('cpu')\n"
+        "assert not kernels.is_available('cpu')\n"
         "x = torch.ones(1, 2, requires_grad=True)\n"
         "s = splat(x * 4, torch.tensor([[4., 0, 4.]]), torch.ones(1), torch.ones(1, 3), 9, 9)\n"
         "l1_ssim(s.colour, torch.zeros(9, 9, 3), 0.8).backward()\n"
@@ -338,15 +340,15 @@ def test_without_numba_all_still_works() -> None:
     assert "slower torch ones" in done.stderr
 
 
-def test_cuda_is_refused_where_it_is_not() -> None:
+def test_cuda_kernels_raise_without_a_gpu() -> None:
     if torch.cuda.is_available():
         pytest.skip("there is a GPU here")
     with pytest.raises(EngineError, match="cuda kernels cannot be used here"):
-        registry.choose("cuda", torch.zeros(1))
+        registry.select_kernels("cuda", torch.zeros(1))
 
 
-def test_the_gradient_of_centres_is_gathered() -> None:
-    """What densification reads equals the gradient by moving the picture."""
+def test_centre_gradients_equal_the_gradient_by_a_shift() -> None:
+    """The statistic of densification equals the gradient by a shift of the picture."""
     given = scene(2)
     weight = torch.linspace(0, 1, 20).expand(16, 20)
     found = []

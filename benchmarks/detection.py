@@ -26,12 +26,12 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from benchmarks.light_composer import Composed, compose
+from benchmarks.light_composer import LitPicture, compose_lights
 from core.capture import Capture
 from core.errors import EngineError, FitFlareError
 from core.images.read import read_picture
-from core.lights import Detection, Detector, detector_for, find_lights, union
-from core.removal.training.backgrounds import PHOTOS, pictures_of
+from core.lights import Detection, Detector, detector_for, find_lights, union_mask
+from core.removal.training.backgrounds import PHOTO_SUFFIXES, list_pictures
 
 THRESHOLDS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
 
@@ -45,9 +45,9 @@ class Tally:
     lights: int = 0
     false: int = 0
 
-    def add(self, picture: Composed, detections: Sequence[Detection]) -> None:
+    def add(self, picture: LitPicture, detections: Sequence[Detection]) -> None:
         """Count one picture."""
-        claimed = union(detections, picture.picture.size)
+        claimed = union_mask(detections, picture.picture.size)
         for name, truth in (("shape", picture.masks.any(axis=0)), ("glare", picture.clipped)):
             self.pixels[name] += [(claimed & truth).sum(), (claimed & ~truth).sum(), (truth & ~claimed).sum()]
         hit = set()
@@ -67,11 +67,11 @@ class Tally:
         return precision, recall, harmonic, hit / max(hit + false + missed, 1)
 
 
-def pictures(photos: Sequence[Path], number: int, seed: int) -> Iterator[Composed]:
+def pictures(photos: Sequence[Path], number: int, seed: int) -> Iterator[LitPicture]:
     """`number` compositions over the photographs in turn."""
     for i in range(number):
         rng = np.random.default_rng((seed, i))
-        yield compose(read_picture(photos[i % len(photos)]), rng, int(rng.integers(1, 6)))
+        yield compose_lights(read_picture(photos[i % len(photos)]), rng, int(rng.integers(1, 6)))
 
 
 def in_pictures(detector: Detector, photos: Sequence[Path], number: int, seed: int) -> dict[float, Tally]:
@@ -130,7 +130,7 @@ def main() -> None:
             print(f"{method}: skipped. {problem}")
             continue
         if words.photos is not None:
-            photos = pictures_of(words.photos, PHOTOS, "all")
+            photos = list_pictures(words.photos, PHOTO_SUFFIXES, "all")
             if not photos:
                 print(f"{method}: skipped, {words.photos} holds no photographs.")
             else:

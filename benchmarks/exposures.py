@@ -69,7 +69,7 @@ class Drifting(Capture):
 
 def scores(run: Run, capture: Capture) -> list[str]:
     """PSNR of each layer, dB, means over the views that were held out."""
-    _, views = capture.exposed(run.exposures).split(run.settings.holdout)
+    _, views = capture.with_exposures(run.exposures).split(run.settings.holdout)
     cameras = {view: view.camera.scaled(run.settings.width) for view in views}
     found: dict[str, Any] = evaluate(run, capture, cameras)
     return [f"{found[layer]['psnr']:.2f}" if layer in found else "-" for layer in LAYERS]

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What users choose from by name, for those who offer the choice where the engine itself cannot be imported."""
+"""Options that users choose by name, for code that offers the choice where torch cannot be imported.
+
+The settings, the commands and the add-on's menus take them from here.
+"""
 from __future__ import annotations
 
 from typing import Literal
@@ -11,13 +14,13 @@ Blend = Literal["over", "add"]
 Kernels = Literal["auto", "torch", "tiles", "cpu", "cuda"]
 Matching = Literal["auto", "exhaustive", "sequential", "similar"]
 Follows = Literal["source", "target", "blend"]
-"""What the appearance of a transferred flare follows: `core.transfer.query`."""
+"""What the appearance of a transferred flare follows, see `core.transfer.query`."""
 
 OUR_PRESETS: tuple[Preset, ...] = ("draft", "standard", "high")
-"""Those of our form, the shortest first."""
+"""Presets of the model "ours", the shortest first."""
 ITERATIONS: dict[Preset, int] = {"draft": 1500, "standard": 3000, "high": 10000, "paper": 30000}
-"""Length of a fit by its preset."""
-BY_PARALLAX: tuple[Mode, ...] = ("estimated", "split")
-"""Those in which scene and flare are told apart by how they move."""
-LONGER_BY_PARALLAX = 1.2
-"""Times that length, in those: they have to find out by themselves what exact flare-free frames would say."""
+"""Number of iterations of a fit by its preset."""
+PARALLAX_MODES: tuple[Mode, ...] = ("estimated", "split")
+"""Modes that separate scene and flare by parallax."""
+PARALLAX_LENGTH_FACTOR = 1.2
+"""Factor on ITERATIONS in those modes, which lack the exact clean frames that tell scene from flare."""

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What can go wrong, by kind.
+"""Errors by kind, and the sentences for what the system refuses.
 
-Every message is one sentence for the person at the other end: what is wrong, where, and what to do.
-The commands and the add-on show it as it stands; anything else that escapes is a defect of ours.
+Every message is one sentence for the user: what is wrong, where, and what to do. The commands and the add-on print it
+unchanged; any other exception that escapes is a defect.
 """
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from collections.abc import Sequence
 
 
 class FitFlareError(Exception):
-    """Base of all errors whose message is meant to be read by the user."""
+    """Base of all errors whose message is for the user."""
 
 
 class SettingsError(FitFlareError):
-    """A setting or argument that makes no sense."""
+    """A setting or argument that is invalid."""
 
 
 class CaptureError(FitFlareError):
@@ -35,42 +35,45 @@ class RunError(FitFlareError):
 
 
 class EngineError(FitFlareError):
-    """The part of the engine that was asked for is not installed here."""
+    """A part of the engine that is needed and not installed."""
 
 
 class Cancelled(FitFlareError):
-    """The user, or the system, asked a long job to stop; what is on disk is whole."""
+    """The user or the system stopped a long job; what is on disk is whole."""
 
 
-_MOST = 20
-"""Failures that are spelled out in the last sentence of many."""
+MAX_SPELLED_OUT = 20
+"""Number of failures that a joint message spells out."""
 
 
-def spelled_out(failures: Sequence[str]) -> str:
-    """The sentences of what failed, one after the other; of many the first, and how many more there are."""
-    more = f" And {len(failures) - _MOST} more." if len(failures) > _MOST else ""
-    return " ".join(failures[:_MOST]) + more
+def join_failures(failures: Sequence[str]) -> str:
+    """Join the sentences of several failures; after the first MAX_SPELLED_OUT, say how many more there are."""
+    more = f" And {len(failures) - MAX_SPELLED_OUT} more." if len(failures) > MAX_SPELLED_OUT else ""
+    return " ".join(failures[:MAX_SPELLED_OUT]) + more
 
 
 DISK_FULL = (errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC))
+"""Error numbers of a full disk or an exhausted quota."""
 
 
 def is_out_of_memory(problem: BaseException) -> bool:
-    """Whether it says that memory is short: torch has a class for that of graphics cards, and for the processor's no
-    more than words in a RuntimeError, as OpenCV has."""
+    """True if an exception says that memory is short.
+
+    torch has a class for that of graphics cards; for the processor's it raises RuntimeError, as OpenCV does.
+    """
     return (isinstance(problem, MemoryError) or type(problem).__name__ == "OutOfMemoryError"
-            or any(words in str(problem) for words in ("DefaultCPUAllocator", "Insufficient memory")))
+            or any(text in str(problem) for text in ("DefaultCPUAllocator", "Insufficient memory")))
 
 
-def refusal(problem: OSError) -> str:
-    """The sentence for what the system refused: a full disk, a folder that may not be written, …"""
+def os_error_message(problem: OSError) -> str:
+    """Return the sentence for what the system refused: a full disk, a folder that is not writable, ..."""
     where = f" ({problem.filename})" if problem.filename else ""
     if problem.errno in DISK_FULL:
         return f"The disk is full{where}; make room and start it again, what is finished is kept."
     if isinstance(problem, IsADirectoryError):
-        return f"There is a folder where a file is to be written{where}; name another."
+        return f"The path of a file to write is a folder{where}; choose another name."
     if isinstance(problem, FileExistsError | NotADirectoryError):
-        return f"There is a file where a folder is to be{where}; name another, or move it away."
+        return f"The path of a folder to create is a file{where}; choose another name or move the file."
     if problem.errno == errno.ELOOP:
-        return f"A symbolic link leads back to itself{where}; remove it, or name another place."
+        return f"A symbolic link leads back to itself{where}; remove it or choose another path."
     return f"The system refused: {problem.strerror or problem}{where}."

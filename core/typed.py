@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Values from files and command lines, checked against the types that dataclasses declare."""
+"""Values from files and command lines, checked against the types that dataclasses declare.
+
+Settings, recipes and the forms of flares are read through it.
+"""
 from __future__ import annotations
 
 import dataclasses
@@ -8,35 +11,36 @@ import types
 import typing
 from typing import Any, Literal
 
-MOST_SEED = 2**31 - 1
-"""The greatest seed that every library takes."""
-WHOLE_DIGITS = 18
-"""Of a whole number that 64 bits hold in any case."""
+MAX_SEED = 2**31 - 1
+"""The greatest seed that every library accepts."""
+MAX_INT_DIGITS = 18
+"""Digits of a whole number that always fits 64 bits."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Bounds:
-    """The numbers from `least` to `most`; above, below: without the least, without the most itself."""
+    """The numbers from `minimum` to `maximum`, with or without the ends themselves (as in JSON Schema)."""
 
-    least: float
-    most: float
-    above: bool = False
-    below: bool = False
+    minimum: float
+    maximum: float
+    exclusive_minimum: bool = False
+    exclusive_maximum: bool = False
 
     def __str__(self) -> str:
-        """After "must lie"."""
-        if not self.above and not self.below:
-            return f"between {self.least} and {self.most}"
-        return f"{'above' if self.above else 'from'} {self.least} {'and below' if self.below else 'to'} {self.most}"
+        """The range in words, to follow "must lie"."""
+        if not self.exclusive_minimum and not self.exclusive_maximum:
+            return f"between {self.minimum} and {self.maximum}"
+        return (f"{'above' if self.exclusive_minimum else 'from'} {self.minimum} "
+                f"{'and below' if self.exclusive_maximum else 'to'} {self.maximum}")
 
-    def hold(self, value: float) -> bool:
-        """Whether the number is one of them; NaN never is."""
-        low = self.least < value if self.above else self.least <= value
-        return low and (value < self.most if self.below else value <= self.most)
+    def contains(self, value: float) -> bool:
+        """True if the number lies in the range; NaN never does."""
+        low = self.minimum < value if self.exclusive_minimum else self.minimum <= value
+        return low and (value < self.maximum if self.exclusive_maximum else value <= self.maximum)
 
 
 def is_utf8(text: str) -> bool:
-    """Whether it can be written into a file. Names of files can be what UTF-8 has no bytes for."""
+    """True if the text can be written as UTF-8; file names may hold bytes that cannot."""
     try:
         text.encode()
     except UnicodeEncodeError:
@@ -44,32 +48,36 @@ def is_utf8(text: str) -> bool:
     return True
 
 
-def table_of(kind: Any, data: Any) -> Any:
-    """A dataclass of `kind` from a dictionary. Raises ValueError for what is no table, has other names, or values of
-    another type."""
+def parse_table(kind: Any, data: Any) -> Any:
+    """Make a dataclass of type `kind` from a dictionary.
+
+    Raises ValueError for anything but a dictionary, for unknown names, and for values of another type.
+    """
     if not isinstance(data, dict):
         raise ValueError(f"{kind.__name__} must be a table")
     hints = typing.get_type_hints(kind)
     unknown = set(data) - set(hints)
     if unknown:
         raise ValueError(f"unknown settings {', '.join(sorted(unknown))}")
-    return kind(**{key: value_of(hints[key], value) for key, value in data.items()})
+    return kind(**{key: parse_value(hints[key], value) for key, value in data.items()})
 
 
-def field_of(kind: Any, name: str, value: Any) -> Any:
-    """A value for the field of a dataclass. Raises ValueError where it is of another type."""
-    return value_of(typing.get_type_hints(kind)[name], value)
+def parse_field(kind: Any, name: str, value: Any) -> Any:
+    """Parse the value of the field `name` of a dataclass. Raises ValueError for a value of another type."""
+    return parse_value(typing.get_type_hints(kind)[name], value)
 
 
-def value_of(kind: Any, value: Any) -> Any:
-    """`value` as the type `kind`: a dataclass, a Literal, a tuple, or one of a union; numbers are finite, whole ones of
-    64 bits as TOML has them, and text is UTF-8. Raises ValueError."""
+def parse_value(kind: Any, value: Any) -> Any:
+    """Parse `value` as the type `kind`: a dataclass, a Literal, a tuple, or one of a union.
+
+    Numbers must be finite, whole ones within 64 bits as in TOML, and text UTF-8. Raises ValueError.
+    """
     if isinstance(value, int) and value.bit_length() > 63:
         raise ValueError("it has too many digits")
     if isinstance(value, str) and not is_utf8(value):
         raise ValueError(f"{value!r} is not UTF-8")
     if dataclasses.is_dataclass(kind):
-        return table_of(kind, value)
+        return parse_table(kind, value)
     parts = typing.get_args(kind)
     if typing.get_origin(kind) is Literal:
         if value not in parts:
@@ -77,11 +85,11 @@ def value_of(kind: Any, value: Any) -> Any:
         return value
     if typing.get_origin(kind) is tuple:
         if not isinstance(value, list | tuple):
-            raise ValueError(f"{value!r} is not {_in_words(kind)}")
+            raise ValueError(f"{value!r} is not {_type_name(kind)}")
         kinds = parts[:1] * len(value) if parts[-1] is Ellipsis else parts
         if len(kinds) != len(value):
             raise ValueError(f"{value!r} should have {len(kinds)} parts")
-        return tuple(value_of(one, part) for one, part in zip(kinds, value, strict=True))
+        return tuple(parse_value(part_kind, part) for part_kind, part in zip(kinds, value, strict=True))
     for option in parts if isinstance(kind, types.UnionType) else (kind,):
         if option is float and isinstance(value, int | float) and not isinstance(value, bool):
             if not math.isfinite(value):
@@ -89,15 +97,15 @@ def value_of(kind: Any, value: Any) -> Any:
             return float(value)
         if type(value) is option or (option is type(None) and value is None):
             return value
-    raise ValueError(f"{value!r} is not {_in_words(kind)}")
+    raise ValueError(f"{value!r} is not {_type_name(kind)}")
 
 
-def _in_words(kind: Any) -> str:
-    """A type, for people."""
+def _type_name(kind: Any) -> str:
+    """Name a type in an error message."""
     if typing.get_origin(kind) is tuple:
         return "a list"
     options = [part for part in typing.get_args(kind) if part is not type(None)] or [kind]
-    return " or ".join(_WORDS.get(option, str(option)) for option in options)
+    return " or ".join(_TYPE_NAMES.get(option, str(option)) for option in options)
 
 
-_WORDS = {int: "a whole number", float: "a number", bool: "true or false", str: "text"}
+_TYPE_NAMES = {int: "a whole number", float: "a number", bool: "true or false", str: "text"}

@@ -1,14 +1,15 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What was filmed: frames, cameras, points and lights, from COLMAP models and transforms.json.
+"""Captures: frames, cameras, points and lights, from COLMAP models and transforms.json.
 
-Reading needs numpy alone, so that Blender's own Python can do it; pictures are decoded by OpenCV and
-OpenEXR, imported when the first one is asked for.
+Reading needs numpy alone, so that Blender's own Python can do it; pictures are decoded by OpenCV and OpenEXR, imported
+with the first one. `solve/` makes captures; fit, bake, transfer and removal read them.
 """
 from __future__ import annotations
 
 from .camera import Camera
-from .capture import LIGHTS, REMOVED, Capture, Light, Twins, View, read_lights
+from .capture import LIGHTS, REMOVED, Capture, Light, PictureIndex, View, read_lights
 from .colmap import PointCloud
 from .lens import Lens
 
-__all__ = ["LIGHTS", "REMOVED", "Camera", "Capture", "Lens", "Light", "PointCloud", "Twins", "View", "read_lights"]
+__all__ = ["LIGHTS", "REMOVED", "Camera", "Capture", "Lens", "Light", "PictureIndex", "PointCloud", "View",
+           "read_lights"]

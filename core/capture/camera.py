@@ -13,14 +13,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Floats = NDArray[np.float64]
-SQUARE = 0.02
-"""So far from 1 the aspect of a pixel still counts as 1."""
+ASPECT_TOLERANCE = 0.02
+"""Difference from 1 within which a pixel aspect ratio counts as 1."""
 
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """Size in pixels, intrinsics in pixels, and `world_to_camera` (4, 4), a rigid motion. exposure: times the light of
-    its capture's usual frame."""
+    """A pinhole camera: size in pixels, intrinsics in pixels, and `world_to_camera` (4, 4), a rigid motion.
+
+    exposure: factor of the frame's light relative to the capture's median frame.
+    """
 
     width: int
     height: int
@@ -38,7 +40,7 @@ class Camera:
 
     @property
     def numbers(self) -> tuple[Any, ...]:
-        """All of it as plain numbers, which change whenever its picture would."""
+        """All values as plain numbers, which change whenever the camera's picture would."""
         unusual = () if self.exposure == 1 else (self.exposure,)
         return self.size, self.intrinsics.tolist(), self.world_to_camera.tolist(), *unusual
 
@@ -49,18 +51,19 @@ class Camera:
 
     @property
     def focal_length(self) -> float:
-        """In pixels, the (geometric) mean of both directions."""
+        """Focal length in pixels, the geometric mean of both directions."""
         return math.sqrt(self.fx * self.fy)
 
     @property
     def pixel_aspect(self) -> float:
-        """A pixel's width by its height, 2 for squeezed plates; 1 where a solve found focal lengths a little apart."""
+        """Pixel aspect ratio (width / height), 2 for squeezed plates; 1 where a solve found slightly different focal
+        lengths."""
         aspect = self.fy / self.fx
-        return round(aspect, 3) if abs(aspect - 1) > SQUARE else 1.0
+        return round(aspect, 3) if abs(aspect - 1) > ASPECT_TOLERANCE else 1.0
 
     @property
-    def reach(self) -> float:
-        """Of its frame from the principal point, normalised coordinates: to the farthest corner."""
+    def corner_radius(self) -> float:
+        """Distance of the frame's farthest corner from the principal point, normalised coordinates."""
         return math.hypot(max(self.cx, self.width - self.cx) / self.fx, max(self.cy, self.height - self.cy) / self.fy)
 
     @property
@@ -82,21 +85,21 @@ class Camera:
         return self.world_to_camera[2, :3].copy()
 
     def scaled(self, width: int, height: int | None = None) -> Camera:
-        """The same view at another size in pixels; without a height the proportions stay."""
+        """Return the camera at another size in pixels; without a height the proportions stay."""
         height = height or max(round(self.height * width / self.width), 1)
         x, y = width / self.width, height / self.height
         return replace(self, width=width, height=height,
                        fx=self.fx * x, cx=self.cx * x, fy=self.fy * y, cy=self.cy * y)
 
     def cropped(self, left: int, top: int, width: int, height: int) -> Camera:
-        """What of its picture lies from this pixel on, of this size."""
+        """Return the camera of the part of its picture with this corner and size, pixels."""
         return replace(self, width=width, height=height, cx=self.cx - left, cy=self.cy - top)
 
     def normalised(self, xyz: ArrayLike) -> tuple[Floats, Floats]:
-        """World points (n, 3) to ((n, 2) of x/z and y/z, (n,) depth z).
+        """Project world points (n, 3) to ((n, 2) of x/z and y/z, (n,) depth z).
 
-        A point in the camera's plane (z = 0) has no image: its coordinates are not finite. A point behind
-        (z < 0) has its mirrored ones, as the formula gives them; look at the depth.
+        A point in the camera's plane (z = 0) has no image: its coordinates are not finite. A point behind (z < 0) has
+        mirrored ones; check the depth.
         """
         points = np.asarray(xyz, np.float64).reshape(-1, 3)
         local = points @ self.world_to_camera[:3, :3].T + self.world_to_camera[:3, 3]
@@ -105,38 +108,38 @@ class Camera:
             return local[:, :2] / depth[:, None], depth
 
     def project(self, xyz: ArrayLike) -> tuple[Floats, Floats]:
-        """World points (n, 3) to (pixels (n, 2), depth (n,)); see `normalised` for points not in front."""
+        """Project world points (n, 3) to (pixels (n, 2), depth (n,)); see `normalised` for points not in front."""
         plane, depth = self.normalised(xyz)
         return plane * (self.fx, self.fy) + (self.cx, self.cy), depth
 
     def jacobian(self, xyz: ArrayLike) -> Floats:
-        """(2, 3): how the pixel of a world point (3,) in front of the camera moves with the point."""
+        """(2, 3) derivative of the pixel of a world point (3,) in front of the camera by the point."""
         rotation = self.world_to_camera[:3, :3]
         x, y, z = rotation @ np.asarray(xyz, np.float64) + self.world_to_camera[:3, 3]
         lens = np.array([[self.fx, 0, -self.fx * x / z], [0, self.fy, -self.fy * y / z]]) / z
         return np.asarray(lens @ rotation)
 
     def rays(self, pixels: ArrayLike) -> Floats:
-        """Pixels (n, 2) to unit directions (n, 3) in world coordinates, from `position`."""
+        """Convert pixels (n, 2) to unit directions (n, 3) in world coordinates, from `position`."""
         plane = (np.asarray(pixels, np.float64).reshape(-1, 2) - (self.cx, self.cy)) / (self.fx, self.fy)
         local = np.concatenate([plane, np.ones((len(plane), 1))], axis=1)
         rays = local @ self.world_to_camera[:3, :3]
         return rays / np.linalg.norm(rays, axis=1, keepdims=True)
 
     def contains(self, pixels: ArrayLike, depth: Any = 1.0) -> NDArray[np.bool_]:
-        """Which pixels (n, 2), with their depths (n,), lie in front of the camera and inside the frame."""
+        """(n,) which pixels (n, 2), with their depths (n,), lie in front of the camera and inside the frame."""
         at = np.asarray(pixels, np.float64).reshape(-1, 2)
         with np.errstate(invalid="ignore"):
             return np.asarray((np.asarray(depth) > 0) & (at >= 0).all(axis=1) & (at <= self.size).all(axis=1))
 
 
 def is_rotation(matrix: Floats) -> bool:
-    """Whether (3, 3) is one, but for the rounding of files."""
+    """True if (3, 3) is a rotation, within the rounding of files."""
     return bool(np.allclose(matrix.T @ matrix, np.eye(3), atol=2e-3) and np.linalg.det(matrix) > 0)
 
 
 def rotation_from_quaternion(wxyz: ArrayLike) -> Floats:
-    """(3, 3) rotation of a quaternion (w, x, y, z), normalised first (Hamilton's convention, as COLMAP)."""
+    """(3, 3) rotation of a quaternion (w, x, y, z), normalised first (Hamilton's convention, as in COLMAP)."""
     w, x, y, z = np.asarray(wxyz, np.float64) / np.linalg.norm(wxyz)
     return np.array([
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""COLMAP sparse models, binary and text, read and written with numpy alone (Blender's own Python has no pycolmap).
+"""Reads and writes COLMAP sparse models, binary and text, with numpy alone: Blender's own Python has no pycolmap.
 
-The format is COLMAP's documented one: cameras, images (pose as quaternion and translation, world to
-camera) and points3D. Counts in a file are checked against its length before anything is allocated.
+The format is COLMAP's documented one: cameras, images (pose as quaternion and translation, world to camera) and
+points3D. Counts in a file are checked against its length before anything is allocated.
 """
 from __future__ import annotations
 
@@ -18,20 +18,22 @@ from numpy.typing import NDArray
 
 from ..errors import CaptureError
 from ..images.size import MAX_PIXELS
-from ..system.files import WRITTEN_BY_HAND, atomic_path
+from ..system.files import UTF8_SIG, atomic_path
 from .camera import Floats, quaternion_from_rotation, rotation_from_quaternion
-from .lens import MODELS, NAMES, Lens
+from .lens import MODEL_NAMES, MODELS, Lens
 
-SENSELESS = 1e12
-"""From which on a number of a pose or a lens makes no sense, whatever its unit."""
-_LARGEST = 1e30
-"""What float32 still computes with: the farthest a point may lie, and as much as its error counts for."""
+MAX_MAGNITUDE = 1e12
+"""Bound for the numbers of a pose or a lens, whatever the unit."""
+_MAX_COORDINATE = 1e30
+"""Bound for coordinates and errors of points, with which float32 can still compute."""
 
 
 @dataclass(frozen=True, eq=False)
 class PointCloud:
-    """Points (n, 3) float32 in world coordinates, colours (n, 3) uint8 sRGB, and the mean reprojection
-    error (n,) float32 in pixels (0 where unknown)."""
+    """Points (n, 3) float32 in world coordinates, colours (n, 3) uint8 sRGB, mean reprojection error (n,) float32 px.
+
+    The error is 0 where unknown.
+    """
 
     xyz: NDArray[np.float32]
     rgb: NDArray[np.uint8]
@@ -42,14 +44,16 @@ class PointCloud:
 
     @classmethod
     def empty(cls) -> PointCloud:
-        """No points at all."""
+        """Make a cloud without points."""
         return cls(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), np.zeros(0, np.float32))
 
 
 @dataclass(frozen=True, eq=False)
-class Posed:
-    """A frame as a model names it: its name, the lens it was seen through, its pose (4, 4), and the indices (n,) of the
-    points that were found in it, where a model tells."""
+class PosedFrame:
+    """A frame of a model: its name, its lens, and its pose (4, 4).
+
+    points: indices (n,) of the points that were observed in it, where the model says.
+    """
 
     name: str
     lens: Lens
@@ -58,54 +62,54 @@ class Posed:
 
 
 def find_model(folder: Path, places: tuple[str, ...] = ("sparse/0", "sparse")) -> Path | None:
-    """The folder of the COLMAP model in a capture, the first of `places` that has one."""
+    """Return the folder of a capture's COLMAP model, the first of `places` that has one, or None."""
     for name in places:
         if any((folder / name / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt")):
             return folder / name
     return None
 
 
-def read_model(folder: Path) -> tuple[list[Posed], PointCloud]:
-    """Read cameras, images and points3D (.bin where there is one, else .txt; points3D may be absent).
+def read_model(folder: Path) -> tuple[list[PosedFrame], PointCloud]:
+    """Read cameras, images and points3D (.bin where it exists, else .txt; points3D may be absent).
 
-    Raises CaptureError, naming the file, where one is missing, damaged, empty or makes no sense.
+    Raises CaptureError, naming the file, where one is missing, damaged, empty or invalid.
     """
-    lenses = _read(folder, "cameras", _cameras_bin, _cameras_txt)
-    images = _read(folder, "images", _images_bin, _images_txt)
-    points, known = _read(folder, "points3D", _points_bin, _points_txt) or (PointCloud.empty(), np.zeros(0, np.int64))
+    lenses = _read_file(folder, "cameras", _read_cameras_bin, _read_cameras_txt)
+    images = _read_file(folder, "images", _read_images_bin, _read_images_txt)
+    points, known = (_read_file(folder, "points3D", _read_points_bin, _read_points_txt)
+                     or (PointCloud.empty(), np.zeros(0, np.int64)))
     order = np.argsort(known, kind="stable")
     if not images:
-        raise CaptureError(f"{_path(folder, 'images')} holds no images; the solve registered no frame.")
+        raise CaptureError(f"{_file_path(folder, 'images')} holds no images; the solve registered no frame.")
     posed = []
     for name, camera, quaternion, translation, seen in images:
         if camera not in lenses:
-            raise CaptureError(f"{_path(folder, 'images')} gives {name} the camera {camera}, which "
-                               f"{_path(folder, 'cameras')} does not have; export the whole model again.")
-        where = f"{_path(folder, 'images')}, {name}:"
+            raise CaptureError(f"{_file_path(folder, 'images')} gives {name} the camera {camera}, which "
+                               f"{_file_path(folder, 'cameras')} does not have; export the whole model again.")
+        where = f"{_file_path(folder, 'images')}, {name}:"
         pose = np.eye(4)
         length = math.sqrt(sum(q * q for q in quaternion))
-        if not all(abs(number) < SENSELESS for number in (*quaternion, *translation)):
+        if not all(abs(number) < MAX_MAGNITUDE for number in (*quaternion, *translation)):
             raise CaptureError(f"{where} the pose is not finite numbers of a sensible size; solve the cameras again.")
         if abs(length - 1.0) > 0.01:
             raise CaptureError(f"{where} the quaternion's length is {length:.4g}, so it is no rotation; "
                                "solve the cameras again.")
         pose[:3, :3], pose[:3, 3] = rotation_from_quaternion(quaternion), translation
-        posed.append(Posed(name, lenses[camera], pose, _indices(seen, known, order)))
+        posed.append(PosedFrame(name, lenses[camera], pose, _indices(seen, known, order)))
     return posed, points
 
 
-def _indices(seen: NDArray[np.int64], known: NDArray[np.int64], order: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Where the numbers `seen` stand among those that are `known`, which `order` sorts; others are left out."""
+def _indices(observed: NDArray[np.int64], known: NDArray[np.int64], order: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the indices of the ids `observed` among `known`, which `order` sorts; unknown ids are dropped."""
     if not len(known):
         return order
-    places = order[np.searchsorted(known, seen, sorter=order).clip(max=len(known) - 1)]
-    return np.unique(places[known[places] == seen])
+    places = order[np.searchsorted(known, observed, sorter=order).clip(max=len(known) - 1)]
+    return np.unique(places[known[places] == observed])
 
 
 @dataclass(frozen=True, eq=False)
-class Observed:
-    """A frame to be written: its name, lens and pose, and the points seen in it: pixels (n, 2) and the index
-    (n,) of each in the model's point cloud."""
+class ObservedFrame:
+    """A frame to be written: its name, lens and pose, and its observations: pixels (n, 2) and point indices (n,)."""
 
     name: str
     lens: Lens
@@ -114,7 +118,7 @@ class Observed:
     points: NDArray[np.int64]
 
 
-def write_model(folder: Path, frames: Sequence[Observed], cloud: PointCloud) -> None:
+def write_model(folder: Path, frames: Sequence[ObservedFrame], cloud: PointCloud) -> None:
     """Write cameras.bin, images.bin and points3D.bin; frames that share a Lens object share a camera."""
     lenses = list(dict.fromkeys(frame.lens for frame in frames))
     cameras = [struct.pack("<Q", len(lenses))]
@@ -141,7 +145,7 @@ def write_model(folder: Path, frames: Sequence[Observed], cloud: PointCloud) -> 
 
 
 def check_lens(lens: Lens, where: str) -> Lens:
-    """`lens`, or CaptureError where its numbers cannot be a camera's."""
+    """Return `lens`; raises CaptureError where its numbers cannot be a camera's."""
     if lens.width <= 0 or lens.height <= 0 or lens.width * lens.height > MAX_PIXELS:
         raise CaptureError(f"{where} a size of {lens.width} x {lens.height} pixels makes no sense; solve the cameras "
                            "again.")
@@ -152,29 +156,29 @@ def check_lens(lens: Lens, where: str) -> Lens:
     return lens
 
 
-def _path(folder: Path, name: str) -> Path:
+def _file_path(folder: Path, name: str) -> Path:
     binary = folder / f"{name}.bin"
     return binary if binary.is_file() else folder / f"{name}.txt"
 
 
-def _read(folder: Path, name: str, binary: Any, text: Any) -> Any:
-    path = _path(folder, name)
+def _read_file(folder: Path, name: str, binary: Any, text: Any) -> Any:
+    path = _file_path(folder, name)
     if not path.is_file():
         if name == "points3D":
             return None
         raise CaptureError(f"{folder} has no {name}.bin or {name}.txt; export the whole COLMAP model.")
     try:
         if path.suffix == ".bin":
-            return binary(_Bytes(path))
-        return text(path, path.read_text(encoding=WRITTEN_BY_HAND).splitlines())
+            return binary(_ByteReader(path))
+        return text(path, path.read_text(encoding=UTF8_SIG).splitlines())
     except OSError as problem:
         raise CaptureError(f"{path} cannot be read: {problem.strerror or problem}.") from problem
     except UnicodeDecodeError as problem:
         raise CaptureError(f"{path} is not UTF-8 text; export the model again.") from problem
 
 
-class _Bytes:
-    """A binary file, read from front to back, that knows when it ends too early."""
+class _ByteReader:
+    """Reads a binary file from front to back; raises CaptureError where it ends too early."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -182,17 +186,17 @@ class _Bytes:
         self.at = 0
 
     def take(self, layout: str) -> tuple[Any, ...]:
-        """Little-endian values by `struct` layout."""
+        """Unpack little-endian values by `struct` layout."""
         size = struct.calcsize("<" + layout)
         self.need(size)
         values = struct.unpack_from("<" + layout, self.data, self.at)
         self.at += size
         return values
 
-    def count(self, smallest: int) -> int:
-        """A 64 bit count of records that take at least `smallest` bytes each."""
+    def count(self, record_size: int) -> int:
+        """Read a 64 bit count of records of at least `record_size` bytes each."""
         number: int = self.take("Q")[0]
-        self.need(number * smallest)
+        self.need(number * record_size)
         return number
 
     def skip(self, size: int) -> None:
@@ -200,7 +204,7 @@ class _Bytes:
         self.at += size
 
     def name(self) -> str:
-        """A name that a zero byte ends."""
+        """Read a name that a zero byte ends."""
         end = self.data.find(b"\0", self.at)
         if end < 0:
             self.need(len(self.data) + 1)
@@ -214,28 +218,28 @@ class _Bytes:
                                "copy or export it again.")
 
 
-def _cameras_bin(file: _Bytes) -> dict[int, Lens]:
+def _read_cameras_bin(file: _ByteReader) -> dict[int, Lens]:
     lenses: dict[int, Lens] = {}
     for _ in range(file.count(24)):
         camera, number, width, height = file.take("iiQQ")
-        if number not in NAMES:
+        if number not in MODEL_NAMES:
             raise CaptureError(f"{file.path} has a camera of model {number}, which this program does not know; solve "
                                "the cameras again with another model (OPENCV, for instance).")
-        model = NAMES[number]
+        model = MODEL_NAMES[number]
         params = file.take("d" * len(MODELS[model][1]))
         _add_lens(lenses, file.path, camera, Lens(model, params, width, height))
     return lenses
 
 
-def _cameras_txt(path: Path, lines: list[str]) -> dict[int, Lens]:
+def _read_cameras_txt(path: Path, lines: list[str]) -> dict[int, Lens]:
     lenses: dict[int, Lens] = {}
-    for number, line in _rows(lines):
+    for number, line in _data_lines(lines):
         words = line.split()
         model = words[1] if len(words) > 1 else ""
         if model not in MODELS:
             raise CaptureError(f"{path}, line {number}: {model!r} is no camera model this program knows; solve the "
                                "cameras again with another (OPENCV, for instance).")
-        camera, width, height, *params = _numbers(path, number, [words[0], *words[2:]], "iii")
+        camera, width, height, *params = _parse_numbers(path, number, [words[0], *words[2:]], "iii")
         if len(params) != len(MODELS[model][1]):
             raise CaptureError(f"{path}, line {number}: {model} takes {len(MODELS[model][1])} parameters "
                                f"({' '.join(MODELS[model][1])}), not {len(params)}; export the model again.")
@@ -250,24 +254,24 @@ def _add_lens(lenses: dict[int, Lens], path: Path, camera: int, lens: Lens) -> N
 
 
 Image = tuple[str, int, tuple[float, ...], tuple[float, ...], NDArray[np.int64]]
-"""Name, camera, quaternion, translation, and the numbers of the points that were found in it."""
-_FOUND = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
+"""Name, camera, quaternion, translation, and the ids of the points observed in it."""
+_POINT2D = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
 
 
-def _images_bin(file: _Bytes) -> list[Image]:
+def _read_images_bin(file: _ByteReader) -> list[Image]:
     images: list[Image] = []
     for _ in range(file.count(73)):
         values = file.take("idddddddi")
         name = file.name()
-        count = file.count(_FOUND.itemsize)
-        found = np.frombuffer(file.data, _FOUND, count, file.at)["point"]
-        file.skip(count * _FOUND.itemsize)
+        count = file.count(_POINT2D.itemsize)
+        found = np.frombuffer(file.data, _POINT2D, count, file.at)["point"]
+        file.skip(count * _POINT2D.itemsize)
         images.append((name, values[8], values[1:5], values[5:8], found))
     return images
 
 
-def _images_txt(path: Path, lines: list[str]) -> list[Image]:
-    """Two lines an image; the second, of 2D points, may be empty."""
+def _read_images_txt(path: Path, lines: list[str]) -> list[Image]:
+    """Read two lines an image; the second, of 2D points, may be empty."""
     images: list[Image] = []
     rest = iter(enumerate(lines, 1))
     for number, line in rest:
@@ -277,17 +281,17 @@ def _images_txt(path: Path, lines: list[str]) -> list[Image]:
         if len(words) < 10:
             raise CaptureError(f"{path}, line {number}: an image takes ten values (number, quaternion, "
                                f"translation, camera, name), not {len(words)}; export the model again.")
-        _, *pose, camera = _numbers(path, number, words[:9], "iqqqqtttc")
+        _, *pose, camera = _parse_numbers(path, number, words[:9], "iqqqqtttc")
         second = next(rest, None)
         if second is None:
             raise CaptureError(f"{path} is truncated: the line of 2D points after {words[9].strip()} is missing; "
                                "export the model again.")
-        images.append((words[9].strip(), camera, tuple(pose[:4]), tuple(pose[4:]), _found(second[1])))
+        images.append((words[9].strip(), camera, tuple(pose[:4]), tuple(pose[4:]), _parse_point_ids(second[1])))
     return images
 
 
-def _found(line: str) -> NDArray[np.int64]:
-    """The points' numbers of x, y, number, x, y, number, ...; none where it says something else: it is a help only."""
+def _parse_point_ids(line: str) -> NDArray[np.int64]:
+    """Parse the point ids of x, y, id, x, y, id, ...; none where the line is invalid: ids are optional."""
     try:
         return np.array([int(word) for word in line.split()[2::3]], np.int64)
     except (ValueError, OverflowError):
@@ -295,10 +299,10 @@ def _found(line: str) -> NDArray[np.int64]:
 
 
 Points = tuple[PointCloud, NDArray[np.int64]]
-"""And the number of each."""
+"""The cloud, and the id of each point."""
 
 
-def _points_bin(file: _Bytes) -> Points:
+def _read_points_bin(file: _ByteReader) -> Points:
     number = file.count(51)
     record = struct.Struct("<Q3d3BdQ")
     values = np.empty((number, 4), np.float64)
@@ -313,43 +317,43 @@ def _points_bin(file: _Bytes) -> Points:
         at += record.size + 8 * track
     else:
         if at <= len(data):
-            return _cloud(file.path, values, rgb), numbers.view(np.int64)
+            return _to_cloud(file.path, values, rgb), numbers.view(np.int64)
     file.need(len(data) + 1)
     raise AssertionError  # need() has raised
 
 
-def _points_txt(path: Path, lines: list[str]) -> Points:
+def _read_points_txt(path: Path, lines: list[str]) -> Points:
     values, rgb, numbers = [], [], []
-    for number, line in _rows(lines):
+    for number, line in _data_lines(lines):
         words = line.split(maxsplit=8)
         if len(words) < 8:
             raise CaptureError(f"{path}, line {number}: a point takes at least eight values, not {len(words)}; export "
                                "the model again.")
-        own, x, y, z, *colour, error = _numbers(path, number, words[:8], "ixyziiie")
+        own, x, y, z, *colour, error = _parse_numbers(path, number, words[:8], "ixyziiie")
         if not all(0 <= c <= 255 for c in colour):
             raise CaptureError(f"{path}, line {number}: the colour {colour} is not within 0 to 255; export the model "
                                "again.")
         values.append((x, y, z, error))
         rgb.append(colour)
         numbers.append(own if abs(own) < 2**63 else 0)
-    cloud = _cloud(path, np.array(values, np.float64).reshape(-1, 4), np.array(rgb, np.uint8).reshape(-1, 3))
+    cloud = _to_cloud(path, np.array(values, np.float64).reshape(-1, 4), np.array(rgb, np.uint8).reshape(-1, 3))
     return cloud, np.array(numbers, np.int64)
 
 
-def _cloud(path: Path, values: Floats, rgb: NDArray[np.uint8]) -> PointCloud:
-    if not np.isfinite(values[:, :3]).all() or (np.abs(values[:, :3]) > _LARGEST).any():
+def _to_cloud(path: Path, values: Floats, rgb: NDArray[np.uint8]) -> PointCloud:
+    if not np.isfinite(values[:, :3]).all() or (np.abs(values[:, :3]) > _MAX_COORDINATE).any():
         raise CaptureError(f"{path} has points that are not finite numbers; solve the cameras again.")
-    error = np.where(np.isfinite(values[:, 3]), np.clip(values[:, 3], 0.0, _LARGEST), 0.0)
+    error = np.where(np.isfinite(values[:, 3]), np.clip(values[:, 3], 0.0, _MAX_COORDINATE), 0.0)
     return PointCloud(values[:, :3].astype(np.float32), rgb, error.astype(np.float32))
 
 
-def _rows(lines: list[str]) -> list[tuple[int, str]]:
+def _data_lines(lines: list[str]) -> list[tuple[int, str]]:
     return [(number, line) for number, line in enumerate(lines, 1)
             if line.strip() and not line.lstrip().startswith("#")]
 
 
-def _numbers(path: Path, line: int, words: list[str], kinds: str) -> list[Any]:
-    """Words to numbers: integers where `kinds` says i or c, floats elsewhere and past its end."""
+def _parse_numbers(path: Path, line: int, words: list[str], kinds: str) -> list[Any]:
+    """Parse words: integers where `kinds` says i or c, floats elsewhere and past its end. Raises CaptureError."""
     try:
         return [int(word) if kinds[i:i + 1] in ("i", "c") else float(word) for i, word in enumerate(words)]
     except ValueError as problem:

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The lights themselves in a picture: discs that the camera clipped."""
+"""Light discs: the clipped pixels of the lights themselves in a frame. Fits and snapping leave them out of the flare.
+"""
 from __future__ import annotations
 
 import numpy as np
@@ -7,22 +8,27 @@ from numpy.typing import ArrayLike, NDArray
 
 from .camera import Camera
 
-SOURCE = 0.02
-"""Radius about a light, of the frame's width, in which what is white is taken for the light itself."""
-WHITE = 0.93
-"""Display value from which a pixel of a light's disc counts as clipped: JPEG and noise leave white a little less."""
+DISC_RADIUS = 0.02
+"""Distance from a light, in frame widths, within which a clipped pixel belongs to its disc."""
+CLIP_LEVEL = 0.93
+"""Display value from which a pixel of a disc counts as clipped: JPEG and noise leave white a little lower."""
 
 
-def clipped_discs(display: NDArray[np.float32], camera: Camera, lights: ArrayLike) -> NDArray[np.bool_]:
-    """(height, width): which pixels of the camera's picture, display values (height, width, 3), are clipped and so near
-    to where one of the lights (n, 3), world coordinates, is seen that they are the light's own."""
-    near = squared_distances(camera, lights) < SOURCE**2
-    return np.asarray(near & (display >= WHITE).all(-1))
+def light_disc_mask(display: NDArray[np.float32], camera: Camera, lights: ArrayLike) -> NDArray[np.bool_]:
+    """(height, width): pixels of the lights' discs in a picture, display values (height, width, 3), of the camera.
+
+    A pixel belongs to a disc if it is clipped and close to the projection of one of the lights (n, 3), world
+    coordinates.
+    """
+    near = squared_light_distances(camera, lights) < DISC_RADIUS**2
+    return np.asarray(near & (display >= CLIP_LEVEL).all(-1))
 
 
-def squared_distances(camera: Camera, lights: ArrayLike) -> NDArray[np.float32]:
-    """(height, width): each pixel's distance to the nearest place where one of the lights (n, 3), world coordinates,
-    is seen, in widths of the frame, squared; infinite where none is in front of the camera."""
+def squared_light_distances(camera: Camera, lights: ArrayLike) -> NDArray[np.float32]:
+    """(height, width): squared distance of each pixel to the nearest projection of the lights (n, 3), in frame widths.
+
+    Infinite where no light is in front of the camera.
+    """
     pixels, depth = camera.project(lights)
     across = np.arange(camera.width, dtype=np.float32) + np.float32(0.5)
     down = np.arange(camera.height, dtype=np.float32)[:, None] + np.float32(0.5)

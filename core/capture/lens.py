@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Lens distortion, in every camera model of COLMAP, and the pinhole view that remains without it.
+"""Lens distortion, in every camera model of COLMAP, and the pinhole view of undistorted frames.
 
 A lens maps a direction, given as the pinhole coordinates (x, y) = (X/Z, Y/Z), to a pixel. Four families:
 
@@ -8,8 +8,8 @@ A lens maps a direction, given as the pinhole coordinates (x, y) = (X/Z, Y/Z), t
     one-parameter (x, y) 2 / (1 + sqrt(1 - 4 k r^2))  division model (Fitzgibbon 2001)
     unified       (x, y) / (a sqrt(b r^2 + 1) + 1 - a)  EUCM (Khomutenko et al. 2016)
 
-followed by focal length and principal point. An equirectangular panorama has no principal point; the
-pinhole view taken from it looks straight ahead.
+followed by focal length and principal point. An equirectangular panorama has no principal point; the pinhole view taken
+from it looks straight ahead.
 """
 from __future__ import annotations
 
@@ -49,17 +49,18 @@ MODELS: dict[str, tuple[int, tuple[str, ...]]] = {
         (17, "EQUIRECTANGULAR", "w h"),
     )
 }
-NAMES = {number: name for name, (number, _) in MODELS.items()}
+MODEL_NAMES = {number: name for name, (number, _) in MODELS.items()}
 PINHOLES = frozenset({"SIMPLE_PINHOLE", "PINHOLE"})
 
-WIDEST = math.tan(math.radians(60.0))  # half diagonal kept of a fisheye; past it a plane stretches too far
+MAX_TAN_HALF_ANGLE = math.tan(math.radians(60.0))
+"""Half diagonal that is kept of a fisheye, normalised coordinates; beyond it a plane stretches too far."""
 
 Parameters = dict[str, float]
 
 
 @dataclass(frozen=True, eq=False)
 class Lens:
-    """A COLMAP camera model, its parameters in COLMAP's order, and the size in pixels they are for."""
+    """A COLMAP camera model, its parameters in COLMAP's order, and their image size in pixels."""
 
     model: str
     params: tuple[float, ...]
@@ -67,14 +68,14 @@ class Lens:
     height: int
 
     @property
-    def named(self) -> Parameters:
+    def parameters(self) -> Parameters:
         """The parameters by name."""
         return dict(zip(MODELS[self.model][1], self.params, strict=True))
 
     @property
     def focal(self) -> tuple[float, float]:
         """(fx, fy) in pixels."""
-        named = self.named
+        named = self.parameters
         if self.model == "EQUIRECTANGULAR":
             return self.width / (2 * math.pi), self.height / math.pi
         return named.get("fx", named.get("f", 0.0)), named.get("fy", named.get("f", 0.0))
@@ -82,18 +83,18 @@ class Lens:
     @property
     def centre(self) -> tuple[float, float]:
         """(cx, cy), the principal point in pixels."""
-        named = self.named
+        named = self.parameters
         return named.get("cx", self.width / 2), named.get("cy", self.height / 2)
 
     def distort(self, plane: ArrayLike) -> Floats:
-        """Directions (n, 2) as X/Z and Y/Z to pixels (n, 2); NaN where the model has no image."""
+        """Map directions (n, 2) as X/Z and Y/Z to pixels (n, 2); NaN where the model has no image."""
         x, y = np.asarray(plane, np.float64).reshape(-1, 2).T
         with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-            bent = _EQUATIONS[self.model](x, y, self.named)
+            bent = _EQUATIONS[self.model](x, y, self.parameters)
         return np.stack(bent, axis=1) * self.focal + self.centre
 
     def undistort(self, pixels: ArrayLike) -> Floats:
-        """Pixels (n, 2) to directions (n, 2) as X/Z and Y/Z: `distort` inverted by Newton's method.
+        """Map pixels (n, 2) to directions (n, 2) as X/Z and Y/Z: inverts `distort` by Newton's method.
 
         NaN where no direction within 89 degrees of the axis leads to the pixel.
         """
@@ -124,34 +125,34 @@ class Lens:
 
     @cached_property
     def pinhole(self) -> tuple[float, float, float, float]:
-        """(fx, fy, cx, cy) of the undistorted view: same size and principal point, and the widest view in
-        which every pixel comes from inside the frame, up to 60 degrees off the axis in the corners.
+        """(fx, fy, cx, cy) of the undistorted view: same size and principal point, and the widest view that the frame
+        covers.
 
-        Raises CaptureError where the parameters bend the picture so that no such view exists.
+        At most 60 degrees off the axis in the corners. Raises CaptureError where the distortion leaves no such view.
         """
         (fx, fy), (cx, cy) = self.focal, self.centre
         if self.model in PINHOLES:
             return fx, fy, cx, cy
         border = self.border - (cx, cy)
-        zoom_cap = float(np.linalg.norm(border / (fx, fy), axis=1).max()) / WIDEST
+        zoom_cap = float(np.linalg.norm(border / (fx, fy), axis=1).max()) / MAX_TAN_HALF_ANGLE
         widest, narrowest = max(zoom_cap, 0.05), 20.0
-        if not (fx > 0 and fy > 0) or not self._filled(border / (fx, fy) / narrowest):
+        if not (fx > 0 and fy > 0) or not self._is_covered(border / (fx, fy) / narrowest):
             raise CaptureError(f"The lens parameters {self.params} ({self.model}) bend the picture until "
                                "nothing is left of it; solve the cameras again with a simpler model.")
-        if self._filled(border / (fx, fy) / widest):
+        if self._is_covered(border / (fx, fy) / widest):
             zoom = widest
-        elif self._filled(border / (fx, fy)) and not self._filled(border / (fx, fy) / 0.9999):
+        elif self._is_covered(border / (fx, fy)) and not self._is_covered(border / (fx, fy) / 0.9999):
             zoom = 1.0
         else:
             low, high = widest, narrowest
             while high / low > 1 + 1e-7:
                 middle = math.sqrt(low * high)
-                low, high = (low, middle) if self._filled(border / (fx, fy) / middle) else (middle, high)
+                low, high = (low, middle) if self._is_covered(border / (fx, fy) / middle) else (middle, high)
             zoom = high
         return fx * zoom, fy * zoom, cx, cy
 
     def maps(self, camera: Camera) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """For `cv2.remap`: where in the distorted frame each pixel of `camera`'s view comes from.
+        """Return the maps for `cv2.remap`: the pixel of the distorted frame for each pixel of `camera`'s view.
 
         `camera` may be of another size than the lens; the distorted frame is then of that size too.
         """
@@ -162,25 +163,25 @@ class Lens:
         return np.ascontiguousarray(source[..., 0]), np.ascontiguousarray(source[..., 1])
 
     @property
-    def bend(self) -> float:
-        """The largest distance, in pixels, between where the lens and where a pinhole puts a border point."""
+    def max_distortion_px(self) -> float:
+        """Largest distance, in pixels, between the lens's and a pinhole's image of a border point."""
         plane = (self.border - self.centre) / self.focal
         straight = plane * self.focal + self.centre
         return float(np.nan_to_num(np.linalg.norm(self.distort(plane) - straight, axis=1), nan=np.inf).max())
 
     @property
     def border(self) -> Floats:
-        """Points (n, 2) along the edge of the frame."""
+        """Points (n, 2) along the edge of the frame, pixels."""
         t = np.linspace(0.0, 1.0, 33)
         x, y, zero, one = t * self.width, t * self.height, np.zeros(33), np.ones(33)
         return np.concatenate([np.stack(side, axis=1) for side in (
             (x, zero), (x, one * self.height), (zero, y), (one * self.width, y))])
 
-    def _filled(self, border: Floats) -> bool:
-        """Whether a view with this border (n, 2), as X/Z and Y/Z, comes from inside the frame everywhere.
+    def _is_covered(self, border: Floats) -> bool:
+        """True if the frame covers a view with this border (n, 2), as X/Z and Y/Z.
 
-        The distance from the centre must grow along the way to the border: a polynomial that folds back
-        shows the frame a second time, mirrored.
+        The distance from the centre must grow along the way to the border: a polynomial that folds back shows the frame
+        a second time, mirrored.
         """
         steps = np.linspace(0.0, 1.0, 17)[1:, None, None]
         pixels = self.distort((steps * border).reshape(-1, 2)).reshape(16, -1, 2)
@@ -190,8 +191,8 @@ class Lens:
         return bool(inside.all() and (np.diff(reach, axis=0) > 0)[:, away].all())
 
 
-def straightened(picture: Picture, maps: tuple[NDArray[np.float32], NDArray[np.float32]]) -> Picture:
-    """A distorted picture as the camera sees it whose `Lens.maps` these are."""
+def undistort_picture(picture: Picture, maps: tuple[NDArray[np.float32], NDArray[np.float32]]) -> Picture:
+    """Remap a distorted picture by `Lens.maps`."""
     import cv2
 
     # Cubic is sharper, but rings where linear light steps from 1 to 100.
@@ -200,12 +201,12 @@ def straightened(picture: Picture, maps: tuple[NDArray[np.float32], NDArray[np.f
     return Picture(np.clip(pixels, 0.0, 1.0) if picture.encoding == "srgb" else pixels, picture.encoding)
 
 
-def _brown(x: Floats, y: Floats, p: Parameters, above: str, below: str = "") -> tuple[Floats, Floats]:
-    """Radial polynomial (k's of `above` over those of `below`), tangential p1 p2, thin prism sx sy."""
+def _brown(x: Floats, y: Floats, p: Parameters, numerator: str, denominator: str = "") -> tuple[Floats, Floats]:
+    """Radial polynomial (coefficients `numerator` over `denominator`), tangential p1 p2, thin prism sx sy."""
     r2 = x * x + y * y
-    radial = _series(r2, [p.get(name, 0.0) for name in above.split()])
-    if below:
-        radial = radial / _series(r2, [p.get(name, 0.0) for name in below.split()])
+    radial = _series(r2, [p.get(name, 0.0) for name in numerator.split()])
+    if denominator:
+        radial = radial / _series(r2, [p.get(name, 0.0) for name in denominator.split()])
     p1, p2, sx, sy = (p.get(name, 0.0) for name in ("p1", "p2", "sx", "sy"))
     return (x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x) + sx * r2,
             y * radial + 2 * p2 * x * y + p1 * (r2 + 2 * y * y) + sy * r2)
@@ -228,7 +229,7 @@ def _perspective(x: Floats, y: Floats, p: Parameters) -> tuple[Floats, Floats]:
 
 
 def _equidistant(x: Floats, y: Floats) -> tuple[Floats, Floats]:
-    """Directions to the plane on which the distance from the centre is the angle."""
+    """Map directions to the plane on which the distance from the centre is the angle."""
     r = np.sqrt(x * x + y * y)
     ratio = np.where(r > 1e-8, np.arctan(r) / np.maximum(r, 1e-8), 1.0)
     return x * ratio, y * ratio
@@ -239,7 +240,7 @@ def _fisheye(x: Floats, y: Floats, p: Parameters) -> tuple[Floats, Floats]:
 
 
 def _project_aria(x: Floats, y: Floats, p: Parameters) -> tuple[Floats, Floats]:
-    """Radial terms first, then tangential and prism terms of the result ("FISHEYE624" of Project Aria)."""
+    """Apply radial terms first, then tangential and prism terms of the result ("FISHEYE624" of Project Aria)."""
     x, y = _equidistant(x, y)
     radial = _series(x * x + y * y, [p[f"k{i}"] for i in range(1, 7)])
     x, y = x * radial, y * radial

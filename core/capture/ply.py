@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Point clouds in PLY, ASCII or binary: the x y z and red green blue of the `vertex` element."""
+"""Reads point clouds in PLY, ASCII or binary: x y z and red green blue of the `vertex` element."""
 from __future__ import annotations
 
 from pathlib import Path
@@ -12,7 +12,7 @@ from .colmap import PointCloud
 
 
 def read_points(path: Path) -> PointCloud:
-    """Read a point cloud; grey where it has no colours. CaptureError where the file is no such thing."""
+    """Read a point cloud; grey where it has no colours. Raises CaptureError where the file is no point cloud."""
     try:
         data = path.read_bytes()
     except OSError as problem:
@@ -28,16 +28,16 @@ def read_points(path: Path) -> PointCloud:
     except ValueError as problem:
         raise CaptureError(f"{path} has the vertex property {problem}, not a plain number.") from problem
     names = [name for name, _ in layout]
-    if header.form not in ply.ORDERS or not {"x", "y", "z"} <= set(names) or len(set(names)) < len(names):
+    if header.format not in ply.BYTE_ORDERS or not {"x", "y", "z"} <= set(names) or len(set(names)) < len(names):
         raise CaptureError(f"{path} is not a PLY file of points with x, y and z.")
     try:
-        if header.form == "ascii":
+        if header.format == "ascii":
             lines = data[header.start:].split(b"\n", number)[:number]
             table = np.array([tuple(map(float, line.split())) for line in lines], [(name, "f8") for name in names])
             if len(table) < number:
                 raise ValueError
         else:
-            table = ply.table(data, vertices.row(ply.ORDERS[header.form]), number, header.start)
+            table = ply.read_table(data, vertices.row(ply.BYTE_ORDERS[header.format]), number, header.start)
     except ValueError as problem:
         raise CaptureError(f"{path} is truncated or damaged; export it again.") from problem
     with np.errstate(over="ignore"):  # told below

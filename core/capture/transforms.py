@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""nerfstudio's and instant-ngp's `transforms.json`.
+"""Reads nerfstudio's and instant-ngp's `transforms.json`.
 
-Poses are camera to world with OpenGL axes (x right, y up, z backward). The file's `applied_transform`
-says what was done to poses and to the point cloud of `ply_file_path` when they were written, so the world
-of the file is the world of the capture; points from a COLMAP model beside it still need it.
+Poses are camera to world with OpenGL axes (x right, y up, z backward). `applied_transform` is already in the poses and
+in the point cloud of `ply_file_path`, so the world of the file is the world of the capture; points of a COLMAP model
+beside it still need it.
 """
 from __future__ import annotations
 
@@ -16,26 +16,26 @@ import numpy as np
 from ..errors import CaptureError
 from ..images.listing import SUFFIXES
 from ..images.size import picture_size
-from ..system.files import inside, read_json
+from ..system.files import read_json, safe_join
 from .camera import Floats, is_rotation
-from .colmap import SENSELESS, PointCloud, Posed, check_lens, find_model, read_model
+from .colmap import MAX_MAGNITUDE, PointCloud, PosedFrame, check_lens, find_model, read_model
 from .lens import Lens
 from .ply import read_points
 
 FILE = "transforms.json"
 
 
-def read_transforms(folder: Path) -> tuple[list[Posed], PointCloud]:
-    """Poses and points of a capture; the names are paths below `folder`.
+def read_transforms(folder: Path) -> tuple[list[PosedFrame], PointCloud]:
+    """Read poses and points of a capture; the names are paths below `folder`.
 
-    Raises CaptureError, naming the file and the frame, where something is missing or makes no sense.
+    Raises CaptureError, naming the file and the frame, where something is missing or invalid.
     """
     path = folder / FILE
     meta = read_json(path, CaptureError)
     frames = meta.get("frames") if isinstance(meta, dict) else None
     if not isinstance(frames, list) or not frames:
         raise CaptureError(f"{path} holds no frames; export it again.")
-    posed: list[Posed] = []
+    posed: list[PosedFrame] = []
     lenses: dict[tuple[object, ...], Lens] = {}  # one object for frames of one lens: its maps are shared
     for number, frame in enumerate(frames):
         name = frame.get("file_path") if isinstance(frame, dict) else None
@@ -43,16 +43,16 @@ def read_transforms(folder: Path) -> tuple[list[Posed], PointCloud]:
             raise CaptureError(f"{path}, frame {number}: file_path is missing; export it again.")
         where = f"{path}, {name}:"
         name = _with_suffix(folder, name)
-        lens = _lens({**meta, **frame}, folder, name, where)
+        lens = _read_lens({**meta, **frame}, folder, name, where)
         lens = lenses.setdefault((lens.model, lens.params, lens.width, lens.height), lens)
-        posed.append(Posed(name, lens, _pose(frame, where)))
-    return posed, _points(folder, meta)
+        posed.append(PosedFrame(name, lens, _read_pose(frame, where)))
+    return posed, _read_points(folder, meta)
 
 
 def _with_suffix(folder: Path, name: str) -> str:
-    """The path of a frame below the folder; NeRF's synthetic scenes leave its suffix out."""
+    """Return the path of a frame below the folder; NeRF's synthetic scenes leave its suffix out."""
     name = Path(name.replace("\\", "/")).as_posix()  # drops a leading "./"
-    path = inside(folder, name, CaptureError)
+    path = safe_join(folder, name, CaptureError)
     if path.suffix.lower() not in SUFFIXES:
         for suffix in sorted(SUFFIXES):
             if path.with_name(path.name + suffix).is_file():
@@ -60,29 +60,30 @@ def _with_suffix(folder: Path, name: str) -> str:
     return name
 
 
-def _number(meta: dict[str, Any], key: str, where: str, default: float | None = None) -> float:
+def _parse_number(meta: dict[str, Any], key: str, where: str, default: float | None = None) -> float:
     value = meta.get(key, default)
-    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < SENSELESS:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < MAX_MAGNITUDE:
         raise CaptureError(f"{where} {key} should be a finite number, not {value!r:.40}; correct it or export the file "
                            "again.")
     return float(value)
 
 
-def _lens(meta: dict[str, Any], folder: Path, name: str, where: str) -> Lens:
+def _read_lens(meta: dict[str, Any], folder: Path, name: str, where: str) -> Lens:
     if "w" in meta or "h" in meta:
-        width, height = int(_number(meta, "w", where)), int(_number(meta, "h", where))
+        width, height = int(_parse_number(meta, "w", where)), int(_parse_number(meta, "h", where))
     else:
-        width, height = picture_size(inside(folder, name, CaptureError))
+        width, height = picture_size(safe_join(folder, name, CaptureError))
     if "fl_x" in meta:
-        fx = _number(meta, "fl_x", where)
+        fx = _parse_number(meta, "fl_x", where)
     else:
-        fx = _focal(_number(meta, "camera_angle_x", where), width, where)
+        fx = _focal_length(_parse_number(meta, "camera_angle_x", where), width, where)
     if "fl_y" in meta:
-        fy = _number(meta, "fl_y", where)
+        fy = _parse_number(meta, "fl_y", where)
     else:
-        fy = _focal(_number(meta, "camera_angle_y", where), height, where) if "camera_angle_y" in meta else fx
-    cx, cy = _number(meta, "cx", where, width / 2), _number(meta, "cy", where, height / 2)
-    k1, k2, k3, k4, p1, p2 = (_number(meta, key, where, 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
+        has_angle = "camera_angle_y" in meta
+        fy = _focal_length(_parse_number(meta, "camera_angle_y", where), height, where) if has_angle else fx
+    cx, cy = _parse_number(meta, "cx", where, width / 2), _parse_number(meta, "cy", where, height / 2)
+    k1, k2, k3, k4, p1, p2 = (_parse_number(meta, key, where, 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
     kind = meta.get("camera_model", "OPENCV")
     if kind in ("OPENCV_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE") or meta.get("is_fisheye"):
         # The fisheye polynomial with every coefficient.
@@ -100,19 +101,19 @@ def _lens(meta: dict[str, Any], folder: Path, name: str, where: str) -> Lens:
     return check_lens(lens, where)
 
 
-def _focal(angle: float, size: int, where: str) -> float:
+def _focal_length(angle: float, size: int, where: str) -> float:
     if not 0 < angle < math.pi:
         raise CaptureError(f"{where} a field of view of {angle:g} radians makes no sense; it lies between 0 and pi.")
     return 0.5 * size / math.tan(0.5 * angle)
 
 
-def _matrix(value: Any, where: str, what: str) -> Floats:
-    """(4, 4) from nested lists of 3 or 4 rows of 4 numbers."""
+def _parse_matrix(value: Any, where: str, what: str) -> Floats:
+    """Parse (4, 4) from nested lists of 3 or 4 rows of 4 numbers. Raises CaptureError."""
     try:
         matrix = np.asarray(value, np.float64)
     except (TypeError, ValueError):
         matrix = np.zeros(0)
-    if matrix.shape not in ((3, 4), (4, 4)) or not (np.abs(matrix) < SENSELESS).all():
+    if matrix.shape not in ((3, 4), (4, 4)) or not (np.abs(matrix) < MAX_MAGNITUDE).all():
         raise CaptureError(f"{where} {what} should be 4 rows of 4 finite numbers of a sensible size; export the file "
                            "again.")
     full = np.eye(4)
@@ -120,9 +121,9 @@ def _matrix(value: Any, where: str, what: str) -> Floats:
     return full
 
 
-def _pose(frame: dict[str, Any], where: str) -> Floats:
-    """world_to_camera with OpenCV axes, of camera_to_world with OpenGL axes."""
-    pose = _matrix(frame.get("transform_matrix"), where, "transform_matrix")
+def _read_pose(frame: dict[str, Any], where: str) -> Floats:
+    """Return world_to_camera with OpenCV axes from camera_to_world with OpenGL axes. Raises CaptureError."""
+    pose = _parse_matrix(frame.get("transform_matrix"), where, "transform_matrix")
     rotation = pose[:3, :3]
     if not is_rotation(rotation):
         raise CaptureError(f"{where} transform_matrix is not a rotation and a translation; export the file again.")
@@ -134,10 +135,10 @@ def _pose(frame: dict[str, Any], where: str) -> Floats:
     return inverse
 
 
-def _points(folder: Path, meta: dict[str, Any]) -> PointCloud:
+def _read_points(folder: Path, meta: dict[str, Any]) -> PointCloud:
     name = meta.get("ply_file_path")
     if isinstance(name, str):
-        path = inside(folder, Path(name).as_posix(), CaptureError)
+        path = safe_join(folder, Path(name).as_posix(), CaptureError)
         if not path.is_file():
             raise CaptureError(f"{path} is missing, which {folder / FILE} names as its points.")
         return read_points(path)
@@ -145,6 +146,6 @@ def _points(folder: Path, meta: dict[str, Any]) -> PointCloud:
     if model is None:
         return PointCloud.empty()
     _, points = read_model(model)
-    applied = _matrix(meta.get("applied_transform", np.eye(4).tolist()), f"{folder / FILE}:", "applied_transform")
+    applied = _parse_matrix(meta.get("applied_transform", np.eye(4).tolist()), f"{folder / FILE}:", "applied_transform")
     moved = points.xyz.astype(np.float64) @ applied[:3, :3].T + applied[:3, 3]
     return PointCloud(moved.astype(np.float32), points.rgb, points.error)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Any space of an OpenColorIO configuration, by PyOpenColorIO: the package `opencolorio`, or Blender's own."""
+"""Colour spaces of OpenColorIO configurations, by PyOpenColorIO: the package `opencolorio`, or Blender's own."""
 from __future__ import annotations
 
 import importlib
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ..errors import EngineError, SettingsError
 from .spaces import REC_709, ColourSpace, colour_space, linear_space
-from .spaces import names as built_in_names
+from .spaces import built_in_names as built_in_names
 
 CONFIGURED_NAMES = {
     "linear": ("lin_rec709_scene", "lin_rec709", "Linear Rec.709 (sRGB)", "Linear Rec.709", "Utility - Linear - sRGB",
@@ -25,27 +25,28 @@ CONFIGURED_NAMES = {
     "rec2020": ("lin_rec2020_scene", "lin_rec2020", "Linear Rec.2020", "Utility - Linear - Rec.2020"),
     "p3-d65": ("lin_p3d65_scene", "lin_p3d65", "Linear P3-D65", "Linear DCI-P3 D65", "Utility - Linear - P3-D65"),
 }
-"""What configurations call the scene-linear spaces of ours."""
+"""Names that configurations use for the built-in linear spaces."""
 _BUILT_IN = "ocio://default"
 
 
-def configured() -> bool:
-    """Whether the variable OCIO names a configuration."""
+def has_configuration() -> bool:
+    """True if the variable OCIO names a configuration."""
     return bool(os.environ.get("OCIO"))
 
 
 def ocio_space(name: str, config: Path | str | None) -> ColourSpace:
-    """The space `name` of a configuration: a file, "ocio://…" for one of the library's own, None for the variable OCIO.
+    """Return the space `name` of a configuration: a file, "ocio://..." for one of the library's own, None for OCIO.
 
-    A space that OpenColorIO calls linear comes as a matrix. Raises SettingsError for a configuration that cannot
-    be read or lacks the space, EngineError where the library is not installed.
+    A space that OpenColorIO calls linear comes as a matrix. Raises SettingsError for a configuration that cannot be
+    read or lacks the space, EngineError where the library is not installed.
     """
     library = _library()
     where = str(config or os.environ.get("OCIO") or _BUILT_IN)
     try:
         opened = library.Config.CreateFromFile(where)
     except Exception as problem:  # its own class, which exists only where it is installed
-        raise SettingsError(f"The OpenColorIO configuration {where} cannot be read ({_short(problem)}).") from problem
+        raise SettingsError(f"The OpenColorIO configuration {where} cannot be read ({_one_line(problem)}); choose another "
+                            "file.") from problem
     found = opened.getColorSpace(name)
     if found is None:
         if name.lower() in built_in_names():
@@ -53,16 +54,17 @@ def ocio_space(name: str, config: Path | str | None) -> ColourSpace:
         raise SettingsError(f"The OpenColorIO configuration {where} has no colour space {name!r}; it has "
                             f"{', '.join(list(opened.getColorSpaceNames())[:12])}, …")
     if opened.isColorSpaceLinear(name, library.REFERENCE_SPACE_SCENE):
-        there = _processor(library, opened, name, forward=True)
-        matrix = _apply(there, np.eye(3, dtype=np.float32)).T.astype(np.float64)
-        known = _known(found)
+        processor = _processor(library, opened, name, forward=True)
+        matrix = _apply_processor(processor, np.eye(3, dtype=np.float32)).T.astype(np.float64)
+        known = _built_in_space(found)
         return linear_space(name, matrix, known.chromaticities if known else _chromaticities(matrix))
-    there, back = (_processor(library, opened, name, forward=forward) for forward in (True, False))
-    return ColourSpace(name, lambda pixels: _apply(there, pixels), lambda pixels: _apply(back, pixels))
+    forward, inverse = (_processor(library, opened, name, forward=is_forward) for is_forward in (True, False))
+    return ColourSpace(name, lambda pixels: _apply_processor(forward, pixels),
+                       lambda pixels: _apply_processor(inverse, pixels))
 
 
 def _library() -> ModuleType:
-    """PyOpenColorIO; Blender as a Python module keeps its own where only Blender looks."""
+    """Import PyOpenColorIO; as a Python module Blender keeps its own where only Blender looks."""
     if importlib.util.find_spec("PyOpenColorIO"):
         return importlib.import_module("PyOpenColorIO")
     blender = sys.modules.get("bpy")
@@ -79,29 +81,29 @@ def _library() -> ModuleType:
 
 
 def _processor(library: ModuleType, config: Any, name: str, *, forward: bool) -> Any:
-    """From the space to linear Rec. 709, or back."""
-    own = next((one for one in CONFIGURED_NAMES["linear"] if config.getColorSpace(one) is not None), None)
+    """Return the processor from the space to linear Rec. 709 (`forward`), or back."""
+    linear = next((name for name in CONFIGURED_NAMES["linear"] if config.getColorSpace(name) is not None), None)
     try:
-        if own is not None:
-            made = config.getProcessor(name, own) if forward else config.getProcessor(own, name)
+        if linear is not None:
+            processor = config.getProcessor(name, linear) if forward else config.getProcessor(linear, name)
         elif forward:
-            made = library.Config.GetProcessorToBuiltinColorSpace(config, name, "lin_rec709_scene")
+            processor = library.Config.GetProcessorToBuiltinColorSpace(config, name, "lin_rec709_scene")
         else:
-            made = library.Config.GetProcessorFromBuiltinColorSpace("lin_rec709_scene", config, name)
-        return made.getDefaultCPUProcessor()
+            processor = library.Config.GetProcessorFromBuiltinColorSpace("lin_rec709_scene", config, name)
+        return processor.getDefaultCPUProcessor()
     except Exception as problem:
-        raise SettingsError(f"OpenColorIO knows no way between {name!r} and linear Rec. 709 in this configuration "
-                            f"({_short(problem)}).") from problem
+        raise SettingsError(f"OpenColorIO cannot convert between {name!r} and linear Rec. 709 in this configuration "
+                            f"({_one_line(problem)}).") from problem
 
 
-def _apply(processor: Any, pixels: NDArray[Any]) -> NDArray[np.float32]:
+def _apply_processor(processor: Any, pixels: NDArray[Any]) -> NDArray[np.float32]:
     values = np.array(pixels, np.float32, order="C")
     processor.applyRGB(values.reshape(-1, 3))
     return values
 
 
-def _known(space: Any) -> ColourSpace | None:
-    """The space of ours that it is, by one of its names."""
+def _built_in_space(space: Any) -> ColourSpace | None:
+    """Return the built-in space that has one of this space's names, or None."""
     for name in (space.getName(), *space.getAliases()):
         plain = name.lower().replace("aces - ", "").strip()
         if plain in ("acescg", "aces2065-1"):
@@ -110,7 +112,7 @@ def _known(space: Any) -> ColourSpace | None:
 
 
 def _chromaticities(matrix: NDArray[np.float64]) -> tuple[float, float, float, float, float, float, float, float]:
-    """Primaries as Rec. 709's white sees them, where nothing better is known."""
+    """Derive primaries from a matrix, with the white of Rec. 709, where nothing better is known."""
     from .spaces import matrix_to_xyz
 
     xyz = matrix_to_xyz(REC_709) @ matrix
@@ -119,5 +121,5 @@ def _chromaticities(matrix: NDArray[np.float64]) -> tuple[float, float, float, f
     return (flat[0], flat[1], flat[2], flat[3], flat[4], flat[5], flat[6], flat[7])
 
 
-def _short(problem: Exception) -> str:
+def _one_line(problem: Exception) -> str:
     return " ".join(str(problem).split())[:200].rstrip(".")

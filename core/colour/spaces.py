@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Colour spaces by name, as primaries and a curve.
+"""Colour spaces by name, as primaries and a transfer curve.
 
-White points are adapted by Bradford's matrix, as ACES and ICC do. Curves go on above 1 and are mirrored below
-0, so that no light is lost on the way.
+White points are adapted by Bradford's matrix, as in ACES and ICC. Curves continue above 1 and are mirrored below 0, so
+that no light is lost.
 """
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from ..errors import SettingsError
 from .srgb import Pixels, linear_from_srgb, srgb_from_linear
 
 Chromaticities = tuple[float, float, float, float, float, float, float, float]
-"""x and y of red, green, blue and white, as OpenEXR's attribute has them."""
+"""x and y of red, green, blue and white, in the order of OpenEXR's attribute."""
 Curve = Callable[[NDArray[Any]], Pixels]
 
 REC_709: Chromaticities = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
@@ -29,15 +29,17 @@ REC_2020: Chromaticities = (0.708, 0.292, 0.170, 0.797, 0.131, 0.046, 0.3127, 0.
 P3_D65: Chromaticities = (0.680, 0.320, 0.265, 0.690, 0.150, 0.060, 0.3127, 0.3290)
 
 _BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
-_SAME = 2e-3  # primaries this near are one space: headers round them
+CHROMATICITY_TOLERANCE = 2e-3
+"""Difference below which primaries count as equal: headers round them."""
 
 
 @dataclass(frozen=True, eq=False)
 class ColourSpace:
-    """to_linear, from_linear: pixels (…, 3) to and from scene-linear Rec. 709, float32.
+    """A colour space relative to scene-linear Rec. 709.
 
-    matrix: (3, 3) to linear Rec. 709, of a space that is linear; None for one with a curve. chromaticities: for the
-    header of a file, where they are known.
+    to_linear, from_linear: convert pixels (..., 3) to and from scene-linear Rec. 709, float32. matrix: (3, 3) to linear
+    Rec. 709, of a linear space; None for one with a curve. chromaticities: for the header of a file, where they are
+    known.
     """
 
     name: str
@@ -48,17 +50,19 @@ class ColourSpace:
 
     @property
     def is_linear(self) -> bool:
-        """Whether light adds in it."""
+        """True if light adds in this space."""
         return self.matrix is not None
 
     @property
-    def meaning(self) -> str:
-        """A short text that changes with what it does to colours: configurations may have other spaces under one name,
-        and a file may be another tomorrow."""
+    def fingerprint(self) -> str:
+        """A short hash of what the space does to colours.
+
+        Configurations may give one name to different spaces, and a file may change.
+        """
         levels = np.array([0.02, 0.18, 0.9], np.float32)
         colours = np.stack(np.meshgrid(levels, levels, levels), -1).reshape(-1, 3)
-        told = np.concatenate([self.to_linear(colours), self.from_linear(colours)]).ravel()
-        digits = " ".join(f"{value:.3g}" for value in told)  # what machines differ in is not among them
+        samples = np.concatenate([self.to_linear(colours), self.from_linear(colours)]).ravel()
+        digits = " ".join(f"{value:.3g}" for value in samples)  # digits that machines agree on
         return hashlib.blake2b(digits.encode(), digest_size=8).hexdigest()
 
 
@@ -70,7 +74,7 @@ def matrix_to_xyz(chromaticities: Chromaticities) -> NDArray[np.float64]:
 
 
 def matrix_between(source: Chromaticities, target: Chromaticities) -> NDArray[np.float64]:
-    """(3, 3) from one linear R, G, B to another, the white adapted."""
+    """(3, 3) from one linear R, G, B to another, with the white point adapted."""
     first, second = (_BRADFORD @ _white(space) for space in (source, target))
     adapted = np.linalg.inv(_BRADFORD) @ np.diag(second / first) @ _BRADFORD
     return np.asarray(np.linalg.inv(matrix_to_xyz(target)) @ adapted @ matrix_to_xyz(source))
@@ -82,21 +86,21 @@ def _white(chromaticities: Chromaticities) -> NDArray[np.float64]:
 
 
 def linear_space(name: str, matrix: NDArray[np.float64], chromaticities: Chromaticities | None) -> ColourSpace:
-    """A linear space from its matrix to linear Rec. 709."""
+    """Make a linear space from its matrix to linear Rec. 709."""
     if np.allclose(matrix, np.eye(3), atol=1e-12):
-        return ColourSpace(name, _same, _same, np.eye(3), chromaticities)
-    there, back = matrix.T.astype(np.float32), np.linalg.inv(matrix).T.astype(np.float32)
-    return ColourSpace(name, lambda pixels: np.asarray(pixels, np.float32) @ there,
-                       lambda pixels: np.asarray(pixels, np.float32) @ back, matrix, chromaticities)
+        return ColourSpace(name, _identity, _identity, np.eye(3), chromaticities)
+    forward, inverse = matrix.T.astype(np.float32), np.linalg.inv(matrix).T.astype(np.float32)
+    return ColourSpace(name, lambda pixels: np.asarray(pixels, np.float32) @ forward,
+                       lambda pixels: np.asarray(pixels, np.float32) @ inverse, matrix, chromaticities)
 
 
 def space_of_chromaticities(chromaticities: Chromaticities) -> ColourSpace:
-    """The linear space with these primaries: one of the named ones, or of its own.
+    """Return the linear space with these primaries: a built-in one where they match, else a new one.
 
     Raises SettingsError where they span no space.
     """
     for name, known in _LINEAR.items():
-        if np.abs(np.subtract(chromaticities, known)).max() < _SAME:
+        if np.abs(np.subtract(chromaticities, known)).max() < CHROMATICITY_TOLERANCE:
             return colour_space(name)
     try:
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -111,10 +115,11 @@ def space_of_chromaticities(chromaticities: Chromaticities) -> ColourSpace:
 
 
 def colour_space(name: str, config: Path | str | None = None) -> ColourSpace:
-    """A space by name: one of `names()`, or of an OpenColorIO configuration (`config`, else the variable OCIO).
+    """Return a space by name: a built-in one, or one of an OpenColorIO configuration (`config`, else the variable
+    OCIO).
 
-    With `config` its own names come first. Raises SettingsError for a name that is not known, EngineError where
-    OpenColorIO is wanted and not installed.
+    With `config` its names come first. Raises SettingsError for an unknown name, EngineError where OpenColorIO is
+    needed and not installed.
     """
     if config is not None:
         from .ocio import ocio_space
@@ -123,25 +128,25 @@ def colour_space(name: str, config: Path | str | None = None) -> ColourSpace:
     plain = name.strip().lower().replace(" ", "").replace("_", "")
     if plain in _ALIASES:
         return _BUILT_IN[_ALIASES[plain]]()
-    from .ocio import configured, ocio_space
+    from .ocio import has_configuration, ocio_space
 
-    if not configured():
+    if not has_configuration():
         raise SettingsError(f"The colour space {name!r} is not one of {', '.join(_BUILT_IN)}; for another, name an "
                             "OpenColorIO configuration with --ocio or the variable OCIO.")
     return ocio_space(name, None)
 
 
-def names() -> list[str]:
-    """The spaces that need no configuration."""
+def built_in_names() -> list[str]:
+    """Names of the spaces that need no configuration."""
     return list(_BUILT_IN)
 
 
-def _same(pixels: NDArray[Any]) -> Pixels:
+def _identity(pixels: NDArray[Any]) -> Pixels:
     return np.asarray(pixels, np.float32)
 
 
 def _rec709_from_linear(linear: NDArray[Any]) -> Pixels:
-    """The camera's curve of ITU-R BT.709, as compositors mean it."""
+    """Encode with the camera curve of ITU-R BT.709, continued as compositors do."""
     size = np.abs(np.asarray(linear, np.float32))
     curve = 1.099 * np.power(np.maximum(size, 0.018), np.float32(0.45)) - 0.099
     return np.copysign(np.where(size < 0.018, 4.5 * size, curve), linear).astype(np.float32)

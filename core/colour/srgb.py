@@ -12,18 +12,18 @@ from numpy.typing import NDArray
 
 Pixels = NDArray[np.float32]
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
-"""Of linear Rec. 709 channels."""
+"""Weights of linear Rec. 709 channels in the luminance."""
 
 
 def srgb_from_linear(linear: NDArray[Any]) -> Pixels:
-    """IEC 61966-2-1 encoding, continued unclipped above 1 and mirrored below 0."""
+    """Encode by IEC 61966-2-1, continued unclipped above 1 and mirrored below 0."""
     size = np.abs(np.asarray(linear, np.float32))
     curve = 1.055 * np.power(np.maximum(size, 0.0031308), np.float32(1 / 2.4)) - 0.055
     return np.copysign(np.where(size <= 0.0031308, 12.92 * size, curve), linear).astype(np.float32)
 
 
 def linear_from_srgb(display: NDArray[Any]) -> Pixels:
-    """The inverse of `srgb_from_linear`."""
+    """Decode: the inverse of `srgb_from_linear`."""
     size = np.abs(np.asarray(display, np.float32))
     curve = np.power((np.maximum(size, 0.04045) + 0.055) / 1.055, np.float32(2.4))
     return np.copysign(np.where(size <= 0.04045, size / 12.92, curve), display).astype(np.float32)

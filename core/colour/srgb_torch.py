@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Display values and linear light as tensors, with gradients: the sRGB curve (IEC 61966-2-1) that `core.pictures` has
-for arrays, and what a camera makes of light, exposure and clipping."""
+"""The sRGB transfer curve (IEC 61966-2-1), exposure and clipping for tensors, with gradients.
+
+`srgb.py` has the same curve for arrays. Fits compare display values by it.
+"""
 from __future__ import annotations
 
 from typing import Any
@@ -9,43 +11,43 @@ import torch
 from torch import Tensor
 
 LINEAR_TOE, DISPLAY_TOE = 0.0031308, 0.04045
-"""Where the curve's straight beginning ends, in linear light and in display values."""
+"""End of the curve's linear segment, in linear light and in display values."""
 TOE_SLOPE = 12.92
 SCALE, OFFSET, GAMMA = 1.055, 0.055, 2.4
-"""Beyond it: display = SCALE * linear**(1 / GAMMA) - OFFSET."""
+"""The curve beyond it: display = SCALE * linear**(1 / GAMMA) - OFFSET."""
 
 
 def decode(display: Tensor) -> Tensor:
-    """sRGB display values, not negative, to linear light (IEC 61966-2-1)."""
+    """Convert sRGB display values, not negative, to linear light (IEC 61966-2-1)."""
     return torch.where(display <= DISPLAY_TOE, display / TOE_SLOPE,
                        ((display.clamp_min(DISPLAY_TOE) + OFFSET) / SCALE) ** GAMMA)
 
 
 def encode(linear: Tensor) -> Tensor:
-    """Linear light, not negative, to sRGB display values; above 1 the curve goes on."""
+    """Convert linear light, not negative, to sRGB display values, unclipped above 1."""
     return torch.where(linear <= LINEAR_TOE, linear * TOE_SLOPE,
                        SCALE * linear.clamp_min(LINEAR_TOE) ** (1 / GAMMA) - OFFSET)
 
 
-def exposed(display: Tensor, exposure: float) -> Tensor:
-    """Display values, not negative, of `exposure` times the light; above 1 the curve goes on."""
-    shown: Tensor = display if exposure == 1 else _Exposed.apply(display, exposure)
+def expose(display: Tensor, exposure: float) -> Tensor:
+    """Multiply the light of display values, not negative, by `exposure`; unclipped above 1."""
+    shown: Tensor = display if exposure == 1 else _Expose.apply(display, exposure)
     return shown
 
 
-def clipped(display: Tensor, white: float) -> Tensor:
-    """As a camera clips it, with the gradient passed on as it is: a pixel that is too bright must be able to come down
-    again."""
+def clip_straight_through(display: Tensor, white: float) -> Tensor:
+    """Clip display values at `white` with a straight-through gradient: a pixel that is too bright must be able to
+    darken."""
     return display - (display - white).clamp_min(0).detach()
 
 
-class _Exposed(torch.autograd.Function):
-    """encode(exposure * decode(display)), by the powers of which the slopes are made too."""
+class _Expose(torch.autograd.Function):
+    """encode(exposure * decode(display)); both slopes reuse the forward pass's powers."""
 
     @staticmethod
     def forward(ctx: Any, display: Tensor, exposure: float) -> Tensor:
-        linear, within = decoded_with_slope(display)
-        shown, slope = encoded_with_slope(linear.mul_(exposure))
+        linear, within = decode_with_slope(display)
+        shown, slope = encode_with_slope(linear.mul_(exposure))
         ctx.save_for_backward(within.mul_(exposure).mul_(slope))
         return shown
 
@@ -54,16 +56,16 @@ class _Exposed(torch.autograd.Function):
         return gradient * ctx.saved_tensors[0], None
 
 
-def decoded_with_slope(display: Tensor) -> tuple[Tensor, Tensor]:
-    """`decode` and its slope, which the same power gives: autograd would take another. Both are the caller's own."""
+def decode_with_slope(display: Tensor) -> tuple[Tensor, Tensor]:
+    """Return `decode` and its derivative from one power. The caller owns both tensors."""
     base = (display + OFFSET) / SCALE
     power, low = base ** (GAMMA - 1), display <= DISPLAY_TOE
     linear = torch.where(low, display / TOE_SLOPE, base * power)
     return linear, power.mul_(GAMMA / SCALE).masked_fill_(low, 1 / TOE_SLOPE)
 
 
-def encoded_with_slope(linear: Tensor) -> tuple[Tensor, Tensor]:
-    """`encode` and its slope, likewise."""
+def encode_with_slope(linear: Tensor) -> tuple[Tensor, Tensor]:
+    """Return `encode` and its derivative from one power. The caller owns both tensors."""
     bright, low = linear.clamp_min(LINEAR_TOE), linear <= LINEAR_TOE
     power = bright ** (1 / GAMMA)
     shown = torch.where(low, linear * TOE_SLOPE, power * SCALE - OFFSET)

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The grid of pixels that Gaussians were learned on, and what shows them the same on another.
+"""The pixel grid that Gaussians were fitted at, and the low-pass filter that renders them alike on another grid.
 
-A rasterizer adds `DILATION` to what a Gaussian covers of the picture (3DGS's low-pass), so a fit makes its Gaussians
-that much thinner than what they show. Seen on a finer grid with the same low-pass they are too thin, on a coarser one
-too thick: a scene then breaks up or swells, and a flare loses light or gains some (Yu et al. 2024, "Mip-Splatting",
-section 3, whose filters have to be learned with). The low-pass of a fit's own grid, which is larger or smaller in
-pixels of the other, shows what the fit's own picture does.
+A rasterizer adds `DILATION` to a Gaussian's projected covariance (3DGS's low-pass filter), so a fit makes its Gaussians
+thinner by that amount. On a finer grid with the same filter they are too thin, on a coarser one too thick: a scene
+breaks up or swells, and a flare loses or gains light (Yu et al. 2024, "Mip-Splatting", section 3, whose filters need
+training with them). The filter of the fit's grid, converted to pixels of the rendered picture, reproduces the fit.
+Scenes and looks carry a `PixelGrid`; `core/gaussians` and `core/look` use `dilation`.
 """
 from __future__ import annotations
 
@@ -16,53 +16,63 @@ from typing import Any
 
 DILATION = 0.3
 """Added to the diagonal of projected covariances, px²: nothing is thinner than about half a pixel."""
-PIXEL = 1 / 12
-"""px², the variance of a pixel's own square: with less than that, thin Gaussians fall between the pixels' middles."""
-SAME = 1e-3
-"""Grids whose sizes differ by less than this share are one."""
-NEARLY = 0.95
-"""As fine as a grid has to be for what was learned on it to be rendered once, as it is."""
-MOST_PIXELS = 1 << 23
-"""Of a picture that is rendered larger than it was asked for."""
+PIXEL_VARIANCE = 1 / 12
+"""Variance of a pixel's square, px²: with a smaller filter, thin Gaussians fall between the pixel centres."""
+SIZE_TOLERANCE = 1e-3
+"""Relative difference of size below which two grids count as equal."""
+MIN_PIXEL_RATIO = 0.95
+"""Pixel ratio from which a scene is rendered without supersampling."""
+MAX_PIXELS = 1 << 23
+"""Largest supersampled picture."""
 
 
 @dataclass(frozen=True)
-class Sampling:
-    """least, most: focal lengths, px, of the frames that something was fitted to, at the size at which they were; they
-    differ where a lens was zoomed. ValueError where they are no such lengths."""
+class PixelGrid:
+    """The range of focal lengths, px, of the frames of a fit, at the size that it used them.
 
-    least: float
-    most: float
+    The two differ where a lens was zoomed. Raises ValueError where they are no focal lengths.
+    """
+
+    min_focal_length: float
+    max_focal_length: float
 
     def __post_init__(self) -> None:
-        if not 0 < self.least <= self.most < math.inf:
-            raise ValueError(f"no focal lengths are from {self.least} to {self.most} pixels")
+        if not 0 < self.min_focal_length <= self.max_focal_length < math.inf:
+            raise ValueError(f"no focal lengths are from {self.min_focal_length} to {self.max_focal_length} pixels")
 
     @classmethod
-    def of(cls, focal_lengths: Iterable[float]) -> Sampling:
-        """Of frames of these focal lengths, px."""
+    def from_focal_lengths(cls, focal_lengths: Iterable[float]) -> PixelGrid:
+        """The grid of frames with these focal lengths, px."""
         known = list(focal_lengths)
         return cls(min(known), max(known))
 
     @classmethod
-    def read(cls, entry: Mapping[str, Any] | None) -> Sampling | None:
-        """From the entry of a file; None where it has none. TypeError, KeyError, ValueError where it makes no sense."""
+    def read(cls, entry: Mapping[str, Any] | None) -> PixelGrid | None:
+        """Read the entry of a file; None where it has none. Raises TypeError, KeyError or ValueError if invalid."""
         return None if entry is None else cls(float(entry["least"]), float(entry["most"]))
 
-    def fineness(self, focal_length: float) -> float:
-        """How many pixels of a picture of this focal length, px, lie along one of the frames' pixels."""
-        ratio = focal_length / min(max(focal_length, self.least), self.most)
-        return 1.0 if abs(ratio - 1) < SAME else ratio
+    def to_entry(self) -> dict[str, float]:
+        """Return the entry that `read` reads."""
+        return {"least": self.min_focal_length, "most": self.max_focal_length}
 
-    def samples(self, focal_length: float, width: int, height: int) -> int:
-        """How many times as large a scene is rendered for a picture of this size that is coarser than the frames, to be
-        averaged: so many that nothing falls between its pixels, and as many as `MOST_PIXELS` leave."""
-        fineness = self.fineness(focal_length)
-        if fineness >= NEARLY:
+    def pixel_ratio(self, focal_length: float) -> float:
+        """How many pixels of a picture of this focal length, px, lie along one pixel of the fit's frames."""
+        ratio = focal_length / min(max(focal_length, self.min_focal_length), self.max_focal_length)
+        return 1.0 if abs(ratio - 1) < SIZE_TOLERANCE else ratio
+
+    def supersampling(self, focal_length: float, width: int, height: int) -> int:
+        """Return by which factor to render a picture larger and average it down; 1 where it is as fine as the frames.
+
+        A factor with which no Gaussian falls between the pixels, limited by `MAX_PIXELS`.
+        """
+        ratio = self.pixel_ratio(focal_length)
+        if ratio >= MIN_PIXEL_RATIO:
             return 1
-        return max(min(math.ceil(1 / fineness), math.isqrt(MOST_PIXELS // (width * height))), 1)
+        return max(min(math.ceil(1 / ratio), math.isqrt(MAX_PIXELS // (width * height))), 1)
 
 
-def dilation(sampling: Sampling | None, focal_length: float) -> float:
-    """The low-pass, px², for a picture of this focal length, px, of what was fitted on this grid; None: not known."""
-    return DILATION if sampling is None else max(DILATION * sampling.fineness(focal_length) ** 2, PIXEL)
+def dilation(pixel_grid: PixelGrid | None, focal_length: float) -> float:
+    """Low-pass filter, px², for a picture of this focal length, px; `DILATION` where the grid is unknown (None)."""
+    if pixel_grid is None:
+        return DILATION
+    return max(DILATION * pixel_grid.pixel_ratio(focal_length) ** 2, PIXEL_VARIANCE)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What the folder of a run holds, by name, for those who look into one where the engine itself cannot be imported."""
+"""Names of the files in a run's folder, for code that reads a run where torch cannot be imported."""
 from __future__ import annotations
 
 CONFIG = "config.toml"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The numbers of splatting that a picture is the same by, drawn with torch's kernels or with numpy alone."""
+"""Constants of splatting, shared by torch's kernels and the numpy renderer so that both draw the same picture."""
 from __future__ import annotations
 
 ALPHA_MIN = 1 / 255

@@ -1,6 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Black borders of a picture: letterboxes above and below it, pillars at its sides. They stay where they are while the
-camera moves, so they are no part of a scene, and nothing of a flare is to be seen in them."""
+"""Black borders of frames: letterboxes above and below, pillars at the sides.
+
+They stay in place while the camera moves, so they belong to no scene, and no flare is visible in them. Fits, scores and
+removal leave them out.
+"""
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
@@ -9,19 +12,21 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-DARKEST = 20 / 255
-"""Display value of a border at most: black is 16 where video levels were taken for full ones."""
-EVEN, SHARE = 4 / 255, 0.98
-"""Display value by which a border's pixels differ from its colour, and the share of a line for which that holds; the
-others, which JPEG makes beside the picture, may differ by three times as much."""
-LEAST = 2
-"""Lines of a border."""
-SMALLEST = 16
-"""Pixels each way that are left of a picture at least."""
+MAX_BORDER_LEVEL = 20 / 255
+"""Highest display value of a border: black is 16 where video levels were taken for full ones."""
+LEVEL_TOLERANCE, MIN_EVEN_SHARE = 4 / 255, 0.98
+"""Difference in display value within which a border's pixels are even, and the share of a line that must be.
+
+The other pixels, which JPEG makes next to the picture, may differ by three times as much.
+"""
+MIN_BORDER_LINES = 2
+"""Lines of the narrowest border; also the difference allowed between two facing ones."""
+MIN_AREA_SIDE = 16
+"""Smallest side, px, of the area inside the borders."""
 
 
 class Borders(NamedTuple):
-    """Lines of a picture that are even and black, from each of its sides inwards."""
+    """Number of even, black lines at each side of a picture."""
 
     top: int
     bottom: int
@@ -29,31 +34,31 @@ class Borders(NamedTuple):
     right: int
 
     @classmethod
-    def of(cls, picture: NDArray[Any], shown: Callable[[NDArray[Any]], NDArray[Any]] = np.asarray) -> Borders:
-        """Of a picture (height, width, 3). shown: makes a line's display values 0..1."""
+    def of(cls, picture: NDArray[Any], to_display: Callable[[NDArray[Any]], NDArray[Any]] = np.asarray) -> Borders:
+        """Measure the borders of a picture (height, width, 3). to_display: converts a line to display values 0..1."""
         height, width = picture.shape[:2]
-        top, bottom = _lines(lambda row: shown(picture[row]), height)
-        left, right = _lines(lambda column: shown(picture[top:height - bottom, column]), width)
+        top, bottom = _count_border_lines(lambda row: to_display(picture[row]), height)
+        left, right = _count_border_lines(lambda column: to_display(picture[top:height - bottom, column]), width)
         return cls(top, bottom, left, right)
 
-    def common(self, other: Borders) -> Borders:
-        """What both have."""
+    def intersection(self, other: Borders) -> Borders:
+        """Return the borders that both have."""
         return Borders(*map(min, self, other))
 
-    def inside(self, width: int, height: int, soft: int = 0) -> Inside:
-        """What of a picture of this size lies inside letterboxes and pillars, `soft` lines beside each left out too.
+    def area(self, width: int, height: int, margin: int = 0) -> PictureArea:
+        """Return the area inside letterboxes and pillars of a picture of this size, less `margin` lines next to each.
 
-        Those are as wide on one side as on the other: a night sky makes the one wider than it is, and is none by
-        itself.
+        Facing borders count by the narrower one: a night sky makes one of them wider, and is no border by itself.
         """
-        (top, bottom), (left, right) = (_facing(*pair) for pair in ((self.top, self.bottom), (self.left, self.right)))
-        found = Inside(top + soft * (top > 0), height - bottom - soft * (bottom > 0), left + soft * (left > 0),
-                       width - right - soft * (right > 0))
-        return found if min(found.size) >= SMALLEST else Inside(0, height, 0, width)
+        top, bottom = _symmetric(self.top, self.bottom)
+        left, right = _symmetric(self.left, self.right)
+        area = PictureArea(top + margin * (top > 0), height - bottom - margin * (bottom > 0),
+                           left + margin * (left > 0), width - right - margin * (right > 0))
+        return area if min(area.size) >= MIN_AREA_SIDE else PictureArea(0, height, 0, width)
 
 
-class Inside(NamedTuple):
-    """The rows and columns of a picture that are no border, from the first to before the last."""
+class PictureArea(NamedTuple):
+    """The rows and columns of a picture inside its borders; bottom and right are exclusive."""
 
     top: int
     bottom: int
@@ -61,8 +66,8 @@ class Inside(NamedTuple):
     right: int
 
     @property
-    def part(self) -> tuple[slice, slice]:
-        """To take it from an array."""
+    def slices(self) -> tuple[slice, slice]:
+        """Index that crops an array (height, width, ...) to the area."""
         return slice(self.top, self.bottom), slice(self.left, self.right)
 
     @property
@@ -71,33 +76,36 @@ class Inside(NamedTuple):
         return self.right - self.left, self.bottom - self.top
 
 
-def inside_borders(picture: NDArray[Any], shown: Callable[[NDArray[Any]], NDArray[Any]] = np.asarray) -> Inside:
-    """What of a picture (height, width, 3) lies inside its borders. shown: makes a line's display values 0..1."""
-    return Borders.of(picture, shown).inside(picture.shape[1], picture.shape[0])
+def find_picture_area(picture: NDArray[Any],
+                      to_display: Callable[[NDArray[Any]], NDArray[Any]] = np.asarray) -> PictureArea:
+    """Find the area inside the borders of a picture (height, width, 3). to_display: converts a line to display values
+    0..1."""
+    return Borders.of(picture, to_display).area(picture.shape[1], picture.shape[0])
 
 
-def _facing(first: int, last: int) -> tuple[int, int]:
-    """Lines of two borders that face each other, of those that are black."""
-    if min(first, last) < LEAST:
+def _symmetric(first: int, last: int) -> tuple[int, int]:
+    """Return the line counts of two facing borders, made equal where they differ; zeros where either is no border."""
+    if min(first, last) < MIN_BORDER_LINES:
         return 0, 0
-    return (first, last) if abs(first - last) <= LEAST else (min(first, last),) * 2
+    return (first, last) if abs(first - last) <= MIN_BORDER_LINES else (min(first, last),) * 2
 
 
-def _lines(line: Callable[[int], NDArray[Any]], count: int) -> tuple[int, int]:
-    """Lines that are black, from the first on and from the last back; none of a picture that is black all over."""
-    first, last = (_before_the_picture(line, order) for order in (range(count), range(count - 1, -1, -1)))
+def _count_border_lines(line: Callable[[int], NDArray[Any]], count: int) -> tuple[int, int]:
+    """Count the black lines at both ends; none in a picture that is black all over."""
+    first, last = (_count_leading_lines(line, order) for order in (range(count), range(count - 1, -1, -1)))
     return (first, last) if first + last < count else (0, 0)
 
 
-def _before_the_picture(line: Callable[[int], NDArray[Any]], order: Iterable[int]) -> int:
+def _count_leading_lines(line: Callable[[int], NDArray[Any]], order: Iterable[int]) -> int:
+    """Count the even, black lines in this order, up to the first other one."""
     colour, number = None, -1
     for number, at in enumerate(order):
         pixels = line(at)
         if colour is None:
             colour = np.median(pixels, 0)
-            if not colour.max() <= DARKEST:
+            if not colour.max() <= MAX_BORDER_LEVEL:
                 return 0
-        apart = np.abs(pixels - colour).max(-1)
-        if (apart <= EVEN).mean() < SHARE or not apart.max() <= 3 * EVEN:
+        difference = np.abs(pixels - colour).max(-1)
+        if (difference <= LEVEL_TOLERANCE).mean() < MIN_EVEN_SHARE or not difference.max() <= 3 * LEVEL_TOLERANCE:
             return number
     return number + 1

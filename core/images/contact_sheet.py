@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Pictures side by side under their names, for people to look at: (height, width, 3), display values."""
+"""Contact sheets: labelled pictures side by side, (height, width, 3), display values."""
 from __future__ import annotations
 
 from collections.abc import Sequence
@@ -8,20 +8,20 @@ import numpy as np
 
 from ..colour.srgb import Pixels
 
-GAP, HEAD = 4, 22
-"""Pixels between two pictures; of a name above one."""
+GAP, LABEL_HEIGHT = 4, 22
+"""Pixels between two pictures, and of a label above one."""
 
 
 def side_by_side(pictures: Sequence[Pixels]) -> Pixels:
-    """Pictures of one height in a row."""
+    """Place pictures of one height in a row."""
     gap = np.zeros((len(pictures[0]), GAP, 3), np.float32)
     return np.concatenate([part for picture in pictures for part in (picture, gap)][:-1], axis=1)
 
 
-def labelled(text: str, picture: Pixels) -> Pixels:
-    """A picture under a line of text."""
+def add_label(text: str, picture: Pixels) -> Pixels:
+    """Add a line of text above a picture."""
     import cv2
 
-    head = np.zeros((HEAD, picture.shape[1], 3), np.float32)
-    cv2.putText(head, text, (4, HEAD - 7), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (0.85,) * 3, 1, cv2.LINE_AA)
+    head = np.zeros((LABEL_HEIGHT, picture.shape[1], 3), np.float32)
+    cv2.putText(head, text, (4, LABEL_HEIGHT - 7), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (0.85,) * 3, 1, cv2.LINE_AA)
     return np.concatenate([head, picture])

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..colour import Chromaticities, space_of_chromaticities
-from ..colour.spaces import names as space_names
+from ..colour.spaces import built_in_names as space_names
 from ..colour.srgb import Pixels
 from ..errors import FrameError, SettingsError
 from .formats import exr_header
@@ -35,31 +35,33 @@ def channel_names(path: Path | str) -> list[str]:
     return names
 
 
-def exr_space(path: Path | str) -> str:
-    """The name of the linear space that an EXR's light is in, by its chromaticities: "linear", Rec. 709, as the format
-    has it, where it tells none; "" for one that has no name here. Raises OSError where there is no such file."""
+def exr_colour_space(path: Path | str) -> str:
+    """Return the name of the linear space of an EXR by its chromaticities; "" for one without a name here.
+
+    Without chromaticities it is "linear", Rec. 709, as the format defines. Raises OSError where the file is missing.
+    """
     with open(path, "rb") as stream:
-        told = exr_header.chromaticities(stream)
-    if told is None:
+        chromaticities = exr_header.chromaticities(stream)
+    if chromaticities is None:
         return "linear"
     try:
-        space = space_of_chromaticities(cast(Chromaticities, told)).name
+        space = space_of_chromaticities(cast(Chromaticities, chromaticities)).name
     except SettingsError:
         return ""
     return space if space in space_names() else ""
 
 
 def exr_pixel_aspect(path: Path | str) -> float:
-    """Width of an EXR's pixels by their height. Raises OSError where there is no such file."""
+    """Return the pixel aspect ratio (width / height) of an EXR. Raises OSError where the file is missing."""
     with open(path, "rb") as stream:
         return exr_header.pixel_aspect(stream)
 
 
-def exr_is_cut_off(path: Path | str) -> bool:
-    """Whether an EXR ends before its last lines, by its table of where they are. Raises OSError where there is no such
-    file."""
+def is_exr_truncated(path: Path | str) -> bool:
+    """True if an EXR ends before its last lines, by its table of line offsets. Raises OSError where the file is
+    missing."""
     with open(path, "rb") as stream:
-        return stream.read(4) == exr_header.MAGIC and exr_header.is_cut_off(stream)
+        return stream.read(4) == exr_header.MAGIC and exr_header.is_truncated(stream)
 
 
 def read_exr_header(path: Path | str) -> dict[str, Any]:
@@ -83,9 +85,11 @@ def _exr_headers(path: Path | str) -> list[dict[str, Any]]:
     return headers
 
 
-def exr_parts(path: Path) -> list[tuple[dict[str, Any], dict[str, NDArray[Any]]]]:
-    """The header and the channels, (height, width) as stored, of each part of an EXR. Raises FrameError where the file
-    is damaged: of one that is cut off the library reads no part at all."""
+def read_exr_parts(path: Path) -> list[tuple[dict[str, Any], dict[str, NDArray[Any]]]]:
+    """Read the header and the channels, (height, width) as stored, of each part of an EXR.
+
+    Raises FrameError where the file is damaged; of a truncated one the library reads no part at all.
+    """
     import OpenEXR
 
     try:
@@ -100,21 +104,24 @@ def exr_parts(path: Path) -> list[tuple[dict[str, Any], dict[str, NDArray[Any]]]
         raise FrameError(f"{path} is a deep EXR, with several values to a pixel; flatten it.")
     return parts
 
+
 _Part = TypeVar("_Part")
 
 
 def main_part(parts: Sequence[tuple[_Part, Container[str]]]) -> _Part:
-    """Of the parts of an EXR, each with the names of its channels, the first that holds a picture: others have the
-    depth, or a pass, with windows of their own. The first of all where none does."""
-    for wanted in ("RGB", "Y"):
+    """Return the first part of an EXR, given with its channel names, that holds a picture; else the first of all.
+
+    Other parts hold depth or a render pass, with windows of their own.
+    """
+    for channels in ("RGB", "Y"):
         for part, names in parts:
-            if all(name in names for name in wanted):
+            if all(name in names for name in channels):
                 return part
     return parts[0][0]
 
 
 def window_from_header(path: Path, header: Mapping[str, Any]) -> DataWindow:
-    """Of an EXR, by its header."""
+    """Read the data window from an EXR's header."""
     stored, frame = (checked_size(path, (int(high[0]) - int(low[0]) + 1, int(high[1]) - int(low[1]) + 1))
                      for low, high in (header["dataWindow"], header["displayWindow"]))
     (x, y), (left, top) = header["dataWindow"][0], header["displayWindow"][0]
@@ -122,8 +129,8 @@ def window_from_header(path: Path, header: Mapping[str, Any]) -> DataWindow:
     return DataWindow(stored, (int(x) - int(left), int(y) - int(top)), frame, aspect)
 
 
-def window_of(path: Path | str) -> DataWindow:
-    """Where a picture's pixels lie on its frame: only EXRs have others than those of the frame. Raises FrameError."""
+def read_data_window(path: Path | str) -> DataWindow:
+    """Read where a picture's stored pixels lie on its frame; only EXRs can differ from the frame. Raises FrameError."""
     path = Path(path)
     size = picture_size(path)
     if path.suffix.lower() != ".exr":
@@ -134,21 +141,22 @@ def window_of(path: Path | str) -> DataWindow:
 
 
 def read_exr(path: Path | str) -> dict[str, Pixels]:
-    """Every channel of every part of an EXR, by name, as (height, width) float32; of two parts with channels of one
-    name (left and right eye, passes of a renderer) the first counts.
+    """Read every channel of every part of an EXR, by name, as (height, width) float32.
 
-    Raises FrameError where the file is damaged or holds NaN or infinity.
+    Of two parts with a channel of one name (left and right eye, render passes) the first counts. Raises FrameError
+    where the file is damaged or holds NaN or infinity.
     """
     path = Path(path)
     picture_size(path)
     channels: dict[str, NDArray[Any]] = {}
-    for _, of_part in exr_parts(path):
+    for _, of_part in read_exr_parts(path):
         for name, pixels in of_part.items():
             channels.setdefault(name, pixels)
-    return {name: _finite(path, name, pixels) for name, pixels in channels.items()}
+    return {name: _check_finite(path, name, pixels) for name, pixels in channels.items()}
 
 
-def _finite(path: Path, name: str, channel: NDArray[Any]) -> Pixels:
+def _check_finite(path: Path, name: str, channel: NDArray[Any]) -> Pixels:
+    """Return a channel as float32. Raises FrameError for NaN and infinity."""
     values = np.asarray(channel, np.float32)
     if not np.isfinite(values).all():
         raise FrameError(f"{path} holds values in channel {name} that are not finite; clean it first.")
@@ -156,24 +164,25 @@ def _finite(path: Path, name: str, channel: NDArray[Any]) -> Pixels:
 
 
 def rgb_channels(path: Path, channels: Mapping[str, NDArray[Any]]) -> Pixels:
+    """Stack R, G and B, or Y three times, to (height, width, 3). Raises FrameError where neither exists."""
     names = "RGB" if all(name in channels for name in "RGB") else "YYY" if "Y" in channels else ""
     if not names:
         raise missing_rgb(path, channels)
-    return np.stack([_finite(path, name, channels[name]) for name in names], axis=-1)
+    return np.stack([_check_finite(path, name, channels[name]) for name in names], axis=-1)
 
 
 def missing_rgb(path: Path, channels: Iterable[str]) -> FrameError:
-    """Of an EXR that has other channels alone."""
+    """Make the error for an EXR without R, G, B or Y."""
     return FrameError(f"{path} has no R, G, B channels at its root (it has {', '.join(sorted(channels))}); export the "
                       "picture under those names.")
 
 
 def rec709_pixels(path: Path, pixels: Pixels, header: Mapping[str, Any]) -> Pixels:
-    """Linear Rec. 709 of an EXR's pixels, by its chromaticities; as they are where it has none."""
-    told = header.get("chromaticities")
-    if told is None:
+    """Convert an EXR's pixels to linear Rec. 709 by its chromaticities; unchanged where it has none."""
+    chromaticities = header.get("chromaticities")
+    if chromaticities is None:
         return pixels
     try:
-        return space_of_chromaticities(tuple(told)).to_linear(pixels)
+        return space_of_chromaticities(tuple(chromaticities)).to_linear(pixels)
     except SettingsError as problem:
         raise FrameError(f"{path} has chromaticities that span no colour space; export it again.") from problem

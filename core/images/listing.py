@@ -8,15 +8,17 @@ SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".tif", ".tiff", ".exr"})
 
 
 def pictures_in(folder: Path) -> list[Path]:
-    """The pictures of a folder by name, but for hidden ones: macOS keeps "._0001.png" beside 0001.png on foreign
+    """List the pictures of a folder by name, without hidden ones: macOS keeps "._0001.png" beside 0001.png on foreign
     disks."""
     return sorted(path for path in folder.iterdir()
                   if path.suffix.lower() in SUFFIXES and path.is_file() and not path.name.startswith("."))
 
 
 def pictures_below(folder: Path) -> list[Path]:
-    """The pictures in a folder and its folders, but for hidden ones, sorted by name. Links that lead nowhere are among
-    them, to be told by whoever reads them: the disk that they lead to may be away."""
+    """List the pictures in a folder and its subfolders by name, without hidden ones.
+
+    Broken links are included, for the reader to report: the disk that they lead to may be offline.
+    """
     return [path for path in sorted(folder.rglob("*"))
             if path.suffix.lower() in SUFFIXES and (path.is_file() or (path.is_symlink() and not path.exists()))
             and not any(part.startswith(".") for part in path.relative_to(folder).parts)]

@@ -29,7 +29,7 @@ class Picture:
         return self.pixels.shape[1], self.pixels.shape[0]
 
     def display(self, white: float = 1.0) -> Pixels:
-        """sRGB display values, clipped to 0..white: as a screen clips, or farther up."""
+        """Return sRGB display values, clipped to 0..white; a screen clips at 1."""
         pixels = srgb_from_linear(self.pixels) if self.encoding == "linear" else self.pixels
         return np.clip(pixels, 0.0, white)
 
@@ -38,8 +38,8 @@ class Picture:
         return linear_from_srgb(self.pixels) if self.encoding == "srgb" else self.pixels
 
     def resized(self, width: int, height: int) -> Picture:
-        """This picture at another size. It shrinks by the average over areas, of light, as a coarser sensor would have
-        seen it; it grows bicubically."""
+        """Return the picture at another size: shrunk by area averages of light, as a coarser sensor sees it, or grown
+        bicubically."""
         if (width, height) == self.size:
             return self
         import cv2
@@ -51,8 +51,8 @@ class Picture:
         return Picture(srgb_from_linear(light) if self.encoding == "srgb" else light, self.encoding)
 
 
-def are_one_shape(size: tuple[int, int], other: tuple[int, int]) -> bool:
-    """Whether one size (width, height) is the other, scaled and rounded to whole pixels."""
+def same_aspect(size: tuple[int, int], other: tuple[int, int]) -> bool:
+    """True if one size (width, height) is the other, scaled and rounded to whole pixels."""
     small, large = sorted((size, other))
     scale = max(large[0] / small[0], large[1] / small[1])
     return (abs(large[0] - small[0] * scale) <= max(scale, 1.0) + 1e-9

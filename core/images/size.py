@@ -8,18 +8,21 @@ from typing import BinaryIO
 from ..errors import FrameError
 from .formats import exr_header, jpeg, png, tiff
 
-MAX_PIXELS = 500_000_000  # pixels; a header that claims more is damaged or hostile
+MAX_PIXELS = 500_000_000
+"""Largest picture that is opened; a header that claims more is damaged or hostile."""
 
 
 def picture_size(path: Path | str) -> tuple[int, int]:
-    """(width, height) from the header alone; an EXR's are those of the frame, its displayWindow. Raises FrameError
-    where the header is no picture's."""
+    """Read (width, height) from the header alone; an EXR's is its displayWindow.
+
+    Raises FrameError where the header is no picture's.
+    """
     path = Path(path)
     if not path.is_file():
         raise FrameError(f"{path} is missing.")
     try:
         with open(path, "rb") as stream:
-            if stream.read(4) in tiff.BIG:
+            if stream.read(4) in tiff.BIG_TIFF:
                 raise FrameError(f"{path} is a BigTIFF; save it as a plain TIFF, of less than 4 GB.")
             stream.seek(0)
             size = _size_from_header(stream)
@@ -29,6 +32,7 @@ def picture_size(path: Path | str) -> tuple[int, int]:
 
 
 def checked_size(path: Path, size: tuple[int, int] | None) -> tuple[int, int]:
+    """Return a size; raises FrameError where it is missing, empty or larger than MAX_PIXELS."""
     if size is None or min(size) <= 0:
         raise FrameError(f"{path} is not a picture, or its header is damaged; export it again.")
     if size[0] * size[1] > MAX_PIXELS:
@@ -44,7 +48,7 @@ def _size_from_header(stream: BinaryIO) -> tuple[int, int] | None:
         header = jpeg.frame_header(stream)
         return (header.width, header.height) if header else None
     if head[:4] in (b"II*\0", b"MM\0*"):
-        sides = tiff.whole_numbers(tiff.read_tags(stream, (tiff.WIDTH, tiff.HEIGHT)))
+        sides = tiff.integer_values(tiff.read_tags(stream, (tiff.WIDTH, tiff.HEIGHT)))
         return (sides[tiff.WIDTH], sides[tiff.HEIGHT]) if len(sides) == 2 else None
     if head[:4] == exr_header.MAGIC:
         return _exr_size(stream)
@@ -52,7 +56,7 @@ def _size_from_header(stream: BinaryIO) -> tuple[int, int] | None:
 
 
 def _exr_size(stream: BinaryIO) -> tuple[int, int] | None:
-    """Of the frame; a dataWindow of more pixels than may be opened counts in its place."""
+    """Return the size of the frame, or the dataWindow where that is too large to be opened."""
     sizes = exr_header.windows(stream)
     stored = sizes.get("dataWindow")
     whole = stored is not None and min(stored) > 0 and stored[0] * stored[1] <= MAX_PIXELS

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Says why an intact file of a known format is not read, and what its owner can do.
 
-OpenCV reads some of these files as something else without an error, so `read.py` asks here before it decodes.
+OpenCV decodes some of these files as something else without an error, so `read.py` calls this module before it decodes.
 """
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from .video import is_video
 
 
 def unsupported_file(path: Path) -> FrameError:
-    """Of a file of another kind, by its name."""
+    """Make the error for a file of another kind, by its name."""
     if is_video(path):
         return FrameError(f"{path} is a video; take its frames out first, as by `ffmpeg -i {path.name} "
                           "frames/%06d.png`, and give their folder.")
@@ -21,47 +21,47 @@ def unsupported_file(path: Path) -> FrameError:
 
 
 def compression_reason(path: Path) -> str:
-    """How a TIFF that OpenCV cannot read is compressed, and what to do; "" where it reads such ones, if they are
-    whole."""
+    """Name a TIFF's compression that OpenCV cannot read, and what to do; "" for one that it can."""
     with open(path, "rb") as stream:
-        told = tiff.whole_numbers(tiff.read_tags(stream, (tiff.COMPRESSION,)))
-    found = tiff.SELDOM_READ.get(told.get(tiff.COMPRESSION, 0))
-    return f"is compressed by {found}, which this program does not read; save it with LZW, ZIP or none" if found else ""
+        tags = tiff.integer_values(tiff.read_tags(stream, (tiff.COMPRESSION,)))
+    name = tiff.UNSUPPORTED_COMPRESSIONS.get(tags.get(tiff.COMPRESSION, 0))
+    return f"is compressed by {name}, which this program does not read; save it with LZW, ZIP or none" if name else ""
+
 
 _CMYK = "is CMYK, for print; convert it to RGB"
 
 
 def unsupported_reason(path: Path) -> str:
-    """What OpenCV would read without a word as something else, or not though it is whole, and what to do; "" where
-    there is no such thing."""
+    """Say what OpenCV would decode wrongly, or not at all though the file is intact, and what to do; "" for a good
+    file."""
     with open(path, "rb") as stream:
-        begins = stream.read(4)
+        magic = stream.read(4)
         stream.seek(0)
-        if begins[:2] == b"\xff\xd8":  # whatever it is named
+        if magic[:2] == b"\xff\xd8":  # whatever it is named
             header = jpeg.frame_header(stream)
             if header is not None and header.bits > 8:
                 return f"holds {header.bits} bits a colour; save it with 8, or as PNG or TIFF with 16"
             return _CMYK if header is not None and header.components == 4 else ""
-        if begins not in (b"II*\0", b"MM\0*"):
+        if magic not in (b"II*\0", b"MM\0*"):
             return ""
         wanted = (tiff.BITS, tiff.PHOTOMETRIC, tiff.SAMPLES, tiff.PLANES, tiff.SAMPLE_FORMAT)
-        told = {name: tag.values[0] for name, tag in tiff.read_tags(stream, wanted).items()}
-    if told.get(tiff.SAMPLES) == 2:
+        tags = {name: tag.values[0] for name, tag in tiff.read_tags(stream, wanted).items()}
+    if tags.get(tiff.SAMPLES) == 2:
         return "is grey with alpha; save it as RGB with alpha, or as PNG"
-    if told.get(tiff.PHOTOMETRIC) == tiff.SEPARATED:
+    if tags.get(tiff.PHOTOMETRIC) == tiff.SEPARATED:
         return _CMYK
-    if told.get(tiff.PHOTOMETRIC) in tiff.LAB:
+    if tags.get(tiff.PHOTOMETRIC) in tiff.LAB:
         return "is in Lab colours; convert it to RGB"
-    if told.get(tiff.SAMPLES, 1) > 4:
-        return f"has {told[tiff.SAMPLES]} channels; save it as RGB, or RGB with alpha"
-    numbers = told.get(tiff.BITS, 1), told.get(tiff.SAMPLE_FORMAT, tiff.WHOLE)
-    if numbers in ((16, tiff.FLOATS), (32, tiff.WHOLE)):
+    if tags.get(tiff.SAMPLES, 1) > 4:
+        return f"has {tags[tiff.SAMPLES]} channels; save it as RGB, or RGB with alpha"
+    numbers = tags.get(tiff.BITS, 1), tags.get(tiff.SAMPLE_FORMAT, tiff.UNSIGNED)
+    if numbers in ((16, tiff.FLOATS), (32, tiff.UNSIGNED)):
         kind = "floats" if numbers[1] == tiff.FLOATS else "whole numbers"
         return f"holds {kind} of {numbers[0]} bits; save it as 8 or 16 bit or as 32 bit float"
-    if told.get(tiff.BITS, 1) <= 8:
+    if tags.get(tiff.BITS, 1) <= 8:
         return ""
-    if told.get(tiff.PLANES) == tiff.IN_PLANES and told.get(tiff.SAMPLES, 1) > 1:
+    if tags.get(tiff.PLANES) == tiff.PLANAR and tags.get(tiff.SAMPLES, 1) > 1:
         return "has its colours apart (per channel, planar); save it interleaved"
-    if told.get(tiff.PHOTOMETRIC) == tiff.WHITE_IS_0:
+    if tags.get(tiff.PHOTOMETRIC) == tiff.WHITE_IS_0:
         return "has 0 for white; save it with 0 for black"
     return ""

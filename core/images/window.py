@@ -12,8 +12,11 @@ from ..colour.srgb import Pixels
 
 @dataclass(frozen=True)
 class DataWindow:
-    """Where the pixels of a file lie on the frame. size: (width, height) of what is stored; origin: (x, y) of its first
-    pixel on the frame, below 0 with overscan; frame: (width, height); aspect: a pixel's width by its height."""
+    """Where the stored pixels of a file lie on the frame.
+
+    size: (width, height) of what is stored; origin: (x, y) of its first pixel on the frame, negative with overscan;
+    frame: (width, height); aspect: pixel aspect ratio (width / height).
+    """
 
     size: tuple[int, int]
     origin: tuple[int, int]
@@ -22,11 +25,11 @@ class DataWindow:
 
     @property
     def is_frame(self) -> bool:
-        """Whether what is stored is the frame and no more."""
+        """True if the stored pixels are exactly the frame."""
         return self.size == self.frame and self.origin == (0, 0)
 
     def header(self) -> dict[str, Any]:
-        """The attributes of an EXR that say so, of a frame that begins at 0."""
+        """Return the EXR attributes of these windows, for a frame that begins at 0."""
         (x, y), (width, height) = self.origin, self.size
         boxes = {"dataWindow": ((x, y), (x + width - 1, y + height - 1)),
                  "displayWindow": ((0, 0), (self.frame[0] - 1, self.frame[1] - 1))}
@@ -34,7 +37,7 @@ class DataWindow:
 
 
 def crop_to_display_window(pixels: Pixels, window: DataWindow) -> Pixels:
-    """The frame of pixels (height, width, ...) that lie in a window of it, 0 where there are none."""
+    """Return the frame of pixels (height, width, ...) that lie in a data window, 0 where there are none."""
     if window.is_frame:
         return pixels
     (width, height), (x, y) = window.frame, window.origin

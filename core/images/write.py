@@ -15,15 +15,15 @@ from numpy.typing import NDArray
 from ..errors import FrameError
 from ..system.files import atomic_path
 from ..typed import is_utf8
-from .exr import exr_is_cut_off
+from .exr import is_exr_truncated
 
 
 def write_exr(path: Path | str, channels: Mapping[str, NDArray[Any]], *, half: bool = True,
-              header: Mapping[str, Any] | None = None, turn: AbstractContextManager[None] | None = None) -> None:
-    """Write one part, scanlines, ZIP; each channel (height, width). Full names as given ("scene.R"). turn: see
-    `atomic_path`.
+              header: Mapping[str, Any] | None = None, commit_lock: AbstractContextManager[None] | None = None) -> None:
+    """Write one part, scanlines, ZIP; each channel (height, width), under its full name ("scene.R").
 
-    `half` stores 16 bit floats; channels that end in ".Z" stay 32 bit, since depth needs the range.
+    half: store 16 bit floats; channels that end in ".Z" stay 32 bit, since depth needs the range. commit_lock: see
+    `atomic_path`.
     """
     import OpenEXR
 
@@ -33,24 +33,27 @@ def write_exr(path: Path | str, channels: Mapping[str, NDArray[Any]], *, half: b
         return np.ascontiguousarray(pixels, np.float32)
 
     attributes = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **(header or {})}
-    save_exr(path, attributes, {name: stored(name, pixels) for name, pixels in channels.items()}, turn)
+    save_exr(path, attributes, {name: stored(name, pixels) for name, pixels in channels.items()}, commit_lock)
 
 
 def save_exr(path: Path | str, header: Mapping[str, Any], channels: Mapping[str, NDArray[Any]],
-             turn: AbstractContextManager[None] | None = None) -> None:
-    """Write one part as it is given. turn: see `atomic_path`. Raises OSError where the system refuses, a full disk
-    among that; FrameError for a path that the library cannot be told."""
+             commit_lock: AbstractContextManager[None] | None = None) -> None:
+    """Write one part with this header and these channels. commit_lock: see `atomic_path`.
+
+    Raises OSError where the system refuses, for instance for a full disk, and FrameError for a path that is not UTF-8.
+    """
     import OpenEXR
 
     if not is_utf8(str(path)):
         raise FrameError(f"The path {str(path)!r} is not UTF-8, and no EXR can be written there; rename its folder.")
-    with atomic_path(path, turn) as temporary, OpenEXR.File(dict(header), dict(channels)) as file:
+    with atomic_path(path, commit_lock) as temporary, OpenEXR.File(dict(header), dict(channels)) as file:
         try:
             file.write(str(temporary))
-        except RuntimeError as problem:  # how the library hands on what the system refused, by its words alone
+        except RuntimeError as problem:  # the library reports a refusal of the system as text
             full = os.strerror(errno.ENOSPC) in str(problem)
             raise OSError(errno.ENOSPC if full else errno.EIO, str(problem), str(path)) from problem
-        if not temporary.stat().st_size or exr_is_cut_off(temporary):  # what is refused at its closing, it keeps quiet
+        # Errors on closing the file are not reported.
+        if not temporary.stat().st_size or is_exr_truncated(temporary):
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
 
 

@@ -1,19 +1,33 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Light sources: found in frames, gathered into 3D.
+"""Lights of a capture: detected in frames and located in 3D.
 
     exposure.py, grounded.py   two detectors behind one interface (detection.py)
-    gather.py                  detections of many views to places, near or far
+    triangulation.py           detections of many views to places, near or far, by way of observations.py,
+                               candidates.py, refinement.py and merging.py
     lifted.py                  the same by way of a fitted scene's Gaussians
     ghosts.py                  a light out of frame, from its ghosts
-    file.py, overlay.py        lights.json, and pictures of what was found
+    file.py, overlay.py        lights.json, and pictures of the result
     find.py                    all of it, for a capture
+    snap.py                    moves inaccurate lights to their flares, for a fit
 """
 from __future__ import annotations
 
-from .detection import Detection, Detector, union
-from .exposure import Exposure
-from .find import Findings, detector_for, find_lights, record
-from .gather import FoundLight, GatherSettings, gather
+from .detection import Detection, Detector, union_mask
+from .exposure import ExposureDetector
+from .find import Findings, detector_for, find_lights, write_findings
+from .found_light import FoundLight
+from .triangulation import TriangulationSettings, triangulate_lights
 
-__all__ = ["Detection", "Detector", "Exposure", "Findings", "FoundLight", "GatherSettings", "detector_for",
-           "find_lights", "gather", "record", "union"]
+__all__ = [
+           "Detection",
+           "Detector",
+           "ExposureDetector",
+           "Findings",
+           "FoundLight",
+           "TriangulationSettings",
+           "detector_for",
+           "find_lights",
+           "triangulate_lights",
+           "union_mask",
+           "write_findings",
+]

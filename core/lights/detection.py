@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What a detector says of one picture, whatever the detector."""
+"""The detection of a light in one picture, whatever the detector."""
 from __future__ import annotations
 
 from collections.abc import Sequence
@@ -16,14 +16,14 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True, eq=False)
 class Detection:
-    """A light source in one picture.
+    """A light in one picture.
 
     xy: (2,) sub-pixel centroid in pixels, pixel centres at +0.5.
     radius: of the disc of the same area, in pixels.
-    score: 0..1, how sure the detector is.
+    score: confidence of the detector, 0..1.
     colour: (3,) linear Rec. 709 of the glow round the clipped core, its largest channel 1.
-    mask: (h, w) of the source within its box; corner: (x, y) of the box in the picture.
-    cut: whether it touches the frame's edge, so that its centroid is not the source's.
+    mask: (h, w) of the light within its box; corner: (x, y) of the box in the picture.
+    is_cut: True if it touches the frame's edge, so that its centroid is not the light's.
     """
 
     xy: NDArray[np.float64]
@@ -32,7 +32,7 @@ class Detection:
     colour: NDArray[np.float64]
     mask: Mask
     corner: tuple[int, int]
-    cut: bool
+    is_cut: bool
 
     @property
     def box(self) -> tuple[int, int, int, int]:
@@ -42,15 +42,15 @@ class Detection:
 
 
 class Detector(Protocol):
-    """Finds light sources in a picture."""
+    """Detects lights in a picture."""
 
     def detect(self, picture: Picture) -> list[Detection]:
-        """The light sources, best first."""
+        """Return the lights, highest score first."""
         ...
 
 
-def union(detections: Sequence[Detection], size: tuple[int, int]) -> Mask:
-    """(h, w) of all masks in a picture of `size` (width, height)."""
+def union_mask(detections: Sequence[Detection], size: tuple[int, int]) -> Mask:
+    """(h, w) union of all masks in a picture of `size` (width, height)."""
     whole = np.zeros((size[1], size[0]), np.bool_)
     for detection in detections:
         left, top, right, bottom = detection.box
@@ -58,12 +58,12 @@ def union(detections: Sequence[Detection], size: tuple[int, int]) -> Mask:
     return whole
 
 
-def measured(mask: Mask, corner: tuple[int, int], picture: Picture, display: NDArray[np.float32],
+def measure_detection(mask: Mask, corner: tuple[int, int], picture: Picture, display: NDArray[np.float32],
              score: float) -> Detection:
-    """A detection from its mask (h, w) at `corner` of a picture whose display values are given.
+    """Measure a detection from its mask (h, w) at `corner` of a picture, whose display values are (height, width, 3).
 
-    The centroid weighs pixels from 0.8 of full scale up, one pixel past the mask: the rim's partly covered
-    pixels then say where between two pixels the edge lies.
+    The centroid weighs pixels from 0.8 of full scale up, one pixel past the mask: partly covered pixels of the rim then
+    locate the edge between two pixels.
     """
     import cv2
 
@@ -78,14 +78,17 @@ def measured(mask: Mask, corner: tuple[int, int], picture: Picture, display: NDA
     v, u = np.mgrid[rows, columns] + 0.5
     xy = np.array([(weight * u).sum(), (weight * v).sum()]) / weight.sum()
     bottom, right = corner[1] + mask.shape[0], corner[0] + mask.shape[1]
-    cut = bool((corner[0] == 0 and mask[:, 0].any()) or (corner[1] == 0 and mask[0].any())
-               or (right == width and mask[:, -1].any()) or (bottom == height and mask[-1].any()))
-    return Detection(xy, float(np.sqrt(mask.sum() / np.pi)), score, _glow(mask, corner, picture), mask, corner, cut)
+    is_cut = bool((corner[0] == 0 and mask[:, 0].any()) or (corner[1] == 0 and mask[0].any())
+                  or (right == width and mask[:, -1].any()) or (bottom == height and mask[-1].any()))
+    radius = float(np.sqrt(mask.sum() / np.pi))
+    return Detection(xy, radius, score, _glow_colour(mask, corner, picture), mask, corner, is_cut)
 
 
-def _glow(mask: Mask, corner: tuple[int, int], picture: Picture) -> NDArray[np.float64]:
-    """Colour of the glow: what the pixels just round the source have more than those further out, of which no more
-    than half is taken for background, lest a bright surface nearby leave none."""
+def _glow_colour(mask: Mask, corner: tuple[int, int], picture: Picture) -> NDArray[np.float64]:
+    """Return the colour of the glow: the light just round the disc less that further out.
+
+    At most half is subtracted, lest a bright surface nearby leave none.
+    """
     import cv2
 
     reach = max(3, round(float(np.sqrt(mask.sum() / np.pi))))
@@ -96,9 +99,10 @@ def _glow(mask: Mask, corner: tuple[int, int], picture: Picture) -> NDArray[np.f
     area = np.zeros((bottom - top, right - left), np.uint8)
     y, x = corner[1] - top, corner[0] - left
     area[y:y + mask.shape[0], x:x + mask.shape[1]] = mask
-    away = cv2.distanceTransform(1 - area, cv2.DIST_L2, 3)
+    distance = cv2.distanceTransform(1 - area, cv2.DIST_L2, 3)
     around = Picture(picture.pixels[top:bottom, left:right], picture.encoding).linear()
-    near, far = (away > 1) & (away <= 1 + 0.5 * reach), (away > 2 * reach) & (away <= 3 * reach)
+    near = (distance > 1) & (distance <= 1 + 0.5 * reach)
+    far = (distance > 2 * reach) & (distance <= 3 * reach)
     if not near.any():
         return np.ones(3)
     glow = around[near].mean(axis=0).astype(np.float64)

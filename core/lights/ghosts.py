@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The direction of a light that is never in frame, from its ghosts.
+"""Finds the direction of a light that is never in frame, from its ghosts.
 
-A ghost lies on the line through the principal point and the light's projection, and to first order at a
-fixed share mu of the way (paraxial optics: Lee and Eisemann 2013): g - p = mu (l - p). So a blob at g claims
-a light at p + (g - p) / mu, and where mu is right the claims of all views meet in one place. We try values of
-mu and gather the claims as if they were detections.
+A ghost lies on the line through the principal point p and the light's projection l, and to first order at a fixed ratio
+mu of the way (paraxial optics: Lee and Eisemann 2013): g - p = mu (l - p). So a blob at g claims a light at p + (g - p)
+/ mu, and where mu is right the claims of all views meet in one place. Values of mu are tried, and the claims
+triangulated like detections.
 
-Only ghosts on the far side of the principal point (mu < 0) are used: a blob that belongs to the scene and not
-to the lens would then have to come from a light behind the camera, so that the scene cannot pose as a ghost.
+Only ghosts on the far side of the principal point (mu < 0) are used: a blob of the scene would then have to come from a
+light behind the camera, so that the scene cannot imitate a ghost.
 """
 from __future__ import annotations
 
@@ -21,12 +21,17 @@ from ..capture.camera import Camera
 from ..images.picture import Picture
 from ..system.progress import Progress
 from .detection import Detection
-from .gather import FoundLight, GatherSettings, gather
+from .found_light import FoundLight
+from .triangulation import TriangulationSettings, triangulate_lights
 
-SHARES = -np.exp(np.linspace(np.log(0.12), np.log(2.5), 28))
-MIN_VIEWS, MIN_SHARE, ACCIDENTS = 6, 0.35, 1e-6  # see GatherSettings; blobs of one scene are no independent accidents
-MOVES = 0.01  # of the diagonal; what keeps its place in the frame is dirt, not a ghost
-BLOBS = 20  # a picture; the strongest
+GHOST_RATIOS = -np.exp(np.linspace(np.log(0.12), np.log(2.5), 28))
+"""Values of mu that are tried."""
+MIN_VIEWS, MIN_SHARE, MAX_NFA = 6, 0.35, 1e-6
+"""Bounds of `TriangulationSettings`; blobs of one scene are not independent, so the NFA must be low."""
+MIN_MOTION = 0.01
+"""Motion of a ghost, in diagonals; what keeps its place in the frame is dirt."""
+MAX_BLOBS = 20
+"""Blobs of a picture, the strongest."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,8 +44,10 @@ class Blob:
 
 
 def find_blobs(picture: Picture, clean: Picture | None = None) -> list[Blob]:
-    """Spots of 0.7 to 6 % of the diagonal that stand out, strongest first; with the frame without flare, of their
-    difference alone. By difference of Gaussians over scales, of the square root of linear light."""
+    """Find bright spots of 0.7 to 6 % of the diagonal, strongest first, by difference of Gaussians over scales.
+
+    On the square root of linear light; with the clean frame, of the difference alone.
+    """
     import cv2
 
     light = picture.linear().max(axis=2)
@@ -65,64 +72,66 @@ def find_blobs(picture: Picture, clean: Picture | None = None) -> list[Blob]:
     for blob in sorted(found, key=lambda blob: -blob.strength):
         if all(np.linalg.norm(blob.xy - other.xy) > 0.7 * other.radius for other in kept):
             kept.append(blob)
-        if len(kept) == BLOBS:
+        if len(kept) == MAX_BLOBS:
             break
     return kept
 
 
-def gather_ghosts(views: Sequence[tuple[str, Camera]], blobs: Sequence[Sequence[Blob]], extent: float,
+def locate_by_ghosts(views: Sequence[tuple[str, Camera]], blobs: Sequence[Sequence[Blob]], extent: float,
                   seed: int = 0, progress: Progress | None = None) -> list[FoundLight]:
-    """At most one light that is out of frame, from the blobs of each view; none where too few views agree.
+    """Return at most one light that is out of frame, from the blobs of each view; none where too few views agree.
 
-    Raises Cancelled when asked to stop.
+    Raises Cancelled on a stop request.
     """
     progress = progress or Progress()
     best: FoundLight | None = None
-    best_share = 0.0
-    for share in SHARES:
+    best_ratio = 0.0
+    for ratio in GHOST_RATIOS:
         progress.check()
-        light = _with_share(views, blobs, extent, float(share), seed)
-        if light is not None and (best is None or _rank(light, float(share)) > _rank(best, best_share)):
-            best, best_share = light, float(share)
+        light = _light_at_ratio(views, blobs, extent, float(ratio), seed)
+        if light is not None and (best is None or _rank(light, float(ratio)) > _rank(best, best_ratio)):
+            best, best_ratio = light, float(ratio)
     if best is None:
         return []
-    for step in (0.06, 0.03, 0.015):  # the share itself, finer
-        for share in (best_share * (1 - step), best_share * (1 + step)):
+    for step in (0.06, 0.03, 0.015):  # the ratio itself, finer
+        for ratio in (best_ratio * (1 - step), best_ratio * (1 + step)):
             progress.check()
-            light = _with_share(views, blobs, extent, share, seed)
-            if light is not None and _rank(light, share) > _rank(best, best_share):
-                best, best_share = light, share
-    return [replace(best, residual=best.residual * abs(best_share), how=f"from a ghost at {best_share:.2f} of the way")]
+            light = _light_at_ratio(views, blobs, extent, ratio, seed)
+            if light is not None and _rank(light, ratio) > _rank(best, best_ratio):
+                best, best_ratio = light, ratio
+    return [replace(best, residual=best.residual * abs(best_ratio), how=f"from a ghost at {best_ratio:.2f} of the way")]
 
 
-def _rank(light: FoundLight, share: float) -> tuple[int, float]:
+def _rank(light: FoundLight, ratio: float) -> tuple[int, float]:
     """Support first, then how well the blobs meet their predicted places, in pixels of the ghost."""
-    return len(light.support), -light.residual * abs(share)
+    return len(light.support), -light.residual * abs(ratio)
 
 
-def _with_share(views: Sequence[tuple[str, Camera]], blobs: Sequence[Sequence[Blob]], extent: float, share: float,
+def _light_at_ratio(views: Sequence[tuple[str, Camera]], blobs: Sequence[Sequence[Blob]], extent: float, ratio: float,
                 seed: int) -> FoundLight | None:
-    """The light out of frame that most views' blobs claim, if they are ghosts at `share` of the way."""
+    """Return the light out of frame that most views' blobs claim if they are ghosts at this ratio, or None."""
     claims = []
     for (_, camera), some in zip(views, blobs, strict=True):
         centre = np.array([camera.cx, camera.cy])
-        # The radius carries the tolerance: an error at the ghost is 1 / share times as large at the light.
+        # The radius carries the tolerance: an error at the ghost is 1 / ratio times as large at the light.
         diagonal = float(np.hypot(*camera.size))
-        claims.append([Detection(centre + (blob.xy - centre) / share, 0.02 * diagonal / abs(share), 1.0,
+        claims.append([Detection(centre + (blob.xy - centre) / ratio, 0.02 * diagonal / abs(ratio), 1.0,
                                  np.ones(3), np.ones((1, 1), bool), (0, 0), False) for blob in some
-                       if not camera.contains([centre + (blob.xy - centre) / share])[0]])
-    settings = GatherSettings(tolerance=0.0, min_views=MIN_VIEWS, accidents=ACCIDENTS / len(SHARES),
-                              min_share=MIN_SHARE, anywhere=True, most=2, tries=1000, seed=seed)
+                       if not camera.contains([centre + (blob.xy - centre) / ratio])[0]])
+    settings = TriangulationSettings(tolerance=0.0, min_views=MIN_VIEWS, max_nfa=MAX_NFA / len(GHOST_RATIOS),
+                                     min_share=MIN_SHARE, allow_out_of_frame=True, max_lights=2, max_candidates=1000,
+                                     seed=seed)
     diagonal = float(np.hypot(*views[0][1].size))
-    for light in gather(views, claims, extent, settings):
-        moved = np.ptp([one.xy * share for _, one in light.detections], axis=0).max()
-        if sum(_well_inside(camera, light.xyz) for _, camera in views) < 0.2 * len(views) and moved > MOVES * diagonal:
+    for light in triangulate_lights(views, claims, extent, settings):
+        moved = np.ptp([one.xy * ratio for _, one in light.detections], axis=0).max()
+        visible = sum(_is_well_inside(camera, light.xyz) for _, camera in views)
+        if visible < 0.2 * len(views) and moved > MIN_MOTION * diagonal:
             return light
     return None
 
 
-def _well_inside(camera: Camera, xyz: NDArray[np.float64]) -> bool:
-    """Whether a light is so far inside the frame that it would be seen itself."""
+def _is_well_inside(camera: Camera, xyz: NDArray[np.float64]) -> bool:
+    """True if a light is so far inside the frame that it would be visible itself."""
     pixels, depth = camera.project(xyz[None])
     margin = 0.05 * float(np.hypot(*camera.size))
     return bool(depth[0] > 0 and (pixels[0] > margin).all() and (pixels[0] < np.array(camera.size) - margin).all())

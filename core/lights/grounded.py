@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Light sources by name: GroundingDINO finds "light source" boxes, SAM 2 their masks, through transformers.
+"""Detects lights by name: GroundingDINO finds "light source" boxes, SAM 2 their masks, through transformers.
 
-The two refinements are the paper's (section "Light Positions"): a mask that is not over-exposed, of mean HSV
-value below 190 of 255, is dropped; and of boxes that overlap or contain one another the smallest stays.
-Optional: needs transformers, and the weights in a local folder or in the hub's cache. Nothing is downloaded.
+The two refinements are the paper's (section "Light Positions"): a mask that is not over-exposed, of mean HSV value
+below 190 of 255, is dropped; and of boxes that overlap or contain one another the smallest stays. Optional: needs
+transformers, and the weights in a local folder or in the hub's cache. Nothing is downloaded.
 """
 from __future__ import annotations
 
@@ -16,22 +16,26 @@ from numpy.typing import NDArray
 
 from ..errors import EngineError
 from ..images.picture import Picture
-from .detection import Detection, Mask, measured
+from .detection import Detection, Mask, measure_detection
 
-BOXES, MASKS = "IDEA-Research/grounding-dino-base", "facebook/sam2.1-hiera-small"
-PROMPT = "light source."  # GroundingDINO wants lower case and a full stop
-DARKEST = 190 / 255       # mean HSV value below which a mask is no light
-MEAN, DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
-OVERLAP = 0.5             # of the smaller box's area; the paper says "high"
+BOX_WEIGHTS, MASK_WEIGHTS = "IDEA-Research/grounding-dino-base", "facebook/sam2.1-hiera-small"
+PROMPT = "light source."
+"""GroundingDINO expects lower case and a full stop."""
+MIN_MASK_LEVEL = 190 / 255
+"""Mean HSV value below which a mask is no light."""
+IMAGENET_MEAN, IMAGENET_DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+MAX_OVERLAP = 0.5
+"""Largest intersection of two boxes, as a share of the smaller one; the paper says "high"."""
 
 
-class Grounded:
-    """The detector. `boxes` and `masks` are folders or hub names; `threshold` is GroundingDINO's, of the box.
+class GroundedDetector:
+    """Detects lights by GroundingDINO and SAM 2.
 
-    Raises EngineError where transformers or weights are missing.
+    boxes, masks: folders or hub names of the weights; threshold: GroundingDINO's, of the box. Raises EngineError where
+    transformers or weights are missing.
     """
 
-    def __init__(self, threshold: float = 0.35, boxes: str | Path = BOXES, masks: str | Path = MASKS,
+    def __init__(self, threshold: float = 0.35, boxes: str | Path = BOX_WEIGHTS, masks: str | Path = MASK_WEIGHTS,
                  device: str = "auto") -> None:
         try:
             import torch
@@ -43,41 +47,44 @@ class Grounded:
         logging.disable_progress_bar()
         self.threshold = threshold
         self._device = ("cuda" if torch.cuda.is_available() else "cpu") if device == "auto" else device
-        self._box_processor = _loaded(AutoProcessor, boxes)
-        self._box_model = _loaded(AutoModelForZeroShotObjectDetection, boxes).to(self._device).eval()
-        self._mask_model = _loaded(Sam2Model, masks).to(self._device).eval()
+        self._box_processor = _load_weights(AutoProcessor, boxes)
+        self._box_model = _load_weights(AutoModelForZeroShotObjectDetection, boxes).to(self._device).eval()
+        self._mask_model = _load_weights(Sam2Model, masks).to(self._device).eval()
 
     def detect(self, picture: Picture) -> list[Detection]:
-        """The light sources of a picture, best first."""
-        boxes, masks, scores = self.raw(picture)
+        """Return the lights of a picture, highest score first."""
+        boxes, masks, scores = self.predict(picture)
         display = picture.display()
         found = []
-        for i in refined(boxes, masks, display):
+        for i in refine_detections(boxes, masks, display):
             rows, columns = np.flatnonzero(masks[i].any(axis=1)), np.flatnonzero(masks[i].any(axis=0))
             tight = masks[i][rows[0]:rows[-1] + 1, columns[0]:columns[-1] + 1]
-            found.append(measured(tight, (int(columns[0]), int(rows[0])), picture, display, float(scores[i])))
+            found.append(measure_detection(tight, (int(columns[0]), int(rows[0])), picture, display, float(scores[i])))
         return sorted(found, key=lambda detection: -detection.score)
 
-    def raw(self, picture: Picture) -> tuple[NDArray[np.float64], list[Mask], NDArray[np.float64]]:
-        """Boxes (n, 4) left top right bottom, a mask (h, w) for each, and scores (n,), before refinement."""
+    def predict(self, picture: Picture) -> tuple[NDArray[np.float64], list[Mask], NDArray[np.float64]]:
+        """Return boxes (n, 4) left top right bottom, a mask (h, w) for each, and scores (n,), before refinement."""
         import torch
 
         image = (picture.display() * 255 + 0.5).astype(np.uint8)
         height, width = image.shape[:2]
         with torch.inference_mode():
-            asked = self._box_processor(images=image, text=PROMPT, return_tensors="pt").to(self._device)
+            inputs = self._box_processor(images=image, text=PROMPT, return_tensors="pt").to(self._device)
             answer = self._box_processor.post_process_grounded_object_detection(
-                self._box_model(**asked), asked["input_ids"], threshold=self.threshold, text_threshold=0.0,
+                self._box_model(**inputs), inputs["input_ids"], threshold=self.threshold, text_threshold=0.0,
                 target_sizes=[(height, width)])[0]
             boxes = answer["boxes"].cpu().double().numpy().reshape(-1, 4)
             scores = answer["scores"].cpu().double().numpy()
             if not len(boxes):
                 return boxes, [], scores
-            return boxes, self._masks(image, boxes), scores
+            return boxes, self._predict_masks(image, boxes), scores
 
-    def _masks(self, image: NDArray[np.uint8], boxes: NDArray[np.float64]) -> list[Mask]:
-        """SAM 2's mask (h, w) for each box. Its input is the picture squeezed into a square, ImageNet's mean and
-        deviation taken out; transformers' own processor does the same, but asks for torchvision."""
+    def _predict_masks(self, image: NDArray[np.uint8], boxes: NDArray[np.float64]) -> list[Mask]:
+        """Return SAM 2's mask (h, w) for each box.
+
+        Its input is the picture scaled to a square and normalised by ImageNet's statistics; transformers' processor
+        does the same, but needs torchvision.
+        """
         import torch
         from torch.nn.functional import interpolate
 
@@ -85,7 +92,8 @@ class Grounded:
         side = int(self._mask_model.config.prompt_encoder_config.image_size)
         pixels = torch.from_numpy(image).permute(2, 0, 1)[None].float() / 255
         pixels = interpolate(pixels, (side, side), mode="bilinear", antialias=True)
-        pixels = (pixels - torch.tensor(MEAN).view(1, 3, 1, 1)) / torch.tensor(DEVIATION).view(1, 3, 1, 1)
+        mean, deviation = (torch.tensor(values).view(1, 3, 1, 1) for values in (IMAGENET_MEAN, IMAGENET_DEVIATION))
+        pixels = (pixels - mean) / deviation
         scaled = torch.from_numpy(boxes * (side / width, side / height, side / width, side / height)).float()
         answer = self._mask_model(pixel_values=pixels.to(self._device), input_boxes=scaled[None].to(self._device),
                                   multimask_output=False)
@@ -93,7 +101,7 @@ class Grounded:
         return [np.asarray(mask[0] > 0) for mask in whole.numpy()]
 
 
-def _loaded(kind: Any, where: str | Path) -> Any:
+def _load_weights(kind: Any, where: str | Path) -> Any:
     try:
         return kind.from_pretrained(str(where), local_files_only=True)
     except (OSError, ValueError) as problem:
@@ -101,27 +109,27 @@ def _loaded(kind: Any, where: str | Path) -> Any:
                           f"huggingface-cli download {where}, or use the exposure method.") from problem
 
 
-def refined(boxes: NDArray[np.float64], masks: Sequence[Mask], display: NDArray[np.float32]) -> list[int]:
-    """Indices of the detections that both of the paper's refinements leave, smallest box first.
+def refine_detections(boxes: NDArray[np.float64], masks: Sequence[Mask], display: NDArray[np.float32]) -> list[int]:
+    """Return the indices of the detections that pass both of the paper's refinements, smallest box first.
 
     boxes (n, 4) left top right bottom; masks n x (h, w); display (h, w, 3) in 0..1.
     """
     value = display.max(axis=2)
-    bright = [i for i, mask in enumerate(masks) if mask.any() and float(value[mask].mean()) >= DARKEST]
-    return smallest(boxes, bright)
+    bright = [i for i, mask in enumerate(masks) if mask.any() and float(value[mask].mean()) >= MIN_MASK_LEVEL]
+    return keep_smallest(boxes, bright)
 
 
-def smallest(boxes: NDArray[np.float64], among: Sequence[int]) -> list[int]:
-    """Of the boxes `among` (indices), those that neither contain nor largely overlap a smaller one kept."""
+def keep_smallest(boxes: NDArray[np.float64], among: Sequence[int]) -> list[int]:
+    """Return those of the boxes `among` (indices) that neither contain nor largely overlap a smaller one."""
     area = (boxes[:, 2] - boxes[:, 0]) * (boxes[:, 3] - boxes[:, 1])
     kept: list[int] = []
     for i in sorted(among, key=lambda i: (area[i], i)):
-        if not any(_shared(boxes[i], boxes[j]) > OVERLAP * max(area[j], 1e-9) for j in kept):
+        if not any(_intersection_area(boxes[i], boxes[j]) > MAX_OVERLAP * max(area[j], 1e-9) for j in kept):
             kept.append(i)
     return kept
 
 
-def _shared(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
+def _intersection_area(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
     """Area of the intersection of two boxes."""
     width, height = np.minimum(a[2:], b[2:]) - np.maximum(a[:2], b[:2])
     return float(max(width, 0.0) * max(height, 0.0))

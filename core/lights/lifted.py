@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Lights from a fitted scene, the paper's way (section "Light Positions"): detections are lifted on to scene
+"""Finds lights on a fitted scene, the paper's way (section "Light Positions"): detections are lifted on to scene
 Gaussians, those are clustered, and each cluster's centroid is a light.
 
-A Gaussian belongs to a light if, of the views that see it, enough have it inside a detection. Hidden ones do
-not count: in each view only what lies near the front of its cell of a coarse depth buffer is seen.
+A Gaussian belongs to a light if enough of the views that see it have it inside a detection. In each view only Gaussians
+near the front of their cell of a coarse depth buffer count as seen.
 """
 from __future__ import annotations
 
@@ -13,68 +13,73 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..capture.camera import Camera, Floats
-from .detection import Detection, union
-from .gather import FoundLight
+from .detection import Detection, union_mask
+from .found_light import FoundLight
 
-CELLS = 120      # of the depth buffer along the frame's long side
-IN_FRONT = 1.05  # of the nearest depth in a cell still counts as its front
-OPAQUE = 0.3     # opacity below which a Gaussian hides nothing and is no part of a light
-REACH = 0.03     # extents between neighbours of one cluster
-MOST = 4000      # Gaussians clustered, those with the most views first
+DEPTH_CELLS = 120
+"""Cells of the depth buffer along the frame's long side."""
+DEPTH_TOLERANCE = 1.05
+"""Factor on the nearest depth in a cell up to which a Gaussian counts as its front."""
+MIN_OPACITY = 0.3
+"""Opacity below which a Gaussian hides nothing and is no part of a light."""
+CLUSTER_DISTANCE = 0.03
+"""Largest distance between neighbours of one cluster, in extents."""
+MAX_GAUSSIANS = 4000
+"""Gaussians that are clustered, those with the most views first."""
 
 
-def lift(views: Sequence[tuple[str, Camera]], detections: Sequence[Sequence[Detection]], means: ArrayLike,
+def lift_to_gaussians(views: Sequence[tuple[str, Camera]], detections: Sequence[Sequence[Detection]], means: ArrayLike,
          opacities: ArrayLike, extent: float, min_views: int = 3, share: float = 0.3) -> list[FoundLight]:
-    """Lights from detections of each view and scene Gaussians: means (n, 3), opacities (n,) in 0..1.
+    """Find lights from detections of each view and scene Gaussians: means (n, 3), opacities (n,) in 0..1.
 
     `share` of the views that see a Gaussian must have it inside a detection.
     """
     xyz, opacity = np.asarray(means, np.float64), np.asarray(opacities, np.float64)
-    xyz, opacity = xyz[opacity > OPAQUE], opacity[opacity > OPAQUE]
-    inside, seen = np.zeros(len(xyz), np.int64), np.zeros(len(xyz), np.int64)
+    xyz, opacity = xyz[opacity > MIN_OPACITY], opacity[opacity > MIN_OPACITY]
+    inside, visible = np.zeros(len(xyz), np.int64), np.zeros(len(xyz), np.int64)
     for (_, camera), some in zip(views, detections, strict=True):
         pixels, depth = camera.project(xyz)
-        front = _front(camera, pixels, depth)
-        seen[front] += 1
+        front = _visible_points(camera, pixels, depth)
+        visible[front] += 1
         if some:
-            mask = union(some, camera.size)
+            mask = union_mask(some, camera.size)
             column, row = np.minimum(pixels[front].astype(int), np.array(camera.size) - 1).T
             inside[front[mask[row, column]]] += 1
-    chosen = np.flatnonzero((inside >= min_views) & (inside >= share * np.maximum(seen, 1)))
-    chosen = chosen[np.argsort(-inside[chosen], kind="stable")][:MOST]
+    chosen = np.flatnonzero((inside >= min_views) & (inside >= share * np.maximum(visible, 1)))
+    chosen = chosen[np.argsort(-inside[chosen], kind="stable")][:MAX_GAUSSIANS]
     found = []
-    for members in _clusters(xyz[chosen], REACH * extent):
-        worth = (inside * opacity)[chosen[members]]
-        centre = (xyz[chosen[members]] * worth[:, None]).sum(axis=0) / worth.sum()
-        spread = float(np.sqrt((((xyz[chosen[members]] - centre) ** 2).sum(axis=1) * worth).sum() / worth.sum()))
-        light = _light(centre, spread, views, detections)
+    for members in _cluster(xyz[chosen], CLUSTER_DISTANCE * extent):
+        weight = (inside * opacity)[chosen[members]]
+        centre = (xyz[chosen[members]] * weight[:, None]).sum(axis=0) / weight.sum()
+        spread = float(np.sqrt((((xyz[chosen[members]] - centre) ** 2).sum(axis=1) * weight).sum() / weight.sum()))
+        light = _to_light(centre, spread, views, detections)
         if len(light.support) >= min_views:
             found.append(light)
     return sorted(found, key=lambda light: -len(light.support))
 
 
-def _front(camera: Camera, pixels: Floats, depth: Floats) -> NDArray[np.int64]:
-    """Indices of the points in frame that nothing hides."""
+def _visible_points(camera: Camera, pixels: Floats, depth: Floats) -> NDArray[np.int64]:
+    """Return the indices of the points that are in frame and not hidden."""
     index = np.flatnonzero(camera.contains(pixels, depth))
-    size = max(camera.size) / CELLS
+    size = max(camera.size) / DEPTH_CELLS
     column, row = (pixels[index] / size).astype(int).T
-    cell = row * (CELLS + 1) + column
-    nearest = np.full((CELLS + 1) ** 2, np.inf)
+    cell = row * (DEPTH_CELLS + 1) + column
+    nearest = np.full((DEPTH_CELLS + 1) ** 2, np.inf)
     np.minimum.at(nearest, cell, depth[index])
-    return index[depth[index] <= IN_FRONT * nearest[cell]]
+    return index[depth[index] <= DEPTH_TOLERANCE * nearest[cell]]
 
 
-def _clusters(xyz: Floats, reach: float) -> list[NDArray[np.int64]]:
-    """Index sets of points linked by steps shorter than `reach`, three points or more."""
-    open_ = np.ones(len(xyz), bool)
+def _cluster(xyz: Floats, reach: float) -> list[NDArray[np.int64]]:
+    """Return index sets of points linked by steps shorter than `reach`, three points or more."""
+    remaining = np.ones(len(xyz), bool)
     found = []
-    while open_.any():
+    while remaining.any():
         members = np.zeros(len(xyz), bool)
-        edge = np.flatnonzero(open_)[:1]
+        edge = np.flatnonzero(remaining)[:1]
         while len(edge):
             members[edge] = True
-            open_[edge] = False
-            rest = np.flatnonzero(open_)
+            remaining[edge] = False
+            rest = np.flatnonzero(remaining)
             if not len(rest):
                 break
             near = np.zeros(len(rest), bool)
@@ -86,9 +91,9 @@ def _clusters(xyz: Floats, reach: float) -> list[NDArray[np.int64]]:
     return found
 
 
-def _light(centre: Floats, spread: float, views: Sequence[tuple[str, Camera]],
+def _to_light(centre: Floats, spread: float, views: Sequence[tuple[str, Camera]],
            detections: Sequence[Sequence[Detection]]) -> FoundLight:
-    """The light at a cluster's centroid, with the detections that it falls on."""
+    """Return the light at a cluster's centroid, with the detections that it falls on."""
     support, off, visible, used = [], [], 0, []
     for (name, camera), some in zip(views, detections, strict=True):
         pixels, depth = camera.project(centre[None])

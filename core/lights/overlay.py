@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Pictures of what was found: every view small, detections ringed, lights marked where they fall."""
+"""Contact sheets of a search for lights: every view small, with its detections and the projections of the lights."""
 from __future__ import annotations
 
 from collections.abc import Sequence
@@ -12,26 +12,26 @@ from ..capture import Capture
 from ..images.write import write_png
 from ..system.files import remove_file
 from .detection import Detection
-from .gather import FoundLight
+from .found_light import FoundLight
 
-COLUMNS, ROWS, WIDE = 4, 5, 360
+COLUMNS, ROWS, TILE_WIDTH = 4, 5, 360
 PALETTE = ((1.0, 0.35, 0.2), (0.25, 0.75, 1.0), (1.0, 0.85, 0.1), (0.9, 0.35, 1.0), (0.35, 1.0, 0.6))
-RING = (0.4, 1.0, 0.3)
+RING_COLOUR = (0.4, 1.0, 0.3)
 
 
-def write_sheets(folder: Path, capture: Capture, detections: Sequence[Sequence[Detection]],
+def write_overlay_sheets(folder: Path, capture: Capture, detections: Sequence[Sequence[Detection]],
                  lights: Sequence[tuple[str, FoundLight]]) -> list[Path]:
     """Write sheet1.png, sheet2.png, ... of all views into `folder`; returns their paths.
 
-    A green ring is a detection; a cross with a name is a light's projection, thick where the view supports it. An
-    arrow at the edge points to a light out of frame.
+    A green ring is a detection; a cross with a name is a light's projection, thick where the view supports it. An arrow
+    at the edge points to a light out of frame.
     """
     for old in folder.glob("sheet*.png"):
         remove_file(old)
     each = COLUMNS * ROWS
     paths = []
     for start in range(0, len(capture.views), each):
-        tiles = [_tile(capture, i, detections[i], lights)
+        tiles = [_draw_tile(capture, i, detections[i], lights)
                  for i in range(start, min(start + each, len(capture.views)))]
         height = max(tile.shape[0] for tile in tiles)
         tiles = [np.pad(tile, ((0, height - tile.shape[0]), (0, 0), (0, 0))) for tile in tiles]
@@ -44,17 +44,17 @@ def write_sheets(folder: Path, capture: Capture, detections: Sequence[Sequence[D
     return paths
 
 
-def _tile(capture: Capture, number: int, detections: Sequence[Detection],
+def _draw_tile(capture: Capture, number: int, detections: Sequence[Detection],
           lights: Sequence[tuple[str, FoundLight]]) -> NDArray[np.float32]:
     import cv2
 
     view = capture.views[number]
-    scale = WIDE / view.camera.width
-    size = (WIDE, round(view.camera.height * scale))
+    scale = TILE_WIDTH / view.camera.width
+    size = (TILE_WIDTH, round(view.camera.height * scale))
     tile = np.ascontiguousarray(capture.frame(view).resized(*size).display())
     for detection in detections:
         at = tuple(int(x) for x in detection.xy * scale)
-        cv2.circle(tile, at, max(4, round(detection.radius * scale) + 3), RING, 1, cv2.LINE_AA)
+        cv2.circle(tile, at, max(4, round(detection.radius * scale) + 3), RING_COLOUR, 1, cv2.LINE_AA)
     for i, (name, light) in enumerate(lights):
         colour = PALETTE[i % len(PALETTE)]
         pixels, depth = view.camera.project(light.xyz[None])

@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Files that are whole or absent, names that stay inside their folder, and results that are written over nothing."""
+"""Safe writing and naming of files: results are whole or absent, names stay inside their folder, sources are not
+overwritten.
+
+Every module that touches the disk goes through here. `folder_lock.py` locks a folder for the length of a job.
+"""
 from __future__ import annotations
 
 import contextlib
@@ -19,136 +23,155 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import FitFlareError, SettingsError
-from .processes import WINDOWS, machine, runs
+from .processes import WINDOWS, is_running, machine_id
 
-WRITTEN_BY_HAND = "utf-8-sig"
-"""Encoding to read what people write: UTF-8, before which Windows' editors put a mark."""
-_PARTIAL, _OLD = ".partial-", ".old-"
-_REFUSALS = 100  # a hundredth of a second apart
-_HELD = (5, 32, 33)  # Windows: access denied, sharing violation, lock violation
-_PATIENCE_S = 2.0
-_WRITER = re.compile(r"-(?P<process>\d+)@(?P<machine>[0-9a-f]{8})-")
-_ABANDONED_S = 3600.0
+UTF8_SIG = "utf-8-sig"
+"""Encoding for reading text that people write: UTF-8, with the byte order mark that Windows' editors put first or
+without."""
+_PARTIAL, _TRASH = ".partial-", ".old-"
+"""Parts of the names of temporary files and of folders on their way out."""
+_MAX_REFUSALS = 100
+"""Failed attempts to create a lock, 0.01 s each, after which the folder counts as not writable."""
+_SHARING_ERRORS = (5, 32, 33)
+"""Error codes of Windows: access denied, sharing violation, lock violation."""
+_RETRY_S = 2.0
+"""Seconds for which a refused change is tried again."""
+_WRITER_TAG = re.compile(r"-(?P<process>\d+)@(?P<machine>[0-9a-f]{8})-")
+"""The process and machine in the name of a temporary file."""
+_ABANDONED_AFTER_S = 3600.0
+"""Age from which a temporary file of another machine counts as abandoned."""
 _DRIVE = re.compile(r".*:" if WINDOWS else r"[A-Za-z]:")
-"""As the first part of a name begins; on Windows any colon, which would name a stream of a file as well."""
-_OF_DEVICES = re.compile(r"^(con|prn|aux|nul|conin\$|conout\$|(com|lpt)[\d¹²³])\s*(\.|$)", re.IGNORECASE)
+"""Start of a path with a drive letter; on Windows any colon, which would name a stream of a file as well."""
+_DEVICE_NAME = re.compile(r"^(con|prn|aux|nul|conin\$|conout\$|(com|lpt)[\d¹²³])\s*(\.|$)", re.IGNORECASE)
+"""File names that Windows takes for a device: con, prn, aux, nul, com1 and their like, whatever suffix follows."""
 
 
 @contextlib.contextmanager
-def atomic_path(target: Path | str, turn: contextlib.AbstractContextManager[None] | None = None) -> Iterator[Path]:
-    """A temporary path beside `target`, renamed on to it when the block ends well and removed when not. turn: held
-    while it is renamed.
+def atomic_path(target: Path | str,
+                commit_lock: contextlib.AbstractContextManager[None] | None = None) -> Iterator[Path]:
+    """Yield a temporary path beside `target`; rename it to `target` when the block succeeds, remove it when it fails.
 
-    The temporary name keeps the suffix, since writers choose their format by it. A symbolic link becomes a file of its
-    own: what it names may be another run's. What a killed process left of the file goes, see `remove_partial_of`.
+    commit_lock: held during the rename. The temporary name keeps the suffix, since writers choose their format by it. A
+    symbolic link is replaced by a file: what it points to may belong to another run. Temporary files that a killed
+    process left of `target` are removed, see `remove_partials_of`.
     """
     target = Path(target)
     target.parent.mkdir(parents=True, exist_ok=True)
-    remove_partial_of(target)
+    remove_partials_of(target)
     temporary = target
     try:
-        handle, name = tempfile.mkstemp(prefix=_partial_of(target) + _writer(), suffix=target.suffix, dir=target.parent)
+        handle, name = tempfile.mkstemp(prefix=_partial_prefix(target) + _writer_tag(), suffix=target.suffix,
+                                        dir=target.parent)
         os.close(handle)
         temporary = Path(name)
         yield temporary
-        _share(temporary, 0o666)
-        with turn or contextlib.nullcontext():
-            patiently(temporary.replace, target)
+        _apply_umask(temporary, 0o666)
+        with commit_lock or contextlib.nullcontext():
+            retry_while_locked(temporary.replace, target)
     except OSError as problem:  # a write to an open file does not say which
         if problem.filename is None or _PARTIAL in str(problem.filename):
             problem.filename = str(target)
         raise
     finally:
         if temporary != target:
-            with contextlib.suppress(OSError):  # what failed before is what is to be told
+            with contextlib.suppress(OSError):  # the earlier failure is reported
                 remove_file(temporary)
 
 
-def named_by(target: Path) -> Path:
-    """The file that a symbolic link names, there or not; any other path as it is. For what people keep and link by
-    hand. Raises OSError for a link that leads back to itself."""
+def follow_link(target: Path) -> Path:
+    """Return the file that a symbolic link points to, existing or not; any other path unchanged.
+
+    For files that people keep and link by hand. Raises OSError for a link that leads back to itself.
+    """
     if not target.is_symlink():
         return target
-    named = resolved(target)
+    named = real_path(target)
     if named.is_symlink():
         raise OSError(errno.ELOOP, os.strerror(errno.ELOOP), str(target))
     return named
 
 
-def rounded(value: float) -> float:
+def round_for_text(value: float) -> float:
     """For a file that people read: six decimals, and more where the world's unit is so large that it takes them."""
     return round(value, 6 + max(0, -math.floor(math.log10(abs(value))))) if value and math.isfinite(value) else value
 
 
-def patiently(change: Callable[..., object], *words: Any) -> None:
-    """Make a change of the disk, where Windows refuses again and again for two seconds: a virus scanner, an indexer or
-    Blender may hold the file for a moment."""
-    end = time.monotonic() + _PATIENCE_S
+def retry_while_locked(change: Callable[..., object], *args: Any) -> None:
+    """Call `change` with `args`; on Windows, repeat it for two seconds while another program holds the file.
+
+    A virus scanner, an indexer or Blender may hold a file for a moment.
+    """
+    end = time.monotonic() + _RETRY_S
     while True:
         try:
-            change(*words)
+            change(*args)
             return
         except PermissionError as problem:
-            if getattr(problem, "winerror", None) not in _HELD or time.monotonic() > end:
+            if getattr(problem, "winerror", None) not in _SHARING_ERRORS or time.monotonic() > end:
                 raise
             time.sleep(0.02)
 
 
 def remove_file(path: Path) -> None:
-    """Remove a file that need not be there, as patiently as Windows wants it. Raises OSError."""
-    patiently(path.unlink, True)
+    """Remove a file if it exists, with `retry_while_locked`. Raises OSError."""
+    retry_while_locked(path.unlink, True)
 
 
 def remove_folder(folder: Path) -> None:
-    """Remove a folder that need not be there, and all that is in it: by its name it is gone as a whole, or OSError is
-    raised and it is as it was, since Windows has something in it in use. What cannot be removed of it after that goes
-    with the next."""
-    for old in folder.parent.glob(f"{glob.escape(folder.name)}{_OLD}*"):
+    """Remove a folder if it exists, with its contents.
+
+    It disappears as a whole, or OSError is raised and it is unchanged, since Windows has a file of it in use. Contents
+    that cannot be deleted after the folder was moved aside are deleted by the next call.
+    """
+    for old in folder.parent.glob(f"{glob.escape(folder.name)}{_TRASH}*"):
         shutil.rmtree(old, ignore_errors=True)
     if not folder.exists():
         return
-    old = Path(tempfile.mkdtemp(prefix=f"{folder.name}{_OLD}", dir=folder.parent))
+    old = Path(tempfile.mkdtemp(prefix=f"{folder.name}{_TRASH}", dir=folder.parent))
     try:
-        patiently(folder.rename, old / folder.name)
+        retry_while_locked(folder.rename, old / folder.name)
     finally:
         shutil.rmtree(old, ignore_errors=True)
 
 
-def _share(temporary: Path, mode: int) -> None:
-    """mkstemp makes private files; the result gets the permissions that any new one here would have, where the disk
-    has permissions at all and lets them be changed (Windows' disks in WSL and some network shares do not)."""
+def _apply_umask(temporary: Path, mode: int) -> None:
+    """Give a file of mkstemp, which is private, the permissions of any new file, where the disk has permissions.
+
+    Windows' disks in WSL and some network shares refuse to change them.
+    """
     with contextlib.suppress(PermissionError):
         temporary.chmod(mode & ~_umask())
 
 
-def _partial_of(target: Path) -> str:
+def _partial_prefix(target: Path) -> str:
+    """Start of the names of temporary files for `target`."""
     return f"{_PARTIAL}{os.fsencode(target.name)[:80].decode(errors='ignore')}-"
 
 
-def _writer() -> str:
-    """This process, for the name of what it writes: its number and its machine's."""
-    return f"{os.getpid()}@{_machine()}-"
+def _writer_tag() -> str:
+    """Identify this process in the name of a file that it writes: process id and a hash of its machine."""
+    return f"{os.getpid()}@{_machine_hash()}-"
 
 
 @lru_cache(maxsize=1)
-def _machine() -> str:
-    return hashlib.sha256(machine().encode()).hexdigest()[:8]
+def _machine_hash() -> str:
+    return hashlib.sha256(machine_id().encode()).hexdigest()[:8]
 
 
 def _is_being_written(partial: Path) -> bool:
-    """Whether the process that its name tells still runs. Of another machine it is taken to for an hour."""
-    told = _WRITER.search(partial.name)
-    if told is None:
+    """True if the process in the name of a temporary file still runs; of another machine, for an hour."""
+    writer = _WRITER_TAG.search(partial.name)
+    if writer is None:
         return False
-    if told["machine"] != _machine():
+    if writer["machine"] != _machine_hash():
         with contextlib.suppress(OSError):
-            return time.time() - partial.stat().st_mtime < _ABANDONED_S
+            return time.time() - partial.stat().st_mtime < _ABANDONED_AFTER_S
         return False
-    return int(told["process"]) == os.getpid() or runs(int(told["process"]))
+    return int(writer["process"]) == os.getpid() or is_running(int(writer["process"]))
 
 
 def _remove_abandoned(partial: Path) -> None:
-    """A file or a folder, unless it is being written, where the system lets it."""
+    """Remove a temporary file or folder unless it is being written, where the system lets it."""
     if _is_being_written(partial):
         return
     if partial.is_dir():
@@ -158,74 +181,81 @@ def _remove_abandoned(partial: Path) -> None:
             remove_file(partial)
 
 
-def remove_partial_of(target: Path | str) -> None:
-    """Remove what a killed process left of `target`, a file or a folder, half written, where the system lets it. What
-    another one is writing stays: on a farm a task may be given again while its first worker still lives."""
+def remove_partials_of(target: Path | str) -> None:
+    """Remove the temporary files and folders that killed processes left of `target`, where the system lets it.
+
+    Those of a running process stay: a farm may start a task again while its first worker still lives.
+    """
     target = Path(target)
-    for path in target.parent.glob(f"{glob.escape(_partial_of(target))}*"):
+    for path in target.parent.glob(f"{glob.escape(_partial_prefix(target))}*"):
         _remove_abandoned(path)
 
 
 @contextlib.contextmanager
-def locked(lock: Path | str, stale_s: float = 10.0) -> Iterator[None]:
-    """Hold a lock file while a short block runs, so that processes of one folder take turns, on shared disks too.
+def file_lock(lock: Path | str, stale_s: float = 10.0) -> Iterator[None]:
+    """Hold a lock file while a short block runs, so that processes that share a folder take turns, on network disks
+    too.
 
-    A lock older than `stale_s` belonged to a process that was killed, and is taken over; so is one that stays the same
-    for so long, whatever the clocks say.
+    A lock older than `stale_s` belonged to a killed process and is taken over; so is one that stays unchanged for that
+    long, whatever the clocks say.
     """
     lock = Path(lock)
     lock.parent.mkdir(parents=True, exist_ok=True)
-    refused, seen, since = 0, 0, time.monotonic()
+    refusals, last_mtime, since = 0, 0, time.monotonic()
     while True:
         try:
             os.close(os.open(lock, os.O_CREAT | os.O_EXCL | os.O_WRONLY))
-            own = lock.stat().st_mtime_ns
+            created_ns = lock.stat().st_mtime_ns
             break
         except (FileExistsError, PermissionError) as problem:
             time.sleep(0.01)
             try:
                 state = lock.stat()
-                if state.st_mtime_ns != seen:
-                    seen, since = state.st_mtime_ns, time.monotonic()
+                if state.st_mtime_ns != last_mtime:
+                    last_mtime, since = state.st_mtime_ns, time.monotonic()
                 if max(time.time() - state.st_mtime, time.monotonic() - since) > stale_s:
-                    with locked(lock.with_name(lock.name + ".taken_over"), stale_s):  # another may wait for the same
+                    with file_lock(lock.with_name(lock.name + ".taken_over"), stale_s):  # others may want to as well
                         _remove_lock(lock, state.st_mtime_ns)
             except FileNotFoundError:
-                # Windows refuses while another one is removing it; a folder that may not be written refuses for ever.
-                refused += isinstance(problem, PermissionError)
-                if refused > _REFUSALS:
+                # Windows refuses while another process removes it; a folder that is not writable refuses for ever.
+                refusals += isinstance(problem, PermissionError)
+                if refusals > _MAX_REFUSALS:
                     raise problem from None
     try:
         yield
     finally:
-        patiently(_remove_lock, lock, own)
+        retry_while_locked(_remove_lock, lock, created_ns)
 
 
-def _remove_lock(lock: Path, made_ns: int) -> None:
-    """The one that was made at that time: who was slow enough to be taken for dead has lost it to another."""
+def _remove_lock(lock: Path, created_ns: int) -> None:
+    """Remove the lock that was created at that time; a process that was slow enough to lose its lock leaves the new
+    one."""
     with contextlib.suppress(FileNotFoundError):
-        if lock.stat().st_mtime_ns == made_ns:
+        if lock.stat().st_mtime_ns == created_ns:
             lock.unlink()
 
 
 @contextlib.contextmanager
 def atomic_folder(target: Path | str) -> Iterator[Path]:
-    """A temporary folder beside `target`, which must not be there yet, renamed to it when the block ends well and
-    removed when not. What a killed process left of it goes, too."""
+    """Yield a temporary folder beside `target`, which must not exist; rename it to `target` when the block succeeds,
+    remove it when it fails.
+
+    Temporary folders that a killed process left of `target` are removed.
+    """
     target = Path(target)
     target.parent.mkdir(parents=True, exist_ok=True)
-    remove_partial_of(target)
-    temporary = Path(tempfile.mkdtemp(prefix=_partial_of(target) + _writer(), dir=target.parent))
+    remove_partials_of(target)
+    temporary = Path(tempfile.mkdtemp(prefix=_partial_prefix(target) + _writer_tag(), dir=target.parent))
     try:
         yield temporary
-        _share(temporary, 0o777)
-        patiently(temporary.rename, target)
+        _apply_umask(temporary, 0o777)
+        retry_while_locked(temporary.rename, target)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
 
 
-def remove_partial(folder: Path | str) -> None:
-    """Remove what a killed process left half written below `folder`; only for whom the folder belongs to alone."""
+def remove_partials_below(folder: Path | str) -> None:
+    """Remove all abandoned temporary files below `folder`; only for the process that has the folder to itself."""
     for path in Path(folder).rglob(f"{_PARTIAL}*"):
         _remove_abandoned(path)
 
@@ -243,56 +273,56 @@ def write_text(path: Path | str, text: str) -> None:
 
 
 def write_json(path: Path | str, data: Any) -> None:
-    """Write JSON atomically. NaN and infinity are refused: other readers would choke on them."""
+    """Write JSON atomically. Raises ValueError for NaN and infinity, which other readers reject."""
     write_text(path, json.dumps(data, indent=2, allow_nan=False) + "\n")
 
 
 def read_json(path: Path | str, error: type[FitFlareError]) -> Any:
-    """The content of a JSON file; `error` with one sentence where it cannot be had."""
+    """Read a JSON file; raises `error` with one sentence if it cannot be read."""
     path = Path(path)
     try:
-        return json.loads(path.read_text(encoding=WRITTEN_BY_HAND), object_pairs_hook=_without_doubles)
+        return json.loads(path.read_text(encoding=UTF8_SIG), object_pairs_hook=_reject_duplicate_keys)
     except OSError as problem:
         raise error(f"{path} cannot be read: {problem.strerror or problem}.") from problem
     except (ValueError, RecursionError) as problem:
-        raise error(f"{path} is not valid JSON ({problem}); mend it or make it again.") from problem
+        raise error(f"{path} is not valid JSON ({problem}); correct it or make it again.") from problem
 
 
-def _without_doubles(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Raises ValueError for a name that is given twice, of which json keeps the last."""
-    found = dict(pairs)
-    if len(found) < len(pairs):
+def _reject_duplicate_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Raise ValueError for a key that occurs twice, of which json would keep the last."""
+    unique = dict(pairs)
+    if len(unique) < len(pairs):
         names = [name for name, _ in pairs]
         raise ValueError(f"it has {next(name for name in names if names.count(name) > 1)!r} twice")
-    return found
+    return unique
 
 
-def plain_name(name: str) -> str:
-    """`name`, with "_" after the part that Windows takes for a device, whatever suffix follows: con, aux, nul, com1 and
-    their like."""
-    return _OF_DEVICES.sub(r"\1_\3", name, count=1)
+def avoid_device_name(name: str) -> str:
+    """Return `name` with "_" after a part that Windows takes for a device (con, aux, nul, com1, ...), whatever suffix
+    follows."""
+    return _DEVICE_NAME.sub(r"\1_\3", name, count=1)
 
 
 def _is_file_name(part: str) -> bool:
-    """Whether any file system would take it: 255 bytes at most, and as Python has the names that are not UTF-8."""
+    """True if any file system accepts the name: at most 255 bytes, in Python's encoding of names that are not UTF-8."""
     try:
         return len(os.fsencode(part)) <= 255
     except UnicodeEncodeError:
         return False
 
 
-def inside(folder: Path | str, name: str, error: type[FitFlareError]) -> Path:
-    """`folder / name`, refused with `error` where the name would lead out of the folder.
+def safe_join(folder: Path | str, name: str, error: type[FitFlareError]) -> Path:
+    """Return `folder / name`; raises `error` where the name would lead out of the folder.
 
-    Absolute names, drive letters, `..` and symbolic links that point outside are refused, on Windows those of devices
-    too; what a file from elsewhere names must not reach the rest of the disk.
+    Absolute names, drive letters, `..` and symbolic links that point outside are refused, on Windows device names too:
+    a name in a file from elsewhere must not reach the rest of the disk.
     """
     folder = Path(folder)
     parts = Path(name.replace("\\", "/"))
     if (not parts.parts or "\0" in name or parts.is_absolute() or _DRIVE.match(parts.parts[0])
             or ".." in parts.parts or not all(map(_is_file_name, parts.parts))):
         raise error(f"{folder} names the file {name!r:.150}, which is not inside the folder; remove that entry.")
-    if WINDOWS and any(map(_OF_DEVICES.match, parts.parts)):
+    if WINDOWS and any(map(_DEVICE_NAME.match, parts.parts)):
         raise error(f"{folder} names the file {name!r:.150}, which Windows takes for a device; give it another name.")
     path = folder / parts
     if not path.resolve().is_relative_to(folder.resolve()):
@@ -300,28 +330,32 @@ def inside(folder: Path | str, name: str, error: type[FitFlareError]) -> Path:
     return path
 
 
-def check_apart(sources: Iterable[Path], results: Iterable[Path]) -> None:
-    """Raises SettingsError where a result would be written over a source, or two would be the same file."""
-    read, written = {_file_of(path) for path in sources}, set()
+def check_no_overwrite(sources: Iterable[Path], results: Iterable[Path]) -> None:
+    """Raise SettingsError where a result would overwrite a source, or two results would be the same file."""
+    source_files, result_files = {_file_identity(path) for path in sources}, set()
     for path in results:
-        whole = _file_of(path)
-        if whole in read:
+        identity = _file_identity(path)
+        if identity in source_files:
             raise SettingsError(f"{path} would be overwritten by a result; choose another folder for the results.")
-        if whole in written:
+        if identity in result_files:
             raise SettingsError(f"Two results would be written to the same file, {path}; choose another folder for "
-                                "one kind of them, or take plates that differ by their suffix alone apart.")
-        written.add(whole)
+                                "one kind of them, or separate plates that differ only by their suffix.")
+        result_files.add(identity)
 
 
-def resolved(path: Path) -> Path:
-    """`Path.resolve`, which before Python 3.13 raises for a link that leads back to itself; that stays as it is."""
+def real_path(path: Path) -> Path:
+    """Resolve links like `Path.resolve`, which before Python 3.13 raises for a link to itself; such a link stays
+    unchanged."""
     return Path(os.path.realpath(path))
 
 
-def _file_of(path: Path) -> object:
-    """The same of every name that a file has: of one that is there its place on the disk, which file systems that do
-    not tell Plates from plates know by both names."""
-    whole = resolved(path)
+def _file_identity(path: Path) -> object:
+    """Return a value that is equal for all names of one file: device and inode of an existing one, else its resolved
+    path.
+
+    File systems that ignore case know one file as both Plates and plates.
+    """
+    whole = real_path(path)
     try:
         folder, file = whole.parent.stat(), whole.stat()
     except OSError:
@@ -329,8 +363,8 @@ def _file_of(path: Path) -> object:
     return (folder.st_dev, folder.st_ino, file.st_ino) if folder.st_ino and file.st_ino else whole
 
 
-def digest_of(paths: Iterable[Path]) -> str:
-    """Changes whenever what these files hold together does; those that are not there are left out."""
+def hash_files(paths: Iterable[Path]) -> str:
+    """Hash the joint content of these files; missing ones are left out."""
     digest = hashlib.sha256()
     for path in paths:
         if path.is_file():
@@ -338,13 +372,13 @@ def digest_of(paths: Iterable[Path]) -> str:
     return digest.hexdigest()[:16]
 
 
-def content_of(path: Path) -> str:
-    """A digest of a file's content. Asked for again it is known, as long as the file's size and time stay."""
+def content_hash(path: Path) -> str:
+    """Hash the content of a file; cached while its size and time stay the same."""
     state = path.stat()
-    return _content(path, state.st_size, state.st_mtime_ns)
+    return _cached_hash(path, state.st_size, state.st_mtime_ns)
 
 
 @lru_cache(maxsize=64)
-def _content(path: Path, _size: int, _time: int) -> str:
+def _cached_hash(path: Path, _size: int, _time: int) -> str:
     with open(path, "rb") as stream:
         return hashlib.file_digest(stream, "blake2b").hexdigest()[:16]

@@ -1,6 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A folder that one process has to itself for as long as a long job runs in it, by a lock of the system's, which goes
-with the process however that ends. For a short turn in a folder that many write to there is `files.locked`."""
+"""Locks a folder for one process for the length of a job: fit, solve and training take it.
+
+The lock is the operating system's and ends with the process, however that ends. `files.file_lock` is for a short turn
+in a folder that many processes write to.
+"""
 from __future__ import annotations
 
 import contextlib
@@ -12,45 +15,46 @@ from pathlib import Path
 
 from ..errors import RunError
 
-_LOCK = ".held"
-_TAKEN = (errno.EACCES, errno.EAGAIN, errno.EWOULDBLOCK, errno.EDEADLK)
+LOCK_FILE = ".held"
+_ALREADY_LOCKED = (errno.EACCES, errno.EAGAIN, errno.EWOULDBLOCK, errno.EDEADLK)
+"""Error numbers that say that another process has the lock."""
 
 
 @contextlib.contextmanager
-def held(folder: Path | str) -> Iterator[None]:
-    """Have a folder. It is made where it is missing, and removed again at the end if nothing was put into it.
+def folder_lock(folder: Path | str) -> Iterator[None]:
+    """Lock a folder. It is created where it is missing, and removed at the end if nothing was put into it.
 
-    Raises RunError where another process has it. On a disk that knows no locks nobody is kept out.
+    Raises RunError where another process has it. On a disk without locks every process gets it.
     """
     folder = Path(folder)
-    made = not folder.exists()
+    is_new = not folder.exists()
     folder.mkdir(parents=True, exist_ok=True)
-    lock = folder / _LOCK
-    descriptor = _locked(lock)
+    lock = folder / LOCK_FILE
+    descriptor = _open_locked(lock)
     if descriptor is None:
-        raise RunError(f"Another process is at work in {folder}; wait for its end or stop it, or choose another "
+        raise RunError(f"Another process is using {folder}; wait until it ends or stop it, or choose another "
                        "folder.")
     try:
         yield
     finally:
         _remove(lock, descriptor)
-        if made:
-            with contextlib.suppress(OSError):  # what is in it stays
+        if is_new:
+            with contextlib.suppress(OSError):  # not empty
                 folder.rmdir()
 
 
-def _locked(lock: Path) -> int | None:
-    """The descriptor of the file, which is locked until that is closed; None where it is locked already."""
+def _open_locked(lock: Path) -> int | None:
+    """Return the descriptor of the lock file, locked until it is closed; None where another process has it."""
     while True:
         descriptor = os.open(lock, os.O_CREAT | os.O_RDWR)
         try:
             _lock(descriptor)
             if os.path.samestat(os.fstat(descriptor), lock.stat()):
                 return descriptor
-        except FileNotFoundError:  # who had it removed it meanwhile
+        except FileNotFoundError:  # its holder has removed it meanwhile
             pass
         except OSError as problem:
-            if problem.errno not in _TAKEN:
+            if problem.errno not in _ALREADY_LOCKED:
                 return descriptor
             os.close(descriptor)
             return None
@@ -58,7 +62,7 @@ def _locked(lock: Path) -> int | None:
 
 
 def _lock(descriptor: int) -> None:
-    """Until the file is closed, by whom that may be; OSError at once where it is locked."""
+    """Lock the file until it is closed; raises OSError at once where it is locked."""
     if sys.platform == "win32":
         import msvcrt
 
@@ -71,8 +75,10 @@ def _lock(descriptor: int) -> None:
 
 
 def _remove(lock: Path, descriptor: int) -> None:
-    """While it is locked, or another process could have it and a third one a new file; but Windows removes no open
-    file."""
+    """Remove the lock file while it is locked, or another process could lock it and a third one a new file.
+
+    Windows removes no open file, so there it is closed first.
+    """
     steps = [lambda: os.close(descriptor), lock.unlink]
     for step in steps if sys.platform == "win32" else reversed(steps):
         with contextlib.suppress(OSError):

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""How long work tells where it stands, and how it is asked to stop.
+"""Reports progress of a job, and passes on requests to stop it.
 
-Core code takes a `Progress` and calls `stage`, `advance`, `say`, `result`. The base class is silent;
-`TerminalProgress` draws a bar; `OpenJdProgress` speaks to farms of the Open Job Description; `JsonProgress`
-writes one JSON object a line for the add-on and other programs:
+Core code takes a `Progress` and calls `stage`, `advance`, `say`, `result`. The base class is silent; `TerminalProgress`
+draws a bar; `OpenJdProgress` writes the Open Job Description of farms; `JsonProgress` writes one JSON object a line for
+the add-on and other programs:
 
     {"type": "stage", "name": "fit", "total": 3000, "done": 0}
-    {"type": "progress", "stage": "fit", "done": 120, "total": 3000, "left_s": 61.2, "figures": {…}}
+    {"type": "progress", "stage": "fit", "done": 120, "total": 3000, "eta_s": 61.2, "figures": {…}}
     {"type": "say", "text": "…"}
     {"type": "result", "data": {…}}
     {"type": "error", "text": "…"}
@@ -30,81 +30,84 @@ from typing import Any, TextIO
 from ..errors import DISK_FULL, Cancelled
 
 STOP_FILE = "FIT_FLARE_STOP"
-"""Of the environment: the path of a file which, when it is there, asks a command to stop."""
-STOP_FILE_EVERY_S = 0.3
-LEAST_PACE_OVER_S, PACE_OVER_S = 1.0, 60.0
-"""Over which the pace of work is measured, at least and at most: a fit slows down as its Gaussians grow more."""
-_NO_LISTENER = (*DISK_FULL, errno.EIO)  # the latter of a terminal that is gone
+"""Environment variable with the path of a file whose existence asks a command to stop."""
+STOP_FILE_INTERVAL_S = 0.3
+"""Seconds between two looks for that file."""
+MIN_PACE_WINDOW_S, MAX_PACE_WINDOW_S = 1.0, 60.0
+"""Shortest and longest time over which the pace of work is measured: a fit slows down as its Gaussians become more."""
+_STREAM_GONE = (*DISK_FULL, errno.EIO)
+"""Error numbers of a stream that takes no more: the disk is full, or (EIO) the terminal is closed."""
 
 
 class Progress:
-    """Silent progress, and the interface of the others; `advance` raises Cancelled after `request_stop`."""
+    """Silent progress, and the interface of the other classes; `advance` raises Cancelled after `request_stop`."""
 
     def __init__(self) -> None:
         self._stop = threading.Event()
         self._stage = ""
         self._total = 0
         self._done = 0
-        self._marks: deque[tuple[float, int]] = deque()
-        """Of this stage when how many steps were done, from the first on, about once a second over the last
-        `PACE_OVER_S`."""
+        self._samples: deque[tuple[float, int]] = deque()
+        """(time, steps done), about once a second over the last MAX_PACE_WINDOW_S of this stage."""
 
     def stage(self, name: str, total: int, done: int = 0) -> None:
         """Begin a stage of `total` steps, of which `done` were made by an earlier run."""
         self._stage, self._total, self._done = name, total, done
-        self._marks.clear()
+        self._samples.clear()
         self._show_stage()
         self.check()
 
     def advance(self, steps: int = 1, **figures: float) -> None:
         """Count steps; `figures` are shown beside them (loss, Gaussians, …)."""
         self._done += steps
-        self._mark()
+        self._sample_pace()
         self._show_progress(figures)
         self.check()
 
     def say(self, text: str) -> None:
-        """One sentence for the person who watches."""
+        """Report one sentence to the user."""
 
     def result(self, **data: Any) -> None:
-        """What the command made: paths and figures, JSON-able."""
+        """Report the paths and figures that the command made, JSON-able."""
 
     def error(self, text: str) -> None:
-        """The one sentence a failed command ends with."""
+        """Report the sentence with which a failed command ends."""
 
     def close(self) -> None:
-        """Leave the terminal tidy."""
+        """Restore the terminal."""
 
     def request_stop(self) -> None:
         """Ask the work to end at its next step; safe from signal handlers and other threads."""
         self._stop.set()
 
     def check(self) -> None:
-        """Raise Cancelled if a stop was asked for."""
+        """Raise Cancelled if a stop was requested."""
         if self._stop.is_set():
-            raise Cancelled(f"Stopped during {self._stage or 'start-up'} as asked; what is done is kept.")
+            raise Cancelled(f"Stopped during {self._stage or 'start-up'} as requested; what is done is kept.")
 
     @property
-    def left_s(self) -> float | None:
-        """Seconds left in this stage at the pace of late; None until a second after the first step, which says little
-        of the others: in it things are compiled and loaded, and processes that work side by side end several at once.
+    def eta_s(self) -> float | None:
+        """Estimated seconds to the end of this stage, by the recent pace; None until a second after the first step.
+
+        The first step says little about the others: code is compiled and data loaded in it, and parallel processes end
+        several at once.
         """
         if self._done >= self._total:
             return 0.0
-        if not self._marks:
+        if not self._samples:
             return None
-        since, before = self._marks[0]
+        since, before = self._samples[0]
         passed = time.monotonic() - since
-        if passed < LEAST_PACE_OVER_S or self._done == before:
+        if passed < MIN_PACE_WINDOW_S or self._done == before:
             return None
         return passed / (self._done - before) * (self._total - self._done)
 
-    def _mark(self) -> None:
-        now, marks = time.monotonic(), self._marks
-        if not marks or now - marks[-1][0] >= LEAST_PACE_OVER_S:
-            marks.append((now, self._done))
-        while len(marks) > 2 and now - marks[1][0] > PACE_OVER_S:
-            marks.popleft()
+    def _sample_pace(self) -> None:
+        now, samples = time.monotonic(), self._samples
+        if not samples or now - samples[-1][0] >= MIN_PACE_WINDOW_S:
+            samples.append((now, self._done))
+        while len(samples) > 2 and now - samples[1][0] > MAX_PACE_WINDOW_S:
+            samples.popleft()
 
     def _show_stage(self) -> None:
         pass
@@ -113,42 +116,44 @@ class Progress:
         pass
 
 
-def _tell(stream: TextIO, line: str) -> None:
-    """A disk too full for what is told is no reason to end: the work goes on, or says so by its own failure. A terminal
-    that is gone has its own way of asking for the end."""
+def _write_line(stream: TextIO, line: str) -> None:
+    """Write a line; drop it where the disk is full or the terminal closed.
+
+    The work goes on, or fails for its own reasons. A closed terminal stops a command by its signal.
+    """
     try:
         stream.write(f"{line}\n")
         stream.flush()
     except OSError as problem:
-        if problem.errno not in _NO_LISTENER:
+        if problem.errno not in _STREAM_GONE:
             raise
 
 
 def flush_or_drop(stream: TextIO) -> None:
-    """Leave nothing in the stream that a full disk or a terminal that is gone refuses: Python would try it again at
-    exit, and fail by it."""
+    """Flush a stream, and discard what a full disk or a closed terminal refuses: Python would retry at exit, and fail.
+    """
     try:
         stream.flush()
     except OSError as problem:
-        if problem.errno not in _NO_LISTENER:
+        if problem.errno not in _STREAM_GONE:
             raise
-        number, nowhere = stream.fileno(), os.open(os.devnull, os.O_WRONLY)
+        number, null = stream.fileno(), os.open(os.devnull, os.O_WRONLY)
         before = os.dup(number)
-        os.dup2(nowhere, number)
+        os.dup2(null, number)
         try:
             stream.flush()
         finally:
             os.dup2(before, number)
             os.close(before)
-            os.close(nowhere)
+            os.close(null)
 
 
-class _Lines:
-    """A line every ten seconds and at the end, in place of tqdm's bar."""
+class _LineProgress:
+    """Prints a line every ten seconds and at the end; stands in for tqdm's bar."""
 
     def __init__(self, name: str, total: int, done: int, stream: TextIO) -> None:
         self._name, self._total, self._done, self._stream = name, total, done, stream
-        self._shown = time.monotonic()
+        self._reported = time.monotonic()
         self._figures = ""
 
     def set_postfix(self, figures: dict[str, str], refresh: bool) -> None:  # noqa: ARG002 - tqdm's own signature
@@ -156,29 +161,29 @@ class _Lines:
 
     def update(self, steps: int) -> None:
         self._done += steps
-        if self._done >= self._total or time.monotonic() - self._shown > 10:
-            self._shown = time.monotonic()
-            _tell(self._stream, f"{self._name}: {self._done}/{self._total}{self._figures}")
+        if self._done >= self._total or time.monotonic() - self._reported > 10:
+            self._reported = time.monotonic()
+            _write_line(self._stream, f"{self._name}: {self._done}/{self._total}{self._figures}")
 
     def clear(self) -> None:
-        """Lines leave nothing to clear."""
+        """Does nothing: lines need no clearing."""
 
     def close(self) -> None:
-        """Nor to close."""
+        """Does nothing."""
 
 
 class TerminalProgress(Progress):
-    """A bar on a terminal (tqdm); plain lines where the output is a file, or tqdm is not installed."""
+    """Draws a bar on a terminal (tqdm); prints lines where the output is a file, or tqdm is not installed."""
 
     def __init__(self, stream: TextIO | None = None) -> None:
         super().__init__()
         self._stream = stream or sys.stderr
         self._bar: Any = None
-        self._shown = 0
+        self._reported = 0
 
     def _show_stage(self) -> None:
         self.close()
-        self._shown = self._done
+        self._reported = self._done
         # Blender's own Python has no tqdm.
         if self._stream.isatty() and importlib.util.find_spec("tqdm"):
             from tqdm import tqdm
@@ -186,26 +191,26 @@ class TerminalProgress(Progress):
             self._bar = tqdm(total=self._total, initial=self._done, desc=self._stage, file=self._stream,
                              dynamic_ncols=True)
         else:
-            self._bar = _Lines(self._stage, self._total, self._done, self._stream)
+            self._bar = _LineProgress(self._stage, self._total, self._done, self._stream)
 
     def _show_progress(self, figures: dict[str, float]) -> None:
         if self._bar is None:
             return
         if figures:
             self._bar.set_postfix({key: f"{value:.4g}" for key, value in figures.items()}, refresh=False)
-        self._bar.update(self._done - self._shown)
-        self._shown = self._done
+        self._bar.update(self._done - self._reported)
+        self._reported = self._done
 
     def say(self, text: str) -> None:
         if self._bar is not None and self._done >= self._total:
             self.close()
         elif self._bar is not None:
             self._bar.clear()
-        _tell(self._stream, text)
+        _write_line(self._stream, text)
 
     def error(self, text: str) -> None:
         self.close()
-        _tell(self._stream, f"error: {text}")
+        _write_line(self._stream, f"error: {text}")
 
     def close(self) -> None:
         if self._bar is not None:
@@ -214,7 +219,7 @@ class TerminalProgress(Progress):
 
 
 class JsonProgress(Progress):
-    """One JSON object a line on stdout, at most ten progress lines a second."""
+    """Writes one JSON object a line to stdout, at most ten progress lines a second."""
 
     def __init__(self, stream: TextIO | None = None) -> None:
         super().__init__()
@@ -222,7 +227,7 @@ class JsonProgress(Progress):
         self._last = 0.0
 
     def _send(self, **event: Any) -> None:
-        _tell(self._stream, json.dumps(event))
+        _write_line(self._stream, json.dumps(event))
 
     def _show_stage(self) -> None:
         self._last = 0.0
@@ -233,9 +238,9 @@ class JsonProgress(Progress):
         if self._done < self._total and now - self._last < 0.1:
             return
         self._last = now
-        left = self.left_s
+        eta = self.eta_s
         self._send(type="progress", stage=self._stage, done=self._done, total=self._total,
-                   left_s=None if left is None else round(left, 1), figures=figures)
+                   eta_s=None if eta is None else round(eta, 1), figures=figures)
 
     def say(self, text: str) -> None:
         self._send(type="say", text=text)
@@ -248,7 +253,7 @@ class JsonProgress(Progress):
 
 
 class OpenJdProgress(Progress):
-    """Lines of the Open Job Description on stdout: openjd_progress (per cent), openjd_status, openjd_fail.
+    """Writes lines of the Open Job Description to stdout: openjd_progress (per cent), openjd_status, openjd_fail.
 
     At most one progress line a second, and each per cent once.
     """
@@ -256,23 +261,23 @@ class OpenJdProgress(Progress):
     def __init__(self, stream: TextIO | None = None) -> None:
         super().__init__()
         self._stream = stream or sys.stdout
-        self._shown = -1
+        self._reported = -1
         self._last = 0.0
 
     def _line(self, kind: str, text: str) -> None:
-        _tell(self._stream, f"openjd_{kind}: {' '.join(text.split())}")
+        _write_line(self._stream, f"openjd_{kind}: {' '.join(text.split())}")
 
     def _show_stage(self) -> None:
-        self._shown, self._last = -1, 0.0
+        self._reported, self._last = -1, 0.0
         self._line("status", f"{self._stage} {self._done}/{self._total}")
         self._show_progress({})
 
     def _show_progress(self, figures: dict[str, float]) -> None:  # noqa: ARG002 - the base's signature
         share = int(100 * min(max(self._done / self._total, 0), 1)) if self._total > 0 else 100
         now = time.monotonic()
-        if share == self._shown or (share < 100 and now - self._last < 1):
+        if share == self._reported or (share < 100 and now - self._last < 1):
             return
-        self._shown, self._last = share, now
+        self._reported, self._last = share, now
         self._line("progress", f"{share}")
 
     def say(self, text: str) -> None:
@@ -283,27 +288,27 @@ class OpenJdProgress(Progress):
 
 
 @contextlib.contextmanager
-def stoppable(progress: Progress) -> Iterator[Progress]:
-    """Let `stop_signals` and a file where STOP_FILE says ask the work to stop at its next step."""
-    with _stopped_by_file(progress), _stopped_by_signals(progress):
+def stop_on_request(progress: Progress) -> Iterator[Progress]:
+    """Stop the work at its next step on one of `stop_signals`, or when the file that STOP_FILE names exists."""
+    with _stop_on_file(progress), _stop_on_signals(progress):
         yield progress
 
 
 @contextlib.contextmanager
-def _stopped_by_file(progress: Progress) -> Iterator[Progress]:
-    named = os.environ.get(STOP_FILE)
-    if not named:
+def _stop_on_file(progress: Progress) -> Iterator[Progress]:
+    path = os.environ.get(STOP_FILE)
+    if not path:
         yield progress
         return
-    file, ended = Path(named), threading.Event()
+    file, ended = Path(path), threading.Event()
 
-    def look() -> None:
-        while not ended.wait(STOP_FILE_EVERY_S):
+    def watch() -> None:
+        while not ended.wait(STOP_FILE_INTERVAL_S):
             if file.exists():
                 progress.request_stop()
                 return
 
-    watcher = threading.Thread(target=look, daemon=True)
+    watcher = threading.Thread(target=watch, daemon=True)
     watcher.start()
     try:
         yield progress
@@ -313,34 +318,36 @@ def _stopped_by_file(progress: Progress) -> Iterator[Progress]:
 
 
 def stop_signals() -> list[int]:
-    """SIGINT, SIGTERM, (Windows) CTRL_BREAK; and where the system has it SIGHUP, of a terminal that is gone, unless
-    nohup has it ignored."""
+    """Return the signals that stop a command: SIGINT, SIGTERM, (Windows) CTRL_BREAK, and SIGHUP where the system has
+    it.
+
+    SIGHUP, which a closed terminal sends, is left out where nohup has it ignored.
+    """
     names = ("SIGINT", "SIGTERM", "SIGBREAK", "SIGHUP")
     numbers = [getattr(signal, name) for name in names if hasattr(signal, name)]
     return [number for number in numbers if not is_hangup(number) or signal.getsignal(number) is not signal.SIG_IGN]
 
 
 def is_hangup(number: int) -> bool:
-    """Whether a signal says that the terminal is gone."""
+    """True if a signal says that the terminal is closed."""
     return number == getattr(signal, "SIGHUP", None)
 
 
 @contextlib.contextmanager
-def _stopped_by_signals(progress: Progress) -> Iterator[Progress]:
-    """Only the main thread may set signal handlers; elsewhere this changes nothing."""
+def _stop_on_signals(progress: Progress) -> Iterator[Progress]:
+    """Set the handlers for the length of the block. Only the main thread may; elsewhere this changes nothing."""
     if threading.current_thread() is not threading.main_thread():
         yield progress
         return
     before = {number: signal.getsignal(number) for number in stop_signals()}
 
-    def ask(number: int, _frame: Any) -> None:
+    def request_stop(number: int, _frame: Any) -> None:
         progress.request_stop()
-        # A second signal gets the system's own, immediate, answer. That a terminal is gone both the system and the
-        # shell tell.
+        # A second signal takes effect at once. A closed terminal signals twice: by the system and by the shell.
         signal.signal(number, signal.SIG_IGN if is_hangup(number) else signal.SIG_DFL)
 
     for number in before:
-        signal.signal(number, ask)
+        signal.signal(number, request_stop)
     try:
         yield progress
     finally:

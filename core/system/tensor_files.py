@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Tensors on disk: safetensors with text in their header, whole or absent."""
+"""Tensors on disk: safetensors with text metadata, written atomically. Checkpoints, flares and weights use it."""
 from __future__ import annotations
 
 from collections.abc import Mapping
@@ -10,19 +10,20 @@ from torch import Tensor
 from .files import atomic_path
 
 
-def write(path: Path | str, tensors: Mapping[str, Tensor], about: Mapping[str, str]) -> None:
-    """Tensors and text about them."""
+def write(path: Path | str, tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> None:
+    """Write tensors and their metadata."""
     from safetensors.torch import save
 
     with atomic_path(path) as temporary:
-        # As bytes: its own writer makes a temporary file of another name, which a kill would leave behind.
-        temporary.write_bytes(save({name: value.cpu().contiguous() for name, value in tensors.items()}, dict(about)))
+        # As bytes: the writer of safetensors makes a temporary file of another name, which a kill would leave behind.
+        temporary.write_bytes(save({name: value.cpu().contiguous() for name, value in tensors.items()}, dict(metadata)))
 
 
 def read(path: Path | str) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """(tensors, the text about them). Raises OSError, and ValueError where the file is damaged.
+    """Read (tensors, metadata). Raises OSError, and ValueError where the file is damaged.
 
-    Copies: what safetensors gives are views of the file, and while one of them is held Windows lets nobody replace it.
+    Returns copies: safetensors gives views of the file, and while one of them exists Windows lets nobody replace the
+    file.
     """
     from safetensors import SafetensorError, safe_open
 

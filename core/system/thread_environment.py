@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The environment variables that numpy and torch read once, when they are loaded."""
+"""Environment variables that numpy and torch read once, when they are imported; each entry point sets them first."""
 from __future__ import annotations
 
 import os
@@ -17,7 +17,7 @@ VARIABLES = {
 }
 
 
-def prepare_for_numpy_and_torch() -> None:
-    """Before either is imported. What the user has set stays."""
+def set_thread_environment() -> None:
+    """Set VARIABLES, but none that the user has set. Call before numpy or torch is imported."""
     for name, value in VARIABLES.items():
         os.environ.setdefault(name, value)

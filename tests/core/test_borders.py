@@ -15,16 +15,16 @@ from numpy.typing import NDArray
 from core.capture import Capture
 from core.colour.srgb import linear_from_srgb
 from core.fit import fit
-from core.fit.frames import SOFT, Frames
-from core.images.borders import LEAST, Borders, Inside, inside_borders
+from core.fit.frames import BORDER_MARGIN, Frames
+from core.images.borders import MIN_BORDER_LINES, Borders, PictureArea, find_picture_area
 from core.images.plates import Plate
 from core.metrics.evaluation import evaluate
 from core.removal.inference.remover import Remover
 from tests.core.captures import picture
 from tests.core.flared import HEIGHT, WIDTH, flared_capture
 from tests.core.heard import Heard
+from tests.core.removal_cases import network_file
 from tests.core.test_fit import flare_psnr, quick
-from tests.core.test_removal import network_file
 
 SIZE = 96, 64
 
@@ -39,16 +39,16 @@ def test_borders_are_found(borders: tuple[int, int, int, int], value: int) -> No
     inner = np.maximum(np.asarray(picture(0, SIZE), np.uint8), 40)
     whole = bordered(inner, *borders, value)
     top, _, left, _ = borders
-    found = inside_borders(whole, lambda line: line / 255)
-    assert found == Inside(top, top + SIZE[1], left, left + SIZE[0])
-    assert np.array_equal(whole[found.part], inner)
+    found = find_picture_area(whole, lambda line: line / 255)
+    assert found == PictureArea(top, top + SIZE[1], left, left + SIZE[0])
+    assert np.array_equal(whole[found.slices], inner)
     assert found.size == SIZE
 
 
 def test_what_jpeg_makes_of_a_border_is_one() -> None:
     smooth = cv2.GaussianBlur(np.maximum(np.asarray(picture(0, SIZE), np.uint8), 60), (0, 0), 4)
     _, code = cv2.imencode(".jpg", bordered(smooth, 16, 16, 0, 0), [cv2.IMWRITE_JPEG_QUALITY, 70])
-    found = inside_borders(cv2.imdecode(code, cv2.IMREAD_COLOR), lambda line: line / 255)
+    found = find_picture_area(cv2.imdecode(code, cv2.IMREAD_COLOR), lambda line: line / 255)
     assert 15 <= found.top <= 16 and 80 <= found.bottom <= 81, "but for the line that rings"
 
 
@@ -67,7 +67,7 @@ def test_what_is_dark_for_another_reason_is_no_border(why: str) -> None:
     if why == "grain":
         noise = np.random.default_rng(0).integers(0, 20, whole.shape).astype(np.uint8)
         whole = np.where(whole == 0, noise, whole)
-    assert inside_borders(whole, lambda line: line / 255) == Inside(0, whole.shape[0], 0, whole.shape[1])
+    assert find_picture_area(whole, lambda line: line / 255) == PictureArea(0, whole.shape[0], 0, whole.shape[1])
 
 
 def test_a_night_sky_makes_no_border_wider() -> None:
@@ -76,9 +76,9 @@ def test_a_night_sky_makes_no_border_wider() -> None:
     for sky in (0, 1, 10, 30):
         dark = inner.copy()
         dark[:sky] = 0
-        found = inside_borders(bordered(dark, 12, 12, 0, 0), lambda line: line / 255)
-        assert found.bottom == 12 + SIZE[1] and 12 <= found.top <= 12 + LEAST
-    assert Borders(40, 12, 0, 0).common(Borders(12, 12, 3, 0)) == Borders(12, 12, 0, 0)
+        found = find_picture_area(bordered(dark, 12, 12, 0, 0), lambda line: line / 255)
+        assert found.bottom == 12 + SIZE[1] and 12 <= found.top <= 12 + MIN_BORDER_LINES
+    assert Borders(40, 12, 0, 0).intersection(Borders(12, 12, 3, 0)) == Borders(12, 12, 0, 0)
 
 
 @pytest.mark.parametrize("kind", ["8 bit", "float"])
@@ -116,11 +116,11 @@ def boxed(tmp_path_factory: pytest.TempPathFactory) -> Capture:
 def test_a_fit_leaves_borders_out(tmp_path: Path, boxed: Capture) -> None:
     frames = Frames(boxed)
     camera, frame, removed = frames.targets(boxed.views[0])
-    assert camera.size == (WIDTH, HEIGHT - 12 - 2 * SOFT) and frame.shape[:2] == camera.size[::-1]
+    assert camera.size == (WIDTH, HEIGHT - 12 - 2 * BORDER_MARGIN) and frame.shape[:2] == camera.size[::-1]
     assert removed is not None and removed.shape == frame.shape
     whole = boxed.views[0].camera
     point = np.array([[0.1, 0.1, 0.3]])
-    assert np.allclose(camera.project(point)[0] + [0, 6 + SOFT], whole.project(point)[0])
+    assert np.allclose(camera.project(point)[0] + [0, 6 + BORDER_MARGIN], whole.project(point)[0])
     heard = Heard()
     settings = quick(400, **{"flare.density.stop": 200, "flare.density.every": 50})
     run = fit(boxed, settings, tmp_path / "run", heard)
@@ -129,7 +129,7 @@ def test_a_fit_leaves_borders_out(tmp_path: Path, boxed: Capture) -> None:
     assert fitted > empty + 5, "the truth goes on behind the borders"
     held_out = boxed.split(settings.holdout)[1]
     cameras = {view: frames.camera(view) for view in held_out}
-    inside, everywhere = (evaluate(run, boxed, cameras, inside=part) for part in (frames.inside, None))
+    inside, everywhere = (evaluate(run, boxed, cameras, area=part) for part in (frames.picture_area, None))
     assert inside["composite"]["psnr"] > everywhere["composite"]["psnr"] + 3
 
 
@@ -137,7 +137,7 @@ def test_frames_that_are_faded_out_or_differ_tell_of_no_border(tmp_path: Path, b
     shutil.copytree(boxed.folder, tmp_path / "capture")
     first, second = (tmp_path / "capture" / "images" / f"{number:04d}.png" for number in (0, 1))
     cv2.imwrite(str(first), np.zeros((HEIGHT, WIDTH, 3), np.uint8))
-    assert Frames(Capture.open(tmp_path / "capture")).inside == Frames(boxed).inside
+    assert Frames(Capture.open(tmp_path / "capture")).picture_area == Frames(boxed).picture_area
     cv2.imwrite(str(second), np.full((HEIGHT, WIDTH, 3), 90, np.uint8))
     found = Frames(Capture.open(tmp_path / "capture"))
-    assert found.inside is None and found.says == ()
+    assert found.picture_area is None and found.warnings == ()

@@ -273,8 +273,8 @@ def test_frames_that_are_not_needed_have_their_size_all_the_same(tmp_path: Path)
     capture = Capture.open(folder, need_frames=False)
     assert [view.camera.size for view in capture.views] == [size, solved.size, solved.size, size]
     assert capture.views[0].camera.fx == solved.fx / 2
-    assert [view.camera.size for view in capture.sized(size).views] == [size, size, solved.size, size]
-    assert capture.sized((33, 7)).views[1].camera.size == solved.size, "of another shape"
+    assert [view.camera.size for view in capture.with_frame_size(size).views] == [size, size, solved.size, size]
+    assert capture.with_frame_size((33, 7)).views[1].camera.size == solved.size, "of another shape"
 
 
 def test_how_a_pixel_moves_with_its_point() -> None:
@@ -329,7 +329,7 @@ def test_the_extent_of_a_tripod_is_that_of_its_points(slip: float, offset: float
     tripod = Capture(whole.folder, views, points, frames={view.name: whole.folder for view in views})
     away = np.linalg.norm(whole.points.xyz - (0.4, 0.1, -5), axis=1)
     assert tripod.extent == pytest.approx(np.median(away), rel=0.05)
-    assert tripod.only_turns and not whole.only_turns
+    assert tripod.is_rotation_only and not whole.is_rotation_only
 
 
 def test_the_cache_is_bounded_and_serves(tmp_path: Path) -> None:

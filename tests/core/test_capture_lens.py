@@ -137,7 +137,7 @@ def test_frames_are_straightened(tmp_path: Path, model: str, scale: int) -> None
 def test_the_distortion_of_a_transforms_json_goes_by_its_names(model: str, told: dict[str, float],
                                                                tmp_path: Path) -> None:
     found = Capture.open(make_transforms(tmp_path / "c", camera_model=model, **told)).views[0].lens
-    assert {name: found.named[name] for name in told} == told
+    assert {name: found.parameters[name] for name in told} == told
 
 
 def test_angles_of_view_stand_for_focal_lengths(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from core.colour import REC_709, colour_space, space_of_chromaticities
-from core.colour.spaces import AP1, REC_2020, matrix_between, names
+from core.colour.spaces import AP1, REC_2020, built_in_names, matrix_between
 from core.errors import SettingsError
 
 VALUES = np.array([[0.0, 0.01, 0.18], [1.0, 0.5, 2.5], [-0.02, 0.9, 100.0]], np.float32)
@@ -26,7 +26,7 @@ def test_matrices_are_the_published_ones() -> None:
         [1.6605, -0.5876, -0.0728], [-0.1246, 1.1329, -0.0083], [-0.0182, -0.1006, 1.1187]], atol=1e-4)
 
 
-@pytest.mark.parametrize("name", names())
+@pytest.mark.parametrize("name", built_in_names())
 def test_there_and_back(name: str) -> None:
     space = colour_space(name)
     np.testing.assert_allclose(space.from_linear(space.to_linear(VALUES)), VALUES, rtol=2e-5, atol=2e-5)
@@ -39,7 +39,7 @@ def test_curves_have_their_known_points() -> None:
 
 
 def test_white_stays_white() -> None:
-    for name in names():
+    for name in built_in_names():
         np.testing.assert_allclose(colour_space(name).to_linear(np.ones((1, 3), np.float32)), 1, atol=1e-5)
 
 

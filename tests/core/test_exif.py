@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from core.images.formats import tiff
-from core.images.formats.exif import as_stored, read_exif, upright
+from core.images.formats.exif import apply_orientation, read_exif, undo_orientation
 
 
 def exif_segment(order: str, orientation: int, focal: int) -> bytes:
@@ -67,5 +67,5 @@ def test_upright(orientation: int) -> None:
     tagged = raw[:2] + exif_segment("MM", orientation, 27) + raw[2:]
     turned = cv2.imdecode(np.frombuffer(tagged, np.uint8), cv2.IMREAD_COLOR)
     plain = cv2.imdecode(data, cv2.IMREAD_COLOR)
-    np.testing.assert_array_equal(upright(plain, orientation), turned)
-    np.testing.assert_array_equal(as_stored(turned, orientation), plain)
+    np.testing.assert_array_equal(apply_orientation(plain, orientation), turned)
+    np.testing.assert_array_equal(undo_orientation(turned, orientation), plain)

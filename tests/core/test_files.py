@@ -14,23 +14,23 @@ from pathlib import Path
 
 import pytest
 
-from core.errors import CaptureError, SettingsError, refusal
+from core.errors import CaptureError, SettingsError, os_error_message
 from core.system.files import (
     atomic_folder,
     atomic_path,
-    check_apart,
-    content_of,
-    inside,
-    locked,
-    named_by,
-    patiently,
-    plain_name,
+    avoid_device_name,
+    check_no_overwrite,
+    content_hash,
+    file_lock,
+    follow_link,
     read_json,
     remove_file,
     remove_folder,
-    remove_partial,
-    remove_partial_of,
-    rounded,
+    remove_partials_below,
+    remove_partials_of,
+    retry_while_locked,
+    round_for_text,
+    safe_join,
     write_json,
     write_text,
 )
@@ -53,13 +53,13 @@ def test_what_the_system_refuses_is_one_sentence_that_names_the_file(tmp_path: P
     write_text(target, "old")
     with pytest.raises(OSError) as full, atomic_path(target):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))  # as a write to an open file says it
-    assert refusal(full.value) == (
+    assert os_error_message(full.value) == (
         f"The disk is full ({target}); make room and start it again, what is finished is kept.")
     assert target.read_text() == "old"
     assert list(tmp_path.iterdir()) == [target]
-    assert refusal(PermissionError(errno.EACCES, "Permission denied", "/a")) == (
+    assert os_error_message(PermissionError(errno.EACCES, "Permission denied", "/a")) == (
         "The system refused: Permission denied (/a).")
-    assert refusal(OSError(errno.ELOOP, os.strerror(errno.ELOOP), "/a")) == (
+    assert os_error_message(OSError(errno.ELOOP, os.strerror(errno.ELOOP), "/a")) == (
         "A symbolic link leads back to itself (/a); remove it, or name another place.")
 
 
@@ -97,9 +97,9 @@ def test_a_file_that_windows_holds_for_a_moment_is_waited_for(tmp_path: Path, mo
         raise PermissionError(errno.EACCES, "Permission denied")
 
     with pytest.raises(PermissionError):
-        patiently(forbidden)
+        retry_while_locked(forbidden)
     assert len(asked) == 1, "what stays forbidden is told at once"
-    monkeypatch.setattr("core.system.files._PATIENCE_S", 0.1)
+    monkeypatch.setattr("core.system.files._RETRY_S", 0.1)
     refusals[:] = [refused_by_windows() for _ in range(100)]
     with pytest.raises(PermissionError):
         write_text(tmp_path / "a.txt", "newer")
@@ -129,8 +129,8 @@ def test_what_cannot_be_tidied_up_hides_no_failure(tmp_path: Path, monkeypatch: 
     with pytest.raises(ZeroDivisionError), atomic_path(tmp_path / "a.txt"):
         raise ZeroDivisionError
     (tmp_path / ".partial-b.txt-").touch()
-    remove_partial_of(tmp_path / "b.txt")
-    remove_partial(tmp_path)
+    remove_partials_of(tmp_path / "b.txt")
+    remove_partials_below(tmp_path)
 
 
 def test_a_folder_is_removed_whole_or_not_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -173,7 +173,7 @@ def test_what_windows_editors_write_is_read(tmp_path: Path) -> None:
     ("conin$", "conin$_"), ("Camera", "Camera"), ("console", "console"), ("com", "com"), ("a.con", "a.con"),
     ("conin", "conin")])
 def test_names_of_devices(name: str, expected: str) -> None:
-    assert plain_name(name) == expected
+    assert avoid_device_name(name) == expected
 
 
 def test_what_windows_takes_for_a_device_is_no_file_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -181,17 +181,17 @@ def test_what_windows_takes_for_a_device_is_no_file_there(tmp_path: Path, monkey
         monkeypatch.setattr("core.system.files.WINDOWS", windows)
         for name in ("images/nul.png", "con/0001.png"):
             with pytest.raises(CaptureError, match="device") if windows else contextlib.nullcontext():
-                assert inside(tmp_path, name, CaptureError) == tmp_path / name
-        assert inside(tmp_path, "console/0001.png", CaptureError) == tmp_path / "console" / "0001.png"
+                assert safe_join(tmp_path, name, CaptureError) == tmp_path / name
+        assert safe_join(tmp_path, "console/0001.png", CaptureError) == tmp_path / "console" / "0001.png"
 
 
 def test_a_file_has_several_names(tmp_path: Path) -> None:
     for name in ("a.png", "b.png"):
         (tmp_path / name).touch()
-    check_apart([tmp_path / "a.png"], [tmp_path / "b.png"])
+    check_no_overwrite([tmp_path / "a.png"], [tmp_path / "b.png"])
     (tmp_path / "A.png").hardlink_to(tmp_path / "a.png")  # what macOS would find below that name
     with pytest.raises(SettingsError, match="overwritten by a result"):
-        check_apart([tmp_path / "a.png"], [tmp_path / "A.png"])
+        check_no_overwrite([tmp_path / "a.png"], [tmp_path / "A.png"])
 
 
 def test_json_refuses_nan(tmp_path: Path) -> None:
@@ -211,21 +211,21 @@ def test_bad_json_is_one_sentence_with_the_name(tmp_path: Path, content: bytes) 
 @pytest.mark.parametrize("name", ["", "/etc/passwd", "../a", "a/../../b", "C:/a", "c:\\a", "..\\a", "a\0b"])
 def test_names_that_lead_out_are_refused(tmp_path: Path, name: str) -> None:
     with pytest.raises(CaptureError):
-        inside(tmp_path, name, CaptureError)
+        safe_join(tmp_path, name, CaptureError)
 
 
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no such names")
 def test_a_time_of_day_is_no_drive(tmp_path: Path) -> None:
-    assert inside(tmp_path, "12:30.png", CaptureError) == tmp_path / "12:30.png"
+    assert safe_join(tmp_path, "12:30.png", CaptureError) == tmp_path / "12:30.png"
 
 
 def test_a_name_need_not_be_utf_8_but_one_that_a_disk_takes(tmp_path: Path) -> None:
-    assert inside(tmp_path, os.fsdecode(b"pl\xe9.png"), CaptureError).parent == tmp_path
+    assert safe_join(tmp_path, os.fsdecode(b"pl\xe9.png"), CaptureError).parent == tmp_path
     for name in (256 * "a", 128 * "\u00e9", "\ud800"):
         if os.name == "nt" and name == "\ud800":
             continue  # of which Windows makes a name
         with pytest.raises(CaptureError, match="not inside the folder"):
-            inside(tmp_path, name, CaptureError)
+            safe_join(tmp_path, name, CaptureError)
 
 
 def test_links_that_lead_out_are_refused(tmp_path: Path) -> None:
@@ -235,9 +235,9 @@ def test_links_that_lead_out_are_refused(tmp_path: Path) -> None:
     (folder / "a.png").symlink_to(tmp_path / "secret.png")
     (folder / "b.png").symlink_to(folder / "c.png")
     with pytest.raises(CaptureError, match="leads out"):
-        inside(folder, "a.png", CaptureError)
-    assert inside(folder, "b.png", CaptureError) == folder / "b.png"
-    assert inside(folder, "sub/c.png", CaptureError) == folder / "sub/c.png"
+        safe_join(folder, "a.png", CaptureError)
+    assert safe_join(folder, "b.png", CaptureError) == folder / "b.png"
+    assert safe_join(folder, "sub/c.png", CaptureError) == folder / "sub/c.png"
 
 
 def test_what_a_link_names_is_written_where_that_is_asked_for_alone(tmp_path: Path) -> None:
@@ -246,13 +246,13 @@ def test_what_a_link_names_is_written_where_that_is_asked_for_alone(tmp_path: Pa
     file.parent.mkdir()
     link.symlink_to(Path("elsewhere", "a.json"))
     for text in ("first", "second"):  # of a file that is not there yet, too
-        write_text(named_by(link), text)
+        write_text(follow_link(link), text)
         assert (link.is_symlink(), file.read_text()) == (True, text)
     write_text(link, "third")
     assert (link.is_symlink(), link.read_text(), file.read_text()) == (False, "third", "second")
     (tmp_path / "loop").symlink_to(tmp_path / "loop")
     with pytest.raises(OSError, match="loop"):
-        named_by(tmp_path / "loop")
+        follow_link(tmp_path / "loop")
 
 
 def test_a_folder_is_there_whole_or_not_at_all(tmp_path: Path) -> None:
@@ -275,12 +275,12 @@ def test_what_a_killed_process_left_of_a_file_can_be_removed(tmp_path: Path) -> 
     assert other.stdout is not None and other.stdout.readline() == b"begun\n"
     with atomic_path(target) as mine, atomic_path(tmp_path / "layers.0002.exr") as next_one:
         assert mine.suffix == ".exr"
-        remove_partial_of(target)
-        remove_partial(tmp_path)
+        remove_partials_of(target)
+        remove_partials_below(tmp_path)
         assert len(list(tmp_path.iterdir())) == 3, "mine, theirs, and the next one"
         other.kill()
         other.communicate()
-        remove_partial_of(target)
+        remove_partials_of(target)
         assert sorted(tmp_path.iterdir()) == sorted([mine, next_one])
     assert sorted(path.name for path in tmp_path.iterdir()) == ["layers.0001.exr", "layers.0002.exr"]
 
@@ -316,10 +316,10 @@ def test_what_a_killed_process_left_of_a_folder_goes_when_that_is_made_again(tmp
 def test_what_another_machine_writes_stays_for_an_hour(tmp_path: Path) -> None:
     target, theirs = tmp_path / "a.exr", tmp_path / f".partial-a.exr-{os.getpid()}@01234567-abc.exr"
     theirs.touch()
-    remove_partial_of(target)
+    remove_partials_of(target)
     assert theirs.exists()
     os.utime(theirs, (time.time() - 4000,) * 2)
-    remove_partial_of(target)
+    remove_partials_of(target)
     assert not theirs.exists()
 
 
@@ -334,18 +334,18 @@ def test_a_file_is_known_by_its_content(tmp_path: Path) -> None:
     path, copy = tmp_path / "a", tmp_path / "b"
     for one in (path, copy):
         one.write_bytes(b"one")
-    assert content_of(path) == content_of(copy)
+    assert content_hash(path) == content_hash(copy)
     path.write_bytes(b"another")
     os.utime(path, (1, 1))
-    assert content_of(path) != content_of(copy)
+    assert content_hash(path) != content_hash(copy)
 
 
 def test_a_lock_is_held_by_one_and_outlives_no_one(tmp_path: Path) -> None:
     lock = tmp_path / ".lock"
-    with locked(lock):
+    with file_lock(lock):
         assert lock.exists()
         started = time.monotonic()
-        with locked(lock, stale_s=0.05):  # as if the holder had been killed
+        with file_lock(lock, stale_s=0.05):  # as if the holder had been killed
             assert time.monotonic() - started >= 0.04
     assert not lock.exists()
 
@@ -353,8 +353,8 @@ def test_a_lock_is_held_by_one_and_outlives_no_one(tmp_path: Path) -> None:
 def test_who_was_taken_for_dead_leaves_the_lock_to_the_next(tmp_path: Path) -> None:
     lock = tmp_path / ".lock"
     with contextlib.ExitStack() as next_one:
-        with locked(lock):
-            next_one.enter_context(locked(lock, stale_s=0.05))
+        with file_lock(lock):
+            next_one.enter_context(file_lock(lock, stale_s=0.05))
         assert lock.exists()
     assert not lock.exists()
 
@@ -376,7 +376,7 @@ def test_of_two_who_wait_for_a_dead_one_the_slower_leaves_the_other_its_lock(tmp
         unlink(path, missing_ok)
 
     def wait(name: str) -> None:
-        with locked(lock, stale_s=2.0):
+        with file_lock(lock, stale_s=2.0):
             inside.append(name)
             time.sleep(0.3)
             inside.append(name)
@@ -397,7 +397,7 @@ def test_a_lock_out_of_the_future_outlives_no_one_either(tmp_path: Path) -> None
     lock.touch()
     os.utime(lock, (time.time() + 3600, time.time() + 3600))
     started = time.monotonic()
-    with locked(lock, stale_s=0.1):
+    with file_lock(lock, stale_s=0.1):
         assert 0.09 <= time.monotonic() - started < 5
 
 
@@ -437,17 +437,17 @@ def test_a_folder_that_may_not_be_written_is_told_in_the_end(tmp_path: Path, mon
     def refuse(*_: object) -> int:
         raise PermissionError(errno.EACCES, "Permission denied", str(tmp_path / ".lock"))
 
-    monkeypatch.setattr("core.system.files._REFUSALS", 3)
+    monkeypatch.setattr("core.system.files._MAX_REFUSALS", 3)
     monkeypatch.setattr("core.system.files.os.open", refuse)
-    with pytest.raises(PermissionError), locked(tmp_path / ".lock"):
+    with pytest.raises(PermissionError), file_lock(tmp_path / ".lock"):
         pass
 
 
 def test_numbers_for_people_keep_what_worlds_of_any_unit_need() -> None:
-    assert [rounded(value) for value in (0.0, 1.23456789, -5e6 - 0.123456789, 0.123456789)] == [
+    assert [round_for_text(value) for value in (0.0, 1.23456789, -5e6 - 0.123456789, 0.123456789)] == [
         0.0, 1.234568, -5000000.123457, 0.1234568]
-    assert rounded(-1.52345678e-5) == pytest.approx(-1.52345678e-5, rel=1e-6)
-    assert rounded(float("inf")) == float("inf")
+    assert round_for_text(-1.52345678e-5) == pytest.approx(-1.52345678e-5, rel=1e-6)
+    assert round_for_text(float("inf")) == float("inf")
 
 
 @pytest.mark.skipif(os.name == "nt", reason="rights are another matter on Windows")

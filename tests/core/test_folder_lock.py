@@ -11,14 +11,14 @@ from pathlib import Path
 import pytest
 
 from core.errors import RunError
-from core.system.folder_lock import held
+from core.system.folder_lock import folder_lock
 
 ROOT = Path(__file__).resolve().parents[2]
 
 HOLD = """
 import sys
-from core.system.folder_lock import held
-with held(sys.argv[1]):
+from core.system.folder_lock import folder_lock
+with folder_lock(sys.argv[1]):
     print("held", flush=True)
     sys.stdin.read()
 """
@@ -30,15 +30,15 @@ def test_a_folder_is_of_one_process_at_a_time_and_free_when_that_is_killed(tmp_p
                              stdin=subprocess.PIPE, stdout=subprocess.PIPE)
     try:
         assert other.stdout is not None and other.stdout.readline() == "held\n"
-        with pytest.raises(RunError, match="Another process is at work in"), held(folder):
+        with pytest.raises(RunError, match="Another process is using"), folder_lock(folder):
             pass
     finally:
         other.kill()
         other.communicate()
-    with held(folder):
+    with folder_lock(folder):
         (folder / "result").touch()
     assert [path.name for path in folder.iterdir()] == ["result"]
-    with pytest.raises(ZeroDivisionError), held(tmp_path / "new"):
+    with pytest.raises(ZeroDivisionError), folder_lock(tmp_path / "new"):
         raise ZeroDivisionError
     assert not (tmp_path / "new").exists()
 
@@ -49,5 +49,5 @@ def test_a_disk_without_locks_keeps_nobody_out(tmp_path: Path, monkeypatch: pyte
         raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
 
     monkeypatch.setattr("core.system.folder_lock._lock", refuses)
-    with held(tmp_path), held(tmp_path):
+    with folder_lock(tmp_path), folder_lock(tmp_path):
         pass

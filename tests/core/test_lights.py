@@ -16,13 +16,25 @@ from core.capture import Camera, Capture
 from core.colour.srgb import srgb_from_linear
 from core.errors import Cancelled, CaptureError, EngineError, SettingsError
 from core.images.picture import Picture
-from core.lights import Detection, Exposure, GatherSettings, detector_for, find_lights, gather, record, union
-from core.lights.exposure import COSTLY
+from core.lights import (
+    Detection,
+    ExposureDetector,
+    TriangulationSettings,
+    detector_for,
+    find_lights,
+    triangulate_lights,
+    union_mask,
+    write_findings,
+)
+from core.lights.candidates import MAX_LISTED_PAIRS
+from core.lights.exposure import MAX_MORPHOLOGY_COST
 from core.lights.file import check_replaceable, write_lights
 from core.lights.find import _from_one_view
-from core.lights.gather import MANY, PAIRS, FoundLight, _at_least, without_ghosts
-from core.lights.ghosts import find_blobs, gather_ghosts
-from core.lights.lifted import lift
+from core.lights.found_light import FoundLight
+from core.lights.ghosts import find_blobs, locate_by_ghosts
+from core.lights.lifted import lift_to_gaussians
+from core.lights.merging import remove_ghosts
+from core.lights.triangulation import binomial_tail
 from core.system.progress import Progress
 from tests.core.captures import make_capture, orbit, picture
 
@@ -53,28 +65,28 @@ class TestExposure:
     @pytest.mark.parametrize("at", [(100.5, 80.5), (100.3, 80.8), (211.9, 133.1)])
     @pytest.mark.parametrize("radius", [3.0, 7.3])
     def test_a_lamp_is_found_where_it_is(self, at: tuple[float, float], radius: float) -> None:
-        (found,) = Exposure().detect(stored(with_disc(backdrop(), at, radius)))
+        (found,) = ExposureDetector().detect(stored(with_disc(backdrop(), at, radius)))
         assert np.linalg.norm(found.xy - at) < 0.25
         assert found.radius == pytest.approx(radius, rel=0.25)
-        assert found.score > 0.8 and not found.cut
+        assert found.score > 0.8 and not found.is_cut
 
     def test_the_colour_is_that_of_the_glow(self) -> None:
         scene = with_disc(np.full((240, 320, 3), 0.1), (150, 100), 7)
-        (found,) = Exposure().detect(stored(scene))
+        (found,) = ExposureDetector().detect(stored(scene))
         np.testing.assert_allclose(found.colour, (1.0, 0.8, 0.6), atol=0.05)
 
     def test_two_lamps_and_their_masks(self) -> None:
         scene = with_disc(with_disc(backdrop(), (60, 60), 6), (250, 150), 9, colour=(0.6, 0.8, 1))
-        found = Exposure().detect(stored(scene))
+        found = ExposureDetector().detect(stored(scene))
         assert len(found) == 2
-        mask = union(found, SIZE)
+        mask = union_mask(found, SIZE)
         assert mask[60, 60] and mask[150, 250] and not mask[100, 150] and 300 < mask.sum() < 700
 
     def test_spikes_and_a_bright_bracket_do_not_hide_a_lamp(self) -> None:
         scene = with_disc(backdrop(), (150, 100), 9)
         cv2.line(scene, (150, 100), (190, 140), (20.0, 20.0, 20.0), 3)
         cv2.line(scene, (150, 100), (150, 70), (20.0, 20.0, 20.0), 1)
-        (found,) = Exposure().detect(stored(scene))
+        (found,) = ExposureDetector().detect(stored(scene))
         assert np.linalg.norm(found.xy - (150, 100)) < 2
 
     def test_a_starburst(self) -> None:
@@ -84,12 +96,12 @@ class TestExposure:
             tip = (np.array([np.cos(angle), np.sin(angle)]) * 17, base, -base)
             cv2.fillPoly(scene, [np.round([np.array([150, 100]) + point for point in tip]).astype(np.int32)],
                          (20.0, 20.0, 20.0))
-        (found,) = Exposure().detect(stored(scene))
+        (found,) = ExposureDetector().detect(stored(scene))
         assert np.linalg.norm(found.xy - (150, 100)) < 1
 
     def test_a_lamp_at_the_edge_is_said_to_be_cut(self) -> None:
-        (found,) = Exposure(0.1).detect(stored(with_disc(backdrop(), (160, 2), 8)))
-        assert found.cut
+        (found,) = ExposureDetector(0.1).detect(stored(with_disc(backdrop(), (160, 2), 8)))
+        assert found.is_cut
 
     @pytest.mark.parametrize("what", ["wall", "sky", "window", "red", "sparkle", "stripe", "nothing", "white"])
     def test_what_is_no_lamp(self, what: str) -> None:
@@ -112,7 +124,7 @@ class TestExposure:
             scene[100:104, 20:300] = 2.0
         elif what == "white":
             scene[:] = 1.0
-        assert not union(Exposure().detect(stored(scene)), SIZE).any()
+        assert not union_mask(ExposureDetector().detect(stored(scene)), SIZE).any()
 
     @pytest.mark.parametrize("what", ["half", "corner"])
     def test_a_large_white_region_is_not_opened_by_a_large_disc(self, what: str,
@@ -127,23 +139,23 @@ class TestExposure:
         steps, morphology = [], cv2.morphologyEx
         monkeypatch.setattr(cv2, "morphologyEx", lambda mask, how, disc: steps.append(mask.size * disc.size) or
                             morphology(mask, how, disc))
-        (found,) = Exposure().detect(Picture(white, "srgb"))
+        (found,) = ExposureDetector().detect(Picture(white, "srgb"))
         assert np.linalg.norm(found.xy - (920, 720)) < 0.01
-        assert max(steps) < 2 * COSTLY
+        assert max(steps) < 2 * MAX_MORPHOLOGY_COST
 
     def test_a_large_lamp_is_opened_by_distances_as_by_a_disc(self, monkeypatch: pytest.MonkeyPatch) -> None:
         scene = with_disc(np.full((600, 800, 3), 0.02), (310, 280), 48, glare=0)
         cv2.fillPoly(scene, [np.array([(310, 270), (310, 290), (420, 330)])], (20.0, 20.0, 20.0))
         cv2.fillPoly(scene, [np.array([(300, 280), (320, 280), (290, 180)])], (20.0, 20.0, 20.0))
-        (by_disc,) = Exposure(0.1).detect(stored(scene))
-        monkeypatch.setattr("core.lights.exposure.COSTLY", 0)
-        (by_distances,) = Exposure(0.1).detect(stored(scene))
+        (by_disc,) = ExposureDetector(0.1).detect(stored(scene))
+        monkeypatch.setattr("core.lights.exposure.MAX_MORPHOLOGY_COST", 0)
+        (by_distances,) = ExposureDetector(0.1).detect(stored(scene))
         assert np.linalg.norm(by_disc.xy - by_distances.xy) < 0.1 and np.linalg.norm(by_disc.xy - (310, 280)) < 1
         assert by_distances.score == pytest.approx(by_disc.score, abs=0.02)
 
     def test_linear_pictures(self) -> None:
         scene = with_disc(backdrop(), (150.2, 99.6), 8)
-        (found,) = Exposure().detect(Picture(scene.astype(np.float32), "linear"))
+        (found,) = ExposureDetector().detect(Picture(scene.astype(np.float32), "linear"))
         assert np.linalg.norm(found.xy - (150.2, 99.6)) < 0.15
 
 
@@ -174,7 +186,7 @@ class TestGather:
     def test_lights_are_found_and_none_invented(self) -> None:
         lights = [(0.4, -0.5, 0.3), (-0.9, -0.2, 1.5), (0.1, 0.3, -1.0)]
         cameras = orbit(30, size=SIZE)
-        found = gather(named(cameras), scene(lights, cameras, hidden=0.3), EXTENT)
+        found = triangulate_lights(named(cameras), scene(lights, cameras, hidden=0.3), EXTENT)
         assert len(found) == 3
         for light in lights:
             nearest = min(found, key=lambda one: float(np.linalg.norm(one.xyz - light)))
@@ -185,18 +197,18 @@ class TestGather:
 
     def test_clutter_alone_is_no_light(self) -> None:
         cameras = orbit(24, size=SIZE)
-        assert not gather(named(cameras), scene([], cameras, clutter=3), EXTENT)
+        assert not triangulate_lights(named(cameras), scene([], cameras, clutter=3), EXTENT)
 
     def test_dirt_on_the_lens_is_no_light(self) -> None:
         cameras = orbit(30, size=SIZE, arc=2.2)
         detections = [[spot(np.array([60.0, 50.0]))] for _ in cameras]
-        assert not [light for light in gather(named(cameras), detections, EXTENT) if len(light.support) > 8]
+        assert not [light for light in triangulate_lights(named(cameras), detections, EXTENT) if len(light.support) > 8]
 
     def test_the_sun_keeps_its_direction(self) -> None:
         direction = np.array([0.15, -0.25, 1.0])
         direction /= np.linalg.norm(direction)
         cameras = orbit(30, size=SIZE, arc=0.7)
-        (found,) = gather(named(cameras), scene([tuple(1e7 * direction)], cameras, clutter=1), EXTENT)
+        (found,) = triangulate_lights(named(cameras), scene([tuple(1e7 * direction)], cameras, clutter=1), EXTENT)
         assert found.far and np.linalg.norm(found.xyz) > 100 * EXTENT
         away = found.xyz - np.mean([camera.position for camera in cameras], axis=0)
         angle = np.degrees(np.arccos(away @ direction / np.linalg.norm(away)))
@@ -207,7 +219,7 @@ class TestGather:
         cameras = orbit(40, size=SIZE)
         some = {}
         for number in (3, 40):
-            (one,) = gather(named(cameras[:number]), scene(light, cameras[:number], clutter=0), EXTENT)
+            (one,) = triangulate_lights(named(cameras[:number]), scene(light, cameras[:number], clutter=0), EXTENT)
             some[number] = one
             assert np.linalg.norm(one.xyz - light[0]) < 4 * one.uncertainty
         assert some[3].uncertainty > 5 * some[40].uncertainty
@@ -216,8 +228,9 @@ class TestGather:
         cameras = orbit(20, size=SIZE)
         detections = scene([(0.2, -0.3, 0.1)], cameras, clutter=0)
         detections[2:] = [[] for _ in detections[2:]]
-        assert not gather(named(cameras), detections, EXTENT)
-        (light,) = gather(named(cameras), detections, EXTENT, GatherSettings(min_views=2, accidents=1, min_share=0))
+        assert not triangulate_lights(named(cameras), detections, EXTENT)
+        settings = TriangulationSettings(min_views=2, max_nfa=1, min_share=0)
+        (light,) = triangulate_lights(named(cameras), detections, EXTENT, settings)
         assert light.support == ("0000.png", "0001.png")
 
     def test_one_lamp_found_twice_is_one(self) -> None:
@@ -225,7 +238,7 @@ class TestGather:
         cameras = orbit(20, size=SIZE)
         detections = [[spot(camera.project([(0.2, -0.3, 0.1)])[0][0], 8.0),
                        spot(camera.project([(0.24, -0.3, 0.1)])[0][0], 8.0)] for camera in cameras]
-        assert len(gather(named(cameras), detections, EXTENT)) == 1
+        assert len(triangulate_lights(named(cameras), detections, EXTENT)) == 1
 
     @pytest.mark.parametrize("share", [0.75, -0.5, 1.0])
     def test_a_ghost_of_a_light_is_no_light(self, share: float) -> None:
@@ -240,12 +253,12 @@ class TestGather:
         real = FoundLight(light, False, tuple(name for name, _ in views), 20, 0.5, 0.01, np.ones(3), 3.0)
         other = FoundLight(beside, False, tuple(name for name, _ in views[:15]), 20, 2.0, 0.01, np.ones(3), 3.0,
                            detections=tuple(follows[:15]))
-        assert without_ghosts([other, real], views) == ([real, other] if share == 1 else [real])
+        assert remove_ghosts([other, real], views) == ([real, other] if share == 1 else [real])
 
     def test_the_same_seed_gives_the_same_lights(self) -> None:
         cameras = orbit(20, size=SIZE)
         detections = scene([(0.4, -0.5, 0.3)], cameras, clutter=6)
-        first, second = (gather(named(cameras), detections, EXTENT) for _ in range(2))
+        first, second = (triangulate_lights(named(cameras), detections, EXTENT) for _ in range(2))
         assert [light.xyz.tolist() for light in first] == [light.xyz.tolist() for light in second]
 
 
@@ -253,17 +266,17 @@ class TestGather:
         cameras = orbit(1100, size=SIZE)
         detections = [some if i % 4 == 0 else [] for i, some in
                       enumerate(scene([(0.4, -0.5, 0.3)], cameras, clutter=0))]
-        (found,) = gather(named(cameras), detections, EXTENT)
+        (found,) = triangulate_lights(named(cameras), detections, EXTENT)
         assert np.linalg.norm(found.xyz - (0.4, -0.5, 0.3)) < 0.02 and len(found.support) == 275
 
     def test_spots_without_a_score_propose_nothing(self) -> None:
         """As a threshold of 0 lets them through, some of them more than there are pairs to be tried."""
         cameras = orbit(16, size=SIZE)
         nothing = [[spot((9.0 + 3 * number, 7.0), score=0.0) for number in range(24)] for _ in cameras]
-        assert not gather(named(cameras), nothing, EXTENT)
+        assert not triangulate_lights(named(cameras), nothing, EXTENT)
         lamp = scene([(0.4, -0.5, 0.3)], cameras, clutter=0)
         lit = [[*some, *none] for some, none in zip(lamp, nothing, strict=True)]
-        (found,) = gather(named(cameras), lit, EXTENT)
+        (found,) = triangulate_lights(named(cameras), lit, EXTENT)
         assert np.linalg.norm(found.xyz - (0.4, -0.5, 0.3)) < 0.05
 
     def test_of_very_many_detections_pairs_are_drawn(self, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -272,22 +285,22 @@ class TestGather:
         monkeypatch.setattr(np, "triu_indices", lambda n, k: listed.append(math.comb(n, 2)) or triangle(n, k))
         cameras = orbit(8, size=SIZE)
         detections = scene([(0.4, -0.5, 0.3)], cameras, clutter=220)
-        assert math.comb(sum(map(len, detections)), 2) > MANY * PAIRS
-        first, second = (gather(named(cameras), detections, EXTENT, GatherSettings(most=1, tries=600, min_views=5,
-                                                                                  accidents=np.inf)) for _ in range(2))
+        assert math.comb(sum(map(len, detections)), 2) > MAX_LISTED_PAIRS
+        settings = TriangulationSettings(max_lights=1, max_candidates=600, min_views=5, max_nfa=np.inf)
+        first, second = (triangulate_lights(named(cameras), detections, EXTENT, settings) for _ in range(2))
         assert [light.xyz.tolist() for light in first] == [light.xyz.tolist() for light in second] and first
         assert len(first[0].support) >= 5
-        assert max(listed, default=0) <= MANY * PAIRS
+        assert max(listed, default=0) <= MAX_LISTED_PAIRS
 
 
 def test_the_chance_of_many_hits() -> None:
     for share in (1e-6, 0.01, 0.3, 0.5):
         for least in (0, 1, 15, 60):
             direct = sum(math.comb(60, k) * share ** k * (1 - share) ** (60 - k) for k in range(least, 61))
-            assert _at_least(least, 60, share) == pytest.approx(direct, rel=1e-9)
-    many = [_at_least(least, 1500, 0.3) for least in (0, 1, 400, 450, 600, 1500, 1501)]
+            assert binomial_tail(least, 60, share) == pytest.approx(direct, rel=1e-9)
+    many = [binomial_tail(least, 1500, 0.3) for least in (0, 1, 400, 450, 600, 1500, 1501)]
     assert many == sorted(many, reverse=True) and many[0] == 1 and 0.5 < many[3] < 0.52 and many[-1] == 0
-    assert (_at_least(0, 60, 0), _at_least(1, 60, 0), _at_least(60, 60, 1), _at_least(61, 60, 1)) == (1, 0, 1, 0)
+    assert (binomial_tail(0, 60, 0), binomial_tail(1, 60, 0), binomial_tail(60, 60, 1), binomial_tail(61, 60, 1)) == (1, 0, 1, 0)
 
 
 def turning(number: int) -> list[Camera]:
@@ -328,7 +341,7 @@ class TestGhosts:
         for camera in cameras:
             assert not camera.contains(*camera.project(self.light[None]))[0]
         blobs = [find_blobs(frame) for frame in self.frames(cameras, -0.35)]
-        (found,) = gather_ghosts(named(cameras), blobs, EXTENT)
+        (found,) = locate_by_ghosts(named(cameras), blobs, EXTENT)
         middle = np.mean([camera.position for camera in cameras], axis=0)
         a, b = found.xyz - middle, self.light - middle
         assert np.degrees(np.arccos(a @ b / np.linalg.norm(a) / np.linalg.norm(b))) < 2
@@ -338,12 +351,12 @@ class TestGhosts:
         progress = Progress()
         progress.request_stop()
         with pytest.raises(Cancelled):
-            gather_ghosts(named(turning(8)), [[] for _ in range(8)], EXTENT, progress=progress)
+            locate_by_ghosts(named(turning(8)), [[] for _ in range(8)], EXTENT, progress=progress)
 
     def test_without_ghosts_none_is_invented(self) -> None:
         cameras = turning(16)
         blobs = [find_blobs(frame) for frame in self.frames(cameras, 0.0)]
-        assert not gather_ghosts(named(cameras), blobs, EXTENT)
+        assert not locate_by_ghosts(named(cameras), blobs, EXTENT)
 
 
 def test_lifting_on_to_a_scene() -> None:
@@ -360,16 +373,16 @@ def test_lifting_on_to_a_scene() -> None:
         pixel = camera.project(lamp[None])[0][0]
         corner = (int(pixel[0]) - 5, int(pixel[1]) - 5)
         detections.append([Detection(pixel, 5.0, 1.0, np.ones(3), np.ones((11, 11), bool), corner, False)])
-    (light,) = lift(named(cameras), detections, means, opacities, EXTENT)
+    (light,) = lift_to_gaussians(named(cameras), detections, means, opacities, EXTENT)
     assert np.linalg.norm(light.xyz - lamp) < 0.01
     assert len(light.support) == 15 and light.residual < 1
-    assert not lift(named(cameras), [[] for _ in cameras], means, opacities, EXTENT)
+    assert not lift_to_gaussians(named(cameras), [[] for _ in cameras], means, opacities, EXTENT)
 
 
 class TestFile:
     def found(self, *places: tuple[float, float, float]) -> list:
         cameras = orbit(12, size=SIZE)
-        return gather(named(cameras), scene(list(places), cameras, noise=0.1, clutter=0), EXTENT)
+        return triangulate_lights(named(cameras), scene(list(places), cameras, noise=0.1, clutter=0), EXTENT)
 
     def test_written_and_read(self, tmp_path: Path) -> None:
         folder = make_capture(tmp_path / "c")
@@ -445,8 +458,8 @@ class TestFind:
     def test_from_frames_to_files(self, tmp_path: Path) -> None:
         places = [(0.4, -0.5, 0.3), (-0.6, 0.2, 0.5)]
         capture = Capture.open(lit_capture(tmp_path / "c", 9, places))
-        findings = find_lights(capture, Exposure(0.3))
-        record(capture, findings)
+        findings = find_lights(capture, ExposureDetector(0.3))
+        write_findings(capture, findings)
         lights = Capture.open(tmp_path / "c").lights
         assert len(lights) == 2
         for place in places:
@@ -457,27 +470,27 @@ class TestFind:
 
     def test_no_light_in_any_view(self, tmp_path: Path) -> None:
         capture = Capture.open(lit_capture(tmp_path / "c", 6, []))
-        findings = find_lights(capture, Exposure(0.3))
-        assert not findings.lights and "No light was found" in findings.says[-1]
-        record(capture, findings)
+        findings = find_lights(capture, ExposureDetector(0.3))
+        assert not findings.lights and "No light was found" in findings.messages[-1]
+        write_findings(capture, findings)
         assert Capture.open(tmp_path / "c").lights == ()
 
     def test_one_view_only(self, tmp_path: Path) -> None:
         capture = Capture.open(lit_capture(tmp_path / "c", 1, [(0.4, -0.5, 0.3)]))
-        findings = find_lights(capture, Exposure(0.3))
+        findings = find_lights(capture, ExposureDetector(0.3))
         (light,) = findings.lights
         ray = light.xyz - capture.views[0].camera.position
         true = np.array((0.4, -0.5, 0.3)) - capture.views[0].camera.position
         assert ray @ true / np.linalg.norm(ray) / np.linalg.norm(true) > 0.9999
-        assert "guess" in findings.says[-1] and "guessed" in light.how
+        assert "guess" in findings.messages[-1] and "guessed" in light.how
 
     def test_a_light_that_two_of_many_views_show_is_doubtful(self, tmp_path: Path) -> None:
         folder = lit_capture(tmp_path / "c", 8, [(0.4, -0.5, 0.3)])
         for i in range(2, 8):
             cv2.imwrite(str(folder / "images" / f"{i:04d}.png"), picture(i, SIZE) // 2)
-        findings = find_lights(Capture.open(folder), Exposure(0.3))
+        findings = find_lights(Capture.open(folder), ExposureDetector(0.3))
         assert not findings.lights and len(findings.doubtful) == 1
-        assert not any("No light was found" in sentence for sentence in findings.says)
+        assert not any("No light was found" in sentence for sentence in findings.messages)
         assert np.linalg.norm(findings.doubtful[0].xyz - (0.4, -0.5, 0.3)) < 4 * findings.doubtful[0].uncertainty
 
     def test_bad_settings(self, tmp_path: Path) -> None:
@@ -486,7 +499,8 @@ class TestFind:
         with pytest.raises(SettingsError, match="magic"):
             detector_for("magic")
         with pytest.raises(SettingsError, match="at least 1"):
-            find_lights(Capture.open(make_capture(tmp_path / "c")), Exposure(), settings=GatherSettings(min_views=0))
+            find_lights(Capture.open(make_capture(tmp_path / "c")), ExposureDetector(),
+                        settings=TriangulationSettings(min_views=0))
 
 
 def test_grounded_without_its_libraries_or_weights(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from core.images.picture import Picture
-from core.lights.grounded import Grounded, refined, smallest
+from core.lights.grounded import GroundedDetector, keep_smallest, refine_detections
 
 
 def frame(*boxes: tuple[int, int, int, int], values: tuple[int, ...]) -> tuple[np.ndarray, list, np.ndarray]:
@@ -25,37 +25,37 @@ def frame(*boxes: tuple[int, int, int, int], values: tuple[int, ...]) -> tuple[n
 
 def test_masks_below_190_are_dropped() -> None:
     boxes, masks, display = frame((0, 0, 10, 10), (20, 0, 30, 10), (40, 0, 50, 10), values=(189, 191, 255))
-    assert refined(boxes, masks, display) == [1, 2]
+    assert refine_detections(boxes, masks, display) == [1, 2]
 
 
 def test_the_value_is_the_mean_over_the_mask() -> None:
     boxes, masks, display = frame((0, 0, 20, 10), values=(255,))
     display[:, :9] = 0.3
-    assert refined(boxes, masks, display) == []  # 0.45 x 76 + 0.55 x 255 = 175
+    assert refine_detections(boxes, masks, display) == []  # 0.45 x 76 + 0.55 x 255 = 175
     display[:, 5:9] = 1.0
-    assert refined(boxes, masks, display) == [0]  # 0.25 x 76 + 0.75 x 255 = 210
+    assert refine_detections(boxes, masks, display) == [0]  # 0.25 x 76 + 0.75 x 255 = 210
 
 
 def test_the_smallest_of_contained_and_overlapping_boxes_stays() -> None:
     boxes = np.array([(0, 0, 60, 60), (10, 10, 20, 20), (12, 12, 24, 22), (70, 70, 90, 90), (80, 60, 100, 80)], float)
     # 0 contains 1; 2 covers 64 of 1's 100 pixels; 3 and 4 share a quarter.
-    assert sorted(smallest(boxes, range(5))) == [1, 3, 4]
+    assert sorted(keep_smallest(boxes, range(5))) == [1, 3, 4]
 
 
 def test_a_region_between_two_sources_goes_and_both_sources_stay() -> None:
     boxes = np.array([(0, 0, 100, 50), (5, 5, 15, 15), (80, 20, 95, 35)], float)
-    assert sorted(smallest(boxes, range(3))) == [1, 2]
+    assert sorted(keep_smallest(boxes, range(3))) == [1, 2]
 
 
 def test_a_box_dropped_as_too_dark_displaces_nothing() -> None:
     boxes, masks, display = frame((0, 0, 40, 40), (10, 10, 14, 14), values=(255, 100))
-    assert refined(boxes, masks, display) == [0]
+    assert refine_detections(boxes, masks, display) == [0]
 
 
 def test_an_empty_mask_is_no_detection() -> None:
     boxes, masks, display = frame((0, 0, 10, 10), values=(255,))
     masks[0][:] = False
-    assert refined(boxes, masks, display) == []
+    assert refine_detections(boxes, masks, display) == []
 
 
 @pytest.fixture(scope="module")
@@ -96,14 +96,14 @@ def models(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 
 def test_the_whole_path(models: tuple[Path, Path]) -> None:
     picture = Picture(np.random.default_rng(0).uniform(0.8, 1, (90, 120, 3)).astype(np.float32), "srgb")
-    everything = Grounded(0.0, *models)
-    boxes, masks, scores = everything.raw(picture)
+    everything = GroundedDetector(0.0, *models)
+    boxes, masks, scores = everything.predict(picture)
     assert boxes.shape == (8, 4) and scores.shape == (8,) and ((scores >= 0) & (scores <= 1)).all()
     assert len(masks) == 8 and all(mask.shape == (90, 120) and mask.dtype == bool for mask in masks)
     found = everything.detect(picture)
-    assert len(found) == len(refined(boxes, masks, picture.pixels)) > 0
+    assert len(found) == len(refine_detections(boxes, masks, picture.pixels)) > 0
     for one in found:
         assert (one.xy >= 0).all() and (one.xy <= (120, 90)).all()
-    assert not Grounded(1.0, *models).detect(picture)
+    assert not GroundedDetector(1.0, *models).detect(picture)
     dark = Picture(picture.pixels * np.float32(0.5), "srgb")
     assert not everything.detect(dark)

@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 
 from core.capture import Camera
 from core.colour.srgb import linear_from_srgb, srgb_from_linear
-from core.lights.snap import Sight, sight, snapped
+from core.lights.snap import FlareView, flare_view, snap_lights
 from tests.core.flared import HEIGHT, WIDTH, cameras
 
 LAMP, SPOT = np.array([0.3, -0.6, 1.5]), np.array([-0.9, 0.3, 2.0])
 SCALE = 3
 
 
-def glow(small: Camera, lights: Sequence[tuple[NDArray[np.float64], float]]) -> Sight:
+def glow(small: Camera, lights: Sequence[tuple[NDArray[np.float64], float]]) -> FlareView:
     """Glow about each (place, strength) with a clipped core, a ghost on the other side, before a grey scene."""
     camera = small.scaled(SCALE * WIDTH, SCALE * HEIGHT)
     across, down = np.arange(camera.width) + 0.5, np.arange(camera.height)[:, None] + 0.5
@@ -35,14 +35,14 @@ def glow(small: Camera, lights: Sequence[tuple[NDArray[np.float64], float]]) -> 
     return seen_by(camera, scene, flare)
 
 
-def seen_by(camera: Camera, scene: NDArray[np.float64], flare: NDArray[np.float64]) -> Sight:
+def seen_by(camera: Camera, scene: NDArray[np.float64], flare: NDArray[np.float64]) -> FlareView:
     """Of grey linear light (height, width)."""
     frame, clean = (np.repeat(srgb_from_linear(np.clip(light, 0, 1))[..., None], 3, -1).astype(np.float32)
                     for light in (scene + flare, scene))
-    return sight(camera, frame, clean)
+    return flare_view(camera, frame, clean)
 
 
-def ghosts_alone(small: Camera, light: NDArray[np.float64]) -> Sight:
+def ghosts_alone(small: Camera, light: NDArray[np.float64]) -> FlareView:
     """What a light out of the frame leaves in it: ghosts on the line through it, soft and brightest in the middle."""
     camera = small.scaled(SCALE * WIDTH, SCALE * HEIGHT)
     across, down = np.arange(camera.width) + 0.5, np.arange(camera.height)[:, None] + 0.5
@@ -54,11 +54,11 @@ def ghosts_alone(small: Camera, light: NDArray[np.float64]) -> Sight:
     return seen_by(camera, np.full_like(flare, 0.1), flare)
 
 
-def sights(*lights: tuple[NDArray[np.float64], float]) -> list[Sight]:
+def sights(*lights: tuple[NDArray[np.float64], float]) -> list[FlareView]:
     return [glow(camera, lights) for camera in cameras(9)]
 
 
-def off(seen: Sequence[Sight], found: NDArray[np.float64], truth: NDArray[np.float64]) -> float:
+def off(seen: Sequence[FlareView], found: NDArray[np.float64], truth: NDArray[np.float64]) -> float:
     """Mean distance in the pictures, of their width."""
     return float(np.mean([np.linalg.norm(np.subtract(*(one.camera.project(place)[0][0] for place in (found, truth))))
                           / one.camera.width for one in seen]))
@@ -68,24 +68,24 @@ def off(seen: Sequence[Sight], found: NDArray[np.float64], truth: NDArray[np.flo
 def test_a_light_beside_its_flare_is_put_there(moved: tuple[float, float, float]) -> None:
     seen = sights((LAMP, 1.0))
     given = LAMP + np.array(moved)
-    found = snapped(seen, [given])[0]
+    found = snap_lights(seen, [given])[0]
     assert off(seen, given, LAMP) > 0.02
     assert off(seen, found, LAMP) < 0.004
 
 
 def test_a_light_in_its_place_stays_to_the_bit_beside_a_far_brighter_one_too() -> None:
     given = LAMP + np.array([0.004, -0.003, 0.01])
-    assert (snapped(sights((LAMP, 1.0)), [given])[0] == given).all()
+    assert (snap_lights(sights((LAMP, 1.0)), [given])[0] == given).all()
     near = LAMP + np.array([0.5, 0.1, 0.0])
     seen = sights((LAMP, 0.4), (near, 4.0))
-    assert (snapped(seen, [LAMP])[0] == LAMP).all()
-    assert (snapped(seen, [LAMP, near]) == [LAMP, near]).all()
+    assert (snap_lights(seen, [LAMP])[0] == LAMP).all()
+    assert (snap_lights(seen, [LAMP, near]) == [LAMP, near]).all()
 
 
 def test_two_lights_find_one_flare_each() -> None:
     seen = sights((LAMP, 1.0), (SPOT, 0.5))
     given = np.add([LAMP, SPOT], [[0.2, 0.25, 0.1], [0.15, -0.3, 0.2]])
-    found = snapped(seen, given)
+    found = snap_lights(seen, given)
     assert off(seen, found[0], LAMP) < 0.004 and off(seen, found[1], SPOT) < 0.004
 
 
@@ -93,27 +93,27 @@ def test_two_lights_do_not_climb_one_flare() -> None:
     """The second light has no flare of its own."""
     seen = sights((LAMP, 1.0))
     given = np.add(LAMP, [[0, 0, 0], [0.3, 0.1, 0.0]])
-    assert (snapped(seen, given) == given).all()
+    assert (snap_lights(seen, given) == given).all()
 
 
 @pytest.mark.parametrize("height", [-1.9, -2.3])
 def test_a_light_out_of_the_frame_is_not_put_on_to_its_ghost(height: float) -> None:
     light = np.array([0.3, height, 1.5])
     assert all(camera.project(light)[0][0, 1] < 0 for camera in cameras(9))
-    assert (snapped([ghosts_alone(camera, light) for camera in cameras(9)], [light])[0] == light).all()
+    assert (snap_lights([ghosts_alone(camera, light) for camera in cameras(9)], [light])[0] == light).all()
 
 
 def test_without_a_flare_nothing_moves() -> None:
     given = np.array([LAMP, SPOT])
-    assert (snapped(sights(), given) == given).all()
+    assert (snap_lights(sights(), given) == given).all()
     behind = np.array([[0.0, 0.0, -9.0]])
-    assert (snapped(sights((LAMP, 1.0)), behind) == behind).all()
-    assert snapped(sights((LAMP, 1.0)), np.zeros((0, 3))).shape == (0, 3)
-    assert (snapped([], given) == given).all()
+    assert (snap_lights(sights((LAMP, 1.0)), behind) == behind).all()
+    assert snap_lights(sights((LAMP, 1.0)), np.zeros((0, 3))).shape == (0, 3)
+    assert (snap_lights([], given) == given).all()
 
 
 def test_how_bright_a_flare_is_counts_in_light() -> None:
     camera = cameras(1)[0]
     clean = np.full((camera.height, camera.width, 3), 0.5, np.float32)
     bright, dark = (float(linear_from_srgb(np.float32(value))) for value in (0.7, 0.5))
-    np.testing.assert_allclose(sight(camera, clean + np.float32(0.2), clean).flare, bright - dark, rtol=1e-4)
+    np.testing.assert_allclose(flare_view(camera, clean + np.float32(0.2), clean).flare, bright - dark, rtol=1e-4)

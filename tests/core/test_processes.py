@@ -30,21 +30,21 @@ def sleeper(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch,
 
 def test_the_same_and_another_of_its_number(sleeper: tuple[subprocess.Popen[bytes], float]) -> None:
     process, started = sleeper
-    assert processes.runs(process.pid)
-    assert processes.is_same(process.pid, started)
-    assert not processes.is_same(process.pid, started - 3600), "it began after that which was written down"
-    assert not processes.is_same(process.pid, started + 3600), "it began before that which was written down"
+    assert processes.is_running(process.pid)
+    assert processes.is_same_process(process.pid, started)
+    assert not processes.is_same_process(process.pid, started - 3600), "it began after that which was written down"
+    assert not processes.is_same_process(process.pid, started + 3600), "it began before that which was written down"
     process.kill()
     process.wait()
-    assert not processes.runs(process.pid)
-    assert not processes.is_same(process.pid, started)
+    assert not processes.is_running(process.pid)
+    assert not processes.is_same_process(process.pid, started)
 
 
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="needs /proc")
 def test_one_that_ended_unasked_does_not_run() -> None:
     process = subprocess.Popen([sys.executable, "-c", ""])
     time.sleep(1)  # not waited for: its number is not given out yet
-    assert not processes.runs(process.pid)
+    assert not processes.is_running(process.pid)
     process.wait()
 
 
@@ -53,9 +53,9 @@ def test_ages_as_ps_tells_them(monkeypatch: pytest.MonkeyPatch) -> None:
                       ("441077234-00:18:40\n", 0)):
         monkeypatch.setattr(processes.subprocess, "run",
                             lambda *_words, told=told, **_options: subprocess.CompletedProcess([], 0, told))
-        assert processes._told_by_ps(1) == pytest.approx(time.time() - age, abs=1)
+        assert processes._start_time_ps(1) == pytest.approx(time.time() - age, abs=1)
     monkeypatch.setattr(processes.subprocess, "run", lambda *_words, **_options: subprocess.CompletedProcess([], 1, ""))
-    assert processes._told_by_ps(1) is None
+    assert processes._start_time_ps(1) is None
 
 
 def test_a_process_of_somebody_else_runs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -64,17 +64,17 @@ def test_a_process_of_somebody_else_runs(monkeypatch: pytest.MonkeyPatch, tmp_pa
     monkeypatch.setattr(processes, "WINDOWS", False)
     for refused, there in ((PermissionError, True), (ProcessLookupError, False)):
         monkeypatch.setattr(processes.os, "kill", lambda *_, refused=refused: (_ for _ in ()).throw(refused))
-        assert processes.runs(1) == there
+        assert processes.is_running(1) == there
 
 
 @pytest.mark.parametrize("inner", ["python.exe", "Scripts/python.exe", "bin/python"])
 def test_a_python_is_found_in_an_environment_of_every_kind(inner: str, tmp_path: Path) -> None:
-    assert processes.python_at(tmp_path) is None
-    assert processes.python_at(tmp_path / ("x" * 300)) is None
+    assert processes.find_python(tmp_path) is None
+    assert processes.find_python(tmp_path / ("x" * 300)) is None
     python = tmp_path / inner
     python.parent.mkdir(exist_ok=True)
     python.touch()
-    assert processes.python_at(tmp_path) == processes.python_at(python) == python
+    assert processes.find_python(tmp_path) == processes.find_python(python) == python
 
 
 def test_an_environment_whose_base_is_gone_has_no_python(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -85,16 +85,16 @@ def test_an_environment_whose_base_is_gone_has_no_python(tmp_path: Path, monkeyp
         file.parent.mkdir(parents=True)
         file.touch()
     (tmp_path / "engine" / "pyvenv.cfg").write_text(f"include-system-site-packages = false\nhome = {base.parent} \n")
-    assert processes.python_at(tmp_path / "engine") == processes.python_at(python) == python
+    assert processes.find_python(tmp_path / "engine") == processes.find_python(python) == python
     base.unlink()
-    assert processes.python_at(tmp_path / "engine") is processes.python_at(python) is None
+    assert processes.find_python(tmp_path / "engine") is processes.find_python(python) is None
 
 
 def test_a_mac_is_itself_in_every_network(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     names = iter(("studio.local", "guest-17.wifi", "studio.local"))
     monkeypatch.setattr(processes.platform, "node", lambda: next(names))
     monkeypatch.setattr(processes.Path, "home", lambda: tmp_path)
-    machine = processes.machine.__wrapped__
+    machine = processes.machine_id.__wrapped__
     assert machine() != machine(), "its name, elsewhere"
     monkeypatch.setattr(processes.sys, "platform", "darwin")
     told = machine()

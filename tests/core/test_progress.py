@@ -23,7 +23,7 @@ from core.system.progress import (
     Progress,
     TerminalProgress,
     flush_or_drop,
-    stoppable,
+    stop_on_request,
 )
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -41,7 +41,7 @@ def test_json_lines_are_whole_and_in_order() -> None:
     assert events[0]["type"] == "stage"
     assert events[-1] == {"type": "result", "data": {"run": "a"}}
     last = [event for event in events if event["type"] == "progress"][-1]
-    assert (last["done"], last["total"], last["left_s"]) == (3, 3, 0.0)
+    assert (last["done"], last["total"], last["eta_s"]) == (3, 3, 0.0)
 
 
 def test_terminal_progress_writes_to_a_plain_stream() -> None:
@@ -106,7 +106,7 @@ def test_what_a_full_disk_refuses_is_flush_or_drop() -> None:
 def test_signals_ask_for_a_stop_and_handlers_come_back(number: int) -> None:
     before = signal.getsignal(number)
     progress = Progress()
-    with stoppable(progress):
+    with stop_on_request(progress):
         os.kill(os.getpid(), number)
         with pytest.raises(Cancelled):
             progress.advance()
@@ -117,12 +117,12 @@ ON_A_TERMINAL = """
 import fcntl, sys, termios, time
 from pathlib import Path
 from core.errors import Cancelled
-from core.system.progress import TerminalProgress, flush_or_drop, stoppable
+from core.system.progress import TerminalProgress, flush_or_drop, stop_on_request
 
 fcntl.ioctl(0, termios.TIOCSCTTY, 0)
 progress = TerminalProgress()
 try:
-    with stoppable(progress):
+    with stop_on_request(progress):
         progress.stage("fit", 10**9)
         while True:
             progress.say("a step")
@@ -156,14 +156,14 @@ def test_work_whose_terminal_is_closed_stops_as_asked(tmp_path: Path) -> None:
 @pytest.mark.usefixtures("hangups_are_heard")
 def test_a_lost_terminal_is_told_twice_and_not_at_all_under_nohup() -> None:
     progress = Progress()
-    with stoppable(progress):
+    with stop_on_request(progress):
         os.kill(os.getpid(), signal.SIGHUP)
         os.kill(os.getpid(), signal.SIGHUP)
         with pytest.raises(Cancelled):
             progress.check()
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
-        with stoppable(progress := Progress()):
+        with stop_on_request(progress := Progress()):
             os.kill(os.getpid(), signal.SIGHUP)
             progress.check()
         assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
@@ -187,13 +187,13 @@ def test_openjd_lines_are_a_farm_s() -> None:
 @pytest.mark.parametrize("of_main_thread", [True, False])
 def test_a_file_asks_for_a_stop(of_main_thread: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(STOP_FILE, str(tmp_path / "stop"))
-    monkeypatch.setattr("core.system.progress.STOP_FILE_EVERY_S", 0.01)
+    monkeypatch.setattr("core.system.progress.STOP_FILE_INTERVAL_S", 0.01)
     stopped: list[str] = []
 
     def work() -> None:
         progress = Progress()
         try:
-            with stoppable(progress):
+            with stop_on_request(progress):
                 progress.stage("fit", 1000)
                 (tmp_path / "stop").touch()
                 for _ in range(1000):
@@ -209,7 +209,7 @@ def test_a_file_asks_for_a_stop(of_main_thread: bool, tmp_path: Path, monkeypatc
         thread = threading.Thread(target=work)
         thread.start()
         thread.join()
-    assert stopped == ["Stopped during fit as asked; what is done is kept."]
+    assert stopped == ["Stopped during fit as requested; what is done is kept."]
     assert threading.active_count() == before, "who looked has gone"
 
 
@@ -223,13 +223,13 @@ class Clock:
     def left_after(self, progress: Progress, seconds: float, steps: int = 1) -> float | None:
         self.now += seconds
         progress.advance(steps)
-        return progress.left_s
+        return progress.eta_s
 
 
 def test_the_time_left_of_what_goes_on_is_by_the_steps_made_since(monkeypatch: pytest.MonkeyPatch) -> None:
     clock, progress = Clock(monkeypatch), Progress()
     progress.stage("fit", 1000, 900)
-    assert progress.left_s is None
+    assert progress.eta_s is None
     assert clock.left_after(progress, 40) is None, "the first step says little"
     assert clock.left_after(progress, 50, 50) == pytest.approx(49)
     assert clock.left_after(progress, 50, 49) == 0
@@ -247,7 +247,7 @@ def test_the_time_left_is_not_by_the_first_step_and_forgets_an_earlier_pace(monk
         left = clock.left_after(progress, 0.3)
     assert left == pytest.approx(0.3 * 578, rel=0.01), "it goes slower now"
     progress.stage("eval", 10)
-    assert progress.left_s is None
+    assert progress.eta_s is None
 
 
 def test_processes_that_end_together_are_no_pace(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -20,21 +20,21 @@ from numpy.typing import NDArray
 
 from core.capture import Camera, Capture
 from core.capture.camera import quaternion_from_rotation, rotation_from_quaternion
-from core.capture.colmap import Observed, PointCloud, read_model, write_model
+from core.capture.colmap import ObservedFrame, PointCloud, read_model, write_model
 from core.capture.lens import Lens
 from core.capture.solve import SolveSettings, develop, solve
 from core.capture.solve.mapping import Model, Solved, SolvedFrame
 from core.capture.solve.pairs import choose_matching, choose_pairs
-from core.capture.solve.stills import Still, choose, gather, usable
+from core.capture.solve.source_frames import SourceFrame, choose_sharpest, feature_mask, prepare_frames
 from core.capture.solve.world import up_direction
 from core.colour.srgb import linear_from_srgb
 from core.errors import Cancelled, CaptureError, FrameError, RunError, SettingsError
 from core.images.picture import Picture
-from core.images.read import read_picture, stored_pixels
+from core.images.read import read_picture, read_stored_pixels
 from core.images.size import picture_size
 from core.images.write import write_exr
 from core.system.files import atomic_path
-from core.system.folder_lock import held
+from core.system.folder_lock import folder_lock
 from core.system.progress import Progress
 from tests.core.captures import look_at, make_capture, orbit
 from tests.core.heard import Heard
@@ -156,7 +156,7 @@ def test_the_report(solved: tuple[Path, list[Camera], dict[str, Any]]) -> None:
 def test_a_solved_shot_is_not_solved_again(solved: tuple[Path, list[Camera], dict[str, Any]]) -> None:
     out, _, report = solved
     before = (out / "solve.json").stat().st_mtime_ns
-    with held(out):  # which nobody needs who writes nothing
+    with folder_lock(out):  # which nobody needs who writes nothing
         assert solve(out.parent / "frames", out, QUICK) == report
     assert (out / "solve.json").stat().st_mtime_ns == before
 
@@ -222,7 +222,7 @@ def test_what_a_killed_solve_left_half_written_is_not_in_the_capture(stopped: Pa
 
 
 def test_one_solves_into_a_folder_at_a_time(stopped: Path, tmp_path: Path) -> None:
-    with held(tmp_path / "out"), pytest.raises(RunError, match="Another process is at work in"):
+    with folder_lock(tmp_path / "out"), pytest.raises(RunError, match="Another process is using"):
         solve(stopped / "frames", tmp_path / "out", QUICK)
 
 
@@ -234,7 +234,7 @@ def test_what_a_power_failure_has_damaged_is_made_again(stopped: Path, tmp_path:
     file = out / ".solve" / damaged
     file.write_bytes(file.read_bytes()[:file.stat().st_size // 2])
     assert solve(stopped / "frames", out, QUICK, heard)["registered"] == 6
-    assert any("begins anew" in line and file.name in line for line in heard.texts), heard.texts
+    assert any("starts over" in line and file.name in line for line in heard.texts), heard.texts
 
 
 @pytest.fixture(scope="module")
@@ -332,17 +332,17 @@ def test_straightened_frames_keep_what_their_files_hold(name: str, kind: type, t
     stored[:, :] = kind(0.1 * full)
     stored[16:32, 20:44] = kind(top * full)
     cv2.imwrite(str(tmp_path / name), stored, [cv2.IMWRITE_TIFF_COMPRESSION, 1])
-    still = Still("000000.png", str(tmp_path / name), 64, 48, None, 1)
+    still = SourceFrame("000000.png", str(tmp_path / name), 64, 48, None, 1)
     lens = Lens("SIMPLE_RADIAL", (58.0, 32.0, 24.0, -0.1), 64, 48)
     frame = SolvedFrame(0, lens, np.eye(4), np.zeros((0, 2)), np.zeros(0, np.int64))
     model = Model(np.zeros((1, 3)), np.zeros((1, 3), np.uint8), np.zeros(1), np.zeros(1, np.int64), [frame])
     out = tmp_path / "out"
     out.mkdir()
-    develop.write([still], Solved(model, [1], "exhaustive", 0), out, tmp_path / "work", 0, Progress())
+    develop.write_capture([still], Solved(model, [1], "exhaustive", 0), out, tmp_path / "work", 0, Progress())
     (written,) = (out / "images").iterdir()
     assert written.name == "a" + suffix and read_picture(written).pixels.max() == pytest.approx(top, rel=1e-3)
     if suffix == ".png":
-        assert stored_pixels(written).dtype == kind
+        assert read_stored_pixels(written).dtype == kind
 
 
 def write_video(path: Path, frames: list[NDArray[np.uint8]]) -> Path:
@@ -371,17 +371,17 @@ def test_a_video_that_is_cut_off_is_told(tmp_path: Path) -> None:
     for camera in orbit(12, size=SIZE, arc=0.3):
         writer.write(render(camera))
     writer.release()
-    gather(video, tmp_path / "whole", 4, 400, heard)
+    prepare_frames(video, tmp_path / "whole", 4, 400, heard)
     assert not heard.texts
     video.write_bytes(video.read_bytes()[:video.stat().st_size // 2])
-    gather(video, tmp_path / "cut", 4, 400, heard)
-    assert len(heard.texts) == 1 and "shot.avi tells of 12 frames, and " in heard.texts[0], heard.texts
+    prepare_frames(video, tmp_path / "cut", 4, 400, heard)
+    assert len(heard.texts) == 1 and "shot.avi promises 12 frames, and " in heard.texts[0], heard.texts
 
 
 def test_the_small_frames_of_a_squeezed_video_are_not(tmp_path: Path) -> None:
     frames = [render(camera) for camera in orbit(4, size=SIZE, arc=0.3)]
     video = with_pixels(write_video(tmp_path / "shot.mp4", frames), 4, 3)
-    stills, _ = gather(video, tmp_path / "work", 0, 400, Progress())
+    stills, _ = prepare_frames(video, tmp_path / "work", 0, 400, Progress())
     assert [(still.width, still.height) for still in stills] == [SIZE] * 4
     assert picture_size(tmp_path / "work" / "small" / stills[0].name) == (400, 225)
     assert picture_size(tmp_path / "work" / "masks" / f"{stills[0].name}.png") == (400, 225)
@@ -475,8 +475,8 @@ def test_bad_settings(bad: dict[str, Any]) -> None:
 
 
 def test_the_sharpest_of_each_stretch() -> None:
-    assert choose([1, 5, 2, 9, 1, 1, 3, 4], 4) == [1, 3, 4, 7]
-    assert choose([1, 2, 3], 0) == choose([1, 2, 3], 9) == [0, 1, 2]
+    assert choose_sharpest([1, 5, 2, 9, 1, 1, 3, 4], 4) == [1, 3, 4, 7]
+    assert choose_sharpest([1, 2, 3], 0) == choose_sharpest([1, 2, 3], 9) == [0, 1, 2]
 
 
 def test_pairs() -> None:
@@ -500,18 +500,18 @@ def test_masks_leave_out_clipped_pixels_and_ghost_lines() -> None:
     pixels = np.full((240, 320, 3), 0.4, np.float32)
     cv2.circle(pixels, (60, 50), 8, (1.0, 1.0, 1.0), -1)
     pixels[200, 300] = 1.0  # sparkle
-    free = usable(Picture(pixels, "srgb"))
+    free = feature_mask(Picture(pixels, "srgb"))
     assert not free[50, 60] and not free[50, 69] and free[200, 300]
     assert not free[120, 160] and not free[190, 260]  # the line through the middle, and its far side
     assert free[50, 260] and free[190, 60] and free.mean() > 0.85
     pixels[30:120, 150:300] = 1.0  # a bright wall clips but casts no line
-    assert usable(Picture(pixels, "srgb"))[230, 60]
+    assert feature_mask(Picture(pixels, "srgb"))[230, 60]
 
 
 def test_masks_of_linear_frames_do_not_depend_on_their_exposure() -> None:
     light = np.full((240, 320, 3), 0.18, np.float32)
     cv2.circle(light, (60, 50), 8, (30.0, 30.0, 30.0), -1)
-    masks = [usable(Picture(light * np.float32(gain), "linear")) for gain in (1 / 16, 1, 16)]
+    masks = [feature_mask(Picture(light * np.float32(gain), "linear")) for gain in (1 / 16, 1, 16)]
     assert not masks[1][50, 60] and masks[1].mean() > 0.85
     assert all((mask == masks[1]).all() for mask in masks)
 
@@ -548,7 +548,7 @@ def test_interlaced_footage_is_told(apart: int, told: int, as_video: bool, tmp_p
         for number, frame in enumerate(frames):
             cv2.imwrite(str(source / f"{number:03d}.png"), frame)
     heard = Heard()
-    gather(source, tmp_path / "work", 6, 480, heard)
+    prepare_frames(source, tmp_path / "work", 6, 480, heard)
     assert sum("interlaced" in text for text in heard.texts) == told
 
 
@@ -560,7 +560,7 @@ def test_models_are_written_as_read(tmp_path: Path) -> None:
     cloud = PointCloud(rng.normal(size=(5, 3)).astype(np.float32), rng.integers(0, 256, (5, 3)).astype(np.uint8),
                        rng.uniform(size=5).astype(np.float32))
     poses = [rotated(rng) for _ in range(3)]
-    frames = [Observed(f"ä {i}.png", lens, pose, rng.uniform(0, 48, (3, 2)), np.array([0, 2, 4]))
+    frames = [ObservedFrame(f"ä {i}.png", lens, pose, rng.uniform(0, 48, (3, 2)), np.array([0, 2, 4]))
               for i, pose in enumerate(poses)]
     write_model(tmp_path, frames, cloud)
     posed, again = read_model(tmp_path)
@@ -629,5 +629,5 @@ def test_who_asks_a_solve_to_end_is_heard() -> None:
 
 
 def test_frames_whose_names_differ_by_case_or_suffix_alone_are_two_on_every_disk() -> None:
-    stills = [Still(name, f"/shoot/{name}", 8, 8, None, 1) for name in ("a.jpg", "A.jpeg", "b.jpg")]
-    assert develop._names(stills) == ["a.png", "A.jpeg.png", "b.png"]
+    stills = [SourceFrame(name, f"/shoot/{name}", 8, 8, None, 1) for name in ("a.jpg", "A.jpeg", "b.jpg")]
+    assert develop._file_names(stills) == ["a.png", "A.jpeg.png", "b.png"]

@@ -58,7 +58,7 @@ def box(transfer: int, matrix: int) -> bytes:
     (360, (0.299, 0.114), b""), (720, (0.2126, 0.0722), b""), (360, (0.2126, 0.0722), box(1, 1)),
     (720, (0.299, 0.114), box(1, 6)), (720, (0.2627, 0.0593), box(1, 9))])
 def test_the_colours_of_a_video_are_those_that_players_show(height: int, weights: tuple[float, float], told: bytes,
-                                                             tmp_path: Path) -> None:
+                                                            tmp_path: Path) -> None:
     with Video(patches(tmp_path / "a.mp4", height, weights, told)) as video:
         frames = list(video)
         assert video.warnings == ()
@@ -196,7 +196,7 @@ def test_missing_frames_of_a_video_are_reported(tmp_path: Path) -> None:
     assert not told.texts
     (tmp_path / "clip.avi").write_bytes(whole[:len(whole) * 6 // 10])
     extract_frames(tmp_path / "clip.avi", tmp_path / "cut", told)
-    assert [sentence for sentence in told.texts if "tells of 4 frames" in sentence]
+    assert [sentence for sentence in told.texts if "promises 4 frames" in sentence]
 
 
 def test_an_unreadable_or_cancelled_video_leaves_no_frames(tmp_path: Path) -> None:

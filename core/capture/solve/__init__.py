@@ -1,15 +1,14 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Structure from motion: from frames or a video to a capture.
 
-    stills.py     which frames; small pictures and masks of them
-    pairs.py      which frames to match with which
-    mapping.py    pycolmap: features, matches, incremental mapping
-    world.py      which way is up, where the floor is, how large things are
-    develop.py    the model and the frames, undistorted, at full size
-    report.py     figures, and a picture of cameras and points
+    source_frames.py  which frames; small pictures and masks of them
+    pairs.py          which frames to match with which
+    mapping.py        features, matches and incremental mapping, by pycolmap
+    world.py          up direction, floor and scale
+    develop.py        the model and the frames, undistorted, at full size
+    report.py         figures, and a picture of cameras and points
 
-Everything in progress lies in OUT/.solve and is taken up again by the next run; the capture itself appears
-whole at the end.
+Intermediate files are in OUT/.solve, from which the next run resumes; the capture itself appears whole at the end.
 """
 from __future__ import annotations
 
@@ -23,29 +22,29 @@ from ...choices import Matching
 from ...errors import CaptureError, SettingsError
 from ...images.listing import pictures_in
 from ...images.video import is_video
-from ...system.files import read_json, remove_file, remove_partial, write_json
-from ...system.folder_lock import held
+from ...system.files import read_json, remove_file, remove_partials_below, write_json
+from ...system.folder_lock import folder_lock
 from ...system.progress import Progress
 from ..capture import LIGHTS, REMOVED
 from ..lens import MODELS
 
-REPORT, PICTURE, WORK, ASKED = "solve.json", "solve.png", ".solve", "request.json"
+REPORT, PICTURE, WORK_FOLDER, REQUEST = "solve.json", "solve.png", ".solve", "request.json"
 
 
 @dataclass(frozen=True)
 class SolveSettings:
-    """How to solve.
+    """Settings of a solve.
 
     frames: how many to choose, 0 = all of a folder and 150 of a video.
-    matching: which frames to match; "auto" takes what fits (pairs.py).
+    matching: which frames to match; "auto" chooses by their number (pairs.py).
     lens: COLMAP's camera model; one camera for all frames of one size. Without tangential terms by default: they
-        stand in for a shift of the principal point, about which flares turn.
+    imitate a shift of the principal point, about which flares turn.
     size: long side in pixels at which features are found.
-    features: at most so many a frame.
+    features: largest number of features of a frame.
     output_size: long side of the frames written; 0 = as filmed.
-    principal_point: find it too, since flares turn about it; kept at the middle where the frames do not tell.
-    mask: leave clipped pixels and their bloom out of feature extraction.
-    seed: of everything random.
+    principal_point: estimate it as well, since flares turn about it; the centre where the frames do not determine it.
+    mask: exclude clipped pixels and their bloom from feature extraction.
+    seed: of all randomness.
     """
 
     frames: int = 0
@@ -77,12 +76,11 @@ def solve(source: Path | str, out: Path | str, settings: SolveSettings | None = 
           progress: Progress | None = None) -> dict[str, Any]:
     """Solve the frames of a folder or video and write the capture `out`; returns the report, also solve.json.
 
-    Frames that cannot be read, and those that find no place in the largest model, are left out and named.
-    An earlier run with the same source and settings is taken up where it stopped.
+    Frames that cannot be read, and those that the largest model does not register, are left out and named. An
+    interrupted run with the same source and settings resumes.
 
-    Raises CaptureError where there is nothing to solve or no parallax to solve it by, FrameError for a video
-    that cannot be read, RunError where another process solves there, Cancelled when asked to stop, EngineError without
-    pycolmap.
+    Raises CaptureError where there is nothing to solve or no parallax, FrameError for a video that cannot be read,
+    RunError where another process solves there, Cancelled on a stop request, EngineError without pycolmap.
     """
     source, out = Path(source), Path(out)
     if not source.exists():
@@ -91,47 +89,47 @@ def solve(source: Path | str, out: Path | str, settings: SolveSettings | None = 
         raise CaptureError(f"{out} is a file; give a folder for the capture.")
     settings, progress = settings or SolveSettings(), progress or Progress()
     request = {"source": _fingerprint(source), "settings": asdict(settings)}
-    finished = _report_in(out)
+    finished = _read_report(out)
     if finished is not None and finished.get("request") == request:  # where nothing may be written, too
         progress.say(f"{out} is solved already.")
-        shutil.rmtree(out / WORK, ignore_errors=True)
+        shutil.rmtree(out / WORK_FOLDER, ignore_errors=True)
         return finished
-    with held(out):  # two in one database would be the end of both
+    with folder_lock(out):  # two in one database would be the end of both
         return _solve(source, out, request, settings, progress)
 
 
 def _solve(source: Path, out: Path, request: dict[str, Any], settings: SolveSettings,
            progress: Progress) -> dict[str, Any]:
-    from . import develop, mapping, report, stills, world
+    from . import develop, mapping, report, source_frames, world
 
     began = time.monotonic()
-    _claim(source, out, request, progress)
-    work = out / WORK
-    chosen, left_out = stills.gather(source, work, settings.frames, settings.size, progress)
+    _prepare_output(source, out, request, progress)
+    work = out / WORK_FOLDER
+    chosen, left_out = source_frames.prepare_frames(source, work, settings.frames, settings.size, progress)
     solved = mapping.solve(chosen, work, settings, is_video(source), progress)
     world.align(solved.model)
-    missing = sorted(set(range(len(chosen))) - {frame.still for frame in solved.frames})
+    missing = sorted(set(range(len(chosen))) - {frame.index for frame in solved.frames})
     if missing:
         names = ", ".join(Path(chosen[i].file).name for i in missing[:12]) + (", …" if len(missing) > 12 else "")
         progress.say(f"{len(missing)} of {len(chosen)} frames found no place in the model and are left out: {names}.")
-    remove_file(out / REPORT)  # it tells of what is about to be replaced
-    develop.write(chosen, solved, out, work, settings.output_size, progress)
-    data = report.figures(chosen, solved, left_out, request, time.monotonic() - began)
-    report.picture(solved, out / PICTURE)
+    remove_file(out / REPORT)  # describes the capture that is about to be replaced
+    develop.write_capture(chosen, solved, out, work, settings.output_size, progress)
+    data = report.make_report(chosen, solved, left_out, request, time.monotonic() - began)
+    report.draw_model(solved, out / PICTURE)
     write_json(out / REPORT, data)
     shutil.rmtree(work, ignore_errors=True)
     return data
 
 
 def _fingerprint(source: Path) -> list[Any]:
-    """What tells one source from another: names, lengths and times of what is read of it."""
+    """Identify a source by names, lengths and times of its files."""
     files = pictures_in(source) if source.is_dir() else [source]
     stats = [(path.name, path.stat()) for path in files]
     return [str(source.resolve()), *([name, stat.st_size, stat.st_mtime_ns] for name, stat in stats)]
 
 
-def _report_in(out: Path) -> dict[str, Any] | None:
-    """Of a finished solve; None where there is none."""
+def _read_report(out: Path) -> dict[str, Any] | None:
+    """Read the report of a finished solve; None where there is none."""
     if not (out / REPORT).is_file():
         return None
     report = read_json(out / REPORT, CaptureError)
@@ -140,8 +138,8 @@ def _report_in(out: Path) -> dict[str, Any] | None:
     return dict(report)
 
 
-def _claim(source: Path, out: Path, request: dict[str, Any], progress: Progress) -> None:
-    """Make `out` ours. Refused where it holds a capture that did not come from here, or the frames to be read."""
+def _prepare_output(source: Path, out: Path, request: dict[str, Any], progress: Progress) -> None:
+    """Prepare `out` for this solve. Raises CaptureError where it holds another capture or the source frames."""
     if source.resolve() in (out.resolve(), (out / "images").resolve()):
         raise CaptureError(f"The frames in {source} would be overwritten by their undistorted selves; give another "
                            "folder for the capture.")
@@ -151,27 +149,27 @@ def _claim(source: Path, out: Path, request: dict[str, Any], progress: Progress)
         if belongs:
             raise CaptureError(f"{out} holds {' and '.join(belongs)} of an earlier solve, which fit no other; choose "
                                "another folder for the capture, or remove them.")
-    elif theirs and not (out / WORK).is_dir():
+    elif theirs and not (out / WORK_FOLDER).is_dir():
         raise CaptureError(f"{out} holds {theirs[0]} that did not come from a solve; give another folder.")
-    if _goes_on(out / WORK, request, progress):
-        remove_partial(out / WORK)
-        progress.say("Going on with the solve that was stopped.")
+    if _can_resume(out / WORK_FOLDER, request, progress):
+        remove_partials_below(out / WORK_FOLDER)
+        progress.say("The interrupted solve is resumed.")
     else:
-        shutil.rmtree(out / WORK, ignore_errors=True)
-        write_json(out / WORK / ASKED, request)
+        shutil.rmtree(out / WORK_FOLDER, ignore_errors=True)
+        write_json(out / WORK_FOLDER / REQUEST, request)
 
 
-def _goes_on(work: Path, request: dict[str, Any], progress: Progress) -> bool:
-    """Whether an earlier solve of the same was stopped here, and what it left is whole."""
-    from . import mapping, stills
+def _can_resume(work: Path, request: dict[str, Any], progress: Progress) -> bool:
+    """True if an interrupted solve of the same request left intact files here."""
+    from . import mapping, source_frames
 
     try:
-        if not (work / ASKED).is_file() or read_json(work / ASKED, CaptureError) != request:
+        if not (work / REQUEST).is_file() or read_json(work / REQUEST, CaptureError) != request:
             return False
-        stills.gathered(work)
-        mapping.check(work)
+        source_frames.read_record(work)
+        mapping.check_intermediate_files(work)
     except CaptureError as problem:
-        progress.say(f"The solve begins anew: {problem}")
+        progress.say(f"The solve starts over: {problem}")
         return False
     return True
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What a solve found: figures as JSON, and a picture of cameras and points from above and from the front."""
+"""The result of a solve as figures (JSON), and a picture of cameras and points from above and from the front."""
 from __future__ import annotations
 
 from collections.abc import Sequence
@@ -11,32 +11,33 @@ import numpy as np
 from ...images.write import write_png
 from ..camera import Floats
 from .mapping import Solved
-from .stills import Still
+from .source_frames import SourceFrame
 
-PANEL = 720  # pixels, each of the two views
+PANEL = 720
+"""Side of each of the two views, pixels."""
 INK, PATH, PAPER = (0.15, 0.15, 0.15), (0.85, 0.2, 0.1), 1.0
 
 
-def figures(stills: Sequence[Still], solved: Solved, left_out: list[str], request: dict[str, Any],
+def make_report(sources: Sequence[SourceFrame], solved: Solved, left_out: list[str], request: dict[str, Any],
             seconds: float) -> dict[str, Any]:
-    """The report, JSON-able. Errors are in pixels of the small pictures features were found in."""
-    registered = {frame.still for frame in solved.frames}
+    """Return the report, JSON-able. Errors are in pixels of the small pictures."""
+    registered = {frame.index for frame in solved.frames}
     model = solved.model
     lenses = list(dict.fromkeys(frame.lens for frame in solved.frames))
     return {
-        "frames": len(stills), "registered": len(registered), "models": solved.sizes,
-        "unregistered": [Path(stills[i].file).name for i in range(len(stills)) if i not in registered],
+        "frames": len(sources), "registered": len(registered), "models": solved.sizes,
+        "unregistered": [Path(sources[i].file).name for i in range(len(sources)) if i not in registered],
         "left_out": left_out, "matching": solved.matching, "pairs": solved.pairs,
         "points": len(model.xyz), "observations": int(model.tracks.sum()),
         "reprojection_error_px": round(float(model.error.mean()), 4),
         "track_length": round(float(model.tracks.mean()), 3),
         "cameras": [{"model": lens.model, "size": [lens.width, lens.height],
-                     "params": dict(zip(lens.named, map(float, lens.params), strict=True))} for lens in lenses],
+                     "params": dict(zip(lens.parameters, map(float, lens.params), strict=True))} for lens in lenses],
         "seconds": round(seconds, 1), "request": request,
     }
 
 
-def picture(solved: Solved, path: Path) -> None:
+def draw_model(solved: Solved, path: Path) -> None:
     """Draw points in their colours, cameras as wedges, and their path, from above and from the front."""
     import cv2
 

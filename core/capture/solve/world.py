@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The world of a solve, which structure from motion leaves open: up is +z, the floor is near z = 0, and the
+"""Aligns the world of a solve, which structure from motion leaves open: up is +z, the floor is near z = 0, and the
 scene is some 5 units away, so that it opens upright and within reach in Blender.
 
-Photographers turn cameras far more than they roll them: the cameras' x axes lie in the horizon. Up is the
-direction most nearly at right angles to all of them that also agrees with the frames' own up.
+Photographers turn cameras far more than they roll them: the cameras' x axes lie in the horizon. Up is the direction
+most nearly perpendicular to all of them that also agrees with the frames' up.
 """
 from __future__ import annotations
 
@@ -14,14 +14,15 @@ import numpy as np
 from ..camera import Floats
 from .mapping import Model
 
-DISTANCE = 5.0  # median distance of a point from the cameras that see it
+MEDIAN_DISTANCE = 5.0
+"""Median distance of a point from the cameras that see it, after alignment."""
 
 
 def up_direction(rotations: Sequence[Floats]) -> Floats:
-    """(3,) unit up vector of world-to-camera rotations (3, 3).
+    """(3,) unit up vector from world-to-camera rotations (3, 3).
 
-    Minimises sum (x_i . u)^2 - n/5 (y . u)^2, with y the mean of the frames' own up: where all cameras look one
-    way their x axes alone leave up undecided.
+    Minimises sum (x_i . u)^2 - n/5 (y . u)^2, with y the mean of the frames' up: where all cameras look one way their x
+    axes alone leave up undecided.
     """
     stack = np.asarray(rotations)
     right, own = stack[:, 0], -stack[:, 1].mean(axis=0)
@@ -31,7 +32,7 @@ def up_direction(rotations: Sequence[Floats]) -> Floats:
 
 
 def align(model: Model) -> None:
-    """Turn, scale and shift the model in place."""
+    """Rotate, scale and shift the model in place."""
     up = up_direction([frame.world_to_camera[:3, :3] for frame in model.frames])
     ahead = np.mean([frame.world_to_camera[2, :3] for frame in model.frames], axis=0)
     ahead = ahead - (ahead @ up) * up
@@ -39,7 +40,7 @@ def align(model: Model) -> None:
         ahead = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
     ahead /= np.linalg.norm(ahead)
     turn = np.stack([np.cross(ahead, up), ahead, up])  # Blender's front view: x right, y ahead, z up
-    scale = DISTANCE / _distance(model)
+    scale = MEDIAN_DISTANCE / _median_distance(model)
     xyz = scale * model.xyz @ turn.T
     shift = -np.array([*np.median(xyz[:, :2], axis=0), np.percentile(xyz[:, 2], 2)])
     model.xyz = xyz + shift
@@ -51,7 +52,7 @@ def align(model: Model) -> None:
         frame.world_to_camera = pose
 
 
-def _distance(model: Model) -> float:
+def _median_distance(model: Model) -> float:
     """Median distance of points from the cameras that see them."""
     each = []
     for frame in model.frames:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Which way a photograph is up, and through how long a lens it was taken, as its Exif block says."""
+"""Orientation and focal length of a photograph, from its Exif block."""
 from __future__ import annotations
 
 import io
@@ -12,27 +12,29 @@ from numpy.typing import NDArray
 from . import jpeg, png, tiff
 
 EXIF, FOCAL_35MM = 0x8769, 0xA405
-WIDTH_35MM = 36.0  # millimetres along the long side
+WIDTH_35MM = 36.0
+"""Long side of 35 mm film in millimetres."""
 
 
 def read_exif(path: Path) -> tuple[int, float | None]:
-    """(orientation 1..8, focal length as a multiple of the long side or None) of a JPEG, PNG or TIFF; (1, None) of
-    others, and where it is not told."""
+    """Return (orientation 1..8, focal length as a multiple of the long side or None) of a JPEG, PNG or TIFF.
+
+    (1, None) for other files, and where the tags are missing.
+    """
     with open(path, "rb") as stream:
         block = _exif_block(stream)
-        first = tiff.whole_numbers(tiff.read_tags(block, (tiff.ORIENTATION, EXIF)))
-        second = tiff.whole_numbers(tiff.read_tags(block, (FOCAL_35MM,), first[EXIF])) if EXIF in first else {}
+        first = tiff.integer_values(tiff.read_tags(block, (tiff.ORIENTATION, EXIF)))
+        second = tiff.integer_values(tiff.read_tags(block, (FOCAL_35MM,), first[EXIF])) if EXIF in first else {}
     orientation, focal = first.get(tiff.ORIENTATION, 1), second.get(FOCAL_35MM, 0)
     return orientation if 1 <= orientation <= 8 else 1, focal / WIDTH_35MM if 5 <= focal <= 2000 else None
 
 
 def _exif_block(stream: BinaryIO) -> BinaryIO:
-    """What a picture says of itself, in the form of a TIFF, as which Exif is written everywhere; empty where it says
-    nothing."""
-    begins = stream.read(8)
-    if begins[:4] in (b"II*\0", b"MM\0*"):
+    """Return the metadata of a picture as a TIFF stream, the form of every Exif block; empty where it has none."""
+    magic = stream.read(8)
+    if magic[:4] in (b"II*\0", b"MM\0*"):
         return stream
-    if begins[:2] == b"\xff\xd8":
+    if magic[:2] == b"\xff\xd8":
         found = (content[6:] for marker, content in jpeg.segments(stream)
                  if marker == jpeg.APP1 and content.startswith(b"Exif\0\0"))
     else:
@@ -40,8 +42,8 @@ def _exif_block(stream: BinaryIO) -> BinaryIO:
     return io.BytesIO(next(found, b""))
 
 
-def upright(pixels: NDArray[Any], orientation: int) -> NDArray[Any]:
-    """(height, width, ...) as stored, turned and mirrored as an Exif orientation asks: as viewers show it."""
+def apply_orientation(pixels: NDArray[Any], orientation: int) -> NDArray[Any]:
+    """Rotate and mirror stored pixels (height, width, ...) by an Exif orientation, as viewers show them."""
     if orientation in (5, 6, 7, 8):
         pixels = np.swapaxes(pixels, 0, 1)
     if orientation in (3, 4, 7, 8):
@@ -51,6 +53,6 @@ def upright(pixels: NDArray[Any], orientation: int) -> NDArray[Any]:
     return np.ascontiguousarray(pixels)
 
 
-def as_stored(pixels: NDArray[Any], orientation: int) -> NDArray[Any]:
-    """The inverse of `upright`."""
-    return upright(pixels, {6: 8, 8: 6}.get(orientation, orientation))
+def undo_orientation(pixels: NDArray[Any], orientation: int) -> NDArray[Any]:
+    """Invert `apply_orientation`."""
+    return apply_orientation(pixels, {6: 8, 8: 6}.get(orientation, orientation))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What an EXR's first header says, read without a library: Blender's own Python has none that reads EXRs.
+"""Reads the first header of an EXR without a library: Blender's own Python has none that reads EXRs.
 
 The layout is that of "OpenEXR File Layout" (Academy Software Foundation): after a magic number and a version, each
 attribute is a name, a type, a length and that many bytes; an empty name ends the header.
@@ -12,29 +12,29 @@ from typing import BinaryIO
 import numpy as np
 
 MAGIC = b"\x76\x2f\x31\x01"
-_LINES = (1, 1, 1, 16, 32, 16, 32, 32, 32, 256, 256, 32)
-"""Lines of a chunk, by the number of the compression: none, RLE, ZIPS, ZIP, PIZ, PXR24, B44, B44A, DWAA, DWAB and two
-of HTJ2K."""
-_TILES, _DEEP, _PARTS = 0x200, 0x800, 0x1000  # flags of the version
-_LONGEST = 1 << 20
-"""Bytes of an attribute that is read: some ten thousand channels, where hostile files claim gigabytes."""
+_LINES_PER_CHUNK = (1, 1, 1, 16, 32, 16, 32, 32, 32, 256, 256, 32)
+"""Lines of a chunk by the number of the compression: none, RLE, ZIPS, ZIP, PIZ, PXR24, B44, B44A, DWAA, DWAB, two of
+HTJ2K."""
+_TILES, _DEEP, _PARTS = 0x200, 0x800, 0x1000
+"""Flags of the version."""
+_MAX_ATTRIBUTE_BYTES = 1 << 20
+"""Largest attribute that is read: some ten thousand channels, where hostile files claim gigabytes."""
 
 
 def windows(stream: BinaryIO) -> dict[str, tuple[int, int]]:
-    """(width, height) of the "dataWindow" (what is stored) and the "displayWindow" (the frame), where they are told."""
-    told = _attributes(stream, {b"dataWindow": b"box2i", b"displayWindow": b"box2i"})
-    corners = {name: np.frombuffer(value, "<i4").tolist() for name, value in told.items() if len(value) == 16}
+    """Return (width, height) of the "dataWindow" (stored pixels) and the "displayWindow" (the frame), where present."""
+    found = _read_attributes(stream, {b"dataWindow": b"box2i", b"displayWindow": b"box2i"})
+    corners = {name: np.frombuffer(value, "<i4").tolist() for name, value in found.items() if len(value) == 16}
     return {name.decode(): (x1 - x0 + 1, y1 - y0 + 1) for name, (x0, y0, x1, y1) in corners.items()}
 
 
 HALF = 1
-"""Of the kinds of a channel's numbers, 16 bit floats."""
+"""Pixel type of a channel: 16 bit floats."""
 
 
 def channel_kinds(stream: BinaryIO) -> dict[str, int]:
-    """Of the channels, such as "flare_sun.R", in the file's order, the kind of their numbers; none where the header is
-    damaged."""
-    value = _attributes(stream, {b"channels": b"chlist"}).get(b"channels", b"")
+    """Return the pixel type of each channel, such as "flare_sun.R", in the file's order; empty for a damaged header."""
+    value = _read_attributes(stream, {b"channels": b"chlist"}).get(b"channels", b"")
     kinds, at = {}, 0
     while (end := value.find(b"\0", at)) > at:
         kinds[value[at:end].decode(errors="replace")] = int.from_bytes(value[end + 1:end + 5], "little")
@@ -43,67 +43,69 @@ def channel_kinds(stream: BinaryIO) -> dict[str, int]:
 
 
 def chromaticities(stream: BinaryIO) -> tuple[float, ...] | None:
-    """Red's, green's, blue's and white's x and y; None where they are not told."""
-    value = _attributes(stream, {b"chromaticities": b"chromaticities"}).get(b"chromaticities", b"")
+    """Return x and y of red, green, blue and white; None where they are missing."""
+    value = _read_attributes(stream, {b"chromaticities": b"chromaticities"}).get(b"chromaticities", b"")
     return tuple(np.frombuffer(value, "<f4").tolist()) if len(value) == 32 else None
 
 
 def pixel_aspect(stream: BinaryIO) -> float:
-    """Width of a pixel by its height; 1 where that is not told, or makes no sense."""
-    value = _attributes(stream, {b"pixelAspectRatio": b"float"}).get(b"pixelAspectRatio", b"")
+    """Return the pixel aspect ratio (width / height); 1 where it is missing or invalid."""
+    value = _read_attributes(stream, {b"pixelAspectRatio": b"float"}).get(b"pixelAspectRatio", b"")
     return sensible_aspect(float(np.frombuffer(value, "<f4")[0]) if len(value) == 4 else 1.0)
 
 
-def sensible_aspect(told: float) -> float:
-    """What a header tells of a pixel's width by its height; 1 where that makes no sense."""
-    return told if 0.1 < told < 10 else 1.0
+def sensible_aspect(aspect: float) -> float:
+    """Return a header's pixel aspect ratio; 1 where it is invalid."""
+    return aspect if 0.1 < aspect < 10 else 1.0
 
 
-def is_cut_off(stream: BinaryIO) -> bool:
-    """Whether the chunks of a picture of one part in lines are not all in the file. Of other kinds it is not known, and
-    none of those is."""
+def is_truncated(stream: BinaryIO) -> bool:
+    """True if chunks of a single-part scanline picture are missing from the file. Other kinds are not checked: False.
+    """
     stream.seek(len(MAGIC))
     flags = int.from_bytes(stream.read(4), "little")
     if flags & (_TILES | _DEEP | _PARTS):
         return False
-    told = _attributes(stream, {b"dataWindow": b"box2i", b"compression": b"compression"}, to_the_end=True)
-    window, compression = told.get(b"dataWindow", b""), told.get(b"compression")
+    found = _read_attributes(stream, {b"dataWindow": b"box2i", b"compression": b"compression"}, to_the_end=True)
+    window, compression = found.get(b"dataWindow", b""), found.get(b"compression")
     if len(window) != 16 or not compression:
         return True
-    if compression[0] >= len(_LINES):
+    if compression[0] >= len(_LINES_PER_CHUNK):
         return False
     _, top, _, bottom = np.frombuffer(window, "<i4").tolist()
-    begin, end = stream.tell(), stream.seek(0, os.SEEK_END)
-    chunks = -(-(bottom + 1 - top) // _LINES[compression[0]])
-    if chunks <= 0 or begin + 8 * chunks > end:
+    start, end = stream.tell(), stream.seek(0, os.SEEK_END)
+    chunks = -(-(bottom + 1 - top) // _LINES_PER_CHUNK[compression[0]])
+    if chunks <= 0 or start + 8 * chunks > end:
         return True
-    stream.seek(begin)
-    places = np.frombuffer(stream.read(8 * chunks), "<u8")
-    if not places.all():  # one that is still being written has none yet
+    stream.seek(start)
+    offsets = np.frombuffer(stream.read(8 * chunks), "<u8")
+    if not offsets.all():  # not written yet
         return True
-    last = int(places.max())
+    last = int(offsets.max())
     stream.seek(min(last + 4, end))
     return last + 8 + int.from_bytes(stream.read(4), "little") > end
 
 
-def _attributes(stream: BinaryIO, kinds: dict[bytes, bytes], *, to_the_end: bool = False) -> dict[bytes, bytes]:
-    """Those of the given names and types, up to where the header ends or is damaged; the stream is past all of them,
-    and `to_the_end` past the header."""
+def _read_attributes(stream: BinaryIO, kinds: dict[bytes, bytes], *, to_the_end: bool = False) -> dict[bytes, bytes]:
+    """Read the attributes of these names and types, up to the end of the header or the first damaged one.
+
+    Leaves the stream behind the last of them; with `to_the_end` behind the header.
+    """
     stream.seek(len(MAGIC) + 4)
     found: dict[bytes, bytes] = {}
-    while (to_the_end or len(found) < len(kinds)) and (name := _until_zero(stream)):
-        kind, length = _until_zero(stream), int.from_bytes(stream.read(4), "little", signed=True)
+    while (to_the_end or len(found) < len(kinds)) and (name := _read_name(stream)):
+        kind, length = _read_name(stream), int.from_bytes(stream.read(4), "little", signed=True)
         if length < 0:
             break
-        if kinds.get(name) == kind and length <= _LONGEST:
+        if kinds.get(name) == kind and length <= _MAX_ATTRIBUTE_BYTES:
             found[name] = stream.read(length)
         else:
             stream.seek(length, os.SEEK_CUR)
     return found
 
 
-def _until_zero(stream: BinaryIO) -> bytes:
-    """A name, 255 bytes at most."""
+def _read_name(stream: BinaryIO) -> bytes:
+    """Read a name that a zero byte ends, at most 255 bytes."""
     name = b""
     while len(name) <= 255 and (byte := stream.read(1)) not in (b"", b"\0"):
         name += byte

@@ -1,24 +1,24 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The segments of a JPEG (ITU-T T.81, annex B) before its pixels: its size, and how it is to be shown."""
+"""Reads and makes the segments of a JPEG (ITU-T T.81, annex B) before its pixels: size and metadata."""
 from __future__ import annotations
 
 import struct
 from collections.abc import Iterator
 from typing import BinaryIO, NamedTuple
 
-FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+SOF = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 """Markers of frame headers (SOF): precision, height, width, number of components."""
-PIXELS, APP1, APP2 = 0xDA, 0xE1, 0xE2
+SOS, APP1, APP2 = 0xDA, 0xE1, 0xE2
 
 
 def segments(stream: BinaryIO) -> Iterator[tuple[int, bytes]]:
-    """(marker, what follows its length), as far as the file is whole."""
+    """Yield (marker, content) of each segment, as far as the file is intact."""
     stream.seek(2)
     while (byte := stream.read(1)) == b"\xff":
         while byte == b"\xff":  # fill bytes may stand before a marker
             byte = stream.read(1)
         length = int.from_bytes(stream.read(2), "big")
-        if not byte or byte[0] == PIXELS or length < 2:
+        if not byte or byte[0] == SOS or length < 2:
             return
         content = stream.read(length - 2)
         if len(content) < length - 2:
@@ -27,7 +27,7 @@ def segments(stream: BinaryIO) -> Iterator[tuple[int, bytes]]:
 
 
 class Header(NamedTuple):
-    """Of a picture: pixels, how many components each has, of how many bits."""
+    """Size in pixels, number of components, and bits of each."""
 
     width: int
     height: int
@@ -36,14 +36,14 @@ class Header(NamedTuple):
 
 
 def frame_header(stream: BinaryIO) -> Header | None:
-    """None where it is missing."""
+    """Read the frame header; None where it is missing."""
     for marker, content in segments(stream):
-        if marker in FRAMES and len(content) >= 6:
+        if marker in SOF and len(content) >= 6:
             bits, height, width, components = struct.unpack(">BHHB", content[:6])
             return Header(width, height, components, bits)
     return None
 
 
-def segment(marker: int, content: bytes) -> bytes:
-    """As it stands in a file."""
+def make_segment(marker: int, content: bytes) -> bytes:
+    """Encode a segment."""
     return bytes((0xFF, marker)) + (len(content) + 2).to_bytes(2, "big") + content

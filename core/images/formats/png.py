@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The chunks of a PNG (PNG specification, chapter 5): what it says of itself beside its pixels."""
+"""Reads and makes the chunks of a PNG (PNG specification, chapter 5): metadata beside the pixels."""
 from __future__ import annotations
 
 import os
@@ -11,22 +11,24 @@ SIGNATURE = b"\x89PNG\r\n\x1a\n"
 EXIF = b"eXIf"
 
 
-def chunks(stream: BinaryIO, wanted: Container[bytes]) -> Iterator[tuple[bytes, bytes]]:
-    """(name, content) of the chunks of these names, in the file's order; damaged ones are left out, and all where it is
-    no PNG."""
-    for name, length in _heads(stream):
-        if name not in wanted:
+def chunks(stream: BinaryIO, names: Container[bytes]) -> Iterator[tuple[bytes, bytes]]:
+    """Yield (name, content) of the chunks of these names, in the file's order, without damaged ones; none of other
+    files."""
+    for name, length in _chunk_headers(stream):
+        if name not in names:
             continue
-        content, sum_told = stream.read(length), stream.read(4)
-        if zlib.crc32(name + content).to_bytes(4, "big") == sum_told:
+        content, checksum = stream.read(length), stream.read(4)
+        if zlib.crc32(name + content).to_bytes(4, "big") == checksum:
             yield name, content
 
 
-def is_cut_off(stream: BinaryIO) -> bool:
-    """Whether a chunk of a PNG claims more than the file holds. OpenCV makes room for as much as it claims, gigabytes
-    for a damaged length in a small file."""
+def is_truncated(stream: BinaryIO) -> bool:
+    """True if a chunk of a PNG claims more than the file holds.
+
+    OpenCV allocates as much as a chunk claims, gigabytes for a damaged length in a small file.
+    """
     end = stream.seek(0, os.SEEK_END)
-    for name, length in _heads(stream):
+    for name, length in _chunk_headers(stream):
         if stream.tell() + length + 4 > end:
             return True
         if name == b"IEND":  # what follows is no part of it
@@ -34,8 +36,8 @@ def is_cut_off(stream: BinaryIO) -> bool:
     return False
 
 
-def _heads(stream: BinaryIO) -> Iterator[tuple[bytes, int]]:
-    """(name, length) of each chunk, the stream where its content begins; none where it is no PNG."""
+def _chunk_headers(stream: BinaryIO) -> Iterator[tuple[bytes, int]]:
+    """Yield (name, length) of each chunk, with the stream at its content; none where it is no PNG."""
     stream.seek(0)
     if stream.read(8) != SIGNATURE:
         return
@@ -46,6 +48,6 @@ def _heads(stream: BinaryIO) -> Iterator[tuple[bytes, int]]:
         stream.seek(after)
 
 
-def chunk(name: bytes, content: bytes) -> bytes:
-    """As it stands in a file."""
+def make_chunk(name: bytes, content: bytes) -> bytes:
+    """Encode a chunk."""
     return len(content).to_bytes(4, "big") + name + content + zlib.crc32(name + content).to_bytes(4, "big")

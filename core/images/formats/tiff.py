@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The tags of a TIFF (Adobe, TIFF 6.0, 1992), which OpenCV, that reads and writes its pixels, does not hand out."""
+"""Reads and writes the tags of a TIFF (Adobe, TIFF 6.0, 1992), which OpenCV does not expose."""
 from __future__ import annotations
 
 import io
@@ -18,42 +18,42 @@ X_RESOLUTION, Y_RESOLUTION, RESOLUTION_UNIT, XMP, COLOUR_PROFILE = 282, 283, 296
 UPRIGHT = 1
 """Orientation: rows from the top, columns from the left."""
 WHITE_IS_0, SEPARATED, LAB = 0, 5, (8, 9, 10)
-"""Photometric interpretation: ink on paper; inks, CMYK; lightness and two differences of colour, of three kinds."""
-SELDOM_READ = {34712: "JPEG 2000", 34887: "LERC", 34925: "LZMA", 50000: "Zstandard", 50001: "WebP", 50002: "JPEG XL"}
+"""Photometric interpretation: 0 is white; CMYK inks; lightness and two colour differences, of three kinds."""
+UNSUPPORTED_COMPRESSIONS = {34712: "JPEG 2000", 34887: "LERC", 34925: "LZMA", 50000: "Zstandard",
+                            50001: "WebP", 50002: "JPEG XL"}
 """Compressions that the library in OpenCV is mostly built without."""
-WHOLE, FLOATS = 1, 3
-"""Sample format: unsigned whole numbers, floats."""
-BIG = (b"II+\0", b"MM\0+")
-"""How a BigTIFF begins, which has 64 bits for each place in the file."""
-IN_PLANES = 2
-"""Planar configuration: all of one colour, then all of the next."""
-PREMULTIPLIED, STRAIGHT = 1, 2
-"""What the extra sample of a pixel is: alpha that the colours were multiplied with, or not."""
+UNSIGNED, FLOATS = 1, 3
+"""Sample format: unsigned integers, floats."""
+BIG_TIFF = (b"II+\0", b"MM\0+")
+"""First bytes of a BigTIFF, which has 64 bit offsets."""
+PLANAR = 2
+"""Planar configuration: one plane for each channel."""
+ASSOCIATED, UNASSOCIATED = 1, 2
+"""Extra sample: alpha that the colours are multiplied with, or not."""
 
 _TYPES = {1: "u1", 2: "u1", 3: "u2", 4: "u4", 5: "u4", 6: "i1", 7: "u1", 8: "i2", 9: "i4", 10: "i4", 11: "f4", 12: "f8"}
 _Order = Literal["<", ">"]
-_NONE: tuple[_Order, list[bytes]] = ("<", [])
+_NO_DIRECTORY: tuple[_Order, list[bytes]] = ("<", [])
 _RATIONALS = (5, 10)
-_MOST_PAGES = 1000
+_MAX_PAGES = 1000
 
 
 class Tag(NamedTuple):
-    """A tag's type, as the standard counts them, and its values; a fraction is two."""
+    """A tag's type, by the standard's number, and its values; a fraction is two."""
 
     kind: int
     values: NDArray[np.generic]
 
 
 def short(value: int) -> Tag:
-    """A tag with one number of 16 bits."""
+    """Make a tag with one 16 bit number."""
     return Tag(3, np.array([value], np.uint16))
 
 
 def read_tags(stream: BinaryIO, wanted: Container[int], at: int | None = None) -> dict[int, Tag]:
-    """Of the first page, or of the directory that stands `at`; those that are damaged are left out, and all where it is
-    no TIFF."""
-    order, entries = next(_directories(stream, at), _NONE)
-    found: dict[int, Tag] = {}
+    """Read tags of the first page, or of the directory at offset `at`, without damaged ones; none of other files."""
+    order, entries = next(_directories(stream, at), _NO_DIRECTORY)
+    tags: dict[int, Tag] = {}
     for entry in entries:
         number, kind, count = struct.unpack(order + "HHI", entry[:8])
         if number not in wanted or kind not in _TYPES:
@@ -68,17 +68,17 @@ def read_tags(stream: BinaryIO, wanted: Container[int], at: int | None = None) -
             stream.seek(start)
             raw = stream.read(length)
         if count and len(raw) == length:
-            found[number] = Tag(kind, np.frombuffer(raw, values).astype(values.newbyteorder("=")))
-    return found
+            tags[number] = Tag(kind, np.frombuffer(raw, values).astype(values.newbyteorder("=")))
+    return tags
 
 
-def whole_numbers(tags: Mapping[int, Tag]) -> dict[int, int]:
-    """The values of those tags that hold one number of 16 or 32 bits."""
+def integer_values(tags: Mapping[int, Tag]) -> dict[int, int]:
+    """Return the values of the tags that hold a single number of 16 or 32 bits."""
     return {name: int(tag.values[0]) for name, tag in tags.items() if tag.kind in (3, 4) and len(tag.values) == 1}
 
 
 def page_count(stream: BinaryIO) -> int:
-    """Pages, without the small copies that some programs put beside them."""
+    """Count the pages, without the thumbnails that some programs add."""
     count = 0
     for order, entries in _directories(stream):
         kinds = [struct.unpack(order + "I", entry[8:])[0] for entry in entries
@@ -88,8 +88,8 @@ def page_count(stream: BinaryIO) -> int:
 
 
 def with_tags(data: bytes, tags: Mapping[int, Tag]) -> bytes:
-    """A TIFF with these tags in its first page, in place of what it has of them; as it is where it is none."""
-    order, entries = next(_directories(io.BytesIO(data)), _NONE)
+    """Return a TIFF with these tags in its first page, instead of its own of the same numbers; other data unchanged."""
+    order, entries = next(_directories(io.BytesIO(data)), _NO_DIRECTORY)
     if not entries or not tags:
         return data
     whole = bytearray(data)
@@ -114,31 +114,32 @@ def with_tags(data: bytes, tags: Mapping[int, Tag]) -> bytes:
 
 
 def is_premultiplied(path: Path) -> bool:
-    """Whether a file's colours are multiplied with its alpha already, as it says."""
+    """True if a file says that its colours are multiplied with its alpha."""
     with open(path, "rb") as stream:
-        told = read_tags(stream, (EXTRA_SAMPLES,))
-    return EXTRA_SAMPLES in told and bool(told[EXTRA_SAMPLES].values[0] == PREMULTIPLIED)
+        tags = read_tags(stream, (EXTRA_SAMPLES,))
+    return EXTRA_SAMPLES in tags and bool(tags[EXTRA_SAMPLES].values[0] == ASSOCIATED)
 
 
-def as_stored(data: bytes) -> bytes:
-    """A TIFF whose pixels a reader leaves alone: it says that they are upright, and not to be multiplied with alpha."""
-    told = read_tags(io.BytesIO(data), (ORIENTATION, EXTRA_SAMPLES))
-    instead = {ORIENTATION: short(UPRIGHT)} if ORIENTATION in told else {}
-    if EXTRA_SAMPLES in told and told[EXTRA_SAMPLES].values[0] == STRAIGHT:
-        instead[EXTRA_SAMPLES] = Tag(3, np.array([PREMULTIPLIED, *told[EXTRA_SAMPLES].values[1:]], np.uint16))
-    return with_tags(data, instead)
+def without_reader_changes(data: bytes) -> bytes:
+    """Return a TIFF whose pixels a reader neither rotates nor multiplies with alpha, by changing the tags that say so.
+    """
+    tags = read_tags(io.BytesIO(data), (ORIENTATION, EXTRA_SAMPLES))
+    changed = {ORIENTATION: short(UPRIGHT)} if ORIENTATION in tags else {}
+    if EXTRA_SAMPLES in tags and tags[EXTRA_SAMPLES].values[0] == UNASSOCIATED:
+        changed[EXTRA_SAMPLES] = Tag(3, np.array([ASSOCIATED, *tags[EXTRA_SAMPLES].values[1:]], np.uint16))
+    return with_tags(data, changed)
 
 
 def _directories(stream: BinaryIO, at: int | None = None) -> Iterator[tuple[_Order, list[bytes]]]:
-    """(byte order, entries of 12 bytes) page by page, or from the directory that stands `at`, as far as the file is
-    whole."""
+    """Yield (byte order, entries of 12 bytes) page by page, or from the directory at offset `at`, while the file is
+    intact."""
     stream.seek(0)
     head = stream.read(8)
     if head[:4] not in (b"II*\0", b"MM\0*") or len(head) < 8:
         return
     order: _Order = "<" if head[:2] == b"II" else ">"
     at = struct.unpack(order + "I", head[4:])[0] if at is None else at
-    for _ in range(_MOST_PAGES):
+    for _ in range(_MAX_PAGES):
         stream.seek(at)
         count = stream.read(2)
         length = 12 * struct.unpack(order + "H", count)[0] if len(count) == 2 else 0

@@ -1,0 +1,84 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Removes lights that are another light over again: duplicates, and ghosts of a light that is in frame."""
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from ..capture.camera import Camera
+from .found_light import FoundLight
+
+
+def merge_duplicates(lights: Sequence[FoundLight], views: Sequence[tuple[str, Camera]],
+                     extent: float) -> list[FoundLight]:
+    """Merge lights that most views show at one spot: the one with the most support stays and gains the others' views.
+
+    Returns them by support, most first.
+    """
+    kept: list[FoundLight] = []
+    for light in _by_support(lights):
+        for i, other in enumerate(kept):
+            if _is_same_light(light, other, views, extent):
+                support = tuple(sorted({*other.support, *light.support}))
+                kept[i] = replace(other, support=support, visible=max(other.visible, len(support)),
+                                  detections=other.detections + light.detections)
+                break
+        else:
+            kept.append(light)
+    return _by_support(kept)
+
+
+def remove_ghosts(lights: Sequence[FoundLight], views: Sequence[tuple[str, Camera]]) -> list[FoundLight]:
+    """Remove the ghosts of better supported lights; returns the others by support, most first.
+
+    A ghost g lies, in every frame, at the same ratio mu of the way from the principal point p to its light l,
+    g = p + mu (l - p), while l moves over the frame.
+    """
+    kept: list[FoundLight] = []
+    cameras = dict(views)
+    for light in _by_support(lights):
+        if not any(_is_ghost(light, other, cameras) for other in kept):
+            kept.append(light)
+    return kept
+
+
+def _by_support(lights: Sequence[FoundLight]) -> list[FoundLight]:
+    return sorted(lights, key=lambda light: -len(light.support))
+
+
+def _is_ghost(light: FoundLight, other: FoundLight, cameras: dict[str, Camera]) -> bool:
+    """True if the detections of `light` are a ghost of `other`."""
+    ghost, source, tolerance = [], [], []
+    for name, detection in light.detections:
+        camera = cameras[name]
+        pixel, depth = camera.project(other.xyz[None])
+        if depth[0] > 0:
+            centre = np.array([camera.cx, camera.cy])
+            ghost.append(detection.xy - centre)
+            source.append(pixel[0] - centre)
+            tolerance.append(0.006 * float(np.hypot(*camera.size)) + 0.25 * detection.radius)
+    if len(ghost) < 3:
+        return False
+    g, s = np.array(ghost), np.array(source)
+    ratio = float((g * s).sum() / (s * s).sum())
+    distance = np.linalg.norm(g - ratio * s, axis=1) / tolerance
+    motion = float(np.linalg.norm(np.ptp(g, axis=0))) / float(np.median(tolerance))
+    return bool(np.median(distance) < 1 and motion > 8 and abs(ratio - 1) > 0.05)
+
+
+def _is_same_light(light: FoundLight, other: FoundLight, views: Sequence[tuple[str, Camera]], extent: float) -> bool:
+    """True if two lights fall on one spot: nearer than their radii in most frames that show both, or nearer in space
+    than their uncertainties."""
+    near = 0.02 * extent + 2 * (light.uncertainty + other.uncertainty)
+    if not light.far and not other.far and np.linalg.norm(light.xyz - other.xyz) < min(near, 0.3 * extent):
+        return True
+    together = separate = 0
+    for _, camera in views:
+        (a, b), depth = camera.project([light.xyz, other.xyz])
+        if (depth > 0).all() and camera.contains([a, b], depth).any():
+            reach = light.radius + other.radius + 0.004 * np.hypot(*camera.size)
+            together += bool(np.linalg.norm(a - b) < reach)
+            separate += bool(np.linalg.norm(a - b) >= reach)
+    return together > 2 * separate

@@ -261,7 +261,7 @@ def confidence(folders: list[Path], lenses: Path | None = None, weights: Path | 
 
     remover = Remover(weights)
     fitted = _logistic(*_draw_features(remover, 1006, count, read_backgrounds(folders, "train", max(SIZE)),
-                                        _training_lenses(lenses)))
+                                       _training_lenses(lenses)))
     print("FEATURE_WEIGHTS, BIAS =", ", ".join(f"{value:.3g}" for value in fitted))
     features, gains = _draw_features(remover, 1007, count // 2, _held_out_backgrounds(folders),
                                      _held_out_lenses(lenses))

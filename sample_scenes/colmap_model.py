@@ -86,14 +86,14 @@ def _filter_points(reconstruction: Any) -> Any:
     import pycolmap
 
     good_points = {number: point for number, point in reconstruction.points3D.items()
-            if point.error <= MAX_REPROJECTION_ERROR and point.track.length() >= MIN_TRACK_LENGTH}
+                   if point.error <= MAX_REPROJECTION_ERROR and point.track.length() >= MIN_TRACK_LENGTH}
     filtered = pycolmap.Reconstruction()
     for camera in reconstruction.cameras.values():
         filtered.add_camera_with_trivial_rig(camera)
     new_index: dict[tuple[int, int], int] = {}
     for number, image in sorted(reconstruction.images.items()):
         observations = [(index, point.xy) for index, point in enumerate(image.points2D)
-                if point.has_point3D() and point.point3D_id in good_points]
+                        if point.has_point3D() and point.point3D_id in good_points]
         new_index.update({(number, index): at for at, (index, _) in enumerate(observations)})
         kept = pycolmap.Image(name=image.name, keypoints=np.array([xy for _, xy in observations]).reshape(-1, 2),
                               camera_id=image.camera_id, image_id=number)

@@ -83,8 +83,8 @@ class Room:
             return
         long, half, high = self.depth + 2, self.width / 2, self.height / 2
         for name, length, position, rotation in (("left", long, (-half, middle, high), 90),
-                                          ("right", long, (half, middle, high), -90),
-                                          ("back", self.width, (0, self.depth, high), 0)):
+                                                 ("right", long, (half, middle, high), -90),
+                                                 ("back", self.width, (0, self.depth, high), 0)):
             if random.random() < 0.92:
                 material = self._surface_material(random.uniform(0.25, 1))
                 stage.sheet(name, length, self.height, position, material, rotation, (90, 0))

@@ -72,7 +72,7 @@ def main() -> int:
     args = parser.parse_args()
     return run_command(lambda progress: make_rooms(args.out, training_pictures(args.photos, PHOTO_SUFFIXES),
                                                    training_pictures(args.maps, MAP_SUFFIXES),
-                                     args.count, progress))
+                                                   args.count, progress))
 
 
 if __name__ == "__main__":

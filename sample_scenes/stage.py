@@ -145,7 +145,7 @@ def rod(name: str, start: Vec, end: Vec, radius: float, material: Any) -> Any:
     """Add a cylinder from `start` to `end`."""
     direction = Vector(end) - Vector(start)
     obj = lathe(name, [(1e-4, 0.0), (radius, 0.0), (radius, direction.length), (1e-4, direction.length)],
-                  (0, 0, 0), material, 24)
+                (0, 0, 0), material, 24)
     obj.matrix_world = Matrix.Translation(Vector(start)) @ direction.to_track_quat("Z", "Y").to_matrix().to_4x4()
     return obj
 

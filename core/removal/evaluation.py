@@ -220,7 +220,7 @@ def held_out_lenses(lenses: Iterable[Prescription]) -> list[Prescription]:
 
 
 def synthetic_cases(seed: int, count: int, backgrounds: Backgrounds, lenses: Sequence[Prescription],
-              size: tuple[int, int]) -> list[Case]:
+                    size: tuple[int, int]) -> list[Case]:
     """Return `count` cases of every flare class, a function of the seed: a test set that needs no data but clean
     pictures. Frames are 8 bit codes."""
     from .synthesis.flare import FLARE_CLASSES

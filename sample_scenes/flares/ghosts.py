@@ -105,7 +105,8 @@ def _non_negative_span(start: float, slope: float, left: float, right: float) ->
 
 @njit(cache=True)
 def _rasterise(rays: Array, arrived: NDArray[np.bool_], px: Array, py: Array, light: Array, stop_x: Array,
-          stop_y: Array, radius: float, edges: Array, rim: float, colour: Array, picture: NDArray[np.float32]) -> None:
+               stop_y: Array, radius: float, edges: Array, rim: float, colour: Array,
+               picture: NDArray[np.float32]) -> None:
     """Add the cells of a traced grid to `picture`. px, py: pixels; light: density by ray."""
     rows, columns = px.shape
     height, width = picture.shape[0], picture.shape[1]
@@ -216,7 +217,7 @@ def draw_ghosts(optics: Optics, pairs: list[tuple[int, int]], settings: GhostSet
             py = supersample * (centre[1] + focal[1] * (sine * x + cosine * y))
             sx, sy = rays[..., STOP_X::2], rays[..., STOP_X + 1::2]
             _rasterise(rays, arrived, px, py, dense, cosine * sx - sine * sy, sine * sx + cosine * sy,
-                  optics.aperture.radius, edges, settings.rim, bands[band], picture)
+                       optics.aperture.radius, edges, settings.rim, bands[band], picture)
     soft = cv2.GaussianBlur(picture, (0, 0), max(settings.size * focal[0] * supersample, 0.3))
     small = cv2.resize(soft, (width, height), interpolation=cv2.INTER_AREA)
     return (small * np.float32(settings.gain)).astype(np.float32)

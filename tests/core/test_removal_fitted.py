@@ -270,7 +270,7 @@ def test_an_exr_frame_keeps_its_format_and_colour_space(capture: Capture, tmp_pa
     view = capture.views[0]
     linear = _as_exr(capture, tmp_path / "exr", colour_space(space))
     remove_fitted_flare(Exact(capture), linear, linear.views[:1], tmp_path / "clean", Progress(),
-                  flare_folder=tmp_path / "flare")
+                        flare_folder=tmp_path / "flare")
     name = linear.views[0].name
     clean = read_plate(tmp_path / "clean" / name)
     assert clean.encoding == "linear" and clean.codes.dtype == np.float32 and clean.space.name == space
@@ -314,7 +314,7 @@ def test_borders_are_unchanged(capture: Capture, tmp_path: Path) -> None:
         cv2.imwrite(str(path), codes)
     boxed = Capture.open(tmp_path / "boxed")
     remove_fitted_flare(Exact(capture), boxed, boxed.views[:1], tmp_path / "clean", Progress(),
-                  flare_folder=tmp_path / "flare")
+                        flare_folder=tmp_path / "flare")
     name = boxed.views[0].name
     before, after = (cv2.imread(str(folder / name)) for folder in (boxed.folder / "images", tmp_path / "clean"))
     taken = read_picture(tmp_path / "flare" / Path(name).with_suffix(".exr")).pixels
@@ -326,9 +326,9 @@ def test_borders_are_unchanged(capture: Capture, tmp_path: Path) -> None:
 def test_flares_requested_later_are_written(capture: Capture, tmp_path: Path) -> None:
     for flares, made in ((None, 3), (tmp_path / "flare", 3), (tmp_path / "flare", 0)):
         found = remove_fitted_flare(Exact(capture), capture, capture.views, tmp_path / "clean", Progress(),
-                              flare_folder=flares)
+                                    flare_folder=flares)
         assert found["made"] == made
     with pytest.raises(SettingsError, match="overwritten"):
         linear = _as_exr(capture, tmp_path / "exr", colour_space("linear"))
         remove_fitted_flare(Exact(capture), linear, linear.views, tmp_path / "other", Progress(),
-                      flare_folder=linear.folder / "images")
+                            flare_folder=linear.folder / "images")

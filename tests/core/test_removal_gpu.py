@@ -66,7 +66,7 @@ def test_batched_warping_equals_that_of_single_pairs() -> None:
     blurs, colours, gains, mosts = (np.array(part) for part in zip(*shining, strict=True))
     assert 1 < (blurs > 0).sum() < len(some) - 1
     how = composition.FlarePlacements(np.array(matrices), blurs, colours[..., None, None], gains[:, None, None, None],
-                             mosts[:, None, None, None]).to(CPU)
+                                      mosts[:, None, None, None]).to(CPU)
     found = composition._warp_to_frame(together(some), how, how.matrices, HEIGHT, WIDTH)
     for row, apart in enumerate(expected):
         for one, other in zip(found, apart, strict=True):

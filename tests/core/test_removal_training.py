@@ -72,7 +72,7 @@ def test_a_resumed_training_ends_as_an_uninterrupted_one(tmp_path: Path) -> None
     whole = run.train(RECIPE, tmp_path / "whole", backgrounds(), built_in_lenses(), processes=1)
     with pytest.raises(Cancelled):
         run.train(RECIPE, tmp_path / "parts", backgrounds(), built_in_lenses(), processes=1,
-                       progress=StopAfter(2))
+                  progress=StopAfter(2))
     with pytest.raises(RunError, match="--resume"):
         run.train(RECIPE, tmp_path / "parts", backgrounds(), built_in_lenses())
     with folder_lock(tmp_path / "parts"), pytest.raises(RunError, match="Another process"):
@@ -517,7 +517,7 @@ def test_scores_have_those_of_the_untouched_input_beside_them(tmp_path: Path) ->
 
 @pytest.mark.parametrize(("shape", "height"), [((1, 1200), 1), ((1200, 1), 80)])
 def test_extreme_aspects_are_squeezed_on_the_sheet(shape: tuple[int, int], height: int,
-                                                              tmp_path: Path) -> None:
+                                                   tmp_path: Path) -> None:
     for kind, level in (("input", 200), ("gt", 100)):
         write_png(tmp_path / kind / "0.png", np.full((*shape, 3), level / 255))
     cases = evaluation.read_cases(tmp_path)

@@ -41,7 +41,7 @@ def sources(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 
 
 def test_rooms_are_functions_of_their_numbers_and_none_is_rendered_twice(sources: tuple[Path, Path],
-                                                                      tmp_path: Path) -> None:
+                                                                         tmp_path: Path) -> None:
     photos, maps = sources
     words = ("--photos", photos, "--maps", maps)
     first = made("--out", tmp_path / "one", "--count", 3, *words)
@@ -62,7 +62,7 @@ def test_rooms_are_functions_of_their_numbers_and_none_is_rendered_twice(sources
 
 
 def test_rooms_use_no_held_out_pictures_and_refuse_an_empty_folder(sources: tuple[Path, Path],
-                                                                     tmp_path: Path) -> None:
+                                                                   tmp_path: Path) -> None:
     held_out = next(name for name in (f"{number}.png" for number in range(1000)) if is_held_out(name))
     write_png(tmp_path / held_out, np.zeros((40, 60, 3), np.float32))
     refused = made("--out", tmp_path / "out", "--photos", tmp_path, "--maps", sources[1])
@@ -72,7 +72,7 @@ def test_rooms_use_no_held_out_pictures_and_refuse_an_empty_folder(sources: tupl
 
 
 def test_rooms_refuse_unreadable_pictures_and_a_count_of_0(sources: tuple[Path, Path],
-                                                                         tmp_path: Path) -> None:
+                                                           tmp_path: Path) -> None:
     broken = tmp_path / "photos" / "broken.png"
     broken.parent.mkdir()
     broken.write_bytes(b"no picture")

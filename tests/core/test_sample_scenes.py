@@ -36,7 +36,7 @@ SAMPLE = Path(__file__).parents[2] / "sample_scenes" / "desk"
 SMALL = Pinhole(120, 68, 118.0, 118.0, 60.0, 34.0)
 LENSES = sorted(path.stem for path in LENS_FOLDER.glob("*.lens"))
 ROUND = LensSetup("US3576360", stop_down=0.34, blades=8, curved=1.0, uneven=0.0,
-             ghosts=GhostSettings(count=8, gain=300.0, bands=3))
+                  ghosts=GhostSettings(count=8, gain=300.0, bands=3))
 """A lens with a round stop: nothing about it has a direction."""
 
 

@@ -120,7 +120,7 @@ def remove_all(inputs: Sequence[Path], folder: Path, remover: Remover, progress:
     results = {name: [folder / name, *([flare_folder / name.with_suffix(".exr")] if flare_folder else [])]
                for _, name in plates}
     check_no_overwrite([*(path for path, _ in plates), *(mattes.files if mattes else ())],
-                itertools.chain.from_iterable(results.values()))
+                       itertools.chain.from_iterable(results.values()))
     manifest = Manifest(folder)
     predictor = ShotPredictor(remover, [] if independent else collect_with_neighbours(inputs, excluded))
     if only is not None:

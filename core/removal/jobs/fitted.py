@@ -20,11 +20,11 @@ from numpy.typing import NDArray
 
 from ...capture import Capture, View
 from ...capture.discs import light_disc_mask
+from ...capture.renderer import ViewRenderer
 from ...colour.srgb import Pixels, linear_from_srgb, srgb_from_linear
 from ...errors import CaptureError
 from ...images.exr import read_data_window
 from ...images.plates import Plate, finite_light, read_plate, write_results
-from ...metrics.evaluation import Renderer
 from ...system.files import check_no_overwrite, safe_join
 from ...system.progress import Progress
 from ..inference.plate_light import CLIPPING_LEVEL
@@ -48,7 +48,7 @@ PRIOR_WEIGHT = 1e-4
 """Weight per pixel of the fitted gains of 1; it exceeds the frame's for flares of a thousandth of white."""
 
 
-def remove_fitted_flare(renderer: Renderer, capture: Capture, views: Sequence[View], folder: Path,
+def remove_fitted_flare(renderer: ViewRenderer, capture: Capture, views: Sequence[View], folder: Path,
                         progress: Progress, *, flare_folder: Path | None = None, overwrite: bool = False,
                         fit_digest: str = "", above_white: bool = False) -> dict[str, Any]:
     """Write the views' frames without the fitted flare below `folder`, and return the counts.
@@ -104,7 +104,7 @@ def _results(view: View, folder: Path, flare_folder: Path | None) -> list[Path]:
     return [plate, safe_join(flare_folder, str(Path(view.name).with_suffix(".exr")), CaptureError)]
 
 
-def _clean_view(renderer: Renderer, capture: Capture, view: View,
+def _clean_view(renderer: ViewRenderer, capture: Capture, view: View,
                 above_white: bool) -> tuple[Plate, NDArray[Any], Pixels, dict[str, float]]:
     """Return a view's plate, the codes of its clean frame, the removed flare in linear light, and each light's gain."""
     plate = read_plate(capture.frame_path(view))

@@ -49,7 +49,7 @@ def draw_ghosts(seed: Sequence[int], lights: Sequence[Point], size: int) -> Arra
     """Return (size, size, 3), linear light >= 0: the ghosts of all lights through the lens of a seed, at its
     brightness."""
     layer = sum((draw_light_ghosts(np.random.default_rng(seed), light, size) for light in lights),
-                 np.zeros((size, size, 3), np.float32))
+                np.zeros((size, size, 3), np.float32))
     return layer * np.float32(log_uniform(np.random.default_rng((*seed, 1)), 0.03, 1.0))
 
 

@@ -84,7 +84,7 @@ def _draw_light_position(random: Random, kind: str) -> Point:
 
 
 def _draw_light_flare(random: Random, lens_seed: int, kind: str, position: Point, size: int, x: Array, y: Array,
-              lenses: Sequence[Prescription]) -> tuple[Array, Array]:
+                      lenses: Sequence[Prescription]) -> tuple[Array, Array]:
     """Return (rest, glow) of one light: the parts of its class, each at a brightness of its own. lens_seed: the same
     for all lights of a picture."""
     lens_random = np.random.default_rng(lens_seed)  # the same for every light of the picture

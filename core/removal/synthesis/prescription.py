@@ -118,7 +118,7 @@ def trace_ghost_pairs(lens: Prescription) -> list[GhostPath]:
                 contrast = np.array([[_index_before(index, i), index[i], _index_before(index, j), index[j]]
                                      for index in indices_by_channel])
                 paths.append(GhostPath((i, j), np.array([row[0] for row in rows]), np.array([row[1] for row in rows]),
-                                   np.array([row[2] for row in rows]), contrast))
+                                       np.array([row[2] for row in rows]), contrast))
     return paths
 
 

@@ -212,7 +212,7 @@ def _perspective_view(random: Random, light: NDArray[np.float16], width: int, he
     u = ((np.arctan2(dx, forward) + yaw) / (2 * math.pi) % 1) * columns
     v = (np.arctan2(up, np.hypot(dx, forward)) / math.pi + 0.5) * rows
     pixels = cv2.remap(light.astype(np.float32), u.astype(np.float32) - 0.5, v.astype(np.float32) - 0.5,
-                     cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
+                       cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
     exposure = math.exp(random.normal(math.log(0.18), 0.5)) / max(float(np.median(pixels)), 1e-4)
     return np.asarray(pixels * min(exposure, 20.0), np.float32)
 

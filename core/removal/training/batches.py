@@ -51,7 +51,7 @@ class Batches:
         random = np.random.default_rng((self.recipe.seed, iteration))
         count, width, height = self.recipe.draw_batch_shape(random, iteration)
         pairs = [self.draw_pair(iteration, number, width, height)
-                for number in range(self._worker.rank, count, self._worker.count)]
+                 for number in range(self._worker.rank, count, self._worker.count)]
         none = np.zeros((0, height, width, 3), np.float32)
         frame, scene, scene_with_glow = (
             torch.from_numpy(np.stack([getattr(pair, part) for pair in pairs]) if pairs else none).permute(0, 3, 1, 2)

@@ -26,7 +26,6 @@ from ...images.listing import SUFFIXES
 from ...images.plates import read_plate
 from ...images.read import read_picture
 from ...images.video import VIDEOS, Video, frame_to_display, is_video
-from ...thinning import subsample
 from ..synthesis.flare import add_aspheric_ghosts, synthesise_flare
 from ..synthesis.prescription import Prescription
 from .pairs import WHITE, FlareLayers, FlareSource
@@ -144,7 +143,7 @@ class UserFlares:
         return len(self._files)
 
     def _drop_unreadable(self) -> None:
-        for file in subsample(self._files, PROBED_FLARES):
+        for file in self._files[:: max(len(self._files) // PROBED_FLARES, 1)]:
             try:
                 self._read(file, np.random.default_rng(0))
             except FrameError as problem:

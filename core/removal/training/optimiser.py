@@ -71,7 +71,7 @@ class MuonAdamW:
         result = {f"moment.momentum.{name}": value for name, value in self._momenta.items()}
         for name, parameter in self._parameters.items():
             result |= {f"moment.{moment}.{name}": value
-                      for moment, value in self._adam.state.get(parameter, {}).items()}
+                       for moment, value in self._adam.state.get(parameter, {}).items()}
         return result
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:

@@ -149,8 +149,8 @@ def _warp_to_frame(layers: FlareLayers, appearance: random_cameras.FlareAppearan
 
     half = math.hypot(width, height) / 2
     rest, glow, light = (cv2.warpAffine(layer, matrix, (width, height),
-                                         flags=cv2.INTER_LINEAR)
-                          for layer in (layers.rest, layers.glow, layers.light))
+                                        flags=cv2.INTER_LINEAR)
+                         for layer in (layers.rest, layers.glow, layers.light))
     if appearance.blur:
         rest = cv2.GaussianBlur(rest, (0, 0), appearance.blur)
     mean = float(np.minimum((rest[::4, ::4] + glow[::4, ::4]) * appearance.gain, 1).mean())

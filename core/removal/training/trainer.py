@@ -100,8 +100,9 @@ class RemovalTrainer:
         """Set the gradients by the captured graph; the metrics are those of the iteration before, so that the CPU does
         not wait for the GPU."""
         psnr_phase, schedule = self._schedule()
+        schedule = schedule.pin_memory().to(self.device, non_blocking=True)
         *gradients, metrics = self._graphed_gradients[psnr_phase](batch.frame, batch.scene, batch.scene_with_glow,
-                                                       schedule.pin_memory().to(self.device, non_blocking=True))
+                                                                  schedule)
         for parameter, gradient in zip(self.network.parameters(), gradients, strict=True):
             parameter.grad = gradient
         before, self._pending_metrics = self._pending_metrics, AsyncCopy(metrics)
@@ -131,7 +132,7 @@ class RemovalTrainer:
         return progress >= 1 - self.recipe.psnr_phase, torch.tensor([0.5 + 0.5 * progress, faint_mse, error_floor])
 
     def _compute_loss(self, psnr_phase: bool, frame: Tensor, scene: Tensor, scene_with_glow: Tensor,
-              schedule: Tensor) -> tuple[Tensor, Tensor]:
+                      schedule: Tensor) -> tuple[Tensor, Tensor]:
         """Return the loss and the metrics.
 
         At first, the squared error of each picture divided by its flare's mean square to a power that rises from 0.5 to

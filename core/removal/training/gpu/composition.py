@@ -128,7 +128,7 @@ def draw_flare_placements(random: Random, count: int, canvas: int, width: int, h
     blurs, colours, gains, mosts = (np.array(part) for part in zip(*shining, strict=True))
     matrices = random_cameras.draw_placement(random, canvas, width, height, (count, random_cameras.PLACEMENTS))
     return FlarePlacements(matrices=matrices, blur=blurs,
-                  colour=colours[..., None, None], gain=_per_frame(gains), max_mean=_per_frame(mosts))
+                           colour=colours[..., None, None], gain=_per_frame(gains), max_mean=_per_frame(mosts))
 
 
 def compose(scene: Tensor, gamma: Tensor, frames: FrameParameters,

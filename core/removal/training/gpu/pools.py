@@ -167,7 +167,7 @@ class Pools:
 
 @contextmanager
 def filled_pools(pools: Pools, recipe: Recipe, backgrounds: Backgrounds, lenses: Sequence[Prescription],
-           user_flares: UserFlares | None, processes: int) -> Iterator[None]:
+                 user_flares: UserFlares | None, processes: int) -> Iterator[None]:
     """Keep `processes` drawing into the pools within this context, half of them scenes and half flares; it is entered
     when there are enough to begin with. Raises RunError where none come."""
     spawning = multiprocessing.get_context("spawn")
@@ -184,7 +184,7 @@ def filled_pools(pools: Pools, recipe: Recipe, backgrounds: Backgrounds, lenses:
             for slot in range(len(memory)):
                 slots.put(slot)
         args = ((backgrounds, pools.shapes), (recipe, lenses, user_flares))
-        processes_drawing = [spawning.Process(target=(_draw_scenes, _draw_flares)[kind], daemon=True,
+        drawing = [spawning.Process(target=(_draw_scenes, _draw_flares)[kind], daemon=True,
                                     args=((recipe.seed, number), files[kind], memories[kind].shape, free[kind], done,
                                           *args[kind]))
                    for kind in (SCENE, FLARE) for number in range(process_counts[kind])]
@@ -192,30 +192,30 @@ def filled_pools(pools: Pools, recipe: Recipe, backgrounds: Backgrounds, lenses:
         transfer_thread = threading.Thread(target=_transfer_drawn, daemon=True,
                                            args=(pools, memories, free, done, ended, ready))
         try:
-            for process in processes_drawing:
+            for process in drawing:
                 process.start()
             transfer_thread.start()
-            _wait_until_ready(ready, processes_drawing)
+            _wait_until_ready(ready, drawing)
             yield
         finally:
             ended.set()
-            kill_processes(processes_drawing)
+            kill_processes(drawing)
             transfer_thread.join()
             memories.clear()
 
 
-def _wait_until_ready(ready: threading.Event, processes_drawing: Sequence[BaseProcess]) -> None:
+def _wait_until_ready(ready: threading.Event, drawing: Sequence[BaseProcess]) -> None:
     for _ in range(round(START_TIMEOUT_S / 0.5)):
         if ready.wait(0.5):
             return
-        if not all(process.is_alive() for process in processes_drawing):
+        if not all(process.is_alive() for process in drawing):
             break
     raise RunError("The processes that draw pictures for the training ended or drew none; if memory is short, give "
                    "fewer --processes.")
 
 
 def _transfer_drawn(pools: Pools, memories: Sequence[Any], free: Sequence[Any], done: Any, ended: threading.Event,
-          ready: threading.Event) -> None:
+                    ready: threading.Event) -> None:
     """Copy drawn items into the pools until the training has ended."""
     while not ended.is_set():
         try:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What an arc is worth on a ghost that the barrel clips: single pictures, fitted with and without arcs.
+"""Gain of arcs for ghosts that the lens barrel clips: single pictures, fitted with and without arcs.
 
     python benchmarks/arcs.py --counts 4 16 --seeds 4
 """
@@ -24,9 +24,9 @@ INTRINSICS = torch.tensor([[96.0, 0, 48], [0, 96.0, 48], [0, 0, 1]])
 
 
 def targets() -> dict[str, Tensor]:
-    """(SIZE, SIZE) linear light: a ring behind the barrel's soft edge, and what a hard one leaves of a rimmed disc."""
-    along = torch.arange(SIZE) + 0.5
-    x, y = torch.meshgrid(along, along, indexing="xy")
+    """Return (SIZE, SIZE) pictures of linear light: a ring clipped by a soft edge, a rimmed disc by a hard one."""
+    coordinates = torch.arange(SIZE) + 0.5
+    x, y = torch.meshgrid(coordinates, coordinates, indexing="xy")
 
     def ring(radius: float, width: float) -> Tensor:
         return torch.exp(-((torch.hypot(x - 48, y - 48) - radius) ** 2) / (2 * width**2))
@@ -38,8 +38,8 @@ def targets() -> dict[str, Tensor]:
             "lune": (0.25 * disc(48, 48, 26, 1) + ring(25, 1.5)) * disc(74, 40, 30, 1.5)}
 
 
-def fitted(target: Tensor, count: int, arcs: bool, seed: int, iterations: int = 600) -> float:
-    """PSNR, dB, of so many Gaussians that began at random; rates as in a short fit."""
+def fit_psnr(target: Tensor, count: int, arcs: bool, seed: int, iterations: int = 600) -> float:
+    """Fit `count` randomly initialised Gaussians with the rates of a short fit; return the PSNR, dB."""
     generator = torch.Generator().manual_seed(seed)
 
     def uniform(low: float, high: float, *shape: int) -> Tensor:
@@ -47,45 +47,45 @@ def fitted(target: Tensor, count: int, arcs: bool, seed: int, iterations: int = 
 
     rings = torch.zeros(count, 2)
     rings[::4] = torch.tensor([3.0, math.log(0.5)])
-    begin = {
+    initial = {
         "means": (uniform(-0.3, 0.3, count, 2), 2e-3),
         "log_scales": (uniform(math.log(0.03), math.log(0.12), count, 1).repeat(1, 2), 2e-2),
         "rotations": (torch.tensor([1.0, 0.0]).repeat(count, 1), 5e-3),
         "opacity_logits": (torch.full((count,), -2.0), 5e-2), "colours": (torch.ones(count, 1), 1e-2),
         "rings": (rings, 2e-2), "arcs": (torch.zeros(count, 2), 2e-2),
     }  # fmt: skip
-    rows = {name: torch.nn.Parameter(values) for name, (values, _) in begin.items()}
-    adam = torch.optim.Adam([{"params": [rows[name]], "lr": rate} for name, (_, rate) in begin.items()])
-    settling = torch.optim.lr_scheduler.LambdaLR(adam, lambda i: 0.05 ** max(2 * i / iterations - 1, 0))
+    rows = {name: torch.nn.Parameter(values) for name, (values, _) in initial.items()}
+    adam = torch.optim.Adam([{"params": [rows[name]], "lr": rate} for name, (_, rate) in initial.items()])
+    schedule = torch.optim.lr_scheduler.LambdaLR(adam, lambda i: 0.05 ** max(2 * i / iterations - 1, 0))
     loss = target.new_zeros(())
     for _ in range(iterations):
         shape = torch.stack([rows["rings"][:, 0], rows["rings"][:, 1].clamp(-3, 3).exp()], -1)
-        opacities, way = rows["opacity_logits"].sigmoid(), None
+        opacities, arc_vectors = rows["opacity_logits"].sigmoid(), None
         if arcs:
             opacities = opacities * opacity_gain(rows["arcs"], shape)
-            way = arcs_of_ellipse(rows["arcs"], rows["log_scales"], rows["rotations"])
+            arc_vectors = arcs_of_ellipse(rows["arcs"], rows["log_scales"], rows["rotations"])
         flare = PlaneGaussians(rows["means"], covariance_of_ellipse(rows["log_scales"], rows["rotations"]), opacities,
-                               rows["colours"].repeat(1, 3), shape, way)
+                               rows["colours"].repeat(1, 3), shape, arc_vectors)
         loss = (splat_flare(flare, INTRINSICS, SIZE, SIZE, "add").colour[..., 0] - target).square().mean()
         adam.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         adam.step()
-        settling.step()
+        schedule.step()
     return -10 * math.log10(float(loss.detach()))
 
 
 def main() -> None:
-    """See the module's head."""
-    parser = argparse.ArgumentParser(description="What an arc is worth on a clipped ghost.")
-    parser.add_argument("--counts", nargs="+", type=int, default=[4, 16], help="of Gaussians")
+    """Print a table of PSNR with and without arcs."""
+    parser = argparse.ArgumentParser(description="Gain of arcs for a clipped ghost.")
+    parser.add_argument("--counts", nargs="+", type=int, default=[4, 16], help="numbers of Gaussians")
     parser.add_argument("--seeds", type=int, default=4)
-    words = parser.parse_args()
+    args = parser.parse_args()
     rows = []
     for name, target in targets().items():
-        for count in words.counts:
-            found = [sum(fitted(target, count, arcs, seed) for seed in range(words.seeds)) / words.seeds
+        for count in args.counts:
+            psnrs = [sum(fit_psnr(target, count, arcs, seed) for seed in range(args.seeds)) / args.seeds
                      for arcs in (False, True)]
-            rows.append([name, str(count), *(f"{value:.1f}" for value in found)])
+            rows.append([name, str(count), *(f"{value:.1f}" for value in psnrs)])
     sys.stdout.write(table(["", "Gaussians", "without arcs, dB", "with arcs, dB"], rows) + "\n")
 
 

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Blender's side, timed: import of a large capture, what a fit costs the window's thread, the overlay's numpy part.
+"""Times of the add-on in Blender: import of a large capture, polling of a fit's events, and the overlay's numpy part.
 
     python benchmarks/blender.py            in a Python that has bpy; prints a table
 
-Import: 400 cameras, 100,000 points. Thread: reading a fit's events and drawing what depends on them, for 400
-cameras in the scene. Overlay: one light of 2,000 Gaussians at 1920 x 1080, all but the GPU's own drawing.
+Import: 400 cameras, 100,000 points. Events: polled in the window's thread, with 400 cameras in the scene. Overlay: one
+light of 2,000 Gaussians at 1920 x 1080, without the drawing on the GPU.
 """
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ CAMERAS, POINTS, GAUSSIANS, LEVELS = 400, 100_000, 2_000, 16
 
 
 def load_module(name: str) -> Any:
-    """A module of the tree, as the package fit_flare."""
+    """Import a module of the tree as a part of the package fit_flare."""
     spec = importlib.util.spec_from_file_location("run", ROOT / "headless" / "run.py")
     assert spec is not None
     assert spec.loader is not None
@@ -36,7 +36,7 @@ def load_module(name: str) -> Any:
 
 
 def make_capture(folder: Path, cameras: int = CAMERAS) -> Path:
-    """Binary model of cameras on a circle, grey frames, points."""
+    """Write a capture: a binary COLMAP model of cameras on a circle, grey frames, and points."""
     import zlib
 
     model, images = folder / "sparse" / "0", folder / "images"
@@ -68,7 +68,7 @@ def make_capture(folder: Path, cameras: int = CAMERAS) -> Path:
 
 
 def make_flare(path: Path) -> Path:
-    """A .flare of one light, written with numpy alone: weights at random, no touched table rows."""
+    """Write a .flare of one light with numpy alone: random weights, empty hash tables."""
     random = np.random.default_rng(1)
     widths = {"positions": 1, "log_scales": 2, "rotations": 2, "opacity_logits": 1, "sh": 3, "rings": 2}
     n = GAUSSIANS
@@ -107,7 +107,7 @@ def make_flare(path: Path) -> Path:
 
 
 def time_range(call: Any, times: int = 10) -> tuple[float, float]:
-    """(fastest, slowest) of some calls, in milliseconds."""
+    """Return the fastest and the slowest of some calls, ms."""
     times_ms = []
     for _ in range(times):
         start = time.perf_counter()
@@ -140,7 +140,7 @@ def main() -> None:
         run.mkdir()
         event = {"type": "progress", "stage": "fit", "done": 1, "total": 3000, "left_s": 9.0, "figures": {"loss": 0.1}}
         (run / jobs.EVENTS).write_text("".join(json.dumps({**event, "done": number}) + "\n" for number in range(3000)))
-        job = jobs.Job("fit", run, os.getpid(), None)
+        job = jobs.Job("fit", run, jobs.Origin(os.getpid()))
         job._alive = lambda: True  # the process that is watched is this one
         fast, slow = time_range(job.poll, 20)
         lines.append(f"reading a fit's events, at most {jobs.READ_CHUNK >> 10} kB a time: {fast:.2f} to {slow:.2f} ms")

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What fits make of a view's flare, as a picture.
+"""A picture of a view's exact flare beside the flares of fits.
 
     python benchmarks/flares_side_by_side.py CAPTURE VIEW RUN ... --out PNG
 
-First row: the frame, the exact flare. Then a row for each run: its flare, and twice its difference from the exact one
-on grey. The flare is |frame - scene|, display values, as the paper measures it.
+First row: the frame and the exact flare. Then a row for each run: its flare, and twice its difference from the exact
+one, on grey. The flare is |frame - scene|, display values, the paper's measure.
 """
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ Pixels = NDArray[np.float32]
 
 
 def side_by_side(capture: Capture, name: str, runs: list[Run]) -> Pixels:
-    """The picture, display values (h, w, 3). Raises CaptureError where the capture lacks the view or its layers."""
+    """Return the picture, display values (h, w, 3). Raises CaptureError if the view or its layers are missing."""
     view = next((one for one in capture.views if Path(one.name).stem == Path(name).stem), None)
     if view is None:
         raise CaptureError(f"{capture.folder} has no view {name}; give a frame's name.")
@@ -40,20 +40,20 @@ def side_by_side(capture: Capture, name: str, runs: list[Run]) -> Pixels:
     rows = [[capture.frame(view, camera.size).display(), exact]]
     for run in runs:
         layers = run.render(camera)
-        found = displayed_flare(sum(layers.flare_by_light.values(), layers.scene), layers.scene)
-        rows.append([found, 0.5 + 2 * (found - exact)])
+        rendered = displayed_flare(sum(layers.flare_by_light.values(), layers.scene), layers.scene)
+        rows.append([rendered, 0.5 + 2 * (rendered - exact)])
     return np.clip(np.concatenate([np.concatenate(row, 1) for row in rows]), 0, 1)
 
 
 def main() -> None:
-    """See the module's head."""
-    parser = argparse.ArgumentParser(description="A view's exact flare and that of fits.")
+    """Write the picture."""
+    parser = argparse.ArgumentParser(description="A view's exact flare beside the flares of fits.")
     parser.add_argument("capture", type=Path)
     parser.add_argument("view")
     parser.add_argument("runs", type=Path, nargs="+", metavar="RUN")
     parser.add_argument("--out", type=Path, required=True)
-    words = parser.parse_args()
-    write_png(words.out, side_by_side(Capture.open(words.capture), words.view, [Run.open(run) for run in words.runs]))
+    args = parser.parse_args()
+    write_png(args.out, side_by_side(Capture.open(args.capture), args.view, [Run.open(run) for run in args.runs]))
 
 
 if __name__ == "__main__":

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The flare fitted alone, over the exact scene: what the representation can do, without the scene's errors."""
+"""A fit of the flare alone over the exact scene: the limit of the representation without the scene's errors."""
 from __future__ import annotations
 
 from collections.abc import Sequence
@@ -16,23 +16,23 @@ from core.fit.rendering import render_flare
 from core.fit.trainer import Trainer
 from core.flare.compositing import composite
 from core.gaussians.loss import l1_ssim
-from core.metrics.evaluation import out_of_range
+from core.metrics.evaluation import unscored_mask
 from core.metrics.pictures import psnr, relative_l2
 
 
 class KnownScene(Trainer):
-    """A trainer whose scene is the flare-free frame of each view; lights are taken as visible."""
+    """A trainer whose scene is the clean frame of each view; all lights count as visible."""
 
     def step(self) -> dict[str, float]:
-        """One iteration on the next view; the loss."""
+        """Make one iteration on the next view; return the loss."""
         self.iteration += 1
         settings = self.settings
         targets = self.frames.targets(self._view())
-        if targets.removed is None:
+        if targets.clean is None:
             raise CaptureError(f"{self.capture.folder} has no flare-free frames; the exact scene must be known.")
         self.optimisers.set_rates(self.iteration)
         flare = render_flare(self.flare, settings.blend, targets.camera, settings.kernels)
-        loss = l1_ssim(composite(targets.removed, flare, settings.blend), targets.frame, 1 - settings.ssim_share)
+        loss = l1_ssim(composite(targets.clean, flare, settings.blend), targets.frame, 1 - settings.ssim_share)
         if loss.requires_grad:
             loss.backward()
         self.optimisers.step(scene=False)
@@ -42,33 +42,33 @@ class KnownScene(Trainer):
 
 @torch.no_grad()
 def score(trainer: Trainer, views: Sequence[View]) -> dict[str, Any]:
-    """Means over views: the flare as |composite - scene| in display space, against that of the exact layers where the
-    capture has them (of frames and flare-free frames, whose noise is no error of a fit's, where it has not), and the
-    linear layer itself where the camera did not clip, against the exact one."""
+    """Return mean scores over views: of the flare as |composite - scene| in display space, compared with exact layers
+    or, without these, with frames and clean frames, whose noise is no error of a fit; and of the linear layer outside
+    clipped pixels, compared with the exact one."""
     display, linear, relative = [], [], []
     for view in views:
         targets = trainer.frames.targets(view)
-        assert targets.removed is not None
+        assert targets.clean is not None
         flare = render_flare(trainer.flare, trainer.settings.blend, targets.camera, trainer.settings.kernels)
         if flare is None:
             continue
-        picture = composite(targets.removed, flare, trainer.settings.blend)
-        shown = (picture - targets.removed).abs().numpy()
+        picture = composite(targets.clean, flare, trainer.settings.blend)
+        rendered_display = (picture - targets.clean).abs().numpy()
         scene, truth = (exact(view, targets.camera.size) for exact in (trainer.capture.truth_scene,
                                                                        trainer.capture.truth_flare))
         if scene is None or truth is None:
-            display.append(psnr(shown, (targets.frame - targets.removed).abs().numpy()))
+            display.append(psnr(rendered_display, (targets.frame - targets.clean).abs().numpy()))
             continue
         with_flare = srgb_from_linear(scene.linear() + truth.linear()).clip(0, 1)
-        display.append(psnr(shown, np.abs(with_flare - srgb_from_linear(scene.linear()).clip(0, 1))))
-        keep = ~out_of_range(trainer.capture, view, targets.camera.size)
-        found = flare.colour if trainer.settings.blend == "add" else decode(picture) - decode(targets.removed)
-        linear.append(psnr(found.numpy(), truth.linear(), keep))
-        relative.append(relative_l2(found.numpy(), truth.linear(), keep))
+        display.append(psnr(rendered_display, np.abs(with_flare - srgb_from_linear(scene.linear()).clip(0, 1))))
+        keep = ~unscored_mask(trainer.capture, view, targets.camera.size)
+        rendered = flare.colour if trainer.settings.blend == "add" else decode(picture) - decode(targets.clean)
+        linear.append(psnr(rendered.numpy(), truth.linear(), keep))
+        relative.append(relative_l2(rendered.numpy(), truth.linear(), keep))
     return {"flare": {"psnr": _mean(display)}, "flare_linear": {"psnr": _mean(linear), "relative_l2": _mean(relative)}}
 
 
 def _mean(values: Sequence[float]) -> float | None:
-    """Of those that are finite: a view without flare has no relative error."""
+    """Return the mean of the finite values: a view without flare has no relative error."""
     finite = [value for value in values if np.isfinite(value)]
     return float(np.mean(finite)) if finite else None

@@ -3,9 +3,9 @@
 
     python benchmarks/memory.py [bake] [fit] [--run RUN] [--frames 100 200 400] [--size 960x540]
 
-Each is a process of its own, as a farm would start it; what is told is the most memory it held (resident), less
-what the same program holds before any frame. A fit's captures are made here: noise over dots, which is as hard to
-keep as film. Every view is looked at once.
+Each measurement is a separate process, as on a farm; the figure is its peak resident memory, beside that of the imports
+alone. The captures of the fits are generated: noise over dots, which compresses as badly as film. A fit visits every
+view once.
 """
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ ROOT = Path(__file__).resolve().parents[1]
 RUN = ROOT / "headless" / "run.py"
 
 
-def most_memory(words: list[object]) -> tuple[float, float]:
-    """(MiB held at most, seconds) of a process. RuntimeError where it fails."""
+def measure_process(args: list[object]) -> tuple[float, float]:
+    """Run a process; return its peak resident memory, MiB, and its seconds. Raises RuntimeError if it fails."""
     began = time.monotonic()
     with tempfile.TemporaryFile() as noise:
-        child = subprocess.Popen(list(map(str, words)), stdout=subprocess.DEVNULL, stderr=noise)
+        child = subprocess.Popen(list(map(str, args)), stdout=subprocess.DEVNULL, stderr=noise)
         _, status, usage = os.wait4(child.pid, 0)
         child.returncode = os.waitstatus_to_exitcode(status)
         if child.returncode:
@@ -43,8 +43,8 @@ def most_memory(words: list[object]) -> tuple[float, float]:
     return usage.ru_maxrss / (1024 if sys.platform != "darwin" else 1 << 20), time.monotonic() - began
 
 
-def look_from(angle: float, width: int, height: int) -> Camera:
-    """A camera on an arc about the origin."""
+def camera_at(angle: float, width: int, height: int) -> Camera:
+    """Return a camera on an arc about the origin."""
     position = np.array([4 * np.sin(angle), -0.3, -4 * np.cos(angle)])
     forward = -position / np.linalg.norm(position)
     right = np.cross([0.0, 1.0, 0.0], forward)
@@ -56,7 +56,7 @@ def look_from(angle: float, width: int, height: int) -> Camera:
 
 
 def make_capture(folder: Path, count: int, width: int, height: int) -> Path:
-    """A capture of noisy frames with their flare-free pairs, and 2,000 points."""
+    """Write a capture of noisy frames with their clean frames, and 2,000 points."""
     random = np.random.default_rng(0)
     xyz, rgb = random.uniform(-1.2, 1.2, (2000, 3)), random.integers(20, 235, (2000, 3))
     model = folder / "sparse" / "0"
@@ -65,15 +65,15 @@ def make_capture(folder: Path, count: int, width: int, height: int) -> Path:
     for kind in ("images", "removed"):
         (folder / kind).mkdir(parents=True)
     for number in range(count):
-        camera = look_from(1.2 * (number / max(count - 1, 1) - 0.5), width, height)
+        camera = camera_at(1.2 * (number / max(count - 1, 1) - 0.5), width, height)
         picture = np.roll(noise, 31 * number, 1) + np.uint8(40)
         for (x, y), colour in zip(camera.project(xyz)[0], rgb, strict=True):
             cv2.circle(picture, (int(x), int(y)), width // 120, colour.tolist(), -1)
         for kind in ("images", "removed"):
             cv2.imwrite(str(folder / kind / f"{number:04d}.jpg"), picture)
         pose = camera.world_to_camera
-        words = " ".join(map(str, (*quaternion_from_rotation(pose[:3, :3]), *pose[:3, 3])))
-        lines.append(f"{number + 1} {words} 1 {number:04d}.jpg\n\n")
+        pose_text = " ".join(map(str, (*quaternion_from_rotation(pose[:3, :3]), *pose[:3, 3])))
+        lines.append(f"{number + 1} {pose_text} 1 {number:04d}.jpg\n\n")
     lens = f"{0.9 * width} {0.9 * width} {width / 2} {height / 2}"
     write_text(model / "cameras.txt", f"1 PINHOLE {width} {height} {lens}\n")
     write_text(model / "images.txt", "".join(lines))
@@ -85,25 +85,25 @@ def make_capture(folder: Path, count: int, width: int, height: int) -> Path:
 
 
 def measure_bake(run: Path, size: str) -> None:
-    """One frame and several, at one size."""
+    """Measure bakes of one frame and of several, at one size."""
     with tempfile.TemporaryDirectory() as folder:
         for frames in ("10", "10-12", "10-15"):
-            most, seconds = most_memory([sys.executable, RUN, "bake", run, "--out", Path(folder) / frames, "--frames",
-                                         frames, "--size", size])
-            print(f"bake {size}, frames {frames:5}: {most:6.0f} MiB, {seconds:5.0f} s", flush=True)
+            peak, seconds = measure_process([sys.executable, RUN, "bake", run, "--out", Path(folder) / frames,
+                                             "--frames", frames, "--size", size])
+            print(f"bake {size}, frames {frames:5}: {peak:6.0f} MiB, {seconds:5.0f} s", flush=True)
 
 
 def measure_fit(counts: list[int], size: str) -> None:
-    """A look at every view once."""
+    """Measure fits that visit every view once."""
     width, height = map(int, size.split("x"))
     for count in counts:
         with tempfile.TemporaryDirectory() as folder:
             capture = make_capture(Path(folder) / "capture", count, width, height)
-            most, seconds = most_memory([
+            peak, seconds = measure_process([
                 sys.executable, RUN, "fit", capture, "--out", Path(folder) / "run", "--preset", "draft", "--iterations",
                 count, "--holdout", "0", "--set", f"preview_every={10 * count}", "--set", "flare.occlusion=false",
                 "--set", "scene.classic.cap=3000"])
-            print(f"fit {size}, {count:4} frames: {most:6.0f} MiB, {seconds:5.0f} s", flush=True)
+            print(f"fit {size}, {count:4} frames: {peak:6.0f} MiB, {seconds:5.0f} s", flush=True)
 
 
 def main() -> None:
@@ -113,13 +113,13 @@ def main() -> None:
     parser.add_argument("--layers", default="3840x2160")
     parser.add_argument("--frames", type=int, nargs="+", default=[100, 200, 400])
     parser.add_argument("--size", default="960x540")
-    words = parser.parse_args()
-    idle, _ = most_memory([sys.executable, "-c", "import torch, numba, cv2, OpenEXR"])
+    args = parser.parse_args()
+    idle, _ = measure_process([sys.executable, "-c", "import torch, numba, cv2, OpenEXR"])
     print(f"the libraries alone: {idle:.0f} MiB")
-    if "bake" in words.what:
-        measure_bake(words.run, words.layers)
-    if "fit" in words.what:
-        measure_fit(words.frames, words.size)
+    if "bake" in args.what:
+        measure_bake(args.run, args.layers)
+    if "fit" in args.what:
+        measure_fit(args.frames, args.size)
 
 
 if __name__ == "__main__":

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""OpenSplat's CPU rasterizer (C++, one thread), built from a checkout of it, for a column beside ours.
+"""OpenSplat's CPU rasterizer (C++, one thread), built from a checkout, for comparison with ours.
 
-Only its rasterizer is timed; what goes into it (projection, spherical harmonics, depth) is made beforehand,
-while ours does all of it within its time. The checkout stays where it is, and the build goes to a folder of
-the system's temporary files; a C++ compiler and ninja have to be there.
+Only its rasterizer is timed; its inputs (projection, spherical harmonics, depth) are computed beforehand, while our
+time includes them. The build goes to a temporary folder and needs a C++ compiler and ninja.
 """
 from __future__ import annotations
 
@@ -47,7 +46,7 @@ PYBIND11_MODULE(TORCH_EXTENSION_NAME, m) {
 
 
 def build(checkout: Path) -> Any:
-    """Its rasterizer as a module with `forward` and `backward`. Raises SystemExit where the folder is another."""
+    """Build the rasterizer as a module with `forward` and `backward`. Raises SystemExit for another `checkout`."""
     from torch.utils.cpp_extension import load
 
     source = checkout / "rasterizer" / "gsplat-cpu" / "gsplat_cpu.cpp"
@@ -63,7 +62,7 @@ def build(checkout: Path) -> Any:
 
 
 class Rasterizer:
-    """A scene, projected once, and its picture's upstream gradient."""
+    """A scene that is projected once, and the upstream gradient of its picture."""
 
     def __init__(
         self, module: Any, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, colours: Tensor,
@@ -71,21 +70,22 @@ class Rasterizer:
     ) -> None:  # fmt: skip
         self.module, self.size, self.upstream = module, (width, height), upstream
         with torch.no_grad():
-            seen = projection.project(
+            projected = projection.project(
                 means, quats, scales, *camera, width, height, rendering.NEAR, DILATION
             )
-            xx, xy, yy = seen.covariances.unbind(-1)
+            xx, xy, yy = projected.covariances.unbind(-1)
             conics = torch.stack([yy, -xy, xx], -1) / (xx * yy - xy * xy)[:, None]
             covariances = torch.stack([torch.stack([xx, xy], -1), torch.stack([xy, yy], -1)], -2)
-            inputs = (seen.centres - 0.5, conics, colours[seen.indices], opacities[seen.indices, None],
-                      torch.zeros(3), covariances, seen.depths)  # fmt: skip
+            inputs = (projected.centres - 0.5, conics, colours[projected.indices], opacities[projected.indices, None],
+                      torch.zeros(3), covariances, projected.depths)  # fmt: skip
         self.inputs = [value.detach().contiguous() for value in inputs]
 
     def picture(self) -> Tensor:
-        """(h, w, 3), to hold against ours."""
+        """Return the picture (h, w, 3), for comparison with ours."""
         return self.module.forward(*self.size, *self.inputs)[0]
 
-    def both(self) -> None:
-        """Forward and backward."""
-        _, left, lists = self.module.forward(*self.size, *self.inputs)
-        self.module.backward(*self.size, *self.inputs, left, lists, self.upstream, torch.zeros_like(left))
+    def forward_backward(self) -> None:
+        """Run the forward and the backward pass."""
+        _, transmittance, lists = self.module.forward(*self.size, *self.inputs)
+        d_alpha = torch.zeros_like(transmittance)
+        self.module.backward(*self.size, *self.inputs, transmittance, lists, self.upstream, d_alpha)

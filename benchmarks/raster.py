@@ -1,18 +1,18 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Time the kernel sets on the workload of `workload.py` and write docs/results/rasterizer.md.
+"""Times the kernel sets on the workload of `workload.py` and writes docs/results/rasterizer.md.
 
     python benchmarks/raster.py                 all of it, some minutes on two cores
     python benchmarks/raster.py --quick         fewer rounds
     python benchmarks/raster.py --only raster curve
-    python benchmarks/raster.py --engine mine=package.module:render
+    python benchmarks/raster.py --rasterizer mine=package.module:render
     python benchmarks/raster.py --only peer --opensplat FOLDER
 
-An `--engine` is any other rasterizer for a column of its own: a function of (means, quats, scales, opacities,
-sh, world_to_camera, intrinsics, width, height) that returns the colour (h, w, 3), differentiable. gsplat has its
-column wherever it is installed and there is a GPU. OpenSplat is built from a checkout (`opensplat.py`).
+`--rasterizer` adds a column for another rasterizer: a function of (means, quats, scales, opacities, sh,
+world_to_camera, intrinsics, width, height) that returns the colour (h, w, 3), differentiable. gsplat has a column if it
+is installed and there is a GPU. OpenSplat is built from a checkout (`opensplat.py`).
 
-Everything timed is the whole of what a user calls: projection, spherical harmonics of degree 3, sorting and
-rasterization; an iteration adds L1 + SSIM, the backward pass and Adam.
+Times include all that a user calls: projection, spherical harmonics of degree 3, sorting and rasterization; an
+iteration adds L1 + SSIM, the backward pass and Adam.
 """
 from __future__ import annotations
 
@@ -32,28 +32,28 @@ from typing import Literal, NamedTuple
 START = time.perf_counter()
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from core.system.thread_environment import prepare_for_numpy_and_torch
+from core.system.thread_environment import set_thread_environment
 
-prepare_for_numpy_and_torch()
+set_thread_environment()
 
 import torch
 from torch import Tensor
 
 from benchmarks import opensplat, report, workload
 from benchmarks.report import milliseconds, table
-from benchmarks.resident import held, held_at_most
-from benchmarks.timing import medians, on_threads, once, threads
+from benchmarks.resident import peak_memory, resident_memory
+from benchmarks.timing import median_times, on_threads, time_once, torch_threads
 from core.fit.optimisers import Optimisers
 from core.fit.settings import FitSettings
 from core.gaussians import Adam, SceneGaussians, kernels, l1_ssim, over, rasterization, splat
 from core.gaussians.spherical_harmonics import colours
 
-Engine = Callable[..., Tensor]
+Rasterizer = Callable[..., Tensor]
 DOCUMENT = report.RESULTS / "rasterizer.md"
 
 
-class Job(NamedTuple):
-    """Gaussians, flare Gaussians, and the picture."""
+class Case(NamedTuple):
+    """Number of Gaussians and flare Gaussians, and size of the picture."""
 
     gaussians: int
     width: int
@@ -67,29 +67,30 @@ class Job(NamedTuple):
         return f"{self.gaussians // 1000}k{flares}, {self.width}x{self.height}"
 
 
-RASTER_JOBS = (
-    Job(10_000, 480, 270), Job(50_000, 480, 270), Job(150_000, 480, 270), Job(50_000, 960, 540),
-    Job(150_000, 960, 540), Job(50_000, 480, 270, 2000),
+RASTER_CASES = (
+    Case(10_000, 480, 270), Case(50_000, 480, 270), Case(150_000, 480, 270), Case(50_000, 960, 540),
+    Case(150_000, 960, 540), Case(50_000, 480, 270, 2000),
 )  # fmt: skip
-ITERATION_JOBS = (
-    Job(50_000, 480, 270), Job(50_000, 480, 270, 2000), Job(50_000, 480, 270, 2000, "mixed"), Job(150_000, 960, 540),
+ITERATION_CASES = (
+    Case(50_000, 480, 270), Case(50_000, 480, 270, 2000), Case(50_000, 480, 270, 2000, "mixed"),
+    Case(150_000, 960, 540),
 )  # fmt: skip
-PEER_JOBS = RASTER_JOBS[:5]
+PEER_CASES = RASTER_CASES[:5]
 CURVE = (10_000, 20_000, 50_000, 100_000, 200_000, 350_000, 500_000)
-SLOW = 150_000
-"""From this many Gaussians or pixels on the torch path is left out of the tables: it takes too long."""
+SLOW_FROM = 150_000
+"""Number of Gaussians or pixels from which the torch kernel sets are omitted, since they take too long."""
 
 
-def our_engine(name: str) -> Engine:
+def our_rasterizer(name: str) -> Rasterizer:
     """One of our kernel sets as an engine."""
 
-    def render(*arguments: object) -> Tensor:
-        return rasterization(*arguments, kernels=name, depth=False).colour  # type: ignore[arg-type]
+    def render(*args: object) -> Tensor:
+        return rasterization(*args, kernels=name, depth=False).colour  # type: ignore[arg-type]
 
     return render
 
 
-def gsplat_engine(
+def gsplat_rasterizer(
     means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, sh: Tensor,
     world_to_camera: Tensor, intrinsics: Tensor, width: int, height: int,
 ) -> Tensor:  # fmt: skip
@@ -106,48 +107,48 @@ def gsplat_engine(
 class Raster:
     """Forward, and forward with backward, of one job by one engine."""
 
-    def __init__(self, job: Job, engine: Engine, kernel_set: str | None, device: str) -> None:
-        self.job, self.engine, self.kernel_set = job, engine, kernel_set
-        raw = workload.scene(job.gaussians)
+    def __init__(self, case: Case, rasterizer: Rasterizer, kernel_set: str | None, device: str) -> None:
+        self.case, self.rasterizer, self.kernel_set = case, rasterizer, kernel_set
+        raw = workload.scene(case.gaussians)
         values = (raw.means, raw.quaternions, raw.log_scales.exp(), raw.opacity_logits.sigmoid(), raw.sh)
         self.inputs = [value.to(device).requires_grad_() for value in values]
-        self.camera = [torch.eye(4, device=device), workload.intrinsics(job.width, job.height).to(device)]
-        flares = workload.flares(job.flares, job.width, job.height)
+        self.camera = [torch.eye(4, device=device), workload.intrinsics(case.width, case.height).to(device)]
+        flares = workload.flares(case.flares, case.width, case.height)
         self.flares = [value.to(device).requires_grad_() for value in flares]
-        self.upstream = torch.randn(job.height, job.width, 3, generator=torch.Generator().manual_seed(0)).to(device)
+        self.upstream = torch.randn(case.height, case.width, 3, generator=torch.Generator().manual_seed(0)).to(device)
 
     def picture(self) -> Tensor:
-        """The scene, behind the flares if there are any."""
-        size = (self.job.width, self.job.height)
-        colour = self.engine(*self.inputs, *self.camera, *size)
-        if not self.job.flares:
+        """Return the picture of the scene, with the flares over it if there are any."""
+        size = (self.case.width, self.case.height)
+        colour = self.rasterizer(*self.inputs, *self.camera, *size)
+        if not self.case.flares:
             return colour
-        laid = splat(*self.flares, *size, kernels=self.kernel_set)  # type: ignore[arg-type]
-        return over(laid, colour)
+        splats = splat(*self.flares, *size, kernels=self.kernel_set)  # type: ignore[arg-type]
+        return over(splats, colour)
 
     def forward(self) -> None:
         with torch.no_grad():
             self.picture()
 
-    def both(self) -> None:
+    def forward_backward(self) -> None:
         for value in (*self.inputs, *self.flares):
             value.grad = None
         self.picture().backward(self.upstream)
 
 
 class Iteration:
-    """A whole step of training by one kernel set; at rates of nothing, so that the work stays that of the job: trained
-    on noise for a few hundred steps the Gaussians would meet a third fewer tiles."""
+    """A training iteration with one kernel set, at learning rates of zero, so that the work does not change: trained on
+    noise for some hundred steps, the Gaussians would cover a third fewer tiles."""
 
-    def __init__(self, job: Job, kernel_set: str) -> None:
-        self.job, self.kernel_set = job, kernel_set
-        self.scene = SceneGaussians(*workload.scene(job.gaussians))
-        self.flares = [torch.nn.Parameter(v) for v in workload.flares(job.flares, job.width, job.height)]
-        self.camera = (torch.eye(4), workload.intrinsics(job.width, job.height))
-        self.target = torch.rand(job.height, job.width, 3, generator=torch.Generator().manual_seed(0))
+    def __init__(self, case: Case, kernel_set: str) -> None:
+        self.case, self.kernel_set = case, kernel_set
+        self.scene = SceneGaussians(*workload.scene(case.gaussians))
+        self.flares = [torch.nn.Parameter(v) for v in workload.flares(case.flares, case.width, case.height)]
+        self.camera = (torch.eye(4), workload.intrinsics(case.width, case.height))
+        self.target = torch.rand(case.height, case.width, 3, generator=torch.Generator().manual_seed(0))
         parameters = dict(self.scene.named_parameters())
         rates = Optimisers(self.scene, None, FitSettings(), extent=1.0, display_white=1.0).scene.rates
-        if job.flares:
+        if case.flares:
             parameters |= {f"flare{i}": p for i, p in enumerate(self.flares)}
             rates |= {f"flare{i}": 1e-6 for i in range(len(self.flares))}
         rates = {name: rate * 0 for name, rate in rates.items()}
@@ -155,134 +156,136 @@ class Iteration:
         self.optimiser = Adam(parameters, rates, kernels=self.fused)  # type: ignore[arg-type]
 
     def step(self) -> None:
-        s, size = self.scene, (self.job.width, self.job.height)
+        s, size = self.scene, (self.case.width, self.case.height)
         picture = rasterization(
             s.means, s.quaternions, s.log_scales, s.opacity_logits, s.sh, *self.camera, *size,
             kernels=self.kernel_set, depth=False, raw=True,  # type: ignore[arg-type]
         ).colour  # fmt: skip
-        if self.job.flares:
-            laid = splat(
-                *self.flares, *size, kernels=self.kernel_set, resolution=self.job.resolution,  # type: ignore[arg-type]
+        if self.case.flares:
+            splats = splat(
+                *self.flares, *size, kernels=self.kernel_set, resolution=self.case.resolution,  # type: ignore[arg-type]
             )  # fmt: skip
-            picture = over(laid, picture)
+            picture = over(splats, picture)
         self.optimiser.zero_grad()
         loss = l1_ssim(picture, self.target, 0.8, kernels=self.fused)  # type: ignore[arg-type]
-        with self.optimiser.stepping():  # as the trainer does where the scene is rendered once
+        with self.optimiser.step_in_backward():  # as the trainer does where the scene is rendered once
             loss.backward()
         self.optimiser.step()
 
 
-def too_slow(name: str, job: Job) -> bool:
-    """The torch paths are kept to sizes at which they finish."""
-    size = max(job.gaussians, job.width * job.height)
-    return (name == "torch" and size > 20_000) or (name == "tiles" and size >= SLOW)
+def too_slow(name: str, case: Case) -> bool:
+    """Return whether a case takes too long for a torch kernel set."""
+    size = max(case.gaussians, case.width * case.height)
+    return (name == "torch" and size > 20_000) or (name == "tiles" and size >= SLOW_FROM)
 
 
-def raster_section(engines: dict[str, Engine], counts: list[int], rounds: int, device: str) -> str:
-    """Forward, and forward + backward: a table for each."""
-    cases: dict[str, Callable[[], object]] = {}
-    for job in RASTER_JOBS:
-        for name, engine in engines.items():
-            if too_slow(name, job) or (job.flares and name not in kernels.MODULES):
+def raster_section(rasterizers: dict[str, Rasterizer], thread_counts: list[int], rounds: int, device: str) -> str:
+    """Return tables of forward, and of forward + backward."""
+    work: dict[str, Callable[[], object]] = {}
+    for case in RASTER_CASES:
+        for name, rasterizer in rasterizers.items():
+            if too_slow(name, case) or (case.flares and name not in kernels.MODULES):
                 continue
-            raster = Raster(job, engine, name if name in kernels.MODULES else None, device)
-            for count in counts:
-                cases[f"{job}|{name}|{count}|forward"] = on_threads(count, raster.forward)
-                cases[f"{job}|{name}|{count}|both"] = on_threads(count, raster.both)
-    times = medians(cases, rounds)
-    shown = [name for name in engines if any(f"|{name}|" in key for key in times)]
+            raster = Raster(case, rasterizer, name if name in kernels.MODULES else None, device)
+            for count in thread_counts:
+                work[f"{case}|{name}|{count}|forward"] = on_threads(count, raster.forward)
+                work[f"{case}|{name}|{count}|both"] = on_threads(count, raster.forward_backward)
+    times = median_times(work, rounds)
+    shown = [name for name in rasterizers if any(f"|{name}|" in key for key in times)]
     parts = []
     for kind, title in (("forward", "Forward, ms"), ("both", "Forward + backward, ms")):
-        head = [title, *[f"{name}, {_count(c)}" for name in shown for c in counts]]
-        head += [f"cpu, {counts[0]} to {counts[-1]} threads", f"tiles / cpu, {_count(counts[-1])}"]
+        head = [title, *[f"{name}, {_thread_label(c)}" for name in shown for c in thread_counts]]
+        few, many = thread_counts[0], thread_counts[-1]
+        head += [f"cpu, {few} to {many} threads", f"tiles / cpu, {_thread_label(many)}"]
         rows = []
-        for job in RASTER_JOBS:
-            found = {(n, c): times.get(f"{job}|{n}|{c}|{kind}") for n in shown for c in counts}
-            gain = _ratio(found.get(("cpu", counts[0])), found.get(("cpu", counts[-1])))
-            against = _ratio(found.get(("tiles", counts[-1])), found.get(("cpu", counts[-1])))
-            rows.append([str(job), *[milliseconds(v) for v in found.values()], gain, against])
+        for case in RASTER_CASES:
+            cells = {(n, c): times.get(f"{case}|{n}|{c}|{kind}") for n in shown for c in thread_counts}
+            speedup = _ratio(cells.get(("cpu", few)), cells.get(("cpu", many)))
+            relative_to_tiles = _ratio(cells.get(("tiles", many)), cells.get(("cpu", many)))
+            rows.append([str(case), *[milliseconds(v) for v in cells.values()], speedup, relative_to_tiles])
         parts.append(table(head, rows))
     return "\n\n".join(parts)
 
 
-GPU_JOBS = (*RASTER_JOBS, Job(1_000_000, 1920, 1080))
+GPU_CASES = (*RASTER_CASES, Case(1_000_000, 1920, 1080))
 
 
 def gpu_section(rounds: int) -> str:
     """Forward, and forward + backward, on an NVIDIA GPU and beside it on all of the processor's threads."""
-    engines = {"cuda": "cuda", "tiles": "cuda", "cpu": "cpu"}
-    cases: dict[str, Callable[[], object]] = {}
-    for job in GPU_JOBS:
-        for name, device in engines.items():
-            if not too_slow(name, job):
-                raster = Raster(job, our_engine(name), name, device)
-                cases |= {f"{job}|{name}|forward": raster.forward, f"{job}|{name}|both": raster.both}
-    times = medians(cases, rounds)
+    rasterizers = {"cuda": "cuda", "tiles": "cuda", "cpu": "cpu"}
+    work: dict[str, Callable[[], object]] = {}
+    for case in GPU_CASES:
+        for name, device in rasterizers.items():
+            if not too_slow(name, case):
+                raster = Raster(case, our_rasterizer(name), name, device)
+                work |= {f"{case}|{name}|forward": raster.forward, f"{case}|{name}|both": raster.forward_backward}
+    times = median_times(work, rounds)
     head = [
-        f"ms; {torch.cuda.get_device_name()}, {_count(torch.get_num_threads())}",
-        *[f"{name}, {kind}" for kind in ("forward", "both") for name in engines],
+        f"ms; {torch.cuda.get_device_name()}, {_thread_label(torch.get_num_threads())}",
+        *[f"{name}, {kind}" for kind in ("forward", "both") for name in rasterizers],
         "tiles / cuda, both", "cpu / cuda, both",
     ]  # fmt: skip
     rows = []
-    for job in GPU_JOBS:
-        found = {(kind, n): times.get(f"{job}|{n}|{kind}") for kind in ("forward", "both") for n in engines}
-        ratios = [_ratio(found["both", name], found["both", "cuda"]) for name in ("tiles", "cpu")]
-        rows.append([str(job), *[milliseconds(v) for v in found.values()], *ratios])
+    for case in GPU_CASES:
+        cells = {(kind, n): times.get(f"{case}|{n}|{kind}") for kind in ("forward", "both") for n in rasterizers}
+        ratios = [_ratio(cells["both", name], cells["both", "cuda"]) for name in ("tiles", "cpu")]
+        rows.append([str(case), *[milliseconds(v) for v in cells.values()], *ratios])
     return table(head, rows)
 
 
-def iteration_section(sets: list[str], counts: list[int], rounds: int) -> str:
-    """Whole iterations."""
-    cases: dict[str, Callable[[], object]] = {}
-    for job in ITERATION_JOBS:
+def iteration_section(sets: list[str], thread_counts: list[int], rounds: int) -> str:
+    """Return the table of training iterations."""
+    work: dict[str, Callable[[], object]] = {}
+    for case in ITERATION_CASES:
         for name in sets:
-            if not too_slow(name, job):
-                step = Iteration(job, name).step
-                cases |= {f"{job}|{name}|{count}": on_threads(count, step) for count in counts}
-    times = medians(cases, rounds)
+            if not too_slow(name, case):
+                step = Iteration(case, name).step
+                work |= {f"{case}|{name}|{count}": on_threads(count, step) for count in thread_counts}
+    times = median_times(work, rounds)
     shown = [name for name in sets if any(f"|{name}|" in key for key in times)]
     rows = [
-        [str(job), *[milliseconds(times.get(f"{job}|{name}|{c}")) for name in shown for c in counts]]
-        for job in ITERATION_JOBS
+        [str(case), *[milliseconds(times.get(f"{case}|{name}|{c}")) for name in shown for c in thread_counts]]
+        for case in ITERATION_CASES
     ]
-    return table(["A training iteration, ms", *[f"{name}, {_count(c)}" for name in shown for c in counts]], rows)
+    head = [f"{name}, {_thread_label(c)}" for name in shown for c in thread_counts]
+    return table(["A training iteration, ms", *head], rows)
 
 
 STAGES = {
     "projection": ("project",),
-    "tiles and depth order": ("list_in_order", "scatter"),
+    "tiles and depth order": ("list_sorted", "scatter"),
     "raster, forward": ("raster",),
     "raster, backward": ("raster_backward",),
-    "projection, backward, and Adam": ("project_backward", "_advance_all"),
+    "projection, backward, and Adam": ("project_backward", "_step_all"),
     "loss": ("loss_and_gradient",),
 }
-STAGE_JOBS = (ITERATION_JOBS[0], ITERATION_JOBS[3])
+STAGE_CASES = (ITERATION_CASES[0], ITERATION_CASES[3])
 
 
-def stage_section(counts: list[int], rounds: int) -> str:
-    """The CPU kernels within whole iterations, and what is left: autograd, Python, memory."""
+def stage_section(thread_counts: list[int], rounds: int) -> str:
+    """Return the table of the CPU kernels within iterations, and of the remainder: autograd, Python, memory."""
     rows = {name: [name] for name in (*STAGES, "between the kernels", "iteration", "the raster alone")}
-    for job in STAGE_JOBS:
-        for count in counts:
-            iteration = Iteration(job, "cpu")
-            with threads(count):
-                found = _stage_times(iteration.step, 10 * rounds)
-            found["the raster alone"] = found["raster, forward"] + found["raster, backward"]
+    for case in STAGE_CASES:
+        for count in thread_counts:
+            iteration = Iteration(case, "cpu")
+            with torch_threads(count):
+                cells = _stage_times(iteration.step, 10 * rounds)
+            cells["the raster alone"] = cells["raster, forward"] + cells["raster, backward"]
             for name, row in rows.items():
-                row.append(milliseconds(found[name]))
-    head = ["ms", *[f"{job}, {_count(count)}" for job in STAGE_JOBS for count in counts]]
+                row.append(milliseconds(cells[name]))
+    head = ["ms", *[f"{case}, {_thread_label(count)}" for case in STAGE_CASES for count in thread_counts]]
     return table(head, list(rows.values()))
 
 
 def _stage_times(step: Callable[[], object], repeats: int) -> dict[str, float]:
-    """Median seconds of each stage over repetitions of a step."""
+    """Return the median seconds of each stage over repetitions of a step."""
     step()  # loads the kernels
     spent: dict[str, float] = {}
     parallel = importlib.import_module("core.gaussians.cpu.threads").parallel
 
-    def timed(function: Callable[..., object], *arguments: object, **options: object) -> None:
+    def timed(function: Callable[..., object], *args: object, **options: object) -> None:
         start = time.perf_counter()
-        parallel(function, *arguments, **options)
+        parallel(function, *args, **options)
         spent[function.__name__] = spent.get(function.__name__, 0.0) + time.perf_counter() - start
 
     users = [module for name, module in sys.modules.items()
@@ -293,7 +296,7 @@ def _stage_times(step: Callable[[], object], repeats: int) -> dict[str, float]:
     try:
         for _ in range(3 + repeats):
             spent.clear()
-            whole = once(step)
+            whole = time_once(step)
             for name, functions in STAGES.items():
                 samples[name].append(sum(spent.get(function, 0.0) for function in functions))
             samples["between the kernels"].append(whole - sum(spent.values()))
@@ -306,7 +309,7 @@ def _stage_times(step: Callable[[], object], repeats: int) -> dict[str, float]:
 
 def flare_section(sets: list[str], rounds: int) -> str:
     """2,000 flare Gaussians alone: both blends, plain and rings, at full and mixed resolution."""
-    rows, cases = [], {}
+    rows, work = [], {}
     variants = [(b, r, m) for b in ("over", "add") for r in (False, True) for m in ("full", "mixed")]
     for width, height in ((480, 270), (960, 540)):
         for name in sets:
@@ -315,10 +318,10 @@ def flare_section(sets: list[str], rounds: int) -> str:
                     continue
                 inputs = [v.requires_grad_() for v in workload.flares(2000, width, height)]
                 rings = torch.tensor([[1.0, 0.3]]).repeat(2000, 1) if ring else None
-                cases[f"{width}|{name}|{blend}|{ring}|{resolution}"] = _laid(
+                work[f"{width}|{name}|{blend}|{ring}|{resolution}"] = _splat_work(
                     inputs, width, height, rings, blend, resolution, name
                 )
-    times = medians(cases, rounds)
+    times = median_times(work, rounds)
     for blend, ring, resolution in variants:
         row = [f"{blend}, {'ring r0 = 1, w = 0.3' if ring else 'plain'}, {resolution}"]
         for width in (480, 960):
@@ -334,7 +337,7 @@ def flare_section(sets: list[str], rounds: int) -> str:
     return table(head, rows)
 
 
-def _laid(
+def _splat_work(
     inputs: list[Tensor], width: int, height: int, rings: Tensor | None, blend: str, resolution: str, name: str
 ) -> Callable[[], object]:
     upstream = torch.randn(height, width, 3, generator=torch.Generator().manual_seed(0))
@@ -342,23 +345,23 @@ def _laid(
     def run() -> None:
         for value in inputs:
             value.grad = None
-        laid = splat(
+        splats = splat(
             *inputs, width, height, rings=rings, blend=blend, resolution=resolution, kernels=name  # type: ignore[arg-type]
         )
-        laid.colour.backward(upstream)
+        splats.colour.backward(upstream)
 
     return run
 
 
-def curve_section(engines: dict[str, Engine], rounds: int, device: str, picture: Path) -> str:
+def curve_section(rasterizers: dict[str, Rasterizer], rounds: int, device: str, picture: Path) -> str:
     """Forward + backward against the count, as a table and as a picture."""
     rows, lines = [], {}
-    fast = [name for name in engines if name not in ("torch", "tiles")]
+    fast = [name for name in rasterizers if name not in ("torch", "tiles")]
     for name in fast:
-        cases: dict[str, Callable[[], object]] = {
-            str(n): Raster(Job(n, 480, 270), engines[name], None, device).both for n in CURVE
+        work: dict[str, Callable[[], object]] = {
+            str(n): Raster(Case(n, 480, 270), rasterizers[name], None, device).forward_backward for n in CURVE
         }
-        lines[name] = medians(cases, rounds)
+        lines[name] = median_times(work, rounds)
     for n in CURVE:
         row = [f"{n // 1000}k"]
         for name in fast:
@@ -380,8 +383,8 @@ def _plot(lines: dict[str, dict[str, float]], picture: Path) -> None:
 
     figure, axes = pyplot.subplots(figsize=(6, 3.6), layout="constrained")
     for name, times in lines.items():
-        counts = [int(n) / 1000 for n in times]
-        axes.plot(counts, [t * 1e3 for t in times.values()], "o-", label=name)
+        thread_counts = [int(n) / 1000 for n in times]
+        axes.plot(thread_counts, [t * 1e3 for t in times.values()], "o-", label=name)
     axes.set(xlabel="Gaussians, thousands", ylabel="forward + backward, ms", xlim=(0, None), ylim=(0, None))
     axes.set_title(f"480x270, {torch.get_num_threads()} threads", fontsize=10)
     axes.grid(alpha=0.3)
@@ -395,22 +398,23 @@ def peer_section(checkout: Path, rounds: int) -> str:
     """OpenSplat's rasterizer beside ours."""
     module, rows = opensplat.build(checkout), []
     threads = torch.get_num_threads()
-    for job in PEER_JOBS:
-        ours = Raster(job, our_engine("cpu"), "cpu", "cpu")
+    for case in PEER_CASES:
+        ours = Raster(case, our_rasterizer("cpu"), "cpu", "cpu")
         means, quats, scales, opacities, sh = (value.detach() for value in ours.inputs)
         seen_colours = colours(means, sh, 3)
         camera = (ours.camera[0], ours.camera[1])
         theirs = opensplat.Rasterizer(
-            module, means, quats, scales, opacities, seen_colours, camera, job.width, job.height, ours.upstream
+            module, means, quats, scales, opacities, seen_colours, camera, case.width, case.height, ours.upstream
         )
         with torch.no_grad():
-            apart = float((theirs.picture() - ours.picture()).abs().mean())
-        cases = {"peer": theirs.both, "1": on_threads(1, ours.both), "all": on_threads(threads, ours.both)}
-        times = medians(cases, rounds)
+            difference = float((theirs.picture() - ours.picture()).abs().mean())
+        work = {"peer": theirs.forward_backward, "1": on_threads(1, ours.forward_backward),
+                "all": on_threads(threads, ours.forward_backward)}
+        times = median_times(work, rounds)
         ratios = [_ratio(times["peer"], times[key]) for key in ("1", "all")]
-        rows.append([str(job), *[milliseconds(times[key]) for key in cases], *ratios, f"{apart:.1e}"])
-    head = ["Forward + backward, ms", "OpenSplat, 1 thread", "cpu, 1 thread", f"cpu, {_count(threads)}"]
-    head += [f"OpenSplat / cpu, {_count(count)}" for count in (1, threads)] + ["pictures apart, mean"]
+        rows.append([str(case), *[milliseconds(times[key]) for key in work], *ratios, f"{difference:.1e}"])
+    head = ["Forward + backward, ms", "OpenSplat, 1 thread", "cpu, 1 thread", f"cpu, {_thread_label(threads)}"]
+    head += [f"OpenSplat / cpu, {_thread_label(count)}" for count in (1, threads)] + ["mean difference of the pictures"]
     return table(head, rows)
 
 
@@ -420,16 +424,16 @@ def process_section(sets: list[str]) -> str:
     for name in sets:
         if name == "torch":
             continue
-        found = _probe("memory", name)
-        rows.append([name, f"{found['before']:.0f}", f"{found['peak']:.0f}"])
+        cells = _probe("memory", name)
+        rows.append([name, f"{cells['before']:.0f}", f"{cells['peak']:.0f}"])
     text = table(["Resident memory, training 50k at 480x270, MB", "after import", "peak"], rows)
     if "cpu" not in sets:
         return text
     with tempfile.TemporaryDirectory() as cache:
         cold, warm = (_probe("start", "cpu", FIT_FLARE_CACHE=cache) for _ in range(2))
     rows = [
-        [what, f"{found['import']:.1f}", f"{found['first']:.1f}", f"{found['second'] * 1e3:.0f} ms"]
-        for what, found in (("empty cache: compiles", cold), ("from the cache", warm))
+        [what, f"{cells['import']:.1f}", f"{cells['first']:.1f}", f"{cells['second'] * 1e3:.0f} ms"]
+        for what, cells in (("empty cache: compiles", cold), ("from the cache", warm))
     ]
     text += "\n\n" + table(
         ["Start of a process", "imports (torch, numba), s", "first iteration, s", "second iteration"], rows
@@ -458,11 +462,11 @@ def _probe(what: str, name: str, **variables: str) -> dict[str, float]:
 
 
 def probe(what: str, name: str) -> dict[str, float]:
-    """What a process of its own is asked to measure."""
-    job = Job(50_000, 480, 270)
+    """Measure one figure, in a process of its own."""
+    case = Case(50_000, 480, 270)
     if what == "start":
         imported = time.perf_counter() - START
-        iteration = Iteration(Job(1000, 480, 270), name)
+        iteration = Iteration(Case(1000, 480, 270), name)
         times = []
         for _ in range(2):
             start = time.perf_counter()
@@ -470,15 +474,15 @@ def probe(what: str, name: str) -> dict[str, float]:
             times.append(time.perf_counter() - start)
         return {"import": imported, "first": times[0], "second": times[1]}
     if what == "both":
-        return medians({"both": Raster(job, our_engine(name), name, "cpu").both}, 5)
-    before = held()
-    iteration = Iteration(job, name)
+        return median_times({"both": Raster(case, our_rasterizer(name), name, "cpu").forward_backward}, 5)
+    before = resident_memory()
+    iteration = Iteration(case, name)
     for _ in range(5):
         iteration.step()
-    return {"before": before, "peak": held_at_most()}
+    return {"before": before, "peak": peak_memory()}
 
 
-def _count(threads: int) -> str:
+def _thread_label(threads: int) -> str:
     return "1 thread" if threads == 1 else f"{threads} threads"
 
 
@@ -487,10 +491,10 @@ def _ratio(a: float | None, b: float | None) -> str:
 
 
 def main() -> None:
-    """See the module's head."""
+    """Time the sections and write their tables."""
     parser = argparse.ArgumentParser(description="Times the kernel sets side by side.")
-    parser.add_argument("--kernels", nargs="+", default=[n for n in ("cpu", "tiles") if kernels.available(n)])
-    parser.add_argument("--engine", action="append", default=[], metavar="NAME=MODULE:FUNCTION")
+    parser.add_argument("--kernels", nargs="+", default=[n for n in ("cpu", "tiles") if kernels.is_available(n)])
+    parser.add_argument("--rasterizer", action="append", default=[], metavar="NAME=MODULE:FUNCTION")
     parser.add_argument("--opensplat", type=Path, metavar="FOLDER", help="a checkout of OpenSplat, for --only peer")
     parser.add_argument("--threads", nargs="+", type=int, default=[1, torch.get_num_threads()])
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
@@ -498,38 +502,38 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="fewer rounds")
     parser.add_argument("--out", type=Path, default=DOCUMENT)
     parser.add_argument("--probe", nargs=2, metavar=("WHAT", "KERNELS"), help=argparse.SUPPRESS)
-    arguments = parser.parse_args()
-    if arguments.probe:
-        sys.stdout.write(json.dumps(probe(*arguments.probe)) + "\n")
+    args = parser.parse_args()
+    if args.probe:
+        sys.stdout.write(json.dumps(probe(*args.probe)) + "\n")
         return
-    engines = {name: our_engine(name) for name in arguments.kernels}
-    if arguments.device == "cuda" and importlib.util.find_spec("gsplat"):
-        engines["gsplat"] = gsplat_engine
-    for entry in arguments.engine:
+    rasterizers = {name: our_rasterizer(name) for name in args.kernels}
+    if args.device == "cuda" and importlib.util.find_spec("gsplat"):
+        rasterizers["gsplat"] = gsplat_rasterizer
+    for entry in args.rasterizer:
         name, place = entry.split("=")
         module, function = place.split(":")
-        engines[name] = getattr(importlib.import_module(module), function)
-    rounds = 2 if arguments.quick else 5
-    counts = sorted(set(arguments.threads))
-    arguments.out.parent.mkdir(parents=True, exist_ok=True)
-    write: dict[str, Callable[[], str]] = {
-        "raster": lambda: raster_section(engines, counts, rounds, arguments.device),
-        "iteration": lambda: iteration_section(arguments.kernels, counts, rounds),
-        "stages": lambda: stage_section(counts, rounds),
-        "flares": lambda: flare_section(arguments.kernels, rounds),
-        "curve": lambda: curve_section(engines, rounds, arguments.device, arguments.out.parent / "raster-curve.png"),
-        "process": lambda: process_section(arguments.kernels),
-        "peer": lambda: peer_section(arguments.opensplat, rounds),
+        rasterizers[name] = getattr(importlib.import_module(module), function)
+    rounds = 2 if args.quick else 5
+    thread_counts = sorted(set(args.threads))
+    args.out.parent.mkdir(parents=True, exist_ok=True)
+    sections: dict[str, Callable[[], str]] = {
+        "raster": lambda: raster_section(rasterizers, thread_counts, rounds, args.device),
+        "iteration": lambda: iteration_section(args.kernels, thread_counts, rounds),
+        "stages": lambda: stage_section(thread_counts, rounds),
+        "flares": lambda: flare_section(args.kernels, rounds),
+        "curve": lambda: curve_section(rasterizers, rounds, args.device, args.out.parent / "raster-curve.png"),
+        "process": lambda: process_section(args.kernels),
+        "peer": lambda: peer_section(args.opensplat, rounds),
         "gpu": lambda: gpu_section(rounds),
     }
-    lacking = {"peer"} if arguments.opensplat is None else set()
-    lacking |= {"gpu"} if arguments.device == "cpu" else set()
-    for section in arguments.only:
-        if section in lacking:
+    unavailable = {"peer"} if args.opensplat is None else set()
+    unavailable |= {"gpu"} if args.device == "cpu" else set()
+    for section in args.only:
+        if section in unavailable:
             continue
         conditions = report.conditions()
-        text = f"## {SECTIONS[section]}\n\n{write[section]()}\n\n{conditions}"
-        report.write_section(arguments.out, section, text)
+        text = f"## {SECTIONS[section]}\n\n{sections[section]()}\n\n{conditions}"
+        report.write_section(args.out, section, text)
         sys.stdout.write(text + "\n\n")
         sys.stdout.flush()
 

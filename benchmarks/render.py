@@ -17,9 +17,9 @@ from typing import NamedTuple
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from core.system.thread_environment import prepare_for_numpy_and_torch
+from core.system.thread_environment import set_thread_environment
 
-prepare_for_numpy_and_torch()
+set_thread_environment()
 
 import numpy as np
 import torch
@@ -27,26 +27,26 @@ from torch import Tensor
 
 from benchmarks import report, workload
 from benchmarks.report import milliseconds, table
-from benchmarks.timing import medians
+from benchmarks.timing import median_times
 from core.capture import Camera
 from core.choices import Blend
 from core.fit.run import Run
-from core.flare.compositing import composite, joined
+from core.flare.compositing import composite, concatenate
 from core.flare.deformation import QueryRange
 from core.flare.model import OURS, PAPER, FlareModel, LightFlare
-from core.flare.placement import PlaneGaussians, pixels, slopes
+from core.flare.placement import PlaneGaussians, pixel_arcs, pixels
 from core.gaussians import SceneGaussians, kernels, splat
-from core.look.look import FlareForm
+from core.look.form import FlareForm
 
 SIZES = ((1920, 1080), (3840, 2160))
 SCENE, FLARE = 162_283, 10_965
 DEFORMATION = {1: 3.9, 2: 6.8, 3: 11.1}
-"""What the paper measured, ms, by the number of lights."""
+"""The paper's measurements, ms, by the number of lights."""
 STAGES = ("deformation", "projection", "flare raster", "flare raster, mixed", "scene", "composite")
 
 
-class Fitted(NamedTuple):
-    """What is rendered: a flare for each light, in the order in which they are switched on."""
+class RenderedScene(NamedTuple):
+    """A scene, and a flare for each light, in the order in which lights are added."""
 
     scene: SceneGaussians
     flares: list[LightFlare]
@@ -54,20 +54,20 @@ class Fitted(NamedTuple):
     blend: Blend
     pose: np.ndarray
     focal: float
-    """Of a picture one pixel wide."""
+    """Focal length of a picture one pixel wide."""
 
 
-def synthetic(form: FlareForm, blend: Blend, size: int = SCENE, flare: int = FLARE) -> Fitted:
-    """Three lights in front of the workload's camera, with untrained flares."""
+def synthetic(form: FlareForm, blend: Blend, size: int = SCENE, flare: int = FLARE) -> RenderedScene:
+    """Return three lights in front of the workload's camera, with untrained flares."""
     generator = torch.Generator().manual_seed(0)
     positions = torch.tensor([[0.6, -0.4, 3.0], [-1.0, 0.3, 4.0], [0.2, 0.8, 5.0]], dtype=torch.float64)
     query = QueryRange((-1, -1, -1), (1, 1, 1), (1, 1, 1))
     flares = [LightFlare(form, query, flare, generator) for _ in positions]
-    return Fitted(SceneGaussians(*workload.scene(size)), flares, positions, blend, np.eye(4), 0.5 / workload.TAN)
+    return RenderedScene(SceneGaussians(*workload.scene(size)), flares, positions, blend, np.eye(4), 0.5 / workload.TAN)
 
 
-def of_run(folder: Path) -> Fitted:
-    """A run's scene and flares, seen by its capture's first camera with a light in front of it."""
+def load_run(folder: Path) -> RenderedScene:
+    """Return a run's scene and flares, for its capture's first camera with all lights in front of it."""
     from core.capture import Capture
 
     run = Run.open(folder)
@@ -80,56 +80,56 @@ def of_run(folder: Path) -> Fitted:
         pose = torch.from_numpy(view.camera.world_to_camera)
         if all(one.depth > 0 for one in run.flare.model.views(pose)):
             camera = view.camera
-            return Fitted(
+            return RenderedScene(
                 run.scene, flares, positions, run.flare.blend, camera.world_to_camera, camera.fx / camera.width
             )
     raise SystemExit(f"No camera of {run.capture_folder} has all lights in front of it.")
 
 
 def stages(
-    fitted: Fitted, lights: int, width: int, height: int, kernel_set: str, device: str
+    rendered: RenderedScene, lights: int, width: int, height: int, kernel_set: str, device: str
 ) -> dict[str, Callable[[], object]]:
-    """Each stage of a frame, as work to be timed."""
-    focal = fitted.focal * width
-    camera = Camera(width, height, focal, focal, width / 2, height / 2, fitted.pose)
+    """Return each stage of a frame as a function to time."""
+    focal = rendered.focal * width
+    camera = Camera(width, height, focal, focal, width / 2, height / 2, rendered.pose)
     pose = torch.from_numpy(camera.world_to_camera)
     intrinsics = torch.from_numpy(camera.intrinsics).float().to(device)
-    model = FlareModel([str(i) for i in range(lights)], fitted.positions[:lights], fitted.flares[:lights])
-    scene = fitted.scene.to(device)
+    model = FlareModel([str(i) for i in range(lights)], rendered.positions[:lights], rendered.flares[:lights])
+    scene = rendered.scene.to(device)
 
-    def deformed() -> PlaneGaussians:
-        found = joined(model(pose))
-        assert found is not None
-        return PlaneGaussians(*(None if part is None else part.to(device) for part in found))
+    def evaluate_flares() -> PlaneGaussians:
+        gaussians = concatenate(model(pose))
+        assert gaussians is not None
+        return PlaneGaussians(*(None if part is None else part.to(device) for part in gaussians))
 
     def raster(resolution: str) -> Callable[[], object]:
         return lambda: splat(
-            *placed, flare.opacities, flare.colours, width, height, rings=flare.rings, arcs=arcs,
-            blend=fitted.blend, resolution=resolution, kernels=kernel_set,  # type: ignore[arg-type]
+            *pixel_gaussians, flare.opacities, flare.colours, width, height, rings=flare.rings, arcs=arcs,
+            blend=rendered.blend, resolution=resolution, kernels=kernel_set,  # type: ignore[arg-type]
         )  # fmt: skip
 
-    def rendered() -> Tensor:
+    def render_scene() -> Tensor:
         return scene.render(camera, kernels=kernel_set, depth=False).colour  # type: ignore[arg-type]
 
-    flare = deformed()
-    placed = pixels(flare, intrinsics)
-    arcs = None if flare.arcs is None else slopes(flare.arcs, placed[1], intrinsics)
-    behind, front = rendered(), splat(
-        *placed, flare.opacities, flare.colours, width, height, blend=fitted.blend, kernels=kernel_set  # type: ignore[arg-type]
+    flare = evaluate_flares()
+    pixel_gaussians = pixels(flare, intrinsics)
+    arcs = None if flare.arcs is None else pixel_arcs(flare.arcs, pixel_gaussians[1], intrinsics)
+    behind, front = render_scene(), splat(
+        *pixel_gaussians, flare.opacities, flare.colours, width, height, blend=rendered.blend, kernels=kernel_set  # type: ignore[arg-type]
     )
     work: tuple[Callable[[], object], ...] = (
-        deformed, lambda: pixels(flare, intrinsics), raster("full"), raster("mixed"), rendered,
-        lambda: composite(behind, front, fitted.blend),
+        evaluate_flares, lambda: pixels(flare, intrinsics), raster("full"), raster("mixed"), render_scene,
+        lambda: composite(behind, front, rendered.blend),
     )  # fmt: skip
     return dict(zip(STAGES, work, strict=True))
 
 
-def measured(fitted: Fitted, kernel_set: str, device: str, rounds: int) -> str:
+def measure(rendered: RenderedScene, kernel_set: str, device: str, rounds: int) -> str:
     """The table."""
     rows = []
     for width, height in SIZES:
         for lights in (1, 2, 3):
-            times = medians(stages(fitted, lights, width, height, kernel_set, device), rounds)
+            times = median_times(stages(rendered, lights, width, height, kernel_set, device), rounds)
             shared = sum(times[stage] for stage in ("deformation", "projection", "scene", "composite"))
             full, mixed = shared + times["flare raster"], shared + times["flare raster, mixed"]
             paper = (str(DEFORMATION[lights]), "10.79" if lights == 1 else "–") if width == 1920 else ("–", "–")
@@ -140,8 +140,8 @@ def measured(fitted: Fitted, kernel_set: str, device: str, rounds: int) -> str:
 
 
 def main() -> None:
-    """See the module's head."""
-    parser = argparse.ArgumentParser(description="Frames per second of a fitted scene, each stage apart.")
+    """Time the stages and write the table."""
+    parser = argparse.ArgumentParser(description="Frames per second of a fitted scene, and the time of each stage.")
     parser.add_argument("--run", type=Path, help="folder of a run; a synthetic scene without it")
     parser.add_argument("--form", choices=("paper", "ours"), default="paper", help="of the synthetic flares")
     parser.add_argument("--blend", choices=("over", "add"), default="over", help="of the synthetic flares")
@@ -149,22 +149,21 @@ def main() -> None:
     parser.add_argument("--kernels", default="auto", choices=["auto", *kernels.MODULES])
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--out", type=Path, default=report.RESULTS / "rasterizer.md")
-    arguments = parser.parse_args()
-    if arguments.run:
-        fitted = of_run(arguments.run)
-    else:
-        fitted = synthetic(PAPER if arguments.form == "paper" else OURS, arguments.blend)
+    args = parser.parse_args()
+    form = PAPER if args.form == "paper" else OURS
+    rendered = load_run(args.run) if args.run else synthetic(form, args.blend)
     conditions = report.conditions()
     with torch.no_grad():
-        text = measured(fitted, arguments.kernels, arguments.device, arguments.rounds)
+        text = measure(rendered, args.kernels, args.device, args.rounds)
     what = (
-        f"{len(fitted.scene):,} scene Gaussians, {fitted.flares[0].count:,} for each light, blend {fitted.blend}, "
-        f"{'a run' if arguments.run else f'synthetic, untrained flares of the form {arguments.form!r}'}, "
-        f"on {arguments.device.upper()}, {torch.get_num_threads()} threads. Scene: projection, sorting and raster."
+        f"{len(rendered.scene):,} scene Gaussians, {rendered.flares[0].count:,} for each light, "
+        f"blend {rendered.blend}, "
+        f"{'a run' if args.run else f'synthetic, untrained flares of the form {args.form!r}'}, "
+        f"on {args.device.upper()}, {torch.get_num_threads()} threads. Scene: projection, sorting and raster."
     )
-    name = "a run" if arguments.run else f"{arguments.form}, {arguments.blend}"
+    name = "a run" if args.run else f"{args.form}, {args.blend}"
     text = f"## Rendering: {name}\n\n{what}\n\n{text}\n\n{conditions}"
-    report.write_section(arguments.out, f"render {name}", text)
+    report.write_section(args.out, f"render {name}", text)
     sys.stdout.write(text + "\n")
 
 

@@ -22,7 +22,7 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def milliseconds(seconds: float | None) -> str:
-    """Three digits; a dash for what was not measured."""
+    """Format with three digits; a dash for None."""
     if seconds is None:
         return "–"
     value = seconds * 1e3

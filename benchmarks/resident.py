@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Memory of the process that is measured, told by itself; `memory.py` asks from outside."""
+"""Memory of the calling process; `memory.py` measures other processes."""
 from __future__ import annotations
 
 import sys
@@ -10,15 +10,15 @@ import psutil
 _MEGABYTE = 1e6
 
 
-def held() -> float:
-    """MB, now."""
+def resident_memory() -> float:
+    """Return the resident memory, MB."""
     return float(psutil.Process().memory_info().rss) / _MEGABYTE
 
 
-def held_at_most() -> float:
-    """MB, since this program began.
+def peak_memory() -> float:
+    """Return the peak resident memory of this program, MB.
 
-    Linux' getrusage would count the program that started this one, too.
+    On Linux getrusage would include the parent process.
     """
     if sys.platform == "win32":
         return float(psutil.Process().memory_info().peak_wset) / _MEGABYTE

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A fit rendered at other sizes than its own, by the grid of pixels it was learned on and without.
+"""A fit rendered at other sizes than its own, with the low-pass filter of its pixel grid and without.
 
     python benchmarks/sizes.py CAPTURE ... [--preset draft] [--size 240]
 
-Captures with exact layers (truth/), against which the views that were held out are scored at each size. The light of
-the flare is a part of that which the fit shows at its own size.
+The captures need exact layers (truth/), with which the held-out views are compared at each size. The light of the flare
+is relative to that at the fit's own size.
 """
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ from core.errors import CaptureError
 from core.fit import Run, fit, preset
 from core.metrics.pictures import psnr
 
-TIMES = (0.25, 0.5, 0.75, 1.0, 1.5, 2.0)
+SCALES = (0.25, 0.5, 0.75, 1.0, 1.5, 2.0)
 COLUMNS = ("size", "", "scene, dB", "composite", "linear flare", "its light")
 
 
 def scores(run: Run, capture: Capture, views: Sequence[View], width: int) -> tuple[float, float, float, float]:
-    """PSNR of scene, composite and linear flare, and the flare's light, means over the views."""
+    """Return PSNR of scene, composite and linear flare, and the flare's mean light, averaged over the views."""
     rows = []
     for view in views:
         camera = view.camera.scaled(width)
@@ -42,28 +42,28 @@ def scores(run: Run, capture: Capture, views: Sequence[View], width: int) -> tup
         if len(exact) < 2:
             raise CaptureError(f"{capture.folder} has no exact layers of {view.name}.")
         scene, flare = exact
-        found = np.sum([*layers.flare_by_light.values()], axis=0)
-        shown = [srgb_from_linear(np.clip(one, 0, 1)) for one in (layers.scene, scene, layers.scene + found,
+        flare_sum = np.sum([*layers.flare_by_light.values()], axis=0)
+        display = [srgb_from_linear(np.clip(one, 0, 1)) for one in (layers.scene, scene, layers.scene + flare_sum,
                                                                   scene + flare)]
-        rows.append((psnr(shown[0], shown[1]), psnr(shown[2], shown[3]),
-                     psnr(np.clip(found, 0, 1), np.clip(flare, 0, 1)), float(found.mean())))
+        rows.append((psnr(display[0], display[1]), psnr(display[2], display[3]),
+                     psnr(np.clip(flare_sum, 0, 1), np.clip(flare, 0, 1)), float(flare_sum.mean())))
     first, second, third, fourth = np.mean(np.array(rows, np.float64), 0).tolist()
     return first, second, third, fourth
 
 
-def compared(run: Run, capture: Capture, own: int, most: int) -> list[list[str]]:
-    """A row for each size and way."""
+def compare_sizes(run: Run, capture: Capture, fitted_width: int, max_width: int) -> list[list[str]]:
+    """Return a row for each size, with the pixel grid and without."""
     _, views = capture.split(run.settings.holdout)
     scene, flare = run.scene, run.flare
     assert flare is not None
-    grids = {"by its grid": (scene.sampling, flare.sampling), "without": (None, None)}
-    light = scores(run, capture, views, own)[3]
+    grids = {"by its grid": (scene.pixel_grid, flare.pixel_grid), "without": (None, None)}
+    light = scores(run, capture, views, fitted_width)[3]
     rows = []
-    for width in sorted({min(round(times * own), most) for times in TIMES}):
+    for width in sorted({min(round(scale * fitted_width), max_width) for scale in SCALES}):
         for name, (of_scene, of_flare) in grids.items():
-            scene.sampling, flare.sampling = of_scene, of_flare
-            *found, total = scores(run, capture, views, width)
-            rows.append([f"{width}", name, *(f"{value:.2f}" for value in found), f"{total / light:.2f}"])
+            scene.pixel_grid, flare.pixel_grid = of_scene, of_flare
+            *flare_sum, total = scores(run, capture, views, width)
+            rows.append([f"{width}", name, *(f"{value:.2f}" for value in flare_sum), f"{total / light:.2f}"])
     return rows
 
 
@@ -73,14 +73,14 @@ def main() -> None:
     parser.add_argument("captures", type=Path, nargs="+")
     parser.add_argument("--preset", choices=OUR_PRESETS, default="draft")
     parser.add_argument("--size", type=int, default=240, help="width at which it is fitted")
-    words = parser.parse_args()
-    for folder in words.captures:
+    args = parser.parse_args()
+    for folder in args.captures:
         capture = Capture.open(folder)
-        most = max(view.camera.width for view in capture.views)
-        with tempfile.TemporaryDirectory() as place:
-            run = fit(capture, replace(preset(words.preset), width=words.size), Path(place) / "run")
-            rows = compared(run, capture, words.size, most)
-        print(f"{folder.name}, preset {words.preset}, fitted at {words.size} pixels\n")
+        max_width = max(view.camera.width for view in capture.views)
+        with tempfile.TemporaryDirectory() as folder_name:
+            run = fit(capture, replace(preset(args.preset), width=args.size), Path(folder_name) / "run")
+            rows = compare_sizes(run, capture, args.size, max_width)
+        print(f"{folder.name}, preset {args.preset}, fitted at {args.size} pixels\n")
         print(report.table(COLUMNS, rows))
 
 

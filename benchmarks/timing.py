@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Side-by-side timing: what is compared takes turns, so that all of it meets the same weather."""
+"""Side-by-side timing: the cases take turns, so that other load affects all of them alike."""
 from __future__ import annotations
 
 import statistics
@@ -9,12 +9,12 @@ from contextlib import contextmanager
 
 import torch
 
-PATIENCE = 0.25
-"""Seconds that a case may take at each turn, if it is short enough to be repeated."""
+MAX_CASE_SECONDS = 0.25
+"""Seconds up to which a short case is repeated in each turn."""
 
 
-def once(work: Callable[[], object]) -> float:
-    """Seconds of one call, with what it started on a GPU."""
+def time_once(work: Callable[[], object]) -> float:
+    """Return the seconds of one call, including its work on a GPU."""
     start = time.perf_counter()
     work()
     if torch.cuda.is_available():
@@ -22,22 +22,22 @@ def once(work: Callable[[], object]) -> float:
     return time.perf_counter() - start
 
 
-def medians(cases: Mapping[str, Callable[[], object]], rounds: int) -> dict[str, float]:
-    """Median seconds of each case over rounds in which each has its turn; a first call goes before."""
+def median_times(cases: Mapping[str, Callable[[], object]], rounds: int) -> dict[str, float]:
+    """Return the median seconds of each case over rounds in which the cases take turns, after a warm-up call."""
     samples: dict[str, list[float]] = {name: [] for name in cases}
     repeats = {}
     for name, work in cases.items():
-        once(work)
-        repeats[name] = max(1, min(30, int(PATIENCE / once(work))))
+        time_once(work)
+        repeats[name] = max(1, min(30, int(MAX_CASE_SECONDS / time_once(work))))
     for _ in range(rounds):
         for name, work in cases.items():
-            samples[name] += [once(work) for _ in range(repeats[name])]
+            samples[name] += [time_once(work) for _ in range(repeats[name])]
     return {name: statistics.median(values) for name, values in samples.items()}
 
 
 @contextmanager
-def threads(count: int) -> Iterator[None]:
-    """Runs the body on this many threads of torch, and of the kernels that follow it."""
+def torch_threads(count: int) -> Iterator[None]:
+    """Run the body with this number of threads of torch, which the kernels use too."""
     before = torch.get_num_threads()
     torch.set_num_threads(count)
     try:
@@ -47,10 +47,10 @@ def threads(count: int) -> Iterator[None]:
 
 
 def on_threads(count: int, work: Callable[[], object]) -> Callable[[], object]:
-    """The same work on this many threads."""
+    """Return the work with this number of threads."""
 
     def run() -> None:
-        with threads(count):
+        with torch_threads(count):
             work()
 
     return run

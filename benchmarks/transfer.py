@@ -147,17 +147,18 @@ def main() -> None:
     parser.add_argument("--out", type=Path)
     args = parser.parse_args()
 
-    truths = Run.open(args.run)
+    run = Run.open(args.run)
     look = read(args.run / FLARE)
-    capture = Capture.open(truths.capture_folder if truths.capture_folder.is_dir() else "sample_scenes/desk",
+    capture = Capture.open(run.capture_folder if run.capture_folder.is_dir() else "sample_scenes/desk",
                            need_frames=False)
-    training = [view.camera.world_to_camera for view in capture.split(truths.settings.holdout)[0]]
+    training = [view.camera.world_to_camera for view in capture.split(run.settings.holdout)[0]]
     if args.to:
         truths, transfer_target = rendered_target(args.to, args.scene, look)
     else:
         truths = target(args.frames, args.world, (args.width, args.width * 5 // 8), look)
         transfer_target = shot_target(Shot(args.run / FLARE, tuple(truth.shot for truth in truths)), look, {})
-    transfer = Transfer(args.run / FLARE, transfer_target, TransferSettings(query=args.query, smooth=args.smooth), training)
+    settings = TransferSettings(query=args.query, smooth=args.smooth)
+    transfer = Transfer(args.run / FLARE, transfer_target, settings, training)
     ranges = {light.name: transfer.training_views[light.name] for light in look.lights}
 
     rows: list[dict[str, Any]] = []
@@ -197,7 +198,7 @@ def main() -> None:
 
 
 def is_inside(training: object, view: ViewOfLight, distance: float) -> bool:
-    """Whether a light stands where training saw it: in the frame's quadrant-folded plane and at its distances."""
+    """Return whether a light is in the range of the training views: of its position, up to mirroring, and distance."""
     lights, distances = np.abs(training.lights), training.distances  # type: ignore[attr-defined]
     place = np.abs(view.light)
     return bool((place <= lights.max(0)).all() and distances.min() <= distance <= distances.max())

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The Gaussians that engines are timed on: the same for all of them, from a seed.
+"""The Gaussians that rasterizers are timed on: the same for all of them, from a seed.
 
 A scene fills the part of a frustum (60 degrees across, 16:9) between the depths 2 and 10, in front of a camera
 at the origin that looks along +z. Scales are log-normal about a size that falls with the square root of the
@@ -19,8 +19,8 @@ TAN = math.tan(math.radians(30))
 
 
 class Scene(NamedTuple):
-    """Parameters as they are optimised: means (n, 3), log_scales (n, 3), quaternions (n, 4) of any length,
-    opacity_logits (n,), sh (n, 16, 3)."""
+    """Parameters of a scene: means (n, 3), log_scales (n, 3), quaternions (n, 4) of any length, opacity_logits (n,),
+    sh (n, 16, 3)."""
 
     means: Tensor
     log_scales: Tensor
@@ -39,7 +39,7 @@ class Flares(NamedTuple):
 
 
 def scene(n: int, seed: int = 0) -> Scene:
-    """n Gaussians."""
+    """Return a scene of n Gaussians."""
     rng = np.random.default_rng(seed)
     z = rng.uniform(2, 10, n)
     x = z * TAN * rng.uniform(-1.1, 1.1, n)
@@ -55,13 +55,13 @@ def scene(n: int, seed: int = 0) -> Scene:
 
 
 def intrinsics(width: int, height: int) -> Tensor:
-    """(3, 3)."""
+    """Return the matrix (3, 3) of the camera."""
     focal = width / (2 * TAN)
     return torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
 
 
 def flares(n: int, width: int, height: int, seed: int = 1) -> Flares:
-    """n flare Gaussians for a picture of this size."""
+    """Return n flare Gaussians for a picture of this size."""
     rng = np.random.default_rng(seed)
     covered = np.exp(rng.uniform(math.log(0.05), math.log(0.4), n)) * width * height
     opacities = np.exp(rng.uniform(math.log(0.006), math.log(0.03), n))

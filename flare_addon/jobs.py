@@ -23,6 +23,7 @@ import subprocess
 import time
 import traceback
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -52,20 +53,28 @@ ON_FINISHED: dict[str, Callable[[Job], None]] = {}
 _jobs: dict[str, Job] = {}
 
 
-class Job:
-    """One command of the engine.
+@dataclass
+class Origin:
+    """The process that a job runs in.
 
-    done, total: steps of `stage`. eta_s: remaining seconds, None where unknown. log_offset: size of the log before the
-    command, bytes. host: id of its machine, `host_name` its name for people. started: seconds since the epoch, which
-    tells the process from a later one of the same number.
+    pid: its number, 0 where it has ended. host: id of its machine, `host_name` its name for people. started: seconds
+    since the epoch, which tells the process from a later one of the same number. log_offset: bytes that the log had
+    before.
     """
 
-    def __init__(self, kind: str, folder: Path, pid: int, process: subprocess.Popen[bytes] | None,
-                 args: Sequence[str] = (), host: str = HOST, log_offset: int = 0, host_name: str = "",
-                 started: float = 0.0) -> None:
-        self.kind, self.folder, self.pid, self.host, self.log_offset = kind, folder, pid, host, log_offset
-        self.started = started
-        self.host_name = host_name or host
+    pid: int
+    host: str = HOST
+    host_name: str = ""
+    started: float = 0.0
+    log_offset: int = 0
+
+
+class Job:
+    """One command of the engine. done, total: steps of `stage`. eta_s: remaining seconds, None where unknown."""
+
+    def __init__(self, kind: str, folder: Path, origin: Origin, args: Sequence[str] = (),
+                 process: subprocess.Popen[bytes] | None = None) -> None:
+        self.kind, self.folder, self.origin = kind, folder, origin
         self.args = [arg for arg in args if arg != "--overwrite"]
         self.state: State = "running"
         self.stage, self.done, self.total, self.eta_s = "starting", 0, 0, None
@@ -118,9 +127,11 @@ class Job:
         self.stage = "stopping"
         with contextlib.suppress(OSError):
             (self.folder / STOP).touch()
-        if not WINDOWS and self.host == HOST and (self._process or processes.is_same_process(self.pid, self.started)):
+        origin = self.origin
+        if not WINDOWS and origin.host == HOST and (
+                self._process or processes.is_same_process(origin.pid, origin.started)):
             with contextlib.suppress(OSError):
-                os.kill(self.pid, signal.SIGINT)
+                os.kill(origin.pid, signal.SIGINT)
 
     def _read(self) -> bool:
         """Read and handle one piece of new events; return whether there was any."""
@@ -160,11 +171,11 @@ class Job:
         """Return whether the process of the job is running."""
         if self._process is not None:
             return self._process.poll() is None
-        if self.host != HOST:
+        if self.origin.host != HOST:
             while self._read():
                 pass
             return not (self._has_result or self.error or self._is_silent())
-        return self.pid > 0 and processes.is_running(self.pid)
+        return self.origin.pid > 0 and processes.is_running(self.origin.pid)
 
     def _is_silent(self) -> bool:
         """Return whether a job on another machine has written no event for SILENCE_LIMIT_S."""
@@ -182,10 +193,10 @@ class Job:
             self.state = "stopped"
         elif self.error:
             self.state = "failed"
-        elif self.host != HOST and is_folder(self.folder):
+        elif self.origin.host != HOST and is_folder(self.folder):
             self.state = "failed"
-            self.error = (f"The engine on {self.host_name} has reported nothing for an hour; check there whether it "
-                          f"still runs in {self.folder}.")
+            self.error = (f"The engine on {self.origin.host_name or self.origin.host} has reported nothing for an "
+                          f"hour; check there whether it still runs in {self.folder}.")
         elif not is_folder(self.folder):
             self.state, self.error = "failed", f"The folder {self.folder} was removed while the engine used it."
         elif _is_full(self.folder):  # the error event could not be written either
@@ -200,7 +211,7 @@ class Job:
     def _last_log_line(self) -> str:
         """Return the last line of the job's log in brackets and quotes; "" without one."""
         try:
-            text = self.log.read_bytes()[self.log_offset:].decode("utf-8", errors="replace")
+            text = self.log.read_bytes()[self.origin.log_offset:].decode("utf-8", errors="replace")
         except OSError:
             return ""
         lines = [line.strip() for line in text.splitlines() if line.strip()]
@@ -251,7 +262,7 @@ def start(kind: str, folder: Path, command: Sequence[str], environment: Mapping[
         if problem.errno in DISK_FULL:
             raise RunError(os_error_message(problem)) from problem
         raise RunError(f"{folder} cannot be used ({problem.strerror or problem}); choose another folder.") from problem
-    job = Job(kind, folder, process.pid, process, [str(arg) for arg in args], log_offset=log_offset)
+    job = Job(kind, folder, Origin(process.pid, log_offset=log_offset), [str(arg) for arg in args], process)
     _jobs[_key(folder)] = job
     if bpy.app.background:
         _wait(job)
@@ -290,9 +301,9 @@ def find(folder: Path | str | None) -> Job | None:
         host = HOST if host == platform.node() else host  # and the next the name of a Mac
         started = float(record["started"])
         is_running = host == HOST and processes.is_same_process(pid, started)
-        job = Job(str(record["kind"]), folder, pid if is_running else 0, None,
-                  list(map(str, record.get("args", record.get("words", ())))), host,
-                  int(record.get("log_from", 0)), str(record.get("host_name", "")), started)
+        origin = Origin(pid if is_running else 0, host, str(record.get("host_name", "")), started,
+                        int(record.get("log_from", 0)))
+        job = Job(str(record["kind"]), folder, origin, list(map(str, record.get("args", record.get("words", ())))))
     except (OSError, ValueError, KeyError, TypeError):
         return None
     _jobs[_key(folder)] = job

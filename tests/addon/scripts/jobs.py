@@ -69,11 +69,12 @@ jobs.stop_watching(goes_on.folder)
 
 # ---- this machine -----------------------------------------------------------------------------------
 facts["written by the version before"] = [jobs.find(begun("old", GOES_ON)).state,
-                                          jobs.find(begun("by name", GOES_ON, host=platform.node())).host == jobs.HOST]
+                                          jobs.find(begun("by name", GOES_ON,
+                                                          host=platform.node())).origin.host == jobs.HOST]
 later = jobs.find(begun("later", GOES_ON, started=time.time() + 3600))  # as when this machine was started anew since
 facts["its number is an older process's"] = later.state
 found = jobs.find(begun("given out again", GOES_ON))
-found.started -= 3600  # as when its engine ended unseen, and the number went to another process
+found.origin.started -= 3600  # as when its engine ended unseen, and the number went to another process
 found.stop()
 time.sleep(0.5)
 facts["the stranger lives"] = sleeper.poll() is None

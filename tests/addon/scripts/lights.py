@@ -24,6 +24,7 @@ ops = bpy.ops.fit_flare
 fits, lights, looks, shots = (part(f"flare_addon.{name}") for name in ("fits", "lights", "looks", "shots"))
 depsgraph_of = part("flare_addon.objects").depsgraph_of
 read_lights, errors = part("core.capture").read_lights, part("core.errors")
+engine_jobs = part("flare_addon.jobs")
 facts: dict[str, object] = {}
 
 
@@ -206,7 +207,7 @@ for how in ("open", "closed"):
     lights.write_to_capture(scene, capture)
     scene.fit_flare.run = str(run)
     if how == "open":
-        job = part("flare_addon.jobs").Job("fit", run, 0, None)
+        job = engine_jobs.Job("fit", run, engine_jobs.Origin(0))
         job.state = "done"
         fits.on_fit_finished(job)
     else:
@@ -234,7 +235,7 @@ lamp.fit_flare.light = "desk lamp"
 bpy.context.view_layer.update()
 stood = lamp.matrix_world.translation.copy()
 path.write_text(json.dumps({"lights": [*json.loads(path.read_text())["lights"], {"name": "more", "xyz": [1, 2, 3]}]}))
-job = part("flare_addon.jobs").Job("lights", capture / "lights", 0, None)
+job = engine_jobs.Job("lights", capture / "lights", engine_jobs.Origin(0))
 job.state = "done"
 fits.on_lights_found(job)
 bpy.context.view_layer.update()
@@ -264,7 +265,7 @@ bpy.ops.scene.new(type="EMPTY")
 bpy.context.scene.name = "Second"
 facts["added in the second"] = refusal(lambda: ops.add_light(name="own"))
 path.write_text(json.dumps({"lights": [*only, {"name": "later", "xyz": [1, 2, 3]}]}))
-job = part("flare_addon.jobs").Job("lights", capture / "lights", 0, None)
+job = engine_jobs.Job("lights", capture / "lights", engine_jobs.Origin(0))
 job.state = "done"
 fits.on_lights_found(job)
 facts["of each scene"] = {one.name: [lights.light_name(item) for item in lights.scene_lights(one)]

@@ -1,15 +1,14 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""How well light sources are found: in single pictures, and in 3D.
+"""Accuracy of the detection of lights: in single pictures, and in 3D.
 
     python benchmarks/detection.py --photos PHOTOS [--pictures 500] [--method exposure]
     python benchmarks/detection.py --capture sample_scenes/desk
 
 Pictures: 1 to 5 synthetic sources over each photograph (light_composer.py), the union of detected masks
 against the union of exact masks by pixel (precision, recall, F1, IoU over all pictures together, as in the
-appendix of the paper), by threshold of the score, and by light: found where a detection's centroid lies on
-it. Two truths: `shape` is the emitting shape alone, `glare` the region that the source and its own glare clip,
-which is all that a picture shows of it. The photographs are taken as they are: lamps and windows of their own
-count against the detector.
+appendix of the paper), by threshold of the score, and by light: detected where a centroid lies on it. Two
+truths: `shape` is the emitting shape, `glare` the region that the light and its glow clip, which is all that
+a picture shows of it. The photographs are unchanged: their own lamps and windows count against the detector.
 
 Captures: lights found from the frames against lights.json, in pixels (median over the views that have the
 light in frame) and in scene units.
@@ -41,7 +40,7 @@ class Tally:
     """Counts over all pictures at one threshold."""
 
     pixels: dict[str, np.ndarray] = field(default_factory=lambda: {"shape": np.zeros(3), "glare": np.zeros(3)})
-    found: int = 0
+    detected: int = 0
     lights: int = 0
     false: int = 0
 
@@ -51,12 +50,12 @@ class Tally:
         for name, truth in (("shape", picture.masks.any(axis=0)), ("glare", picture.clipped)):
             self.pixels[name] += [(claimed & truth).sum(), (claimed & ~truth).sum(), (truth & ~claimed).sum()]
         hit = set()
-        for one in detections:
-            x, y = one.xy.astype(int)
+        for detection in detections:
+            x, y = detection.xy.astype(int)
             on = np.flatnonzero(picture.masks[:, y, x])
             hit.update(on.tolist())
             self.false += not len(on)
-        self.found += len(hit)
+        self.detected += len(hit)
         self.lights += len(picture.masks)
 
     def row(self, truth: str) -> tuple[float, float, float, float]:
@@ -80,7 +79,7 @@ def in_pictures(detector: Detector, photos: Sequence[Path], number: int, seed: i
     for picture in pictures(photos, number, seed):
         detections = detector.detect(picture.picture)
         for threshold, tally in tallies.items():
-            tally.add(picture, [one for one in detections if one.score >= threshold])
+            tally.add(picture, [detection for detection in detections if detection.score >= threshold])
     return tallies
 
 
@@ -93,14 +92,14 @@ def in_captures(folders: Sequence[Path], detector: Detector) -> None:
         except FitFlareError as problem:
             print(f"skipped: {problem}")
             continue
-        found = find_lights(capture, detector).lights
-        left = list(found)
+        lights = find_lights(capture, detector).lights
+        unmatched = list(lights)
         for light in capture.lights:
-            if not left:
+            if not unmatched:
                 print(f"{folder.name:24s} {light.name:12s} not found")
                 continue
-            nearest = min(left, key=lambda one: float(np.linalg.norm(one.xyz - light.xyz)))
-            left.remove(nearest)
+            nearest = min(unmatched, key=lambda other: float(np.linalg.norm(other.xyz - light.xyz)))
+            unmatched.remove(nearest)
             off = []
             for view in capture.views:
                 pixel, depth = view.camera.project([light.xyz])
@@ -109,11 +108,11 @@ def in_captures(folders: Sequence[Path], detector: Detector) -> None:
             error = float(np.linalg.norm(nearest.xyz - light.xyz))
             print(f"{folder.name:24s} {light.name:12s} {error:9.4f} {error / capture.extent:9.4f} "
                   f"{np.median(off):9.3f} {len(nearest.support):4d}/{nearest.visible}")
-        print(f"{folder.name:24s} {len(capture.lights)} lights, {len(found)} found, {len(left)} invented")
+        print(f"{folder.name:24s} {len(capture.lights)} lights, {len(lights)} found, {len(unmatched)} false")
 
 
 def main() -> None:
-    """Read the words and print the tables."""
+    """Parse the arguments and print the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--photos", type=Path, help="folder of photographs, searched with its subfolders")
     parser.add_argument("--pictures", type=int, default=500)
@@ -122,22 +121,22 @@ def main() -> None:
     parser.add_argument("--boxes", help="GroundingDINO's weights: folder or hub name")
     parser.add_argument("--masks", help="SAM 2's weights: folder or hub name")
     parser.add_argument("--seed", type=int, default=0)
-    words = parser.parse_args()
-    for method in words.method or ["exposure", "grounded"]:
+    args = parser.parse_args()
+    for method in args.method or ["exposure", "grounded"]:
         try:
-            detector = detector_for(method, THRESHOLDS[0], words.boxes, words.masks)
+            detector = detector_for(method, THRESHOLDS[0], args.boxes, args.masks)
         except EngineError as problem:
             print(f"{method}: skipped. {problem}")
             continue
-        if words.photos is not None:
-            photos = list_pictures(words.photos, PHOTO_SUFFIXES, "all")
+        if args.photos is not None:
+            photos = list_pictures(args.photos, PHOTO_SUFFIXES, "all")
             if not photos:
-                print(f"{method}: skipped, {words.photos} holds no photographs.")
+                print(f"{method}: skipped, {args.photos} holds no photographs.")
             else:
-                _print(method, in_pictures(detector, photos, words.pictures, words.seed), words.pictures)
-        if words.capture:
-            in_captures(words.capture, detector_for(method, None, words.boxes, words.masks))
-    if words.photos is None and not words.capture:
+                _print(method, in_pictures(detector, photos, args.pictures, args.seed), args.pictures)
+        if args.capture:
+            in_captures(args.capture, detector_for(method, None, args.boxes, args.masks))
+    if args.photos is None and not args.capture:
         print("Nothing to measure: give --photos FOLDER, --capture FOLDER or both.")
 
 
@@ -147,8 +146,8 @@ def _print(method: str, tallies: dict[float, Tally], number: int) -> None:
     print("threshold |  P     R     F1    IoU   |  P     R     F1    IoU   | recall  precision  false a picture")
     for threshold, tally in tallies.items():
         cells = " | ".join(" ".join(f"{x:.3f}" for x in tally.row(truth)) + " " for truth in ("shape", "glare"))
-        precision = tally.found / max(tally.found + tally.false, 1)
-        print(f"   {threshold:.2f}   | {cells} |  {tally.found / max(tally.lights, 1):.3f}    {precision:.3f}      "
+        precision = tally.detected / max(tally.detected + tally.false, 1)
+        print(f"   {threshold:.2f}   | {cells} |  {tally.detected / max(tally.lights, 1):.3f}    {precision:.3f}      "
               f"{tally.false / number:.2f}")
     for truth in ("shape", "glare"):
         threshold = max(tallies, key=lambda t: tallies[t].row(truth)[2])

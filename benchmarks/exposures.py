@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Frames whose exposure changes, fitted as if it did not and as it is found.
+"""Fits of frames whose exposure changes, with a fixed and with a measured exposure.
 
     python benchmarks/exposures.py CAPTURE ... [--stops 0.7] [--preset draft] [--size 240]
 
-The frames of captures of one exposure, and their flare-free frames and exact layers, are brought to a light that goes
-up and down by so many stops along the shot, and rounded and clipped as files are. Held-out views are scored against
-them, beside those of the captures as they are.
+The frames, clean frames and exact layers of captures of constant exposure are multiplied by a factor that varies by so
+many stops along the shot, then rounded and clipped as in files. Held-out views are scored against them, and those of
+the unchanged captures for comparison.
 """
 from __future__ import annotations
 
@@ -30,33 +30,33 @@ from core.fit import Run, fit, preset
 from core.images.picture import Picture
 from core.metrics.evaluation import LAYERS, evaluate
 
-COLUMNS = ("mode", "frames", "fitted as", *LAYERS, "found, stops off")
+COLUMNS = ("mode", "frames", "fitted as", *LAYERS, "error, stops")
 ROUNDS = 1.5
-"""Times that the light goes up and down."""
+"""Periods of that variation along the shot."""
 
 
 class Drifting(Capture):
-    """A capture, each view times some light; clipped at white, in 8 bits."""
+    """A capture whose views are multiplied by factors; clipped at white, in 8 bits."""
 
     def __init__(self, capture: Capture, times: Mapping[str, float]) -> None:
         self.__dict__.update(capture.__dict__)
         self.times = times
 
     def frame(self, view: View, size: tuple[int, int] | None = None) -> Picture:
-        """As filmed."""
+        """Return the frame as a camera of that exposure films it."""
         return self._filmed(super().frame(view, size), view)
 
     def removed(self, view: View, size: tuple[int, int] | None = None) -> Picture | None:
-        """Without flare."""
+        """Return its clean frame."""
         picture = super().removed(view, size)
         return None if picture is None else self._filmed(picture, view)
 
     def truth_scene(self, view: View, size: tuple[int, int] | None = None) -> Picture | None:
-        """The exact layer."""
+        """Return its exact scene layer."""
         return self._lit(super().truth_scene(view, size), view)
 
     def truth_flare(self, view: View, size: tuple[int, int] | None = None) -> Picture | None:
-        """The exact layer."""
+        """Return its exact flare layer."""
         return self._lit(super().truth_flare(view, size), view)
 
     def _filmed(self, picture: Picture, view: View) -> Picture:
@@ -68,34 +68,35 @@ class Drifting(Capture):
 
 
 def scores(run: Run, capture: Capture) -> list[str]:
-    """PSNR of each layer, dB, means over the views that were held out."""
+    """PSNR of each layer, dB, means over the held-out views."""
     _, views = capture.with_exposures(run.exposures).split(run.settings.holdout)
     cameras = {view: view.camera.scaled(run.settings.width) for view in views}
-    found: dict[str, Any] = evaluate(run, capture, cameras)
-    return [f"{found[layer]['psnr']:.2f}" if layer in found else "-" for layer in LAYERS]
+    results: dict[str, Any] = evaluate(run, capture, cameras)
+    return [f"{results[layer]['psnr']:.2f}" if layer in results else "-" for layer in LAYERS]
 
 
-def compared(capture: Capture, mode: str, words: argparse.Namespace) -> list[list[str]]:
-    """A row for the capture as it is, and for each way to fit it drifting."""
+def compare(capture: Capture, mode: str, args: argparse.Namespace) -> list[list[str]]:
+    """A row for the unchanged capture, and one for each way to fit the drifting one."""
     count = len(capture.views)
-    stops = {view.name: words.stops * math.sin(2 * math.pi * ROUNDS * number / count)
+    stops = {view.name: args.stops * math.sin(2 * math.pi * ROUNDS * number / count)
              for number, view in enumerate(capture.views)}
-    drifting = Drifting(capture, {name: 2**one for name, one in stops.items()})
+    drifting = Drifting(capture, {name: 2**stop for name, stop in stops.items()})
     rows = []
-    for name, one, way in (("as they are", capture, "found"), ("drifting", drifting, "fixed"),
-                           ("drifting", drifting, "found")):
-        settings = replace(preset(words.preset, mode=mode), width=words.size, exposure=way)  # type: ignore[arg-type]
+    for name, frames, exposure in (("as they are", capture, "measured"), ("drifting", drifting, "fixed"),
+                           ("drifting", drifting, "measured")):
+        settings = replace(preset(args.preset, mode=mode), width=args.size, exposure=exposure)  # type: ignore[arg-type]
         with tempfile.TemporaryDirectory() as place:
-            run = fit(one, settings, Path(place) / "run")
-            rows.append([mode, name, way, *scores(run, one), _off(run.exposures, stops if one is drifting else {})])
+            run = fit(frames, settings, Path(place) / "run")
+            error = _error(run.exposures, stops if frames is drifting else {})
+            rows.append([mode, name, exposure, *scores(run, frames), error])
     return rows
 
 
-def _off(found: Mapping[str, float], stops: Mapping[str, float]) -> str:
-    """Standard deviation from the true ones."""
-    if not found:
-        return "nothing found"
-    return f"{np.std([math.log2(one) - stops.get(name, 0.0) for name, one in found.items()]):.3f}"
+def _error(estimated: Mapping[str, float], stops: Mapping[str, float]) -> str:
+    """Standard deviation from the true exposures, stops."""
+    if not estimated:
+        return "none"
+    return f"{np.std([math.log2(value) - stops.get(name, 0.0) for name, value in estimated.items()]):.3f}"
 
 
 def main() -> None:
@@ -105,12 +106,12 @@ def main() -> None:
     parser.add_argument("--stops", type=float, default=0.7, help="to either side")
     parser.add_argument("--preset", choices=OUR_PRESETS, default="draft")
     parser.add_argument("--size", type=int, default=240, help="width at which it is fitted")
-    words = parser.parse_args()
-    for folder in words.captures:
+    args = parser.parse_args()
+    for folder in args.captures:
         capture = Capture.open(folder)
         modes = ["split", *(["default"] if capture.has_removed or capture.has_truth else [])]
-        rows = [row for mode in modes for row in compared(capture, mode, words)]
-        print(f"{folder.name}, {words.stops:g} stops to either side, preset {words.preset}, {words.size} pixels\n")
+        rows = [row for mode in modes for row in compare(capture, mode, args)]
+        print(f"{folder.name}, {args.stops:g} stops to either side, preset {args.preset}, {args.size} pixels\n")
         print(report.table(COLUMNS, rows))
 
 

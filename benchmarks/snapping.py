@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Lights moved by noise, and where a fit puts them before it begins.
+"""Errors of lights that were moved by noise, before and after a fit snaps them to their flares.
 
     python benchmarks/snapping.py CAPTURE ... [--seeds 6]
 
-Captures with flare-free frames, whose lights.json is exact. Distances are means over the views, of the frame's width.
+Captures with clean frames, whose lights.json is exact. Distances are means over the views, of the frame's width.
 """
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ SIGMAS = (0.0, 0.1, 0.25, 0.5, 1.0)
 NEAR = 0.012
 
 
-def off(capture: Capture, places: ArrayLike) -> NDArray[np.float64]:
+def errors(capture: Capture, places: ArrayLike) -> NDArray[np.float64]:
     """(lights,) mean distance of these places (lights, 3) from the lights, over the views that have both in front."""
     distances = []
     for view in capture.views:
@@ -39,26 +39,27 @@ def off(capture: Capture, places: ArrayLike) -> NDArray[np.float64]:
 
 def main() -> None:
     """Print a row for each capture and sigma."""
-    parser = argparse.ArgumentParser(description="Lights moved by noise, and where a fit puts them.")
+    parser = argparse.ArgumentParser(description="Errors of noisy lights before and after snapping.")
     parser.add_argument("captures", type=Path, nargs="+")
     parser.add_argument("--seeds", type=int, default=6)
-    words = parser.parse_args()
+    args = parser.parse_args()
     rows = []
-    for folder in words.captures:
+    for folder in args.captures:
         truth = Capture.open(folder)
         for sigma in SIGMAS:
             before, after = [], []
-            for seed in range(words.seeds if sigma else 1):
+            for seed in range(args.seeds if sigma else 1):
                 moved = displaced(Capture.open(folder), sigma, seed)
                 flare = Trainer(moved, preset("standard")).flare
                 assert flare is not None
-                before.append(off(truth, [light.xyz for light in moved.lights]))
-                after.append(off(truth, flare.positions.numpy()))
-            given, found = np.concatenate(before), np.concatenate(after)
-            rows.append([folder.name, f"{sigma:g}", f"{given.max():.1%}", f"{np.median(found):.2%}",
-                         f"{(found < NEAR).sum()} of {len(found)}", str((found > given + 1e-3).sum())])
+                before.append(errors(truth, [light.xyz for light in moved.lights]))
+                after.append(errors(truth, flare.positions.numpy()))
+            initial, snapped = np.concatenate(before), np.concatenate(after)
+            rows.append([folder.name, f"{sigma:g}", f"{initial.max():.1%}", f"{np.median(snapped):.2%}",
+                         f"{(snapped < NEAR).sum()} of {len(snapped)}", str((snapped > initial + 1e-3).sum())])
             print(*rows[-1], sep="\t", file=sys.stderr, flush=True)
-    print(report.table(["capture", "sigma", "given, worst", "found, median", f"within {NEAR:.1%}", "worse than given"],
+    print(report.table(["capture", "sigma", "initial, worst", "snapped, median",
+                        f"within {NEAR:.1%}", "worse than initial"],
                        rows))
 
 

@@ -14,7 +14,7 @@ Blend = Literal["over", "add"]
 Kernels = Literal["auto", "torch", "tiles", "cpu", "cuda"]
 Matching = Literal["auto", "exhaustive", "sequential", "similar"]
 Follows = Literal["source", "target", "blend"]
-"""What the appearance of a transferred flare follows, see `core.transfer.query`."""
+"""Camera and lights that the appearance of a transferred flare follows, see `core.transfer.query`."""
 
 OUR_PRESETS: tuple[Preset, ...] = ("draft", "standard", "high")
 """Presets of the model "ours", the shortest first."""

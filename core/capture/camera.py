@@ -128,9 +128,9 @@ class Camera:
 
     def contains(self, pixels: ArrayLike, depth: Any = 1.0) -> NDArray[np.bool_]:
         """(n,) which pixels (n, 2), with their depths (n,), lie in front of the camera and inside the frame."""
-        at = np.asarray(pixels, np.float64).reshape(-1, 2)
+        points = np.asarray(pixels, np.float64).reshape(-1, 2)
         with np.errstate(invalid="ignore"):
-            return np.asarray((np.asarray(depth) > 0) & (at >= 0).all(axis=1) & (at <= self.size).all(axis=1))
+            return np.asarray((np.asarray(depth) > 0) & (points >= 0).all(axis=1) & (points <= self.size).all(axis=1))
 
 
 def is_rotation(matrix: Floats) -> bool:

@@ -447,18 +447,18 @@ class PictureIndex:
 
 def _matching_pictures(folder: Path, views: Sequence[View]) -> dict[str, Path]:
     """Map the views to their pictures in `folder`."""
-    found: dict[str, Path] = {}
+    matches: dict[str, Path] = {}
     if not folder.is_dir():
-        return found
+        return matches
     pictures = PictureIndex(folder)
     for view in views:
         safe_join(folder, view.name, CaptureError)
         match = pictures.find(view.name)
         if match is not None:
-            found[view.name] = safe_join(folder, match, CaptureError)
-    if pictures.paths and views and not found:
+            matches[view.name] = safe_join(folder, match, CaptureError)
+    if pictures.paths and views and not matches:
         raise CaptureError(f"{folder} holds {len(pictures.paths)} pictures, the first {pictures.paths[0].name}, and "
                            f"none has the name of a frame, such as {views[0].name}; give them the frames' names.")
-    return found
+    return matches
 
 

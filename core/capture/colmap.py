@@ -82,7 +82,7 @@ def read_model(folder: Path) -> tuple[list[PosedFrame], PointCloud]:
     if not images:
         raise CaptureError(f"{_file_path(folder, 'images')} holds no images; the solve registered no frame.")
     posed = []
-    for name, camera, quaternion, translation, seen in images:
+    for name, camera, quaternion, translation, point_ids in images:
         if camera not in lenses:
             raise CaptureError(f"{_file_path(folder, 'images')} gives {name} the camera {camera}, which "
                                f"{_file_path(folder, 'cameras')} does not have; export the whole model again.")
@@ -95,7 +95,7 @@ def read_model(folder: Path) -> tuple[list[PosedFrame], PointCloud]:
             raise CaptureError(f"{where} the quaternion's length is {length:.4g}, so it is no rotation; "
                                "solve the cameras again.")
         pose[:3, :3], pose[:3, 3] = rotation_from_quaternion(quaternion), translation
-        posed.append(PosedFrame(name, lenses[camera], pose, _indices(seen, known, order)))
+        posed.append(PosedFrame(name, lenses[camera], pose, _indices(point_ids, known, order)))
     return posed, points
 
 
@@ -130,9 +130,9 @@ def write_model(folder: Path, frames: Sequence[ObservedFrame], cloud: PointCloud
         quaternion = quaternion_from_rotation(frame.world_to_camera[:3, :3])
         images.append(struct.pack("<i7di", number, *quaternion, *frame.world_to_camera[:3, 3],
                                   lenses.index(frame.lens) + 1) + frame.name.encode() + b"\0")
-        seen = np.zeros(len(frame.points), [("xy", "<f8", 2), ("id", "<i8")])
-        seen["xy"], seen["id"] = frame.pixels, frame.points + 1
-        images.append(struct.pack("<Q", len(seen)) + seen.tobytes())
+        observations = np.zeros(len(frame.points), [("xy", "<f8", 2), ("id", "<i8")])
+        observations["xy"], observations["id"] = frame.pixels, frame.points + 1
+        images.append(struct.pack("<Q", len(observations)) + observations.tobytes())
         for index, point in enumerate(frame.points):
             tracks[point].append((number, index))
     points = [struct.pack("<Q", len(cloud))]
@@ -329,13 +329,13 @@ def _read_points_txt(path: Path, lines: list[str]) -> Points:
         if len(words) < 8:
             raise CaptureError(f"{path}, line {number}: a point takes at least eight values, not {len(words)}; export "
                                "the model again.")
-        own, x, y, z, *colour, error = _parse_numbers(path, number, words[:8], "ixyziiie")
+        point_id, x, y, z, *colour, error = _parse_numbers(path, number, words[:8], "ixyziiie")
         if not all(0 <= c <= 255 for c in colour):
             raise CaptureError(f"{path}, line {number}: the colour {colour} is not within 0 to 255; export the model "
                                "again.")
         values.append((x, y, z, error))
         rgb.append(colour)
-        numbers.append(own if abs(own) < 2**63 else 0)
+        numbers.append(point_id if abs(point_id) < 2**63 else 0)
     cloud = _to_cloud(path, np.array(values, np.float64).reshape(-1, 4), np.array(rgb, np.uint8).reshape(-1, 3))
     return cloud, np.array(numbers, np.int64)
 

@@ -173,9 +173,9 @@ class Lens:
     def border(self) -> Floats:
         """Points (n, 2) along the edge of the frame, pixels."""
         t = np.linspace(0.0, 1.0, 33)
-        x, y, zero, one = t * self.width, t * self.height, np.zeros(33), np.ones(33)
+        x, y, zero, ones = t * self.width, t * self.height, np.zeros(33), np.ones(33)
         return np.concatenate([np.stack(side, axis=1) for side in (
-            (x, zero), (x, one * self.height), (zero, y), (one * self.width, y))])
+            (x, zero), (x, ones * self.height), (zero, y), (ones * self.width, y))])
 
     def _is_covered(self, border: Floats) -> bool:
         """True if the frame covers a view with this border (n, 2), as X/Z and Y/Z.

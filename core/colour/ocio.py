@@ -45,10 +45,10 @@ def ocio_space(name: str, config: Path | str | None) -> ColourSpace:
     try:
         opened = library.Config.CreateFromFile(where)
     except Exception as problem:  # its own class, which exists only where it is installed
-        raise SettingsError(f"The OpenColorIO configuration {where} cannot be read ({_one_line(problem)}); choose another "
-                            "file.") from problem
-    found = opened.getColorSpace(name)
-    if found is None:
+        raise SettingsError(f"The OpenColorIO configuration {where} cannot be read ({_one_line(problem)}); choose "
+                            "another file.") from problem
+    configured = opened.getColorSpace(name)
+    if configured is None:
         if name.lower() in built_in_names():
             return colour_space(name)
         raise SettingsError(f"The OpenColorIO configuration {where} has no colour space {name!r}; it has "
@@ -56,7 +56,7 @@ def ocio_space(name: str, config: Path | str | None) -> ColourSpace:
     if opened.isColorSpaceLinear(name, library.REFERENCE_SPACE_SCENE):
         processor = _processor(library, opened, name, forward=True)
         matrix = _apply_processor(processor, np.eye(3, dtype=np.float32)).T.astype(np.float64)
-        known = _built_in_space(found)
+        known = _built_in_space(configured)
         return linear_space(name, matrix, known.chromaticities if known else _chromaticities(matrix))
     forward, inverse = (_processor(library, opened, name, forward=is_forward) for is_forward in (True, False))
     return ColourSpace(name, lambda pixels: _apply_processor(forward, pixels),

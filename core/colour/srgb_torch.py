@@ -31,8 +31,8 @@ def encode(linear: Tensor) -> Tensor:
 
 def expose(display: Tensor, exposure: float) -> Tensor:
     """Multiply the light of display values, not negative, by `exposure`; unclipped above 1."""
-    shown: Tensor = display if exposure == 1 else _Expose.apply(display, exposure)
-    return shown
+    encoded: Tensor = display if exposure == 1 else _Expose.apply(display, exposure)
+    return encoded
 
 
 def clip_straight_through(display: Tensor, white: float) -> Tensor:
@@ -47,9 +47,9 @@ class _Expose(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, display: Tensor, exposure: float) -> Tensor:
         linear, within = decode_with_slope(display)
-        shown, slope = encode_with_slope(linear.mul_(exposure))
+        encoded, slope = encode_with_slope(linear.mul_(exposure))
         ctx.save_for_backward(within.mul_(exposure).mul_(slope))
-        return shown
+        return encoded
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
@@ -68,5 +68,5 @@ def encode_with_slope(linear: Tensor) -> tuple[Tensor, Tensor]:
     """Return `encode` and its derivative from one power. The caller owns both tensors."""
     bright, low = linear.clamp_min(LINEAR_TOE), linear <= LINEAR_TOE
     power = bright ** (1 / GAMMA)
-    shown = torch.where(low, linear * TOE_SLOPE, power * SCALE - OFFSET)
-    return shown, power.mul_(SCALE / GAMMA).div_(bright).masked_fill_(low, TOE_SLOPE)
+    encoded = torch.where(low, linear * TOE_SLOPE, power * SCALE - OFFSET)
+    return encoded, power.mul_(SCALE / GAMMA).div_(bright).masked_fill_(low, TOE_SLOPE)

@@ -43,12 +43,12 @@ def number_views(views: Iterable[str]) -> list[NumberedFrame]:
         folders.setdefault(PurePosixPath(view).parent, []).append(view)
     frames: list[NumberedFrame] = []
     for folder, names in sorted(folders.items()):
-        found = {name: _parse_number(PurePosixPath(name)) for name in sorted(names)}
-        numbers = {name: number for name, number in found.items() if number is not None}
+        parsed = {name: _parse_number(PurePosixPath(name)) for name in sorted(names)}
+        numbers = {name: number for name, number in parsed.items() if number is not None}
         if len(set(numbers.values())) < len(numbers):
             numbers = {}
         after = max(numbers.values(), default=0) + 1
-        numbers.update(zip((name for name in found if name not in numbers), itertools.count(after)))
+        numbers.update(zip((name for name in parsed if name not in numbers), itertools.count(after)))
         pairs = sorted((number, name) for name, number in numbers.items())
         frames += [NumberedFrame(name, number, layers_file(folder, number)) for number, name in pairs]
     return frames
@@ -69,15 +69,15 @@ def plates_by_number(pictures: Sequence[Path]) -> dict[int, Path]:
     Where no plate has a number, they are counted from 1 in their order. Raises SettingsError where two share a number,
     or one has a number below 0.
     """
-    found: dict[int, Path] = {}
+    plates: dict[int, Path] = {}
     for path in pictures:
         number = _parse_number(path)
         if number is None:
             continue
-        if number in found:
-            raise SettingsError(f"{found[number]} and {path} have one number; keep one sequence in a folder.")
-        found[number] = path
-    return found or dict(enumerate(sorted(pictures), 1))
+        if number in plates:
+            raise SettingsError(f"{plates[number]} and {path} have one number; keep one sequence in a folder.")
+        plates[number] = path
+    return plates or dict(enumerate(sorted(pictures), 1))
 
 
 def select_frames(frames: Sequence[NumberedFrame], text: str | None) -> list[NumberedFrame]:

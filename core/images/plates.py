@@ -259,9 +259,9 @@ def _copy_tags(encoded: bytes, suffix: str, plate: Plate) -> bytes:
         data = plate.path.read_bytes()
         was_grey, is_grey = (not header[25] & 2 for header in (data, encoded))
         left_out = (b"iCCP",) if was_grey != is_grey else ()
-        kept = b"".join(png.make_chunk(name, content) for name, content in png.chunks(io.BytesIO(data), _KEPT_CHUNKS)
+        chunks = b"".join(png.make_chunk(name, content) for name, content in png.chunks(io.BytesIO(data), _KEPT_CHUNKS)
                         if name not in left_out)
-        return encoded[:33] + kept + encoded[33:]  # behind the header chunk
+        return encoded[:33] + chunks + encoded[33:]  # behind the header chunk
     if suffix in _TIFFS and source in _TIFFS:
         tags = tiff.read_tags(io.BytesIO(plate.path.read_bytes()), _KEPT_TAGS)
         if plate.alpha is None:

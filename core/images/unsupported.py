@@ -44,8 +44,8 @@ def unsupported_reason(path: Path) -> str:
             return _CMYK if header is not None and header.components == 4 else ""
         if magic not in (b"II*\0", b"MM\0*"):
             return ""
-        wanted = (tiff.BITS, tiff.PHOTOMETRIC, tiff.SAMPLES, tiff.PLANES, tiff.SAMPLE_FORMAT)
-        tags = {name: tag.values[0] for name, tag in tiff.read_tags(stream, wanted).items()}
+        numbers = (tiff.BITS, tiff.PHOTOMETRIC, tiff.SAMPLES, tiff.PLANES, tiff.SAMPLE_FORMAT)
+        tags = {name: tag.values[0] for name, tag in tiff.read_tags(stream, numbers).items()}
     if tags.get(tiff.SAMPLES) == 2:
         return "is grey with alpha; save it as RGB with alpha, or as PNG"
     if tags.get(tiff.PHOTOMETRIC) == tiff.SEPARATED:
@@ -54,10 +54,10 @@ def unsupported_reason(path: Path) -> str:
         return "is in Lab colours; convert it to RGB"
     if tags.get(tiff.SAMPLES, 1) > 4:
         return f"has {tags[tiff.SAMPLES]} channels; save it as RGB, or RGB with alpha"
-    numbers = tags.get(tiff.BITS, 1), tags.get(tiff.SAMPLE_FORMAT, tiff.UNSIGNED)
-    if numbers in ((16, tiff.FLOATS), (32, tiff.UNSIGNED)):
-        kind = "floats" if numbers[1] == tiff.FLOATS else "whole numbers"
-        return f"holds {kind} of {numbers[0]} bits; save it as 8 or 16 bit or as 32 bit float"
+    depth = tags.get(tiff.BITS, 1), tags.get(tiff.SAMPLE_FORMAT, tiff.UNSIGNED)
+    if depth in ((16, tiff.FLOATS), (32, tiff.UNSIGNED)):
+        kind = "floats" if depth[1] == tiff.FLOATS else "whole numbers"
+        return f"holds {kind} of {depth[0]} bits; save it as 8 or 16 bit or as 32 bit float"
     if tags.get(tiff.BITS, 1) <= 8:
         return ""
     if tags.get(tiff.PLANES) == tiff.PLANAR and tags.get(tiff.SAMPLES, 1) > 1:

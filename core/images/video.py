@@ -26,7 +26,7 @@ LUMA_WEIGHTS = {"BT.601": (0.299, 0.114), "BT.709": (0.2126, 0.0722), "BT.2020":
 MATRICES = {1: "BT.709", 5: "BT.601", 6: "BT.601", 9: "BT.2020"}
 """Names by the numbers of ITU-T H.273: matrix coefficients, transfer characteristics."""
 HDR_TRANSFERS = {16: "PQ", 18: "HLG"}
-"""By the numbers of ITU-T H.273: matrix coefficients, transfer characteristics."""
+"""Names by the numbers of ITU-T H.273: matrix coefficients, transfer characteristics."""
 UNSPECIFIED = 2
 MAX_MOOV_BYTES = 1 << 24
 """Bytes of a file's description that are searched."""

@@ -12,7 +12,7 @@ from ..colour.srgb import Pixels
 
 @dataclass(frozen=True)
 class DataWindow:
-    """Where the stored pixels of a file lie on the frame.
+    """The place of a file's stored pixels on the frame.
 
     size: (width, height) of what is stored; origin: (x, y) of its first pixel on the frame, negative with overscan;
     frame: (width, height); aspect: pixel aspect ratio (width / height).

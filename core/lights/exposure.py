@@ -43,7 +43,7 @@ class ExposureDetector:
         clipped = (display.max(axis=2) >= self.clipped).astype(np.uint8)
         number, labels, boxes, _ = cv2.connectedComponentsWithStats(clipped, connectivity=8)
         crowd = _neighbourhood_area(clipped)
-        found = []
+        detections = []
         for label in range(1, number):
             left, top, width, height, area = map(int, boxes[label])
             if area < MIN_AREA_PX:
@@ -59,8 +59,8 @@ class ExposureDetector:
                 rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
                 tight = mask[rows[0]:rows[-1] + 1, columns[0]:columns[-1] + 1]
                 corner = (left + int(columns[0]), top + int(rows[0]))
-                found.append(measure_detection(tight, corner, picture, display, score))
-        return sorted(found, key=lambda detection: -detection.score)
+                detections.append(measure_detection(tight, corner, picture, display, score))
+        return sorted(detections, key=lambda detection: -detection.score)
 
 
 def _neighbourhood_area(clipped: NDArray[np.uint8]) -> NDArray[np.int64]:

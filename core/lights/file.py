@@ -44,7 +44,7 @@ def check_replaceable(path: Path) -> None:
                            "to keep them, or remove the file to search for all lights again.")
 
 
-def write_lights(path: Path, found: Sequence[FoundLight], views: Sequence[tuple[str, Camera]],
+def write_lights(path: Path, lights: Sequence[FoundLight], views: Sequence[tuple[str, Camera]],
                  keep: bool = False) -> list[dict[str, Any]]:
     """Write lights.json and return its entries. keep: see the module's head.
 
@@ -59,11 +59,11 @@ def write_lights(path: Path, found: Sequence[FoundLight], views: Sequence[tuple[
         for entry in entries:
             _check_writable(entry, path)
     known = [*(entry["xyz"] for entry in entries), *found_before]
-    for light in found:
+    for light in lights:
         if any(_is_same_light(light.xyz, xyz, views) for xyz in known):
             continue
         entries.append(_to_entry(light, _free_name({entry["name"] for entry in entries})))
-    places = [[round_for_text(float(x)) for x in light.xyz] for light in found]
+    places = [[round_for_text(float(x)) for x in light.xyz] for light in lights]
     places += [xyz for xyz in found_before if not any(_is_same_light(place, xyz, views) for place in places)]
     write_json(follow_link(path), {"lights": entries, "found": places})
     return entries
@@ -94,9 +94,9 @@ def _to_entry(light: FoundLight, name: str) -> dict[str, Any]:
             "uncertainty": round(light.uncertainty, 5), "far": light.far, "how": light.how}
 
 
-def _free_name(taken: set[str]) -> str:
+def _free_name(used_names: set[str]) -> str:
     number = 1
-    while f"light{number}" in taken:
+    while f"light{number}" in used_names:
         number += 1
     return f"light{number}"
 

@@ -70,9 +70,9 @@ def find_lights(capture: Capture, detector: Detector, progress: Progress | None 
             messages.append("One view gives directions only: distances are those of the points nearby, or a guess.")
     else:
         permissive = replace(settings, min_views=2, max_nfa=np.inf, min_share=0.0)
-        found = triangulate_lights(views, detections, capture.extent, permissive)
-        lights = [light for light in found if _is_well_supported(light, min_views, settings)]
-        doubtful = [light for light in found if not _is_well_supported(light, min_views, settings)]
+        candidates = triangulate_lights(views, detections, capture.extent, permissive)
+        lights = [light for light in candidates if _is_well_supported(light, min_views, settings)]
+        doubtful = [light for light in candidates if not _is_well_supported(light, min_views, settings)]
     if not lights and len(views) > 1:
         lights = _find_by_ghosts(capture, progress, settings.seed)
         if lights:
@@ -106,9 +106,9 @@ def write_findings(capture: Capture, findings: Findings, keep: bool = False) -> 
                      for light in findings.doubtful],
         "support": {name: list(light.support) for name, light in named},
         "views": [{"name": view.name, "detections": [
-            {"xy": one.xy.round(3).tolist(), "radius": round(one.radius, 2), "score": round(one.score, 3),
-             "cut": one.is_cut} for one in some]}
-            for view, some in zip(capture.views, findings.detections, strict=True)],
+            {"xy": detection.xy.round(3).tolist(), "radius": round(detection.radius, 2),
+             "score": round(detection.score, 3), "cut": detection.is_cut} for detection in in_view]}
+            for view, in_view in zip(capture.views, findings.detections, strict=True)],
         "sheets": [str(path.relative_to(capture.folder)) for path in sheets],
     }
     write_json(capture.folder / SHEETS / REPORT, report)
@@ -132,19 +132,19 @@ def _from_one_view(capture: Capture, detections: Sequence[Detection]) -> list[Fo
     """Place the detections of a single view at the depth of the nearest points in the picture, or far away."""
     view = capture.views[0]
     pixels, depth = view.camera.project(capture.points.xyz)
-    seen = view.camera.contains(pixels, depth)
+    in_frame = view.camera.contains(pixels, depth)
     reach = 0.05 * float(np.hypot(*view.camera.size))
-    found = []
+    lights = []
     for detection in detections:
-        near = seen & (np.linalg.norm(pixels - detection.xy, axis=1) < reach)
+        near = in_frame & (np.linalg.norm(pixels - detection.xy, axis=1) < reach)
         ray = view.camera.rays(detection.xy)[0]
         far = not near.any()
         distance = FAR * capture.extent if far else float(np.median(depth[near])) / float(ray @ view.camera.forward)
         uncertainty = 0.0 if far else distance
-        found.append(FoundLight(view.camera.position + distance * ray, far, (view.name,), 1, 0.0, uncertainty,
+        lights.append(FoundLight(view.camera.position + distance * ray, far, (view.name,), 1, 0.0, uncertainty,
                                 detection.colour, detection.radius, how="one view, distance guessed",
                                 detections=((view.name, detection),)))
-    return found
+    return lights
 
 
 def _find_by_ghosts(capture: Capture, progress: Progress, seed: int) -> list[FoundLight]:

@@ -58,7 +58,7 @@ def find_blobs(picture: Picture, clean: Picture | None = None) -> list[Blob]:
     size = (max(8, round(width * scale)), max(8, round(height * scale)))
     small = np.sqrt(np.asarray(cv2.resize(np.minimum(light, 4.0), size, interpolation=cv2.INTER_AREA), np.float32))
     diagonal = float(np.hypot(*size))
-    found: list[Blob] = []
+    candidates: list[Blob] = []
     for radius in np.exp(np.linspace(np.log(0.007), np.log(0.06), 6)) * diagonal:
         sigma = radius / 1.6
         inner = cv2.GaussianBlur(small, (0, 0), sigma)
@@ -67,14 +67,14 @@ def find_blobs(picture: Picture, clean: Picture | None = None) -> list[Blob]:
         peak = (stands_out == cv2.dilate(stands_out, np.ones((window, window), np.uint8))) & (stands_out > 0.004)
         for y, x in np.argwhere(peak):
             at = np.array([(x + 0.5) / size[0] * width, (y + 0.5) / size[1] * height])
-            found.append(Blob(at, float(radius / scale), float(stands_out[y, x])))
-    kept: list[Blob] = []
-    for blob in sorted(found, key=lambda blob: -blob.strength):
-        if all(np.linalg.norm(blob.xy - other.xy) > 0.7 * other.radius for other in kept):
-            kept.append(blob)
-        if len(kept) == MAX_BLOBS:
+            candidates.append(Blob(at, float(radius / scale), float(stands_out[y, x])))
+    strongest: list[Blob] = []
+    for blob in sorted(candidates, key=lambda blob: -blob.strength):
+        if all(np.linalg.norm(blob.xy - other.xy) > 0.7 * other.radius for other in strongest):
+            strongest.append(blob)
+        if len(strongest) == MAX_BLOBS:
             break
-    return kept
+    return strongest
 
 
 def locate_by_ghosts(views: Sequence[tuple[str, Camera]], blobs: Sequence[Sequence[Blob]], extent: float,
@@ -111,19 +111,19 @@ def _light_at_ratio(views: Sequence[tuple[str, Camera]], blobs: Sequence[Sequenc
                 seed: int) -> FoundLight | None:
     """Return the light out of frame that most views' blobs claim if they are ghosts at this ratio, or None."""
     claims = []
-    for (_, camera), some in zip(views, blobs, strict=True):
+    for (_, camera), in_view in zip(views, blobs, strict=True):
         centre = np.array([camera.cx, camera.cy])
         # The radius carries the tolerance: an error at the ghost is 1 / ratio times as large at the light.
         diagonal = float(np.hypot(*camera.size))
         claims.append([Detection(centre + (blob.xy - centre) / ratio, 0.02 * diagonal / abs(ratio), 1.0,
-                                 np.ones(3), np.ones((1, 1), bool), (0, 0), False) for blob in some
+                                 np.ones(3), np.ones((1, 1), bool), (0, 0), False) for blob in in_view
                        if not camera.contains([centre + (blob.xy - centre) / ratio])[0]])
     settings = TriangulationSettings(tolerance=0.0, min_views=MIN_VIEWS, max_nfa=MAX_NFA / len(GHOST_RATIOS),
                                      min_share=MIN_SHARE, allow_out_of_frame=True, max_lights=2, max_candidates=1000,
                                      seed=seed)
     diagonal = float(np.hypot(*views[0][1].size))
     for light in triangulate_lights(views, claims, extent, settings):
-        moved = np.ptp([one.xy * ratio for _, one in light.detections], axis=0).max()
+        moved = np.ptp([detection.xy * ratio for _, detection in light.detections], axis=0).max()
         visible = sum(_is_well_inside(camera, light.xyz) for _, camera in views)
         if visible < 0.2 * len(views) and moved > MIN_MOTION * diagonal:
             return light

@@ -55,12 +55,13 @@ class GroundedDetector:
         """Return the lights of a picture, highest score first."""
         boxes, masks, scores = self.predict(picture)
         display = picture.display()
-        found = []
+        detections = []
         for i in refine_detections(boxes, masks, display):
             rows, columns = np.flatnonzero(masks[i].any(axis=1)), np.flatnonzero(masks[i].any(axis=0))
             tight = masks[i][rows[0]:rows[-1] + 1, columns[0]:columns[-1] + 1]
-            found.append(measure_detection(tight, (int(columns[0]), int(rows[0])), picture, display, float(scores[i])))
-        return sorted(found, key=lambda detection: -detection.score)
+            corner = (int(columns[0]), int(rows[0]))
+            detections.append(measure_detection(tight, corner, picture, display, float(scores[i])))
+        return sorted(detections, key=lambda detection: -detection.score)
 
     def predict(self, picture: Picture) -> tuple[NDArray[np.float64], list[Mask], NDArray[np.float64]]:
         """Return boxes (n, 4) left top right bottom, a mask (h, w) for each, and scores (n,), before refinement."""
@@ -122,11 +123,11 @@ def refine_detections(boxes: NDArray[np.float64], masks: Sequence[Mask], display
 def keep_smallest(boxes: NDArray[np.float64], among: Sequence[int]) -> list[int]:
     """Return those of the boxes `among` (indices) that neither contain nor largely overlap a smaller one."""
     area = (boxes[:, 2] - boxes[:, 0]) * (boxes[:, 3] - boxes[:, 1])
-    kept: list[int] = []
+    smallest_boxes: list[int] = []
     for i in sorted(among, key=lambda i: (area[i], i)):
-        if not any(_intersection_area(boxes[i], boxes[j]) > MAX_OVERLAP * max(area[j], 1e-9) for j in kept):
-            kept.append(i)
-    return kept
+        if not any(_intersection_area(boxes[i], boxes[j]) > MAX_OVERLAP * max(area[j], 1e-9) for j in smallest_boxes):
+            smallest_boxes.append(i)
+    return smallest_boxes
 
 
 def _intersection_area(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:

@@ -37,25 +37,25 @@ def lift_to_gaussians(views: Sequence[tuple[str, Camera]], detections: Sequence[
     xyz, opacity = np.asarray(means, np.float64), np.asarray(opacities, np.float64)
     xyz, opacity = xyz[opacity > MIN_OPACITY], opacity[opacity > MIN_OPACITY]
     inside, visible = np.zeros(len(xyz), np.int64), np.zeros(len(xyz), np.int64)
-    for (_, camera), some in zip(views, detections, strict=True):
+    for (_, camera), in_view in zip(views, detections, strict=True):
         pixels, depth = camera.project(xyz)
         front = _visible_points(camera, pixels, depth)
         visible[front] += 1
-        if some:
-            mask = union_mask(some, camera.size)
+        if in_view:
+            mask = union_mask(in_view, camera.size)
             column, row = np.minimum(pixels[front].astype(int), np.array(camera.size) - 1).T
             inside[front[mask[row, column]]] += 1
     chosen = np.flatnonzero((inside >= min_views) & (inside >= share * np.maximum(visible, 1)))
     chosen = chosen[np.argsort(-inside[chosen], kind="stable")][:MAX_GAUSSIANS]
-    found = []
+    lights = []
     for members in _cluster(xyz[chosen], CLUSTER_DISTANCE * extent):
         weight = (inside * opacity)[chosen[members]]
         centre = (xyz[chosen[members]] * weight[:, None]).sum(axis=0) / weight.sum()
         spread = float(np.sqrt((((xyz[chosen[members]] - centre) ** 2).sum(axis=1) * weight).sum() / weight.sum()))
         light = _to_light(centre, spread, views, detections)
         if len(light.support) >= min_views:
-            found.append(light)
-    return sorted(found, key=lambda light: -len(light.support))
+            lights.append(light)
+    return sorted(lights, key=lambda light: -len(light.support))
 
 
 def _visible_points(camera: Camera, pixels: Floats, depth: Floats) -> NDArray[np.int64]:
@@ -72,7 +72,7 @@ def _visible_points(camera: Camera, pixels: Floats, depth: Floats) -> NDArray[np
 def _cluster(xyz: Floats, reach: float) -> list[NDArray[np.int64]]:
     """Return index sets of points linked by steps shorter than `reach`, three points or more."""
     remaining = np.ones(len(xyz), bool)
-    found = []
+    clusters = []
     while remaining.any():
         members = np.zeros(len(xyz), bool)
         edge = np.flatnonzero(remaining)[:1]
@@ -87,28 +87,28 @@ def _cluster(xyz: Floats, reach: float) -> list[NDArray[np.int64]]:
                 near |= ((xyz[rest] - point) ** 2).sum(axis=1) < reach ** 2
             edge = rest[near]
         if members.sum() >= 3:
-            found.append(np.flatnonzero(members))
-    return found
+            clusters.append(np.flatnonzero(members))
+    return clusters
 
 
 def _to_light(centre: Floats, spread: float, views: Sequence[tuple[str, Camera]],
            detections: Sequence[Sequence[Detection]]) -> FoundLight:
     """Return the light at a cluster's centroid, with the detections that it falls on."""
     support, off, visible, used = [], [], 0, []
-    for (name, camera), some in zip(views, detections, strict=True):
+    for (name, camera), in_view in zip(views, detections, strict=True):
         pixels, depth = camera.project(centre[None])
         if not camera.contains(pixels, depth)[0]:
             continue
         visible += 1
-        near = [(float(np.linalg.norm(one.xy - pixels[0])), one) for one in some]
-        near = [(gap, one) for gap, one in near if gap < one.radius + 0.006 * np.hypot(*camera.size)]
+        near = [(float(np.linalg.norm(detection.xy - pixels[0])), detection) for detection in in_view]
+        near = [(gap, detection) for gap, detection in near if gap < detection.radius + 0.006 * np.hypot(*camera.size)]
         if near:
-            gap, one = min(near, key=lambda pair: pair[0])
+            gap, detection = min(near, key=lambda pair: pair[0])
             support.append(name)
             off.append(gap)
-            used.append((name, one))
-    colour = np.median([one.colour for _, one in used], axis=0) if used else np.ones(3)
+            used.append((name, detection))
+    colour = np.median([detection.colour for _, detection in used], axis=0) if used else np.ones(3)
     return FoundLight(centre, False, tuple(support), visible, float(np.median(off)) if off else 0.0, spread,
                       colour / max(float(colour.max()), 1e-6),
-                      float(np.median([one.radius for _, one in used])) if used else 0.0,
+                      float(np.median([detection.radius for _, detection in used])) if used else 0.0,
                       how="lifted on to the scene", detections=tuple(used))

@@ -17,17 +17,17 @@ def merge_duplicates(lights: Sequence[FoundLight], views: Sequence[tuple[str, Ca
 
     Returns them by support, most first.
     """
-    kept: list[FoundLight] = []
+    distinct: list[FoundLight] = []
     for light in _by_support(lights):
-        for i, other in enumerate(kept):
+        for i, other in enumerate(distinct):
             if _is_same_light(light, other, views, extent):
                 support = tuple(sorted({*other.support, *light.support}))
-                kept[i] = replace(other, support=support, visible=max(other.visible, len(support)),
+                distinct[i] = replace(other, support=support, visible=max(other.visible, len(support)),
                                   detections=other.detections + light.detections)
                 break
         else:
-            kept.append(light)
-    return _by_support(kept)
+            distinct.append(light)
+    return _by_support(distinct)
 
 
 def remove_ghosts(lights: Sequence[FoundLight], views: Sequence[tuple[str, Camera]]) -> list[FoundLight]:
@@ -36,12 +36,12 @@ def remove_ghosts(lights: Sequence[FoundLight], views: Sequence[tuple[str, Camer
     A ghost g lies, in every frame, at the same ratio mu of the way from the principal point p to its light l,
     g = p + mu (l - p), while l moves over the frame.
     """
-    kept: list[FoundLight] = []
+    distinct: list[FoundLight] = []
     cameras = dict(views)
     for light in _by_support(lights):
-        if not any(_is_ghost(light, other, cameras) for other in kept):
-            kept.append(light)
-    return kept
+        if not any(_is_ghost(light, other, cameras) for other in distinct):
+            distinct.append(light)
+    return distinct
 
 
 def _by_support(lights: Sequence[FoundLight]) -> list[FoundLight]:

@@ -95,15 +95,15 @@ def _mean_shift(views: Sequence[FlareView], places: Floats, free: NDArray[np.boo
 def _are_on_peaks(views: Sequence[FlareView], places: Floats) -> NDArray[np.bool_]:
     """(n,) which lights sit on a peak of brightness."""
     fine, wide = (_observe(views, places, window) for window in (PEAK_WINDOW, 2 * PEAK_WINDOW))
-    found = np.zeros(len(places), bool)
+    on_peak = np.zeros(len(places), bool)
     for light, (near, wide_observations) in enumerate(zip(fine, wide, strict=True)):
         if near:
             brightness = np.array([observation.brightness for observation in near])
             shifts = np.array([np.linalg.norm(observation.shift) for observation in near])
             shift = shifts @ brightness / brightness.sum()
             peak = brightness.mean() / np.mean([observation.brightness for observation in wide_observations])
-            found[light] = peak > MIN_PEAK_RATIO and shift < MAX_SHIFT * PEAK_WINDOW * views[0].camera.width
-    return found
+            on_peak[light] = peak > MIN_PEAK_RATIO and shift < MAX_SHIFT * PEAK_WINDOW * views[0].camera.width
+    return on_peak
 
 
 class _Observation(NamedTuple):
@@ -130,8 +130,11 @@ def _least_squares_step(observations: Sequence[_Observation]) -> Floats:
 
 
 def _observe(views: Sequence[FlareView], places: Floats, window: float) -> list[list[_Observation]]:
-    """By light, the views that see light under its window, of this standard deviation in frame widths."""
-    found: list[list[_Observation]] = [[] for _ in places]
+    """Observe each light in the views that show flare under its window.
+
+    window: standard deviation in frame widths. Returns the observations by light.
+    """
+    by_light: list[list[_Observation]] = [[] for _ in places]
     for camera, flare in views:
         height, width = flare.shape
         deviation = window * width
@@ -150,9 +153,9 @@ def _observe(views: Sequence[FlareView], places: Floats, window: float) -> list[
             # Relative to the window's mean, which the frame's edge and the other lights' windows displace.
             shift = [(weights.sum(axis) @ where) / total - (support.sum(axis) @ where) / whole
                      for axis, where in ((0, across), (1, down))]
-            found[light].append(_Observation(float(total) / (2 * np.pi * deviation**2), np.array(shift),
+            by_light[light].append(_Observation(float(total) / (2 * np.pi * deviation**2), np.array(shift),
                                              camera.jacobian(places[light])))
-    return found
+    return by_light
 
 
 def _are_merged(views: Sequence[FlareView], places: Floats) -> NDArray[np.bool_]:

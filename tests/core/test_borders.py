@@ -45,7 +45,7 @@ def test_borders_are_found(borders: tuple[int, int, int, int], value: int) -> No
     assert found.size == SIZE
 
 
-def test_what_jpeg_makes_of_a_border_is_one() -> None:
+def test_a_border_with_jpeg_noise_is_found() -> None:
     smooth = cv2.GaussianBlur(np.maximum(np.asarray(picture(0, SIZE), np.uint8), 60), (0, 0), 4)
     _, code = cv2.imencode(".jpg", bordered(smooth, 16, 16, 0, 0), [cv2.IMWRITE_JPEG_QUALITY, 70])
     found = find_picture_area(cv2.imdecode(code, cv2.IMREAD_COLOR), lambda line: line / 255)
@@ -54,7 +54,7 @@ def test_what_jpeg_makes_of_a_border_is_one() -> None:
 
 @pytest.mark.parametrize("why", ["one side alone", "one line", "grey", "grain", "faint stars", "a ghost",
                                  "next to nothing left", "all of it"])
-def test_what_is_dark_for_another_reason_is_no_border(why: str) -> None:
+def test_other_dark_areas_are_no_borders(why: str) -> None:
     inner = np.maximum(np.asarray(picture(0, SIZE), np.uint8), 40)
     ghost = bordered(inner, 20, 20, 0, 0)
     ghost[0, 5] = ghost[-1, 9] = 120
@@ -70,7 +70,7 @@ def test_what_is_dark_for_another_reason_is_no_border(why: str) -> None:
     assert find_picture_area(whole, lambda line: line / 255) == PictureArea(0, whole.shape[0], 0, whole.shape[1])
 
 
-def test_a_night_sky_makes_no_border_wider() -> None:
+def test_a_night_sky_does_not_widen_a_border() -> None:
     """Nor are frames with one another picture than those beside them."""
     inner = np.maximum(np.asarray(picture(0, SIZE), np.uint8), 40)
     for sky in (0, 1, 10, 30):
@@ -133,7 +133,7 @@ def test_a_fit_leaves_borders_out(tmp_path: Path, boxed: Capture) -> None:
     assert inside["composite"]["psnr"] > everywhere["composite"]["psnr"] + 3
 
 
-def test_frames_that_are_faded_out_or_differ_tell_of_no_border(tmp_path: Path, boxed: Capture) -> None:
+def test_black_or_differing_frames_give_no_border(tmp_path: Path, boxed: Capture) -> None:
     shutil.copytree(boxed.folder, tmp_path / "capture")
     first, second = (tmp_path / "capture" / "images" / f"{number:04d}.png" for number in (0, 1))
     cv2.imwrite(str(first), np.zeros((HEIGHT, WIDTH, 3), np.uint8))

@@ -20,7 +20,7 @@ from core.images.write import write_exr, write_png
 from tests.core.captures import SIZE, look_at, make_capture, make_transforms, orbit, picture
 
 
-def test_text_model(tmp_path: Path) -> None:
+def test_a_text_model_is_read(tmp_path: Path) -> None:
     capture = Capture.open(make_capture(tmp_path / "c"))
     assert [view.name for view in capture.views] == ["0000.png", "0001.png", "0002.png", "0003.png"]
     for view, camera in zip(capture.views, orbit(4), strict=True):
@@ -35,7 +35,7 @@ def test_text_model(tmp_path: Path) -> None:
 
 
 @pytest.mark.filterwarnings("error")
-def test_an_error_beyond_floats_counts_for_as_much_as_they_hold(tmp_path: Path) -> None:
+def test_errors_beyond_floats_are_clipped(tmp_path: Path) -> None:
     folder = make_capture(tmp_path / "c")
     points = folder / "sparse/0/points3D.txt"
     points.write_text("".join(" ".join([*line.split()[:7], "1e200", *line.split()[8:]]) + "\n"
@@ -45,7 +45,7 @@ def test_an_error_beyond_floats_counts_for_as_much_as_they_hold(tmp_path: Path) 
 
 
 @pytest.mark.filterwarnings("error")
-def test_colours_that_are_no_numbers_are_black(tmp_path: Path) -> None:
+def test_nan_colours_are_black(tmp_path: Path) -> None:
     names = ("float x", "float y", "float z", "float red", "float green", "float blue")
     (tmp_path / "points.ply").write_text("\n".join([
         "ply", "format ascii 1.0", "element vertex 1", *(f"property {name}" for name in names), "end_header",
@@ -127,7 +127,7 @@ def test_transforms_with_an_angle_and_a_fisheye(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg", ".tif", ".exr"])
-def test_frame_formats(tmp_path: Path, suffix: str) -> None:
+def test_frames_of_every_format_are_read(tmp_path: Path, suffix: str) -> None:
     folder = make_capture(tmp_path / "c", suffix=".png" if suffix == ".exr" else suffix)
     if suffix == ".exr":
         text = (folder / "sparse/0/images.txt").read_text().replace(".png", ".exr")
@@ -161,7 +161,7 @@ def test_frames_at_a_uniform_scale_of_the_model_scale_the_camera(tmp_path: Path)
     assert capture.frame(capture.views[0]).size == (32, 24)
 
 
-def test_several_cameras(tmp_path: Path) -> None:
+def test_a_capture_may_have_several_cameras(tmp_path: Path) -> None:
     folder = make_capture(tmp_path / "c")
     sparse = folder / "sparse" / "0"
     with open(sparse / "cameras.txt", "a") as file:
@@ -174,7 +174,7 @@ def test_several_cameras(tmp_path: Path) -> None:
     assert capture.frame(capture.views[3], (16, 12)).size == (16, 12)
 
 
-def test_names_in_folders(tmp_path: Path) -> None:
+def test_frames_in_subfolders_keep_their_names(tmp_path: Path) -> None:
     folder = make_capture(tmp_path / "c")
     (folder / "images" / "cam a").mkdir()
     (folder / "images" / "0001.png").rename(folder / "images" / "cam a" / "0001.png")
@@ -185,7 +185,7 @@ def test_names_in_folders(tmp_path: Path) -> None:
     assert capture.frame(capture.view("cam a/0001.png")).size == SIZE
 
 
-def test_removed_and_truth(tmp_path: Path) -> None:
+def test_clean_frames_and_truth_are_read(tmp_path: Path) -> None:
     folder = make_capture(tmp_path / "c", model="SIMPLE_RADIAL", params=(57.6, 32, 24, -0.1))
     (folder / "removed").mkdir()
     (folder / "truth" / "scene").mkdir(parents=True)
@@ -204,7 +204,7 @@ def test_removed_and_truth(tmp_path: Path) -> None:
     assert capture.truth_flare(capture.views[0]) is None
 
 
-def test_flare_free_frames_by_other_suffixes_and_names(tmp_path: Path) -> None:
+def test_clean_frames_may_have_another_suffix(tmp_path: Path) -> None:
     folder = make_capture(tmp_path / "c")
     (folder / "removed").mkdir()
     for i in range(4):
@@ -217,7 +217,7 @@ def test_flare_free_frames_by_other_suffixes_and_names(tmp_path: Path) -> None:
         Capture.open(folder)
 
 
-def test_split(tmp_path: Path) -> None:
+def test_views_are_split_by_file_or_interval(tmp_path: Path) -> None:
     folder = make_capture(tmp_path / "c", views=10)
     capture = Capture.open(folder)
 
@@ -236,7 +236,7 @@ def test_split(tmp_path: Path) -> None:
     assert names(tmp_path / "other.json") == names(str(tmp_path / "other.json")) == ["0009"]
 
 
-def test_lights(tmp_path: Path) -> None:
+def test_lights_are_read_and_checked(tmp_path: Path) -> None:
     folder = make_capture(tmp_path / "c")
     (folder / "lights.json").write_text(
         '{"lights": [{"name": "lamp", "xyz": [1, 2.5, -3], "support": 4}, {"name": "sun", "xyz": [0, -1e6, 0]}]}')
@@ -244,14 +244,14 @@ def test_lights(tmp_path: Path) -> None:
     assert (lamp.name, lamp.xyz.tolist()) == ("lamp", [1, 2.5, -3]) and sun.xyz[1] == -1e6
 
 
-def test_without_points(tmp_path: Path) -> None:
+def test_a_capture_without_points_opens(tmp_path: Path) -> None:
     folder = make_capture(tmp_path / "c", points=0)
     assert len(Capture.open(folder).points) == 0
     (folder / "sparse/0/points3D.txt").unlink()
     assert Capture.open(folder).points.xyz.shape == (0, 3)
 
 
-def test_without_frames(tmp_path: Path) -> None:
+def test_a_capture_without_frames_opens(tmp_path: Path) -> None:
     folder = make_capture(tmp_path / "c")
     for file in (folder / "images").iterdir():
         file.unlink()
@@ -261,7 +261,7 @@ def test_without_frames(tmp_path: Path) -> None:
         capture.frame(capture.views[0])
 
 
-def test_frames_that_are_not_needed_have_their_size_all_the_same(tmp_path: Path) -> None:
+def test_frames_that_exist_set_the_size_where_none_are_needed(tmp_path: Path) -> None:
     """Layers are baked to lie over the frames, which may be smaller than those that were solved."""
     folder = make_capture(tmp_path / "c")
     solved = Capture.open(folder).views[0].camera
@@ -277,7 +277,7 @@ def test_frames_that_are_not_needed_have_their_size_all_the_same(tmp_path: Path)
     assert capture.with_frame_size((33, 7)).views[1].camera.size == solved.size, "of another shape"
 
 
-def test_how_a_pixel_moves_with_its_point() -> None:
+def test_the_jacobian_is_the_derivative_of_the_projection() -> None:
     camera, point = orbit(3)[1], np.array([0.2, -0.1, 0.3])
     moved = [(camera.project(point + step)[0][0] - camera.project(point - step)[0][0]) / 2e-5
              for step in 1e-5 * np.eye(3)]
@@ -298,7 +298,7 @@ def test_extent_and_camera() -> None:
     np.testing.assert_allclose(half[0] * 2, pixels[1])
 
 
-def test_extent(tmp_path: Path) -> None:
+def test_the_extent_follows_the_cameras(tmp_path: Path) -> None:
     capture = Capture.open(make_capture(tmp_path / "c"))
     positions = np.array([view.camera.position for view in capture.views])
     assert capture.extent == pytest.approx(1.1 * np.linalg.norm(positions - positions.mean(0), axis=1).max())
@@ -306,7 +306,7 @@ def test_extent(tmp_path: Path) -> None:
         np.median(np.linalg.norm(capture.points.xyz - orbit(1)[0].position, axis=1)), rel=1e-6)
 
 
-def test_the_extent_looks_at_each_camera_a_few_times_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_extent_reads_each_camera_a_few_times_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     capture = Capture.open(make_capture(tmp_path / "c", views=12))
     asked, position = [], Camera.position.fget
     monkeypatch.setattr(Camera, "position", property(lambda camera: asked.append(camera) or position(camera)))
@@ -316,7 +316,7 @@ def test_the_extent_looks_at_each_camera_a_few_times_only(tmp_path: Path, monkey
 
 @pytest.mark.parametrize("slip", [0.0, 1e-15, 1e-7, 1e-4])
 @pytest.mark.parametrize("offset", [0.0, 1e6])
-def test_the_extent_of_a_tripod_is_that_of_its_points(slip: float, offset: float, tmp_path: Path) -> None:
+def test_the_extent_of_a_rotating_camera_is_that_of_its_points(slip: float, offset: float, tmp_path: Path) -> None:
     """Its positions are told by rotated vectors, whose rounding is no path."""
     whole = Capture.open(make_capture(tmp_path / "c"))
     random = np.random.default_rng(0)
@@ -332,7 +332,7 @@ def test_the_extent_of_a_tripod_is_that_of_its_points(slip: float, offset: float
     assert tripod.is_rotation_only and not whole.is_rotation_only
 
 
-def test_the_cache_is_bounded_and_serves(tmp_path: Path) -> None:
+def test_the_picture_cache_is_bounded(tmp_path: Path) -> None:
     capture = Capture.open(make_capture(tmp_path / "c"), cache_bytes=2 * 64 * 48 * 12)
     first = capture.frame(capture.views[0])
     assert capture.frame(capture.views[0]) is first
@@ -375,7 +375,7 @@ def test_opening_needs_numpy_alone(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
 
 
-def test_view_by_name(tmp_path: Path) -> None:
+def test_a_view_is_found_by_name(tmp_path: Path) -> None:
     capture = Capture.open(make_capture(tmp_path / "c"))
     assert capture.view("0002.png") is capture.views[2]
     with pytest.raises(CaptureError, match=r"9999\.png"):

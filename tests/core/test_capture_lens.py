@@ -72,7 +72,7 @@ def test_no_direction_leads_outside_a_folded_polynomial() -> None:
 
 
 @pytest.mark.parametrize("model", MODELS)
-def test_the_undistorted_view_is_filled_and_as_wide_as_can_be(model: str) -> None:
+def test_the_undistorted_view_is_covered_and_as_wide_as_possible(model: str) -> None:
     ours = lens(model)
     fx, fy, cx, cy = ours.pinhole
     assert (cx, cy) == ours.centre and fx / fy == pytest.approx(ours.focal[0] / ours.focal[1])
@@ -94,7 +94,7 @@ def test_no_distortion_changes_nothing() -> None:
     assert none.pinhole == (*none.focal, *none.centre)
 
 
-def test_a_lens_that_leaves_nothing_is_refused() -> None:
+def test_a_lens_without_undistorted_view_is_refused() -> None:
     with pytest.raises(CaptureError, match="simpler model"):
         _ = Lens("SIMPLE_RADIAL", (100.0, 50.0, 50.0, -1e5), 100, 100).pinhole
     with pytest.raises(CaptureError, match="simpler model"):
@@ -103,7 +103,7 @@ def test_a_lens_that_leaves_nothing_is_refused() -> None:
 
 @pytest.mark.parametrize("model", ["OPENCV", "FOV", "THIN_PRISM_FISHEYE", "EUCM", "SIMPLE_DIVISION", "EQUIRECTANGULAR"])
 @pytest.mark.parametrize("scale", [1, 2])
-def test_frames_are_straightened(tmp_path: Path, model: str, scale: int) -> None:
+def test_frames_are_undistorted(tmp_path: Path, model: str, scale: int) -> None:
     """Dots drawn through the lens land where the pinhole camera of the view puts them."""
     ours = lens(model, (320, 240))
     folder = make_capture(tmp_path / "c", views=1, size=(ours.width, ours.height), model=model, params=ours.params)
@@ -134,13 +134,13 @@ def test_frames_are_straightened(tmp_path: Path, model: str, scale: int) -> None
 @pytest.mark.parametrize(("model", "told"), [
     ("OPENCV", {"k1": -0.1, "k2": 0.02, "k3": -0.003, "p1": 0.004, "p2": -0.005}),
     ("OPENCV_FISHEYE", {"k1": -0.1, "k2": 0.02, "k3": -0.003, "k4": 0.0006})])
-def test_the_distortion_of_a_transforms_json_goes_by_its_names(model: str, told: dict[str, float],
+def test_coefficients_of_transforms_json_are_read_by_name(model: str, told: dict[str, float],
                                                                tmp_path: Path) -> None:
     found = Capture.open(make_transforms(tmp_path / "c", camera_model=model, **told)).views[0].lens
     assert {name: found.parameters[name] for name in told} == told
 
 
-def test_angles_of_view_stand_for_focal_lengths(tmp_path: Path) -> None:
+def test_fields_of_view_give_focal_lengths(tmp_path: Path) -> None:
     folder = make_transforms(tmp_path / "c", camera_angle_x=1.0, camera_angle_y=0.7)
     meta = json.loads((folder / "transforms.json").read_text())
     del meta["fl_x"], meta["fl_y"]

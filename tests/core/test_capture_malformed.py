@@ -283,7 +283,7 @@ def test_malformed_transforms_capture(tmp_path: Path, case: str) -> None:
 
 
 @pytest.mark.parametrize("kind", ["absent", "file", "empty"])
-def test_no_capture_at_all(tmp_path: Path, kind: str) -> None:
+def test_a_folder_without_a_capture_is_refused(tmp_path: Path, kind: str) -> None:
     folder = tmp_path / "c"
     if kind == "file":
         folder.write_text("")
@@ -292,7 +292,7 @@ def test_no_capture_at_all(tmp_path: Path, kind: str) -> None:
     check(folder, CaptureError, "c")
 
 
-def test_a_frame_cut_short_is_told_when_it_is_decoded(tmp_path: Path) -> None:
+def test_a_truncated_frame_is_reported_when_it_is_decoded(tmp_path: Path) -> None:
     folder = make_capture(tmp_path / "c")
     path = folder / "images" / "0001.png"
     path.write_bytes(path.read_bytes()[:200])
@@ -303,14 +303,14 @@ def test_a_frame_cut_short_is_told_when_it_is_decoded(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("holdout", ["-3", -1, 1, "1", "no such file.json", "split.json/"])
-def test_bad_holdout(tmp_path: Path, holdout: str | int) -> None:
+def test_an_invalid_holdout_is_refused(tmp_path: Path, holdout: str | int) -> None:
     capture = Capture.open(make_capture(tmp_path / "c"))
     with pytest.raises(CaptureError):
         capture.split(holdout)
 
 
 @pytest.mark.parametrize("form", ["binary", "text", "transforms"])
-def test_random_damage_ends_in_our_errors(tmp_path: Path, form: str) -> None:
+def test_random_damage_raises_our_errors(tmp_path: Path, form: str) -> None:
     """Any bytes may change: the capture opens, or one of our errors says why it does not."""
     folder = make_transforms(tmp_path / "c") if form == "transforms" else make_capture(tmp_path / "c")
     if form == "binary":

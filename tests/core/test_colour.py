@@ -27,7 +27,7 @@ def test_matrices_are_the_published_ones() -> None:
 
 
 @pytest.mark.parametrize("name", built_in_names())
-def test_there_and_back(name: str) -> None:
+def test_spaces_convert_there_and_back_without_loss(name: str) -> None:
     space = colour_space(name)
     np.testing.assert_allclose(space.from_linear(space.to_linear(VALUES)), VALUES, rtol=2e-5, atol=2e-5)
     assert space.is_linear == (name not in ("srgb", "rec709"))
@@ -43,7 +43,7 @@ def test_white_stays_white() -> None:
         np.testing.assert_allclose(colour_space(name).to_linear(np.ones((1, 3), np.float32)), 1, atol=1e-5)
 
 
-def test_a_space_is_known_by_its_chromaticities() -> None:
+def test_a_space_is_identified_by_its_chromaticities() -> None:
     rounded = tuple(round(value, 3) for value in AP1)
     assert space_of_chromaticities(rounded).name == "acescg"  # type: ignore[arg-type]
     assert space_of_chromaticities(REC_709).name == "linear"
@@ -53,12 +53,12 @@ def test_a_space_is_known_by_its_chromaticities() -> None:
         space_of_chromaticities((0.3, 0.3) * 4)  # type: ignore[arg-type]
 
 
-def test_names_as_opencolorio_has_them_need_no_configuration(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_names_of_opencolorio_need_no_configuration(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("OCIO", raising=False)
     assert [colour_space(name).name for name in ("lin_rec709", "lin_rec2020")] == ["linear", "rec2020"]
 
 
-def test_an_unknown_name_is_told_what_there_is(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unknown_space_is_refused_with_the_known_names(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("OCIO", raising=False)
     with pytest.raises(SettingsError, match=r"srgb, rec709, linear, acescg.*--ocio"):
         colour_space("log of mine")
@@ -98,7 +98,7 @@ def test_spaces_of_a_configuration(config: Path, monkeypatch: pytest.MonkeyPatch
         colour_space("absent", config)
 
 
-def test_ours_are_opencolorio_s_own() -> None:
+def test_built_in_spaces_equal_those_of_opencolorio() -> None:
     pytest.importorskip("PyOpenColorIO", reason="the package opencolorio is not installed")
     for ours, theirs in (("acescg", "ACEScg"), ("aces2065-1", "ACES2065-1"), ("rec2020", "Linear Rec.2020"),
                          ("p3-d65", "Linear P3-D65"), ("linear", "Linear Rec.709 (sRGB)")):
@@ -107,14 +107,14 @@ def test_ours_are_opencolorio_s_own() -> None:
         assert other.chromaticities == pytest.approx(colour_space(ours).chromaticities, abs=1e-5)
 
 
-def test_a_bad_configuration_is_one_sentence(tmp_path: Path) -> None:
+def test_an_invalid_configuration_is_refused(tmp_path: Path) -> None:
     pytest.importorskip("PyOpenColorIO", reason="the package opencolorio is not installed")
     (tmp_path / "bad.ocio").write_text("no configuration")
     with pytest.raises(SettingsError, match=r"bad\.ocio cannot be read"):
         colour_space("ACEScg", tmp_path / "bad.ocio")
 
 
-def test_blender_s_own_library_serves_inside_blender() -> None:
+def test_blender_s_library_is_used_inside_blender() -> None:
     """In a Blender without the package, by the library and the configuration that ship with it."""
     root = Path(__file__).resolve().parents[2]
     older = root / ".venv-bpy45" / ("Scripts/python.exe" if os.name == "nt" else "bin/python")

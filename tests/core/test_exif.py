@@ -31,7 +31,7 @@ def exif_segment(order: str, orientation: int, focal: int) -> bytes:
 
 
 @pytest.mark.parametrize("order", ["II", "MM"])
-def test_exif(tmp_path: Path, order: str) -> None:
+def test_exif_gives_orientation_and_focal_length(tmp_path: Path, order: str) -> None:
     _, data = cv2.imencode(".jpg", np.zeros((8, 8, 3), np.uint8))
     raw = data.tobytes()
     (tmp_path / "a.jpg").write_bytes(raw[:2] + exif_segment(order, 6, 27) + raw[2:])
@@ -58,7 +58,7 @@ def test_orientation_of_pngs_and_tiffs(suffix: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))
-def test_upright(orientation: int) -> None:
+def test_an_orientation_is_applied_and_undone(orientation: int) -> None:
     """As OpenCV turns a JPEG of that orientation."""
     picture = np.zeros((16, 24, 3), np.uint8)
     picture[:8, :8], picture[8:, 16:] = (255, 0, 0), (0, 255, 0)

@@ -48,7 +48,7 @@ def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> 
     assert list(tmp_path.iterdir()) == [target]
 
 
-def test_what_the_system_refuses_is_one_sentence_that_names_the_file(tmp_path: Path) -> None:
+def test_a_refused_write_raises_an_error_that_names_the_file(tmp_path: Path) -> None:
     target = tmp_path / "a.txt"
     write_text(target, "old")
     with pytest.raises(OSError) as full, atomic_path(target):
@@ -78,7 +78,7 @@ def refused_by_windows() -> PermissionError:
     return problem
 
 
-def test_a_file_that_windows_holds_for_a_moment_is_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_write_waits_for_a_file_that_windows_locks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     refusals, replace = [refused_by_windows() for _ in range(3)], Path.replace
 
     def held(path: Path, target: Path) -> Path:
@@ -106,7 +106,7 @@ def test_a_file_that_windows_holds_for_a_moment_is_waited_for(tmp_path: Path, mo
     assert [path.name for path in tmp_path.iterdir()] == ["a.txt"]
 
 
-def test_what_windows_holds_for_a_moment_is_removed_after_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_removal_waits_for_a_file_that_windows_locks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     refusals, unlink = [refused_by_windows() for _ in range(3)], Path.unlink
 
     def held(path: Path, missing_ok: bool = False) -> None:
@@ -121,7 +121,7 @@ def test_what_windows_holds_for_a_moment_is_removed_after_it(tmp_path: Path, mon
     assert (list(tmp_path.iterdir()), refusals) == ([], [])
 
 
-def test_what_cannot_be_tidied_up_hides_no_failure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failed_clean_up_does_not_hide_the_failure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: object) -> None:
         raise PermissionError(errno.EACCES, "Permission denied")
 
@@ -151,7 +151,7 @@ def test_a_folder_is_removed_whole_or_not_at_all(tmp_path: Path, monkeypatch: py
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_disk_without_permissions_is_written_to(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_disk_without_permissions_can_be_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(_path: Path, _mode: int) -> None:
         raise PermissionError(errno.EPERM, "Operation not permitted")
 
@@ -163,7 +163,7 @@ def test_a_disk_without_permissions_is_written_to(tmp_path: Path, monkeypatch: p
     assert (tmp_path / "folder" / "b.txt").is_file()
 
 
-def test_what_windows_editors_write_is_read(tmp_path: Path) -> None:
+def test_json_with_a_byte_order_mark_is_read(tmp_path: Path) -> None:
     (tmp_path / "lights.json").write_bytes(b'\xef\xbb\xbf{"a": 1}')
     assert read_json(tmp_path / "lights.json", CaptureError) == {"a": 1}
 
@@ -172,11 +172,11 @@ def test_what_windows_editors_write_is_read(tmp_path: Path) -> None:
     ("Aux", "Aux_"), ("con.flare", "con_.flare"), ("COM1", "COM1_"), ("nul .png", "nul_.png"), ("lpt²", "lpt²_"),
     ("conin$", "conin$_"), ("Camera", "Camera"), ("console", "console"), ("com", "com"), ("a.con", "a.con"),
     ("conin", "conin")])
-def test_names_of_devices(name: str, expected: str) -> None:
+def test_device_names_of_windows_get_an_underscore(name: str, expected: str) -> None:
     assert avoid_device_name(name) == expected
 
 
-def test_what_windows_takes_for_a_device_is_no_file_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_device_name_is_refused_on_windows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for windows in (False, True):
         monkeypatch.setattr("core.system.files.WINDOWS", windows)
         for name in ("images/nul.png", "con/0001.png"):
@@ -185,7 +185,7 @@ def test_what_windows_takes_for_a_device_is_no_file_there(tmp_path: Path, monkey
         assert safe_join(tmp_path, "console/0001.png", CaptureError) == tmp_path / "console" / "0001.png"
 
 
-def test_a_file_has_several_names(tmp_path: Path) -> None:
+def test_a_file_is_recognised_by_each_of_its_names(tmp_path: Path) -> None:
     for name in ("a.png", "b.png"):
         (tmp_path / name).touch()
     check_no_overwrite([tmp_path / "a.png"], [tmp_path / "b.png"])
@@ -201,7 +201,7 @@ def test_json_refuses_nan(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("content", [b"", b"{", b"\xff\xfe\x00", b"[" * 100_000])
-def test_bad_json_is_one_sentence_with_the_name(tmp_path: Path, content: bytes) -> None:
+def test_invalid_json_raises_an_error_that_names_the_file(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "split.json"
     path.write_bytes(content)
     with pytest.raises(CaptureError, match=r"split\.json"):
@@ -209,17 +209,17 @@ def test_bad_json_is_one_sentence_with_the_name(tmp_path: Path, content: bytes) 
 
 
 @pytest.mark.parametrize("name", ["", "/etc/passwd", "../a", "a/../../b", "C:/a", "c:\\a", "..\\a", "a\0b"])
-def test_names_that_lead_out_are_refused(tmp_path: Path, name: str) -> None:
+def test_names_that_leave_the_folder_are_refused(tmp_path: Path, name: str) -> None:
     with pytest.raises(CaptureError):
         safe_join(tmp_path, name, CaptureError)
 
 
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no such names")
-def test_a_time_of_day_is_no_drive(tmp_path: Path) -> None:
+def test_a_name_with_a_colon_is_no_drive(tmp_path: Path) -> None:
     assert safe_join(tmp_path, "12:30.png", CaptureError) == tmp_path / "12:30.png"
 
 
-def test_a_name_need_not_be_utf_8_but_one_that_a_disk_takes(tmp_path: Path) -> None:
+def test_names_beyond_utf_8_are_accepted_and_too_long_ones_refused(tmp_path: Path) -> None:
     assert safe_join(tmp_path, os.fsdecode(b"pl\xe9.png"), CaptureError).parent == tmp_path
     for name in (256 * "a", 128 * "\u00e9", "\ud800"):
         if os.name == "nt" and name == "\ud800":
@@ -228,7 +228,7 @@ def test_a_name_need_not_be_utf_8_but_one_that_a_disk_takes(tmp_path: Path) -> N
             safe_join(tmp_path, name, CaptureError)
 
 
-def test_links_that_lead_out_are_refused(tmp_path: Path) -> None:
+def test_links_that_leave_the_folder_are_refused(tmp_path: Path) -> None:
     folder = tmp_path / "images"
     folder.mkdir()
     (tmp_path / "secret.png").touch()
@@ -240,7 +240,7 @@ def test_links_that_lead_out_are_refused(tmp_path: Path) -> None:
     assert safe_join(folder, "sub/c.png", CaptureError) == folder / "sub/c.png"
 
 
-def test_what_a_link_names_is_written_where_that_is_asked_for_alone(tmp_path: Path) -> None:
+def test_a_write_replaces_a_link_unless_it_is_followed(tmp_path: Path) -> None:
     """A frame that one bake has linked from another is not the other's any more."""
     link, file = tmp_path / "link.json", tmp_path / "elsewhere" / "a.json"
     file.parent.mkdir()
@@ -255,7 +255,7 @@ def test_what_a_link_names_is_written_where_that_is_asked_for_alone(tmp_path: Pa
         follow_link(tmp_path / "loop")
 
 
-def test_a_folder_is_there_whole_or_not_at_all(tmp_path: Path) -> None:
+def test_an_atomic_folder_appears_whole_or_not_at_all(tmp_path: Path) -> None:
     with pytest.raises(RuntimeError), atomic_folder(tmp_path / "made") as folder:
         (folder / "a").write_text("half")
         raise RuntimeError
@@ -266,7 +266,7 @@ def test_a_folder_is_there_whole_or_not_at_all(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["made"]
 
 
-def test_what_a_killed_process_left_of_a_file_can_be_removed(tmp_path: Path) -> None:
+def test_partial_files_of_a_killed_process_are_removed(tmp_path: Path) -> None:
     """And what a living one is writing cannot: on a farm a task may be given again while its worker still lives."""
     target = tmp_path / "layers.0001.exr"
     writes = ("import sys, time\nfrom core.system.files import atomic_path\n"
@@ -285,7 +285,7 @@ def test_what_a_killed_process_left_of_a_file_can_be_removed(tmp_path: Path) -> 
     assert sorted(path.name for path in tmp_path.iterdir()) == ["layers.0001.exr", "layers.0002.exr"]
 
 
-def test_what_a_killed_process_left_of_a_file_goes_when_that_is_written_again(tmp_path: Path) -> None:
+def test_a_new_write_removes_the_partial_file_of_a_killed_process(tmp_path: Path) -> None:
     """Whatever writes it, and nothing of another file's."""
     dies = "import os, sys\nfrom core.system.files import atomic_path\nwith atomic_path(sys.argv[1]):\n    os._exit(9)"
     for name in ("eval.json", "report.json"):
@@ -296,7 +296,7 @@ def test_what_a_killed_process_left_of_a_file_goes_when_that_is_written_again(tm
     assert len(left) == 2 and left[0].startswith(".partial-report.json-") and left[1] == "eval.json"
 
 
-def test_what_a_killed_process_left_of_a_folder_goes_when_that_is_made_again(tmp_path: Path) -> None:
+def test_a_new_folder_removes_the_partial_folder_of_a_killed_process(tmp_path: Path) -> None:
     """And what a living one makes stays."""
     makes = ("import os, sys\nfrom core.system.files import atomic_folder\n"
              "with atomic_folder(sys.argv[1]) as folder:\n    (folder / 'a').touch()\n    ")
@@ -313,7 +313,7 @@ def test_what_a_killed_process_left_of_a_folder_goes_when_that_is_made_again(tmp
     other.communicate()
 
 
-def test_what_another_machine_writes_stays_for_an_hour(tmp_path: Path) -> None:
+def test_a_partial_file_of_another_machine_is_kept_for_an_hour(tmp_path: Path) -> None:
     target, theirs = tmp_path / "a.exr", tmp_path / f".partial-a.exr-{os.getpid()}@01234567-abc.exr"
     theirs.touch()
     remove_partials_of(target)
@@ -330,7 +330,7 @@ def test_a_long_name_leaves_room_for_its_partial_one(tmp_path: Path) -> None:
     assert target.exists()
 
 
-def test_a_file_is_known_by_its_content(tmp_path: Path) -> None:
+def test_equal_content_has_an_equal_hash(tmp_path: Path) -> None:
     path, copy = tmp_path / "a", tmp_path / "b"
     for one in (path, copy):
         one.write_bytes(b"one")
@@ -340,7 +340,7 @@ def test_a_file_is_known_by_its_content(tmp_path: Path) -> None:
     assert content_hash(path) != content_hash(copy)
 
 
-def test_a_lock_is_held_by_one_and_outlives_no_one(tmp_path: Path) -> None:
+def test_a_file_lock_has_one_holder_and_expires(tmp_path: Path) -> None:
     lock = tmp_path / ".lock"
     with file_lock(lock):
         assert lock.exists()
@@ -350,7 +350,7 @@ def test_a_lock_is_held_by_one_and_outlives_no_one(tmp_path: Path) -> None:
     assert not lock.exists()
 
 
-def test_who_was_taken_for_dead_leaves_the_lock_to_the_next(tmp_path: Path) -> None:
+def test_a_slow_process_leaves_the_lock_that_replaced_its_own(tmp_path: Path) -> None:
     lock = tmp_path / ".lock"
     with contextlib.ExitStack() as next_one:
         with file_lock(lock):
@@ -359,7 +359,7 @@ def test_who_was_taken_for_dead_leaves_the_lock_to_the_next(tmp_path: Path) -> N
     assert not lock.exists()
 
 
-def test_of_two_who_wait_for_a_dead_one_the_slower_leaves_the_other_its_lock(tmp_path: Path,
+def test_two_processes_that_take_over_a_stale_lock_get_it_in_turn(tmp_path: Path,
                                                                              monkeypatch: pytest.MonkeyPatch) -> None:
     """Both have seen that it is stale before either removes it."""
     lock = tmp_path / ".lock"
@@ -391,7 +391,7 @@ def test_of_two_who_wait_for_a_dead_one_the_slower_leaves_the_other_its_lock(tmp
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_lock_out_of_the_future_outlives_no_one_either(tmp_path: Path) -> None:
+def test_a_lock_dated_in_the_future_expires(tmp_path: Path) -> None:
     """A clock was set back, or another machine's goes before."""
     lock = tmp_path / ".lock"
     lock.touch()
@@ -401,14 +401,14 @@ def test_a_lock_out_of_the_future_outlives_no_one_either(tmp_path: Path) -> None
         assert 0.09 <= time.monotonic() - started < 5
 
 
-def test_a_name_that_json_has_twice_is_told(tmp_path: Path) -> None:
+def test_a_duplicate_key_in_json_is_reported(tmp_path: Path) -> None:
     """The first of both would be lost."""
     (tmp_path / "a.json").write_text('{"frames": {"6": [1], "7": [], "6": [2]}}')
     with pytest.raises(CaptureError, match="it has '6' twice"):
         read_json(tmp_path / "a.json", CaptureError)
 
 
-def test_a_file_takes_its_name_in_turn(tmp_path: Path) -> None:
+def test_the_commit_lock_is_held_during_the_rename(tmp_path: Path) -> None:
     seen = []
 
     @contextlib.contextmanager
@@ -423,7 +423,7 @@ def test_a_file_takes_its_name_in_turn(tmp_path: Path) -> None:
     assert seen == [False, True]
 
 
-def test_where_nothing_may_be_written_the_file_itself_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_error_in_a_read_only_folder_names_the_target(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(**_: object) -> None:
         raise PermissionError(errno.EACCES, "Permission denied", str(tmp_path / ".partial-eval.json-1"))
 
@@ -433,7 +433,7 @@ def test_where_nothing_may_be_written_the_file_itself_is_named(tmp_path: Path, m
     assert problem.value.filename == str(tmp_path / "eval.json")
 
 
-def test_a_folder_that_may_not_be_written_is_told_in_the_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_lock_in_a_read_only_folder_raises_after_a_while(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: object) -> int:
         raise PermissionError(errno.EACCES, "Permission denied", str(tmp_path / ".lock"))
 
@@ -443,7 +443,7 @@ def test_a_folder_that_may_not_be_written_is_told_in_the_end(tmp_path: Path, mon
         pass
 
 
-def test_numbers_for_people_keep_what_worlds_of_any_unit_need() -> None:
+def test_rounding_keeps_significant_digits_at_any_scale() -> None:
     assert [round_for_text(value) for value in (0.0, 1.23456789, -5e6 - 0.123456789, 0.123456789)] == [
         0.0, 1.234568, -5000000.123457, 0.1234568]
     assert round_for_text(-1.52345678e-5) == pytest.approx(-1.52345678e-5, rel=1e-6)
@@ -451,7 +451,7 @@ def test_numbers_for_people_keep_what_worlds_of_any_unit_need() -> None:
 
 
 @pytest.mark.skipif(os.name == "nt", reason="rights are another matter on Windows")
-def test_what_is_written_can_be_read_by_those_whom_the_system_lets(tmp_path: Path) -> None:
+def test_written_files_have_the_permissions_of_the_umask(tmp_path: Path) -> None:
     """Temporary files are their owner's alone; other workers of a farm have to read the results."""
     mask = os.umask(0o022)
     try:

@@ -24,7 +24,7 @@ with folder_lock(sys.argv[1]):
 """
 
 
-def test_a_folder_is_of_one_process_at_a_time_and_free_when_that_is_killed(tmp_path: Path) -> None:
+def test_a_folder_lock_has_one_holder_and_ends_with_its_process(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     other = subprocess.Popen([sys.executable, "-c", HOLD, str(folder)], cwd=ROOT, text=True,
                              stdin=subprocess.PIPE, stdout=subprocess.PIPE)
@@ -43,7 +43,7 @@ def test_a_folder_is_of_one_process_at_a_time_and_free_when_that_is_killed(tmp_p
     assert not (tmp_path / "new").exists()
 
 
-def test_a_disk_without_locks_keeps_nobody_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_folder_lock_on_a_disk_without_locks_is_granted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuses(descriptor: int) -> None:
         del descriptor
         raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))

@@ -104,7 +104,7 @@ def test_broken_files_are_refused_by_name(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("read", [read_picture, read_plate])
-def test_who_gives_a_video_is_told_how_to_get_its_frames(read: Callable[[Path], object], tmp_path: Path) -> None:
+def test_a_video_is_refused_with_a_way_to_extract_its_frames(read: Callable[[Path], object], tmp_path: Path) -> None:
     for name, told in (("a.MP4", r"a\.MP4 is a video; .*ffmpeg -i a\.MP4"), ("a.txt", r"a\.txt is not a picture")):
         (tmp_path / name).touch()
         with pytest.raises(FrameError, match=told):
@@ -132,7 +132,7 @@ def test_a_chunk_that_claims_too_much_is_refused_before_memory_is_taken(tmp_path
         read_picture(tmp_path / "bomb.png")
 
 
-def test_what_follows_a_png_does_not_matter(tmp_path: Path) -> None:
+def test_bytes_after_the_end_of_a_png_are_ignored(tmp_path: Path) -> None:
     write_png(tmp_path / "a.png", RAMP)
     whole = read_picture(tmp_path / "a.png").display()
     with open(tmp_path / "a.png", "ab") as stream:
@@ -143,7 +143,7 @@ def test_what_follows_a_png_does_not_matter(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("kind", "count", "width"), [
     (11, 1, struct.pack("<f", np.nan)), (11, 1, struct.pack("<f", np.inf)), (12, 0xFFFFFFFF, struct.pack("<I", 8)),
     (3, 2, struct.pack("<HH", 9, 9))], ids=["not a number", "infinite", "more than the file", "two numbers"])
-def test_a_tiff_of_no_sensible_width_is_refused(kind: int, count: int, width: bytes, tmp_path: Path) -> None:
+def test_a_tiff_with_an_invalid_width_is_refused(kind: int, count: int, width: bytes, tmp_path: Path) -> None:
     entries = [(tiff.WIDTH, kind, count, width), (tiff.HEIGHT, 3, 1, struct.pack("<H", 7))]
     (tmp_path / "a.tif").write_bytes(struct.pack("<2sHIH", b"II", 42, 8, len(entries)) + b"".join(
         struct.pack("<HHI4s", *entry) for entry in entries) + bytes(4))
@@ -152,7 +152,7 @@ def test_a_tiff_of_no_sensible_width_is_refused(kind: int, count: int, width: by
 
 
 @pytest.mark.parametrize("name", [tiff.EXTRA_SAMPLES, tiff.SAMPLES])
-def test_a_tiff_of_no_sensible_tag_is_read_or_refused(name: int, tmp_path: Path) -> None:
+def test_a_tiff_with_an_invalid_tag_is_read_or_refused(name: int, tmp_path: Path) -> None:
     done, data = cv2.imencode(".tif", np.full((4, 5, 4), 51, np.uint8))
     assert done
     (tmp_path / "a.tif").write_bytes(tiff.with_tags(data.tobytes(), {
@@ -183,7 +183,7 @@ def test_an_exr_in_another_space_is_read_as_rec_709(tmp_path: Path) -> None:
         read_picture(tmp_path / "bad.exr")
 
 
-def test_a_picture_shrinks_in_light() -> None:
+def test_a_picture_is_shrunk_in_linear_light() -> None:
     board = np.zeros((4, 4, 3), np.float32)
     board[::2, ::2] = board[1::2, 1::2] = 1
     small = Picture(board, "srgb").resized(2, 2)
@@ -200,7 +200,7 @@ def test_a_folder_that_is_not_utf8_is_refused_by_name(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs the device that is always full, which Linux has")
-def test_a_full_disk_is_told_as_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_is_reported_as_such(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     @contextlib.contextmanager
     def full(_target: Path, _turn: object = None) -> Iterator[Path]:
         yield Path("/dev/full")
@@ -228,7 +228,7 @@ def test_a_tiff_that_would_be_read_as_something_else_is_refused(tag: int, value:
             reader(tmp_path / "a.tif")
 
 
-def test_of_an_exr_only_the_picture_counts(tmp_path: Path) -> None:
+def test_other_channels_of_an_exr_are_not_read_as_picture(tmp_path: Path) -> None:
     """Depth in a part before it, cropped to what is there and infinite behind that."""
     depth = np.full((3, 2), np.inf, np.float32)
     parts = [OpenEXR.Part({"name": "depth", "type": OpenEXR.scanlineimage,
@@ -255,7 +255,7 @@ def test_a_deep_exr_is_refused(tmp_path: Path) -> None:
         read_picture(tmp_path / "deep.exr")
 
 
-def test_of_parts_with_channels_of_one_name_the_first_counts(tmp_path: Path) -> None:
+def test_the_first_of_parts_with_equal_channel_names_is_read(tmp_path: Path) -> None:
     parts = [OpenEXR.Part({"name": name, "type": OpenEXR.scanlineimage},
                           dict.fromkeys("RGB", np.full((4, 5), value, np.float32)))
              for name, value in (("left", 0.25), ("right", 0.75))]
@@ -270,7 +270,7 @@ def test_a_long_header_before_the_size_is_no_damage(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("low", "high"), [((-4, -2), (23, 13)), ((3, 2), (9, 30)), ((40, 0), (50, 3))])
-def test_an_exr_is_what_its_frame_shows(low: tuple[int, int], high: tuple[int, int], tmp_path: Path) -> None:
+def test_an_exr_is_cropped_to_its_display_window(low: tuple[int, int], high: tuple[int, int], tmp_path: Path) -> None:
     """With overscan, with a part left out, with nothing on the frame at all."""
     width, height = high[0] - low[0] + 1, high[1] - low[1] + 1
     stored = np.random.default_rng(0).random((height, width)).astype(np.float32)
@@ -289,7 +289,7 @@ def test_an_exr_is_what_its_frame_shows(low: tuple[int, int], high: tuple[int, i
     assert (window.size, window.origin, window.is_frame) == ((width, height), low, False)
 
 
-def test_the_channels_of_an_exr_by_its_header_alone(tmp_path: Path) -> None:
+def test_channel_names_are_read_from_the_header(tmp_path: Path) -> None:
     names = ["R", "flare_key light.R", "flare_ö.A", "depth.Z"]
     write_exr(tmp_path / "a.exr", dict.fromkeys(names, RAMP[..., 0]), header={"view": "x" * 90_000})
     assert sorted(channel_names(tmp_path / "a.exr")) == sorted(names)
@@ -299,7 +299,7 @@ def test_the_channels_of_an_exr_by_its_header_alone(tmp_path: Path) -> None:
     lambda whole: whole[:0], lambda whole: whole[:40], lambda whole: b"\x89PNG" + whole[4:],
     lambda whole: whole.replace(b"chlist\0" + whole.split(b"chlist\0")[1][:4], b"chlist\0\xff\xff\xff\x7f"),
     lambda whole: whole.replace(b"flare", b"\0lare")])
-def test_the_channels_of_a_damaged_header_are_told_as_such(damage: Callable[[bytes], bytes], tmp_path: Path) -> None:
+def test_a_damaged_header_is_reported(damage: Callable[[bytes], bytes], tmp_path: Path) -> None:
     write_exr(tmp_path / "a.exr", {"flare.R": RAMP[..., 0]})
     (tmp_path / "a.exr").write_bytes(damage((tmp_path / "a.exr").read_bytes()))
     with pytest.raises(FrameError, match=r"a\.exr is not an EXR, or its header is damaged"):
@@ -308,7 +308,7 @@ def test_the_channels_of_a_damaged_header_are_told_as_such(damage: Callable[[byt
 
 @pytest.mark.parametrize("lines", [1, 16, 257])
 @pytest.mark.parametrize("compression", ["NO", "RLE", "ZIPS", "ZIP", "PIZ", "PXR24", "B44", "B44A", "DWAA", "DWAB"])
-def test_an_exr_that_ends_too_soon_is_known_by_its_table(compression: str, lines: int, tmp_path: Path) -> None:
+def test_a_truncated_exr_is_recognised_by_its_offset_table(compression: str, lines: int, tmp_path: Path) -> None:
     path = tmp_path / "a.exr"
     header = {"type": OpenEXR.scanlineimage, "compression": getattr(OpenEXR, f"{compression}_COMPRESSION")}
     save_exr(path, header, {"R": np.random.default_rng(0).random((lines, 9)).astype(np.float16)})
@@ -321,7 +321,7 @@ def test_an_exr_that_ends_too_soon_is_known_by_its_table(compression: str, lines
             read_picture(path)
 
 
-def test_of_an_exr_in_tiles_it_is_not_known_whether_it_is_cut_off(tmp_path: Path) -> None:
+def test_a_tiled_exr_is_not_checked_for_truncation(tmp_path: Path) -> None:
     tiles = {"type": OpenEXR.tiledimage, "tiles": OpenEXR.TileDescription()}
     save_exr(tmp_path / "a.exr", tiles, {"R": RAMP[..., 0]})
     assert not is_exr_truncated(tmp_path / "a.exr")

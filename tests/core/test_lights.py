@@ -70,7 +70,7 @@ class TestExposure:
         assert found.radius == pytest.approx(radius, rel=0.25)
         assert found.score > 0.8 and not found.is_cut
 
-    def test_the_colour_is_that_of_the_glow(self) -> None:
+    def test_the_colour_of_a_detection_is_that_of_its_glow(self) -> None:
         scene = with_disc(np.full((240, 320, 3), 0.1), (150, 100), 7)
         (found,) = ExposureDetector().detect(stored(scene))
         np.testing.assert_allclose(found.colour, (1.0, 0.8, 0.6), atol=0.05)
@@ -89,7 +89,7 @@ class TestExposure:
         (found,) = ExposureDetector().detect(stored(scene))
         assert np.linalg.norm(found.xy - (150, 100)) < 2
 
-    def test_a_starburst(self) -> None:
+    def test_a_starburst_is_one_detection(self) -> None:
         scene = with_disc(backdrop(), (150, 100), 9)
         for angle in np.linspace(0, 2 * np.pi, 8, endpoint=False):
             base = np.array([-np.sin(angle), np.cos(angle)]) * 2.5
@@ -99,12 +99,12 @@ class TestExposure:
         (found,) = ExposureDetector().detect(stored(scene))
         assert np.linalg.norm(found.xy - (150, 100)) < 1
 
-    def test_a_lamp_at_the_edge_is_said_to_be_cut(self) -> None:
+    def test_a_lamp_at_the_edge_is_cut(self) -> None:
         (found,) = ExposureDetector(0.1).detect(stored(with_disc(backdrop(), (160, 2), 8)))
         assert found.is_cut
 
     @pytest.mark.parametrize("what", ["wall", "sky", "window", "red", "sparkle", "stripe", "nothing", "white"])
-    def test_what_is_no_lamp(self, what: str) -> None:
+    def test_other_bright_regions_are_no_lamps(self, what: str) -> None:
         scene = backdrop()
         if what == "wall":
             scene[40:200, 30:200] = 1.2
@@ -153,7 +153,7 @@ class TestExposure:
         assert np.linalg.norm(by_disc.xy - by_distances.xy) < 0.1 and np.linalg.norm(by_disc.xy - (310, 280)) < 1
         assert by_distances.score == pytest.approx(by_disc.score, abs=0.02)
 
-    def test_linear_pictures(self) -> None:
+    def test_lights_in_linear_pictures_are_detected(self) -> None:
         scene = with_disc(backdrop(), (150.2, 99.6), 8)
         (found,) = ExposureDetector().detect(Picture(scene.astype(np.float32), "linear"))
         assert np.linalg.norm(found.xy - (150.2, 99.6)) < 0.15
@@ -183,7 +183,7 @@ def named(cameras: list[Camera]) -> list[tuple[str, Camera]]:
 
 
 class TestGather:
-    def test_lights_are_found_and_none_invented(self) -> None:
+    def test_lights_are_triangulated_without_false_ones(self) -> None:
         lights = [(0.4, -0.5, 0.3), (-0.9, -0.2, 1.5), (0.1, 0.3, -1.0)]
         cameras = orbit(30, size=SIZE)
         found = triangulate_lights(named(cameras), scene(lights, cameras, hidden=0.3), EXTENT)
@@ -224,7 +224,7 @@ class TestGather:
             assert np.linalg.norm(one.xyz - light[0]) < 4 * one.uncertainty
         assert some[3].uncertainty > 5 * some[40].uncertainty
 
-    def test_too_few_views(self) -> None:
+    def test_a_light_in_too_few_views_is_rejected(self) -> None:
         cameras = orbit(20, size=SIZE)
         detections = scene([(0.2, -0.3, 0.1)], cameras, clutter=0)
         detections[2:] = [[] for _ in detections[2:]]
@@ -233,7 +233,7 @@ class TestGather:
         (light,) = triangulate_lights(named(cameras), detections, EXTENT, settings)
         assert light.support == ("0000.png", "0001.png")
 
-    def test_one_lamp_found_twice_is_one(self) -> None:
+    def test_two_detections_of_one_lamp_are_merged(self) -> None:
         """A lamp and its glow, a little apart, in the same views."""
         cameras = orbit(20, size=SIZE)
         detections = [[spot(camera.project([(0.2, -0.3, 0.1)])[0][0], 8.0),
@@ -279,7 +279,7 @@ class TestGather:
         (found,) = triangulate_lights(named(cameras), lit, EXTENT)
         assert np.linalg.norm(found.xyz - (0.4, -0.5, 0.3)) < 0.05
 
-    def test_of_very_many_detections_pairs_are_drawn(self, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_pairs_of_very_many_detections_are_drawn(self, monkeypatch: pytest.MonkeyPatch) -> None:
         """Without a list of all, and the same ones by the same seed."""
         listed, triangle = [], np.triu_indices
         monkeypatch.setattr(np, "triu_indices", lambda n, k: listed.append(math.comb(n, 2)) or triangle(n, k))
@@ -293,14 +293,15 @@ class TestGather:
         assert max(listed, default=0) <= MAX_LISTED_PAIRS
 
 
-def test_the_chance_of_many_hits() -> None:
+def test_the_binomial_tail_is_exact() -> None:
     for share in (1e-6, 0.01, 0.3, 0.5):
         for least in (0, 1, 15, 60):
             direct = sum(math.comb(60, k) * share ** k * (1 - share) ** (60 - k) for k in range(least, 61))
             assert binomial_tail(least, 60, share) == pytest.approx(direct, rel=1e-9)
     many = [binomial_tail(least, 1500, 0.3) for least in (0, 1, 400, 450, 600, 1500, 1501)]
     assert many == sorted(many, reverse=True) and many[0] == 1 and 0.5 < many[3] < 0.52 and many[-1] == 0
-    assert (binomial_tail(0, 60, 0), binomial_tail(1, 60, 0), binomial_tail(60, 60, 1), binomial_tail(61, 60, 1)) == (1, 0, 1, 0)
+    edges = [binomial_tail(least, 60, share) for least, share in ((0, 0), (1, 0), (60, 1), (61, 1))]
+    assert edges == [1, 0, 1, 0]
 
 
 def turning(number: int) -> list[Camera]:
@@ -353,13 +354,13 @@ class TestGhosts:
         with pytest.raises(Cancelled):
             locate_by_ghosts(named(turning(8)), [[] for _ in range(8)], EXTENT, progress=progress)
 
-    def test_without_ghosts_none_is_invented(self) -> None:
+    def test_no_light_is_found_without_ghosts(self) -> None:
         cameras = turning(16)
         blobs = [find_blobs(frame) for frame in self.frames(cameras, 0.0)]
         assert not locate_by_ghosts(named(cameras), blobs, EXTENT)
 
 
-def test_lifting_on_to_a_scene() -> None:
+def test_lights_are_lifted_on_to_a_scene() -> None:
     """Gaussians of a lamp, a wall behind it and haze of no opacity: the lamp's centroid comes out."""
     rng = np.random.default_rng(0)
     lamp = np.array([0.3, -0.4, 0.2])
@@ -384,7 +385,7 @@ class TestFile:
         cameras = orbit(12, size=SIZE)
         return triangulate_lights(named(cameras), scene(list(places), cameras, noise=0.1, clutter=0), EXTENT)
 
-    def test_written_and_read(self, tmp_path: Path) -> None:
+    def test_written_lights_are_read_back(self, tmp_path: Path) -> None:
         folder = make_capture(tmp_path / "c")
         write_lights(folder / "lights.json", self.found((0.4, -0.5, 0.3)), named(orbit(12, size=SIZE)))
         (light,) = Capture.open(folder).lights
@@ -417,7 +418,7 @@ class TestFile:
         write_lights(path, self.found(a), views)  # and without keep the file is made afresh
         assert len(json.loads(path.read_text())["lights"]) == 1
 
-    def test_a_file_that_cannot_be_kept(self, tmp_path: Path) -> None:
+    def test_an_invalid_file_cannot_be_kept(self, tmp_path: Path) -> None:
         path = tmp_path / "lights.json"
         path.write_text("{")
         with pytest.raises(CaptureError, match=r"lights\.json"):
@@ -428,7 +429,7 @@ class TestFile:
         ('"found": [', '"found": null, "before": ['), ('"found": [', '"found": [["a", 1, 2], '),
         ('"found": [', '"found": [[NaN, 1, 2], '), ('"found": [', '"found": [[1, 2], '),
         ('"uncertainty": ', '"uncertainty": NaN, "before": ')])
-    def test_what_a_hand_has_put_there_is_told(self, tmp_path: Path, old: str, new: str) -> None:
+    def test_lights_edited_by_hand_are_not_replaced(self, tmp_path: Path, old: str, new: str) -> None:
         path, views = tmp_path / "lights.json", named(orbit(12, size=SIZE))
         found = self.found((0.4, -0.5, 0.3))
         write_lights(path, found, views)
@@ -455,7 +456,7 @@ def lit_capture(folder: Path, views: int, places: list[tuple[float, float, float
 
 
 class TestFind:
-    def test_from_frames_to_files(self, tmp_path: Path) -> None:
+    def test_lights_of_frames_are_found_and_written(self, tmp_path: Path) -> None:
         places = [(0.4, -0.5, 0.3), (-0.6, 0.2, 0.5)]
         capture = Capture.open(lit_capture(tmp_path / "c", 9, places))
         findings = find_lights(capture, ExposureDetector(0.3))
@@ -468,14 +469,14 @@ class TestFind:
         report = json.loads((tmp_path / "c/lights/report.json").read_text())
         assert len(report["views"]) == 9 and all(len(view["detections"]) == 2 for view in report["views"])
 
-    def test_no_light_in_any_view(self, tmp_path: Path) -> None:
+    def test_views_without_a_light_give_a_message(self, tmp_path: Path) -> None:
         capture = Capture.open(lit_capture(tmp_path / "c", 6, []))
         findings = find_lights(capture, ExposureDetector(0.3))
         assert not findings.lights and "No light was found" in findings.messages[-1]
         write_findings(capture, findings)
         assert Capture.open(tmp_path / "c").lights == ()
 
-    def test_one_view_only(self, tmp_path: Path) -> None:
+    def test_a_single_view_gives_a_guessed_distance(self, tmp_path: Path) -> None:
         capture = Capture.open(lit_capture(tmp_path / "c", 1, [(0.4, -0.5, 0.3)]))
         findings = find_lights(capture, ExposureDetector(0.3))
         (light,) = findings.lights
@@ -493,7 +494,7 @@ class TestFind:
         assert not any("No light was found" in sentence for sentence in findings.messages)
         assert np.linalg.norm(findings.doubtful[0].xyz - (0.4, -0.5, 0.3)) < 4 * findings.doubtful[0].uncertainty
 
-    def test_bad_settings(self, tmp_path: Path) -> None:
+    def test_invalid_settings_are_refused(self, tmp_path: Path) -> None:
         with pytest.raises(SettingsError, match="0 and 1"):
             detector_for("exposure", 2.0)
         with pytest.raises(SettingsError, match="magic"):
@@ -508,7 +509,7 @@ def test_grounded_without_its_libraries_or_weights(tmp_path: Path) -> None:
         detector_for("grounded", boxes=tmp_path / "none", masks=tmp_path / "none")
 
 
-def test_a_light_taken_out_by_hand_stays_out_when_it_was_missed_in_between(tmp_path: Path) -> None:
+def test_a_deleted_light_stays_deleted_after_a_search_that_missed_it(tmp_path: Path) -> None:
     path, views, found = tmp_path / "lights.json", named(orbit(12, size=SIZE)), TestFile().found
     kept, out = (0.4, -0.5, 0.3), (0.0, 0.5, 0.0)
     write_lights(path, found(kept, out), views)
@@ -520,7 +521,7 @@ def test_a_light_taken_out_by_hand_stays_out_when_it_was_missed_in_between(tmp_p
     assert len(json.loads(path.read_text())["lights"]) == 1
 
 
-def test_a_light_of_one_view_lies_as_deep_as_the_points_not_as_far() -> None:
+def test_a_light_of_one_view_has_the_depth_of_the_points() -> None:
     camera, place = Camera(64, 48, 30.0, 30.0, 32.0, 24.0, np.eye(4)), np.array([2.0, 0.0, 2.4])
     capture = SimpleNamespace(views=[SimpleNamespace(name="a", camera=camera)], extent=1.0,
                               points=SimpleNamespace(xyz=place[None]))

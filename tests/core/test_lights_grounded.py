@@ -42,7 +42,7 @@ def test_the_smallest_of_contained_and_overlapping_boxes_stays() -> None:
     assert sorted(keep_smallest(boxes, range(5))) == [1, 3, 4]
 
 
-def test_a_region_between_two_sources_goes_and_both_sources_stay() -> None:
+def test_a_box_around_two_lights_is_dropped_and_both_lights_stay() -> None:
     boxes = np.array([(0, 0, 100, 50), (5, 5, 15, 15), (80, 20, 95, 35)], float)
     assert sorted(keep_smallest(boxes, range(3))) == [1, 2]
 
@@ -52,7 +52,7 @@ def test_a_box_dropped_as_too_dark_displaces_nothing() -> None:
     assert refine_detections(boxes, masks, display) == [0]
 
 
-def test_an_empty_mask_is_no_detection() -> None:
+def test_an_empty_mask_is_dropped() -> None:
     boxes, masks, display = frame((0, 0, 10, 10), values=(255,))
     masks[0][:] = False
     assert refine_detections(boxes, masks, display) == []
@@ -94,7 +94,7 @@ def models(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     return folder / "boxes", folder / "masks"
 
 
-def test_the_whole_path(models: tuple[Path, Path]) -> None:
+def test_lights_are_detected_by_the_weights(models: tuple[Path, Path]) -> None:
     picture = Picture(np.random.default_rng(0).uniform(0.8, 1, (90, 120, 3)).astype(np.float32), "srgb")
     everything = GroundedDetector(0.0, *models)
     boxes, masks, scores = everything.predict(picture)

@@ -65,7 +65,7 @@ def off(seen: Sequence[FlareView], found: NDArray[np.float64], truth: NDArray[np
 
 
 @pytest.mark.parametrize("moved", [(0.3, 0.2, -0.1), (-0.25, 0.3, 0.4), (0.0, -0.4, 0.0), (0.1, 0.0, -0.6)])
-def test_a_light_beside_its_flare_is_put_there(moved: tuple[float, float, float]) -> None:
+def test_a_light_beside_its_flare_is_snapped_to_it(moved: tuple[float, float, float]) -> None:
     seen = sights((LAMP, 1.0))
     given = LAMP + np.array(moved)
     found = snap_lights(seen, [given])[0]
@@ -73,7 +73,7 @@ def test_a_light_beside_its_flare_is_put_there(moved: tuple[float, float, float]
     assert off(seen, found, LAMP) < 0.004
 
 
-def test_a_light_in_its_place_stays_to_the_bit_beside_a_far_brighter_one_too() -> None:
+def test_an_accurate_light_is_unchanged_beside_a_brighter_one() -> None:
     given = LAMP + np.array([0.004, -0.003, 0.01])
     assert (snap_lights(sights((LAMP, 1.0)), [given])[0] == given).all()
     near = LAMP + np.array([0.5, 0.1, 0.0])
@@ -97,7 +97,7 @@ def test_two_lights_do_not_climb_one_flare() -> None:
 
 
 @pytest.mark.parametrize("height", [-1.9, -2.3])
-def test_a_light_out_of_the_frame_is_not_put_on_to_its_ghost(height: float) -> None:
+def test_a_light_out_of_frame_is_not_snapped_to_its_ghost(height: float) -> None:
     light = np.array([0.3, height, 1.5])
     assert all(camera.project(light)[0][0, 1] < 0 for camera in cameras(9))
     assert (snap_lights([ghosts_alone(camera, light) for camera in cameras(9)], [light])[0] == light).all()
@@ -112,7 +112,7 @@ def test_without_a_flare_nothing_moves() -> None:
     assert (snap_lights([], given) == given).all()
 
 
-def test_how_bright_a_flare_is_counts_in_light() -> None:
+def test_the_brightness_of_a_flare_is_measured_in_linear_light() -> None:
     camera = cameras(1)[0]
     clean = np.full((camera.height, camera.width, 3), 0.5, np.float32)
     bright, dark = (float(linear_from_srgb(np.float32(value))) for value in (0.7, 0.5))

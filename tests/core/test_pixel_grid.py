@@ -26,10 +26,9 @@ from core.flare.compositing import splat_flare
 from core.flare.placement import PlaneGaussians
 from core.gaussians import SceneGaussians
 from core.gaussians.ply import read_ply, write_ply
+from core.look import PlacedLight, draw, pixels, read
 from core.look import PlaneGaussians as LookGaussians
-from core.look import draw, pixels, read
-from core.look.container import read_tensors, rewritten
-from core.look import PlacedLight
+from core.look.container import read_tensors, rewrite_metadata
 from core.look.shot import Shot, ShotFrame
 from tests.core.flared import HEIGHT, LIGHT, WIDTH, cameras, flared_capture
 from tests.core.test_fit import quick
@@ -85,7 +84,7 @@ def flare_at(camera: Camera, pixel_grid: PixelGrid | None) -> torch.Tensor:
 # ---- grids ----------------------------------------------------------------------------------------
 
 
-def test_a_grid_is_as_fine_as_its_focal_length_is_long() -> None:
+def test_the_pixel_ratio_follows_the_focal_length() -> None:
     zoom = PixelGrid(500.0, 800.0)
     assert [zoom.pixel_ratio(focal) for focal in (250, 499.9, 500, 600, 800, 800.1, 1600)] == [0.5, 1, 1, 1, 1, 1, 2]
     assert PixelGrid.from_focal_lengths([600.0, 500.0, 800.0]) == zoom
@@ -94,7 +93,7 @@ def test_a_grid_is_as_fine_as_its_focal_length_is_long() -> None:
     assert dilation(zoom, 50) == PIXEL_VARIANCE, "less, and thin ones fall between the pixels' middles"
 
 
-def test_a_coarser_picture_is_rendered_larger_as_far_as_there_is_room() -> None:
+def test_coarse_pictures_are_supersampled_up_to_a_limit() -> None:
     grid = PixelGrid(1000.0, 1000.0)
     factors = [grid.supersampling(focal, 100, 50) for focal in (2000, 1000, 990, 940, 500, 400, 100)]
     assert factors == [1, 1, 1, 2, 2, 3, 10]
@@ -104,7 +103,7 @@ def test_a_coarser_picture_is_rendered_larger_as_far_as_there_is_room() -> None:
 
 @pytest.mark.parametrize("lengths", [(0.0, 1.0), (-1.0, 1.0), (2.0, 1.0), (1.0, math.inf), (math.nan, 1.0),
                                      (1.0, math.nan)])
-def test_focal_lengths_that_are_none_are_refused(lengths: tuple[float, float]) -> None:
+def test_invalid_focal_lengths_are_refused(lengths: tuple[float, float]) -> None:
     with pytest.raises(ValueError, match="focal lengths"):
         PixelGrid(*lengths)
 
@@ -113,7 +112,7 @@ def test_focal_lengths_that_are_none_are_refused(lengths: tuple[float, float]) -
 
 
 @pytest.mark.parametrize("times", [3, 5])
-def test_a_flare_on_a_finer_grid_is_that_of_the_fit_s(times: int) -> None:
+def test_a_flare_on_a_finer_grid_equals_the_fit(times: int) -> None:
     own = flare_at(CAMERA, GRID)
     assert torch.equal(own, flare_at(CAMERA, None)), "as it was learned"
     kept, lost = (flare_at(at(times), pixel_grid) for pixel_grid in (GRID, None))
@@ -122,14 +121,14 @@ def test_a_flare_on_a_finer_grid_is_that_of_the_fit_s(times: int) -> None:
     assert float(lost.mean()) < 0.8 * float(own.mean()), "what thin ones lost before"
 
 
-def test_a_flare_on_a_coarser_grid_has_its_light() -> None:
+def test_a_flare_on_a_coarser_grid_keeps_its_light() -> None:
     own = float(flare_at(CAMERA, GRID).mean())
     assert float(flare_at(at(0.5), GRID).mean()) == pytest.approx(own, rel=0.1)
     assert float(flare_at(at(0.5), None).mean()) > 1.5 * own
 
 
 @pytest.mark.parametrize("times", [0.25, 0.5, 1, 2])
-def test_numpy_draws_it_as_torch_does(times: float) -> None:
+def test_numpy_and_torch_filter_alike(times: float) -> None:
     camera, some = at(times), streaks()
     twin = LookGaussians(*(None if part is None else part.numpy() for part in some))  # type: ignore[arg-type]
     theirs = flare_at(camera, GRID).numpy()
@@ -141,7 +140,7 @@ def test_numpy_draws_it_as_torch_does(times: float) -> None:
 # ---- scenes ---------------------------------------------------------------------------------------
 
 
-def test_a_scene_on_a_finer_grid_is_that_of_the_fit_s() -> None:
+def test_a_scene_on_a_finer_grid_equals_the_fit() -> None:
     scene = fine_scene()
     with torch.no_grad():
         own, broken = (render_scene(scene, camera).colour for camera in (CAMERA, at(3)))
@@ -152,7 +151,7 @@ def test_a_scene_on_a_finer_grid_is_that_of_the_fit_s() -> None:
     assert float((same_places(broken, 3) - own).abs().max()) > 0.2, "what thin ones lost before"
 
 
-def test_a_scene_on_a_coarser_grid_is_the_mean_of_the_fit_s_in_light() -> None:
+def test_a_scene_on_a_coarser_grid_is_the_fit_averaged_in_light() -> None:
     scene = fine_scene()
     scene.pixel_grid = GRID
     with torch.no_grad():
@@ -170,7 +169,7 @@ def test_a_scene_on_a_coarser_grid_is_the_mean_of_the_fit_s_in_light() -> None:
 # ---- files ----------------------------------------------------------------------------------------
 
 
-def test_a_scene_s_grid_comes_back(tmp_path: Path) -> None:
+def test_the_pixel_grid_of_a_scene_is_stored_in_its_ply(tmp_path: Path) -> None:
     scene = fine_scene(3)
     scene.pixel_grid = PixelGrid(512.25, 1024.5)
     write_ply(tmp_path / "a.ply", scene)
@@ -189,7 +188,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
     return fit(capture, quick(20, **{"width": WIDTH // 2}), folder / "run")
 
 
-def test_a_fit_writes_down_the_size_of_its_frames(run: Run) -> None:
+def test_a_fit_stores_its_pixel_grid(run: Run) -> None:
     half = CAMERA.focal_length / 2
     assert run.scene.pixel_grid == run.look.pixel_grid == run.flare.pixel_grid == PixelGrid(half, half)  # type: ignore[union-attr]
     own, large = (run.render(at(times)) for times in (0.5, 1))
@@ -198,7 +197,7 @@ def test_a_fit_writes_down_the_size_of_its_frames(run: Run) -> None:
         assert float(big.mean()) == pytest.approx(float(small.mean()), rel=0.01)
 
 
-def test_a_shot_shows_it_as_its_run_does(run: Run) -> None:
+def test_a_shot_and_its_run_render_alike(run: Run) -> None:
     camera = at(2)
     light = PlacedLight("lamp", run.lights[0], np.array(LIGHT), 1.0)
     one = ShotFrame("shot", 1, camera, (light,))
@@ -207,7 +206,7 @@ def test_a_shot_shows_it_as_its_run_does(run: Run) -> None:
     assert np.allclose(shown.scene, layers.scene, atol=1e-5)
 
 
-def test_another_fit_of_its_scene_learns_another_grid(run: Run) -> None:
+def test_a_fit_that_continues_a_scene_has_a_new_grid(run: Run) -> None:
     capture = Capture.open(run.capture_folder)
     begun = {"scene.start": str(run.folder / SCENE), "width": 0}
     assert Trainer(capture, quick(20, **begun)).scene.pixel_grid is None
@@ -215,17 +214,17 @@ def test_another_fit_of_its_scene_learns_another_grid(run: Run) -> None:
     assert frozen.scene.pixel_grid == run.scene.pixel_grid, "it stays as it is"
 
 
-def test_a_flare_with_a_damaged_grid_is_one_sentence(run: Run, tmp_path: Path) -> None:
+def test_a_flare_with_a_damaged_grid_is_refused(run: Run, tmp_path: Path) -> None:
     _, metadata = read_tensors(run.folder / FLARE)
     description = json.loads(metadata["fit_flare"])
     for entry in ({"least": 0, "most": 1}, {"least": 5}, [1, 2], "far", {"least": "a", "most": "b"}, 7):
-        rewritten(run.folder / FLARE, tmp_path / "a.flare",
+        rewrite_metadata(run.folder / FLARE, tmp_path / "a.flare",
                   {**metadata, "fit_flare": json.dumps({**description, "sampling": entry})})
         for reader in (read, flare_file.load):
             with pytest.raises(FlareFileError, match=r"a\.flare is damaged"):
                 reader(tmp_path / "a.flare")
     del description["sampling"]  # as fits wrote it before
-    rewritten(run.folder / FLARE, tmp_path / "a.flare", {**metadata, "fit_flare": json.dumps(description)})
+    rewrite_metadata(run.folder / FLARE, tmp_path / "a.flare", {**metadata, "fit_flare": json.dumps(description)})
     assert read(tmp_path / "a.flare").pixel_grid is None
     assert flare_file.load(tmp_path / "a.flare").pixel_grid is None
     assert replace(GRID, min_focal_length=1.0).pixel_ratio(2.0) == 1

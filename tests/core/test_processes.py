@@ -28,7 +28,7 @@ def sleeper(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch,
     process.wait()
 
 
-def test_the_same_and_another_of_its_number(sleeper: tuple[subprocess.Popen[bytes], float]) -> None:
+def test_a_process_is_identified_by_id_and_start_time(sleeper: tuple[subprocess.Popen[bytes], float]) -> None:
     process, started = sleeper
     assert processes.is_running(process.pid)
     assert processes.is_same_process(process.pid, started)
@@ -41,14 +41,14 @@ def test_the_same_and_another_of_its_number(sleeper: tuple[subprocess.Popen[byte
 
 
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="needs /proc")
-def test_one_that_ended_unasked_does_not_run() -> None:
+def test_an_unreaped_process_does_not_run() -> None:
     process = subprocess.Popen([sys.executable, "-c", ""])
     time.sleep(1)  # not waited for: its number is not given out yet
     assert not processes.is_running(process.pid)
     process.wait()
 
 
-def test_ages_as_ps_tells_them(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_start_times_are_read_from_ps(monkeypatch: pytest.MonkeyPatch) -> None:
     for told, age in (("      03:07\n", 187), ("1-02:03:04", 93784), ("   12:00:00", 43200),
                       ("441077234-00:18:40\n", 0)):
         monkeypatch.setattr(processes.subprocess, "run",
@@ -58,7 +58,7 @@ def test_ages_as_ps_tells_them(monkeypatch: pytest.MonkeyPatch) -> None:
     assert processes._start_time_ps(1) is None
 
 
-def test_a_process_of_somebody_else_runs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_process_of_another_user_runs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """What it writes is no leftover: on macOS, where a signal alone tells, one may not be sent to it."""
     monkeypatch.setattr(processes, "PROC", tmp_path / "none")
     monkeypatch.setattr(processes, "WINDOWS", False)
@@ -77,7 +77,7 @@ def test_a_python_is_found_in_an_environment_of_every_kind(inner: str, tmp_path:
     assert processes.find_python(tmp_path) == processes.find_python(python) == python
 
 
-def test_an_environment_whose_base_is_gone_has_no_python(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_environment_without_its_base_has_no_python(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """On Windows, where its python.exe outlives that."""
     monkeypatch.setattr(processes, "WINDOWS", True)
     python, base = tmp_path / "engine" / "Scripts" / "python.exe", tmp_path / "Blender 5.0" / "python.exe"
@@ -90,7 +90,7 @@ def test_an_environment_whose_base_is_gone_has_no_python(tmp_path: Path, monkeyp
     assert processes.find_python(tmp_path / "engine") is processes.find_python(python) is None
 
 
-def test_a_mac_is_itself_in_every_network(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_machine_id_of_a_mac_is_independent_of_the_network(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     names = iter(("studio.local", "guest-17.wifi", "studio.local"))
     monkeypatch.setattr(processes.platform, "node", lambda: next(names))
     monkeypatch.setattr(processes.Path, "home", lambda: tmp_path)

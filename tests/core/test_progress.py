@@ -56,7 +56,7 @@ def test_terminal_progress_writes_to_a_plain_stream() -> None:
     assert "error: wrong" in stream.getvalue()
 
 
-def test_a_stop_is_heard_at_the_next_step() -> None:
+def test_a_stop_request_ends_the_work_at_the_next_step() -> None:
     progress = Progress()
     progress.stage("fit", 5)
     progress.advance()
@@ -80,7 +80,7 @@ class Gone(io.StringIO):
 
 
 @pytest.mark.parametrize("kind", [JsonProgress, OpenJdProgress, TerminalProgress])
-def test_a_disk_too_full_for_what_is_told_does_not_end_the_work(kind: type[Progress]) -> None:
+def test_progress_on_a_full_disk_does_not_end_the_work(kind: type[Progress]) -> None:
     progress = kind(FullDisk())
     progress.stage("fit", 2)
     progress.advance(2)
@@ -91,7 +91,7 @@ def test_a_disk_too_full_for_what_is_told_does_not_end_the_work(kind: type[Progr
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="only Linux has a disk that is always full")
-def test_what_a_full_disk_refuses_is_flush_or_drop() -> None:
+def test_output_that_a_full_disk_refuses_is_dropped() -> None:
     stream = open("/dev/full", "w")  # noqa: SIM115 - closed below, which tries what is left in it again
     stream.write("a line")
     flush_or_drop(stream)
@@ -103,7 +103,7 @@ def test_what_a_full_disk_refuses_is_flush_or_drop() -> None:
 @pytest.mark.parametrize("number", [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP")
                                     if hasattr(signal, name)])
 @pytest.mark.usefixtures("hangups_are_heard")
-def test_signals_ask_for_a_stop_and_handlers_come_back(number: int) -> None:
+def test_signals_request_a_stop_and_handlers_are_restored(number: int) -> None:
     before = signal.getsignal(number)
     progress = Progress()
     with stop_on_request(progress):
@@ -137,7 +137,7 @@ except Cancelled as stop:
 
 @pytest.mark.skipif(not hasattr(os, "openpty") or sys.platform == "darwin", reason="of Linux's terminals")
 @pytest.mark.usefixtures("hangups_are_heard")
-def test_work_whose_terminal_is_closed_stops_as_asked(tmp_path: Path) -> None:
+def test_a_closed_terminal_stops_the_work(tmp_path: Path) -> None:
     ours, theirs = os.openpty()
     words = [sys.executable, "-c", ON_A_TERMINAL, str(tmp_path / "saved")]
     with subprocess.Popen(words, cwd=ROOT, stdin=theirs, stdout=theirs, stderr=theirs, start_new_session=True) as work:
@@ -154,7 +154,7 @@ def test_work_whose_terminal_is_closed_stops_as_asked(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="Windows has no such signal")
 @pytest.mark.usefixtures("hangups_are_heard")
-def test_a_lost_terminal_is_told_twice_and_not_at_all_under_nohup() -> None:
+def test_a_hangup_may_repeat_and_is_ignored_under_nohup() -> None:
     progress = Progress()
     with stop_on_request(progress):
         os.kill(os.getpid(), signal.SIGHUP)
@@ -171,7 +171,7 @@ def test_a_lost_terminal_is_told_twice_and_not_at_all_under_nohup() -> None:
         signal.signal(signal.SIGHUP, before)
 
 
-def test_openjd_lines_are_a_farm_s() -> None:
+def test_openjd_lines_follow_the_specification() -> None:
     stream = io.StringIO()
     progress = OpenJdProgress(stream)
     progress.stage("bake", 4)
@@ -185,7 +185,7 @@ def test_openjd_lines_are_a_farm_s() -> None:
 
 
 @pytest.mark.parametrize("of_main_thread", [True, False])
-def test_a_file_asks_for_a_stop(of_main_thread: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stop_file_ends_the_work(of_main_thread: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(STOP_FILE, str(tmp_path / "stop"))
     monkeypatch.setattr("core.system.progress.STOP_FILE_INTERVAL_S", 0.01)
     stopped: list[str] = []
@@ -226,7 +226,7 @@ class Clock:
         return progress.eta_s
 
 
-def test_the_time_left_of_what_goes_on_is_by_the_steps_made_since(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_eta_of_resumed_work_counts_new_steps_only(monkeypatch: pytest.MonkeyPatch) -> None:
     clock, progress = Clock(monkeypatch), Progress()
     progress.stage("fit", 1000, 900)
     assert progress.eta_s is None
@@ -235,7 +235,7 @@ def test_the_time_left_of_what_goes_on_is_by_the_steps_made_since(monkeypatch: p
     assert clock.left_after(progress, 50, 49) == 0
 
 
-def test_the_time_left_is_not_by_the_first_step_and_forgets_an_earlier_pace(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_eta_ignores_the_first_step_and_old_pace(monkeypatch: pytest.MonkeyPatch) -> None:
     clock, progress = Clock(monkeypatch), Progress()
     progress.stage("fit", 1000)
     assert clock.left_after(progress, 20) is None, "compiling"
@@ -250,7 +250,7 @@ def test_the_time_left_is_not_by_the_first_step_and_forgets_an_earlier_pace(monk
     assert progress.eta_s is None
 
 
-def test_processes_that_end_together_are_no_pace(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_eta_ignores_steps_that_end_together(monkeypatch: pytest.MonkeyPatch) -> None:
     clock, progress = Clock(monkeypatch), Progress()
     progress.stage("clean", 64)
     lefts = [clock.left_after(progress, 0.01 if number % 16 else 5) for number in range(48)]

@@ -99,7 +99,7 @@ def solved(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Camera]
     return folder / "out", cameras, report
 
 
-def test_cameras_come_out_right(solved: tuple[Path, list[Camera], dict[str, Any]]) -> None:
+def test_solved_cameras_match_the_truth(solved: tuple[Path, list[Camera], dict[str, Any]]) -> None:
     out, cameras, report = solved
     capture = Capture.open(out)
     assert report["registered"] == len(capture.views) == 9 and report["reprojection_error_px"] < 0.6
@@ -116,7 +116,7 @@ def test_cameras_come_out_right(solved: tuple[Path, list[Camera], dict[str, Any]
     assert capture.views[0].camera.fx == pytest.approx(0.9 * SIZE[0], rel=0.05)
 
 
-def test_frames_are_straight_and_points_lie_on_them(solved: tuple[Path, list[Camera], dict[str, Any]]) -> None:
+def test_solved_frames_are_undistorted_and_show_their_points(solved: tuple[Path, list[Camera], dict[str, Any]]) -> None:
     """Every view is a pinhole's, and the points' colours are those of the pixels they fall on."""
     capture = Capture.open(solved[0])
     off, beside = [], []
@@ -132,7 +132,7 @@ def test_frames_are_straight_and_points_lie_on_them(solved: tuple[Path, list[Cam
     assert np.median(np.concatenate(off)) < 0.5 * np.median(np.concatenate(beside))
 
 
-def test_the_model_is_colmaps(solved: tuple[Path, list[Camera], dict[str, Any]]) -> None:
+def test_colmap_reads_the_solved_model(solved: tuple[Path, list[Camera], dict[str, Any]]) -> None:
     import pycolmap
 
     model = pycolmap.Reconstruction(str(solved[0] / "sparse" / "0"))
@@ -143,7 +143,7 @@ def test_the_model_is_colmaps(solved: tuple[Path, list[Camera], dict[str, Any]])
     assert error < 0.7
 
 
-def test_the_report(solved: tuple[Path, list[Camera], dict[str, Any]]) -> None:
+def test_the_report_has_the_figures_of_the_solve(solved: tuple[Path, list[Camera], dict[str, Any]]) -> None:
     out, _, report = solved
     assert json.loads((out / "solve.json").read_text()) == report
     assert len(report["left_out"]) == 1 and "004.png" in report["left_out"][0]
@@ -161,7 +161,7 @@ def test_a_solved_shot_is_not_solved_again(solved: tuple[Path, list[Camera], dic
     assert (out / "solve.json").stat().st_mtime_ns == before
 
 
-def test_lights_of_another_solve_are_not_taken_for_this_one_s(solved: tuple[Path, list[Camera], dict[str, Any]],
+def test_lights_of_an_earlier_solve_are_refused(solved: tuple[Path, list[Camera], dict[str, Any]],
                                                             tmp_path: Path) -> None:
     shutil.copytree(solved[0], tmp_path / "out")
     (tmp_path / "out" / "lights.json").write_text('{"lights": []}')
@@ -189,7 +189,7 @@ class Stopping(Progress):
         super().advance(steps, **figures)
 
 
-def test_stopped_and_taken_up_again(tmp_path: Path) -> None:
+def test_a_stopped_solve_resumes(tmp_path: Path) -> None:
     frames = shoot(tmp_path / "frames", orbit(9, size=SIZE, arc=0.9))
     out = tmp_path / "out"
     for stage in ("read frames", "find features", "match frames", "place cameras", "write frames"):
@@ -205,7 +205,7 @@ def test_stopped_and_taken_up_again(tmp_path: Path) -> None:
     assert report["registered"] == 9 and len(Capture.open(out).views) == 9
 
 
-def test_what_a_killed_solve_left_half_written_is_not_in_the_capture(stopped: Path, tmp_path: Path) -> None:
+def test_partial_files_of_a_killed_solve_are_not_in_the_capture(stopped: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     shutil.copytree(stopped / "out", out)
     gone = subprocess.Popen([sys.executable, "-c", ""])
@@ -221,14 +221,14 @@ def test_what_a_killed_solve_left_half_written_is_not_in_the_capture(stopped: Pa
     assert not list(out.rglob(".*"))
 
 
-def test_one_solves_into_a_folder_at_a_time(stopped: Path, tmp_path: Path) -> None:
+def test_two_solves_cannot_write_to_one_folder(stopped: Path, tmp_path: Path) -> None:
     with folder_lock(tmp_path / "out"), pytest.raises(RunError, match="Another process is using"):
         solve(stopped / "frames", tmp_path / "out", QUICK)
 
 
 @pytest.mark.parametrize("damaged", ["request.json", "stills.json", "mapped.json", "database.db",
                                      "models/0/points3D.bin"])
-def test_what_a_power_failure_has_damaged_is_made_again(stopped: Path, tmp_path: Path, damaged: str) -> None:
+def test_damaged_intermediate_files_are_made_again(stopped: Path, tmp_path: Path, damaged: str) -> None:
     out, heard = tmp_path / "out", Heard()
     shutil.copytree(stopped / "out", out)
     file = out / ".solve" / damaged
@@ -262,7 +262,7 @@ class Failing(Progress):
 
 
 @pytest.mark.parametrize("count", [1, 5])
-def test_what_fails_while_cameras_are_placed_is_told_and_none_are_kept(stopped: Path, tmp_path: Path,
+def test_a_failure_during_mapping_is_raised_and_no_model_recorded(stopped: Path, tmp_path: Path,
                                                                        count: int) -> None:
     """At the first pair, and at the last frame, when there is a model already."""
     out, heard = tmp_path / "out", Stopping()
@@ -275,7 +275,7 @@ def test_what_fails_while_cameras_are_placed_is_told_and_none_are_kept(stopped: 
     assert "place cameras" in heard.seen
 
 
-def test_a_mapping_that_ends_beside_a_failure_is_not_written_down(stopped: Path, tmp_path: Path,
+def test_a_mapping_that_ends_with_a_failure_is_not_recorded(stopped: Path, tmp_path: Path,
                                                                   monkeypatch: pytest.MonkeyPatch) -> None:
     """pycolmap looks at its token between steps, so that it may come back with what it has."""
     import pycolmap
@@ -293,7 +293,7 @@ def test_a_mapping_that_ends_beside_a_failure_is_not_written_down(stopped: Path,
     assert not (out / ".solve" / "mapped.json").exists()
 
 
-def test_frames_of_different_sizes(tmp_path: Path) -> None:
+def test_frames_of_different_sizes_are_solved(tmp_path: Path) -> None:
     cameras = orbit(10, size=SIZE, arc=0.9)
     cameras[7:] = [camera.scaled(400, 300) for camera in cameras[7:]]
     frames = shoot(tmp_path / "frames", cameras)
@@ -307,7 +307,7 @@ def test_frames_of_different_sizes(tmp_path: Path) -> None:
     assert capture.views[0].camera.fx == pytest.approx(capture.views[9].camera.fx * 320 / 400, rel=0.05)
 
 
-def test_squeezed_frames(tmp_path: Path) -> None:
+def test_squeezed_frames_keep_their_pixel_aspect(tmp_path: Path) -> None:
     """EXRs whose pixels are twice as wide as high: the cameras are those of the frames as filmed."""
     cameras = [camera.scaled(SIZE[0] // 2, SIZE[1]) for camera in orbit(8, size=SIZE, arc=0.9)]
     frames = tmp_path / "frames"
@@ -325,7 +325,7 @@ def test_squeezed_frames(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("name", "kind", "top", "suffix"), [
     ("a.png", np.uint8, 1.0, ".png"), ("a.png", np.uint16, 1.0, ".png"), ("a.tif", np.uint8, 1.0, ".png"),
     ("a.tif", np.uint16, 1.0, ".png"), ("a.tif", np.float32, 1e5, ".exr")])
-def test_straightened_frames_keep_what_their_files_hold(name: str, kind: type, top: float, suffix: str,
+def test_undistorted_frames_keep_the_depth_of_their_files(name: str, kind: type, top: float, suffix: str,
                                                         tmp_path: Path) -> None:
     full = 1 if kind is np.float32 else np.iinfo(kind).max
     stored = np.zeros((48, 64, 3), kind)
@@ -353,7 +353,7 @@ def write_video(path: Path, frames: list[NDArray[np.uint8]]) -> Path:
     return path
 
 
-def test_a_video(tmp_path: Path) -> None:
+def test_a_video_is_solved(tmp_path: Path) -> None:
     """The sharpest frame of each stretch is taken: two of three are blurred here."""
     frames = [render(camera) for camera in orbit(30, size=SIZE, arc=0.9)]
     frames = [frame if i % 3 == 1 else cv2.GaussianBlur(frame, (0, 0), 3) for i, frame in enumerate(frames)]
@@ -364,7 +364,7 @@ def test_a_video(tmp_path: Path) -> None:
     assert names == [f"{i:06d}.png" for i in range(1, 30, 3)]
 
 
-def test_a_video_that_is_cut_off_is_told(tmp_path: Path) -> None:
+def test_a_truncated_video_is_reported(tmp_path: Path) -> None:
     """An AVI has its frames before its index: what there is of it can be read."""
     video, heard = tmp_path / "shot.avi", Heard()
     writer = cv2.VideoWriter(str(video), cv2.VideoWriter.fourcc(*"MJPG"), 25, SIZE)
@@ -397,7 +397,7 @@ def refusal(source: Path, out: Path, settings: SolveSettings = QUICK) -> str:
     return message
 
 
-def test_a_video_without_motion(tmp_path: Path) -> None:
+def test_a_video_without_motion_is_refused(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     still = render(orbit(1, size=SIZE)[0]).astype(np.float64)
     frames = [np.clip(still + rng.normal(0, 6, still.shape), 0, 255).astype(np.uint8) for _ in range(12)]
@@ -405,12 +405,12 @@ def test_a_video_without_motion(tmp_path: Path) -> None:
     assert "same picture" in message or "hardly moves" in message
 
 
-def test_all_frames_identical(tmp_path: Path) -> None:
+def test_identical_frames_are_refused(tmp_path: Path) -> None:
     frames = shoot(tmp_path / "frames", orbit(1, size=SIZE) * 6)
     assert "same picture" in refusal(frames, tmp_path / "out")
 
 
-def test_a_camera_that_only_turns(tmp_path: Path) -> None:
+def test_a_rotating_camera_is_refused(tmp_path: Path) -> None:
     turn = [cv2.Rodrigues(np.array([0.0, 0.05 * i, 0.0]))[0] for i in range(7)]
     still = look_at((0.0, -0.3, -3.0))
     cameras = []
@@ -421,7 +421,7 @@ def test_a_camera_that_only_turns(tmp_path: Path) -> None:
     assert "parallax" in refusal(shoot(tmp_path / "frames", cameras), tmp_path / "out")
 
 
-def test_frames_that_share_nothing(tmp_path: Path) -> None:
+def test_frames_without_overlap_are_refused(tmp_path: Path) -> None:
     folder = tmp_path / "frames"
     folder.mkdir()
     for i in range(4):
@@ -431,7 +431,7 @@ def test_frames_that_share_nothing(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("case", ["absent", "empty", "two", "broken", "text", "own images", "own folder", "theirs",
                                   "file", "damaged"])
-def test_nothing_to_solve(tmp_path: Path, case: str) -> None:
+def test_a_source_without_frames_is_refused(tmp_path: Path, case: str) -> None:
     source, out = tmp_path / "frames", tmp_path / "out"
     if case not in ("absent", "text"):
         shoot(source, orbit(2 if case in ("two", "broken") else 4, size=SIZE))
@@ -463,23 +463,23 @@ def test_nothing_to_solve(tmp_path: Path, case: str) -> None:
         path for path in before if path != out]
 
 
-def test_a_video_that_is_none(tmp_path: Path) -> None:
+def test_an_invalid_video_is_refused(tmp_path: Path) -> None:
     (tmp_path / "shot.mp4").write_bytes(b"no video at all")
     assert "shot.mp4" in refusal(tmp_path / "shot.mp4", tmp_path / "out")
 
 
 @pytest.mark.parametrize("bad", [{"lens": "PERISCOPE"}, {"frames": -1}, {"matching": "none"}, {"size": 10}])
-def test_bad_settings(bad: dict[str, Any]) -> None:
+def test_invalid_settings_are_refused(bad: dict[str, Any]) -> None:
     with pytest.raises(SettingsError):
         SolveSettings(**bad)
 
 
-def test_the_sharpest_of_each_stretch() -> None:
+def test_the_sharpest_frame_of_each_stretch_is_chosen() -> None:
     assert choose_sharpest([1, 5, 2, 9, 1, 1, 3, 4], 4) == [1, 3, 4, 7]
     assert choose_sharpest([1, 2, 3], 0) == choose_sharpest([1, 2, 3], 9) == [0, 1, 2]
 
 
-def test_pairs() -> None:
+def test_pairs_follow_the_matching() -> None:
     rng = np.random.default_rng(0)
     places = rng.integers(0, 256, (5, 300, 128)).astype(np.uint8)  # five places, visited again and again
     def descriptors(i: int) -> NDArray[np.uint8]:
@@ -496,7 +496,7 @@ def test_pairs() -> None:
     assert len(loops) > 40 and np.mean([(j - i) % 5 == 0 for i, j in loops]) > 0.9
 
 
-def test_masks_leave_out_clipped_pixels_and_ghost_lines() -> None:
+def test_feature_masks_exclude_clipped_pixels_and_ghost_lines() -> None:
     pixels = np.full((240, 320, 3), 0.4, np.float32)
     cv2.circle(pixels, (60, 50), 8, (1.0, 1.0, 1.0), -1)
     pixels[200, 300] = 1.0  # sparkle
@@ -516,7 +516,7 @@ def test_masks_of_linear_frames_do_not_depend_on_their_exposure() -> None:
     assert all((mask == masks[1]).all() for mask in masks)
 
 
-def test_up() -> None:
+def test_the_up_direction_is_found() -> None:
     rng = np.random.default_rng(0)
     up = np.array([0.2, -0.9, 0.3])
     up /= np.linalg.norm(up)
@@ -534,7 +534,7 @@ def test_up() -> None:
 
 @pytest.mark.parametrize(("apart", "told"), [(0, 0), (1, 1)])
 @pytest.mark.parametrize("as_video", [True, False])
-def test_interlaced_footage_is_told(apart: int, told: int, as_video: bool, tmp_path: Path) -> None:
+def test_interlaced_footage_raises_a_warning(apart: int, told: int, as_video: bool, tmp_path: Path) -> None:
     """Every other line of the frame after."""
     frames = [render(camera) for camera in orbit(8, size=SIZE, arc=0.9)]
     for first, second in pairwise(list(frames)):
@@ -581,7 +581,7 @@ def test_models_are_written_as_read(tmp_path: Path) -> None:
     assert kept == {float(again.xyz[index, 0]) for index in (0, 2, 4)}, "the numbers are not the indices"
 
 
-def test_points_that_a_model_lists_and_lacks_are_left_out(tmp_path: Path) -> None:
+def test_observations_of_missing_points_are_left_out(tmp_path: Path) -> None:
     folder = make_capture(tmp_path / "c")
     images = folder / "sparse" / "0" / "images.txt"
     lines = images.read_text(encoding="utf-8").splitlines()
@@ -599,7 +599,7 @@ def rotated(rng: np.random.Generator) -> NDArray[np.float64]:
     return pose
 
 
-def test_quaternions() -> None:
+def test_quaternions_convert_to_rotations_and_back() -> None:
     rng = np.random.default_rng(0)
     for _ in range(50):
         rotation = rotated(rng)[:3, :3]
@@ -621,13 +621,13 @@ print("stopped as asked" if told.wait(5) else "not told")
 
 
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no such signal")
-def test_who_asks_a_solve_to_end_is_heard() -> None:
+def test_a_solve_keeps_the_handler_of_sigterm() -> None:
     """pycolmap's logging would end the process with a trace of its stack."""
     done = subprocess.run([sys.executable, "-c", LISTENS], cwd=Path(__file__).resolve().parents[2], text=True,
                           capture_output=True, check=False)
     assert (done.returncode, done.stdout.strip()) == (0, "stopped as asked"), done.stderr[-500:]
 
 
-def test_frames_whose_names_differ_by_case_or_suffix_alone_are_two_on_every_disk() -> None:
+def test_frames_whose_names_differ_by_case_or_suffix_get_distinct_files() -> None:
     stills = [SourceFrame(name, f"/shoot/{name}", 8, 8, None, 1) for name in ("a.jpg", "A.jpeg", "b.jpg")]
     assert develop._file_names(stills) == ["a.png", "A.jpeg.png", "b.png"]

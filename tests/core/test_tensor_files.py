@@ -12,7 +12,7 @@ from core.system import tensor_files
 MAPS = Path("/proc/self/maps")
 
 
-def test_what_is_written_is_read(tmp_path: Path) -> None:
+def test_written_tensors_are_read_back(tmp_path: Path) -> None:
     table = torch.arange(12.0).reshape(3, 4)
     tensor_files.write(tmp_path / "a.safetensors", {"table": table.T, "one": torch.ones(2, dtype=torch.half)},
                        {"who": "me"})
@@ -24,7 +24,7 @@ def test_what_is_written_is_read(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(not MAPS.exists(), reason="needs a system that tells what is mapped")
-def test_the_file_is_not_held(tmp_path: Path) -> None:
+def test_reading_leaves_no_mapping_of_the_file(tmp_path: Path) -> None:
     tensor_files.write(tmp_path / "held.safetensors", {"table": torch.zeros(1000, 1000)}, {})
     read, _ = tensor_files.read(tmp_path / "held.safetensors")
     part = read["table"][10:20]
@@ -32,7 +32,7 @@ def test_the_file_is_not_held(tmp_path: Path) -> None:
     assert part.sum() == 0
 
 
-def test_a_damaged_file(tmp_path: Path) -> None:
+def test_a_damaged_file_raises_value_error(tmp_path: Path) -> None:
     (tmp_path / "cut.safetensors").write_bytes(b"\0\1")
     with pytest.raises(ValueError, match=r"\w"):
         tensor_files.read(tmp_path / "cut.safetensors")

@@ -23,13 +23,13 @@ def variables_after(script: str, given: dict[str, str]) -> dict[str, str | None]
     return read
 
 
-def test_it_is_prepared_before_both_and_what_the_user_has_set_stays() -> None:
+def test_thread_variables_are_set_and_the_user_s_are_kept() -> None:
     script = ("import sys; from core.system.thread_environment import set_thread_environment\n"
               "set_thread_environment(); assert not {'numpy', 'torch'} & set(sys.modules)")
     assert variables_after(script, {"OMP_WAIT_POLICY": "ACTIVE"}) == {**VARIABLES, "OMP_WAIT_POLICY": "ACTIVE"}
 
 
-def test_the_door_prepares_it() -> None:
+def test_the_command_line_sets_the_thread_environment() -> None:
     script = ("import runpy, sys; sys.argv = ['run.py', '--help']\n"
               "try: runpy.run_path('headless/run.py', run_name='__main__')\n"
               "except SystemExit: pass")

@@ -68,7 +68,7 @@ def test_the_colours_of_a_video_are_those_that_players_show(height: int, weights
 
 
 @pytest.mark.parametrize(("suffix", "codec"), [("mkv", "FFV1"), ("avi", "MJPG"), ("mov", "png ")])
-def test_colours_that_are_read_as_they_are_stay(suffix: str, codec: str, tmp_path: Path) -> None:
+def test_colours_of_rgb_and_motion_jpeg_are_unchanged(suffix: str, codec: str, tmp_path: Path) -> None:
     """RGB itself, and JPEG, which is of BT.601 at any size."""
     frame = np.repeat(np.repeat(PATCHES.astype(np.uint8)[None, :, ::-1], 256, 1), 720, 0)
     path = tmp_path / f"a.{suffix}"
@@ -82,13 +82,13 @@ def test_colours_that_are_read_as_they_are_stay(suffix: str, codec: str, tmp_pat
 
 
 @pytest.mark.parametrize(("transfer", "name"), [(16, "PQ"), (18, "HLG")])
-def test_high_dynamic_range_is_told(transfer: int, name: str, tmp_path: Path) -> None:
+def test_high_dynamic_range_raises_a_warning(transfer: int, name: str, tmp_path: Path) -> None:
     with Video(patches(tmp_path / "a.mp4", 64, (0.299, 0.114), box(transfer, 9))) as video:
         assert len(video.warnings) == 1
         assert name in video.warnings[0]
 
 
-def test_an_upright_telephone_s_video_stands_upright(tmp_path: Path) -> None:
+def test_rotated_phone_footage_is_read_upright(tmp_path: Path) -> None:
     path = patches(tmp_path / "a.mp4", 96, (0.299, 0.114))
     data = bytearray(path.read_bytes())
     at = data.find(b"tkhd") + 4 + 40
@@ -102,14 +102,14 @@ def test_an_upright_telephone_s_video_stands_upright(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("content", [b"", b"no video at all", None])
-def test_what_is_no_video_or_cut_off_is_told(content: bytes | None, tmp_path: Path) -> None:
+def test_an_invalid_or_truncated_video_is_reported(content: bytes | None, tmp_path: Path) -> None:
     path = patches(tmp_path / "a.mp4", 64, (0.299, 0.114))
     path.write_bytes(path.read_bytes()[:200] if content is None else content)
     with pytest.raises(FrameError, match=r"a\.mp4 cannot be decoded: it is cut off, or"):
         Video(path)
 
 
-def test_a_video_of_a_flare_is_drawn_in_its_own_colours(tmp_path: Path) -> None:
+def test_a_flare_video_keeps_its_colours(tmp_path: Path) -> None:
     """Of high definition."""
     path = tmp_path / "clips" / "flare.mp4"
     path.parent.mkdir()
@@ -153,7 +153,7 @@ def with_pixels(path: Path, wide: int, high: int) -> Path:
     return path
 
 
-def test_the_shape_of_pixels_is_told(tmp_path: Path) -> None:
+def test_the_pixel_aspect_is_read(tmp_path: Path) -> None:
     path = patches(tmp_path / "a.mp4", 240, (0.299, 0.114))
     with Video(path) as video:
         assert video.aspect == 1

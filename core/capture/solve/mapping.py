@@ -374,10 +374,10 @@ def _to_model(reconstruction: Any, names: dict[str, int]) -> Model:
             continue
         pose = np.eye(4)
         pose[:3] = image.cam_from_world().matrix()
-        seen = image.get_observation_points2D()
+        observed = image.get_observation_points2D()
         frames.append(SolvedFrame(names[image.name], lenses[image.camera_id], pose,
-                                  np.array([point.xy for point in seen], np.float64).reshape(-1, 2),
-                                  np.array([index[point.point3D_id] for point in seen], np.int64)))
+                                  np.array([point.xy for point in observed], np.float64).reshape(-1, 2),
+                                  np.array([index[point.point3D_id] for point in observed], np.int64)))
     return Model(np.array([point.xyz for point in points], np.float64).reshape(-1, 3),
                  np.array([point.color for point in points], np.uint8).reshape(-1, 3),
                  np.array([point.error for point in points], np.float64),

@@ -68,11 +68,11 @@ def similarity(descriptors: Callable[[int], NDArray[np.uint8]], frames: int, see
     vocabulary = _k_means(_random_rows(sample, 12000, rng), VOCABULARY_SIZE, rng)
     vectors = np.zeros((frames, VOCABULARY_SIZE * sample.shape[1]), np.float32)
     for i in range(frames):
-        some = _random_rows(descriptors(i), 2000, rng).astype(np.float32)
-        if not len(some):
+        rows = _random_rows(descriptors(i), 2000, rng).astype(np.float32)
+        if not len(rows):
             continue
-        nearest = _nearest_centre(some, vocabulary)
-        summed = _sum_by_group(some - vocabulary[nearest], nearest, VOCABULARY_SIZE)
+        nearest = _nearest_centre(rows, vocabulary)
+        summed = _sum_by_group(rows - vocabulary[nearest], nearest, VOCABULARY_SIZE)
         summed /= np.maximum(np.linalg.norm(summed, axis=1, keepdims=True), 1e-9)
         vectors[i] = summed.ravel() / max(float(np.linalg.norm(summed)), 1e-9)
     return np.asarray(vectors @ vectors.T)

@@ -42,12 +42,12 @@ def draw_model(solved: Solved, path: Path) -> None:
     import cv2
 
     model = solved.model
-    at = np.array([-frame.world_to_camera[:3, :3].T @ frame.world_to_camera[:3, 3] for frame in solved.frames])
+    positions = np.array([-frame.world_to_camera[:3, :3].T @ frame.world_to_camera[:3, 3] for frame in solved.frames])
     ahead = np.array([frame.world_to_camera[2, :3] for frame in solved.frames])
     good = model.tracks >= 3 if (model.tracks >= 3).sum() > 50 else np.ones(len(model.xyz), bool)
     xyz, rgb = model.xyz[good], model.rgb[good]
     low, high = np.percentile(xyz, (2, 98), axis=0)
-    low, high = np.minimum(low, at.min(axis=0)), np.maximum(high, at.max(axis=0))
+    low, high = np.minimum(low, positions.min(axis=0)), np.maximum(high, positions.max(axis=0))
     middle, reach = (low + high) / 2, 0.55 * float((high - low).max())
     sheet = np.full((PANEL, 2 * PANEL + 8, 3), PAPER, np.float32)
     for left, axes, title in ((0, (0, 1), "from above"), (PANEL + 8, (0, 2), "from the front")):
@@ -61,10 +61,10 @@ def draw_model(solved: Solved, path: Path) -> None:
         inside = ((spots >= 1) & (spots < PANEL - 1)).all(axis=1)
         for (x, y), colour in zip(spots[inside], rgb[inside] / 255.0, strict=True):
             panel[y - 1:y + 1, x - 1:x + 1] = colour
-        cameras = place(at)
+        cameras = place(positions)
         if len(cameras) > 1:
             cv2.polylines(panel, [cameras.reshape(-1, 1, 2)], False, PATH, 1, cv2.LINE_AA)
-        for spot, tip in zip(cameras, place(at + 0.06 * reach * ahead), strict=True):
+        for spot, tip in zip(cameras, place(positions + 0.06 * reach * ahead), strict=True):
             cv2.line(panel, tuple(map(int, spot)), tuple(map(int, tip)), INK, 1, cv2.LINE_AA)
             cv2.circle(panel, tuple(map(int, spot)), 3, INK, -1, cv2.LINE_AA)
         cv2.putText(panel, title, (12, 26), cv2.FONT_HERSHEY_SIMPLEX, 0.6, INK, 1, cv2.LINE_AA)

@@ -25,10 +25,10 @@ def up_direction(rotations: Sequence[Floats]) -> Floats:
     axes alone leave up undecided.
     """
     stack = np.asarray(rotations)
-    right, own = stack[:, 0], -stack[:, 1].mean(axis=0)
-    form = right.T @ right / len(stack) - 0.2 * np.outer(own, own)
+    right, mean_up = stack[:, 0], -stack[:, 1].mean(axis=0)
+    form = right.T @ right / len(stack) - 0.2 * np.outer(mean_up, mean_up)
     up = np.linalg.eigh(form)[1][:, 0]
-    return up if up @ own >= 0 else -up
+    return up if up @ mean_up >= 0 else -up
 
 
 def align(model: Model) -> None:

@@ -35,11 +35,11 @@ def _exif_block(stream: BinaryIO) -> BinaryIO:
     if magic[:4] in (b"II*\0", b"MM\0*"):
         return stream
     if magic[:2] == b"\xff\xd8":
-        found = (content[6:] for marker, content in jpeg.segments(stream)
+        blocks = (content[6:] for marker, content in jpeg.segments(stream)
                  if marker == jpeg.APP1 and content.startswith(b"Exif\0\0"))
     else:
-        found = (content for _, content in png.chunks(stream, (png.EXIF,)))
-    return io.BytesIO(next(found, b""))
+        blocks = (content for _, content in png.chunks(stream, (png.EXIF,)))
+    return io.BytesIO(next(blocks, b""))
 
 
 def apply_orientation(pixels: NDArray[Any], orientation: int) -> NDArray[Any]:

@@ -23,8 +23,8 @@ _MAX_ATTRIBUTE_BYTES = 1 << 20
 
 def windows(stream: BinaryIO) -> dict[str, tuple[int, int]]:
     """Return (width, height) of the "dataWindow" (stored pixels) and the "displayWindow" (the frame), where present."""
-    found = _read_attributes(stream, {b"dataWindow": b"box2i", b"displayWindow": b"box2i"})
-    corners = {name: np.frombuffer(value, "<i4").tolist() for name, value in found.items() if len(value) == 16}
+    attributes = _read_attributes(stream, {b"dataWindow": b"box2i", b"displayWindow": b"box2i"})
+    corners = {name: np.frombuffer(value, "<i4").tolist() for name, value in attributes.items() if len(value) == 16}
     return {name.decode(): (x1 - x0 + 1, y1 - y0 + 1) for name, (x0, y0, x1, y1) in corners.items()}
 
 
@@ -66,8 +66,8 @@ def is_truncated(stream: BinaryIO) -> bool:
     flags = int.from_bytes(stream.read(4), "little")
     if flags & (_TILES | _DEEP | _PARTS):
         return False
-    found = _read_attributes(stream, {b"dataWindow": b"box2i", b"compression": b"compression"}, to_the_end=True)
-    window, compression = found.get(b"dataWindow", b""), found.get(b"compression")
+    attributes = _read_attributes(stream, {b"dataWindow": b"box2i", b"compression": b"compression"}, to_the_end=True)
+    window, compression = attributes.get(b"dataWindow", b""), attributes.get(b"compression")
     if len(window) != 16 or not compression:
         return True
     if compression[0] >= len(_LINES_PER_CHUNK):
@@ -92,16 +92,16 @@ def _read_attributes(stream: BinaryIO, kinds: dict[bytes, bytes], *, to_the_end:
     Leaves the stream behind the last of them; with `to_the_end` behind the header.
     """
     stream.seek(len(MAGIC) + 4)
-    found: dict[bytes, bytes] = {}
-    while (to_the_end or len(found) < len(kinds)) and (name := _read_name(stream)):
+    attributes: dict[bytes, bytes] = {}
+    while (to_the_end or len(attributes) < len(kinds)) and (name := _read_name(stream)):
         kind, length = _read_name(stream), int.from_bytes(stream.read(4), "little", signed=True)
         if length < 0:
             break
         if kinds.get(name) == kind and length <= _MAX_ATTRIBUTE_BYTES:
-            found[name] = stream.read(length)
+            attributes[name] = stream.read(length)
         else:
             stream.seek(length, os.SEEK_CUR)
-    return found
+    return attributes
 
 
 def _read_name(stream: BinaryIO) -> bytes:

@@ -50,13 +50,13 @@ def short(value: int) -> Tag:
     return Tag(3, np.array([value], np.uint16))
 
 
-def read_tags(stream: BinaryIO, wanted: Container[int], at: int | None = None) -> dict[int, Tag]:
+def read_tags(stream: BinaryIO, numbers: Container[int], at: int | None = None) -> dict[int, Tag]:
     """Read tags of the first page, or of the directory at offset `at`, without damaged ones; none of other files."""
     order, entries = next(_directories(stream, at), _NO_DIRECTORY)
     tags: dict[int, Tag] = {}
     for entry in entries:
         number, kind, count = struct.unpack(order + "HHI", entry[:8])
-        if number not in wanted or kind not in _TYPES:
+        if number not in numbers or kind not in _TYPES:
             continue
         values = np.dtype(_TYPES[kind]).newbyteorder(order)
         length = count * values.itemsize * (2 if kind in _RATIONALS else 1)
@@ -93,7 +93,7 @@ def with_tags(data: bytes, tags: Mapping[int, Tag]) -> bytes:
     if not entries or not tags:
         return data
     whole = bytearray(data)
-    kept = [entry for entry in entries if struct.unpack(order + "H", entry[:2])[0] not in tags]
+    new_entries = [entry for entry in entries if struct.unpack(order + "H", entry[:2])[0] not in tags]
     for number, (kind, values) in tags.items():
         raw = values.astype(values.dtype.newbyteorder(order)).tobytes()
         count = len(values) // (2 if kind in _RATIONALS else 1)
@@ -103,13 +103,13 @@ def with_tags(data: bytes, tags: Mapping[int, Tag]) -> bytes:
             whole += b"\0" * (len(whole) % 2)
             place = struct.pack(order + "I", len(whole))
             whole += raw
-        kept.append(struct.pack(order + "HHI", number, kind, count) + place)
+        new_entries.append(struct.pack(order + "HHI", number, kind, count) + place)
     whole += b"\0" * (len(whole) % 2)
     at = struct.unpack(order + "I", data[4:8])[0]
     following = data[at + 2 + 12 * len(entries):][:4].ljust(4, b"\0")
-    kept.sort(key=lambda entry: struct.unpack(order + "H", entry[:2])[0])
+    new_entries.sort(key=lambda entry: struct.unpack(order + "H", entry[:2])[0])
     whole[4:8] = struct.pack(order + "I", len(whole))
-    whole += struct.pack(order + "H", len(kept)) + b"".join(kept) + following
+    whole += struct.pack(order + "H", len(new_entries)) + b"".join(new_entries) + following
     return bytes(whole)
 
 

@@ -1,19 +1,20 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A .flare looked at without the engine: read, evaluated for a camera and lights, edited, drawn. numpy alone.
+"""Reads a .flare with numpy alone, without torch, and evaluates, edits and draws it for any camera and lights.
 
     look = read("lamp.flare")
     seen = look.evaluate(world_to_camera, edits=LookEdits.parse(["lamp.intensity=2"], look.names))
-    picture = draw(seen.values(), intrinsics, 960, 540, look.blend, look.sampling)
+    picture = draw(seen.values(), intrinsics, 960, 540, look.blend, look.pixel_grid)
 
+    form.py        the switches and sizes of a flare model
     container.py   the safetensors file
     network.py     hash grids and the deformation network
     plane.py       Gaussians on the normalised plane, placement and colour
-    elements.py    the Gaussians of a light as named ghosts, streaks, rings, glare
-    edits.py       what an artist changes: the one definition, which bake and transfer use too
-    keyed.py       edits that differ from frame to frame
-    look.py        all of it together
-    shot.py        cameras and placed lights frame by frame, written down for the engine to render
-    drawing.py     Gaussians to pixels, for thumbnails and checks
+    elements.py    the Gaussians of a light grouped into named ghosts, streaks, rings and glare
+    edits.py       an artist's edits, for the overlay, bake and transfer
+    keyed.py       edits by frame
+    look.py        the lights of a .flare: reading and evaluation
+    shot.py        cameras and placed lights by frame, as a JSON file that `bake` renders
+    drawing.py     rasterization of Gaussians, for thumbnails and checks
 """
 from __future__ import annotations
 
@@ -21,8 +22,8 @@ from .drawing import draw
 from .edits import Edit, LookEdits
 from .elements import Element
 from .keyed import KeyedEdits
-from .look import LightLook, Look, TrainedCamera, ViewOfLight, list_elements, read
+from .look import LightLook, Look, PlacedLight, TrainedCamera, ViewOfLight, read, store_elements
 from .plane import PlaneGaussians, pixels
 
-__all__ = ["Edit", "Element", "KeyedEdits", "LightLook", "Look", "LookEdits", "PlaneGaussians", "TrainedCamera",
-           "ViewOfLight", "draw", "list_elements", "pixels", "read"]
+__all__ = ["Edit", "Element", "KeyedEdits", "LightLook", "Look", "LookEdits", "PlacedLight", "PlaneGaussians",
+           "TrainedCamera", "ViewOfLight", "draw", "pixels", "read", "store_elements"]

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""safetensors files, read with numpy and json: eight bytes of length, a JSON header, raw little-endian tensors.
+"""Reads safetensors files with numpy and json: eight bytes of length, a JSON header, raw little-endian tensors.
 
-The header is bounded and every tensor is checked against the file's length before it is touched; nothing
-is executed or unpickled.
+The header's size is bounded, and every tensor is checked against the file's length before access; nothing is executed
+or unpickled.
 """
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ from ..system.files import atomic_path
 
 Arrays = dict[str, NDArray[Any]]
 
-LONGEST_HEADER = 100_000_000  # bytes, the format's own limit
-_KINDS = {"F64": "<f8", "F32": "<f4", "F16": "<f2", "I64": "<i8", "I32": "<i4", "I16": "<i2", "I8": "i1", "U8": "u1",
+MAX_HEADER_BYTES = 100_000_000  # bytes, the format's own limit
+_DTYPES = {"F64": "<f8", "F32": "<f4", "F16": "<f2", "I64": "<i8", "I32": "<i4", "I16": "<i2", "I8": "i1", "U8": "u1",
           "BOOL": "?"}
 
 
 def read_tensors(path: Path | str) -> tuple[Arrays, dict[str, str]]:
-    """Tensors by name, and the metadata. Raises FlareFileError where the file is missing or damaged."""
+    """Return tensors by name, and the metadata. Raises FlareFileError for a missing or damaged file."""
     path = Path(path)
     if not path.is_file():
         raise FlareFileError(f"{path} is missing; choose a .flare file that a fit has written.")
     try:
         data = path.read_bytes()
-        return _parsed(data)
+        return _parse(data)
     except OSError as problem:
         raise FlareFileError(f"{path} cannot be read ({problem.strerror or problem}); copy it again, or choose "
                              "another.") from problem
@@ -39,9 +39,9 @@ def read_tensors(path: Path | str) -> tuple[Arrays, dict[str, str]]:
         raise FlareFileError(f"{path} is damaged or not a flare ({problem}); save it again.") from problem
 
 
-def _parsed(data: bytes) -> tuple[Arrays, dict[str, str]]:
+def _parse(data: bytes) -> tuple[Arrays, dict[str, str]]:
     length = int.from_bytes(data[:8], "little")
-    if len(data) < 8 or length > min(len(data) - 8, LONGEST_HEADER):
+    if len(data) < 8 or length > min(len(data) - 8, MAX_HEADER_BYTES):
         raise ValueError("it ends inside its header")
     header = json.loads(data[8:8 + length].decode("utf-8"))
     metadata = header.pop("__metadata__", {}) or {}
@@ -50,7 +50,7 @@ def _parsed(data: bytes) -> tuple[Arrays, dict[str, str]]:
     for name, entry in header.items():
         shape = [int(size) for size in entry["shape"]]
         begin, end = (int(at) for at in entry["data_offsets"])
-        kind = np.dtype(_KINDS[entry["dtype"]])
+        kind = np.dtype(_DTYPES[entry["dtype"]])
         count = math.prod(shape)
         if min([0, *shape]) < 0 or not 0 <= begin <= end <= len(body) or end - begin != count * kind.itemsize:
             raise ValueError(f"the tensor {name} does not fit the file")
@@ -58,9 +58,9 @@ def _parsed(data: bytes) -> tuple[Arrays, dict[str, str]]:
     return arrays, {str(key): str(value) for key, value in metadata.items()}
 
 
-def rewritten(source: Path | str, target: Path | str, metadata: dict[str, str]) -> None:
-    """A copy of a safetensors file with other metadata, its tensors byte for byte. Raises FlareFileError."""
-    read_tensors(source)  # checks it
+def rewrite_metadata(source: Path | str, target: Path | str, metadata: dict[str, str]) -> None:
+    """Copy a safetensors file with other metadata and the same tensors, byte for byte. Raises FlareFileError."""
+    read_tensors(source)  # raises for an invalid file
     data = Path(source).read_bytes()
     length = int.from_bytes(data[:8], "little")
     header = json.loads(data[8:8 + length].decode("utf-8"))

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Plane Gaussians to pixels in numpy, for thumbnails and checks.
+"""Rasterizes plane Gaussians in numpy, for thumbnails and checks.
 
-The definition is core/gaussians/reference.py. Not for speed: each Gaussian is drawn over the box it reaches.
+The definition is core/gaussians/reference.py. Not fast: each Gaussian is drawn over its bounding box.
 """
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..choices import Blend
-from ..conventions.pixel_grid import Sampling
+from ..conventions.pixel_grid import PixelGrid
 from ..conventions.splatting import ALPHA_MIN, PROFILE_MIN
 from ..conventions.splatting import OPACITY_MAX as OPACITY_MAX
-from .plane import Floats, PlaneGaussians, arc_level, joined, pixels, strengths, ways
+from .plane import Floats, PlaneGaussians, arc_log_peak, arc_strengths, concatenate, pixel_arcs, pixels
 
 
-def reach(gaussians: PlaneGaussians, blend: Blend = "add") -> Floats:
-    """(n,) Mahalanobis radius beyond which nothing of a Gaussian is drawn."""
+def extent(gaussians: PlaneGaussians, blend: Blend = "add") -> Floats:
+    """Return (n,) the Mahalanobis radius beyond which a Gaussian is not drawn."""
     if blend == "add":
         radius = np.full(len(gaussians), math.sqrt(-2 * math.log(PROFILE_MIN)), np.float32)
     else:
@@ -28,25 +28,24 @@ def reach(gaussians: PlaneGaussians, blend: Blend = "add") -> Floats:
         radius = np.sqrt(2 * np.log(np.maximum(peaks / ALPHA_MIN, 1)))
     if gaussians.rings is not None:
         r0, w = gaussians.rings.T
-        radius = np.maximum(r0 + w * radius + w * w * gaussians.strengths, 0)
+        radius = np.maximum(r0 + w * radius + w * w * gaussians.arc_strengths, 0)
     return np.asarray(radius, np.float32)
 
 
 def draw(flares: Iterable[PlaneGaussians], intrinsics: ArrayLike, width: int, height: int,
-         blend: Blend = "add", sampling: Sampling | None = None) -> Floats:
-    """The flares as a picture (height, width, 3) under intrinsics (3, 3), pixel centres at + 0.5. sampling: the grid on
-    which they were learned.
+         blend: Blend = "add", pixel_grid: PixelGrid | None = None) -> Floats:
+    """Draw flares to a picture (height, width, 3) with intrinsics (3, 3), pixel centres at + 0.5.
 
-    "add": scene-linear light. "over": display colour, premultiplied, laid over black.
+    blend "add": scene-linear light; "over": display colour, premultiplied, over black. pixel_grid: of the fit.
     """
     picture = np.zeros((height, width, 3), np.float32)
-    gaussians = joined(list(flares))
+    gaussians = concatenate(list(flares))
     if gaussians is None:
         return picture
-    left = np.ones((height, width), np.float32)
-    centres, covariances = pixels(gaussians, intrinsics, sampling)
-    arcs = ways(gaussians, intrinsics)
-    radii = reach(gaussians, blend)
+    transmittance = np.ones((height, width), np.float32)
+    centres, covariances = pixels(gaussians, intrinsics, pixel_grid)
+    arcs = pixel_arcs(gaussians, intrinsics)
+    radii = extent(gaussians, blend)
     for number in range(len(gaussians)):
         box = _box(centres[number], covariances[number], float(radii[number]), width, height)
         if box is None:
@@ -59,14 +58,15 @@ def draw(flares: Iterable[PlaneGaussians], intrinsics: ArrayLike, width: int, he
         else:
             profile = profile * min(float(gaussians.opacities[number]), OPACITY_MAX)
             profile = np.where(profile >= ALPHA_MIN, profile, 0)
-            profile, left[rows, columns] = profile * left[rows, columns], left[rows, columns] * (1 - profile)
+            in_front = transmittance[rows, columns]
+            profile, transmittance[rows, columns] = profile * in_front, in_front * (1 - profile)
         picture[rows, columns] += profile[..., None] * gaussians.colours[number]
     return picture
 
 
 def _box(centre: Floats, covariance: Floats, radius: float, width: int,
          height: int) -> tuple[int, int, int, int] | None:
-    """Columns and rows that a Gaussian reaches: left, top, right, bottom; None where it reaches none."""
+    """Return the bounding box of a Gaussian in the picture as left, top, right, bottom; None if it is outside."""
     xx, xy, yy = (float(value) for value in covariance)
     if not xx * yy - xy * xy > 0:
         return None
@@ -79,7 +79,7 @@ def _box(centre: Floats, covariance: Floats, radius: float, width: int,
     return box if box[0] < box[2] and box[1] < box[3] else None
 
 
-def _profile(centre: Floats, covariance: Floats, ring: NDArray[Any] | None, way: Floats,
+def _profile(centre: Floats, covariance: Floats, ring: NDArray[Any] | None, pixel_arc: Floats,
              box: tuple[int, int, int, int]) -> Floats:
     xx, xy, yy = covariance
     dx = np.arange(box[0], box[2], dtype=np.float32) + 0.5 - centre[0]
@@ -88,9 +88,10 @@ def _profile(centre: Floats, covariance: Floats, ring: NDArray[Any] | None, way:
     if ring is None:
         return np.asarray(np.exp(-q / 2), np.float32)
     r0, w = ring
-    halves = (np.sqrt(np.maximum(q, 1e-12)) - r0) ** 2 / (2 * w * w)
-    if way.any():
-        slope = np.array([yy * way[0] - xy * way[1], xx * way[1] - xy * way[0]]) / (xx * yy - xy * xy)
-        level = arc_level(strengths(way[None], covariance[None])[0], ring)
-        halves = halves - (slope[0] * dx + slope[1] * dy - level)
-    return np.asarray(np.exp(-halves), np.float32)
+    exponent = (np.sqrt(np.maximum(q, 1e-12)) - r0) ** 2 / (2 * w * w)
+    if pixel_arc.any():
+        x, y = pixel_arc
+        slope = np.array([yy * x - xy * y, xx * y - xy * x]) / (xx * yy - xy * xy)
+        log_peak = arc_log_peak(arc_strengths(pixel_arc[None], covariance[None])[0], ring)
+        exponent = exponent - (slope[0] * dx + slope[1] * dy - log_peak)
+    return np.asarray(np.exp(-exponent), np.float32)

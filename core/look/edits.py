@@ -1,21 +1,22 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What an artist changes of a look. The one definition: the overlay, bake and transfer all go by it.
+"""An artist's edits of a look: definition, text form and application, for the overlay, bake and transfer.
 
-An edit belongs to all lights (`*`), to a light (`lamp`), or to one of its elements (`lamp/ghost 2`); what
-belongs to an element in the end is the product of the three (rotations add up).
+An edit applies to all lights (`*`), to a light (`lamp`), or to one of its elements (`lamp/ghost 2`). The edits of the
+three levels multiply; rotations add.
 
-    intensity   factor on the linear light, 0 or more
-    tint        factors on linear R, G, B, or #rrggbb
-    saturation  0 grey, 1 as it is, above 1 stronger: L + s (c - L), L the luminance of Rec. 709
+    intensity   factor of the linear light, 0 or more
+    tint        factors of linear R, G, B, or #rrggbb
+    saturation  0 grey, 1 unchanged, above 1 more saturated: L + s (c - L), L the luminance of Rec. 709
     scale       size of each element about its own centre
-    spread      distance of each element's centre from the light: 0 all at the light, 1 as it is
-    rotation    degrees that each element turns about its own centre, clockwise as the picture is seen
+    spread      distance of each element's centre from the light: 0 at the light, 1 unchanged
+    rotation    rotation of each element about its own centre, degrees, clockwise in the picture
     streak      length of the streaks: stretches elements of that kind along their long axis
-    mute        1 leaves it out; solo: 1 leaves out the others (lights beside lights, elements beside elements)
+    mute        1 turns it off
+    solo        1 turns off the others of its level: the other lights, or the other elements of the light
 
-Colour is linear in the light, so for whole lights it can be applied to finished layers (`matrix`), whatever
-was fitted. Where the flare covers ("over"), an element's light is not a sum: there intensity below 1 makes
-it more transparent and above 1 brighter.
+Colour edits are linear, so for whole lights they can be applied to finished layers (`matrix`), whatever the blend. With
+the blend "over", the light of an element is not additive: there an intensity below 1 makes it more transparent, above 1
+brighter.
 """
 from __future__ import annotations
 
@@ -32,7 +33,7 @@ from ..choices import Blend
 from ..colour.srgb import LUMINANCE, linear_from_srgb, srgb_from_linear
 from ..errors import SettingsError
 from .elements import Element
-from .plane import Floats, PlaneGaussians, joined
+from .plane import Floats, PlaneGaussians, concatenate
 
 Gain = tuple[float, float, float]
 
@@ -41,12 +42,12 @@ _WHITE: Gain = (1.0, 1.0, 1.0)
 _HEX = re.compile(r"#[0-9A-Fa-f]{6}")
 _FACTORS = ("intensity", "saturation", "scale", "spread", "streak")
 _FLAGS = ("mute", "solo")
-_LARGEST = 1e6
+MAX_VALUE = 1e6
 
 
 @dataclass(frozen=True)
 class Edit:
-    """See the module's head; the defaults change nothing."""
+    """One edit, with the properties of the module's head; the defaults change nothing."""
 
     intensity: float = 1.0
     tint: Gain = _WHITE
@@ -58,31 +59,31 @@ class Edit:
     mute: bool = False
     solo: bool = False
 
-    def then(self, other: Edit) -> Edit:
-        """Both together. mute: of either; solo is a matter of each level alone and is left out."""
+    def combine(self, other: Edit) -> Edit:
+        """Return both edits combined; muted if either is. Solo acts within its level and is dropped."""
         r, g, b = (x * y for x, y in zip(self.tint, other.tint, strict=True))
         factors = {name: getattr(self, name) * getattr(other, name) for name in _FACTORS}
         return Edit(tint=(r, g, b), rotation=self.rotation + other.rotation, mute=self.mute or other.mute, **factors)
 
     @property
-    def coloured(self) -> bool:
-        """Whether it changes colour or brightness."""
+    def changes_colour(self) -> bool:
+        """Return whether it changes colour or brightness."""
         return (self.intensity, self.tint, self.saturation) != (1.0, _WHITE, 1.0)
 
     @property
-    def moved(self) -> bool:
-        """Whether it changes shape or place."""
+    def changes_shape(self) -> bool:
+        """Return whether it changes shape or position."""
         return (self.scale, self.spread, self.rotation, self.streak) != (1.0, 1.0, 0.0, 1.0)
 
     @property
     def matrix(self) -> NDArray[np.float64]:
-        """(3, 3) from linear R, G, B to linear R, G, B: saturation, then tint and intensity."""
+        """The matrix (3, 3) on linear R, G, B: saturation, then tint and intensity."""
         grey = np.tile(LUMINANCE, (3, 1))
         mixed = self.saturation * np.eye(3) + (1 - self.saturation) * grey
         return self.intensity * np.array(self.tint)[:, None] * mixed
 
-    def of_shape(self) -> Edit:
-        """All but its colour."""
+    def without_colour(self) -> Edit:
+        """Return the edit without its colour and brightness."""
         return replace(self, intensity=1.0, tint=_WHITE, saturation=1.0)
 
 
@@ -91,55 +92,55 @@ NEUTRAL = Edit()
 
 @dataclass(frozen=True)
 class LookEdits:
-    """Edits of all lights together, by light, and by (light, element)."""
+    """The edits of a look: of all lights (`master`), by light, and by (light, element)."""
 
     master: Edit = NEUTRAL
     lights: Mapping[str, Edit] = field(default_factory=dict)
     elements: Mapping[tuple[str, str], Edit] = field(default_factory=dict)
 
-    # ---- what it means -----------------------------------------------------------------------------
+    # ---- meaning -----------------------------------------------------------------------------------
 
-    def light(self, name: str) -> Edit:
-        """The edit of a light as a whole, the master's included."""
-        return self.master.then(self.lights.get(name, NEUTRAL))
+    def light_edit(self, name: str) -> Edit:
+        """Return the edit of a light as a whole, combined with the master's."""
+        return self.master.combine(self.lights.get(name, NEUTRAL))
 
-    def shows(self, light: str, among: Iterable[str]) -> bool:
-        """Whether a light of those in `among` is left in by mute and solo."""
-        if self.light(light).mute:
+    def is_visible(self, light: str, among: Iterable[str]) -> bool:
+        """Return whether mute and solo leave a light of `among` on."""
+        if self.light_edit(light).mute:
             return False
         solo = [name for name in among if self.lights.get(name, NEUTRAL).solo]
         return not solo or light in solo
 
-    def hidden(self, light: str, elements: Sequence[Element]) -> set[str]:
-        """Names of the elements of `light` that mute and solo leave out."""
+    def hidden_elements(self, light: str, elements: Sequence[Element]) -> set[str]:
+        """Return the names of the elements of `light` that mute and solo turn off."""
         edits = {element.name: self.elements.get((light, element.name), NEUTRAL) for element in elements}
         solo = any(edit.solo for edit in edits.values())
         return {name for name, edit in edits.items() if edit.mute or (solo and not edit.solo)}
 
     @property
-    def neutral(self) -> bool:
-        """Whether nothing at all is changed."""
+    def is_neutral(self) -> bool:
+        """Return whether no edit changes anything."""
         return all(edit == NEUTRAL for edit in (self.master, *self.lights.values(), *self.elements.values()))
 
     @property
-    def colour_of_lights_only(self) -> bool:
-        """Whether finished layers, one for each light, suffice: no element and no shape is changed."""
+    def changes_light_colours_only(self) -> bool:
+        """Return whether no edit changes an element or a shape, so that finished layers of the lights suffice."""
         whole = (self.master, *self.lights.values())
-        return all(edit == NEUTRAL for edit in self.elements.values()) and not any(edit.moved for edit in whole)
+        return all(edit == NEUTRAL for edit in self.elements.values()) and not any(edit.changes_shape for edit in whole)
 
-    def without_colour_of_lights(self) -> LookEdits:
-        """What is left for the Gaussians once the lights' colours are applied to finished layers."""
-        lights = {name: edit.of_shape() for name, edit in self.lights.items()}
-        return LookEdits(self.master.of_shape(), lights, self.elements)
+    def without_light_colours(self) -> LookEdits:
+        """Return the edits without the colours of whole lights, which `matrices` applies to finished layers."""
+        lights = {name: edit.without_colour() for name, edit in self.lights.items()}
+        return LookEdits(self.master.without_colour(), lights, self.elements)
 
     def matrices(self, names: Sequence[str]) -> dict[str, NDArray[np.float64]]:
-        """The linear colour matrix (3, 3) of each light that is changed; zeros where it is left out."""
+        """Return the linear colour matrix (3, 3) of each changed light; zeros for a light that is off."""
         result = {}
         for name in names:
-            edit = self.light(name)
-            if not self.shows(name, names):
+            edit = self.light_edit(name)
+            if not self.is_visible(name, names):
                 result[name] = np.zeros((3, 3))
-            elif edit.coloured:
+            elif edit.changes_colour:
                 result[name] = edit.matrix
         return result
 
@@ -148,33 +149,34 @@ class LookEdits:
     @classmethod
     def parse(cls, edits: Iterable[str], lights: Sequence[str],
               elements: Mapping[str, Sequence[str]] | None = None) -> LookEdits:
-        """From `light.property=value` and `light/element.property=value`; later ones add to earlier ones.
+        """Parse texts `light.property=value` and `light/element.property=value`; edits of one target combine.
 
-        lights: the names there are. elements: by light; None where they are not known and any is taken.
-        Raises SettingsError for an edit that names no light, element or property, or has no sensible value.
+        lights: known names. elements: known names by light; None accepts any name.
+        Raises SettingsError for an edit with an unknown light, element or property, or an invalid value.
         """
-        made: dict[tuple[str, str], Edit] = {}
+        edits_by_target: dict[tuple[str, str], Edit] = {}
         for text in edits:
             name, equals, value = text.rpartition("=")  # a light's name may hold one itself
-            whom, dot, what = name.rpartition(".")
+            whom, dot, property_name = name.rpartition(".")
             if not (equals and dot and whom.strip()):
                 raise SettingsError(f"The edit {text!r} is not of the form light.intensity=2 or light.tint=1,0.5,0.2.")
-            change = _change(text, what.rstrip(), value.strip())
-            for target in _targets(text, whom, lights, elements):
-                before = made.get(target, NEUTRAL)
-                after = before.then(change)
-                made[target] = replace(after, solo=before.solo or change.solo)
-        return cls(made.pop((ALL, ""), NEUTRAL), {light: edit for (light, part), edit in made.items() if not part},
-                   {pair: edit for pair, edit in made.items() if pair[1]})
+            change = _parse_change(text, property_name.rstrip(), value.strip())
+            for target in _parse_targets(text, whom, lights, elements):
+                before = edits_by_target.get(target, NEUTRAL)
+                after = before.combine(change)
+                edits_by_target[target] = replace(after, solo=before.solo or change.solo)
+        return cls(edits_by_target.pop((ALL, ""), NEUTRAL),
+                   {light: edit for (light, part), edit in edits_by_target.items() if not part},
+                   {pair: edit for pair, edit in edits_by_target.items() if pair[1]})
 
-    def words(self) -> list[str]:
-        """The same as text that `parse` takes; nothing where nothing is changed."""
+    def texts(self) -> list[str]:
+        """Return the texts that `parse` reads as these edits; [] for edits that change nothing."""
         whole = [(ALL, self.master), *self.lights.items()]
         parts = [(f"{light}/{part}", edit) for (light, part), edit in self.elements.items()]
-        return [f"{name}.{what}" for name, edit in (*whole, *parts) for what in _words(edit)]
+        return [f"{name}.{property_name}" for name, edit in (*whole, *parts) for property_name in _to_texts(edit)]
 
-    def towards(self, other: LookEdits, share: float) -> LookEdits:
-        """Between these (0) and others (1), number by number; mute and solo change at 1."""
+    def interpolate(self, other: LookEdits, share: float) -> LookEdits:
+        """Interpolate linearly between these edits (share 0) and others (1); mute and solo change at 1."""
         def between(a: Edit, b: Edit) -> Edit:
             if a == b:
                 return a
@@ -191,9 +193,9 @@ class LookEdits:
         return LookEdits(between(self.master, other.master), lights, elements)
 
 
-def _targets(text: str, whom: str, lights: Sequence[str],
+def _parse_targets(text: str, whom: str, lights: Sequence[str],
              elements: Mapping[str, Sequence[str]] | None) -> list[tuple[str, str]]:
-    """(light, element or "") that an edit is for."""
+    """Return the (light, element or "") pairs that an edit applies to."""
     if not any(whom == light or whom.startswith(f"{light}/") for light in lights):
         whom = whom.lstrip()  # only here, since a light's name may begin with a blank
     if whom in lights:
@@ -216,79 +218,81 @@ def _targets(text: str, whom: str, lights: Sequence[str],
     return found
 
 
-def _change(text: str, what: str, value: str) -> Edit:
-    if what == "tint" and _HEX.fullmatch(value):
+def _parse_change(text: str, property_name: str, value: str) -> Edit:
+    if property_name == "tint" and _HEX.fullmatch(value):
         channels = np.array([int(value[at:at + 2], 16) / 255 for at in (1, 3, 5)])
         red, green, blue = linear_from_srgb(channels).tolist()
         return Edit(tint=(red, green, blue))
-    wanted = 3 if what == "tint" else 1
-    if what not in {entry.name for entry in fields(Edit)}:
+    expected = 3 if property_name == "tint" else 1
+    if property_name not in {entry.name for entry in fields(Edit)}:
         known = ", ".join(entry.name for entry in fields(Edit))
-        raise SettingsError(f"The edit {text!r} sets {what!r}; there are {known}.")
+        raise SettingsError(f"The edit {text!r} sets {property_name!r}; there are {known}.")
     try:
         numbers = [float(part) for part in value.split(",")]
     except ValueError:
         numbers = []
-    signed = what == "rotation"
-    if len(numbers) != wanted or not all(abs(number) <= _LARGEST and (signed or number >= 0) for number in numbers):
-        kind = "one number" if wanted == 1 else "three numbers (or #rrggbb)"
-        least = -_LARGEST if signed else 0
-        raise SettingsError(f"The edit {text!r} needs {kind} from {least:g} to {_LARGEST:g} after the equals sign.")
-    if what in _FLAGS and numbers[0] not in (0, 1):
+    signed = property_name == "rotation"
+    if len(numbers) != expected or not all(abs(number) <= MAX_VALUE and (signed or number >= 0) for number in numbers):
+        kind = "one number" if expected == 1 else "three numbers (or #rrggbb)"
+        least = -MAX_VALUE if signed else 0
+        raise SettingsError(f"The edit {text!r} needs {kind} from {least:g} to {MAX_VALUE:g} after the equals sign.")
+    if property_name in _FLAGS and numbers[0] not in (0, 1):
         raise SettingsError(f"The edit {text!r} needs 0 or 1 after the equals sign.")
-    value_of: Any = tuple(numbers) if what == "tint" else bool(numbers[0]) if what in _FLAGS else numbers[0]
-    return replace(NEUTRAL, **{what: value_of})
+    parsed: Any = tuple(numbers) if expected == 3 else bool(numbers[0]) if property_name in _FLAGS else numbers[0]
+    return replace(NEUTRAL, **{property_name: parsed})
 
 
-def _words(edit: Edit) -> list[str]:
-    words = []
+def _to_texts(edit: Edit) -> list[str]:
+    texts = []
     for entry in fields(Edit):
-        value, usual = getattr(edit, entry.name), getattr(NEUTRAL, entry.name)
-        if value != usual:
+        value, default = getattr(edit, entry.name), getattr(NEUTRAL, entry.name)
+        if value != default:
             numbers = value if isinstance(value, tuple) else (int(value) if isinstance(value, bool) else value,)
-            # Seven digits: all that a slider's 32 bits hold.
-            words.append(f"{entry.name}={','.join(f'{number:.7g}' for number in numbers)}")
-    return words
+            # Seven digits: the precision of a slider's float32.
+            texts.append(f"{entry.name}={','.join(f'{number:.7g}' for number in numbers)}")
+    return texts
 
 
 # ---- on Gaussians ---------------------------------------------------------------------------------
 
 
-def edited(gaussians: PlaneGaussians, light: str, place: NDArray[Any], elements: Sequence[Element], edits: LookEdits,
-           blend: Blend) -> PlaneGaussians:
-    """One light's Gaussians with the edits applied; order kept, hidden ones gone.
+def apply_edits(gaussians: PlaneGaussians, light: str, light_position: NDArray[Any], elements: Sequence[Element],
+                edits: LookEdits, blend: Blend) -> PlaneGaussians:
+    """Apply the edits of one light to its Gaussians; preserves their order, drops those of hidden elements.
 
-    place: (2,) the light on the normalised plane, delta_l included. elements: groups of the rows.
-    blend: "add", where colours are linear light, or "over", where they are display values.
+    light_position: (2,) on the normalised plane, delta_l included. elements: groups of the rows.
+    blend: "add" for colours in linear light, "over" for display values.
     """
-    whole = edits.light(light)
-    hidden = edits.hidden(light, elements)
-    own = [edits.elements.get((light, element.name), NEUTRAL) for element in elements]
-    if not hidden and whole == NEUTRAL and all(edit == NEUTRAL for edit in own):
+    whole = edits.light_edit(light)
+    hidden = edits.hidden_elements(light, elements)
+    element_edits = [edits.elements.get((light, element.name), NEUTRAL) for element in elements]
+    if not hidden and whole == NEUTRAL and all(edit == NEUTRAL for edit in element_edits):
         return gaussians
     rows: list[NDArray[np.int64]] = []
     parts: list[PlaneGaussians] = []
-    loose = np.ones(len(gaussians), bool)
-    for element, edit in zip(elements, own, strict=True):
-        loose[element.members] = False
+    ungrouped = np.ones(len(gaussians), bool)
+    for element, edit in zip(elements, element_edits, strict=True):
+        ungrouped[element.members] = False
         if element.name not in hidden and len(element.members):
-            part = _shaped(gaussians.kept(element.members), whole.then(edit), place, element.kind == "streak")
-            parts.append(_coloured(part, whole.then(edit), blend))
+            combined = whole.combine(edit)
+            part = _apply_shape(gaussians.select(element.members), combined, light_position, element.kind == "streak")
+            parts.append(_apply_colour(part, combined, blend))
             rows.append(element.members)
-    if loose.any():
-        parts.append(_coloured(_shaped(gaussians.kept(loose), whole, place, False), whole, blend))
-        rows.append(np.flatnonzero(loose))
-    every = joined(parts)
-    if every is None:
-        return gaussians.kept(np.zeros(0, np.int64))
-    return every.kept(np.argsort(np.concatenate(rows), kind="stable"))
+    if ungrouped.any():
+        part = _apply_shape(gaussians.select(ungrouped), whole, light_position, False)
+        parts.append(_apply_colour(part, whole, blend))
+        rows.append(np.flatnonzero(ungrouped))
+    whole_flare = concatenate(parts)
+    if whole_flare is None:
+        return gaussians.select(np.zeros(0, np.int64))
+    return whole_flare.select(np.argsort(np.concatenate(rows), kind="stable"))
 
 
-def _coloured(part: PlaneGaussians, edit: Edit, blend: Blend) -> PlaneGaussians:
-    if not edit.coloured:
+def _apply_colour(part: PlaneGaussians, edit: Edit, blend: Blend) -> PlaneGaussians:
+    if not edit.changes_colour:
         return part
     if blend == "add":
-        # Not clipped: a sum of Gaussians then is changed as a finished layer would be.
+        # Not clipped, so that a sum of Gaussians changes as a finished layer would.
         return replace(part, colours=np.asarray(part.colours @ edit.matrix.T, np.float32))
     dimmed, brighter = min(edit.intensity, 1.0), max(edit.intensity, 1.0)
     linear = linear_from_srgb(part.colours) @ replace(edit, intensity=brighter).matrix.T
@@ -296,8 +300,8 @@ def _coloured(part: PlaneGaussians, edit: Edit, blend: Blend) -> PlaneGaussians:
                    colours=srgb_from_linear(np.maximum(linear, 0)))
 
 
-def _shaped(part: PlaneGaussians, edit: Edit, place: NDArray[Any], streak: bool) -> PlaneGaussians:
-    """Moved and turned as one: x' = c' + A (x - c), covariance' = A covariance A^T, arc' = A arc."""
+def _apply_shape(part: PlaneGaussians, edit: Edit, light_position: NDArray[Any], streak: bool) -> PlaneGaussians:
+    """Transform an element as a whole: x' = c' + A (x - c), covariance' = A covariance A^T, arc' = A arc."""
     length = edit.streak if streak else 1.0
     if (edit.scale, edit.spread, edit.rotation, length) == (1.0, 1.0, 0.0, 1.0):
         return part
@@ -309,7 +313,7 @@ def _shaped(part: PlaneGaussians, edit: Edit, place: NDArray[Any], streak: bool)
         affine = affine @ (np.eye(2) + (length - 1) * np.outer(axis, axis))
     angle = math.radians(edit.rotation)
     affine = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]]) @ affine
-    moved = np.asarray(place, np.float64) + edit.spread * (centre - place)
+    moved = np.asarray(light_position, np.float64) + edit.spread * (centre - light_position)
     means = moved + (part.means - centre) @ affine.T
     (a, b), (c, d) = affine
     xx, xy, yy = part.covariances.T.astype(np.float64)
@@ -321,9 +325,9 @@ def _shaped(part: PlaneGaussians, edit: Edit, place: NDArray[Any], streak: bool)
 
 
 def _long_axis(part: PlaneGaussians, weights: Floats | NDArray[Any], centre: NDArray[Any]) -> NDArray[np.float64]:
-    """Unit vector along the longest extent of all the Gaussians together."""
+    """Return the unit vector along the longest extent of the Gaussians as a whole."""
     xx, xy, yy = np.average(part.covariances, axis=0, weights=weights)
-    away = part.means - centre
-    spread = (away * np.asarray(weights)[:, None]).T @ away / np.sum(weights)
+    offsets = part.means - centre
+    spread = (offsets * np.asarray(weights)[:, None]).T @ offsets / np.sum(weights)
     _, axes = np.linalg.eigh(np.array([[xx, xy], [xy, yy]]) + spread)
     return np.asarray(axes[:, 1], np.float64)

@@ -1,10 +1,14 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A .flare as a look: what it shows for a camera and lights, with an artist's edits."""
+"""A .flare as a look: reads it, and evaluates its flares for a camera and lights, with an artist's edits.
+
+`Look.evaluate_lights` is the one loop over lights: the overlay and shot bakes call it, and `Look.evaluate` does for the
+lights where the file has them. `core.transfer` uses `Look.visible_lights` with queries of its own.
+"""
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
@@ -14,12 +18,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..choices import Blend
-from ..conventions.pixel_grid import Sampling
+from ..conventions.pixel_grid import PixelGrid
 from ..errors import FlareFileError
-from ..typed import Bounds, table_of
+from ..typed import parse_table
 from . import container, elements
-from .edits import LookEdits, edited
+from .edits import LookEdits, apply_edits
 from .elements import Element
+from .form import FlareForm
 from .network import Floats, Network, QueryRange, frequency_encoding
 from .plane import (
     PlaneGaussians,
@@ -31,55 +36,12 @@ from .plane import (
 )
 
 VERSION = 1
-KEY = "fit_flare"
-"""Of the description in a .flare's metadata."""
-MOST_GAUSSIANS = 1_000_000
-"""Of a light; a file that claims more is damaged or hostile."""
-FORM_BOUNDS = {"sh_degree": Bounds(0, 3), "latent": Bounds(0, 64), "levels": Bounds(1, 16), "base": Bounds(1, 256)}
-"""What the numbers of a form may be, likewise."""
+METADATA_KEY = "fit_flare"
+"""Key of the description in a .flare's metadata."""
+MAX_GAUSSIANS = 1_000_000
+"""Most Gaussians of a light; a file that claims more is damaged or hostile."""
 
 Query = Literal["target", "source", "trained"]
-
-
-@dataclass(frozen=True)
-class FlareForm:
-    """What the model is made of; each field a choice that can be measured alone.
-
-    line              Gaussians live on the line through principal point and light; else free (mode `2d`)
-    light_correction  delta_l, a 2D correction of the light's position for each view (paper, eq. 4)
-    plane_offset      delta_f, a deformed 2D offset of each Gaussian (paper, eq. 3)
-    solid             3D Gaussians with SH colour at depth 0.21 (paper); else ellipses on the plane
-    sh_degree         of the colour's view dependence, 0 to 3 (solid only)
-    static_offset     a learned 2D offset of each Gaussian, the same in all views
-    rings             the radial profile exp(-(r - r0)^2 / (2 w^2)) (ours; docs/interop.md)
-    arcs              one side of it brighter, by exp(b·d): rings of which the lens's barrel hides a part (ellipses with
-                      rings only)
-    latent            width of a per-Gaussian code that the network sees
-    levels, base      of the hash grids: how many, and the resolution of the coarsest. Fine cells hold a view
-                      each, and learn nothing about the views between
-    """
-
-    line: bool = True
-    light_correction: bool = True
-    plane_offset: bool = True
-    solid: bool = True
-    sh_degree: int = 3
-    static_offset: bool = False
-    rings: bool = False
-    latent: int = 0
-    levels: int = 16
-    base: int = 16
-    arcs: bool = False
-
-    @property
-    def consistent(self) -> bool:
-        """Whether its parts go together."""
-        return not self.arcs or (self.rings and not self.solid)
-
-    @property
-    def makes_sense(self) -> bool:
-        """Whether its numbers lie within `FORM_BOUNDS` too."""
-        return self.consistent and all(bounds.hold(getattr(self, name)) for name, bounds in FORM_BOUNDS.items())
 
 
 @dataclass(frozen=True)
@@ -95,20 +57,23 @@ class TrainedCamera:
 
     @property
     def intrinsics(self) -> NDArray[np.float64]:
-        """(3, 3)."""
+        """The matrix (3, 3)."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
-    def pixels_across(self, width: int, height: int) -> float:
-        """How many times as many pixels a picture of that size has across this camera's field of view: by the width;
-        where one of the two is upright and the other is not by the long sides, since that is how a camera is turned."""
+    def pixel_ratio(self, width: int, height: int) -> float:
+        """Return the ratio of a picture's pixels to this camera's across its field of view.
+
+        Compares widths; for a portrait and a landscape picture the long sides, since the camera is turned then."""
         turned = (width < height) != (self.width < self.height)
         return max(width, height) / max(self.width, self.height) if turned else width / self.width
 
 
 @dataclass(frozen=True, eq=False)
 class ViewOfLight:
-    """One light seen from one camera. camera (3,) in the world, rotation (3, 3) world to camera, light (2,)
-    normalised coordinates, depth along the axis in world units: not positive means behind the camera."""
+    """One light seen by one camera.
+
+    camera (3,): position in the world; rotation (3, 3): world to camera; light (2,): normalised image coordinates;
+    depth: of the light along the axis, world units, not positive behind the camera."""
 
     camera: Floats
     rotation: Floats
@@ -117,7 +82,7 @@ class ViewOfLight:
 
     @classmethod
     def of(cls, world_to_camera: ArrayLike, xyz: ArrayLike) -> ViewOfLight:
-        """From a pose (4, 4) and the light's position (3,)."""
+        """Return the view of a light at xyz (3,) for a pose (4, 4), world to camera."""
         pose = np.asarray(world_to_camera, np.float64)
         x, y, z = (pose[:3, :3] @ np.asarray(xyz, np.float64) + pose[:3, 3]).tolist()
         camera = -pose[:3, :3].T @ pose[:3, 3]
@@ -125,184 +90,217 @@ class ViewOfLight:
         return cls(camera.astype(np.float32), pose[:3, :3].astype(np.float32), np.array(light, np.float32), z)
 
 
+@dataclass(frozen=True, eq=False)
+class PlacedLight:
+    """A light at xyz (3,) that shows the flare of the look's light `source`; visibility: 0..1."""
+
+    name: str
+    source: str
+    xyz: NDArray[np.float64]
+    visibility: float = 1.0
+
+
 class LightLook:
-    """The flare of one light; made by `read`."""
+    """The flare of one light; created by `read`."""
 
     def __init__(self, name: str, xyz: NDArray[np.float64], form: FlareForm, query_range: QueryRange,
                  rows: Mapping[str, Floats], tensors: Mapping[str, NDArray[Any]], blend: Blend,
-                 listed: list[Element], clear: float = 1.0) -> None:
-        """rows: canonical Gaussians by name; tensors: the network's; listed: elements the file has, [] for none.
-        clear: what the scene it was learned in leaves of the light where nothing hides it, 0..1
+                 listed: list[Element], clear_visibility: float = 1.0) -> None:
+        """rows: canonical Gaussians by name; tensors: the network's; listed: elements in the file, or [].
+        clear_visibility: visibility of the unoccluded light through the scene of its fit, 0..1
         (`core.flare.model.FlareModel`)."""
         self.name, self.xyz, self.form, self.query_range, self.blend = name, xyz, form, query_range, blend
-        self.clear = clear
+        self.clear_visibility = clear_visibility
         self._rows, self._listed = rows, listed
         encoded = frequency_encoding(rows["positions"])
         if form.latent:
             encoded = np.concatenate([encoded, rows["latent"]], -1)
-        self._network = Network(tensors, _heads(form, rows), form.levels, form.base, query_range, encoded)
-        self._network.check(corrects=form.light_correction)
+        self._network = Network(tensors, _head_widths(form, rows), form.levels, form.base, query_range, encoded)
+        self._network.check(has_correction=form.light_correction)
 
     @property
     def count(self) -> int:
-        """Gaussians."""
+        """Number of Gaussians."""
         return len(self._rows["positions"])
 
     @cached_property
     def elements(self) -> list[Element]:
-        """Its elements: the file's own, or else found from the canonical Gaussians."""
+        """The elements in the file, or else those that `group_elements` makes of the canonical Gaussians."""
         if self._listed:
             return self._listed
         along = self.query_range.light_high[2] * np.array([0.55, 0.35], np.float32)
         middle = (self.query_range.camera_low + self.query_range.camera_high) / 2
         seen, _ = self._gaussians(ViewOfLight(middle, np.eye(3, dtype=np.float32), np.asarray(along, np.float32), 1.0),
                                   None)
-        return elements.group(seen, self._rows["positions"][:, 0] if self.form.line else None)
+        return elements.group_elements(seen, self._rows["positions"][:, 0] if self.form.line else None)
 
     def evaluate(self, view: ViewOfLight, *, query: ViewOfLight | None = None, edits: LookEdits | None = None,
-                 share: float = 1.0, name: str | None = None) -> PlaneGaussians | None:
-        """The Gaussians this light shows in `view`; None for a light behind the camera, which has no flare.
+                 visibility: float = 1.0, name: str | None = None) -> PlaneGaussians | None:
+        """Return the plane Gaussians of this light's flare in `view`; None for a light behind the camera.
 
-        query: the camera and light the network is asked for, if not the view's own: appearance follows it,
-        placement follows the view. share: how much of the light is visible, 0..1; scales the opacities. name:
-        whose edits are applied, if not this light's.
+        query: camera and light at which the network is evaluated, by default the view's: appearance follows it,
+        placement follows the view. visibility: 0..1, scales the opacities. name: of the light whose edits are applied,
+        by default this light's.
         """
         if view.depth <= 0:
             return None
         gaussians, light = self._gaussians(view, query)
         if edits is not None:
-            gaussians = edited(gaussians, name or self.name, light, self.elements, edits, self.blend)
-        if share != 1.0:
-            gaussians = replace(gaussians, opacities=np.asarray(gaussians.opacities * share, np.float32))
+            gaussians = apply_edits(gaussians, name or self.name, light, self.elements, edits, self.blend)
+        if visibility != 1.0:
+            gaussians = replace(gaussians, opacities=np.asarray(gaussians.opacities * visibility, np.float32))
         return gaussians
 
     def _gaussians(self, view: ViewOfLight, query: ViewOfLight | None) -> tuple[PlaneGaussians, Floats]:
-        """Gaussians on the plane (paper, eq. 1 to 3), and the light with delta_l."""
-        form, rows, asked = self.form, self._rows, query or view
-        features = self._network.view_features(asked.camera, asked.light)
-        change = self._network.offsets(features)
+        """Return Gaussians on the plane (paper, eq. 1 to 3), and the light's position with delta_l."""
+        form, rows, queried = self.form, self._rows, query or view
+        features = self._network.view_features(queried.camera, queried.light)
+        offsets = self._network.offsets(features)
         light = view.light
         if form.light_correction:
             light = light + self._network.light_correction(features)
-        positions = rows["positions"] + change["positions"]
+        positions = rows["positions"] + offsets["positions"]
         means = positions * light if form.line else positions
-        if "plane_offset" in change:
-            means = means + change["plane_offset"]
+        if "plane_offset" in offsets:
+            means = means + offsets["plane_offset"]
         if form.static_offset:
             means = means + rows["offsets"]
-        scales, rotations = rows["log_scales"] + change["log_scales"], rows["rotations"] + change["rotations"]
+        scales, rotations = rows["log_scales"] + offsets["log_scales"], rows["rotations"] + offsets["rotations"]
         covariances = (covariance_of_solid(means, scales, rotations) if form.solid
                        else covariance_of_ellipse(scales, rotations))
         with np.errstate(over="ignore"):
-            opacities = 1 / (1 + np.exp(-(rows["opacity_logits"] + change["opacity_logits"])[:, 0]))
+            opacities = 1 / (1 + np.exp(-(rows["opacity_logits"] + offsets["opacity_logits"])[:, 0]))
         rays = np.concatenate([means, np.ones_like(means[:, :1])], -1) @ view.rotation
-        sh = (rows["sh"] + change["sh"]).reshape(len(means), (self.form.sh_degree + 1) ** 2, 3)
+        sh = (rows["sh"] + offsets["sh"]).reshape(len(means), (self.form.sh_degree + 1) ** 2, 3)
         rings = arcs = None
         if form.rings:
-            raw = rows["rings"] + change["rings"]
+            raw = rows["rings"] + offsets["rings"]
             rings = np.stack([raw[:, 0], np.exp(np.clip(raw[:, 1], -3, 3))], -1)
         if form.arcs and rings is not None:
-            own = rows["arcs"] + change["arcs"]
-            opacities = opacities * opacity_gain(own, rings)
-            arcs = arcs_of_ellipse(own, scales, rotations)
+            own_rows = rows["arcs"] + offsets["arcs"]
+            opacities = opacities * opacity_gain(own_rows, rings)
+            arcs = arcs_of_ellipse(own_rows, scales, rotations)
         return PlaneGaussians(means, covariances, opacities, colours(rays, sh, form.sh_degree), rings, arcs), light
 
 
 class Look:
-    """All lights of a .flare; made by `read`."""
+    """The lights of a .flare; created by `read`."""
 
     def __init__(self, path: Path, lights: tuple[LightLook, ...], blend: Blend, camera: TrainedCamera,
-                 licence: str = "", notes: str = "", sampling: Sampling | None = None) -> None:
+                 licence: str = "", notes: str = "", pixel_grid: PixelGrid | None = None) -> None:
         self.path, self.lights, self.blend, self.camera = path, lights, blend, camera
-        self.sampling = sampling
+        self.pixel_grid = pixel_grid
         self.licence, self.notes = licence, notes
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the lights, in their order."""
+        """Names of the lights, in the file's order."""
         return tuple(light.name for light in self.lights)
 
     @property
     def element_names(self) -> dict[str, list[str]]:
-        """Names of the elements by light, as `LookEdits.parse` takes them."""
+        """Names of the elements by light, an argument of `LookEdits.parse`."""
         return {light.name: [element.name for element in light.elements] for light in self.lights}
 
     @property
     def count(self) -> int:
-        """Gaussians of all lights."""
+        """Number of Gaussians of all lights."""
         return sum(light.count for light in self.lights)
 
     def evaluate(self, world_to_camera: ArrayLike, *, lights: Mapping[str, ArrayLike] | None = None,
-                 edits: LookEdits | None = None, shares: Mapping[str, float] | None = None,
+                 edits: LookEdits | None = None, visibilities: Mapping[str, float] | None = None,
                  query: Query = "target") -> dict[str, PlaneGaussians]:
-        """The Gaussians of each light in front of the camera, by the light's name, in the file's order.
+        """Return the plane Gaussians of each visible light in front of the camera, by name, in the file's order.
 
-        world_to_camera: (4, 4), x right, y down, z forward. lights: positions (3,) by name where they differ
-        from the file's; with it, lights it does not name are left out. edits: mute and solo leave lights out.
-        shares: how much of a light is visible, 0..1, by name (1 where not named).
-        query: what appearance follows: "target" the view as it is; "trained" the view, kept inside what training
-        saw; "source" the middle of what training saw. Placement follows the view always.
+        world_to_camera: (4, 4), x right, y down, z forward. lights: positions (3,) by name, by default the file's;
+        lights that are missing in it are omitted. visibilities: 0..1, by name, by default 1.
+        edits, query: see `evaluate_lights`.
         """
-        placed = {light.name: light.xyz for light in self.lights} if lights is None else dict(lights)
-        shown: dict[str, PlaneGaussians] = {}
-        for light in self.lights:
-            if light.name not in placed or (edits is not None and not edits.shows(light.name, placed)):
+        positions = {light.name: light.xyz for light in self.lights} if lights is None else lights
+        names = sorted(positions, key=lambda name: self.names.index(name) if name in self.names else len(self.names))
+        placed = [PlacedLight(name, name, np.asarray(positions[name], np.float64), (visibilities or {}).get(name, 1.0))
+                  for name in names]
+        return self.evaluate_lights(world_to_camera, placed, edits, query)
+
+    def evaluate_lights(self, world_to_camera: ArrayLike, lights: Sequence[PlacedLight],
+                        edits: LookEdits | None = None, query: Query = "target") -> dict[str, PlaneGaussians]:
+        """Return the plane Gaussians of each placed light of `visible_lights` with a visibility above 0, by its name.
+
+        edits: by the names of the placed lights; lights that mute and solo turn off are omitted.
+        query: the view at which the network is evaluated: "target" the view itself; "trained" the view, clipped to the
+        range of the training views; "source" the middle of that range. Placement always follows the view.
+        """
+        flares: dict[str, PlaneGaussians] = {}
+        for light, source, view in self.visible_lights(world_to_camera, lights, edits):
+            if light.visibility <= 0:
                 continue
-            view = ViewOfLight.of(world_to_camera, placed[light.name])
-            if view.depth <= 0:
+            gaussians = source.evaluate(view, query=network_query(source, view, query), edits=edits,
+                                        visibility=light.visibility, name=light.name)
+            if gaussians is not None:
+                flares[light.name] = gaussians
+        return flares
+
+    def visible_lights(self, world_to_camera: ArrayLike, lights: Sequence[PlacedLight],
+                       edits: LookEdits | None = None) -> Iterator[tuple[PlacedLight, LightLook, ViewOfLight]]:
+        """Yield each placed light with its source and its view.
+
+        Omits lights behind the camera, lights that mute and solo turn off, and lights whose source the look lacks."""
+        sources = {light.name: light for light in self.lights}
+        names = [light.name for light in lights]
+        for light in lights:
+            source = sources.get(light.source)
+            if source is None or (edits is not None and not edits.is_visible(light.name, names)):
                 continue
-            found = light.evaluate(view, query=asked(light, view, query), edits=edits,
-                                   share=(shares or {}).get(light.name, 1.0))
-            if found is not None:
-                shown[light.name] = found
-        return shown
+            view = ViewOfLight.of(world_to_camera, light.xyz)
+            if view.depth > 0:
+                yield light, source, view
 
 
-def asked(light: LightLook, view: ViewOfLight, query: Query) -> ViewOfLight | None:
-    """What the network is asked for, by name; see `Look.evaluate`. None: the view itself."""
+def network_query(light: LightLook, view: ViewOfLight, query: Query) -> ViewOfLight | None:
+    """Return the view at which the network is evaluated, see `Look.evaluate_lights`; None for `view` itself."""
     if query == "target":
         return None
-    reach = light.query_range
+    query_range = light.query_range
     if query == "trained":
-        camera, place = reach.clipped(view.camera, view.light)
+        camera, position = query_range.clip(view.camera, view.light)
     else:
-        camera = (reach.camera_low + reach.camera_high) / 2
-        _, place = reach.clipped(camera, view.light)
-    return replace(view, camera=camera, light=place)
+        camera = (query_range.camera_low + query_range.camera_high) / 2
+        _, position = query_range.clip(camera, view.light)
+    return replace(view, camera=camera, light=position)
 
 
 # ---- the file -------------------------------------------------------------------------------------
 
 
-def describe(path: Path | str) -> dict[str, Any]:
-    """The description of a .flare (lights, blend, camera, licence, notes), without its tensors' meaning.
+def read_description(path: Path | str) -> dict[str, Any]:
+    """Read the description of a .flare (lights, blend, camera, licence, notes), without its tensors.
 
-    Raises FlareFileError where the file is missing, damaged, newer, or not a flare.
+    Raises FlareFileError for a file that is missing, damaged, of a newer version, or not a flare.
     """
-    return _described(Path(path), container.read_tensors(path)[1])
+    return _parse_json(Path(path), container.read_tensors(path)[1])
 
 
-def list_elements(path: Path | str) -> None:
-    """Write the elements of each light into a .flare that lists none, so that they stay what they are."""
+def store_elements(path: Path | str) -> None:
+    """Write the elements of each light into a .flare without elements, so that later versions group them alike."""
     look = read(path)
     _, metadata = container.read_tensors(path)
-    listed = [element.entry(light.name) for light in look.lights for element in light.elements]
-    description = {**_described(Path(path), metadata), "elements": listed}
-    container.rewritten(path, path, {**metadata, KEY: json.dumps(description)})
+    listed = [element.to_json(light.name) for light in look.lights for element in light.elements]
+    description = {**_parse_json(Path(path), metadata), "elements": listed}
+    container.rewrite_metadata(path, path, {**metadata, METADATA_KEY: json.dumps(description)})
 
 
-def annotated(source: Path | str, target: Path | str, *, notes: str, licence: str) -> None:
-    """A copy of a .flare with other notes and licence. Raises FlareFileError where `source` is not a flare."""
+def write_annotated(source: Path | str, target: Path | str, *, notes: str, licence: str) -> None:
+    """Write a copy of a .flare with other notes and licence. Raises FlareFileError if `source` is not a flare."""
     _, metadata = container.read_tensors(source)
-    description = {**_described(Path(source), metadata), "notes": notes, "licence": licence}
-    container.rewritten(source, target, {**metadata, KEY: json.dumps(description)})
+    description = {**_parse_json(Path(source), metadata), "notes": notes, "licence": licence}
+    container.rewrite_metadata(source, target, {**metadata, METADATA_KEY: json.dumps(description)})
 
 
-def _described(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
-    if KEY not in metadata:
+def _parse_json(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
+    if METADATA_KEY not in metadata:
         raise FlareFileError(f"{path} is a safetensors file, but not a flare; choose another.")
     try:
-        description = json.loads(metadata[KEY])
+        description = json.loads(metadata[METADATA_KEY])
     except (ValueError, RecursionError) as problem:
         raise FlareFileError(f"{path} is damaged or not a flare ({problem}); save it again.") from problem
     version = description.get("version") if isinstance(description, dict) else None
@@ -311,20 +309,21 @@ def _described(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
     return description
 
 
-def checked(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
-    """The description in a .flare's metadata, for every reader: what one refuses all do. Raises FlareFileError where
-    it is not there, newer, or makes no sense; whether the tensors fit it is the reader's to say."""
-    description = _described(path, metadata)
+def parse_description(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
+    """Parse and validate the description in a .flare's metadata, for all readers, so that they accept the same files.
+
+    Raises FlareFileError if it is missing, of a newer version, or invalid. Does not compare it with the tensors."""
+    description = _parse_json(path, metadata)
     try:
         names = [_check_light(path, entry, description.get("elements", [])) for entry in description["lights"]]
         if len(set(names)) < len(names):
             raise ValueError("two lights have one name")
         if description["blend"] not in ("over", "add"):
             raise ValueError(f"blend {description['blend']!r}")
-        camera = table_of(TrainedCamera, description["camera"])
+        camera = parse_table(TrainedCamera, description["camera"])
         if min(camera.width, camera.height, camera.fx, camera.fy) <= 0:
             raise ValueError("its camera makes no sense")
-        Sampling.read(description.get("sampling"))
+        PixelGrid.read(description.get("sampling"))
         for rows in description.get("seen", {}).values():
             if any(len([float(value) for value in row]) != 5 for row in rows):
                 raise ValueError("a training view makes no sense")
@@ -335,58 +334,58 @@ def checked(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
 
 
 def _check_light(path: Path, entry: Mapping[str, Any], listed: Any) -> str:
-    """Its name."""
-    strange = set(entry["form"]) - {one.name for one in fields(FlareForm)}
-    if strange:
-        raise FlareFileError(f"{path} was written by a newer Fit Flare (its form has {', '.join(sorted(strange))}); "
+    """Validate the description of a light, and return its name."""
+    unknown = set(entry["form"]) - {one.name for one in fields(FlareForm)}
+    if unknown:
+        raise FlareFileError(f"{path} was written by a newer Fit Flare (its form has {', '.join(sorted(unknown))}); "
                              "update to open it.")
     name, count, xyz = str(entry["name"]), int(entry["count"]), [float(value) for value in entry["xyz"]]
-    if not 0 <= count <= MOST_GAUSSIANS or len(xyz) != 3 or not all(map(math.isfinite, xyz)):
+    if not 0 <= count <= MAX_GAUSSIANS or len(xyz) != 3 or not all(map(math.isfinite, xyz)):
         raise ValueError("a light's description makes no sense")
-    if not FlareForm(**entry["form"]).makes_sense:
+    if not FlareForm(**entry["form"]).is_valid:
         raise ValueError("a light's form makes no sense")
     if not 0 <= float(entry.get("clear", 1.0)) <= 1:
         raise ValueError("a light's clear share makes no sense")
     QueryRange.read(entry["range"])
-    elements.read(listed, name, count)
+    elements.read_elements(listed, name, count)
     return name
 
 
 def read(path: Path | str) -> Look:
-    """Read a .flare. Raises FlareFileError where it is missing, damaged, newer, or not a flare."""
+    """Read a .flare. Raises FlareFileError for a file that is missing, damaged, of a newer version, or not a flare."""
     path = Path(path)
     tensors, metadata = container.read_tensors(path)
-    description = checked(path, metadata)
+    description = parse_description(path, metadata)
     for name, tensor in tensors.items():
         if tensor.dtype.kind == "f" and not np.isfinite(tensor).all():
             raise FlareFileError(f"{path} is damaged: {name} holds values that are not finite; save it again.")
     blend = description["blend"]
     try:
-        lights = tuple(_light(number, entry, tensors, blend, description.get("elements", []))
+        lights = tuple(_read_light(number, entry, tensors, blend, description.get("elements", []))
                        for number, entry in enumerate(description["lights"]))
     except (KeyError, TypeError, ValueError, IndexError, AttributeError) as problem:
         raise FlareFileError(f"{path} is damaged: its tensors do not fit its description ({problem}).") from problem
-    return Look(path, lights, blend, table_of(TrainedCamera, description["camera"]),
+    return Look(path, lights, blend, parse_table(TrainedCamera, description["camera"]),
                 str(description.get("licence", "")), str(description.get("notes", "")),
-                Sampling.read(description.get("sampling")))
+                PixelGrid.read(description.get("sampling")))
 
 
-def _light(number: int, entry: Mapping[str, Any], tensors: Mapping[str, NDArray[Any]], blend: Blend,
+def _read_light(number: int, entry: Mapping[str, Any], tensors: Mapping[str, NDArray[Any]], blend: Blend,
            listed: Any) -> LightLook:
     form, name, count = FlareForm(**entry["form"]), str(entry["name"]), int(entry["count"])
     xyz = np.array([float(value) for value in entry["xyz"]], np.float64)
-    own = {key[len(f"{number}."):]: value for key, value in tensors.items() if key.startswith(f"{number}.")}
-    rows = {key[len("gaussians."):]: np.asarray(value, np.float32) for key, value in own.items()
+    own_rows = {key[len(f"{number}."):]: value for key, value in tensors.items() if key.startswith(f"{number}.")}
+    rows = {key[len("gaussians."):]: np.asarray(value, np.float32) for key, value in own_rows.items()
             if key.startswith("gaussians.")}
-    for key, width in _widths(form).items():
+    for key, width in _row_widths(form).items():
         if rows[key].shape != (count, width):
             raise ValueError(f"{key} has the shape {rows[key].shape}")
-    return LightLook(name, xyz, form, QueryRange.read(entry["range"]), rows, own, blend,
-                     elements.read(listed, name, count), float(entry.get("clear", 1.0)))
+    return LightLook(name, xyz, form, QueryRange.read(entry["range"]), rows, own_rows, blend,
+                     elements.read_elements(listed, name, count), float(entry.get("clear", 1.0)))
 
 
-def _widths(form: FlareForm) -> dict[str, int]:
-    """Columns of the canonical Gaussians by name (core.flare.model.LightFlare)."""
+def _row_widths(form: FlareForm) -> dict[str, int]:
+    """Return the number of columns of the canonical Gaussians by name (core.flare.model.LightFlare)."""
     widths = {"positions": 1 if form.line else 2, "log_scales": 3 if form.solid else 2,
               "rotations": 4 if form.solid else 2, "opacity_logits": 1, "sh": 3 * (form.sh_degree + 1) ** 2}
     extra = {"offsets": (form.static_offset, 2), "rings": (form.rings, 2), "arcs": (form.arcs, 2),
@@ -394,9 +393,9 @@ def _widths(form: FlareForm) -> dict[str, int]:
     return {**widths, **{name: width for name, (there, width) in extra.items() if there}}
 
 
-def _heads(form: FlareForm, rows: Mapping[str, Floats]) -> dict[str, int]:
-    """Offsets by name, in the order of the network's one head matrix (core.flare.model.LightFlare)."""
-    known = sorted(name for name in _widths(form) if name not in ("offsets", "latent"))  # as torch sorts parameters
+def _head_widths(form: FlareForm, rows: Mapping[str, Floats]) -> dict[str, int]:
+    """Return the widths of the offsets by name, in the order of the network's head (core.flare.model.LightFlare)."""
+    known = sorted(name for name in _row_widths(form) if name not in ("offsets", "latent"))  # as torch sorts parameters
     heads = {name: rows[name].shape[1] for name in known}
     if form.line and form.plane_offset:
         heads["plane_offset"] = 2

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The deformation network and its encodings in numpy: what core.flare has in torch, without gradients.
+"""The deformation network and its encodings in numpy, for inference; core.flare has the torch version.
 
-Hash tables stay as the rows that training touched (sorted), since one view asks for 128 rows of millions.
+Hash tables are stored sparsely, as the sorted rows that training touched: one view needs 128 rows of millions.
 """
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ Floats = NDArray[np.float32]
 BANDS = 3
 """Octaves of the frequency encoding of canonical positions."""
 LIGHT_BITS, LIGHT_GROWTH, CAMERA_BITS, CAMERA_GROWTH = 17, 1.8, 15, 1.6
-"""Of the two hash grids: log2 of the rows of a level's table, and the growth of resolution from level to level."""
+"""log2 of the rows of a level's table, and growth of the resolution from level to level, of the two hash grids."""
 PRIMES = np.array([1, 2654435761, 805459861], np.int64)
-"""Of the spatial hash (Müller et al. 2022, eq. 4)."""
+"""Primes of the spatial hash (Müller et al. 2022, eq. 4)."""
 CORNERS = np.array([[(corner >> axis) & 1 for axis in range(3)] for corner in range(8)], np.int64)
-"""Of a cell, (8, 3)."""
+"""Corners of a cell, (8, 3)."""
 
 
 class HashGrid:
@@ -31,18 +31,18 @@ class HashGrid:
 
     def __init__(self, bits: int, growth: float, levels: int, base: int, rows: NDArray[Any],
                  values: NDArray[Any]) -> None:
-        """rows: ascending numbers of the table rows that are not zero, (k,); values: their content, (k, features)."""
+        """rows: ascending indices of the stored table rows, (k,), the others are zero; values: (k, features)."""
         size = 1 << bits
         self._resolutions = np.array([math.floor(base * growth**level) for level in range(levels)], np.int64)
         self._sizes = np.minimum((self._resolutions + 1) ** 3, size)
         self._starts = np.concatenate([[0], np.cumsum(self._sizes)[:-1]]).astype(np.int64)
-        self._kept, self._values = np.asarray(rows, np.int64), np.asarray(values, np.float32)
-        if (self._values.ndim != 2 or self._kept.shape != self._values.shape[:1] or (np.diff(self._kept) <= 0).any()
-                or (len(self._kept) and not 0 <= self._kept[0] <= self._kept[-1] < self._sizes.sum())):
+        self._rows, self._values = np.asarray(rows, np.int64), np.asarray(values, np.float32)
+        if (self._values.ndim != 2 or self._rows.shape != self._values.shape[:1] or (np.diff(self._rows) <= 0).any()
+                or (len(self._rows) and not 0 <= self._rows[0] <= self._rows[-1] < self._sizes.sum())):
             raise ValueError("a hash table's rows make no sense")
 
     def __call__(self, point: Floats) -> Floats:
-        """Features (levels * features,) of a point (3,), clamped to 0..1."""
+        """Return features (levels * features,) of a point (3,), clamped to 0..1."""
         resolutions = self._resolutions[:, None]
         scaled = (np.clip(point, 0, 1).astype(np.float32)[None] * resolutions.astype(np.float32))
         low = np.minimum(np.floor(scaled), resolutions.astype(np.float32) - 1)
@@ -57,16 +57,16 @@ class HashGrid:
         return np.asarray((self._row_values(rows) * weights[..., None]).sum(1).reshape(-1), np.float32)
 
     def _row_values(self, rows: NDArray[np.int64]) -> Floats:
-        found = np.zeros((*rows.shape, self._values.shape[1]), np.float32)
-        if len(self._kept):
-            at = np.minimum(np.searchsorted(self._kept, rows), len(self._kept) - 1)
-            known = self._kept[at] == rows
-            found[known] = self._values[at[known]]
-        return found
+        values = np.zeros((*rows.shape, self._values.shape[1]), np.float32)
+        if len(self._rows):
+            at = np.minimum(np.searchsorted(self._rows, rows), len(self._rows) - 1)
+            is_stored = self._rows[at] == rows
+            values[is_stored] = self._values[at[is_stored]]
+        return values
 
 
 def frequency_encoding(values: Floats, bands: int = BANDS) -> Floats:
-    """sin and cos of 2^k pi x for k < bands (Mildenhall et al. 2020, eq. 4): (n, d) to (n, 2 * bands * d)."""
+    """Return sin and cos of 2^k pi x for k < bands (Mildenhall et al. 2020, eq. 4): (n, d) to (n, 2 * bands * d)."""
     octaves = (math.pi * 2.0 ** np.arange(bands)).astype(np.float32)
     angles = (values[..., None] * octaves).reshape(len(values), values.shape[1] * bands)
     return np.concatenate([np.sin(angles), np.cos(angles)], -1)
@@ -74,7 +74,7 @@ def frequency_encoding(values: Floats, bands: int = BANDS) -> Floats:
 
 @dataclass(frozen=True)
 class QueryRange:
-    """The boxes that map camera and light to the unit cube: what the network was trained on.
+    """The boxes that map camera and light to the unit cube: the range of the training views.
 
     camera_low, camera_high: world units. light_high: largest |x|, |y|, norm of the light's offset from the
     principal point, normalised image coordinates.
@@ -86,29 +86,29 @@ class QueryRange:
 
     @classmethod
     def read(cls, entry: Mapping[str, Sequence[float]]) -> QueryRange:
-        """From the .flare's description; ValueError where it makes no sense."""
+        """Read the entry of a .flare's description. Raises ValueError for invalid values."""
         parts = [np.asarray(entry[name], np.float32) for name in ("camera_low", "camera_high", "light_high")]
         if any(part.shape != (3,) or not np.isfinite(part).all() for part in parts):
             raise ValueError("a light's range makes no sense")
         return cls(*parts)
 
-    def clipped(self, camera: Floats, light: Floats) -> tuple[Floats, Floats]:
-        """Camera (3,) and light (2,) moved to the nearest that training saw."""
+    def clip(self, camera: Floats, light: Floats) -> tuple[Floats, Floats]:
+        """Clip camera (3,) and light (2,) to the range of the training views."""
         camera = np.clip(camera, self.camera_low, self.camera_high)
-        reach = float(np.linalg.norm(light))
-        sizes = np.append(np.abs(light), reach)
+        norm = float(np.linalg.norm(light))
+        sizes = np.append(np.abs(light), norm)
         with np.errstate(divide="ignore", invalid="ignore"):
             shrink = np.min(np.where(sizes > self.light_high, self.light_high / sizes, 1.0))
         return camera, np.asarray(light * shrink, np.float32)
 
 
 class Network:
-    """Offsets of `heads` (name: width) for the canonical Gaussians, and delta_l, from one camera and light."""
+    """The network that computes the offsets of the canonical Gaussians, and delta_l, from one camera and light."""
 
     def __init__(self, tensors: Mapping[str, NDArray[Any]], heads: Mapping[str, int], levels: int, base: int,
                  query_range: QueryRange, encoded: Floats) -> None:
-        """tensors: by their names in the file, without the light's number. encoded: (n, d) canonical positions,
-        frequency encoded, with latent codes after them."""
+        """tensors: by their names in the file, without the light's number. heads: width of each offset by name.
+        encoded: (n, d) frequency-encoded canonical positions, followed by latent codes."""
         self._t = {name: np.asarray(value, np.float32) for name, value in tensors.items()
                    if not name.endswith(".rows")}
         self._heads, self._range = dict(heads), query_range
@@ -126,44 +126,44 @@ class Network:
             raise ValueError("the network's heads do not fit the form")
 
     @cached_property
-    def _gaussian_share(self) -> Floats:
-        """The Gaussians' part of the first layer, which no view changes."""
-        return self._share_of(self._encoded)
+    def _gaussian_features(self) -> Floats:
+        """The Gaussians' contribution to the first layer, which is independent of the view."""
+        return self._encode_gaussians(self._encoded)
 
     def view_features(self, camera: Floats, light: Floats) -> Floats:
-        """Features of a camera position (3,), world units, and a light (2,), normalised coordinates."""
+        """Return the features of a camera position (3,), world units, and a light (2,), normalised coordinates."""
         extent = self._range.camera_high - self._range.camera_low
         folded = np.append(np.abs(light), np.linalg.norm(light)).astype(np.float32)
         where = (camera.astype(np.float32) - self._range.camera_low) / extent
         return np.concatenate([self._light_grid(folded / self._range.light_high), self._camera_grid(where)])
 
-    def check(self, *, corrects: bool) -> None:
-        """Ask it for one Gaussian, and for delta_l where it `corrects`: ValueError or KeyError where its tensors do not
-        fit each other, before any view is asked for."""
-        nowhere = np.zeros(3, np.float32)
-        features = np.concatenate([self._light_grid(nowhere), self._camera_grid(nowhere)])
-        self._all_offsets(self._share_of(self._encoded[:1]), features)
-        if corrects and self.light_correction(features).shape != (2,):
+    def check(self, *, has_correction: bool) -> None:
+        """Evaluate one Gaussian, and delta_l if `has_correction`. Raises ValueError or KeyError for tensors that do not
+        fit each other."""
+        origin = np.zeros(3, np.float32)
+        features = np.concatenate([self._light_grid(origin), self._camera_grid(origin)])
+        self._concatenated_offsets(self._encode_gaussians(self._encoded[:1]), features)
+        if has_correction and self.light_correction(features).shape != (2,):
             raise ValueError("the correction of the light is no place")
 
     def offsets(self, features: Floats) -> dict[str, Floats]:
-        """Offsets by name, (n, width) each."""
-        every = self._all_offsets(self._gaussian_share, features)
+        """Return the offsets by name, (n, width) each."""
+        every = self._concatenated_offsets(self._gaussian_features, features)
         edges = np.cumsum([0, *self._heads.values()])
         return {name: every[:, a:b] for name, a, b in zip(self._heads, edges[:-1], edges[1:], strict=True)}
 
-    def _share_of(self, encoded: Floats) -> Floats:
+    def _encode_gaussians(self, encoded: Floats) -> Floats:
         return np.asarray(encoded @ self._t["network.gaussian_layer.weight"].T, np.float32)
 
-    def _all_offsets(self, gaussian_share: Floats, features: Floats) -> Floats:
-        """(n, sum of the heads' widths)."""
-        x = np.maximum(gaussian_share + self._linear("network.view_layer", features[None]), 0)
+    def _concatenated_offsets(self, gaussian_features: Floats, features: Floats) -> Floats:
+        """Return the offsets of all heads, (n, sum of their widths)."""
+        x = np.maximum(gaussian_features + self._linear("network.view_layer", features[None]), 0)
         for name in self._hidden:
             x = np.maximum(self._linear(name, x), 0)
         return self._linear("network.head", x)
 
     def light_correction(self, features: Floats) -> Floats:
-        """delta_l (2,), normalised coordinates."""
+        """Return delta_l (2,), normalised coordinates."""
         hidden = np.maximum(self._linear("network.correction.0", features[None]), 0)
         return self._linear("network.correction.2", hidden)[0]
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Gaussians on the normalised plane: covariances, colours, pixels. The formulas of core/flare/placement.py in numpy.
+"""Gaussians on the normalised plane: covariances, colours, pixels; core/flare/placement.py has the torch version.
 
 Everything is in normalised image coordinates (x/z, y/z, origin at the principal point, y down).
 """
@@ -15,25 +15,28 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..choices import Blend
 from ..colour.srgb import LUMINANCE
-from ..conventions.exposures import brightness
-from ..conventions.pixel_grid import Sampling, dilation
+from ..conventions.exposures import colour_scale
+from ..conventions.pixel_grid import PixelGrid, dilation
 from ..conventions.splatting import C0, C1, C2, C3
 
 Floats = NDArray[np.float32]
 
 PLANE_DEPTH = 0.21
-"""Where solid Gaussians lie: just past 3DGS's near plane of 0.2 (paper, appendix)."""
-ARC_SOFT = 0.1
-"""Strength of an arc at which its opacity begins to be that of the brightest place; see `opacity_gain`."""
+"""Camera depth of solid Gaussians: just past 3DGS's near plane of 0.2 (paper, appendix)."""
+ARC_SOFTNESS = 0.1
+"""Strength of an arc from which its opacity is that of its peak; see `opacity_gain`."""
 
 
 @dataclass(frozen=True, eq=False)
 class PlaneGaussians:
-    """Gaussians on the normalised plane, ready to be drawn.
+    """Gaussians on the normalised plane, in the form that rasterizers draw.
 
-    means (n, 2), covariances (n, 3) as xx, xy, yy, opacities (n,) in 0..1 (any gain where light adds), colours
-    (n, 3) (linear where light adds, display values where it covers), rings (n, 2) as r0 and w or None, arcs (n, 2) as
-    the way from the mean towards the brighter side, or None (core/flare/placement.py).
+    means        (n, 2)
+    covariances  (n, 3) xx, xy, yy
+    opacities    (n,)   0..1 (blend "add": any gain >= 0)
+    colours      (n, 3) display values (blend "add": linear)
+    rings        (n, 2) r0 and w, or None
+    arcs         (n, 2) vector from the mean towards the brighter side, or None (core/flare/placement.py)
     """
 
     means: Floats
@@ -46,39 +49,39 @@ class PlaneGaussians:
     def __len__(self) -> int:
         return len(self.means)
 
-    def exposed(self, exposure: float, blend: Blend) -> PlaneGaussians:
-        """As a frame shows them that was exposed to so many times the usual light."""
-        return replace(self, colours=np.float32(brightness(exposure, blend)) * self.colours)
+    def with_exposure(self, exposure: float, blend: Blend) -> PlaneGaussians:
+        """Return the Gaussians in a frame whose exposure is a multiple of the usual one."""
+        return replace(self, colours=np.float32(colour_scale(exposure, blend)) * self.colours)
 
-    def kept(self, rows: Any) -> PlaneGaussians:
-        """The Gaussians of these rows (a mask or numbers)."""
+    def select(self, rows: Any) -> PlaneGaussians:
+        """Return the Gaussians of these rows (a mask or numbers)."""
         rings, arcs = (None if part is None else part[rows] for part in (self.rings, self.arcs))
         return PlaneGaussians(self.means[rows], self.covariances[rows], self.opacities[rows], self.colours[rows], rings,
                               arcs)
 
     @property
-    def strengths(self) -> Floats:
-        """(n,) of the arcs, 0 for none: how many deviations each points away."""
+    def arc_strengths(self) -> Floats:
+        """(n,) length of each arc in standard deviations; 0 without arcs."""
         if self.arcs is None:
             return np.zeros(len(self), np.float32)
-        return strengths(self.arcs, self.covariances)
+        return arc_strengths(self.arcs, self.covariances)
 
     @property
     def energy(self) -> Floats:
-        """(n,) luminance each adds to the plane: opacity times the profile's area times luminance."""
+        """(n,) luminance that each adds to the plane: opacity times the profile's area times luminance."""
         luminance = np.maximum(self.colours, 0) @ LUMINANCE.astype(np.float32)
         xx, xy, yy = self.covariances.T
         area = 2 * np.pi * np.sqrt(np.maximum(xx * yy - xy * xy, 0))
         if self.rings is not None:  # a ring's area: radius times width, that of the plain profile for r0 = 0
             r0, w = self.rings.T
             area = area * (w * w + np.sqrt(np.pi / 2) * np.maximum(r0, 0) * w)
-            turned = np.clip(np.maximum(r0, 0) * self.strengths.astype(np.float64), 0, 500)  # what an arc leaves of it
-            area = area * np.i0(turned) * np.exp(-turned)
+            clipped = np.clip(np.maximum(r0, 0) * self.arc_strengths.astype(np.float64), 0, 500)
+            area = area * np.i0(clipped) * np.exp(-clipped)  # mean of the arc's factor over the ring
         return np.asarray(self.opacities * area * luminance, np.float32)
 
 
 def covariance_of_solid(means: Floats, log_scales: Floats, quaternions: Floats) -> Floats:
-    """(n, 3) on the plane of 3D Gaussians at depth PLANE_DEPTH (Zwicker et al. 2002)."""
+    """Return (n, 3) covariances on the plane of 3D Gaussians at depth PLANE_DEPTH (Zwicker et al. 2002)."""
     q = quaternions / np.maximum(np.linalg.norm(quaternions, axis=-1, keepdims=True), 1e-12)
     w, x, y, z = q.T
     rotation = np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
@@ -91,27 +94,29 @@ def covariance_of_solid(means: Floats, log_scales: Floats, quaternions: Floats) 
 
 
 def covariance_of_ellipse(log_scales: Floats, directions: Floats) -> Floats:
-    """(n, 3) of ellipses: log_scales (n, 2), directions (n, 2) of the first axis, any length."""
+    """Return (n, 3) covariances of ellipses: log_scales (n, 2), directions (n, 2) of the first axis, of any length."""
     c, s = (directions / np.maximum(np.linalg.norm(directions, axis=-1, keepdims=True), 1e-12)).T
     a, b = np.exp(2 * log_scales).T
     return np.stack([a * c * c + b * s * s, (a - b) * c * s, a * s * s + b * c * c], -1)
 
 
 def arcs_of_ellipse(arcs: Floats, log_scales: Floats, directions: Floats) -> Floats:
-    """(n, 2) on the plane of arcs (n, 2) in deviations along the axes."""
+    """Return (n, 2) arcs on the plane from arcs (n, 2) in standard deviations along the axes."""
     axis = directions / np.maximum(np.linalg.norm(directions, axis=-1, keepdims=True), 1e-12)
     along, aside = (arcs * np.exp(log_scales)).T
     return along[:, None] * axis + aside[:, None] * np.stack([-axis[:, 1], axis[:, 0]], -1)
 
 
 def opacity_gain(arcs: Floats, rings: Floats) -> Floats:
-    """(n,) by which opacities are multiplied so that they are smooth in arcs (n, 2), in deviations, at zero."""
+    """Return (n,) factors of the opacities that make them smooth at zero in arcs (n, 2), in standard deviations."""
     squared = (arcs * arcs).sum(-1)
-    return np.asarray(np.exp(rings[:, 0] * (np.sqrt(squared) - squared / np.sqrt(squared + ARC_SOFT**2))), np.float32)
+    softened = squared / np.sqrt(squared + ARC_SOFTNESS**2)
+    return np.asarray(np.exp(rings[:, 0] * (np.sqrt(squared) - softened)), np.float32)
 
 
-def strengths(arcs: Floats, covariances: Floats) -> Floats:
-    """(n,) lengths of arcs (n, 2) in deviations of covariances (n, 3); in double precision, for needles."""
+def arc_strengths(arcs: Floats, covariances: Floats) -> Floats:
+    """Return (n,) lengths of arcs (n, 2) in standard deviations of covariances (n, 3); in double precision, for
+    needles."""
     xx, xy, yy = covariances.T.astype(np.float64)
     x, y = arcs.T.astype(np.float64)
     squared = (yy * x * x - 2 * xy * x * y + xx * y * y) / np.maximum(xx * yy - xy * xy, 1e-30)
@@ -119,7 +124,7 @@ def strengths(arcs: Floats, covariances: Floats) -> Floats:
 
 
 def colours(rays: Floats, sh: Floats, degree: int) -> Floats:
-    """(n, 3) >= 0: spherical harmonics (n, k, 3) seen along rays (n, 3) of any length."""
+    """Return colours (n, 3) >= 0 of spherical harmonics (n, k, 3) along rays (n, 3) of any length."""
     x, y, z = (rays / np.maximum(np.linalg.norm(rays, axis=-1, keepdims=True), 1e-12)).T
     functions = [np.full_like(x, C0)]
     if degree >= 1:
@@ -131,38 +136,39 @@ def colours(rays: Floats, sh: Floats, degree: int) -> Floats:
         functions += [-C3[0] * y * (3 * x * x - y * y), C3[1] * x * y * z, -C3[2] * y * (4 * z * z - x * x - y * y),
                       C3[3] * z * (2 * z * z - 3 * x * x - 3 * y * y), -C3[2] * x * (4 * z * z - x * x - y * y),
                       C3[4] * z * (x * x - y * y), -C3[0] * x * (x * x - 3 * y * y)]
-    shown = np.einsum("nk,nkc->nc", np.stack(functions, -1), sh[:, :len(functions)])
-    return np.maximum(shown + np.float32(0.5), 0)
+    sh_colours = np.einsum("nk,nkc->nc", np.stack(functions, -1), sh[:, :len(functions)])
+    return np.maximum(sh_colours + np.float32(0.5), 0)
 
 
-def pixels(gaussians: PlaneGaussians, intrinsics: ArrayLike, sampling: Sampling | None = None) -> tuple[Floats, Floats]:
-    """Centres (n, 2) px and covariances (n, 3) px² under intrinsics (3, 3), with the low-pass added, that of the grid
-    on which they were learned where it is known."""
+def pixels(gaussians: PlaneGaussians, intrinsics: ArrayLike,
+           pixel_grid: PixelGrid | None = None) -> tuple[Floats, Floats]:
+    """Return centres (n, 2), px, and covariances (n, 3), px², for intrinsics (3, 3), with the low-pass filter of the
+    fit's pixel grid, or the default one if it is unknown."""
     k = np.asarray(intrinsics, np.float32)
     focal, centre = k.diagonal()[:2], k[:2, 2]
     stretch = np.array([focal[0] ** 2, focal[0] * focal[1], focal[1] ** 2], np.float32)
-    wide = dilation(sampling, math.sqrt(float(focal[0] * focal[1])))
-    low_pass = np.array([wide, 0, wide], np.float32)
+    variance = dilation(pixel_grid, math.sqrt(float(focal[0] * focal[1])))
+    low_pass = np.array([variance, 0, variance], np.float32)
     return gaussians.means * focal + centre, gaussians.covariances * stretch + low_pass
 
 
-def ways(gaussians: PlaneGaussians, intrinsics: ArrayLike) -> Floats:
-    """(n, 2) arcs in pixels under intrinsics (3, 3), 0 for none: the slope of the profile's logarithm is the inverse
-    covariance (of `pixels`) times this."""
+def pixel_arcs(gaussians: PlaneGaussians, intrinsics: ArrayLike) -> Floats:
+    """Return (n, 2) arcs in pixels for intrinsics (3, 3), 0 without arcs: the inverse covariance (of `pixels`) times
+    this is b, the slope of the profile's logarithm."""
     if gaussians.arcs is None:
         return np.zeros_like(gaussians.means)
     return gaussians.arcs * np.asarray(intrinsics, np.float32).diagonal()[:2]
 
 
-def arc_level(strength: Any, ring: Any) -> Any:
-    """m, the logarithm of what an arc of this strength makes of a profile's peak, ring (n, 2); see `levelled` in
-    core/gaussians/rendering.py."""
+def arc_log_peak(strength: Any, ring: Any) -> Any:
+    """Return m, the logarithm of the peak that an arc of this strength gives a profile; ring (n, 2); see
+    `normalise_arcs` in core/gaussians/rendering.py."""
     r0, w = np.asarray(ring).T
     return strength * (r0 + strength * w * w / 2)
 
 
-def joined(sets: Sequence[PlaneGaussians]) -> PlaneGaussians | None:
-    """Several sets as one; None where there are none. Sets without rings or arcs get plain ones beside sets with."""
+def concatenate(sets: Sequence[PlaneGaussians]) -> PlaneGaussians | None:
+    """Concatenate several sets; None for no sets. Sets without rings or arcs get plain ones if other sets have them."""
     if not sets:
         return None
 
@@ -173,7 +179,7 @@ def joined(sets: Sequence[PlaneGaussians]) -> PlaneGaussians | None:
         return np.concatenate([np.tile(np.array(plain, np.float32), (len(one), 1)) if part is None else part
                                for one, part in zip(sets, parts, strict=True)])
 
-    means, covariances, opacities, shown = (
+    means, covariances, opacities, sh_colours = (
         np.concatenate([getattr(one, name) for one in sets])
         for name in ("means", "covariances", "opacities", "colours"))
-    return PlaneGaussians(means, covariances, opacities, shown, extra("rings", (0, 1)), extra("arcs", (0, 0)))
+    return PlaneGaussians(means, covariances, opacities, sh_colours, extra("rings", (0, 1)), extra("arcs", (0, 0)))

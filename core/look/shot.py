@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A shot: cameras and placed lights frame by frame, as any program can write it down for a look to be rendered.
+"""A shot: cameras, placed lights and edits by frame, in a JSON file that any program can write and `bake` renders.
 
     {"version": 1, "flare": "lamp.flare", "run": null, "width": 960, "height": 540, "query": "target",
      "frames": [{"frame": 1, "name": "Camera", "intrinsics": [fx, fy, cx, cy], "world_to_camera": [[…], …],
                  "lights": [{"name": "lamp", "source": "lamp", "xyz": [x, y, z], "share": 1.0}],
                  "edits": ["lamp.intensity=2"]}]}
 
-A light of the shot shows the look of the .flare's light `source`; `name` is its own, by which edits and
-layers go, so one look may be used several times. Coordinates are the capture's where the flare is shown in
-the scene it was learned from, else any.
+A light of the shot shows the flare of the .flare's light `source`. Edits and layers use its own `name`, so that several
+lights can share a source. `share` is its visibility, 0..1, and `apart` is true if the layers of a single camera have a
+folder of their own too. Coordinates are the capture's if the flare is shown in the scene of its fit, else any.
 """
 from __future__ import annotations
 
@@ -16,43 +16,31 @@ import hashlib
 import math
 import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..capture.camera import Camera
 from ..errors import SettingsError
-from ..system.files import plain_name, read_json, write_json
-from .edits import LookEdits
-from .look import Look, Query, ViewOfLight, asked
-from .plane import PlaneGaussians
+from ..system.files import avoid_device_name, read_json, write_json
+from .look import PlacedLight, Query
 
 VERSION = 1
-_LARGEST = 1 << 15  # pixels of a side
-_MOST_FRAMES = 10**9
+MAX_SIDE = 1 << 15  # pixels of a side
+MAX_FRAME = 10**9
 LIGHT_RADIUS = 0.01
-"""Of a light's distance, unless another is told: the deviation of the soft disc of which a share is visible."""
+"""Default radius of a light, relative to its distance: the standard deviation of the soft disc whose visible part is
+its visibility."""
 LIGHT_MARGIN = 0.06
-"""Of a light's distance: what stands nearer to the light is the lamp itself and hides nothing."""
-
-
-@dataclass(frozen=True, eq=False)
-class PlacedLight:
-    """A light at xyz (3,) that shows the look of `source`; share: how much of it is visible, 0..1."""
-
-    name: str
-    source: str
-    xyz: NDArray[np.float64]
-    share: float = 1.0
+"""Distance from a light, relative to the camera's, within which surfaces belong to the lamp itself and hide nothing."""
 
 
 @dataclass(frozen=True, eq=False)
 class ShotFrame:
-    """One camera at one frame, with the lights as they are there and the words of the edits."""
+    """One camera at one frame, with the lights of that frame and the texts of the edits."""
 
     frame: int
     name: str
@@ -60,44 +48,24 @@ class ShotFrame:
     lights: tuple[PlacedLight, ...]
     edits: tuple[str, ...] = ()
 
-    def described(self) -> str:
-        """Changes whenever its picture would, with one .flare and query."""
+    def cache_key(self) -> str:
+        """Return a text that changes whenever the frame's picture would, for the same .flare and query."""
         return repr((self.frame, self.name, self.edits, *self.camera.numbers,
-                     [(light.name, light.source, light.xyz.tolist(), light.share) for light in self.lights]))
-
-
-def evaluate(look: Look, world_to_camera: Any, lights: Sequence[PlacedLight], edits: LookEdits | None = None,
-             query: Query = "target") -> dict[str, PlaneGaussians]:
-    """The Gaussians of each placed light that is in front of the camera and not hidden, by the light's own name.
-
-    Lights whose source the look does not have show nothing.
-    """
-    sources = {light.name: light for light in look.lights}
-    names = [light.name for light in lights]
-    shown: dict[str, PlaneGaussians] = {}
-    for light in lights:
-        source = sources.get(light.source)
-        if source is None or light.share <= 0 or (edits is not None and not edits.shows(light.name, names)):
-            continue
-        view = ViewOfLight.of(world_to_camera, light.xyz)
-        found = source.evaluate(view, query=asked(source, view, query), edits=edits, share=light.share, name=light.name)
-        if found is not None:
-            shown[light.name] = found
-    return shown
+                     [(light.name, light.source, light.xyz.tolist(), light.visibility) for light in self.lights]))
 
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """Frames to be rendered with a flare. run: the folder of the fit whose scene belongs under it, or None. live:
-    whoever lays the layers over something applies the colour of whole lights, which the edits leave out. apart: one
-    camera's layers, too, have a folder of their own."""
+    """Frames to render with a flare. run: folder of the fit whose scene is behind it, or None. live: the compositor
+    applies the colour of whole lights, which the edits then omit. own_folder: the layers of a single camera have a
+    folder of their own too."""
 
     flare: Path
     frames: tuple[ShotFrame, ...]
     query: Query = "target"
     run: Path | None = None
     live: bool = False
-    apart: bool = False
+    own_folder: bool = False
 
     @property
     def lights(self) -> tuple[str, ...]:
@@ -106,102 +74,101 @@ class Shot:
 
     @property
     def folders(self) -> dict[str, str]:
-        """Of each camera the folder for its layers, "" where there is but one that is not to have its own; no two are
-        one, on any file system."""
+        """Folder of each camera's layers, "" for a single camera without `own_folder`; distinct on any file system."""
         found: dict[str, str] = {}
         for name in dict.fromkeys(frame.name for frame in self.frames):
             plain = re.sub(r"[^\w-]+", "_", name).strip("_") or "camera"
-            plain = plain_name(plain)
-            taken, folder, number = {other.casefold() for other in found.values()}, plain, 1
-            while folder.casefold() in taken:
+            plain = avoid_device_name(plain)
+            used, folder, number = {other.casefold() for other in found.values()}, plain, 1
+            while folder.casefold() in used:
                 number += 1
                 folder = f"{plain}_{number}"
             found[name] = folder
-        return found if len(found) > 1 or self.apart else dict.fromkeys(found, "")
+        return found if len(found) > 1 or self.own_folder else dict.fromkeys(found, "")
 
     def fingerprint(self, run: str = "") -> str:
-        """Changes whenever all its pictures would; what is a frame's alone, `ShotFrame.described` tells. run: the
-        fingerprint of the fit whose scene belongs under it."""
+        """Return a hash that changes whenever all pictures would; `ShotFrame.cache_key` covers the single frames. run:
+        fingerprint of the fit whose scene is behind the flare."""
         digest = hashlib.sha256(self.flare.read_bytes())
         digest.update(repr((self.query, self.live, self.lights)).encode())
         digest.update(run.encode())
         return digest.hexdigest()[:16]
 
     def write(self, path: Path | str) -> None:
-        """Write what `read` reads."""
+        """Write a JSON file for `read`."""
         frames = [{"frame": one.frame, "name": one.name, "width": one.camera.width, "height": one.camera.height,
                    "intrinsics": [one.camera.fx, one.camera.fy, one.camera.cx, one.camera.cy],
                    "world_to_camera": one.camera.world_to_camera.tolist(), "exposure": one.camera.exposure,
                    "edits": list(one.edits),
                    "lights": [{"name": light.name, "source": light.source, "xyz": light.xyz.tolist(),
-                               "share": light.share} for light in one.lights]} for one in self.frames]
+                               "share": light.visibility} for light in one.lights]} for one in self.frames]
         write_json(path, {"version": VERSION, "flare": str(self.flare), "run": str(self.run) if self.run else None,
-                          "query": self.query, "live": self.live, "apart": self.apart, "frames": frames})
+                          "query": self.query, "live": self.live, "apart": self.own_folder, "frames": frames})
 
     @classmethod
     def read(cls, path: Path | str) -> Shot:
-        """Raises SettingsError where the file is missing, damaged or of another form."""
+        """Read a shot. Raises SettingsError for a missing or invalid file."""
         data = read_json(path, SettingsError)
         try:
             if data["version"] != VERSION:
                 raise ValueError(f"version {data['version']}")
             if data.get("query", "target") not in get_args(Query):
                 raise ValueError(f"query {data['query']!r}")
-            frames = tuple(_frame(entry, data) for entry in data["frames"])
+            frames = tuple(_read_frame(entry, data) for entry in data["frames"])
             if not frames:
                 raise ValueError("it has no frames")
-            twice = [one for one, count in Counter((one.name, one.frame) for one in frames).items() if count > 1]
-            if twice:
-                raise ValueError(f"frame {twice[0][1]} of {twice[0][0]!r} is listed twice")
-            here = Path(path).parent
-            run = here / data["run"] if data.get("run") else None
-            return cls(here / data["flare"], frames, data.get("query", "target"), run, bool(data.get("live")),
+            duplicates = [one for one, count in Counter((one.name, one.frame) for one in frames).items() if count > 1]
+            if duplicates:
+                raise ValueError(f"frame {duplicates[0][1]} of {duplicates[0][0]!r} is listed duplicates")
+            folder_of_file = Path(path).parent
+            run = folder_of_file / data["run"] if data.get("run") else None
+            return cls(folder_of_file / data["flare"], frames, data.get("query", "target"), run, bool(data.get("live")),
                        bool(data.get("apart")))
         except (ArithmeticError, AttributeError, KeyError, TypeError, ValueError, np.linalg.LinAlgError) as problem:
             raise SettingsError(f"{path} is not a shot that can be rendered ({problem!r}); "
                                 "export it again.") from problem
 
-    def sized(self, width: int | None, height: int | None) -> Shot:
-        """The same at another size in pixels; without a height the proportions stay."""
+    def resized(self, width: int | None, height: int | None) -> Shot:
+        """Return the shot at another size, px; without a height the aspect ratio is preserved."""
         if not width:
             return self
         return replace(self, frames=tuple(replace(one, camera=one.camera.scaled(width, height))
                                           for one in self.frames))
 
 
-def _frame(entry: Mapping[str, Any], data: Mapping[str, Any]) -> ShotFrame:
-    width, height = (_whole(entry.get(key, data.get(key))) for key in ("width", "height"))
-    fx, fy, cx, cy = (_number(value) for value in entry["intrinsics"])
-    pose = np.array([[_number(value) for value in row] for row in entry["world_to_camera"]])
-    exposure = _number(entry.get("exposure", 1.0))
-    if not (0 < width <= _LARGEST and 0 < height <= _LARGEST and fx > 0 and fy > 0 and pose.shape == (4, 4)
+def _read_frame(entry: Mapping[str, Any], data: Mapping[str, Any]) -> ShotFrame:
+    width, height = (_to_int(entry.get(key, data.get(key))) for key in ("width", "height"))
+    fx, fy, cx, cy = (_to_float(value) for value in entry["intrinsics"])
+    pose = np.array([[_to_float(value) for value in row] for row in entry["world_to_camera"]])
+    exposure = _to_float(entry.get("exposure", 1.0))
+    if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE and fx > 0 and fy > 0 and pose.shape == (4, 4)
             and exposure > 0):
         raise ValueError(f"frame {entry['frame']} has no sensible camera")
-    lights = tuple(PlacedLight(str(one["name"]), str(one["source"]), np.array([_number(x) for x in one["xyz"]]),
-                               _number(one.get("share", 1.0))) for one in entry["lights"])
+    lights = tuple(PlacedLight(str(one["name"]), str(one["source"]), np.array([_to_float(x) for x in one["xyz"]]),
+                               _to_float(one.get("share", 1.0))) for one in entry["lights"])
     if len({light.name for light in lights}) < len(lights):
         raise ValueError(f"frame {entry['frame']} has two lights of one name")
     if any(light.xyz.shape != (3,) for light in lights):
         raise ValueError("a light has no place")
-    if not all(0 <= light.share <= 1 for light in lights):
+    if not all(0 <= light.visibility <= 1 for light in lights):
         raise ValueError("the share of a light lies between 0 and 1")
     if not all(isinstance(word, str) for word in entry.get("edits", [])):
         raise ValueError("edits are a list of texts")
-    number = _whole(entry["frame"])
-    if not 0 <= number < _MOST_FRAMES:
+    number = _to_int(entry["frame"])
+    if not 0 <= number < MAX_FRAME:
         raise ValueError(f"the frame {number} is no number of a file")
     return ShotFrame(number, str(entry.get("name", "Camera")),
                      Camera(width, height, fx, fy, cx, cy, pose, exposure), lights, tuple(entry.get("edits", [])))
 
 
-def _whole(value: Any) -> int:
-    number = _number(value)
+def _to_int(value: Any) -> int:
+    number = _to_float(value)
     if number != int(number):
         raise ValueError(f"{value!r} is no whole number")
     return int(number)
 
 
-def _number(value: Any) -> float:
+def _to_float(value: Any) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise TypeError(f"{value!r:.100} is no number")
     number = float(value)

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A captured flare on to other footage: pictures, captures, splats, Blender scenes; and out to other tools."""
+"""Transfers a fitted flare to other targets (pictures, captures, splats, Blender scenes), and exports it."""

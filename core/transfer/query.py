@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What the flare's network is asked for when the flare stands elsewhere (docs/transfer.md).
+"""Chooses the views at which a flare's network is evaluated for a target; called by `transfer` (docs/transfer.md).
 
 Placement always follows the target. Appearance follows
 
-source  one training view, for the whole shot: the one whose light stands most like the target's
-target  the target's view as it is, outside what was trained too
-blend   the target's view, kept inside what was trained; the default
+source  one training view for the whole shot: the most similar one to the target's views
+target  the target's view, even outside the range of the training views
+blend   the target's view, kept inside that range; the default
 
-A camera's position in another world means nothing to the network, which learned it in the source's. Where the
-target's light stands where the source's does, the worlds are one and positions hold. Elsewhere, `target` takes
-the camera's offset from the light over, and `blend` mixes what the training views show that have the light at a
-like place in the frame and at a like distance; the mix changes smoothly along a path.
+The network learned camera positions in the source's world. If the target's light is where the source's is, both worlds
+are the same and positions are valid. Else `target` adopts the camera's offset from the light, and `blend` averages the
+flares of the training views that have the light at a similar position in the frame and at a similar distance; their
+weights change smoothly along a path.
 """
 from __future__ import annotations
 
@@ -25,18 +25,22 @@ from numpy.typing import ArrayLike, NDArray
 from ..choices import Follows
 from ..errors import FlareFileError
 from ..look import LightLook, LookEdits, PlaneGaussians, ViewOfLight
-from ..look.look import describe
+from ..look.look import read_description
 
 NEIGHBOURS = 4
-PLACE = 0.1  # of the normalised plane: lights this far apart are as unlike
-DISTANCE = 0.2  # as distances whose logarithms differ by this
-SAME_WORLD = 0.02  # of the distance, within which two lights are one: as well as lights are found
+"""Number of training views that `blend` averages."""
+POSITION_SCALE = 0.1
+"""Difference of positions on the normalised plane that counts as a dissimilarity of 1."""
+LOG_DISTANCE_SCALE = 0.2
+"""Difference of the logarithms of distances that counts as a dissimilarity of 1."""
+SAME_WORLD_TOLERANCE = 0.02
+"""Distance of two lights, relative to the camera's, below which they are one: the accuracy of light detection."""
 
 Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
+class TrainingViews:
     """Training views of one light: cameras (v, 3), world units; lights (v, 2), normalised; distances (v,)."""
 
     cameras: Floats
@@ -44,24 +48,25 @@ class Seen:
     distances: Floats
 
     @classmethod
-    def of(cls, rows: ArrayLike, xyz: ArrayLike) -> Seen:
-        """From rows (v, 5) of camera x, y, z and light x, y, and the light's position (3,)."""
+    def of(cls, rows: ArrayLike, xyz: ArrayLike) -> TrainingViews:
+        """Read rows (v, 5) of camera x, y, z and light x, y; xyz (3,): the light's position."""
         table = np.asarray(rows, np.float64).reshape(-1, 5)
         return cls(table[:, :3], table[:, 3:], np.linalg.norm(table[:, :3] - np.asarray(xyz), axis=1))
 
-    def unlikeness(self, light: ArrayLike, distance: float) -> Floats:
-        """(v,) how unlike a view each is, of a light (2,) at a distance; the frame's quadrants count as one."""
-        place = np.linalg.norm(np.abs(self.lights) - np.abs(light), axis=1) / PLACE
-        far = np.log(self.distances / max(distance, 1e-9)) / DISTANCE
-        return np.asarray(np.hypot(place, far))
+    def dissimilarity(self, light: ArrayLike, distance: float) -> Floats:
+        """Return (v,) dissimilarities to a view of a light (2,) at a distance; the frame's quadrants are equivalent."""
+        in_position = np.linalg.norm(np.abs(self.lights) - np.abs(light), axis=1) / POSITION_SCALE
+        in_distance = np.log(self.distances / max(distance, 1e-9)) / LOG_DISTANCE_SCALE
+        return np.asarray(np.hypot(in_position, in_distance))
 
 
-def seen_by(path: Path | str, lights: Sequence[LightLook],
-            poses: Sequence[ArrayLike] | None = None) -> dict[str, Seen]:
-    """What each light's network was trained on: as the .flare says, or from the training poses (4, 4) where it
-    does not; lights of which neither tells are left out. Raises FlareFileError where the file makes no sense."""
-    listed = describe(path).get("seen", {})
-    found: dict[str, Seen] = {}
+def training_views(path: Path | str, lights: Sequence[LightLook],
+                   poses: Sequence[ArrayLike] | None = None) -> dict[str, TrainingViews]:
+    """Return the training views of each light: those that the .flare lists, else from the training poses (4, 4).
+
+    Omits lights for which there is neither. Raises FlareFileError for an invalid file."""
+    listed = read_description(path).get("seen", {})
+    by_light: dict[str, TrainingViews] = {}
     for light in lights:
         rows: Any = listed.get(light.name) if isinstance(listed, Mapping) else None
         if not rows and poses is not None:
@@ -69,82 +74,84 @@ def seen_by(path: Path | str, lights: Sequence[LightLook],
             rows = [[*view.camera, *view.light] for view in views if view.depth > 0]
         if rows:
             try:
-                found[light.name] = Seen.of(rows, light.xyz)
+                by_light[light.name] = TrainingViews.of(rows, light.xyz)
             except (TypeError, ValueError) as problem:
                 raise FlareFileError(f"{path} is damaged: its training views make no sense ({problem}).") from problem
-    return found
+    return by_light
 
 
-def evaluate(light: LightLook, view: ViewOfLight, xyz: ArrayLike, query: Follows, seen: Seen | None, *,
-             share: float = 1.0, edits: LookEdits | None = None, name: str | None = None, scale: float = 1.0,
+def evaluate(light: LightLook, view: ViewOfLight, xyz: ArrayLike, query: Follows, training: TrainingViews | None, *,
+             visibility: float = 1.0, edits: LookEdits | None = None, name: str | None = None, scale: float = 1.0,
              fixed: ViewOfLight | None = None) -> PlaneGaussians | None:
-    """The Gaussians of `light` placed in `view`, where the target's light stands at `xyz` (3,) in its own world.
+    """Return the plane Gaussians of `light` in `view`; xyz (3,): position of the target's light in its own world.
 
-    seen: of the source; without it, `blend` keeps to the trained box. scale: units of the target's world to one of
-    the source's. fixed: what `source` asks for. The flare fades where the light leaves what was trained far behind.
+    training: views of the source; without them, `blend` clips to the range of the training views. scale: units of the
+    target's world for one of the source's. fixed: view for the query `source`. The flare fades out for a light far
+    outside the range of the training views.
     """
-    if view.depth <= 0 or share <= 0:
+    if view.depth <= 0 or visibility <= 0:
         return None
-    share *= fade(light, view)
-    if share <= 0:
+    visibility *= extrapolation_fade(light, view)
+    if visibility <= 0:
         return None
-    asked = _asked(light, view, np.asarray(xyz, np.float64), query, seen, scale, fixed)
-    parts = [light.evaluate(view, query=one, edits=edits, share=share, name=name) for _, one in asked]
-    return _mixed([part for part in parts if part is not None], [weight for weight, _ in asked])
+    queries = _weighted_queries(light, view, np.asarray(xyz, np.float64), query, training, scale, fixed)
+    parts = [light.evaluate(view, query=one, edits=edits, visibility=visibility, name=name) for _, one in queries]
+    return _average([part for part in parts if part is not None], [weight for weight, _ in queries])
 
 
 def fixed_view(light: LightLook, views: Sequence[ViewOfLight], distances: Sequence[float],
-               seen: Seen | None) -> ViewOfLight | None:
-    """The training view that is asked for throughout a shot with these views of the light (`source`).
+               training: TrainingViews | None) -> ViewOfLight | None:
+    """Return the training view for the query `source`, for a shot with these views of the light.
 
-    The one most like the shot's middle; None where the light is never in front.
+    It is the most similar one to the shot's median view; None if the light is never in front of the camera.
     """
-    front = [(view, far) for view, far in zip(views, distances, strict=True) if view.depth > 0]
+    front = [(view, distance) for view, distance in zip(views, distances, strict=True) if view.depth > 0]
     if not front:
         return None
-    place = np.median([view.light for view, _ in front], axis=0)
-    if seen is None:
+    position = np.median([view.light for view, _ in front], axis=0)
+    if training is None:
         camera = (light.query_range.camera_low + light.query_range.camera_high) / 2
-        return replace(front[0][0], camera=camera, light=light.query_range.clipped(camera, place)[1])
-    best = int(seen.unlikeness(place, float(np.median([far for _, far in front]))).argmin())
-    return replace(front[0][0], camera=seen.cameras[best].astype(np.float32),
-                   light=seen.lights[best].astype(np.float32))
+        return replace(front[0][0], camera=camera, light=light.query_range.clip(camera, position)[1])
+    best = int(training.dissimilarity(position, float(np.median([distance for _, distance in front]))).argmin())
+    return replace(front[0][0], camera=training.cameras[best].astype(np.float32),
+                   light=training.lights[best].astype(np.float32))
 
 
-def fade(light: LightLook, view: ViewOfLight) -> float:
-    """1 while the light is no further out than in training, 0 from twice as far: nothing is known there, and a
-    light that goes behind the camera passes through it."""
-    reach = float(light.query_range.light_high[2])
-    t = min(max(2 - float(np.linalg.norm(view.light)) / max(reach, 1e-6), 0.0), 1.0)
+def extrapolation_fade(light: LightLook, view: ViewOfLight) -> float:
+    """Return 1 for a light no further from the principal point than in training, falling to 0 at twice that distance.
+
+    Nothing is known there, and a light that goes behind the camera passes through it."""
+    trained_distance = float(light.query_range.light_high[2])
+    t = min(max(2 - float(np.linalg.norm(view.light)) / max(trained_distance, 1e-6), 0.0), 1.0)
     return t * t * (3 - 2 * t)
 
 
-def _asked(light: LightLook, view: ViewOfLight, xyz: Floats, query: Follows, seen: Seen | None, scale: float,
-           fixed: ViewOfLight | None) -> list[tuple[float, ViewOfLight]]:
-    """Views to ask the network for, with weights that sum to 1."""
-    away = (view.camera - xyz) / scale
-    distance = float(np.linalg.norm(away))
-    one_world = scale == 1 and np.linalg.norm(xyz - light.xyz) <= SAME_WORLD * distance
-    camera = view.camera if one_world else (light.xyz + away).astype(np.float32)
+def _weighted_queries(light: LightLook, view: ViewOfLight, xyz: Floats, query: Follows, training: TrainingViews | None,
+                      scale: float, fixed: ViewOfLight | None) -> list[tuple[float, ViewOfLight]]:
+    """Return the views at which the network is evaluated, with weights that sum to 1."""
+    offset = (view.camera - xyz) / scale
+    distance = float(np.linalg.norm(offset))
+    is_same_world = scale == 1 and np.linalg.norm(xyz - light.xyz) <= SAME_WORLD_TOLERANCE * distance
+    camera = view.camera if is_same_world else (light.xyz + offset).astype(np.float32)
     if query == "target":
         return [(1.0, replace(view, camera=camera))]
     if query == "source" and fixed is not None:
         return [(1.0, fixed)]
-    inside, place = light.query_range.clipped(camera, view.light)
-    if seen is None or one_world:
-        return [(1.0, replace(view, camera=inside, light=place))]
-    unlike = seen.unlikeness(place, distance)
-    order = np.argsort(unlike)[:NEIGHBOURS + 1]
-    # The farthest of them has no weight, so that none enters or leaves with a jump.
-    edge = unlike[order[-1]] if len(order) > NEIGHBOURS else 2 * unlike[order[-1]] + 1e-6
-    weights = np.maximum(1 - (unlike[order] / max(edge, 1e-9)) ** 2, 0) ** 2 + 1e-12
+    inside, position = light.query_range.clip(camera, view.light)
+    if training is None or is_same_world:
+        return [(1.0, replace(view, camera=inside, light=position))]
+    dissimilarity = training.dissimilarity(position, distance)
+    order = np.argsort(dissimilarity)[:NEIGHBOURS + 1]
+    # The most dissimilar one has no weight, so that weights change continuously when the neighbours change.
+    edge = dissimilarity[order[-1]] if len(order) > NEIGHBOURS else 2 * dissimilarity[order[-1]] + 1e-6
+    weights = np.maximum(1 - (dissimilarity[order] / max(edge, 1e-9)) ** 2, 0) ** 2 + 1e-12
     weights /= weights.sum()
-    return [(float(weight), replace(view, camera=seen.cameras[row].astype(np.float32), light=place))
+    return [(float(weight), replace(view, camera=training.cameras[row].astype(np.float32), light=position))
             for weight, row in zip(weights, order, strict=True) if weight > 1e-6]
 
 
-def _mixed(parts: Sequence[PlaneGaussians], weights: Sequence[float]) -> PlaneGaussians | None:
-    """The same Gaussians under several queries, averaged."""
+def _average(parts: Sequence[PlaneGaussians], weights: Sequence[float]) -> PlaneGaussians | None:
+    """Return the weighted average of the same Gaussians, evaluated for several queries."""
     if len(parts) < 2:
         return parts[0] if parts else None
 

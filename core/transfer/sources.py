@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Which light of a look each light of the target shows."""
+"""Assigns a light of the look to each light of the target."""
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
@@ -7,15 +7,17 @@ from collections.abc import Mapping, Sequence
 from ..errors import SettingsError
 
 
-def assigned(targets: Sequence[str], sources: Sequence[str], wanted: Mapping[str, str] | None = None) -> dict[str, str]:
-    """Source by target: as `wanted`, else the source of the same name, else the sources in turn.
+def assign_sources(
+    targets: Sequence[str], sources: Sequence[str], requested: Mapping[str, str] | None = None
+) -> dict[str, str]:
+    """Return the source of each target: as `requested`, else the source of the same name, else the sources in turn.
 
-    Raises SettingsError where `wanted` names a light that is not there, or the look has none.
+    Raises SettingsError if `requested` names an unknown light, or the look has no lights.
     """
-    wanted = wanted or {}
+    requested = requested or {}
     if not sources:
         raise SettingsError("The flare has no lights; choose another.")
-    for target, source in wanted.items():
+    for target, source in requested.items():
         if target not in targets:
             raise SettingsError(f"The target has no light {target!r}; it has {', '.join(targets) or 'none'}.")
         if source not in sources:
@@ -23,8 +25,8 @@ def assigned(targets: Sequence[str], sources: Sequence[str], wanted: Mapping[str
     chosen: dict[str, str] = {}
     turn = 0
     for target in targets:
-        if target in wanted:
-            chosen[target] = wanted[target]
+        if target in requested:
+            chosen[target] = requested[target]
         elif target in sources:
             chosen[target] = target
         else:
@@ -33,12 +35,12 @@ def assigned(targets: Sequence[str], sources: Sequence[str], wanted: Mapping[str
     return chosen
 
 
-def parsed(words: Sequence[str]) -> dict[str, str]:
-    """"target=source" as pairs. Raises SettingsError."""
+def parse_assignments(texts: Sequence[str]) -> dict[str, str]:
+    """Parse texts "target=source" to a dictionary. Raises SettingsError."""
     pairs = {}
-    for word in words:
-        target, equals, source = word.partition("=")
+    for text in texts:
+        target, equals, source = text.partition("=")
         if not equals or not target.strip() or not source.strip():
-            raise SettingsError(f"{word!r} is not of the form light-of-the-target=light-of-the-flare.")
+            raise SettingsError(f"{text!r} is not of the form light-of-the-target=light-of-the-flare.")
         pairs[target.strip()] = source.strip()
     return pairs

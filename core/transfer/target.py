@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What a flare goes on to: pictures, a capture, a run, splats with cameras, or a shot that Blender wrote down.
+"""Targets of a transfer: pictures, a capture, a run, splats with cameras, or a shot written by Blender.
 
-All become frames with a camera and placed lights, each perhaps with a plate, and perhaps one scene of Gaussians
-that hides lights and can be shown.
+Each becomes a `Target`: frames with a camera and placed lights, with optional plates, and an optional scene of
+Gaussians that hides lights and can be the background.
 """
 from __future__ import annotations
 
@@ -16,59 +16,65 @@ from numpy.typing import NDArray
 
 from ..capture import Camera, Capture, Light, View, read_lights
 from ..colour import ColourSpace
-from ..conventions.frame_numbers import Frame, layers_file, numbered, plates_by_number
+from ..conventions.frame_numbers import NumberedFrame, layers_file, number_views, plates_by_number
 from ..errors import CaptureError, SettingsError
 from ..gaussians.ply import read_ply
 from ..gaussians.scene import SceneGaussians
-from ..images.exr import window_of
+from ..images.exr import read_data_window
 from ..images.listing import pictures_in
-from ..images.picture import Picture, are_one_shape
+from ..images.picture import Picture, same_aspect
 from ..images.read import read_picture
 from ..lights.detection import Detector
-from ..look import Look
-from ..look.shot import PlacedLight, Shot, ShotFrame
-from ..system.files import content_of
-from .query import Seen
-from .sources import assigned
+from ..look import Look, PlacedLight
+from ..look.shot import Shot, ShotFrame
+from ..system.files import content_hash
+from .query import TrainingViews
+from .sources import assign_sources
 
-Mapped = Mapping[str, str]
+SourceNames = Mapping[str, str]
 
 
 @dataclass(frozen=True, eq=False)
 class TargetFrame:
-    """frame: its number and the file of its layers. shot: camera and lights. plate: its picture, if it has one.
+    """One frame of a target. frame: its number and the file of its layers. shot: camera and lights. plate: its picture,
+    or None.
 
-    undistorted: gives the plate's picture where the file itself is a distorted one, asked whether with the numbers of
-    the file, which are not converted by what it says of its space.
+    undistorted: reads the plate's undistorted picture, if the file is distorted; its argument is True for the file's
+    own numbers, without conversion from the file's colour space.
     """
 
-    frame: Frame
+    frame: NumberedFrame
     shot: ShotFrame
     plate: Path | None = None
     undistorted: Callable[[bool], Picture] | None = None
 
-    def flared(self, folder: Path) -> Path | None:
-        """Where below `folder` the plate with its flare goes: beside those of the layers' folder, under its own name.
-        None where none is written: without a plate, and at another size or form than the file's."""
-        if self.plate is None or self.undistorted is not None or window_of(self.plate).size != self.shot.camera.size:
+    def plate_with_flare_path(self, folder: Path) -> Path | None:
+        """Return the path below `folder` of the plate with its flare: in the layers' subfolder, with the plate's name.
+
+        None if it is not written: without a plate, or if the frame's size or distortion differs from the file's."""
+        if self.plate is None or self.undistorted is not None\
+                or read_data_window(self.plate).size != self.shot.camera.size:
             return None
         return folder / Path(self.frame.file).parent / self.plate.name
 
-    def described(self) -> str:
-        """Changes whenever the frame would; its plate counts by name and content, so that mirrored disks agree."""
-        plate = (self.plate.name, content_of(self.plate)) if self.plate else None
-        return repr((self.frame, plate)) + self.shot.described()
+    def cache_key(self) -> str:
+        """Return a text that changes whenever the frame would; the plate counts by name and content, not by path."""
+        plate = (self.plate.name, content_hash(self.plate)) if self.plate else None
+        view, number, file = self.frame.view, self.frame.number, self.frame.file
+        # Written out, not the repr of the class: a change would invalidate the layers of earlier transfers.
+        return f"(Frame(view={view!r}, number={number!r}, file={file!r}), {plate!r})" + self.shot.cache_key()
 
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """frames: of the whole shot, in order. scene: hides lights; shown: it is the picture too, where no plate is."""
+    """Frames of the whole shot, in order. scene: hides lights; shown: the scene is the background of frames without a
+    plate."""
 
     frames: tuple[TargetFrame, ...]
     scene: SceneGaussians | None = None
     shown: bool = False
-    says: tuple[str, ...] = ()
-    """Sentences for the person who asked for it."""
+    warnings: tuple[str, ...] = ()
+    """Sentences for the user."""
 
     @property
     def lights(self) -> tuple[str, ...]:
@@ -76,7 +82,7 @@ class Target:
         return tuple(dict.fromkeys(light.name for one in self.frames for light in one.shot.lights))
 
     def fingerprint(self) -> str:
-        """Changes whenever the scene does; "" without one."""
+        """Return a hash of the scene; "" without one."""
         digest = hashlib.sha256()
         for parameter in self.scene.parameters() if self.scene is not None else ():
             digest.update(parameter.detach().numpy().tobytes())
@@ -86,15 +92,16 @@ class Target:
 # ---- pictures -------------------------------------------------------------------------------------
 
 
-def of_pictures(paths: Sequence[Path], look: Look, lights: Mapping[str, tuple[float, float]], wanted: Mapped,
-                distances: Mapping[str, float], *, detector: Detector | None = None, focal: float | None = None,
-                centre: tuple[float, float] | None = None, seen: Mapping[str, Seen] | None = None) -> Target:
-    """Pictures with a light each in 2D: `lights` in pixels by name, else what `detector` finds.
+def picture_target(paths: Sequence[Path], look: Look, lights: Mapping[str, tuple[float, float]], requested: SourceNames,
+                   distances: Mapping[str, float], *, detector: Detector | None = None, focal: float | None = None,
+                   centre: tuple[float, float] | None = None,
+                   training: Mapping[str, TrainingViews] | None = None) -> Target:
+    """Return a target of pictures with lights in 2D: `lights`, px, by name, else those that `detector` finds.
 
-    focal: in pixels (default: the training camera's field of view, turned where the picture is); centre: principal
-    point in pixels (default: the middle). distances: of each source, at which its flare is as bright as it was learned.
-    seen: what each source was learned from; a light that was found shows the source that stood most like it. Raises
-    SettingsError where a picture has no light, and for two of one name.
+    focal: px (default: the training camera's field of view, turned for a picture of the other orientation); centre:
+    principal point, px (default: the middle). distances: distance of each source at which its flare has the brightness
+    of the fit. training: training views by source; a detected light shows the source with the most similar view.
+    Raises SettingsError if no picture has a light, and for two pictures of one name.
     """
     paths = list(dict.fromkeys(paths))
     by_name = {path.name: path for path in paths}
@@ -102,34 +109,35 @@ def of_pictures(paths: Sequence[Path], look: Look, lights: Mapping[str, tuple[fl
         twin = next(path for path in paths if by_name[path.name] != path)
         raise SettingsError(f"{twin} and {by_name[twin.name]} have one name; put the flare on them one after the "
                             "other, each with an --out of its own.")
-    frames, dark = [], []
-    for frame in numbered(by_name):
+    frames, unlit = [], []
+    for frame in number_views(by_name):
         path = by_name[frame.view]
-        window = window_of(path)
+        window = read_data_window(path)
         width, height = window.frame
-        larger = look.camera.pixels_across(width, height)
+        larger = look.camera.pixel_ratio(width, height)
         fx = focal or look.camera.fx * larger
         fy = (focal or look.camera.fy * larger) * window.aspect
         cx, cy = centre or (width / 2, height / 2)
-        camera = on_plate(Camera(width, height, fx, fy, cx, cy, np.eye(4)), path)
+        camera = plate_camera(Camera(width, height, fx, fy, cx, cy, np.eye(4)), path)
         found = dict(lights) or _detected(path, detector)
         if not found:
-            dark.append(path.name)
-        told = {name: source for name, source in wanted.items() if name in found}
+            unlit.append(path.name)
+        sources_by_light = {name: source for name, source in requested.items() if name in found}
         if not lights:
             places = {name: ((x - cx) / fx, (y - cy) / fy) for name, (x, y) in found.items()}
-            told = {**_most_alike(places, seen or {}), **told}
-        sources = assigned(list(found), look.names, told)
+            sources_by_light = {**_most_similar_sources(places, training or {}), **sources_by_light}
+        sources = assign_sources(list(found), look.names, sources_by_light)
         placed = []
         for name, (x, y) in found.items():
             ray = np.array([(x - cx) / fx, (y - cy) / fy, 1.0])
             placed.append(PlacedLight(name, sources[name], ray / np.linalg.norm(ray) * distances[sources[name]]))
         frames.append(TargetFrame(frame, ShotFrame(frame.number, frame.view, camera, tuple(placed)), path))
-    if len(dark) == len(frames):
+    if len(unlit) == len(frames):
         raise SettingsError(f"No light was found in {paths[0]}; say where it is with --light X,Y.")
-    target = Target(tuple(frames), says=(f"{len(dark)} of {len(frames)} pictures show no light, and get no flare: "
-                                         f"{', '.join(dark[:12])}{', …' if len(dark) > 12 else ''}.",) if dark else ())
-    if missing := set(wanted) - set(target.lights):
+    names = f"{', '.join(unlit[:12])}{', …' if len(unlit) > 12 else ''}"
+    warning = f"{len(unlit)} of {len(frames)} pictures show no light, and get no flare: {names}."
+    target = Target(tuple(frames), warnings=(warning,) if unlit else ())
+    if missing := set(requested) - set(target.lights):
         raise SettingsError(f"The pictures have no light {min(missing)!r}; they have {', '.join(target.lights)}.")
     return target
 
@@ -141,13 +149,16 @@ def _detected(path: Path, detector: Detector | None) -> dict[str, tuple[float, f
     return {f"found{number + 1}": (float(one.xy[0]), float(one.xy[1])) for number, one in enumerate(found)}
 
 
-def _most_alike(places: Mapping[str, tuple[float, float]], seen: Mapping[str, Seen]) -> dict[str, str]:
-    """For each light at a place of the plane the source that training saw nearest to it, each source once if there
-    are enough."""
+def _most_similar_sources(
+    positions: Mapping[str, tuple[float, float]], training: Mapping[str, TrainingViews]
+) -> dict[str, str]:
+    """Return for each light, by its position on the plane, the source with the nearest light in a training view.
+
+    Uses each source once if there are enough."""
     chosen: dict[str, str] = {}
-    pairs = sorted((float(np.linalg.norm(of.lights - place, axis=1).min()), name, source)
-                   for name, place in places.items() for source, of in seen.items())
-    while pairs and len(chosen) < len(places):
+    pairs = sorted((float(np.linalg.norm(views.lights - position, axis=1).min()), name, source)
+                   for name, position in positions.items() for source, views in training.items())
+    while pairs and len(chosen) < len(positions):
         used = set(chosen.values())
         free = [pair for pair in pairs if pair[1] not in chosen]
         _, name, source = next((pair for pair in free if pair[2] not in used), free[0])
@@ -158,73 +169,74 @@ def _most_alike(places: Mapping[str, tuple[float, float]], seen: Mapping[str, Se
 # ---- captures and splats --------------------------------------------------------------------------
 
 
-def of_capture(capture: Capture, look: Look, wanted: Mapped, *, lights: Path | None = None, scene: Path | None = None,
-               shown: bool = False) -> Target:
-    """A capture's views. lights: a lights.json instead of the capture's. scene: a 3DGS PLY in its world, which hides
-    lights; shown: it is the picture too, and the frames are left alone.
+def capture_target(capture: Capture, look: Look, requested: SourceNames, *, lights: Path | None = None,
+                   scene: Path | None = None, shown: bool = False) -> Target:
+    """Return a target of a capture's views. lights: a lights.json instead of the capture's. scene: a 3DGS PLY in its
+    world, which hides lights; shown: the scene is the background instead of the frames.
 
-    Raises CaptureError where there are no lights.
+    Raises CaptureError without lights.
     """
     known = read_lights(lights) if lights else capture.lights
     if lights and not lights.is_file():
         raise CaptureError(f"{lights} is missing.")
     if not known:
         raise CaptureError(f"{capture.folder} has no lights; run lights on it, or name a lights.json with --lights.")
-    placed = _placed(known, look, wanted)
+    placed = _placed(known, look, requested)
     views = {view.name: view for view in capture.views}
     frames = []
-    for frame in numbered(views):
+    for frame in number_views(views):
         view = views[frame.view]
         path = None if shown else capture.frame_path(view)
         undistorted = None if view.lens is None or path is None else _undistorted(capture, view)
-        camera = on_plate(view.camera, path) if undistorted is None and path is not None else view.camera
+        camera = plate_camera(view.camera, path) if undistorted is None and path is not None else view.camera
         shot = ShotFrame(frame.number, str(Path(frame.view).parent), camera, placed)
         frames.append(TargetFrame(frame, shot, path, undistorted))
     return Target(tuple(frames), read_ply(scene) if scene else None, shown)
 
 
-def _placed(lights: Sequence[Light], look: Look, wanted: Mapped) -> tuple[PlacedLight, ...]:
-    sources = assigned([light.name for light in lights], look.names, wanted)
+def _placed(lights: Sequence[Light], look: Look, requested: SourceNames) -> tuple[PlacedLight, ...]:
+    sources = assign_sources([light.name for light in lights], look.names, requested)
     return tuple(PlacedLight(light.name, sources[light.name], light.xyz) for light in lights)
 
 
 def _undistorted(capture: Capture, view: View) -> Callable[[bool], Picture]:
-    return lambda own: capture.frame_in_own_primaries(view) if own else capture.frame(view)
+    return lambda in_file_primaries: capture.frame_in_file_primaries(view) if in_file_primaries else capture.frame(view)
 
 
-def of_cameras(capture: Capture, look: Look, scene: Path | None = None) -> Target:
-    """A capture's cameras without its pictures, and the lights where the flare was learned: for a flare that is shown
-    in the scene it comes from. scene: a 3DGS PLY that hides them."""
+def cameras_target(capture: Capture, look: Look, scene: Path | None = None) -> Target:
+    """Return a target of a capture's cameras without its frames, and the lights where the .flare has them: for a flare
+    in the scene of its fit. scene: a 3DGS PLY that hides lights."""
     placed = tuple(PlacedLight(light.name, light.name, light.xyz) for light in look.lights)
     views = {view.name: view for view in capture.views}
-    return Target(tuple(TargetFrame(frame, ShotFrame(frame.number, str(Path(frame.view).parent),
-                                                     views[frame.view].camera, placed)) for frame in numbered(views)),
-                  read_ply(scene) if scene else None)
+    frames = tuple(
+        TargetFrame(frame, ShotFrame(frame.number, str(Path(frame.view).parent), views[frame.view].camera, placed))
+        for frame in number_views(views))
+    return Target(frames, read_ply(scene) if scene else None)
 
 
 # ---- shots ----------------------------------------------------------------------------------------
 
 
-def of_shot(shot: Shot, look: Look, wanted: Mapped, *, plates: Path | None = None, scene: Path | None = None,
-            wanted_frames: Container[int] | None = None) -> Target:
-    """A shot's frames. plates: a folder of pictures whose names end with the frames' numbers. wanted_frames: those that
-    have to have one, None for all: a farm's task may begin before the last frame is rendered.
+def shot_target(shot: Shot, look: Look, requested: SourceNames, *, plates: Path | None = None,
+                scene: Path | None = None, required_frames: Container[int] | None = None) -> Target:
+    """Return a target of a shot's frames. plates: a folder of pictures whose names end with the frames' numbers.
 
-    Raises SettingsError where a frame has no plate there.
+    required_frames: frames that need a plate, None for all: a task of a farm may begin before the last plate exists.
+    Raises SettingsError if one of them has no plate.
     """
-    given = _by_number(plates) if plates else {}
-    # Sources that the shot names itself hold, unless others are wanted or this look has none such.
-    told = {light.name: light.source for one in shot.frames for light in one.lights}
-    sources = assigned(list(told), look.names,
-                       {**{name: source for name, source in told.items() if source in look.names}, **wanted})
+    plates_by_frame = _plates_by_number(plates) if plates else {}
+    # The shot's own sources are used, unless others are requested or this look lacks them.
+    sources_by_light = {light.name: light.source for one in shot.frames for light in one.lights}
+    known = {name: source for name, source in sources_by_light.items() if source in look.names}
+    sources = assign_sources(list(sources_by_light), look.names, {**known, **requested})
     frames, folders = [], shot.folders
     for one in sorted(shot.frames, key=lambda each: (each.name, each.frame)):
-        if plates and one.frame not in given and (wanted_frames is None or one.frame in wanted_frames):
+        if plates and one.frame not in plates_by_frame and (required_frames is None or one.frame in required_frames):
             raise SettingsError(f"{plates} has no picture for frame {one.frame}.")
         lights = tuple(replace(light, source=sources[light.name]) for light in one.lights)
-        frame = Frame(f"{one.name}/{one.frame}", one.frame, layers_file(folders[one.name], one.frame))
-        plate = given.get(one.frame)
-        camera = on_plate(one.camera, plate) if plate is not None else one.camera
+        frame = NumberedFrame(f"{one.name}/{one.frame}", one.frame, layers_file(folders[one.name], one.frame))
+        plate = plates_by_frame.get(one.frame)
+        camera = plate_camera(one.camera, plate) if plate is not None else one.camera
         if plate is not None:
             _check_shape(plate, camera)
         frames.append(TargetFrame(frame, replace(one, camera=camera, lights=lights), plate))
@@ -234,17 +246,18 @@ def of_shot(shot: Shot, look: Look, wanted: Mapped, *, plates: Path | None = Non
 
 
 def _check_shape(plate: Path, camera: Camera) -> None:
-    """Raises SettingsError for a plate of another shape than the frame, which would be stretched."""
-    width, height = window_of(plate).size
-    if not are_one_shape((width, height), camera.size):
+    """Raise SettingsError for a plate of another aspect ratio than the frame, which would be stretched."""
+    width, height = read_data_window(plate).size
+    if not same_aspect((width, height), camera.size):
         raise SettingsError(f"{plate} is {width} x {height} pixels and the shot {camera.width} x {camera.height}, "
                             "which is another shape; give the plates of this shot.")
 
 
-def on_plate(camera: Camera, plate: Path) -> Camera:
-    """The camera of the pixels that a plate's file has: an EXR's may be more than those of the frame (overscan), or
-    fewer. Raises SettingsError where they are, and the frame is not of the camera's size."""
-    window = window_of(plate)
+def plate_camera(camera: Camera, plate: Path) -> Camera:
+    """Return the camera of a plate's data window, which in an EXR may be larger (overscan) or smaller than the frame.
+
+    Raises SettingsError if it is, and the frame does not have the camera's size."""
+    window = read_data_window(plate)
     if window.is_frame:
         return camera
     if window.frame != camera.size:
@@ -254,16 +267,16 @@ def on_plate(camera: Camera, plate: Path) -> Camera:
     return camera.cropped(*window.origin, *window.size)
 
 
-def _by_number(folder: Path) -> dict[int, Path]:
-    """Pictures of a folder by the number that each name ends with."""
+def _plates_by_number(folder: Path) -> dict[int, Path]:
+    """Return the pictures of a folder by the number at the end of their names. Raises SettingsError for no pictures."""
     files = pictures_in(folder) if folder.is_dir() else []
     if not files:
         raise SettingsError(f"{folder} holds no pictures; name the folder of the plates.")
     return plates_by_number(files)
 
 
-def sized(target: Target, width: int | None, height: int | None) -> Target:
-    """The same at another size in pixels; without a height the proportions stay."""
+def resized(target: Target, width: int | None, height: int | None) -> Target:
+    """Return the target at another size, px; without a height the aspect ratio is preserved."""
     if not width:
         return target
     return replace(target, frames=tuple(
@@ -271,8 +284,8 @@ def sized(target: Target, width: int | None, height: int | None) -> Target:
 
 
 def background(one: TargetFrame, size: tuple[int, int], space: ColourSpace | None) -> NDArray[np.float32] | None:
-    """The undistorted plate in linear Rec. 709 at `size`, where the plate's own file cannot be used; else None. space:
-    that its numbers are in, where its file is not to say."""
+    """Return the undistorted plate in linear Rec. 709 at `size`; None if the plate's file is not distorted. space: the
+    plate's colour space, None to use that of its file."""
     if one.undistorted is None:
         return None
     picture = one.undistorted(space is not None)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The look in numpy against the flare in torch, and what edits do to it."""
+"""The look in numpy compared with the flare in torch; elements, edits and shots."""
 from __future__ import annotations
 
 import json
@@ -23,18 +23,20 @@ from core.look import (
     Edit,
     KeyedEdits,
     LookEdits,
+    PlacedLight,
     PlaneGaussians,
     TrainedCamera,
     ViewOfLight,
     draw,
-    list_elements,
     read,
+    store_elements,
 )
 from core.look import elements as grouping
-from core.look.container import read_tensors, rewritten
-from core.look.edits import edited
-from core.look.look import FORM_BOUNDS, FlareForm, asked
-from core.look.shot import PlacedLight, Shot, ShotFrame, evaluate
+from core.look.container import read_tensors, rewrite_metadata
+from core.look.edits import apply_edits
+from core.look.form import FORM_BOUNDS, FlareForm
+from core.look.look import network_query
+from core.look.shot import Shot, ShotFrame
 from tests.core.flared import cameras
 from tests.core.test_flare import pose, some_flare
 
@@ -52,7 +54,7 @@ def saved(path: Path, form: FlareForm = SMALL, lights: int = 2, blend: str = "ad
 
 
 @pytest.mark.parametrize("name", FORMS)
-def test_it_evaluates_as_torch_does(name: str, tmp_path: Path) -> None:
+def test_the_look_evaluates_as_the_torch_model(name: str, tmp_path: Path) -> None:
     model = saved(tmp_path / "a.flare", FORMS[name])
     look = read(tmp_path / "a.flare")
     assert look.names == model.names
@@ -70,7 +72,7 @@ def test_it_evaluates_as_torch_does(name: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("blend", ["add", "over"])
 @pytest.mark.parametrize("form", ["small", "arcs"])
-def test_it_draws_as_the_rasterizer_does(form: str, blend: str, tmp_path: Path) -> None:
+def test_draw_equals_the_rasterizer(form: str, blend: str, tmp_path: Path) -> None:
     model = saved(tmp_path / "a.flare", FORMS[form], 1, blend)
     if form == "arcs":
         with torch.no_grad():
@@ -92,16 +94,16 @@ def test_a_light_behind_the_camera_has_no_flare(tmp_path: Path) -> None:
     assert read(tmp_path / "a.flare").evaluate(behind) == {}
 
 
-def test_lights_can_be_placed_left_out_and_hidden(tmp_path: Path) -> None:
+def test_lights_can_be_placed_omitted_and_hidden(tmp_path: Path) -> None:
     saved(tmp_path / "a.flare")
     look, view = read(tmp_path / "a.flare"), cameras(3)[0].world_to_camera
     moved = look.evaluate(view, lights={"lamp 1": look.lights[0].xyz})
     assert list(moved) == ["lamp 1"]
-    half = look.evaluate(view, shares={"lamp 0": 0.25})
+    half = look.evaluate(view, visibilities={"lamp 0": 0.25})
     np.testing.assert_allclose(half["lamp 0"].opacities, 0.25 * look.evaluate(view)["lamp 0"].opacities, rtol=1e-6)
 
 
-def test_a_query_can_stay_in_the_trained_range(tmp_path: Path) -> None:
+def test_a_query_can_be_clipped_to_the_trained_range(tmp_path: Path) -> None:
     saved(tmp_path / "a.flare", replace(PAPER, levels=6), 1)
     look = read(tmp_path / "a.flare")
     inside, far = cameras(3)[1].world_to_camera, cameras(3)[1].world_to_camera.copy()
@@ -110,7 +112,7 @@ def test_a_query_can_stay_in_the_trained_range(tmp_path: Path) -> None:
         free, kept = (look.evaluate(view, query=query)["lamp 0"] for query in ("target", "trained"))
         assert np.allclose(free.colours, kept.colours) == same
     low, high = look.lights[0].query_range.camera_low, look.lights[0].query_range.camera_high
-    camera, light = look.lights[0].query_range.clipped(np.array([9, 0, -4], np.float32), np.array([3, 4], np.float32))
+    camera, light = look.lights[0].query_range.clip(np.array([9, 0, -4], np.float32), np.array([3, 4], np.float32))
     assert (camera >= low).all()
     assert (camera <= high).all()
     np.testing.assert_allclose(light[1] / light[0], 4 / 3, rtol=1e-5)
@@ -120,13 +122,13 @@ def test_a_query_can_stay_in_the_trained_range(tmp_path: Path) -> None:
 # ---- files ----------------------------------------------------------------------------------------
 
 
-def test_notes_and_licence_come_along(tmp_path: Path) -> None:
+def test_notes_and_licence_are_read(tmp_path: Path) -> None:
     saved(tmp_path / "a.flare")
     look = read(tmp_path / "a.flare")
     assert (look.licence, look.notes, look.camera.width, look.count) == ("CC0", "some notes", 64, 80)
 
 
-def test_bad_files_are_one_sentence(tmp_path: Path) -> None:
+def test_bad_files_raise_in_one_line(tmp_path: Path) -> None:
     good = tmp_path / "good.flare"
     saved(good, replace(OURS, levels=2))
     data = good.read_bytes()
@@ -158,7 +160,7 @@ def test_bad_files_are_one_sentence(tmp_path: Path) -> None:
         read(tmp_path / "absent.flare")
 
 
-def test_the_container_is_safetensors(tmp_path: Path) -> None:
+def test_the_container_equals_safetensors(tmp_path: Path) -> None:
     from safetensors.numpy import save_file
 
     arrays = {"a": np.arange(6, dtype=np.float32).reshape(2, 3), "b": np.array([], np.int32), "c": np.array([True])}
@@ -181,55 +183,55 @@ def plane(places: list[float], *, size: float = 0.02, long: float = 1.0, ring: f
     return PlaneGaussians(means, covariances, np.full(n, 0.5, np.float32), np.ones((n, 3), np.float32), rings)
 
 
-def test_gaussians_are_grouped_by_kind_and_place() -> None:
-    from core.look.plane import joined
+def test_gaussians_are_grouped_by_kind_and_position() -> None:
+    from core.look.plane import concatenate
 
     mu = [1.0, 1.02, 0.98, 0.4, 0.42, -0.5, 1.0, 0.4]
-    gaussians = joined([plane(mu[:6]), plane(mu[6:7], long=9), plane(mu[7:], ring=3)])
+    gaussians = concatenate([plane(mu[:6]), plane(mu[6:7], long=9), plane(mu[7:], ring=3)])
     assert gaussians is not None
-    found = {element.name: element for element in grouping.group(gaussians, np.array(mu, np.float32))}
+    found = {element.name: element for element in grouping.group_elements(gaussians, np.array(mu, np.float32))}
     assert {name: sorted(element.members.tolist()) for name, element in found.items()} == {
         "glare": [0, 1, 2], "ghost": [3, 4], "ghost 2": [5], "streak": [6], "ring": [7]}
     assert abs(found["ghost 2"].mu + 0.5) < 1e-5
     assert sum(element.energy for element in found.values()) == pytest.approx(1, abs=1e-5)
 
 
-def test_ghosts_close_to_each_other_are_cut_where_they_part() -> None:
+def test_close_ghosts_are_split_at_the_valley_between_them() -> None:
     """Within less than a kernel's reach of one another."""
     mu = np.array([0, 0.005, 0.01, 0.1, 0.105, 0.11], np.float32)
-    found = grouping.group(plane(mu.tolist()), mu)
+    found = grouping.group_elements(plane(mu.tolist()), mu)
     assert sorted(element.members.tolist() for element in found) == [[0, 1, 2], [3, 4, 5]]
 
 
-def test_every_gaussian_has_one_element_whatever_they_are() -> None:
+def test_every_gaussian_belongs_to_one_element() -> None:
     random = np.random.default_rng(2)
     for count in (0, 1, 2, 400):
         gaussians = plane(random.uniform(-2, 2, count).tolist())
         for mu in (gaussians.means[:, 0] / np.float32(0.3), None):
-            found = grouping.group(gaussians, mu)
-            assert len(found) <= grouping.MOST
+            found = grouping.group_elements(gaussians, mu)
+            assert len(found) <= grouping.MAX_ELEMENTS
             assert len({element.name for element in found}) == len(found)
             members = np.concatenate([np.zeros(0, np.int64), *(element.members for element in found)])
             assert sorted(members.tolist()) == list(range(count))
 
 
-def test_an_element_knows_its_extent_and_colour() -> None:
+def test_elements_have_their_extent_and_colour() -> None:
     gaussians = replace(plane([1.0, 0.4, 0.44], size=0.02), colours=np.array([[2, 1, 0]] * 3, np.float32))
-    source, pair = grouping.group(gaussians, gaussians.means[:, 0] / np.float32(0.3))
+    source, pair = grouping.group_elements(gaussians, gaussians.means[:, 0] / np.float32(0.3))
     if source.mu < pair.mu:
         source, pair = pair, source
     assert source.extent == pytest.approx(0.02 * np.sqrt(2), rel=1e-4)
     assert pair.extent == pytest.approx(np.sqrt(2 * 0.02**2 + (0.3 * 0.02) ** 2), rel=1e-4)
     assert source.colour == (1.0, 0.5, 0.0)
-    hole = grouping.group(plane([1.0], size=0.02, ring=5), np.ones(1, np.float32))[0]
+    hole = grouping.group_elements(plane([1.0], size=0.02, ring=5), np.ones(1, np.float32))[0]
     assert hole.extent == pytest.approx(0.02 * 5, rel=0.1)
 
 
-def test_elements_that_are_listed_stay_what_they_are(tmp_path: Path) -> None:
+def test_stored_elements_are_not_regrouped(tmp_path: Path) -> None:
     path = tmp_path / "a.flare"
     flare_file.save(path, FlareFile(some_flare(SMALL, 40, 2), "add", CAMERA))
     found = read(path)
-    list_elements(path)
+    store_elements(path)
     again = read(path)
     assert len(flare_file.load(path).elements) == sum(len(light.elements) for light in found.lights)
     for before, after_ in zip(found.lights, again.lights, strict=True):
@@ -242,7 +244,7 @@ def test_elements_that_are_listed_stay_what_they_are(tmp_path: Path) -> None:
             assert other.colour == pytest.approx(one.colour, abs=1e-3)
 
 
-def test_elements_of_the_file_come_first(tmp_path: Path) -> None:
+def test_elements_in_the_file_take_precedence(tmp_path: Path) -> None:
     model = some_flare(SMALL, 6, 1)
     listed = [{"light": "lamp 0", "name": "iris", "kind": "ring", "members": [0, 2], "mu": 0.5, "energy": 0.7}]
     flare_file.save(tmp_path / "a.flare", FlareFile(model, "add", CAMERA, elements=listed))
@@ -258,18 +260,18 @@ LIGHT = np.array([0.3, 0.0])
 
 def ghosts() -> tuple[PlaneGaussians, list[grouping.Element]]:
     gaussians = plane([1.0, 0.4, 0.44])
-    return gaussians, grouping.group(gaussians, gaussians.means[:, 0] / np.float32(0.3))
+    return gaussians, grouping.group_elements(gaussians, gaussians.means[:, 0] / np.float32(0.3))
 
 
 def after(*words: str, blend: str = "add") -> PlaneGaussians:
     gaussians, elements = ghosts()
     names = {"lamp": [element.name for element in elements]}
-    return edited(gaussians, "lamp", LIGHT, elements, LookEdits.parse(words, ["lamp"], names), blend)
+    return apply_edits(gaussians, "lamp", LIGHT, elements, LookEdits.parse(words, ["lamp"], names), blend)
 
 
-def test_no_edit_changes_nothing() -> None:
+def test_neutral_edits_change_nothing() -> None:
     gaussians, elements = ghosts()
-    assert edited(gaussians, "lamp", LIGHT, elements, LookEdits(), "add") is gaussians
+    assert apply_edits(gaussians, "lamp", LIGHT, elements, LookEdits(), "add") is gaussians
 
 
 def test_scale_grows_each_element_about_its_own_centre() -> None:
@@ -281,7 +283,7 @@ def test_scale_grows_each_element_about_its_own_centre() -> None:
     np.testing.assert_allclose(scaled.means[1:].mean(0), before.means[1:].mean(0), atol=1e-6)
 
 
-def test_spread_moves_ghosts_and_leaves_the_source() -> None:
+def test_spread_moves_ghosts_and_not_the_light() -> None:
     before, _ = ghosts()
     spread = after("lamp.spread=0.5")
     np.testing.assert_allclose(spread.means[0], before.means[0], atol=1e-6)
@@ -301,15 +303,15 @@ def test_arcs_are_scaled_and_turned_with_their_gaussians() -> None:
     """The edited look drawn is the look drawn and turned: a quarter, about the middle of a square picture."""
     one = plane([0.0], ring=3.0)
     one = replace(one, arcs=np.array([[0.02, 0.01]], np.float32))
-    elements = grouping.group(one, np.zeros(1, np.float32))
+    elements = grouping.group_elements(one, np.zeros(1, np.float32))
     intrinsics = np.array([[100.0, 0, 20], [0, 100, 20], [0, 0, 1]])
-    turned = edited(one, "lamp", LIGHT, elements, LookEdits(Edit(rotation=90)), "add")
+    turned = apply_edits(one, "lamp", LIGHT, elements, LookEdits(Edit(rotation=90)), "add")
     expected = np.rot90(draw([one], intrinsics, 40, 40), -1)
     assert np.abs(expected - draw([one], intrinsics, 40, 40)).max() > 0.1
     np.testing.assert_allclose(draw([turned], intrinsics, 40, 40), expected, atol=1e-5)
-    large = edited(one, "lamp", LIGHT, elements, LookEdits(Edit(scale=2)), "add")
-    np.testing.assert_allclose(large.strengths, one.strengths, rtol=1e-5)
-    assert one.strengths[0] == pytest.approx(5**0.5 / 2, rel=1e-5)
+    large = apply_edits(one, "lamp", LIGHT, elements, LookEdits(Edit(scale=2)), "add")
+    np.testing.assert_allclose(large.arc_strengths, one.arc_strengths, rtol=1e-5)
+    assert one.arc_strengths[0] == pytest.approx(5**0.5 / 2, rel=1e-5)
     # What a ring loses to an arc it loses in its energy, too; a plain Gaussian is only shifted.
     assert one.energy[0] < 0.5 * replace(one, arcs=None).energy[0]
     assert plane([0.0]).energy[0] == pytest.approx(replace(plane([0.0]), arcs=one.arcs).energy[0], rel=1e-5)
@@ -320,34 +322,34 @@ def test_arcs_need_rings(tmp_path: Path) -> None:
     _, metadata = read_tensors(tmp_path / "a.flare")
     description = json.loads(metadata["fit_flare"])
     description["lights"][0]["form"]["rings"] = False
-    rewritten(tmp_path / "a.flare", tmp_path / "b.flare", {"fit_flare": json.dumps(description)})
+    rewrite_metadata(tmp_path / "a.flare", tmp_path / "b.flare", {"fit_flare": json.dumps(description)})
     for reader in (read, flare_file.load):
         with pytest.raises(FlareFileError, match="is damaged"):
             reader(tmp_path / "b.flare")
 
 
 @pytest.mark.parametrize("name", FORM_BOUNDS)
-def test_a_form_outside_of_its_bounds_is_refused_by_all_readers(name: str, tmp_path: Path) -> None:
+def test_a_form_out_of_bounds_raises_in_all_readers(name: str, tmp_path: Path) -> None:
     saved(tmp_path / "a.flare", SMALL, 1)
     _, metadata = read_tensors(tmp_path / "a.flare")
     description = json.loads(metadata["fit_flare"])
-    for value in (FORM_BOUNDS[name].least - 1, FORM_BOUNDS[name].most + 1):
+    for value in (FORM_BOUNDS[name].minimum - 1, FORM_BOUNDS[name].maximum + 1):
         description["lights"][0]["form"][name] = value
-        rewritten(tmp_path / "a.flare", tmp_path / "b.flare", {"fit_flare": json.dumps(description)})
+        rewrite_metadata(tmp_path / "a.flare", tmp_path / "b.flare", {"fit_flare": json.dumps(description)})
         for reader in (read, flare_file.load):
             with pytest.raises(FlareFileError, match="form makes no sense"):
                 reader(tmp_path / "b.flare")
 
 
 @pytest.mark.parametrize("changed", [{"latent": 0}, {"latent": 3}, {"levels": 5}])
-def test_a_network_that_does_not_fit_its_form_is_refused_when_it_is_read(changed: dict[str, int],
+def test_a_network_that_does_not_fit_its_form_raises_on_reading(changed: dict[str, int],
                                                                          tmp_path: Path) -> None:
     """Not when it is first asked for a view: by then it stands in a library or a scene."""
     saved(tmp_path / "a.flare", OURS, 1)
     _, metadata = read_tensors(tmp_path / "a.flare")
     description = json.loads(metadata["fit_flare"])
     description["lights"][0]["form"].update(changed)
-    rewritten(tmp_path / "a.flare", tmp_path / "b.flare", {"fit_flare": json.dumps(description)})
+    rewrite_metadata(tmp_path / "a.flare", tmp_path / "b.flare", {"fit_flare": json.dumps(description)})
     for reader in (read, flare_file.load):
         with pytest.raises(FlareFileError, match="is damaged"):
             reader(tmp_path / "b.flare")
@@ -360,7 +362,7 @@ def test_a_network_that_does_not_fit_its_form_is_refused_when_it_is_read(changed
     ("elements without their Gaussians", "names Gaussians that are not there"), ("seen 3", "is damaged"),
     ("seen from nowhere", "training view makes no sense"), ("a wide camera", "'wide'"),
     ("endless count", "is damaged")])
-def test_what_one_reader_refuses_the_other_does_for_the_same_reason(what: str, said: str, tmp_path: Path) -> None:
+def test_both_readers_raise_the_same_errors(what: str, said: str, tmp_path: Path) -> None:
     saved(tmp_path / "a.flare")
     _, metadata = read_tensors(tmp_path / "a.flare")
     description = json.loads(metadata["fit_flare"])
@@ -382,84 +384,84 @@ def test_what_one_reader_refuses_the_other_does_for_the_same_reason(what: str, s
             description["camera"]["fx"] = "wide"
         case _:
             second["count"] = math.inf
-    rewritten(tmp_path / "a.flare", tmp_path / "b.flare", {"fit_flare": json.dumps(description)})
+    rewrite_metadata(tmp_path / "a.flare", tmp_path / "b.flare", {"fit_flare": json.dumps(description)})
     for reader in (read, flare_file.load):
         reader(tmp_path / "a.flare")
         with pytest.raises(FlareFileError, match=rf"b\.flare.*{said}"):
             reader(tmp_path / "b.flare")
 
 
-def test_streaks_alone_are_lengthened() -> None:
+def test_only_streaks_are_lengthened() -> None:
     gaussians = plane([1.0], long=8.0)
-    elements = grouping.group(gaussians, np.ones(1, np.float32))
+    elements = grouping.group_elements(gaussians, np.ones(1, np.float32))
     assert elements[0].kind == "streak"
-    longer = edited(gaussians, "lamp", LIGHT, elements, LookEdits(Edit(streak=3.0)), "add")
+    longer = apply_edits(gaussians, "lamp", LIGHT, elements, LookEdits(Edit(streak=3.0)), "add")
     np.testing.assert_allclose(longer.covariances[0] / [gaussians.covariances[0, 0], 1, gaussians.covariances[0, 2]],
                                [9, 0, 1], atol=1e-4)
     np.testing.assert_array_equal(after("*.streak=3").covariances, ghosts()[0].covariances)
 
 
-def test_mute_and_solo_of_elements_and_lights() -> None:
+def test_mute_and_solo_turn_elements_and_lights_off() -> None:
     assert len(after("lamp/ghost.mute=1")) == 1
     assert len(after("lamp/ghost.solo=1")) == 2
     assert len(after("lamp/ghost.solo=1", "lamp/ghost.mute=1")) == 0
     edits = LookEdits.parse(["a.solo=1", "c.mute=1"], ["a", "b", "c"])
-    assert [edits.shows(name, ["a", "b", "c"]) for name in "abc"] == [True, False, False]
-    assert not LookEdits.parse(["*.mute=1"], ["a"]).shows("a", ["a"])
+    assert [edits.is_visible(name, ["a", "b", "c"]) for name in "abc"] == [True, False, False]
+    assert not LookEdits.parse(["*.mute=1"], ["a"]).is_visible("a", ["a"])
 
 
-def test_colour_on_gaussians_is_colour_on_the_layer() -> None:
-    """Where light adds: drawn and then changed is changed and then drawn, saturation past 1 included."""
+def test_colour_edits_of_gaussians_equal_those_of_the_layer() -> None:
+    """For the blend "add", editing and drawing commute, also for a saturation above 1."""
     intrinsics = np.array([[50.0, 0, 10], [0, 50, 10], [0, 0, 1]])
     gaussians, elements = ghosts()
     gaussians = replace(gaussians, colours=np.array([[1, 0.2, 0], [0.1, 0.9, 0.3], [0, 0, 1]], np.float32))
     edits = LookEdits.parse(["lamp.intensity=2", "lamp.tint=1,0.5,0.25", "*.saturation=1.6"], ["lamp"])
-    gaussians_first = draw([edited(gaussians, "lamp", LIGHT, elements, edits, "add")], intrinsics, 40, 20)
+    gaussians_first = draw([apply_edits(gaussians, "lamp", LIGHT, elements, edits, "add")], intrinsics, 40, 20)
     layer_first = draw([gaussians], intrinsics, 40, 20) @ edits.matrices(["lamp"])["lamp"].T
     np.testing.assert_allclose(gaussians_first, layer_first, atol=1e-5)
 
 
-def test_colour_of_what_covers_fades_and_brightens() -> None:
+def test_intensity_fades_and_brightens_an_over_flare() -> None:
     before, _ = ghosts()
     np.testing.assert_allclose(after("lamp.intensity=0.5", blend="over").opacities, 0.5 * before.opacities)
     np.testing.assert_allclose(after("lamp.tint=0.5,1,1", blend="over").colours[:, 0], 0.735357, atol=1e-5)
 
 
-def test_edits_go_to_words_and_back() -> None:
+def test_edits_are_restored_from_their_texts() -> None:
     names = {"lamp": ["ghost", "streak 2"], "key/1": []}
     words = ["*.intensity=0.5", "lamp.tint=1,0.8,0.6", "lamp/streak 2.streak=2.5", "key/1.solo=1", "key/1.rotation=-30"]
     edits = LookEdits.parse(words, ["lamp", "key/1"], names)
-    assert LookEdits.parse(edits.words(), ["lamp", "key/1"], names) == edits
-    assert set(edits.words()) == set(words)
-    assert LookEdits().words() == []
+    assert LookEdits.parse(edits.texts(), ["lamp", "key/1"], names) == edits
+    assert set(edits.texts()) == set(words)
+    assert LookEdits().texts() == []
     assert edits.elements["lamp", "streak 2"].streak == 2.5
     both = LookEdits.parse(["*/ghost.scale=2", "lamp/*.scale=3"], ["lamp"], names)
     assert both.elements == {("lamp", "ghost"): Edit(scale=6.0), ("lamp", "streak 2"): Edit(scale=3.0)}
 
 
 @pytest.mark.parametrize("name", ["key=1", " lamp", "a.b", " a.scale=2 /b = "])
-def test_edits_go_to_words_and_back_whatever_a_light_is_called(name: str) -> None:
+def test_edits_are_restored_from_their_texts_for_any_light_name(name: str) -> None:
     edits = LookEdits(lights={name: Edit(intensity=2.5), "lamp": Edit(mute=True)},
                       elements={(name, "ghost 2"): Edit(tint=(1.0, 0.5, 0.25), rotation=-30.0)})
-    assert LookEdits.parse(edits.words(), ["lamp", name], {name: ["ghost 2"]}) == edits
+    assert LookEdits.parse(edits.texts(), ["lamp", name], {name: ["ghost 2"]}) == edits
 
 
 @pytest.mark.parametrize("edit", ["lamp/iris.scale=2", "lamp.scale=-1", "lamp.mute=2", "lamp.rotation=a", "lamp.solo=",
                                   "sun/ghost.scale=1", "lamp.sizes=1", "lamp.scale=1e9", "lamp.rotation=inf"])
-def test_edits_that_make_no_sense_are_refused(edit: str) -> None:
+def test_invalid_edits_raise(edit: str) -> None:
     with pytest.raises(SettingsError, match="edit"):
         LookEdits.parse([edit], ["lamp"], {"lamp": ["ghost"]})
 
 
-def test_keyed_edits_run_between_frames(tmp_path: Path) -> None:
+def test_keyed_edits_are_interpolated_between_keyframes(tmp_path: Path) -> None:
     keyed = KeyedEdits(("lamp.scale=2",), {10: ("lamp.intensity=0",), 20: ("lamp.intensity=1", "lamp.mute=1")})
     keyed.write(tmp_path / "edits.json")
     again = KeyedEdits.read(tmp_path / "edits.json")
     assert again == keyed
-    strength = [again.at(frame, ["lamp"]).light("lamp").intensity for frame in (1, 10, 15, 20, 99)]
+    strength = [again.at(frame, ["lamp"]).light_edit("lamp").intensity for frame in (1, 10, 15, 20, 99)]
     np.testing.assert_allclose(strength, [0, 0, 0.5, 1, 1])
-    assert [again.at(frame, ["lamp"]).light("lamp").mute for frame in (10, 19, 20)] == [False, False, True]
-    assert again.at(15, ["lamp"]).light("lamp").scale == 2
+    assert [again.at(frame, ["lamp"]).light_edit("lamp").mute for frame in (10, 19, 20)] == [False, False, True]
+    assert again.at(15, ["lamp"]).light_edit("lamp").scale == 2
     for text in ("[]", '{"set": "a"}', '{"frames": {"x": []}}', "{", '{"frames": {"6": [], "06": []}}',
                  '{"frames": {"6": [], "6": []}}', '{"frames": {"1_0": []}}', '{"frames": {"9999999999": []}}'):
         (tmp_path / "edits.json").write_text(text)
@@ -479,8 +481,8 @@ def test_a_rotated_light_flare_is_finite_everywhere(tmp_path: Path) -> None:
 CAMERA_K = np.array([[70.0, 0, 33], [0, 70, 19.5], [0, 0, 1]])
 
 
-def test_the_engine_draws_edits_as_the_look_does(tmp_path: Path) -> None:
-    """What bake renders under edits of shape and element is what the overlay evaluates."""
+def test_the_rasterizer_draws_edits_as_the_look(tmp_path: Path) -> None:
+    """A bake with edits of shape and element renders what the overlay evaluates."""
     from core.fit.rendering import render
     from core.gaussians.scene import SceneGaussians
 
@@ -508,14 +510,14 @@ def a_shot(tmp_path: Path, *words: str) -> Shot:
         ShotFrame(number + 1, "Camera", camera, lights, words) for number, camera in enumerate(cameras(3))))
 
 
-def test_a_shot_is_read_as_it_was_written(tmp_path: Path) -> None:
+def test_a_shot_is_restored_from_its_file(tmp_path: Path) -> None:
     shot = a_shot(tmp_path, "second.tint=1,0.5,0.5")
     shot.write(tmp_path / "shot.json")
     again = Shot.read(tmp_path / "shot.json")
     assert again.lights == ("lamp 0", "second")
     assert again.frames[2].edits == ("second.tint=1,0.5,0.5",)
     np.testing.assert_array_equal(again.frames[1].camera.world_to_camera, shot.frames[1].camera.world_to_camera)
-    assert again.sized(128, None).frames[0].camera.size == (128, 80)
+    assert again.resized(128, None).frames[0].camera.size == (128, 80)
     text = (tmp_path / "shot.json").read_text()
     for old, new in (('"version": 1', '"version": 2'), ('"share": 1.0', '"share": "x"'), ('"frames"', '"frame"'),
                      ('"width": 64', '"width": -1'), ('"query": "target"', '"query": "moon"'),
@@ -533,7 +535,7 @@ def test_a_shot_is_read_as_it_was_written(tmp_path: Path) -> None:
             Shot.read(tmp_path / "bad.json")
 
 
-def test_a_shot_is_baked_as_the_overlay_shows_it(tmp_path: Path) -> None:
+def test_a_shot_bake_equals_the_overlay(tmp_path: Path) -> None:
     from core.bake.exr import read_layers
     from core.bake.shot import bake_shot
 
@@ -542,7 +544,7 @@ def test_a_shot_is_baked_as_the_overlay_shows_it(tmp_path: Path) -> None:
     assert [entry["file"] for entry in record["frames"]] == [f"layers.000{number}.exr" for number in (1, 2, 3)]
     look, frame = read(shot.flare), shot.frames[2]
     edits = LookEdits.parse(frame.edits, shot.lights)
-    shown = evaluate(look, frame.camera.world_to_camera, frame.lights, edits)
+    shown = look.evaluate_lights(frame.camera.world_to_camera, frame.lights, edits)
     layers = read_layers(tmp_path / "layers" / "layers.0003.exr")
     for name, gaussians in shown.items():
         picture = draw([gaussians], frame.camera.intrinsics, *frame.camera.size)
@@ -552,7 +554,7 @@ def test_a_shot_is_baked_as_the_overlay_shows_it(tmp_path: Path) -> None:
         frame.camera.world_to_camera, lights={"lamp 0": frame.lights[1].xyz})["lamp 0"].opacities.max(), rtol=1e-5)
 
 
-def test_every_camera_has_a_folder_of_its_own(tmp_path: Path) -> None:
+def test_every_camera_has_its_own_folder(tmp_path: Path) -> None:
     frame = a_shot(tmp_path).frames[0]
     names = ("Cam.left", "Cam left", "cam_LEFT", "Левая", "カメラ", "../escaped", "..")
     folders = Shot(tmp_path, tuple(replace(frame, name=name) for name in names)).folders
@@ -560,7 +562,7 @@ def test_every_camera_has_a_folder_of_its_own(tmp_path: Path) -> None:
     assert Shot(tmp_path, (frame, frame)).folders == {frame.name: ""}
 
 
-def test_frames_baked_before_stay_when_others_are_baked(tmp_path: Path) -> None:
+def test_earlier_frames_stay_when_others_are_baked(tmp_path: Path) -> None:
     from core.bake.shot import bake_shot
 
     def times() -> list[int]:
@@ -578,11 +580,11 @@ def test_frames_baked_before_stay_when_others_are_baked(tmp_path: Path) -> None:
     assert [path.name for path in out.glob("*.exr")] == ["layers.0001.exr"], "colours half applied are no sequence"
 
 
-def test_notes_can_be_changed_and_the_engine_reads_it(tmp_path: Path) -> None:
-    from core.look.look import annotated
+def test_annotated_flares_are_read_by_both_readers(tmp_path: Path) -> None:
+    from core.look.look import write_annotated
 
     saved(tmp_path / "a.flare")
-    annotated(tmp_path / "a.flare", tmp_path / "b.flare", notes="Zeiss, wide open: ö", licence="CC BY 4.0")
+    write_annotated(tmp_path / "a.flare", tmp_path / "b.flare", notes="Zeiss, wide open: ö", licence="CC BY 4.0")
     look, engine = read(tmp_path / "b.flare"), flare_file.load(tmp_path / "b.flare")
     assert (look.notes, look.licence) == (engine.notes, engine.licence) == ("Zeiss, wide open: ö", "CC BY 4.0")
     view = cameras(3)[0].world_to_camera
@@ -590,10 +592,10 @@ def test_notes_can_be_changed_and_the_engine_reads_it(tmp_path: Path) -> None:
     np.testing.assert_array_equal(before["lamp 1"].means, after_["lamp 1"].means)
 
 
-def test_a_shot_with_an_edit_of_no_sense_leaves_what_was_baked_before(tmp_path: Path) -> None:
+def test_a_shot_with_an_invalid_edit_leaves_earlier_layers(tmp_path: Path) -> None:
     from core.bake.shot import bake_shot
 
-    bake_shot(a_shot(tmp_path), tmp_path / "layers", wanted={1, 2})
+    bake_shot(a_shot(tmp_path), tmp_path / "layers", frame_numbers={1, 2})
     before = {path.name: path.read_bytes() for path in (tmp_path / "layers").iterdir()}
     shot = a_shot(tmp_path, "second.intensity=2")
     *good, last = shot.frames
@@ -604,8 +606,8 @@ def test_a_shot_with_an_edit_of_no_sense_leaves_what_was_baked_before(tmp_path: 
 
 
 @pytest.mark.parametrize("blend", ["add", "over"])
-def test_the_light_of_a_shot_s_layers_follows_its_intensity(blend: str, tmp_path: Path) -> None:
-    """As that of a run's: an exact factor, whatever the blend."""
+def test_the_layers_of_a_shot_scale_with_intensity(blend: str, tmp_path: Path) -> None:
+    """Intensity is an exact factor for any blend, as in the layers of a run."""
     from core.bake.exr import read_layers
     from core.bake.shot import bake_shot
 
@@ -625,22 +627,22 @@ def test_the_light_of_a_shot_s_layers_follows_its_intensity(blend: str, tmp_path
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # of Rec. 709
 
 
-def test_colour_is_taken_away_before_the_tint_gives_one() -> None:
+def test_saturation_is_applied_before_the_tint() -> None:
     words = ["lamp.tint=1,0.5,0.25", "lamp.saturation=0", "lamp.intensity=2"]
     matrix = LookEdits.parse(words, ["lamp"]).matrices(["lamp"])["lamp"]
     np.testing.assert_allclose(matrix @ (0.2, 0.6, 1.0), 2 * (LUMINANCE @ (0.2, 0.6, 1.0)) * np.array([1, 0.5, 0.25]),
                                rtol=1e-6)
 
 
-def test_covering_flares_lose_their_colour_in_light() -> None:
+def test_over_flares_are_desaturated_in_linear_light() -> None:
     gaussians, elements = ghosts()
     gaussians = replace(gaussians, colours=np.array([[1, 0.2, 0], [0.1, 0.9, 0.3], [0, 0, 1]], np.float32))
     grey = srgb_from_linear(linear_from_srgb(gaussians.colours) @ LUMINANCE)
-    shown = edited(gaussians, "lamp", LIGHT, elements, LookEdits.parse(["lamp.saturation=0"], ["lamp"]), "over")
+    shown = apply_edits(gaussians, "lamp", LIGHT, elements, LookEdits.parse(["lamp.saturation=0"], ["lamp"]), "over")
     np.testing.assert_allclose(shown.colours, np.repeat(grey[:, None], 3, 1), atol=1e-5)
 
 
-def test_a_bake_of_a_shot_goes_by_its_query_and_its_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_shot_bake_uses_its_query_and_its_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     one = a_shot(tmp_path)
     prints = {shot_bakes.ShotRenderer(one).fingerprint,
               shot_bakes.ShotRenderer(replace(one, query="trained")).fingerprint}
@@ -651,10 +653,10 @@ def test_a_bake_of_a_shot_goes_by_its_query_and_its_run(tmp_path: Path, monkeypa
     assert len(prints) == 4
 
 
-def test_the_source_s_view_lies_within_what_was_trained(tmp_path: Path) -> None:
+def test_the_source_query_lies_within_the_trained_range(tmp_path: Path) -> None:
     saved(tmp_path / "a.flare", lights=1)
     light = read(tmp_path / "a.flare").lights[0]
     far = ViewOfLight(np.zeros(3, np.float32), np.eye(3, dtype=np.float32), np.array([3, 4], np.float32), 1.0)
-    found, reach = asked(light, far, "source").light, light.query_range.light_high
+    found, reach = network_query(light, far, "source").light, light.query_range.light_high
     assert np.linalg.norm(found) <= reach[2] + 1e-5
     assert (np.abs(found) <= reach[:2] + 1e-5).all()

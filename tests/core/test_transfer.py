@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A flare on other frames: where it stands, what it shows, when it is not there, and what it leaves alone."""
+"""Transfer of a flare: placement, queries, visibility, plates and layers."""
 from __future__ import annotations
 
 import os
@@ -13,7 +13,7 @@ import OpenEXR
 import pytest
 import torch
 
-from core.bake.bake import RECORD, BakeSettings, read_record
+from core.bake.bake import MANIFEST, BakeSettings, read_manifest
 from core.bake.exr import read_layers
 from core.capture import Camera, Capture
 from core.colour import colour_space
@@ -23,16 +23,24 @@ from core.flare import file as flare_file
 from core.flare.file import FlareFile
 from core.gaussians import SceneGaussians
 from core.gaussians.ply import write_ply
-from core.images.exr import read_exr, window_of
+from core.images.exr import read_data_window, read_exr
 from core.images.plates import Plate
 from core.images.write import write_exr, write_png
-from core.look import KeyedEdits, Look, TrainedCamera, ViewOfLight, read
-from core.look.shot import PlacedLight, Shot, ShotFrame
+from core.look import KeyedEdits, Look, PlacedLight, TrainedCamera, ViewOfLight, read
+from core.look.shot import Shot, ShotFrame
 from core.system.files import write_json
 from core.transfer import query as queries
 from core.transfer.plates import ColouredPlate
-from core.transfer.sources import assigned, parsed
-from core.transfer.target import Target, _most_alike, background, of_capture, of_pictures, of_shot, sized
+from core.transfer.sources import assign_sources, parse_assignments
+from core.transfer.target import (
+    Target,
+    _most_similar_sources,
+    background,
+    capture_target,
+    picture_target,
+    resized,
+    shot_target,
+)
 from core.transfer.transfer import Transfer, TransferSettings
 from tests.core.captures import make_capture
 from tests.core.flared import cameras
@@ -54,7 +62,7 @@ def flare(tmp_path_factory: pytest.TempPathFactory) -> Path:
             layer.bias *= 0.02
     poses = [torch.from_numpy(camera.world_to_camera) for camera in cameras(6)]
     flare_file.save(path, FlareFile(model, "add", TrainedCamera(64, 40, 70.0, 70.0, 33.0, 19.5),
-                                    seen=model.seen_from(poses)))
+                                    training_views=model.training_views(poses)))
     return path
 
 
@@ -76,17 +84,17 @@ def shot(flare: Path, look: Look, views: list[Camera], xyz: Any = None, shares: 
 
 def light_of(transfer: Transfer, index: int = 0) -> np.ndarray[Any, Any]:
     one = transfer.target.frames[index]
-    return sum(transfer.of_frame(one.frame).render(one.shot.camera).flare_by_light.values())  # type: ignore[return-value]
+    return sum(transfer.frame_renderer(one.frame).render(one.shot.camera).flare_by_light.values())  # type: ignore[return-value]
 
 
 # ---- placement ------------------------------------------------------------------------------------
 
 
-def test_it_follows_focal_length_aspect_principal_point_and_resolution(flare: Path, look: Look) -> None:
-    """The same pose through another camera: every Gaussian at the same place of the normalised plane."""
+def test_a_transfer_follows_the_target_camera(flare: Path, look: Look) -> None:
+    """Another camera with the same pose: every Gaussian has the same position on the normalised plane."""
     camera = cameras(3)[1]
     other = Camera(150, 60, 120.0, 110.0, 80.0, 25.0, camera.world_to_camera)
-    transfer = Transfer(flare, of_shot(shot(flare, look, [camera, other]), look, {}))
+    transfer = Transfer(flare, shot_target(shot(flare, look, [camera, other]), look, {}))
     first, second = light_of(transfer, 0), light_of(transfer, 1)
     assert first.max() > 0.02
 
@@ -100,53 +108,53 @@ def test_it_follows_focal_length_aspect_principal_point_and_resolution(flare: Pa
     np.testing.assert_allclose(centre(first, camera), centre(second, other), atol=0.02)
 
 
-def test_on_to_a_picture_the_flare_goes_to_the_light(look: Look, tmp_path: Path) -> None:
+def test_the_flare_of_a_picture_lies_at_its_light(look: Look, tmp_path: Path) -> None:
     write_png(tmp_path / "plate.0007.png", np.full((80, 120, 3), 0.2))
-    there = of_pictures([tmp_path / "plate.0007.png"], look, {"sun": (90.0, 20.0)}, {}, {name(look): 4.0}, focal=131.25,
-                        centre=(60.0, 40.0))
+    there = picture_target([tmp_path / "plate.0007.png"], look, {"sun": (90.0, 20.0)}, {}, {name(look): 4.0},
+                           focal=131.25, centre=(60.0, 40.0))
     one = there.frames[0]
     assert (one.frame.number, one.frame.file) == (7, "layers.0007.exr")
     pixels, depth = one.shot.camera.project(one.shot.lights[0].xyz)
     np.testing.assert_allclose(pixels[0], (90.0, 20.0), atol=1e-9)
     assert depth[0] > 0
     assert np.linalg.norm(one.shot.lights[0].xyz) == pytest.approx(4.0)
-    twice = of_pictures(2 * [tmp_path / "plate.0007.png"], look, {"sun": (90.0, 20.0)}, {}, {name(look): 4.0})
+    twice = picture_target(2 * [tmp_path / "plate.0007.png"], look, {"sun": (90.0, 20.0)}, {}, {name(look): 4.0})
     assert len(twice.frames) == 1
     with pytest.raises(SettingsError, match="No light was found"):
-        of_pictures([tmp_path / "plate.0007.png"], look, {}, {}, {name(look): 4.0})
+        picture_target([tmp_path / "plate.0007.png"], look, {}, {}, {name(look): 4.0})
 
 
 @pytest.mark.parametrize(("size", "expected"), [((96, 54), 70 * 96 / 64), ((54, 96), 70 * 96 / 64),
                                                 ((128, 32), 140.0), ((60, 60), 70 * 60 / 64)])
-def test_an_upright_picture_is_of_a_camera_that_was_turned(look: Look, tmp_path: Path, size: tuple[int, int],
+def test_a_portrait_picture_has_the_turned_field_of_view(look: Look, tmp_path: Path, size: tuple[int, int],
                                                            expected: float) -> None:
     """Its focal length is that of the picture that lies, not that of its narrow side."""
     write_png(tmp_path / "a.png", np.full((size[1], size[0], 3), 0.2))
-    found = of_pictures([tmp_path / "a.png"], look, {"sun": (20.0, 12.0)}, {}, {name(look): 4.0})
+    found = picture_target([tmp_path / "a.png"], look, {"sun": (20.0, 12.0)}, {}, {name(look): 4.0})
     assert look.camera.width == 64 and look.camera.fx == 70
     assert found.frames[0].shot.camera.fx == pytest.approx(expected)
 
 
-def test_lights_that_were_found_show_what_stood_most_like_them() -> None:
+def test_detected_lights_show_the_most_similar_source() -> None:
     """Each source once where there are enough; nearest pairs first."""
-    def at(*places: tuple[float, float]) -> queries.Seen:
-        return queries.Seen(np.zeros((len(places), 3)), np.array(places), np.ones(len(places)))
+    def at(*places: tuple[float, float]) -> queries.TrainingViews:
+        return queries.TrainingViews(np.zeros((len(places), 3)), np.array(places), np.ones(len(places)))
 
     seen = {"left": at((-0.3, 0), (-0.2, 0)), "right": at((0.2, 0.1))}
-    assert _most_alike({"a": (0.1, 0), "b": (-0.2, 0.1)}, seen) == {"a": "right", "b": "left"}
-    assert _most_alike({"a": (0.3, 0), "b": (0.2, 0)}, seen) == {"b": "right", "a": "left"}
-    three = _most_alike({"a": (0.3, 0), "b": (0.2, 0), "c": (0.25, 0)}, seen)
+    assert _most_similar_sources({"a": (0.1, 0), "b": (-0.2, 0.1)}, seen) == {"a": "right", "b": "left"}
+    assert _most_similar_sources({"a": (0.3, 0), "b": (0.2, 0)}, seen) == {"b": "right", "a": "left"}
+    three = _most_similar_sources({"a": (0.3, 0), "b": (0.2, 0), "c": (0.25, 0)}, seen)
     assert three == {"b": "right", "c": "left", "a": "right"}
-    assert _most_alike({"a": (0.3, 0)}, {}) == {}
+    assert _most_similar_sources({"a": (0.3, 0)}, {}) == {}
 
 
 # ---- visibility -----------------------------------------------------------------------------------
 
 
-def test_hidden_lights_and_lights_behind_give_none(flare: Path, look: Look) -> None:
+def test_hidden_lights_and_lights_behind_the_camera_have_no_flare(flare: Path, look: Look) -> None:
     camera = cameras(3)[1]
     turned = replace(camera, world_to_camera=np.diag([-1.0, 1.0, -1.0, 1.0]) @ camera.world_to_camera)
-    transfer = Transfer(flare, of_shot(shot(flare, look, [camera, camera, turned], shares=[1, 0, 1]), look, {}),
+    transfer = Transfer(flare, shot_target(shot(flare, look, [camera, camera, turned], shares=[1, 0, 1]), look, {}),
                         TransferSettings(smooth=0))
     assert light_of(transfer, 0).max() > 0
     assert not light_of(transfer, 1).any()
@@ -159,30 +167,30 @@ def slow(count: int) -> list[Camera]:
         [[1, 0, 0, 0.01 * step], [0, 1, 0, 0], [0, 0, 1, 4], [0, 0, 0, 1.0]])) for step in range(count)]
 
 
-def test_visibility_is_a_ramp_that_reaches_nothing_where_it_is_hidden(flare: Path, look: Look) -> None:
+def test_visibility_ramps_to_zero_at_hidden_frames(flare: Path, look: Look) -> None:
     shares = [1.0] * 6 + [0.0] * 3 + [1.0] * 6
-    there = of_shot(shot(flare, look, slow(15), shares=shares), look, {})
+    there = shot_target(shot(flare, look, slow(15), shares=shares), look, {})
     transfer = Transfer(flare, there, TransferSettings(smooth=2))
-    smooth = [transfer.share(index, "lamp") for index in range(15)]
+    smooth = [transfer.visibility(index, "lamp") for index in range(15)]
     assert smooth[0] == smooth[-1] == 1
     assert smooth[6:9] == [0, 0, 0]
     assert max(abs(np.diff(smooth))) < 0.5
     assert all(value <= share for value, share in zip(smooth, shares, strict=True))
 
 
-def test_stills_are_not_mixed(flare: Path, look: Look) -> None:
+def test_visibility_is_not_smoothed_across_stills(flare: Path, look: Look) -> None:
     """Frames far apart, or with a number left out, are no path."""
-    stills = of_shot(shot(flare, look, cameras(3), shares=[1, 0, 1]), look, {})
+    stills = shot_target(shot(flare, look, cameras(3), shares=[1, 0, 1]), look, {})
     far = Transfer(flare, stills, TransferSettings(smooth=2))
-    assert [far.share(index, "lamp") for index in range(3)] == [1, 0, 1]
+    assert [far.visibility(index, "lamp") for index in range(3)] == [1, 0, 1]
     whole = shot(flare, look, slow(3), shares=[1, 0, 1])
     gaps = replace(whole, frames=tuple(replace(one, frame=2 * one.frame) for one in whole.frames))
-    gapped = Transfer(flare, of_shot(gaps, look, {}), TransferSettings(smooth=2))
-    assert [gapped.share(index, "lamp") for index in range(3)] == [1, 0, 1]
+    gapped = Transfer(flare, shot_target(gaps, look, {}), TransferSettings(smooth=2))
+    assert [gapped.visibility(index, "lamp") for index in range(3)] == [1, 0, 1]
 
 
-def test_splats_that_a_flare_was_learned_in_hide_as_little_as_then(flare: Path, tmp_path: Path) -> None:
-    """Of splats that leave a third of a light where nothing hides it, a third is all of it."""
+def test_the_scene_of_the_fit_hides_lights_as_in_the_fit(flare: Path, tmp_path: Path) -> None:
+    """If splats leave a third of an unoccluded light, a third counts as full visibility."""
     flare_file.save(tmp_path / "veiled.flare", replace(flare_file.load(flare), model=veiled(flare, 1 / 3)))
     look, camera = read(tmp_path / "veiled.flare"), cameras(3)[1]
     middle = camera.position + 0.5 * (look.lights[0].xyz - camera.position)
@@ -192,8 +200,8 @@ def test_splats_that_a_flare_was_learned_in_hide_as_little_as_then(flare: Path, 
     settings = TransferSettings(smooth=0)
 
     def share(xyz: Any) -> float:
-        there = of_shot(shot(flare, look, [camera], xyz=xyz), look, {}, scene=tmp_path / "haze.ply")
-        return Transfer(tmp_path / "veiled.flare", there, settings).share(0, "lamp")
+        there = shot_target(shot(flare, look, [camera], xyz=xyz), look, {}, scene=tmp_path / "haze.ply")
+        return Transfer(tmp_path / "veiled.flare", there, settings).visibility(0, "lamp")
 
     assert share(look.lights[0].xyz) == pytest.approx(1, abs=0.03)
     assert share(look.lights[0].xyz + 1e-3) == pytest.approx(1 / 3, abs=0.03), "a world of its own"
@@ -205,7 +213,7 @@ def veiled(flare: Path, clear: float) -> Any:
     return model
 
 
-def test_the_target_s_splats_hide_its_lights(flare: Path, look: Look, tmp_path: Path) -> None:
+def test_the_scene_of_the_target_hides_its_lights(flare: Path, look: Look, tmp_path: Path) -> None:
     """A wall between camera and light, in one of two views."""
     camera = cameras(3)[1]
     away = replace(camera, world_to_camera=np.array([[1, 0, 0, -3.0], [0, 1, 0, 0], [0, 0, 1, 4], [0, 0, 0, 1.0]]))
@@ -213,12 +221,12 @@ def test_the_target_s_splats_hide_its_lights(flare: Path, look: Look, tmp_path: 
     wall = SceneGaussians(torch.tensor(middle[None], dtype=torch.float32), torch.full((1, 3), -1.5),
                           torch.tensor([[1.0, 0, 0, 0]]), torch.tensor([9.0]), torch.zeros(1, 16, 3))
     write_ply(tmp_path / "wall.ply", wall)
-    there = of_shot(shot(flare, look, [camera, away]), look, {}, scene=tmp_path / "wall.ply")
+    there = shot_target(shot(flare, look, [camera, away]), look, {}, scene=tmp_path / "wall.ply")
     transfer = Transfer(flare, there, TransferSettings(smooth=0))
-    assert transfer.share(0, "lamp") == 0, "splats are never quite opaque, but hide all the same"
-    assert transfer.share(1, "lamp") == 1
+    assert transfer.visibility(0, "lamp") == 0, "splats are never quite opaque, but hide all the same"
+    assert transfer.visibility(1, "lamp") == 1
     shown = Transfer(flare, replace(there, shown=True), TransferSettings(smooth=0))
-    rendering = shown.of_frame(there.frames[0].frame).render(camera)
+    rendering = shown.frame_renderer(there.frames[0].frame).render(camera)
     assert rendering.scene.max() > 0.1
     assert rendering.depth.max() > 1
     assert there.scene is not None
@@ -226,16 +234,18 @@ def test_the_target_s_splats_hide_its_lights(flare: Path, look: Look, tmp_path: 
         there.scene.sh[:, 0] = (3.0 - 0.5) / 0.28209479  # a display value
     for white, brightest in ((1.0, 1.0), (5.9, 12.5)):  # of a wall that is not quite opaque
         there.scene.display_white = white
-        assert shown.of_frame(there.frames[0].frame).render(camera).scene.max() == pytest.approx(brightest, rel=0.05)
+        scene = shown.frame_renderer(there.frames[0].frame).render(camera).scene
+        assert scene.max() == pytest.approx(brightest, rel=0.05)
 
 
-def test_far_outside_of_what_was_trained_it_fades(look: Look) -> None:
+def test_the_flare_fades_far_outside_the_trained_range(look: Look) -> None:
     light = look.lights[0]
     reach = float(light.query_range.light_high[2])
 
     def at(distance: float) -> float:
         place = np.array([distance, 0.0], np.float32)
-        return queries.fade(light, ViewOfLight(np.zeros(3, np.float32), np.eye(3, dtype=np.float32), place, 1.0))
+        view = ViewOfLight(np.zeros(3, np.float32), np.eye(3, dtype=np.float32), place, 1.0)
+        return queries.extrapolation_fade(light, view)
 
     assert at(0.9 * reach) == 1
     assert at(2.1 * reach) == 0
@@ -245,10 +255,10 @@ def test_far_outside_of_what_was_trained_it_fades(look: Look) -> None:
 # ---- appearance -----------------------------------------------------------------------------------
 
 
-def test_in_its_own_world_target_and_blend_are_the_flare_itself(flare: Path, look: Look) -> None:
+def test_target_and_blend_equal_the_flare_in_its_own_world(flare: Path, look: Look) -> None:
     camera = cameras(6)[2]
     expected = look.evaluate(camera.world_to_camera)[name(look)]
-    seen = queries.seen_by(flare, look.lights)
+    seen = queries.training_views(flare, look.lights)
     view = ViewOfLight.of(camera.world_to_camera, look.lights[0].xyz)
     for query in ("target", "blend"):
         found = queries.evaluate(look.lights[0], view, look.lights[0].xyz, query, seen[name(look)])  # type: ignore[arg-type]
@@ -257,15 +267,15 @@ def test_in_its_own_world_target_and_blend_are_the_flare_itself(flare: Path, loo
         np.testing.assert_allclose(found.colours, expected.colours, atol=1e-6)
 
 
-def test_elsewhere_blend_is_a_mix_of_what_was_trained_and_changes_smoothly(flare: Path, look: Look) -> None:
-    light, seen = look.lights[0], queries.seen_by(flare, look.lights)[name(look)]
+def test_blend_averages_training_views_and_changes_smoothly(flare: Path, look: Look) -> None:
+    light, seen = look.lights[0], queries.training_views(flare, look.lights)[name(look)]
     assert len(seen.cameras) == 6
     xyz = light.xyz + np.array([100.0, 0, 0])
     means = []
     for step in np.linspace(0, 1, 60):
         view = ViewOfLight(np.float32([100 + 1.2 * (2 * step - 1), 0, -4]), np.eye(3, dtype=np.float32),
                            np.float32([0.05 + 0.1 * step, -0.1]), 5.0)
-        asked = queries._asked(light, view, xyz, "blend", seen, 1.0, None)
+        asked = queries._weighted_queries(light, view, xyz, "blend", seen, 1.0, None)
         assert sum(weight for weight, _ in asked) == pytest.approx(1)
         assert all(any(np.allclose(one.camera, known, atol=1e-4) for known in seen.cameras) for _, one in asked)
         found = queries.evaluate(light, view, xyz, "blend", seen)
@@ -276,16 +286,16 @@ def test_elsewhere_blend_is_a_mix_of_what_was_trained_and_changes_smoothly(flare
 
 
 @pytest.mark.parametrize("query", ["target", "blend"])
-def test_a_light_found_a_little_beside_its_place_is_in_its_own_world_still(query: Any, flare: Path,
+def test_a_slightly_displaced_light_is_in_the_same_world(query: Any, flare: Path,
                                                                            look: Look) -> None:
     """Lights are found to a hundredth of their distance or so: the camera is where it is, and nothing is mixed."""
-    light, seen, camera = look.lights[0], queries.seen_by(flare, look.lights)[name(look)], cameras(6)[2]
+    light, seen, camera = look.lights[0], queries.training_views(flare, look.lights)[name(look)], cameras(6)[2]
     aside = np.array([0.0, np.linalg.norm(camera.position - light.xyz), 0.0])
 
     def asked(share: float) -> list[ViewOfLight]:
         xyz = light.xyz + share * aside
         view = ViewOfLight.of(camera.world_to_camera, xyz)
-        return [one for _, one in queries._asked(light, view, xyz, query, seen, 1.0, None)]
+        return [one for _, one in queries._weighted_queries(light, view, xyz, query, seen, 1.0, None)]
 
     for share in (0.0, 0.01):
         assert len(asked(share)) == 1
@@ -293,44 +303,45 @@ def test_a_light_found_a_little_beside_its_place_is_in_its_own_world_still(query
     assert np.linalg.norm(asked(0.05)[0].camera - camera.position) > 0.1, "elsewhere it is another world"
 
 
-def test_views_are_alike_by_the_light_s_place_and_by_its_distance() -> None:
+def test_dissimilarity_grows_with_position_and_distance() -> None:
     """Half the plane aside is less alike than twice as far, and that less than a tenth of the plane aside."""
     def likest(aside: float, times: float) -> str:
-        seen = queries.Seen(np.zeros((2, 3)), np.array([[0.1 + aside, 0.0], [0.1, 0.0]]), np.array([4.0, 4.0 * times]))
-        return ("aside", "farther")[int(seen.unlikeness((0.1, 0.0), 4.0).argmin())]
+        lights = np.array([[0.1 + aside, 0.0], [0.1, 0.0]])
+        seen = queries.TrainingViews(np.zeros((2, 3)), lights, np.array([4.0, 4.0 * times]))
+        return ("aside", "farther")[int(seen.dissimilarity((0.1, 0.0), 4.0).argmin())]
 
     assert likest(0.5, 2.0) == "farther"
     assert likest(0.1, 2.0) == "aside"
 
 
-def test_source_asks_for_one_view_throughout(flare: Path, look: Look) -> None:
+def test_source_queries_one_view_for_the_whole_shot(flare: Path, look: Look) -> None:
     views = cameras(5)
-    transfer = Transfer(flare, of_shot(shot(flare, look, views), look, {}), TransferSettings(query="source"))
+    transfer = Transfer(flare, shot_target(shot(flare, look, views), look, {}), TransferSettings(query="source"))
     fixed = transfer._fixed["lamp"]
-    assert any(np.allclose(fixed.camera, known, atol=1e-4) for known in transfer.seen[name(look)].cameras)
-    asked = [queries._asked(look.lights[0], ViewOfLight.of(view.world_to_camera, look.lights[0].xyz),
+    assert any(np.allclose(fixed.camera, known, atol=1e-4) for known in transfer.training_views[name(look)].cameras)
+    asked = [queries._weighted_queries(look.lights[0], ViewOfLight.of(view.world_to_camera, look.lights[0].xyz),
                             look.lights[0].xyz, "source", None, 1.0, fixed) for view in views]
     assert all(one == [(1.0, fixed)] for one in asked)
 
 
-def test_lights_find_their_sources() -> None:
-    assert assigned(["lamp", "sun", "moon"], ["lamp", "neon"]) == {"lamp": "lamp", "sun": "lamp", "moon": "neon"}
-    assert assigned(["sun"], ["lamp", "neon"], parsed(["sun=neon"])) == {"sun": "neon"}
+def test_sources_are_assigned_by_request_name_and_turn() -> None:
+    assert assign_sources(["lamp", "sun", "moon"], ["lamp", "neon"]) == {"lamp": "lamp", "sun": "lamp", "moon": "neon"}
+    assert assign_sources(["sun"], ["lamp", "neon"], parse_assignments(["sun=neon"])) == {"sun": "neon"}
     with pytest.raises(SettingsError, match="no light 'moon'"):
-        assigned(["sun"], ["lamp"], {"moon": "lamp"})
+        assign_sources(["sun"], ["lamp"], {"moon": "lamp"})
     with pytest.raises(SettingsError, match="not of the form"):
-        parsed(["sun"])
+        parse_assignments(["sun"])
 
 
 # ---- plates ---------------------------------------------------------------------------------------
 
 
 def plate_target(path: Path, look: Look) -> Target:
-    return of_pictures([path], look, {"sun": (20.0, 12.0)}, {}, {name(look): 4.0})
+    return picture_target([path], look, {"sun": (20.0, 12.0)}, {}, {name(look): 4.0})
 
 
 @pytest.mark.parametrize("half", [True, False])
-def test_an_acescg_plate_keeps_its_values_outside_the_flare(flare: Path, look: Look, tmp_path: Path,
+def test_an_acescg_plate_is_unchanged_outside_the_flare(flare: Path, look: Look, tmp_path: Path,
                                                             half: bool) -> None:
     random = np.random.default_rng(3)
     values = (random.standard_normal((90, 160, 3)) * 3).astype(np.float16 if half else np.float32)  # below 0, above 1
@@ -354,7 +365,7 @@ def test_an_acescg_plate_keeps_its_values_outside_the_flare(flare: Path, look: L
         with OpenEXR.File(str(path), header_only=True) as file:
             assert file.parts[0].header["chromaticities"] == pytest.approx(aces.chromaticities, abs=1e-6)
     # The flare is the same light, in the plate's primaries.
-    plain = sum(transfer.of_frame(transfer.target.frames[0].frame).render(
+    plain = sum(transfer.frame_renderer(transfer.target.frames[0].frame).render(
         transfer.target.frames[0].shot.camera).flare_by_light.values())
     np.testing.assert_allclose(aces.to_linear(light), plain, atol=0.01 * plain.max())
 
@@ -390,12 +401,12 @@ def plate_exr(path: Path, size: tuple[int, int], origin: tuple[int, int], frame:
 
 def lies_at(path: Path) -> tuple[tuple[int, int], ...]:
     """Size, origin and frame of an EXR's pixels; how wide one is the camera says, and the plate for itself."""
-    window = window_of(path)
+    window = read_data_window(path)
     return window.size, window.origin, window.frame
 
 
 @pytest.mark.parametrize(("size", "origin"), [((120, 80), (-10, -10)), ((100, 30), (0, 20)), ((60, 40), (13, 5))])
-def test_the_flare_lies_on_the_frame_whatever_of_it_is_stored(flare: Path, look: Look, tmp_path: Path,
+def test_the_flare_lies_on_the_frame_for_any_data_window(flare: Path, look: Look, tmp_path: Path,
                                                               size: tuple[int, int], origin: tuple[int, int]) -> None:
     """Overscan, and frames of which a part was left out: to the camera of a picture, and of a shot."""
     whole = plate_exr(tmp_path / "whole.0001.exr", (100, 60), (0, 0), (100, 60))
@@ -404,7 +415,8 @@ def test_the_flare_lies_on_the_frame_whatever_of_it_is_stored(flare: Path, look:
     expected = light_of(Transfer(flare, plate_target(whole, look)))
     camera = plate_target(whole, look).frames[0].shot.camera
     light = plate_target(whole, look).frames[0].shot.lights[0]
-    by_shot = of_shot(Shot(flare, (ShotFrame(1, "Camera", camera, (light,)),)), look, {}, plates=tmp_path / "plates")
+    one = Shot(flare, (ShotFrame(1, "Camera", camera, (light,)),))
+    by_shot = shot_target(one, look, {}, plates=tmp_path / "plates")
     (x, y), (width, height) = origin, size
     left, top, right, bottom = max(x, 0), max(y, 0), min(x + width, 100), min(y + height, 60)
     for target in (plate_target(plate, look), by_shot):
@@ -420,35 +432,35 @@ def test_the_flare_lies_on_the_frame_whatever_of_it_is_stored(flare: Path, look:
     layers = by_shot.frames[0].frame.file
     assert lies_at(tmp_path / "out" / layers) == lies_at(plate) == (size, origin, (100, 60))
     np.testing.assert_allclose(read_exr(tmp_path / "out" / layers)["flare.R"], found[..., 0], atol=1e-5)
-    Transfer(flare, sized(by_shot, 50, 30)).bake(tmp_path / "small")
+    Transfer(flare, resized(by_shot, 50, 30)).bake(tmp_path / "small")
     assert lies_at(tmp_path / "small" / layers) == ((50, 30), (0, 0), (50, 30))
 
 
-def test_a_plate_of_another_frame_with_overscan_is_refused(flare: Path, look: Look, tmp_path: Path) -> None:
+def test_an_overscan_plate_of_another_frame_size_raises(flare: Path, look: Look, tmp_path: Path) -> None:
     plate_exr(tmp_path / "plate.0002.exr", (120, 80), (-10, -10), (100, 60))
     with pytest.raises(SettingsError, match="not the camera's 64 x 40"):
-        of_shot(shot(flare, look, [replace(cameras(3)[1], width=64, height=40)] * 2), look, {},
+        shot_target(shot(flare, look, [replace(cameras(3)[1], width=64, height=40)] * 2), look, {},
                 plates=plate_exr(tmp_path / "plate.0001.exr", (120, 80), (-10, -10), (100, 60)).parent)
 
 
-def test_plates_may_be_of_another_size_than_the_shot_but_not_of_another_shape(flare: Path, look: Look,
+def test_plates_may_differ_from_the_shot_in_size_and_not_in_aspect(flare: Path, look: Look,
                                                                               tmp_path: Path) -> None:
     one, plate = shot(flare, look, [cameras(3)[1]]), tmp_path / "plate.0001.png"
     write_png(plate, np.full((80, 128, 3), 0.2))
-    assert of_shot(one, look, {}, plates=tmp_path).frames[0].plate == plate
+    assert shot_target(one, look, {}, plates=tmp_path).frames[0].plate == plate
     write_png(plate, np.full((60, 60, 3), 0.2))
     with pytest.raises(SettingsError, match="60 x 60 pixels and the shot 64 x 40, which is another shape"):
-        of_shot(one, look, {}, plates=tmp_path)
+        shot_target(one, look, {}, plates=tmp_path)
 
 
-def test_wide_pixels_are_not_stretched_twice(look: Look, tmp_path: Path) -> None:
+def test_anamorphic_pixels_are_not_stretched_twice(look: Look, tmp_path: Path) -> None:
     """An anamorphic plate: squeezed as it is stored, round as it is shown."""
     squeezed = plate_target(plate_exr(tmp_path / "plate.exr", (100, 120), (0, 0), (100, 120), aspect=2.0), look)
     camera = squeezed.frames[0].shot.camera
     assert camera.fy == pytest.approx(2 * camera.fx)
 
 
-def test_no_plate_is_written_over_and_none_is_lost(flare: Path, look: Look, tmp_path: Path) -> None:
+def test_no_plate_is_overwritten(flare: Path, look: Look, tmp_path: Path) -> None:
     plates = [tmp_path / side / "frames" / "plate.png" for side in ("left", "right")]
     for path in plates:
         write_png(path, np.full((40, 60, 3), 0.2))
@@ -456,7 +468,7 @@ def test_no_plate_is_written_over_and_none_is_lost(flare: Path, look: Look, tmp_
     with pytest.raises(SettingsError, match="would be overwritten"):
         transfer.bake(tmp_path / "left")
     with pytest.raises(SettingsError, match="have one name"):
-        of_pictures(plates, look, {"sun": (20.0, 12.0)}, {}, {name(look): 4.0})
+        picture_target(plates, look, {"sun": (20.0, 12.0)}, {}, {name(look): 4.0})
     transfer.bake(tmp_path / "out")
     flared = (tmp_path / "out" / "frames" / "plate.png").read_bytes()
     (tmp_path / "out" / "frames" / "plate.png").unlink()
@@ -464,7 +476,7 @@ def test_no_plate_is_written_over_and_none_is_lost(flare: Path, look: Look, tmp_
     assert (tmp_path / "out" / "frames" / "plate.png").read_bytes() == flared
 
 
-def test_a_plate_whose_name_is_not_utf_8_is_made_and_known_again(flare: Path, look: Look, tmp_path: Path) -> None:
+def test_a_plate_with_a_name_that_is_not_utf_8_is_written_and_kept(flare: Path, look: Look, tmp_path: Path) -> None:
     plate = tmp_path / os.fsdecode(b"pl\xe9_0001.png")
     try:
         write_png(plate, np.full((40, 60, 3), 0.2))
@@ -473,7 +485,7 @@ def test_a_plate_whose_name_is_not_utf_8_is_made_and_known_again(flare: Path, lo
     transfer = Transfer(flare, plate_target(plate, look))
     record = transfer.bake(tmp_path / "out")
     flared = tmp_path / "out" / "frames" / plate.name
-    assert record["frames"][0]["rest"] == [f"frames/{plate.name}"] and read_record(tmp_path / "out") == record
+    assert record["frames"][0]["rest"] == [f"frames/{plate.name}"] and read_manifest(tmp_path / "out") == record
     made = flared.stat().st_mtime_ns
     assert transfer.bake(tmp_path / "out") == record and flared.stat().st_mtime_ns == made
     transfer.bake(tmp_path / "out", settings=BakeSettings(edits=("*.intensity=3",)), overwrite=True)
@@ -481,14 +493,14 @@ def test_a_plate_whose_name_is_not_utf_8_is_made_and_known_again(flare: Path, lo
 
 
 @pytest.mark.parametrize("overwrite", [False, True])
-def test_layers_do_not_lie_among_plates(flare: Path, look: Look, tmp_path: Path, overwrite: bool) -> None:
+def test_layers_in_the_plates_folder_raise(flare: Path, look: Look, tmp_path: Path, overwrite: bool) -> None:
     """They would be written over, or be plates themselves the next time."""
     for kind in ("exr", "png"):
         plate = tmp_path / kind / ("layers.0001.exr" if kind == "exr" else "shot.0001.png")
         plate.parent.mkdir()
         if kind == "exr":
             write_exr(plate, dict.fromkeys("RGB", np.full((40, 60), 0.2)))
-            write_json(plate.parent / RECORD, {"version": 1, "made_from": {}, "layers": {}, "frames": [
+            write_json(plate.parent / MANIFEST, {"version": 1, "made_from": {}, "layers": {}, "frames": [
                 {"file": plate.name, "frame": 1, "width": 60, "height": 40}]})
         else:
             write_png(plate, np.full((40, 60, 3), 0.2))
@@ -498,10 +510,10 @@ def test_layers_do_not_lie_among_plates(flare: Path, look: Look, tmp_path: Path,
         assert {path.name: path.read_bytes() for path in plate.parent.iterdir()} == before
 
 
-def test_what_is_made_again_leaves_no_frames_of_before(flare: Path, look: Look, tmp_path: Path) -> None:
+def test_an_overwriting_transfer_leaves_no_earlier_frames(flare: Path, look: Look, tmp_path: Path) -> None:
     folder = make_capture(tmp_path / "capture", views=3)
     (folder / "lights.json").write_text('{"lights": [{"name": "sun", "xyz": [0.2, -0.3, 0.5]}]}')
-    target = of_capture(Capture.open(folder), look, {})
+    target = capture_target(Capture.open(folder), look, {})
     Transfer(flare, target).bake(tmp_path / "out")
     assert len(list((tmp_path / "out" / "frames").iterdir())) == 3
     (tmp_path / "out" / "frames" / "notes.txt").touch()
@@ -512,7 +524,7 @@ def test_what_is_made_again_leaves_no_frames_of_before(flare: Path, look: Look, 
     assert {path.name for path in (tmp_path / "out" / "frames").iterdir()} == {plate.name, "notes.txt"}
 
 
-def test_layers_in_a_space_with_a_curve_are_refused(flare: Path, look: Look, tmp_path: Path) -> None:
+def test_layers_in_a_nonlinear_space_raise(flare: Path, look: Look, tmp_path: Path) -> None:
     write_png(tmp_path / "plate.png", np.full((40, 60, 3), 0.2))
     with pytest.raises(SettingsError, match="srgb is not linear"):
         Transfer(flare, plate_target(tmp_path / "plate.png", look)).bake(
@@ -522,14 +534,14 @@ def test_layers_in_a_space_with_a_curve_are_refused(flare: Path, look: Look, tmp
 # ---- captures, chunks -----------------------------------------------------------------------------
 
 
-def test_on_to_a_capture_and_in_chunks(flare: Path, look: Look, tmp_path: Path) -> None:
+def test_a_capture_is_rendered_in_chunks(flare: Path, look: Look, tmp_path: Path) -> None:
     folder = make_capture(tmp_path / "capture", views=4)
     (folder / "lights.json").write_text('{"lights": [{"name": "sun", "xyz": [0.2, -0.3, 0.5]}]}')
-    target = of_capture(Capture.open(folder), look, {})
+    target = capture_target(Capture.open(folder), look, {})
     assert [one.plate is not None for one in target.frames] == [True] * 4
     Transfer(flare, target).bake(tmp_path / "whole")
     for part in (slice(2, 4), slice(0, 2)):
-        again = Transfer(flare, of_capture(Capture.open(folder), look, {}))
+        again = Transfer(flare, capture_target(Capture.open(folder), look, {}))
         again.bake(tmp_path / "parts", [one.frame for one in target.frames[part]])
     written = {path.relative_to(tmp_path / "whole").as_posix() for path in (tmp_path / "whole").rglob("*.*")}
     assert written == {"bake.json", *(f"layers.{k:04d}.exr" for k in range(4)),
@@ -541,16 +553,16 @@ def test_on_to_a_capture_and_in_chunks(flare: Path, look: Look, tmp_path: Path) 
 
 
 @pytest.mark.parametrize(("model", "params"), [("PINHOLE", None), ("OPENCV", (57.6, 57.6, 32, 24, 0.02, 0, 0, 0))])
-def test_the_space_that_plates_are_said_to_be_in_counts(model: str, params: Any, flare: Path, look: Look,
+def test_the_given_plate_space_overrides_the_file(model: str, params: Any, flare: Path, look: Look,
                                                         tmp_path: Path) -> None:
     """With a lens that distorts as well, whose frames are straightened first."""
     folder = make_capture(tmp_path / "capture", views=3, model=model, params=params)
     (folder / "lights.json").write_text('{"lights": [{"name": "sun", "xyz": [0.2, -0.3, 0.5]}]}')
     scenes = []
     for space in ("srgb", "linear"):
-        target = of_capture(Capture.open(folder), look, {})
+        target = capture_target(Capture.open(folder), look, {})
         transfer = Transfer(flare, target, TransferSettings(plate_space=space))
-        scenes.append(transfer.of_frame(target.frames[1].frame).render(target.frames[1].shot.camera).scene)
+        scenes.append(transfer.frame_renderer(target.frames[1].frame).render(target.frames[1].shot.camera).scene)
     np.testing.assert_allclose(scenes[0], linear_from_srgb(scenes[1]), atol=0.01)
     assert np.abs(scenes[0] - scenes[1]).mean() > 0.1
 
@@ -566,7 +578,7 @@ def test_a_distorted_exr_is_converted_once(space: str, look: Look, tmp_path: Pat
         write_exr(path.with_suffix(".exr"), {channel: np.full((48, 64), value) for channel, value in
                                              zip("RGB", (0.5, 0.1, 0.02), strict=True)},
                   half=False, header={"chromaticities": colour_space("acescg").chromaticities})
-    one = of_capture(Capture.open(folder), look, {}).frames[1]
+    one = capture_target(Capture.open(folder), look, {}).frames[1]
     assert one.plate is not None
     straight = background(one, one.shot.camera.size, None if space == "auto" else colour_space(space))
     assert straight is not None
@@ -574,8 +586,8 @@ def test_a_distorted_exr_is_converted_once(space: str, look: Look, tmp_path: Pat
     np.testing.assert_allclose(straight, np.broadcast_to(expected, straight.shape), atol=1e-5)
 
 
-def test_edits_go_by_the_target_s_lights(flare: Path, look: Look, tmp_path: Path) -> None:
-    target = of_shot(shot(flare, look, [cameras(3)[1]]), look, {})
+def test_edits_apply_to_the_lights_of_the_target(flare: Path, look: Look, tmp_path: Path) -> None:
+    target = shot_target(shot(flare, look, [cameras(3)[1]]), look, {})
     Transfer(flare, target).bake(tmp_path / "one", settings=BakeSettings(half=False))
     Transfer(flare, target).bake(tmp_path / "two", settings=BakeSettings(half=False, edits=("lamp.intensity=2",)))
     Transfer(flare, target).bake(tmp_path / "big", settings=BakeSettings(half=False, edits=("lamp.scale=2",)))
@@ -586,18 +598,18 @@ def test_edits_go_by_the_target_s_lights(flare: Path, look: Look, tmp_path: Path
         Transfer(flare, target).bake(tmp_path / "bad", settings=BakeSettings(edits=("moon.intensity=2",)))
 
 
-def test_the_edits_of_a_shot_stay_below_others(flare: Path, look: Look, tmp_path: Path) -> None:
+def test_the_edits_of_a_shot_combine_with_others(flare: Path, look: Look, tmp_path: Path) -> None:
     plain = shot(flare, look, [cameras(3)[1]])
     muted = replace(plain, frames=tuple(replace(one, edits=("lamp.mute=1",)) for one in plain.frames))
     for number, words in enumerate((("lamp.saturation=0.9",), ("lamp.scale=1.1",))):
-        Transfer(flare, of_shot(muted, look, {})).bake(tmp_path / str(number), settings=BakeSettings(edits=words))
+        Transfer(flare, shot_target(muted, look, {})).bake(tmp_path / str(number), settings=BakeSettings(edits=words))
         assert not read_layers(tmp_path / str(number) / "layers.0001.exr").flare.any()
 
 
-def test_cameras_of_a_shot_stay_below_the_folder(flare: Path, look: Look, tmp_path: Path) -> None:
+def test_the_layers_of_a_shot_stay_in_the_output_folder(flare: Path, look: Look, tmp_path: Path) -> None:
     one = shot(flare, look, [cameras(3)[1]]).frames[0]
     two = Shot(flare, tuple(replace(one, name=camera) for camera in ("../escaped", "other")))
-    record = Transfer(flare, of_shot(two, look, {})).bake(tmp_path / "out")
+    record = Transfer(flare, shot_target(two, look, {})).bake(tmp_path / "out")
     assert sorted(entry["file"] for entry in record["frames"]) == ["escaped/layers.0001.exr", "other/layers.0001.exr"]
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
 
@@ -606,8 +618,8 @@ def test_edits_by_frame_may_be_toml(tmp_path: Path) -> None:
     (tmp_path / "edits.toml").write_text('set = ["lamp.tint=1,0.5,1"]\n[frames]\n1 = ["lamp.intensity=0"]\n'
                                          '3 = ["lamp.intensity=1"]\n')
     keyed = KeyedEdits.read(tmp_path / "edits.toml")
-    assert keyed.at(2, ["lamp"]).light("lamp").intensity == pytest.approx(0.5)
-    assert keyed.at(2, ["lamp"]).light("lamp").tint == (1, 0.5, 1)
+    assert keyed.at(2, ["lamp"]).light_edit("lamp").intensity == pytest.approx(0.5)
+    assert keyed.at(2, ["lamp"]).light_edit("lamp").tint == (1, 0.5, 1)
     (tmp_path / "bad.toml").write_text("set = [")
     with pytest.raises(SettingsError, match=r"bad\.toml is not valid TOML"):
         KeyedEdits.read(tmp_path / "bad.toml")
@@ -621,32 +633,32 @@ def from_ten_times_as_far(camera: Camera, centre: np.ndarray, xyz: np.ndarray) -
 
 
 @pytest.mark.parametrize("times", [1, 10])
-def test_a_world_of_ten_times_the_size_is_asked_at_the_source_s_own_distance(times: int, flare: Path,
+def test_a_scaled_world_is_queried_at_the_source_s_distance(times: int, flare: Path,
                                                                              look: Look) -> None:
     light, camera = look.lights[0], cameras(3)[1]
     xyz = times * light.xyz
-    pose, seen = from_ten_times_as_far(camera, light.xyz, xyz), queries.seen_by(flare, look.lights)[light.name]
-    target, blend = (queries._asked(light, ViewOfLight.of(pose, xyz), xyz, query, seen, 10.0, None)
+    pose, seen = from_ten_times_as_far(camera, light.xyz, xyz), queries.training_views(flare, look.lights)[light.name]
+    target, blend = (queries._weighted_queries(light, ViewOfLight.of(pose, xyz), xyz, query, seen, 10.0, None)
                      for query in ("target", "blend"))
     np.testing.assert_allclose(target[0][1].camera, camera.position, atol=1e-4)
     assert len(blend) > 1
     assert min(np.linalg.norm(one.camera - camera.position) for _, one in blend) < 0.5, "a view of the training"
 
 
-def test_the_one_view_of_the_source_is_chosen_by_its_own_distances(flare: Path, look: Look,
-                                                                   monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_fixed_view_is_chosen_by_scaled_distances(flare: Path, look: Look,
+                                                      monkeypatch: pytest.MonkeyPatch) -> None:
     xyz, told = look.lights[0].xyz, list[float]()
     fixed_view = queries.fixed_view
-    monkeypatch.setattr(queries, "fixed_view", lambda light, views, distances, seen: (
-        told.extend(distances), fixed_view(light, views, distances, seen))[1])
+    monkeypatch.setattr(queries, "fixed_view", lambda light, views, distances, training: (
+        told.extend(distances), fixed_view(light, views, distances, training))[1])
     views = [replace(camera, world_to_camera=from_ten_times_as_far(camera, xyz, xyz)) for camera in cameras(5)[:2]]
-    Transfer(flare, of_shot(shot(flare, look, views), look, {}), TransferSettings(query="source", scale=10))
+    Transfer(flare, shot_target(shot(flare, look, views), look, {}), TransferSettings(query="source", scale=10))
     np.testing.assert_allclose(told, [np.linalg.norm(camera.position - xyz) for camera in cameras(5)[:2]], rtol=1e-6)
 
 
-def test_a_frame_is_made_again_when_one_changes_that_it_is_smoothed_with(flare: Path, look: Look) -> None:
+def test_a_frame_is_rendered_again_when_a_smoothing_neighbour_changes(flare: Path, look: Look) -> None:
     def prints(*shares: float) -> list[str]:
-        target = of_shot(shot(flare, look, cameras(5), shares=list(shares)), look, {})
+        target = shot_target(shot(flare, look, cameras(5), shares=list(shares)), look, {})
         transfer = Transfer(flare, target, TransferSettings(smooth=1))
         return [transfer.fingerprint_of(number) for number in range(5)]
 
@@ -654,7 +666,7 @@ def test_a_frame_is_made_again_when_one_changes_that_it_is_smoothed_with(flare: 
     assert same == [True, True, False, False, False], "the share is smoothed, then its step: two frames to each side"
 
 
-def test_a_half_plate_holds_no_infinity() -> None:
+def test_a_half_float_plate_is_clamped_below_infinity() -> None:
     plate = ColouredPlate(Plate(Path("a.exr"), np.full((2, 2, 3), 60000, np.float16), "linear"), colour_space("linear"))
     stored = plate.with_light(np.full((2, 2, 3), 30000, np.float32))
     assert stored.dtype == np.float16

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A flare as a PLY renders as the flare does; a preset says where its elements are."""
+"""Export of a flare as a PLY and as a preset."""
 from __future__ import annotations
 
 import json
@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import torch
 
-from core.conventions.exposures import brightness
-from core.conventions.pixel_grid import Sampling
+from core.conventions.exposures import colour_scale
+from core.conventions.pixel_grid import PixelGrid
 from core.flare.model import OURS, PAPER
 from core.gaussians import rasterization
 from core.gaussians.ply import read_ply
@@ -23,15 +23,15 @@ from tests.core.flared import cameras
 from tests.core.test_look import saved
 
 
-@pytest.mark.parametrize("sampling", [None, Sampling(70.0, 70.0), Sampling(25.0, 35.0)])
+@pytest.mark.parametrize("pixel_grid", [None, PixelGrid(70.0, 70.0), PixelGrid(25.0, 35.0)])
 @pytest.mark.parametrize("blend", ["over", "add"])
-def test_the_ply_of_a_frame_renders_as_the_flare(blend: str, sampling: Sampling | None, tmp_path: Path) -> None:
+def test_the_ply_of_a_frame_renders_as_the_flare(blend: str, pixel_grid: PixelGrid | None, tmp_path: Path) -> None:
     """Without rings, which 3DGS has no word for; "over", which is what a 3DGS renderer does."""
     form = replace(PAPER if blend == "over" else OURS, rings=False)
     saved(tmp_path / "a.flare", form, 2, blend)
     look, camera = read(tmp_path / "a.flare"), cameras(3)[0]
     seen = look.evaluate(camera.world_to_camera)
-    write_flare_ply(tmp_path / "flare.ply", seen, camera, blend, sampling)
+    write_flare_ply(tmp_path / "flare.ply", seen, camera, blend, pixel_grid)
     scene = read_ply(tmp_path / "flare.ply")
     assert len(scene) == look.count
     with torch.no_grad():
@@ -39,14 +39,14 @@ def test_the_ply_of_a_frame_renders_as_the_flare(blend: str, sampling: Sampling 
             scene.means, scene.quaternions, scene.scales, scene.opacities, scene.sh,
             torch.from_numpy(camera.world_to_camera).float(), torch.from_numpy(camera.intrinsics).float(),
             camera.width, camera.height, kernels="torch").colour.numpy()
-    expected = draw(seen.values(), camera.intrinsics, camera.width, camera.height, "over", sampling)
+    expected = draw(seen.values(), camera.intrinsics, camera.width, camera.height, "over", pixel_grid)
     assert expected.max() > 0.05
     apart = np.abs(shown - expected)
     assert (apart < 2e-3).mean() > 0.999
     assert apart.max() < ALPHA_MIN, "one that is just too faint here and not there, at most"
 
 
-def test_rings_stand_beside_the_gaussians(tmp_path: Path) -> None:
+def test_rings_are_extra_properties_of_the_ply(tmp_path: Path) -> None:
     saved(tmp_path / "a.flare", OURS, 1)
     look, camera = read(tmp_path / "a.flare"), cameras(3)[1]
     seen = look.evaluate(camera.world_to_camera)
@@ -58,14 +58,14 @@ def test_rings_stand_beside_the_gaussians(tmp_path: Path) -> None:
     np.testing.assert_array_equal(table[:, 62:], next(iter(seen.values())).rings)
 
 
-def test_arcs_stand_beside_the_gaussians_too(tmp_path: Path) -> None:
+def test_arcs_are_extra_properties_of_the_ply(tmp_path: Path) -> None:
     """In the Gaussians' own axes: exp(arc_0 u + arc_1 v) of the PLY's u and v is exp(b·d) of the plane's d."""
     saved(tmp_path / "a.flare", replace(OURS, arcs=True), 1)
     look, camera = read(tmp_path / "a.flare"), cameras(3)[1]
     seen = next(iter(look.evaluate(camera.world_to_camera).values()))
     scene, more = flare_scene({"lamp": seen}, camera)
     assert list(more) == ["ring_r0", "ring_w", "arc_0", "arc_1"]
-    np.testing.assert_allclose(np.hypot(more["arc_0"], more["arc_1"]), seen.strengths, rtol=1e-3)
+    np.testing.assert_allclose(np.hypot(more["arc_0"], more["arc_1"]), seen.arc_strengths, rtol=1e-3)
     axes = rotation_matrices(scene.quaternions).detach().numpy()[:, :, :2]  # in the world
     depth = (scene.means.detach().numpy() - camera.position) @ camera.world_to_camera[2, :3]
     own = np.stack([more["arc_0"], more["arc_1"]], -1) * scene.scales.detach().numpy()[:, :2]
@@ -73,12 +73,12 @@ def test_arcs_stand_beside_the_gaussians_too(tmp_path: Path) -> None:
     np.testing.assert_allclose(on_plane, seen.arcs, atol=1e-4 * np.abs(seen.arcs).max())
 
 
-def test_a_flare_out_of_sight_is_an_empty_ply(tmp_path: Path) -> None:
+def test_an_invisible_flare_is_an_empty_ply(tmp_path: Path) -> None:
     write_flare_ply(tmp_path / "flare.ply", {}, cameras(1)[0], "add")
     assert len(read_ply(tmp_path / "flare.ply")) == 0
 
 
-def test_a_light_s_name_of_several_lines_stays_in_the_header(tmp_path: Path) -> None:
+def test_a_light_name_with_line_breaks_stays_in_one_comment(tmp_path: Path) -> None:
     saved(tmp_path / "a.flare", OURS, 1)
     look, camera = read(tmp_path / "a.flare"), cameras(3)[1]
     seen = next(iter(look.evaluate(camera.world_to_camera).values()))
@@ -87,7 +87,7 @@ def test_a_light_s_name_of_several_lines_stays_in_the_header(tmp_path: Path) -> 
     assert b"\ncomment lights left element lamp right\n" in (tmp_path / "flare.ply").read_bytes()
 
 
-def test_a_preset_says_where_and_how_bright(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_preset_has_position_and_intensity(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """One Gaussian of each kind at a known place."""
     saved(tmp_path / "a.flare", OURS, 1, count=4)
     look = read(tmp_path / "a.flare")
@@ -123,7 +123,7 @@ def test_a_preset_says_where_and_how_bright(tmp_path: Path, monkeypatch: pytest.
 
 
 @pytest.mark.parametrize("blend", ["over", "add"])
-def test_a_preset_is_of_the_lights_that_are_shown_as_the_frame_is_exposed(blend: str, tmp_path: Path) -> None:
+def test_a_preset_has_the_visible_lights_at_the_frame_s_exposure(blend: str, tmp_path: Path) -> None:
     saved(tmp_path / "a.flare", OURS, 2, blend)
     look, camera = read(tmp_path / "a.flare"), cameras(3)[1]
     view = {light.name: ViewOfLight.of(camera.world_to_camera, light.xyz) for light in look.lights}
@@ -133,11 +133,11 @@ def test_a_preset_is_of_the_lights_that_are_shown_as_the_frame_is_exposed(blend:
     before, after = ([part["intensity"] for element in one["lights"][0]["elements"] for part in element["parts"]]
                      for one in (usual, exposed))
     assert max(before) > 0
-    np.testing.assert_allclose(after, np.multiply(before, brightness(0.5, blend)), rtol=1e-5)
+    np.testing.assert_allclose(after, np.multiply(before, colour_scale(0.5, blend)), rtol=1e-5)
 
 
 @pytest.mark.parametrize("word", ["mute", "solo"])
-def test_a_preset_lacks_the_elements_that_are_hidden_and_no_others(word: str, tmp_path: Path) -> None:
+def test_a_preset_omits_exactly_the_hidden_elements(word: str, tmp_path: Path) -> None:
     saved(tmp_path / "a.flare", OURS, 1)
     look, camera = read(tmp_path / "a.flare"), cameras(3)[1]
     light = look.lights[0]
@@ -152,7 +152,7 @@ def test_a_preset_lacks_the_elements_that_are_hidden_and_no_others(word: str, tm
         assert found == [everything[name] for name in everything if name in left]
 
 
-def test_a_preset_is_in_widths_of_the_picture_it_is_of(tmp_path: Path) -> None:
+def test_a_preset_is_in_picture_widths(tmp_path: Path) -> None:
     """Not of the footage the flare was trained on."""
     saved(tmp_path / "a.flare", OURS, 1)
     look, camera = read(tmp_path / "a.flare"), cameras(3)[1]
@@ -167,7 +167,7 @@ def test_a_preset_is_in_widths_of_the_picture_it_is_of(tmp_path: Path) -> None:
     assert closer["offset"] == part["offset"]
 
 
-def test_a_preset_tells_to_which_side_a_part_lies_and_turns() -> None:
+def test_a_preset_has_side_and_rotation_of_a_part() -> None:
     """Clockwise of the axis through the light, as the picture is seen."""
     along, aside = np.array([0.6, 0.8]), np.array([-0.8, 0.6])
     long = np.cos(np.radians(30)) * along + np.sin(np.radians(30)) * aside

@@ -60,7 +60,7 @@ def test_a_refused_write_raises_an_error_that_names_the_file(tmp_path: Path) -> 
     assert os_error_message(PermissionError(errno.EACCES, "Permission denied", "/a")) == (
         "The system refused: Permission denied (/a).")
     assert os_error_message(OSError(errno.ELOOP, os.strerror(errno.ELOOP), "/a")) == (
-        "A symbolic link leads back to itself (/a); remove it, or name another place.")
+        "A symbolic link leads back to itself (/a); remove it or choose another path.")
 
 
 def test_a_write_replaces_the_file_and_makes_its_folder(tmp_path: Path) -> None:

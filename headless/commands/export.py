@@ -76,7 +76,7 @@ def run(args: argparse.Namespace, progress: Progress) -> dict[str, Any]:
     progress.stage("export", len(selected))
     for frame in selected:
         camera = cameras[frame.view]
-        flares = {light: one.exposed(camera.exposure, look.blend)
+        flares = {light: one.with_exposure(camera.exposure, look.blend)
                   for light, one in look.evaluate(camera.world_to_camera, edits=edits).items()}
         write_flare_ply(args.out / frame.file.replace("layers.", "flare.").replace(".exr", ".ply"), flares, camera,
                         look.blend, look.pixel_grid)

@@ -22,7 +22,7 @@ from fit_flare.headless.child import Child, EventQueue, next_event
 HERE = [sys.executable, str(hand_off.RUN_SCRIPT)]
 
 
-class Heard(Progress):
+class RecordingProgress(Progress):
     """Remembers what was shown."""
 
     def __init__(self) -> None:
@@ -143,7 +143,7 @@ def child(tmp_path: Path, code: str) -> list[str]:
 
 
 def test_events_of_the_child_are_forwarded(tmp_path: Path) -> None:
-    heard = Heard()
+    heard = RecordingProgress()
     code = ("print('Blender 9.9')\n"
             "tell(type='stage', name='bake', total=5, done=2)\n"
             "tell(type='progress', done=4, total=5, figures={'loss': 0.5})\n"
@@ -159,27 +159,29 @@ def test_events_of_the_child_are_forwarded(tmp_path: Path) -> None:
 def test_the_error_of_the_child_is_raised(tmp_path: Path, status: int, error: type[FitFlareError]) -> None:
     code = f"tell(type='error', text='The lamp is broken.')\nsys.exit({status})"
     with pytest.raises(FitFlareError, match=r"^The lamp is broken\.$") as problem:
-        hand_off.run_in_child(child(tmp_path, code), [], "x", Heard())
+        hand_off.run_in_child(child(tmp_path, code), [], "x", RecordingProgress())
     assert type(problem.value) is error
 
 
 def test_options_are_added_before_the_end_of_options(tmp_path: Path) -> None:
     """Behind "--" all words are names of files."""
     code = "tell(type='result', data={'words': sys.argv[1:]})\n"
-    result = hand_off.run_in_child(child(tmp_path, code), ["remove", "--out", "o", "--", "-a.png"], "remove", Heard())
+    result = hand_off.run_in_child(child(tmp_path, code), ["remove", "--out", "o", "--", "-a.png"], "remove",
+                                    RecordingProgress())
     assert result["words"] == ["remove", "--out", "o", "--step", "remove", "--progress", "json", "--", "-a.png"]
 
 
 def test_a_crash_of_the_child_is_reported_with_the_end_of_its_log(tmp_path: Path,
                                                                   capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(EngineError, match="status 9"):
-        hand_off.run_in_child(child(tmp_path, "print('boom', file=sys.stderr)\nsys.exit(9)"), [], "x", Heard())
+        hand_off.run_in_child(child(tmp_path, "print('boom', file=sys.stderr)\nsys.exit(9)"), [], "x",
+                              RecordingProgress())
     assert "boom" in capsys.readouterr().err
 
 
 def test_a_program_that_cannot_start_is_reported_in_one_line(tmp_path: Path) -> None:
     with pytest.raises(EngineError, match="cannot be started"):
-        hand_off.run_in_child([str(tmp_path / "nothing")], [], "x", Heard())
+        hand_off.run_in_child([str(tmp_path / "nothing")], [], "x", RecordingProgress())
 
 
 def test_waiting_for_an_event_can_be_stopped(tmp_path: Path) -> None:
@@ -215,7 +217,7 @@ def test_a_stop_reaches_the_child_which_ends_by_itself(tmp_path: Path, numbers: 
             "for _ in range(300):\n"
             "    time.sleep(0.1)\n")
 
-    class Stopping(Heard):
+    class Stopping(RecordingProgress):
         def _show_stage(self) -> None:
             for number in numbers:
                 os.kill(os.getpid(), getattr(signal, number))
@@ -230,7 +232,7 @@ def test_a_stop_reaches_the_child_which_ends_by_itself(tmp_path: Path, numbers: 
 
 @pytest.mark.skipif(os.name == "nt", reason="the test looks for the process by its number")
 def test_no_child_is_left_when_the_parent_fails(tmp_path: Path) -> None:
-    class Failing(Heard):
+    class Failing(RecordingProgress):
         def say(self, text: str) -> None:
             raise BrokenPipeError(text)
 

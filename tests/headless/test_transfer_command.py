@@ -141,7 +141,7 @@ def test_a_preset_needs_a_light_in_front_of_the_camera(run: Run, tmp_path: Path)
     save_flare(tmp_path / "a.flare", FlareFile(flare, "add", TrainedCamera(64, 40, 70.0, 70.0, 33.0, 19.5)))
     words = ["export", tmp_path / "a.flare", "--capture", folder, "--as", "preset", "--out", tmp_path / "a.json"]
     told = [event["text"] for event in run(*words) if event["type"] == "say"]
-    assert told[-1] == "Lights behind the camera in frame 0 are not in it: lamp 1."
+    assert told[-1] == "Lights behind the camera in frame 0 are left out: lamp 1."
     made = (tmp_path / "a.json").read_text()
     assert [light["name"] for light in json.loads(made)["lights"]] == ["lamp 0"]
     assert "No light is in front of the camera in frame 1" in run(*words, "--frames", "1", status=1)[-1]["text"]

@@ -182,7 +182,7 @@ def named(cameras: list[Camera]) -> list[tuple[str, Camera]]:
     return [(f"{i:04d}.png", camera) for i, camera in enumerate(cameras)]
 
 
-class TestGather:
+class TestTriangulation:
     def test_lights_are_triangulated_without_false_ones(self) -> None:
         lights = [(0.4, -0.5, 0.3), (-0.9, -0.2, 1.5), (0.1, 0.3, -1.0)]
         cameras = orbit(30, size=SIZE)

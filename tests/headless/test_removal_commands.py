@@ -44,8 +44,8 @@ def test_training_stops_at_its_length_and_resumes(backgrounds: Path, tmp_path: P
     made = tmp_path / "made"
     shorter = ["train-removal", "--backgrounds", str(backgrounds), "--out", str(made), "--resume", "--processes", "1"]
     assert cli.main([*shorter, "--set", "clean=0.5"]) == 0
-    goes_by = read_recipe(made)  # with what it was begun by, not with the usual length and size
-    assert goes_by is not None and (goes_by.iterations, goes_by.bank, goes_by.clean) == (3, 2, 0.5)
+    recipe = read_recipe(made)  # with its own settings, not the default length and size
+    assert recipe is not None and (recipe.iterations, recipe.bank_size, recipe.clean_share) == (3, 2, 0.5)
     weights = str(tmp_path / "made" / "removal.safetensors")
     assert cli.main(["remove", str(backgrounds), "--out", str(tmp_path / "clean"), "--weights", weights]) == 0
     assert {path.name for path in (tmp_path / "clean").iterdir()} == {"a.png", "b.png", "remove.json"}

@@ -1,0 +1,37 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Orders and compares the names of files: by number, and in one form whatever program wrote them.
+
+Captures, plates and sequences are listed by `natural_key`; names in models and lists are compared by `canonical_name`.
+"""
+from __future__ import annotations
+
+import re
+import unicodedata
+from pathlib import PurePath, PurePosixPath
+
+_DIGITS = re.compile(r"(\d+)")
+_MAX_DIGITS = 4000
+"""Digits that Python converts to an integer."""
+
+
+def natural_key(name: PurePath | str) -> list[tuple[tuple[int, int, str], ...]]:
+    """Return the key of natural order, folder by folder: numbers in a name by value, so that 9 comes before 10.
+
+    Names that are equal but for leading zeros or the form of their letters keep a fixed order by their text.
+    """
+    parts = PurePosixPath(str(name).replace("\\", "/")).parts
+    return [*(_part_key(part) for part in parts), ((2, 0, str(name)),)]
+
+
+def _part_key(part: str) -> tuple[tuple[int, int, str], ...]:
+    return tuple((0, int(piece), "") if piece.isascii() and piece.isdigit() and len(piece) < _MAX_DIGITS
+                 else (1, 0, piece) for piece in _DIGITS.split(unicodedata.normalize("NFC", part)) if piece)
+
+
+def canonical_name(name: PurePath | str) -> str:
+    """Return one form of a relative path for comparison: forward slashes, no "./", NFC, suffix in lower case.
+
+    Windows' tools write backslashes, macOS stores accents decomposed (NFD), and cameras write .JPG.
+    """
+    path = PurePosixPath(unicodedata.normalize("NFC", str(name).replace("\\", "/")))
+    return str(path.with_suffix(path.suffix.lower())) if path.suffix else str(path)
